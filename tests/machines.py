@@ -1,9 +1,10 @@
 """Machines of the class, one function each, for tests that write them in many layouts."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+import yaml
 from layouts import LegSpec, MachineSpec
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -86,3 +87,26 @@ MACHINES: dict[str, Callable[[], MachineSpec]] = {
     "hexapod with a rod": lambda: of_types(["US"] * 6, ["actuated"] * 5 + ["constant"]),
     "hexapod with a strut": lambda: of_types(["US"] * 6 + ["SS"], ["actuated"] * 6 + ["passive"]),
 }
+
+
+def displaced(T: RigidTransform, step: Sequence[float] | Array) -> RigidTransform:
+    """Return a pose after a rotation about its origin [rad] and a displacement [m], in the base."""
+    turn = Rotation.from_rotvec(np.asarray(step)[:3])
+    return RigidTransform.from_components(T.translation + np.asarray(step)[3:], turn * T.rotation)
+
+
+def write_home(folder: Path, name: str, home: RigidTransform | None) -> Path:
+    """Write the YAML of a shipped model with another home, or none, and return it."""
+    document = yaml.safe_load((ROOT / "models" / f"{name}.yaml").read_text())
+    block = document["legcal"]
+    block["urdf"] = str(ROOT / "urdf" / f"{name}.urdf")
+    if home is None:
+        del block["home"]
+    else:
+        block["home"] = {
+            "xyz": [float(x) for x in home.translation],
+            "quat_xyzw": [float(x) for x in home.rotation.as_quat()],
+        }
+    path = folder / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(document, sort_keys=False))
+    return path

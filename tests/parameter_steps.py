@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.geometry.types import Array
+from legcal.geometry import Array
 from legcal.machine import (
     KinematicParameters,
     Leg,
@@ -16,8 +16,9 @@ from legcal.machine import (
     load_mechanism,
     moved_legs,
     with_platform_foot,
+    write_calibrated_yaml,
+    write_urdf,
 )
-from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
 
 
 def random_covariance(

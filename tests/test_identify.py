@@ -16,7 +16,7 @@ import yaml
 from hexapod_example import HEXAPOD
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mechanisms import SHIPPED_URDF, SHIPPED_YAML
+from machines import SHIPPED_URDF, SHIPPED_YAML
 from rich.console import Console
 from thinned import thinned
 

@@ -1,129 +1,202 @@
-"""Kinematics of the closed chain against closed forms, finite differences and a second reader."""
+"""Kinematics of closed chains against closed forms, finite differences and another reader."""
 
-import csv
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from mechanisms import ROOT, SHIPPED_URDF, SHIPPED_YAML, Layout, geometry, write_hexapod
-from scipy.spatial.transform import RigidTransform, Rotation
+from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
+from machines import HOME, MACHINES, SHIPPED, SHIPPED_URDF, displaced, of_types, ring
+from scipy.spatial.transform import RigidTransform
+from thinned import thinned
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.geometry.types import Array
+from legcal.geometry import Array
 from legcal.machine import (
+    Configurations,
+    Follower,
     LegKind,
     Machine,
+    follow,
     forward_kinematics,
     forward_kinematics_many,
     inverse_kinematics,
     leg_vectors,
     load_mechanism,
-    platform_pose,
+    pose_equations,
+    random_configurations,
+    slider_columns,
 )
-from legcal.machine.chain import ClosedChain, Closure
-from legcal.machine.kinematics import close_at
-from legcal.machine.mobility import mobility
+
+machine_of = cache(load_mechanism)
+DRAWN = 8
 
 
-@pytest.fixture(scope="module")
-def hexapod() -> Machine:
-    return load_mechanism("hexapod")
+@cache
+def drawn_of(name: str) -> Configurations:
+    return random_configurations(machine_of(name), DRAWN, 5)
 
 
-def _sample_readings(machine: Machine) -> Array:
-    with (ROOT / "examples" / "hexapod" / "measurements.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    return np.array([[float(row[str(leg.prismatic)]) for leg in machine.legs] for row in rows])
+@pytest.fixture(scope="module", params=SHIPPED)
+def name(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
 
 
-def _length_misfit(machine: Machine, T: RigidTransform, q: Array) -> float:
-    lengths = np.linalg.norm(leg_vectors(machine, T), axis=1)
-    return float(np.abs(lengths - (machine.sign * q + machine.q0)).max())
+def free_motions(machine: Machine, configuration: Array) -> Array:
+    """Return a basis of the motions of the closed chain, (nv, n)."""
+    jacobian = machine.chain.linearize(configuration)[1]
+    values, right = np.linalg.svd(jacobian)[1:]
+    return np.asarray(right[int(np.sum(values > 1e-7)) :].T)
 
 
-@settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+def without_a_motor(name: str) -> Machine:
+    machine = machine_of(name)
+    legs = list(machine.legs)
+    legs[1] = replace(legs[1], kind=LegKind.PASSIVE)
+    return replace(machine, legs=tuple(legs))
+
+
+# --- every shipped machine ----------------------------------------------------------------------
+
+
+def test_the_mobility_is_the_rank_of_the_platforms_motions(name: str) -> None:
+    machine = machine_of(name)
+    spins = sum(leg.idle_spins for leg in machine.legs)
+    for configuration in drawn_of(name).configurations[:3]:
+        motions = free_motions(machine, configuration)
+        twists = machine.chain.twist(machine.base, machine.platform) @ motions
+        values = np.linalg.svd(twists, compute_uv=False)
+        assert int(np.sum(values > 1e-6)) == machine.mobility == len(machine.motors)
+        assert motions.shape[1] == machine.mobility + spins
+
+
+def test_random_configurations_are_closed_inside_the_travel_and_unflipped(name: str) -> None:
+    machine, drawn = machine_of(name), drawn_of(name)
+    lower, upper = np.array([leg.travel for leg in machine.legs]).T
+    sliding = [j for j, leg in enumerate(machine.legs) if leg.prismatic is not None]
+    columns = slider_columns(machine, sliding)[0]
+    for configuration, q, T in zip(*drawn, strict=True):
+        assert np.abs(machine.chain.residual(configuration)).max() < 1e-12
+        assert np.all((q >= lower - 1e-9) & (q <= upper + 1e-9))
+        np.testing.assert_allclose(configuration[columns], q[sliding], atol=1e-12)
+        np.testing.assert_allclose(inverse_kinematics(machine, T), q, atol=1e-11)
+        vectors = leg_vectors(machine, T)
+        lengths = (machine.sign * q + machine.q0)[sliding]
+        assert lengths.min() > 0.0
+        np.testing.assert_allclose(lengths, np.linalg.norm(vectors, axis=1)[sliding], atol=1e-11)
+        for leg, u in zip(machine.legs, vectors, strict=True):
+            if leg.platform_axis is not None and leg.type == "UP":
+                assert T.rotation.apply(leg.platform_axis) @ u > 0.0
+    assert np.ptp(drawn.readings[:, list(machine.motors)], axis=0).min() > 1e-3
+
+
+def test_forward_kinematics_inverts_inverse_kinematics_from_any_start(name: str) -> None:
+    machine, drawn = machine_of(name), drawn_of(name)
+    backwards = forward_kinematics_many(machine, drawn.readings[::-1])[::-1]
+    for T, found in zip(drawn.poses, backwards, strict=True):
+        np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
+    q, T = drawn.readings[0], drawn.poses[0]
+    home = inverse_kinematics(machine, machine.home)
+    follower = Follower(machine)
+    poses = [follower.move_to(home + s * (q - home)) for s in np.linspace(0.0, 1.0, 12)]
+    np.testing.assert_allclose(poses[0].as_matrix(), machine.home.as_matrix(), atol=1e-12)
+    rounded = RigidTransform.from_matrix(np.round(poses[-2].as_matrix(), 4))
+    for found in (
+        poses[-1],
+        forward_kinematics(machine, q),
+        forward_kinematics(machine, q, start=poses[-2]),
+        forward_kinematics(machine, q, start=rounded),
+    ):
+        np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
+
+
+def test_closed_forms_have_the_derivatives_of_the_closures(name: str) -> None:
+    machine, drawn = machine_of(name), drawn_of(name)
+    columns = slider_columns(machine, machine.motors)[1]
+    for configuration, T in zip(drawn.configurations[:3], drawn.poses[:3], strict=True):
+        motions = free_motions(machine, configuration)
+        local = machine.chain.twist(machine.base, machine.platform) @ motions
+        R = T.rotation.as_matrix()
+        twist = np.concatenate([R @ local[3:], R @ local[:3]])  # as the legs' equations have it
+        found = pose_equations(machine.legs, R[None], T.translation[None])
+        rates = found.by_pose[0] @ twist
+        assert np.abs(rates[~found.measured]).max(initial=0.0) < 1e-9  # no constraint is broken
+        signs = machine.sign[list(machine.motors)]
+        np.testing.assert_allclose(
+            rates[found.measured], signs[:, None] * motions[columns], atol=1e-9
+        )
+
+
+@pytest.mark.parametrize("name", ["hexapod", "3-upu"])  # closed by points, and by frames
+def test_the_jacobian_of_the_closures_is_the_derivative_of_their_residual(name: str) -> None:
+    chain = machine_of(name).chain
+    turned = np.random.default_rng(2).uniform(-0.5, 0.5, chain.nv)
+    configuration = chain.integrate(chain.neutral(), turned)  # far from closed
+    residual, jacobian = chain.linearize(configuration)
+    np.testing.assert_allclose(residual, chain.residual(configuration), atol=1e-15)
+    assert np.abs(residual).max() > 0.1
+    h = 1e-6
+    ends = [
+        [chain.residual(chain.integrate(configuration, s * h * e)) for e in np.eye(chain.nv)]
+        for s in (1.0, -1.0)
+    ]
+    numeric = (np.array(ends[0]) - np.array(ends[1])).T / (2 * h)
+    np.testing.assert_allclose(jacobian, numeric, atol=1e-8)
+
+
+# --- closed forms and other routes --------------------------------------------------------------
+
+
+@settings(max_examples=25, deadline=None)
 @given(xyz=st.tuples(*[st.floats(-0.05, 0.05)] * 3), turn=st.tuples(*[st.floats(-0.25, 0.25)] * 3))
-def test_forward_kinematics_inverts_inverse_kinematics(
-    hexapod: Machine, xyz: tuple[float, float, float], turn: tuple[float, float, float]
+def test_a_hexapod_goes_where_its_leg_lengths_put_it(
+    xyz: tuple[float, ...], turn: tuple[float, ...]
 ) -> None:
-    T = RigidTransform.from_components(
-        np.asarray(hexapod.home.translation) + xyz, Rotation.from_rotvec(turn)
-    ) * RigidTransform.from_rotation(hexapod.home.rotation)
-    found = forward_kinematics(hexapod, inverse_kinematics(hexapod, T))
-    np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-11)
+    hexapod = machine_of("hexapod")
+    T = displaced(hexapod.home, [*turn, *xyz])
+    q = inverse_kinematics(hexapod, T)
+    lengths = np.linalg.norm(T.apply(hexapod.B_platform) - hexapod.A_base, axis=1)
+    np.testing.assert_allclose(q, lengths - hexapod.q0, atol=1e-12)
+    np.testing.assert_allclose(
+        forward_kinematics(hexapod, q).as_matrix(), T.as_matrix(), atol=1e-11
+    )
 
 
-def test_every_random_reading_of_the_travel_closes_in_one_assembly_mode(
-    hexapod: Machine,
-) -> None:
-    rng = np.random.default_rng(11)
-    lower, upper = np.array([leg.travel for leg in hexapod.legs]).T
-    q = rng.uniform(lower, upper, (150, 6))
-    poses = forward_kinematics_many(hexapod, q)
-    for row, T in zip(q, poses, strict=True):
-        assert _length_misfit(hexapod, T, row) < 1e-12
-        assert T.translation[2] > 0.1
-    for row, T in list(zip(q, poses, strict=True))[::10]:
-        alone = forward_kinematics(hexapod, row)
-        np.testing.assert_allclose(alone.as_matrix(), T.as_matrix(), atol=1e-11)
-
-
-def test_a_path_of_readings_gives_a_continuous_path_of_poses(hexapod: Machine) -> None:
-    start, end = np.full(6, 0.0), np.array([0.14, 0.0, 0.14, 0.02, 0.1, 0.03])
+def test_a_path_of_readings_gives_a_continuous_path_of_poses() -> None:
+    start, end = np.zeros(6), np.array([0.14, 0.0, 0.14, 0.02, 0.1, 0.03])
     q = start + np.linspace(0.0, 1.0, 60)[:, None] * (end - start)
-    poses = forward_kinematics_many(hexapod, q)
-    for one, two in pairwise(poses):
+    for one, two in pairwise(forward_kinematics_many(machine_of("hexapod"), q)):
         step = one.inv() * two
         assert np.linalg.norm(step.translation) < 0.02
         assert step.rotation.magnitude() < 0.05
 
 
-def test_the_sample_readings_close_and_row_order_does_not_matter(hexapod: Machine) -> None:
-    q = _sample_readings(hexapod)
-    poses = forward_kinematics_many(hexapod, q)
-    backwards = forward_kinematics_many(hexapod, q[::-1])[::-1]
-    for row, T, other in zip(q, poses, backwards, strict=True):
-        assert _length_misfit(hexapod, T, row) < 1e-12
-        np.testing.assert_allclose(T.as_matrix(), other.as_matrix(), atol=1e-12)
-
-
-def test_a_warm_start_leads_to_the_same_pose(hexapod: Machine) -> None:
-    q = inverse_kinematics(hexapod, hexapod.home)
-    q = q + np.array([0.01, -0.02, 0.03, 0.0, 0.02, -0.01])
-    cold = forward_kinematics(hexapod, q)
-    warm = forward_kinematics(hexapod, q, start=cold)
-    np.testing.assert_allclose(warm.as_matrix(), cold.as_matrix(), atol=1e-12)
-
-
-def test_a_start_in_another_assembly_mode_stays_there(hexapod: Machine) -> None:
+def test_a_start_in_another_assembly_mode_stays_there() -> None:
     # Base and platform joints are coplanar: the mirror image in their planes has equal legs.
-    below = RigidTransform.from_components(
-        hexapod.home.translation * [1.0, 1.0, -1.0], hexapod.home.rotation
-    )
-    q = inverse_kinematics(hexapod, hexapod.home) + 0.01
+    hexapod, mirror = machine_of("hexapod"), np.array([1.0, 1.0, -1.0])
+    home = hexapod.home
+    below = RigidTransform.from_components(home.translation * mirror, home.rotation)
+    q = inverse_kinematics(hexapod, home) + 0.01
     above_T, below_T = forward_kinematics(hexapod, q), forward_kinematics(hexapod, q, start=below)
-    np.testing.assert_allclose(
-        below_T.translation, above_T.translation * [1.0, 1.0, -1.0], atol=1e-9
-    )
+    np.testing.assert_allclose(below_T.translation, above_T.translation * mirror, atol=1e-9)
 
 
-def test_both_readers_of_the_urdf_place_every_link_alike(hexapod: Machine) -> None:
+def test_another_reader_of_the_urdf_places_every_link_alike() -> None:
     from yourdfpy import URDF
 
+    hexapod = machine_of("hexapod")
     robot = URDF.load(str(SHIPPED_URDF), load_meshes=False)
-    q = inverse_kinematics(hexapod, hexapod.home)
     configuration = hexapod.home_configuration
     values = {
         joint.name: float(configuration[hexapod.chain.q_index(joint.name)])
         for joint in hexapod.urdf.joints.values()
         if joint.type in ("revolute", "prismatic")
     }
+    q = inverse_kinematics(hexapod, hexapod.home)
     assert [values[str(leg.prismatic)] for leg in hexapod.legs] == pytest.approx(q, abs=1e-12)
     robot.update_cfg(values)
     for j in range(1, 7):
@@ -136,97 +209,238 @@ def test_both_readers_of_the_urdf_place_every_link_alike(hexapod: Machine) -> No
         np.testing.assert_allclose(end, hexapod.A_base[j - 1], atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["3d", "6d"])
-def test_the_jacobian_of_a_closure_is_the_derivative_of_its_residual(kind: str) -> None:
-    closure = Closure("3d" if kind == "3d" else "6d", "leg1_end", "leg2_seat")
-    chain = ClosedChain(SHIPPED_URDF.read_text(), [closure])
-    configuration = chain.integrate(
-        chain.neutral(), np.random.default_rng(2).uniform(-0.5, 0.5, chain.nv)
-    )
-    residual, jacobian = chain.linearize(configuration)
-    np.testing.assert_allclose(residual, chain.residual(configuration), atol=1e-15)
-    h = 1e-6
-    numeric = np.stack(
-        [
-            chain.residual(chain.integrate(configuration, h * e))
-            - chain.residual(chain.integrate(configuration, -h * e))
-            for e in np.eye(chain.nv)
-        ],
-        axis=1,
-    ) / (2 * h)
-    np.testing.assert_allclose(jacobian, numeric, atol=1e-8)
-    assert np.abs(jacobian).max() > 0.1
+def test_a_3_rpr_agrees_with_its_distance_equations() -> None:
+    machine, drawn = machine_of("3-rpr"), drawn_of("3-rpr")
+    A, B = machine.A_base, machine.B_platform
+    for q, T in zip(drawn.readings, drawn.poses, strict=True):
+        x, y, _ = T.translation
+        angle = T.rotation.as_rotvec()[2]
+        c, s = np.cos(angle), np.sin(angle)
+        across = x + c * B[:, 0] - s * B[:, 1] - A[:, 0]
+        along = y + s * B[:, 0] + c * B[:, 1] - A[:, 1]
+        np.testing.assert_allclose(np.hypot(across, along), q + machine.q0, atol=1e-12)
 
 
-def test_rotation_columns_are_those_that_turn(hexapod: Machine) -> None:
-    columns = set(hexapod.chain.rotation_columns().tolist())
-    angles = {
-        hexapod.chain.v_index(joint.name)
-        for joint in hexapod.urdf.joints.values()
-        if joint.type == "revolute"
-    }
-    floating = hexapod.chain.v_index("platform_free")
-    assert columns == angles | {floating + 3, floating + 4, floating + 5}
+@pytest.mark.parametrize("virtual", ["floating", "planar"])
+def test_a_planar_platform_stays_in_its_plane(virtual: str, tmp_path: Path) -> None:
+    description = MACHINES["3-RPR, tilted plane"]()
+    machine = load_mechanism(write_machine(tmp_path, description, Layout(virtual=virtual)))
+    n = description.normal
+    assert n is not None
+    drawn = random_configurations(machine, 5, 2)
+    for q, T in zip(drawn.readings, drawn.poses, strict=True):
+        axis = (T * machine.home.inv()).rotation.as_rotvec()
+        assert np.abs(np.cross(axis, n)).max() < 1e-12
+        assert abs((T.translation - machine.home.translation) @ n) < 1e-12
+        lengths = np.linalg.norm(leg_vectors(machine, T), axis=1)
+        np.testing.assert_allclose(lengths, machine.sign * q + machine.q0, atol=1e-12)
 
 
-def test_closing_at_a_pose_never_flips_a_leg(hexapod: Machine) -> None:
-    T = RigidTransform.from_components([0.05, -0.03, 0.42], Rotation.from_rotvec([0.2, 0.1, 0.8]))
-    configuration = close_at(hexapod, T)
-    np.testing.assert_allclose(
-        platform_pose(hexapod, configuration).as_matrix(), T.as_matrix(), atol=1e-12
-    )
-    for leg in hexapod.legs:
-        q = configuration[hexapod.chain.q_index(str(leg.prismatic))]
-        assert leg.sign * q + leg.q0 > 0.1
+def test_axes_that_are_a_little_off_still_close_and_are_not_refused(tmp_path: Path) -> None:
+    machine = of_types(["RS"] * 3)
+    leg = machine.legs[0]
+    slides = leg.u + 2e-4 * np.asarray(leg.base_axis)
+    legs = (replace(leg, slides=slides / np.linalg.norm(slides)), *machine.legs[1:])
+    crooked = load_mechanism(write_machine(tmp_path, replace(machine, legs=legs), Layout()))
+    assert np.abs(crooked.chain.residual(crooked.home_configuration)).max() < 1e-12
+    q = inverse_kinematics(crooked, crooked.home) + 0.003
+    T = forward_kinematics(crooked, q)
+    np.testing.assert_allclose(inverse_kinematics(crooked, T), q, atol=1e-4)
 
 
-def test_motors_that_do_not_determine_the_pose_are_refused(hexapod: Machine) -> None:
-    passive = replace(hexapod.legs[1], kind=LegKind.PASSIVE)
-    legs = (hexapod.legs[0], passive, *hexapod.legs[2:])
-    with pytest.raises(NotIdentifiable, match="mobility 6 and 5 motors"):
-        forward_kinematics(replace(hexapod, legs=legs), np.zeros(6))
+# --- the same machine in other trees, far from home ---------------------------------------------
 
 
-def test_readings_that_make_no_sense_are_refused(hexapod: Machine) -> None:
-    with pytest.raises(UsageError, match=r"needed \(6,\)"):
-        forward_kinematics(hexapod, np.zeros(5))
-    q = np.full(6, 0.07)
-    q[3] = np.nan
-    with pytest.raises(UsageError, match="reading nan of leg 'leg4'"):
-        forward_kinematics(hexapod, q)
-    q[3] = -0.4
-    with pytest.raises(UsageError, match=r"reading -0\.4 of leg 'leg4'"):
-        forward_kinematics_many(hexapod, np.array([np.full(6, 0.07), q]))
-
-
-def test_readings_that_no_pose_has_do_not_converge(hexapod: Machine) -> None:
-    q = np.array([3.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    with pytest.raises(DidNotConverge, match=r"of row 2 could not be reached: at .* %"):
-        forward_kinematics_many(hexapod, np.array([np.full(6, 0.07), q]))
-
-
-def test_mobility_is_six_although_the_neutral_tree_is_singular(hexapod: Machine) -> None:
-    assert mobility(hexapod) == 6
-    assert pin.__version__.startswith("4.")
-
-
-def test_spheres_as_revolutes_move_as_far_as_cut_ones(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> None:
-    description = geometry()
-    layouts = (Layout(), Layout(welded=True), Layout(hung="base", first="S", welded=True))
-    found = [
-        load_mechanism(write_hexapod(tmp_path_factory.mktemp("layout"), layout, description))
-        for layout in layouts
+def _square(seed: int, *, hung: str = "base", sphere: bool = True) -> Layout:
+    """Return a layout whose spherical joints turn anywhere, with the same axes in every tree."""
+    legs = [
+        LegLayout(seed=10 * seed + j, flip_axes=True, hung=hung, sphere=sphere) for j in range(6)
     ]
-    T = RigidTransform.from_components([0.06, 0.05, 0.40], Rotation.from_rotvec([0.3, -0.3, 0.9]))
-    q = inverse_kinematics(found[0], T)
-    for machine in found:
-        np.testing.assert_allclose(
-            forward_kinematics(machine, q).as_matrix(), T.as_matrix(), atol=1e-10
-        )
+    return Layout(tuple(legs))
 
 
-def test_the_yaml_of_the_example_is_the_shipped_one() -> None:
-    example = ROOT / "examples" / "hexapod" / "models" / "hexapod.yaml"
-    assert example.read_bytes() == SHIPPED_YAML.read_bytes()
+def _stops_on_the_chain(machine: Machine, readings: Array) -> bool:
+    try:
+        follow(machine, machine.home_configuration, readings, on_the_chain=True)
+    except DidNotConverge:
+        return True
+    return False
+
+
+@pytest.mark.parametrize(
+    ("leg_type", "seed", "stops", "hung"),
+    thinned(
+        [
+            (*machine, hung)
+            for machine in (("US", 1, True), ("US", 6, True), ("SU", 6, True), ("SS", 2, False))
+            for hung in ("base", "platform")
+        ],
+        [("US", 6, True, "platform"), ("SS", 2, False, "platform")],
+    ),
+)
+def test_random_readings_give_the_same_poses_in_every_tree(
+    leg_type: str, seed: int, stops: bool, hung: str, tmp_path: Path
+) -> None:
+    machine = of_types([leg_type] * 6, seed=seed)
+    cut = load_mechanism(write_machine(tmp_path / "cut", machine, _square(seed)))
+    layout = _square(seed, hung=hung, sphere=False)
+    other = load_mechanism(write_machine(tmp_path / "other", machine, layout))
+    columns = slider_columns(other, other.motors)[0]
+    drawn = random_configurations(cut, 20, 1)
+    stopped = 0
+    for q, T in zip(drawn.readings, drawn.poses, strict=True):
+        found = forward_kinematics(other, q)
+        np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
+        if stops and stopped < 1 and _stops_on_the_chain(other, q):
+            stopped += 1
+            closed = follow(other, other.home_configuration, q)
+            assert np.abs(other.chain.residual(closed)).max() < 1e-12
+            np.testing.assert_allclose(closed[columns], q, rtol=0.0, atol=1e-12)
+    assert stopped == stops
+
+
+def test_revolutes_that_do_not_turn_so_far_are_refused(tmp_path: Path) -> None:
+    machine = of_types(["US"] * 6, seed=1)
+    cut = load_mechanism(write_machine(tmp_path / "cut", machine, Layout()))
+    skew = Layout(tuple(LegLayout(sphere=False, seed=10 + j) for j in range(6)))
+    other = load_mechanism(write_machine(tmp_path / "other", machine, skew))
+    readings = random_configurations(cut, 20, 1).readings
+    with pytest.raises(DidNotConverge, match=r"joints that were not closed there, .* right angles"):
+        forward_kinematics_many(other, readings)
+
+
+# --- random configurations ----------------------------------------------------------------------
+
+
+def _lines(machine: Machine, T: RigidTransform) -> float:
+    """Return the determinant of the leg lines of a hexapod, written down once more."""
+    u = leg_vectors(machine, T)
+    arms = T.apply(machine.B_platform) - T.translation
+    return float(np.linalg.det(np.hstack([np.cross(arms, u), u])))
+
+
+def _check(machine: Machine, drawn: Configurations) -> None:
+    lower, upper = np.array([leg.travel for leg in machine.legs]).T
+    home = np.sign(_lines(machine, machine.home))
+    for configuration, q, T in zip(*drawn, strict=True):
+        assert np.abs(machine.chain.residual(configuration)).max() < 1e-12
+        assert np.all((q >= lower) & (q <= upper))
+        assert np.sign(_lines(machine, T)) == home
+
+
+@pytest.mark.parametrize("n", thinned([300, 1000], [300]))
+def test_hundreds_of_random_poses_of_the_hexapod_fill_its_travel_in_one_mode(n: int) -> None:
+    machine = machine_of("hexapod")
+    drawn = random_configurations(machine, n, 2026)
+    assert len(drawn.poses) == len(drawn.readings) == len(drawn.configurations) == n
+    _check(machine, drawn)
+    lower, upper = np.array([leg.travel for leg in machine.legs]).T
+    share = (drawn.readings - lower) / (upper - lower)
+    assert np.abs(share.mean(axis=0) - 0.5).max() < 0.06  # none was drawn again
+    assert share.min() < 0.01
+    assert share.max() > 0.99
+
+
+def test_the_same_seed_gives_the_same_poses_and_another_one_others() -> None:
+    machine = machine_of("hexapod")
+    chances = (3, 3, np.random.default_rng(3), 4)
+    one, same, rng, other = (random_configurations(machine, 5, c).readings for c in chances)
+    np.testing.assert_array_equal(one, same)
+    np.testing.assert_array_equal(one, rng)
+    assert np.abs(one - other).max() > 1e-3
+
+
+def test_long_travels_that_exclude_each_other_still_give_poses_in_one_mode() -> None:
+    machine = machine_of("nategh-agheli")
+    drawn = random_configurations(machine, 15, 1)
+    _check(machine, drawn)
+    assert np.ptp(drawn.readings, axis=0).min() > 0.02
+
+
+@pytest.mark.parametrize("name", ["hexapod", "3-rpr", "3-upu", "tricept"])
+def test_without_enough_motors_home_wanders_inside_the_travel(name: str) -> None:
+    machine = without_a_motor(name)
+    drawn = random_configurations(machine, 10, 1)
+    lower, upper = np.array([leg.travel for leg in machine.legs]).T
+    for configuration, q in zip(drawn.configurations, drawn.readings, strict=True):
+        assert np.abs(machine.chain.residual(configuration)).max() < 1e-12
+        assert np.all((q >= lower - 1e-9) & (q <= upper + 1e-9))
+    assert np.ptp(drawn.readings, axis=0).min() > 1e-3
+    middles: Array = np.array([T.translation for T in drawn.poses])
+    assert np.ptp(middles, axis=0).max() > 5e-3
+
+
+@pytest.mark.slow
+def test_poses_are_drawn_where_home_is_nearly_singular(tmp_path: Path) -> None:
+    chance = np.random.default_rng(3)
+    A, B = ring(list(np.arange(6) * 60.0), 0.3), ring(list(np.arange(6) * 60.0 + 6.0), 0.15)
+    A, B = A + chance.normal(0.0, 0.02, A.shape), B + chance.normal(0.0, 0.015, B.shape)
+    legs = tuple(LegSpec("SU", a, HOME.apply(b)) for a, b in zip(A, B, strict=True))
+    machine = load_mechanism(write_machine(tmp_path, MachineSpec(legs, HOME), Layout()))
+    _check(machine, random_configurations(machine, 20, 1))
+
+
+# --- refusals -----------------------------------------------------------------------------------
+
+
+def _with_reading(q: object) -> Array:
+    return np.array([0.07, 0.07, 0.07, q, 0.07, 0.07])
+
+
+@pytest.mark.parametrize(
+    ("rows", "kind", "named"),
+    [
+        (np.zeros(5), UsageError, r"needed \(6,\)"),
+        (_with_reading(np.nan), UsageError, "reading nan of leg 'leg4'"),
+        (np.stack([np.full(6, 0.07), _with_reading(-0.4)]), UsageError, r"-0\.4 of leg 'leg4'"),
+        (np.stack([np.full(6, 0.07), _with_reading(3.0)]), DidNotConverge, r"row 2 .*: at .* %"),
+    ],
+)
+def test_readings_that_no_pose_has_are_refused(
+    rows: Array, kind: type[Exception], named: str
+) -> None:
+    hexapod = machine_of("hexapod")
+    with pytest.raises(kind, match=named):
+        (forward_kinematics if rows.ndim == 1 else forward_kinematics_many)(hexapod, rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "step", "found"),
+    [
+        ("hexapod-rod", (0, 0, 0, 0, 0, 0.02), r"leg '\w+' would be .* mm off its constant length"),
+        ("3-rps", (0, 0, 0.1, 0, 0, 0), r"would be .* mm off the plane normal to its axis"),
+        ("3-upu", (0, 0, 0.1, 0, 0, 0), r"would be .* mm twisted at its end"),
+        ("3-rpr", (0, 0, 0, 0, 0, 0.002), r"the platform would be 2 mm out of its plane"),
+        ("tricept", (0, 0.1, 0, 0, 0, 0), r"would be .* mm off the direction that it has in the"),
+    ],
+)
+def test_poses_that_legs_forbid_are_refused(name: str, step: tuple[float, ...], found: str) -> None:
+    machine = machine_of(name)
+    there = displaced(machine.home, step)
+    with pytest.raises(UsageError, match=f"The platform cannot stand there: .*{found}"):
+        inverse_kinematics(machine, there)
+    if name == "3-rps":
+        q = inverse_kinematics(machine, machine.home)
+        with pytest.raises(UsageError, match=r"followed from its start: found leg .* mm off"):
+            forward_kinematics(machine, q, start=displaced(machine.home, [0, 0, 0.3, 0, 0, 0]))
+
+
+@pytest.mark.parametrize(("name", "found"), [("hexapod", "6 and 5"), ("3-rps", "3 and 2")])
+def test_too_few_motors_are_refused_with_both_numbers(name: str, found: str) -> None:
+    loose = without_a_motor(name)
+    mobility, motors = found.split(" and ")
+    with pytest.raises(NotIdentifiable, match=f"mobility {mobility} and {motors} motors"):
+        forward_kinematics(loose, np.zeros(loose.n_legs))
+    with pytest.raises(NotIdentifiable, match=f"mobility {mobility} and {motors} motors"):
+        Follower(loose)
+
+
+@pytest.mark.parametrize("motors", ["enough", "too few"])
+def test_a_travel_that_home_cannot_enter_is_refused_once(motors: str) -> None:
+    machine = (
+        machine_of("hexapod-strut") if motors == "enough" else without_a_motor("hexapod-strut")
+    )
+    far = replace(machine.legs[6], travel=(5.0, 5.1))
+    machine = replace(machine, legs=(*machine.legs[:6], far))
+    with pytest.raises(DidNotConverge, match=r"found 0 of 3 inside the travel.*check legcal\.home"):
+        random_configurations(machine, 3, 1)

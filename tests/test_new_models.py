@@ -1,6 +1,7 @@
 """Models written from tables and families: what is written is what was stated, and it closes."""
 
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -517,7 +518,7 @@ def test_what_stands_in_the_way_leaves_nothing_behind(
     def refuse(path: Path) -> None:
         raise OutOfClass(f"{path}: this machine is outside the method.")
 
-    monkeypatch.setattr("legcal.machine.model_builder.load_mechanism", refuse)
+    monkeypatch.setattr(sys.modules[create_model.__module__], "load_mechanism", refuse)
     with pytest.raises(LegcalError, match=r"table.yaml: models/tripod.yaml: this machine"):
         create_model(machine, tmp_path / "new" / "folder")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["blocked", "file", "table.yaml"]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mechanisms import ROOT
+from machines import ROOT
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError

@@ -1,0 +1,141 @@
+"""What ``legcal inspect`` and ``legcal evaluate`` say of machines."""
+
+import io
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from authoring import read_family
+from machines import ROOT
+from rich.console import Console
+
+from legcal import evaluate, load_mechanism
+from legcal.machine import create_model, describe
+from legcal.report import accuracy_table, inspect_table
+
+
+def _printed(what: object) -> str:
+    console = Console(file=io.StringIO(), width=80, highlight=False)
+    console.print(what)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert isinstance(text, str)
+    assert max(len(line) for line in text.splitlines()) <= 80
+    return text
+
+
+def _described(name: str | Path) -> dict[str, Any]:
+    document = json.loads(json.dumps(describe(load_mechanism(name)), allow_nan=False))
+    assert isinstance(document, dict)
+    return document
+
+
+def test_counts_of_the_paper_follow_from_legs_and_motors() -> None:
+    expected = {  # n, n_d, r, n_ac, idle spins
+        "hexapod": (6, 3, 0, 6, 0),
+        "hexapod-strut": (7, 3, 0, 6, 1),
+        "3-rps": (3, 3, 3, 3, 0),
+        "3-rpr": (3, 2, 3, 3, 0),
+        "3-upu-tilted": (3, 3, 0, 3, 0),
+    }
+    for name, counts in expected.items():
+        document = _described(name)
+        assert tuple(document[key] for key in ("n", "n_d", "r", "n_ac", "idle_spins")) == counts
+    cylinders = _described("hexapod")["legs"][0]["cylinders"]
+    assert cylinders == [
+        {"link": "leg1_b2_link", "radius": 0.01},
+        {"link": "leg1_tube", "radius": 0.01},
+    ]
+
+
+def test_the_table_shows_millimetres_axes_and_twists_in_80_columns() -> None:
+    text = _printed(inspect_table(_described("hexapod")))
+    assert "A in base [mm]" in text
+    assert "mobility 6, 6 motors" in text
+    row = next(line for line in text.splitlines() if line.startswith("leg5"))
+    numbers = ["0.0", "270.0", "0.0", "0.0", "195.0", "0.0", "345.000"]
+    assert row.split() == ["leg5", "SPU", *numbers, "+", "q", "10"]
+    tilted = _described("3-upu-tilted")
+    text = _printed(inspect_table(tilted))
+    assert "axis at base" in text
+    assert f"{np.degrees(tilted['legs'][1]['twist']):.3f}" in text
+    assert "axis at base" not in _printed(inspect_table(_described("3-rpr")))
+
+
+def test_the_table_shows_signs_kinds_and_notes(tmp_path: Path) -> None:
+    text = (ROOT / "urdf" / "6-sps.urdf").read_text()
+    reversed_axis = '<axis xyz="0.0 0.0 -1.0"/><limit lower="-0.13" upper="0.0"'
+    text = text.replace('<axis xyz="0.0 0.0 1.0"/><limit lower="0.0" upper="0.13"', reversed_axis)
+    (tmp_path / "6-sps.urdf").write_text(text)
+    text = (ROOT / "models" / "6-sps.yaml").read_text()
+    path = tmp_path / "6-sps.yaml"
+    path.write_text(text.replace("../urdf/", "").replace("- leg2_prismatic\n", "", 1))
+    text = _printed(inspect_table(_described(path)))
+    assert "passive" in text
+    assert "520.000 - q" in text
+    assert "note: the motors do not determine the pose" in text
+
+
+@pytest.mark.parametrize(
+    ("family", "found", "notes"),
+    [
+        ("4-RPR", "more than it needs", ["more motors than the pose needs: mobility 3"]),
+        ("8-SPS", "more than it needs", ["mobility 6, motors 8", "is singular at home"]),
+        ("3-SPS", "NOT determined", ["do not determine the pose: mobility 6"]),
+        ("6-SS", "it cannot move", ["the platform cannot move: mobility 0"]),
+    ],
+)
+def test_motors_that_are_too_many_or_hold_nothing_are_noted(
+    family: str, found: str, notes: list[str], tmp_path: Path
+) -> None:
+    sizes: dict[str, Any] = {"base_radius": 300.0, "platform_radius": 150.0, "height": 400.0}
+    if family.endswith("RPR"):
+        del sizes["height"]
+    description = describe(create_model(read_family(family, **sizes), tmp_path).machine)
+    assert found in _printed(inspect_table(description))
+    said = [note for note in description["diagnostics"] if "motors" in note or "cannot" in note]
+    assert len(said) == len(notes)
+    assert all(note in text for note, text in zip(notes, said, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("hidden", "note"),
+    [
+        ("1", "leg 'leg1' has no <visual> cylinder along its axis: it cannot be seen"),
+        ("[1-3]", "legs leg1, leg2, leg3 have no <visual> cylinder along their axes: they cannot"),
+    ],
+)
+def test_legs_that_cannot_be_seen_are_in_one_note(hidden: str, note: str, tmp_path: Path) -> None:
+    text = (ROOT / "urdf" / "3-rps.urdf").read_text()
+    visual = re.compile(rf'(<link name="leg{hidden}_\w+">)<visual>.*</visual>')
+    (tmp_path / "3-rps.urdf").write_text(visual.sub(r"\1", text))
+    path = tmp_path / "3-rps.yaml"
+    path.write_text((ROOT / "models" / "3-rps.yaml").read_text().replace("../urdf/", ""))
+    (found,) = _described(path)["diagnostics"]
+    assert found.startswith(note)
+
+
+def test_an_evaluation_leaves_out_what_a_machine_does_not_have(tmp_path: Path) -> None:
+    name = "hexapod-strut"
+    evaluation = evaluate(name, name)  # the strut is passive: it has no offset
+    passive = load_mechanism(name).legs[6].name
+    assert f"{passive}.platform.z" in evaluation.names
+    assert f"{passive}.offset" not in evaluation.names
+    assert np.all(evaluation.values == evaluation.references)
+    assert all(np.isfinite(row["difference"]) for row in evaluation.document()["parameters"])
+
+    entry = yaml.safe_load((ROOT / "models" / f"{name}.yaml").read_text())
+    entry["name_mot"].pop()  # without enough motors parameters alone are compared
+    entry["legcal"]["urdf"] = str(ROOT / "urdf" / f"{name}.urdf")
+    path = tmp_path / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(entry))
+    evaluation = evaluate(path, path)
+    document = evaluation.document()
+    assert document["dX_m"] is document["dE_rad"] is document["dX_max_m"] is None
+    assert document["poses"] == 0
+    assert len(document["parameters"]) > 30
+    text = _printed(accuracy_table(evaluation))
+    assert "Parameters only: readings do not give one pose" in text

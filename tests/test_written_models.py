@@ -1,0 +1,512 @@
+"""Models written with other numbers: the same files but for these, loaded again and closed."""
+
+import re
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
+from lxml import etree
+from machines import MACHINES, ROOT, SHIPPED, SHIPPED_URDF, SHIPPED_YAML, of_types, ring
+from scipy.spatial.transform import RigidTransform
+from thinned import thinned
+
+from legcal import load_mechanism, simulate
+from legcal.errors import DidNotConverge, ModelError, OutOfClass, UsageError
+from legcal.geometry import Array, roll_pitch_yaw
+from legcal.machine import (
+    EquationKind,
+    Leg,
+    LegKind,
+    Machine,
+    UrdfPatch,
+    check_closes,
+    geometries,
+    home_of_legs,
+    moved_legs,
+    parametrization_of,
+    pose_equations,
+    reload_and_check,
+    vector_of,
+    with_platform_foot,
+    write_calibrated_yaml,
+    write_urdf,
+)
+from legcal.simulation import ParameterErrors, SimulationSettings, Spread, draw_poses
+from legcal.simulation.request import Level
+from legcal.simulation.settings import Distribution
+from legcal.simulation.truth import draw_errors, write_true_model
+
+ORIGIN = re.compile(rb"""(<origin\b[^>]*?\bxyz\s*=\s*["'])([^"']*)(["'])""")
+ORIGINS = re.compile(rb'(<origin xyz=")[^"]*(" rpy=")[^"]*(")')
+RADIUS = re.compile(rb'radius="[^"]*"')
+
+
+def other_legs(nominal: Machine, size: float) -> tuple[Leg, ...]:
+    """Return legs whose every parameter is wrong by so much [m, and ten times that in rad]."""
+    parametrization = parametrization_of(nominal, twists=True)
+    unit = np.where([unit == "m" for unit in parametrization.units], size, 10.0 * size)
+    signs = np.random.default_rng(2).choice([-1.0, 1.0], len(unit))
+    legs = moved_legs(geometries(nominal), parametrization.place, unit * signs)
+    return with_platform_foot(legs, np.asarray(nominal.T_platform_Re.inv().translation))
+
+
+def write(nominal: Machine, legs: tuple[Leg, ...], folder: Path) -> Machine:
+    """Write a calibrated model and load it again."""
+    home = home_of_legs(nominal, legs, 0.2)
+    assert home is not None
+    write_urdf(nominal, legs, folder / "calibrated.urdf")
+    write_calibrated_yaml(nominal, folder / "calibrated.yaml", "calibrated.urdf", home)
+    return reload_and_check(folder / "calibrated.yaml")
+
+
+def apart(one: Leg, two: Leg) -> float:
+    """Return the largest difference of two legs [m, rad], axes and twists as those of lines."""
+    found = [np.abs(one.A - two.A).max(), np.abs(one.B - two.B).max(), abs(one.q0 - two.q0)]
+    for key in ("base_axis", "platform_axis"):
+        axis, other = getattr(one, key), getattr(two, key)
+        assert (axis is None) == (other is None)
+        if axis is not None:
+            found.append(min(np.abs(axis - other).max(), np.abs(axis + other).max()))
+    assert (one.twist is None) == (two.twist is None)
+    if one.twist is not None and two.twist is not None:
+        found.append(abs(np.remainder(one.twist - two.twist + np.pi / 2.0, np.pi) - np.pi / 2.0))
+    return float(max(found))
+
+
+# --- calibrated models --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name", ["hexapod", "3-rpr", "3-rps", "3-upu-tilted", "hexapod-rod", "tricept"]
+)
+def test_a_calibrated_model_has_the_numbers_that_were_wanted(name: str, tmp_path: Path) -> None:
+    nominal = load_mechanism(name)
+    legs = other_legs(nominal, 3e-3)
+    written = write(nominal, legs, tmp_path)
+    parametrization = parametrization_of(nominal, twists=True)
+    here = vector_of(parametrization, geometries(written), legs)
+    np.testing.assert_allclose(here, vector_of(parametrization, legs, legs), atol=1e-11)
+    for frame in ("T_base_Rb", "T_platform_Re"):
+        np.testing.assert_allclose(
+            getattr(written, frame).as_matrix(), getattr(nominal, frame).as_matrix(), atol=1e-12
+        )
+
+
+def test_nominal_parameters_leave_every_byte(tmp_path: Path) -> None:
+    nominal = load_mechanism("hexapod")
+    write_urdf(nominal, geometries(nominal), tmp_path / "same.urdf")
+    assert (tmp_path / "same.urdf").read_bytes() == SHIPPED_URDF.read_bytes()
+
+
+def _canonical(content: bytes) -> bytes:
+    """Return a file with other quotes and white space in tags, and without numbers of origins."""
+    tree = etree.fromstring(content).getroottree()
+    return ORIGIN.sub(rb"\1\3", etree.tostring(tree, method="c14n"))
+
+
+def test_comments_quotes_white_space_unknown_tags_and_line_ends_survive(tmp_path: Path) -> None:
+    path = write_machine(tmp_path / "nominal", of_types(["US"] * 6), Layout())
+    urdf = path.with_suffix(".urdf")
+    text = urdf.read_text()
+    text = text.replace(
+        '<robot name="machine">',
+        "<!-- é <joint name='leg1_slider'><origin xyz='9 9 9'/></joint> -->\n"
+        '<robot  name = "machine" >\n<gazebo reference="base"><joint name="leg1_a1">'
+        '<origin xyz="8 8 8"/></joint></gazebo>\n<transmission name="t"><type>a &gt; b</type>'
+        "</transmission>",
+    )
+    text = re.sub(
+        r'(name="leg2_slider".*?)<origin xyz="([^"]*)" rpy="([^"]*)"/>',
+        r"\1<origin\n\t rpy = '\3'\n\t xyz = '  \2 '  />",
+        text,
+    )
+    text = re.sub(r'(name="leg3_a1" [^>]*>)(.*?)(<origin [^>]*/>)', r"\1\3\2", text)
+    urdf.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    nominal = load_mechanism(path)
+    legs = other_legs(nominal, 2e-3)
+    written = write(nominal, legs, tmp_path)
+    assert max(map(apart, legs, geometries(written))) < 1e-12
+    before, after = urdf.read_bytes(), (tmp_path / "calibrated.urdf").read_bytes()
+    assert after.count(b"\n") == after.count(b"\r\n")
+    assert _canonical(before) == _canonical(after)
+    for kept in (b"xyz='9 9 9'", b'xyz="8 8 8"', b"a &gt; b", "<!-- é".encode()):
+        assert kept in after
+
+
+def test_origins_and_radii_are_added_and_changed_in_place() -> None:
+    content = (
+        b'<robot name="r"><joint name="a" type="fixed"><parent link="x &gt; y"/></joint>'
+        b'<joint name="b" note="1 &gt; 0"><origin rpy="0 0 1"/></joint>'
+        b'<joint name="c" type="fixed"><origin/></joint></robot>'
+    )
+    patch = UrdfPatch(content)
+    assert patch.content() == content
+    patch.set_origin("a", np.array([0.1, 0.2, 1 / 3]))
+    patch.set_origin("b", np.zeros(3))
+    patch.set_origin("c", rpy=np.array([0.5, 0.0, -1.0]))
+    assert patch.content() == (
+        b'<robot name="r"><joint name="a" type="fixed"><origin xyz="0.1 0.2 0.3333333333333333"/>'
+        b'<parent link="x &gt; y"/></joint>'
+        b'<joint name="b" note="1 &gt; 0"><origin rpy="0 0 1" xyz="0.0 0.0 0.0"/></joint>'
+        b'<joint name="c" type="fixed"><origin rpy="0.5 0.0 -1.0"/></joint></robot>'
+    )
+    with pytest.raises(ModelError, match="found no joint 'd'"):
+        patch.set_origin("d", np.zeros(3))
+    cylinders = b"""<robot name="a"><link name="x"><collision><geometry>
+    <cylinder radius="1" length="1"/></geometry></collision><visual><geometry>
+    <box size="1 1 1"/></geometry></visual><visual><geometry>
+    <cylinder radius='2' length="1"/></geometry></visual><visual><geometry>
+    <cylinder length="1" radius='3'/></geometry></visual></link></robot>"""
+    for number, old in enumerate((b"'2'", b"'3'")):
+        patch = UrdfPatch(cylinders)
+        patch.set_radius("x", number, 0.25)
+        changed = cylinders.replace(old, b"'0.25'").replace(b"'", b'"')
+        assert patch.content() == changed
+
+
+@pytest.mark.parametrize(
+    ("carried", "link", "found"),
+    [
+        (True, "", "leg 'leg1' could not be written: found that joint"),
+        (False, "leg3_seat", "'leg3_seat' on a link that carries other things"),
+    ],
+)
+def test_a_link_that_carries_other_things_cannot_be_moved(
+    carried: bool, link: str, found: str, tmp_path: Path
+) -> None:
+    layout = Layout((LegLayout(cut="carry"), *[LegLayout()] * 5)) if carried else Layout()
+    path = write_machine(tmp_path, of_types(["US"] * 6), layout)
+    if carried:
+        link = load_mechanism(path).urdf.joints["platform_carried"].parent
+    extra = (
+        f'<link name="camera"/><joint name="camera_mount" type="fixed"><parent link="{link}"/>'
+        '<child link="camera"/></joint></robot>'
+    )
+    urdf = path.with_suffix(".urdf")
+    urdf.write_text(urdf.read_text().replace("</robot>", extra))
+    nominal = load_mechanism(path)
+    with pytest.raises(OutOfClass, match=found):
+        write_urdf(nominal, geometries(nominal), tmp_path / "calibrated.urdf")
+    assert not (tmp_path / "calibrated.urdf").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("  urdf: ../urdf/hexapod.urdf\n", "  urdf: calibrated.urdf\n"),
+        ("  urdf: '../urdf/hexapod.urdf'  # here\n", "  urdf: calibrated.urdf  # here\n"),
+        ("", ""),
+    ],
+)
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_the_yaml_changes_in_one_value_only(
+    tmp_path: Path, mark: str, text: str, expected: str
+) -> None:
+    shipped = SHIPPED_YAML.read_text()
+    line = "  urdf: ../urdf/hexapod.urdf\n"
+    for name in ("models", "urdf"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "urdf" / "hexapod.urdf").write_bytes(SHIPPED_URDF.read_bytes())
+    path = tmp_path / "models" / "hexapod.yaml"
+    comment = f"{mark}# ünïcode\r\n"
+    path.write_bytes((comment + shipped.replace(line, text)).encode())
+    write_calibrated_yaml(load_mechanism(path), tmp_path / "calibrated.yaml", "calibrated.urdf")
+    written = (tmp_path / "calibrated.yaml").read_bytes().decode()
+    if text:
+        assert written == comment + shipped.replace(line, expected)
+    else:
+        head = "legcal:\n  version: 1\n"
+        added = "legcal:\n  urdf: calibrated.urdf\n  version: 1\n"
+        assert written == comment + shipped.replace(line, "").replace(head, added)
+
+
+def test_only_the_numbers_of_home_change_in_the_yaml(tmp_path: Path) -> None:
+    nominal = load_mechanism("3-rps")
+    legs = other_legs(nominal, 3e-3)
+    write(nominal, legs, tmp_path)
+    text = (tmp_path / "calibrated.yaml").read_text()
+    write_calibrated_yaml(nominal, tmp_path / "calibrated.yaml", "calibrated.urdf")
+    without = (tmp_path / "calibrated.yaml").read_text()
+    with pytest.raises(ModelError, match=r"legcal\.home could not be used"):
+        load_mechanism(tmp_path / "calibrated.yaml")
+    number = r"-?\d[\d.e-]*"
+    assert re.sub(number, "#", text) == re.sub(number, "#", without)
+    differing = sum(a != b for a, b in zip(text.split(), without.split(), strict=True))
+    assert 3 <= differing <= 7
+
+
+def test_a_machine_that_does_not_close_at_home_is_noticed() -> None:
+    machine = load_mechanism("hexapod")
+    check_closes(machine)
+    mirror = RigidTransform.from_components(
+        machine.home.translation * np.array([1.0, 1.0, -1.0]), machine.home.rotation
+    )
+    with pytest.raises(DidNotConverge, match="does not close at home"):
+        check_closes(replace(machine, home=mirror))
+
+
+# --- true machines of simulations ---------------------------------------------------------------
+
+LAYOUTS = {
+    "S as revolutes, hung from the platform": Layout(
+        (LegLayout(hung="platform", sphere=False, flip_axes=True),)
+    ),
+    "cut behind the slider": Layout((LegLayout(cut="mid", flip_slider=True, slid=0.02),)),
+    "cut before the slider": Layout((LegLayout(cut="slider", mount=True),)),
+    "carried by leg 2": Layout(
+        (LegLayout(), LegLayout(cut="carry"), *[LegLayout(spin="S", seed=k) for k in range(5)])
+    ),
+}
+ALL = ParameterErrors(
+    base_joints=Spread(3e-3),
+    platform_joints=Spread(1e-3, Distribution.NORMAL),
+    offsets=Spread(2e-3),
+    lengths=Spread(2e-3),
+    axes=Spread(0.01),
+    twists=Spread(0.01),
+)
+N = 140  # draws of errors
+
+
+def _check(nominal: Machine, folder: Path, seed: int = 3) -> Machine:
+    """Check that a true model has the numbers that were drawn, and meets them where it stands."""
+    true = write_true_model(nominal, ALL, np.random.default_rng(seed), folder)
+    rng, found = np.random.default_rng(seed), geometries(true)
+    draws = (draw_errors(nominal, ALL, rng) for _ in range(20))
+    drawn = next(legs for legs in draws if max(map(apart, legs, found)) < 1e-6)
+    assert max(map(apart, drawn, geometries(nominal))) > 5e-4
+    assert max(map(apart, drawn, found)) < 1e-12
+    for frame in ("T_base_Rb", "T_platform_Re"):
+        np.testing.assert_allclose(
+            getattr(true, frame).as_matrix(), getattr(nominal, frame).as_matrix(), atol=1e-12
+        )
+    assert np.abs(true.chain.residual(true.home_configuration)).max() < 1e-11
+    assert (true.mobility, true.spatial) == (nominal.mobility, nominal.spatial)
+    assert [leg.type for leg in true.legs] == [leg.type for leg in nominal.legs]
+    poses = draw_poses(true, 2, np.random.default_rng(0), "workspace")
+    for T, readings in zip(poses.poses, poses.readings, strict=True):
+        # the chain's poses meet the closed form of the drawn legs, in their frames
+        T_Rb_Re = (true.T_base_Rb.inv() * T * true.T_platform_Re).as_matrix()[None]
+        for j, leg in enumerate(drawn):
+            at = pose_equations([leg], T_Rb_Re[:, :3, :3], T_Rb_Re[:, :3, 3])
+            for kind, value in zip(at.kinds, at.values[0], strict=True):
+                is_read = kind is EquationKind.LENGTH and leg.kind is not LegKind.CONSTANT
+                wanted = true.legs[j].sign * readings[j] if is_read else 0.0
+                assert abs(value - wanted) < 1e-10
+    return true
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_true_model_of_a_shipped_one_has_the_drawn_numbers(name: str, tmp_path: Path) -> None:
+    nominal = load_mechanism(name)
+    true = _check(nominal, tmp_path)
+    assert true.yaml_path == tmp_path / "models" / f"{name}.yaml"
+    assert true.urdf_path.resolve() == tmp_path / "urdf" / f"{name}.urdf"
+    before, after = nominal.urdf.content, true.urdf.content
+    assert before != after
+    assert ORIGINS.sub(rb"\1\2\3", before) == ORIGINS.sub(rb"\1\2\3", after)
+
+
+@pytest.mark.parametrize(
+    ("machine", "layout"),
+    thinned(
+        product(["6-UPS", "3-UPU", "Tricept"], LAYOUTS),
+        [
+            ("6-UPS", "S as revolutes, hung from the platform"),
+            ("6-UPS", "carried by leg 2"),
+            ("3-UPU", "cut behind the slider"),
+            ("3-UPU", "cut before the slider"),
+            ("Tricept", "cut behind the slider"),
+            ("Tricept", "carried by leg 2"),
+        ],
+    ),
+)
+def test_a_true_model_can_be_written_in_any_tree(machine: str, layout: str, tmp_path: Path) -> None:
+    path = write_machine(tmp_path / "nominal", MACHINES[machine](), LAYOUTS[layout])
+    _check(load_mechanism(path), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("machine", "hung", "cut"),
+    thinned(
+        product(["2-RPR with a rod", "hexapod with a rod"], ["base", "platform"], ["far", "mid"]),
+        [("2-RPR with a rod", "base", "mid"), ("hexapod with a rod", "platform", "far")],
+    ),
+)
+def test_rods_get_other_lengths_wherever_they_hang(
+    machine: str, hung: str, cut: str, tmp_path: Path
+) -> None:
+    layout = Layout((LegLayout(hung=hung, cut=cut, seed=2),))
+    nominal = load_mechanism(write_machine(tmp_path / "nominal", MACHINES[machine](), layout))
+    true = _check(nominal, tmp_path)
+    (rod,) = [j for j, leg in enumerate(true.legs) if leg.kind is LegKind.CONSTANT]
+    assert abs(true.q0[rod] - nominal.q0[rod]) > 1e-5
+
+
+def test_a_leg_welded_to_the_platform_link_itself_moves_with_its_own_frame(tmp_path: Path) -> None:
+    layout = Layout((LegLayout(sphere=False, seed=1), *[LegLayout(seed=k) for k in range(2, 7)]))
+    path = write_machine(tmp_path / "nominal", MACHINES["6-UPS"](), layout)
+    joints = load_mechanism(path).urdf.joints
+    end, seat = (joints[f"leg1_{name}_frame"].T_parent_origin for name in ("end", "seat"))
+    T = end * seat.inv()
+    origin = " ".join(repr(float(x)) for x in T.translation)
+    angles = " ".join(repr(float(x)) for x in roll_pitch_yaw(T.rotation.as_matrix()))
+    urdf = path.with_suffix(".urdf")
+    head, tail = urdf.read_text().split('<joint name="leg1_end_frame"')
+    tail = re.sub("<origin [^>]*>", f'<origin xyz="{origin}" rpy="{angles}"/>', tail, count=1)
+    urdf.write_text(f'{head}<joint name="leg1_end_frame"{tail}')
+    path.write_text(path.read_text().replace("- leg1_seat", "- platform"))
+    _check(load_mechanism(path), tmp_path)
+
+
+def test_without_errors_the_urdf_is_the_nominal_one(tmp_path: Path) -> None:
+    for name in ("hexapod", "3-upu-tilted", "tricept"):
+        nominal = load_mechanism(name)
+        true = write_true_model(nominal, ParameterErrors(), np.random.default_rng(0), tmp_path)
+        assert true.urdf.content == nominal.urdf.content
+        np.testing.assert_allclose(true.home.as_matrix(), nominal.home.as_matrix(), atol=1e-12)
+
+
+def _differences(
+    nominal: Machine, errors: ParameterErrors, n: int
+) -> tuple[tuple[str, ...], Array]:
+    """Return the names of all parameters and n draws of their errors, (n, n_parameters)."""
+    found, legs = parametrization_of(nominal, twists=True), geometries(nominal)
+    rng = np.random.default_rng(11)
+    nothing = vector_of(found, legs, legs)
+    rows = [vector_of(found, draw_errors(nominal, errors, rng), legs) for _ in range(n)]
+    return found.names, np.array(rows) - nothing
+
+
+def test_errors_have_the_size_and_distribution_that_was_asked_for() -> None:
+    names, found = _differences(load_mechanism("3-upu-tilted"), ALL, N)
+    sizes = {".base.": 3e-3, ".platform.": 1e-3, ".offset": 2e-3, "_axis.": 0.01, ".twist": 0.01}
+    for name, column in zip(names, found.T, strict=True):
+        size = next(size for key, size in sizes.items() if key in name)
+        is_normal = ".platform." in name
+        sd = size if is_normal else size / np.sqrt(3.0)
+        assert abs(column.mean()) < 4.0 * sd / np.sqrt(N)
+        assert abs(column.std() / sd - 1.0) < 0.3
+        assert (np.abs(column).max() > 1.8 * size) == is_normal
+        assert is_normal or np.abs(column).max() < size * (1.0 + 1e-9)
+    correlation = np.corrcoef(found.T) - np.eye(len(names))
+    assert np.abs(correlation).max() < 0.45
+
+
+def test_errors_of_one_kind_do_not_depend_on_those_of_another(tmp_path: Path) -> None:
+    nominal = load_mechanism("tricept")
+    names, everything = _differences(nominal, ALL, 1)
+    _, offsets = _differences(nominal, ParameterErrors(offsets=ALL.offsets), 1)
+    of_offsets = np.array([name.endswith(".offset") for name in names])
+    np.testing.assert_allclose(offsets[0, of_offsets], everything[0, of_offsets], atol=1e-15)
+    assert np.abs(offsets[0, ~of_offsets]).max() < 1e-12
+    hexapod = load_mechanism("hexapod")
+    errors = ParameterErrors(Spread(2e-3), Spread(2e-3), coplanar=True)
+    true = write_true_model(hexapod, errors, np.random.default_rng(5), tmp_path)
+    for joints in (true.parameters.base_joints, true.parameters.platform_joints):
+        assert np.abs(joints[:, 2]).max() < 1e-15
+        assert np.abs(joints - hexapod.parameters.base_joints).max() > 1e-4
+
+
+@pytest.mark.parametrize("name", ["hexapod", "3-rpr", "tricept"])
+def test_radii_of_the_true_legs_are_drawn_and_nothing_else_with_them(
+    name: str, tmp_path: Path
+) -> None:
+    nominal = load_mechanism(name)
+    of_radii = ParameterErrors(radii=Spread(1e-4))
+    true = write_true_model(nominal, of_radii, np.random.default_rng(2), tmp_path)
+    before, after = nominal.urdf.content, true.urdf.content
+    assert RADIUS.sub(b"", before) == RADIUS.sub(b"", after)
+    pairs = [
+        (j, was.radius, now.radius)
+        for j, (leg, true_leg) in enumerate(zip(nominal.legs, true.legs, strict=True))
+        for was, now in zip(leg.cylinders, true_leg.cylinders, strict=True)
+    ]
+    errors = {(j, was): now - was for j, was, now in pairs}
+    assert all(errors[j, was] == now - was for j, was, now in pairs)  # one tube stays one
+    size = np.abs(list(errors.values()))
+    assert 3e-5 < size.max() <= 1e-4
+    assert len(set(errors.values())) == len(errors) >= nominal.n_legs
+    both = replace(ALL, radii=Spread(1e-4))
+    found = write_true_model(nominal, both, np.random.default_rng(2), tmp_path / "both")
+    alone = write_true_model(nominal, ALL, np.random.default_rng(2), tmp_path / "alone")
+    assert RADIUS.findall(found.urdf.content) == RADIUS.findall(after)
+    assert np.array_equal(found.A_base, alone.A_base)
+
+
+@pytest.mark.parametrize(
+    ("name", "errors", "found"),
+    [
+        ("3-upu", ParameterErrors(axes=Spread(-1e-3)), "errors of axes .* found a size of"),
+        ("3-upu", ParameterErrors(axes=Spread(float("nan"))), "errors of axes .* a size of"),
+        ("3-upu", ParameterErrors(axes=Spread(2.0)), "errors of axes .* found a size of"),
+        ("hexapod", ParameterErrors(radii=Spread(8e-3)), "errors of radii .* needed at most"),
+        ("hexapod", ParameterErrors(radii=Spread(2e-3, Distribution.NORMAL)), "errors of radii"),
+    ],
+)
+def test_errors_without_a_sensible_size_are_refused(
+    name: str, errors: ParameterErrors, found: str, tmp_path: Path
+) -> None:
+    with pytest.raises(UsageError, match=found):
+        write_true_model(load_mechanism(name), errors, np.random.default_rng(0), tmp_path)
+
+
+def _five_parallel_rods(folder: Path) -> Path:
+    """Write a platform that five equal and parallel rods keep upright: no others would."""
+    A = ring([10, 80, 150, 220, 290, 330, 100, 190], 0.3)
+    A[:, 2] = np.linspace(-0.03, 0.03, 8)
+    home = RigidTransform.from_translation([0.05, 0.02, 0.5])
+    B = np.vstack([A[:5] + home.translation, home.apply(ring([121.0, 218.0, 315.0], 0.15))])
+    kinds = ["constant"] * 5 + ["actuated"] * 3
+    legs = [LegSpec("US", a, b, kind) for a, b, kind in zip(A, B, kinds, strict=True)]
+    return write_machine(folder, MachineSpec(tuple(legs), home), Layout())
+
+
+def test_errors_that_leave_no_closed_machine_are_refused_and_leave_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("legcal.simulation.truth.MAX_DRAWS", 3)
+    nominal = load_mechanism(_five_parallel_rods(tmp_path / "nominal"))
+    chance = np.random.default_rng(1)
+    offsets, lengths = ParameterErrors(offsets=Spread(2e-3)), ParameterErrors(lengths=Spread(2e-3))
+    assert write_true_model(nominal, offsets, chance, tmp_path).is_determined
+    with pytest.raises(ModelError, match=r"found 3 times .*smaller errors"):
+        write_true_model(nominal, lengths, chance, tmp_path)
+    assert not list((tmp_path / "models").glob("*"))
+    huge = ParameterErrors(Spread(1.0), Spread(1.0), Spread(1.0))
+    with pytest.raises(ModelError, match=r"3 times a machine that .* in 3 draws") as caught:
+        write_true_model(load_mechanism("hexapod"), huge, np.random.default_rng(0), tmp_path)
+    assert str(tmp_path) not in str(caught.value)  # files that are gone
+
+
+def test_a_machine_without_enough_motors_gets_a_true_model_and_poses(tmp_path: Path) -> None:
+    path = tmp_path / "models" / "tricept.yaml"
+    path.parent.mkdir()
+    document = yaml.safe_load((ROOT / "models" / "tricept.yaml").read_text())
+    document["name_mot"] = document["name_mot"][1:]
+    document["legcal"]["urdf"] = str(ROOT / "urdf" / "tricept.urdf")
+    path.write_text(yaml.safe_dump(document))
+    nominal = load_mechanism(path)
+    assert not nominal.is_determined
+    true = _check(nominal, tmp_path / "true")
+    poses = draw_poses(true, 8, np.random.default_rng(0))
+    assert np.ptp(poses.readings, axis=0).min() > 0.02
+
+
+def test_meshes_beside_the_nominal_urdf_are_seen_on_the_true_machine(tmp_path: Path) -> None:
+    mesh = '<visual><geometry><mesh filename="meshes/plate.stl"/></geometry></visual>'
+    for kind, suffix in (("models", "yaml"), ("urdf", "urdf")):
+        (tmp_path / kind).mkdir()
+        text = (ROOT / kind / f"3-rps.{suffix}").read_text()
+        text = text.replace('<link name="platform"/>', f'<link name="platform">{mesh}</link>')
+        (tmp_path / kind / f"3-rps.{suffix}").write_text(text)
+    (tmp_path / "urdf" / "meshes").mkdir()
+    trimesh.creation.box((0.1, 0.1, 0.02)).export(tmp_path / "urdf" / "meshes" / "plate.stl")
+    settings = SimulationSettings(level=Level.OUTLINES, poses=1, views=1)
+    simulate(tmp_path / "models" / "3-rps.yaml", tmp_path / "seen", settings)
+    assert (tmp_path / "seen" / "observations.csv").exists()
