@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError
 from legcal.files import motion_to_xyz_quat
-from legcal.geometry import Array, frame_on_points, motion_of
+from legcal.geometry import Array, cross, cross_matrices, frame_on_points, motion_of
 from legcal.machine.description import (
     Description,
     Home,
@@ -20,13 +19,14 @@ from legcal.machine.description import (
     wrong_lengths,
     wrong_sizes,
 )
-from legcal.machine.leg import JointType, LegKind
+from legcal.machine.equations import pose_equations
+from legcal.machine.leg import EquationKind, Leg, LegKind
+from legcal.machine.solver import moved, solve
 
 TRIALS = 40
-EVALUATIONS = 60  # of the closure in each trial; good starts need about ten
 CLOSED = 1e-10  # of the size of the machine
-CLOSED_EXACTLY = 1e-13
-MAX_OUTSIDE = 0.01  # of the size: a home written with few digits is nearer
+ROUNDING = 1e-13
+MAX_HOME_RESIDUAL = 0.01  # of the size: a home written with few digits is nearer
 PARALLEL = 1e-9
 FREE_TRAVEL = (0.5, 1.5)  # of the length at home, for passive sliders without limits
 
@@ -196,14 +196,14 @@ def _refuse(problems: list[str]) -> None:
 
 
 def find_home(described: Description) -> Home:
-    """Return a pose in which a machine closes, moved onto what its legs keep constant.
+    """Return a pose in which a machine closes, projected onto what its legs keep constant.
 
     Without a given one it is the pose where all motors are at the middle of their travel that
     turns the platform least; of mirror images in the plane of the base joints the one on the
     positive side of z is taken.
     """
     if described.home is not None:
-        return _settle(described, described.home)
+        return _project(described, described.home)
     closure = _Closure(described, mid_travel=True)
     found = _search(closure, turning=False) or _search(closure, turning=True)
     if found is None:
@@ -216,152 +216,136 @@ def find_home(described: Description) -> Home:
 
 
 class _Closure:
-    """What must vanish at home, as a function of three coordinates [m] and a rotation vector."""
+    """The equations of home: lengths, axes of R joints, and in a plane parallel axes.
+
+    Residuals are parts of the machine's size.
+    """
 
     def __init__(self, described: Description, *, mid_travel: bool) -> None:
-        legs = described.legs
-        self.A = np.array([leg.A_base for leg in legs])
-        self.B = np.array([leg.B_platform for leg in legs])
-        self.size = float(max(np.ptp(self.A, axis=0).max(), np.ptp(self.B, axis=0).max(), 1e-3))
-        self._legs = legs
-        self._planar = all(leg.type.is_planar for leg in legs)
-        self.wanted = np.full(len(legs), np.nan)
-        for j, leg in enumerate(legs):
-            if leg.kind is LegKind.CONSTANT:
-                self.wanted[j] = np.nan if leg.offset is None else leg.offset
-            elif mid_travel and leg.kind is LegKind.ACTUATED and leg.travel is not None:
-                self.wanted[j] = (leg.offset or 0.0) + 0.5 * sum(leg.travel)
-        known = self.wanted[np.isfinite(self.wanted)]
-        self.size = max(self.size, float(known.max(initial=0.0)))
+        self.planar = all_revolute(described)
+        legs = [_fixed_leg(entry, self.planar, mid_travel) for entry in described.legs]
+        self.legs = tuple(leg for leg in legs if leg.n_constraints)
+        self.A = np.array([leg.A for leg in legs])
+        self.B = np.array([leg.B for leg in legs])
+        lengths = [leg.q0 for leg in self.legs if leg.kind is LegKind.CONSTANT]
+        spread = max(float(np.ptp(points, axis=0).max()) for points in (self.A, self.B))
+        self.size = max(spread, 1e-3, *lengths)
+        self.unit = np.array([1.0] * 3 + [self.size] * 3)
 
-    def residual(self, T: RigidTransform) -> Array:
-        """Return lengths and axes that are off, as parts of the machine's size."""
-        vectors = T.apply(self.B) - self.A
-        lengths = np.linalg.norm(vectors, axis=1)
-        held = np.isfinite(self.wanted)
-        rows = [(lengths - self.wanted)[held] / self.size]
-        for leg, vector in zip(self._legs, vectors, strict=True):
-            axes = self._axes(leg.base_axis, leg.platform_axis, T)
-            for joint, axis in zip((leg.type.base, leg.type.platform), axes, strict=True):
-                if joint is JointType.REVOLUTE and axis is not None:
-                    rows.append(np.array([axis @ vector]) / self.size)
-            if self._planar:
-                rows.append(np.cross(axes[0], axes[1]))  # type: ignore[arg-type]
-        return np.concatenate(rows)
+    def __call__(self, poses: Array) -> tuple[Array, Array]:
+        """Return residuals (k, m) at poses (k, 3, 4) and derivatives (k, m, 6)."""
+        if not self.legs:
+            return np.zeros((len(poses), 0)), np.zeros((len(poses), 0, 6))
+        with np.errstate(invalid="ignore"):  # a leg without length has no direction
+            found = pose_equations(self.legs, poses[:, :, :3], poses[:, :, 3], by_local=False)
+        values, by_pose = [found.values / self.size], [found.by_pose / self.size]
+        for leg in self.legs if self.planar else ():
+            if leg.base_axis is not None and leg.platform_axis is not None:
+                turned = poses[:, :, :3] @ leg.platform_axis
+                values.append(cross(leg.base_axis, turned))
+                slope = -cross_matrices(leg.base_axis) @ cross_matrices(turned)
+                by_pose.append(np.concatenate([slope, np.zeros_like(slope)], axis=2))
+        return np.concatenate(values, axis=1), np.concatenate(by_pose, axis=1)
 
-    def misfits(self, T: RigidTransform) -> list[str]:
-        """Return what is off at a pose, in words."""
-        found = []
-        for leg, wanted, vector in zip(
-            self._legs, self.wanted, T.apply(self.B) - self.A, strict=True
-        ):
-            length = float(np.linalg.norm(vector))
-            if abs(length - wanted) > CLOSED * self.size:
-                found.append(
-                    f"leg '{leg.name}' {1e3 * length:.6g} mm long instead of {1e3 * wanted:.6g} mm"
-                )
-            axes = self._axes(leg.base_axis, leg.platform_axis, T)
-            for side, axis in zip(("base", "platform"), axes, strict=True):
-                if getattr(leg.type, side) is not JointType.REVOLUTE or axis is None:
-                    continue
-                angle = np.degrees(np.arccos(min(1.0, abs(float(axis @ vector)) / length)))
-                if 90.0 - angle > 1e-6:
-                    found.append(
-                        f"the {side} axis of leg '{leg.name}' at {angle:.4g} deg to the leg "
-                        "instead of 90 deg, which an R joint needs,"
+    def residual(self, T: RigidTransform) -> float:
+        """Return the largest residual at a pose."""
+        return float(np.abs(self(T.as_matrix()[None, :3])[0]).max(initial=0.0))
+
+    def nearest(self, T: RigidTransform) -> RigidTransform:
+        """Return the nearest pose that closes, as far as steps get nearer to one."""
+        found = solve(
+            self, moved, T.as_matrix()[None, :3], tolerance=1e-16, unit=self.unit, steps=30
+        )
+        return motion_of(found.points[0, :, :3], found.points[0, :, 3])
+
+    def describe(self, T: RigidTransform) -> list[str]:
+        """Return the residuals at a pose in words."""
+        matrix = T.as_matrix()[None]
+        found = pose_equations(self.legs, matrix[:, :3, :3], matrix[:, :3, 3], by_local=False)
+        words = []
+        for j, kind, value in zip(found.leg, found.kinds, found.values[0], strict=True):
+            leg = self.legs[j]
+            length = float(np.linalg.norm(T.apply(leg.B) - leg.A))
+            if kind is EquationKind.LENGTH:
+                if abs(value) > CLOSED * self.size:
+                    words.append(
+                        f"leg '{leg.name}' {1e3 * length:.6g} mm long instead of "
+                        f"{1e3 * leg.q0:.6g} mm"
                     )
-        return found or ["axes of a planar mechanism that are not parallel"]
-
-    def _axes(
-        self, base: Array | None, platform: Array | None, T: RigidTransform
-    ) -> tuple[Array | None, Array | None]:
-        """Return the given axes in the base; in the plane also the default ones."""
-        if self._planar:
-            z = np.array([0.0, 0.0, 1.0])
-            base, platform = (z if axis is None else axis for axis in (base, platform))
-        if platform is not None:
-            platform = np.asarray(T.rotation.apply(platform))
-        return base, platform
+                continue
+            angle = np.degrees(np.arccos(min(1.0, abs(float(value)) / length)))
+            if 90.0 - angle > 1e-6:
+                side = "base" if kind is EquationKind.BASE_AXIS else "platform"
+                words.append(
+                    f"the {side} axis of leg '{leg.name}' at {angle:.4g} deg to the leg "
+                    "instead of 90 deg, which an R joint needs,"
+                )
+        return words or ["axes of a planar mechanism that are not parallel"]
 
 
-def _settle(described: Description, home: Home) -> Home:
+def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool) -> Leg:
+    """Return a leg of the length that home needs, passive where any will do."""
+    length = entry.offset if entry.kind is LegKind.CONSTANT else None
+    if mid_travel and entry.kind is LegKind.ACTUATED and entry.travel is not None:
+        length = (entry.offset or 0.0) + 0.5 * sum(entry.travel)
+    z = np.array([0.0, 0.0, 1.0]) if planar else None
+    return Leg(
+        entry.type.base,
+        entry.type.platform,
+        LegKind.PASSIVE if length is None else LegKind.CONSTANT,
+        entry.A_base,
+        entry.B_platform,
+        0.0 if length is None else length,
+        z if entry.base_axis is None else entry.base_axis,
+        z if entry.platform_axis is None else entry.platform_axis,
+        name=entry.name,
+    )
+
+
+def _project(described: Description, home: Home) -> Home:
     """Return the pose nearest to home that closes where legs leave no choice."""
-    closure = _Closure(described, mid_travel=False)
-    T = home.motion()
-    miss = closure.residual(T)
-    if np.abs(miss).max(initial=0.0) < CLOSED_EXACTLY:
+    closure, T = _Closure(described, mid_travel=False), home.motion()
+    if closure.residual(T) < ROUNDING:
         return home
-    if np.abs(miss).max() < MAX_OUTSIDE:
-        T = _polished(closure, T)
-        miss = closure.residual(T)
-    if np.abs(miss).max() < CLOSED:
+    if closure.residual(T) < MAX_HOME_RESIDUAL:
+        T = closure.nearest(T)
+    if closure.residual(T) < CLOSED:
         return _written(T)
     raise ModelError(
         [
             f"{described.source}: home could not be used: found {found} there, needed a pose in "
             "which the machine closes; correct home, lengths or axes."
-            for found in closure.misfits(home.motion())
+            for found in closure.describe(home.motion())
         ]
     )
-
-
-def _polished(closure: _Closure, T: RigidTransform) -> RigidTransform:
-    """Return the nearest pose that closes, as far as steps get nearer to one."""
-    miss = closure.residual(T)
-    for _ in range(30):
-        step = np.linalg.lstsq(_jacobian(closure, T), miss, rcond=1e-9)[0]
-        moved = _moved(T, np.asarray(-step), closure.size)
-        if np.abs(closure.residual(moved)).max() >= np.abs(miss).max():
-            break
-        T, miss = moved, closure.residual(moved)
-    return T
 
 
 def _search(closure: _Closure, *, turning: bool) -> Home | None:
     """Return the best of the poses that seeded starts find; without turning first."""
     rng = np.random.default_rng(1965)
     centre = closure.A.mean(axis=0) - closure.B.mean(axis=0)
-    n_free = 6 if turning else 3
-
-    def pose(x: Array) -> RigidTransform:
-        turn = np.zeros(3) if n_free == 3 else x[3:]
-        return motion_of(Rotation.from_rotvec(turn).as_matrix(), closure.size * x[:3])
-
-    def misfit(x: Array) -> Array:
-        return closure.residual(pose(x))
-
-    best: tuple[float, RigidTransform] | None = None
-    for trial in range(TRIALS if turning else 8):
+    n_trials = TRIALS if turning else 8
+    starts = np.zeros((n_trials, 3, 4))
+    for trial in range(n_trials):
         shift = rng.normal(0.0, 1.0, 3) if trial else np.array([0.0, 0.0, 1.0])
-        start = np.concatenate([centre / closure.size + shift, rng.normal(0.0, 0.3, n_free - 3)])
-        fit = least_squares(misfit, start, xtol=1e-15, gtol=1e-15, max_nfev=EVALUATIONS)
-        if np.abs(fit.fun).max(initial=0.0) > CLOSED:
-            continue
-        T = pose(fit.x)
+        starts[trial, :, 3] = centre + closure.size * shift
+        turn = rng.normal(0.0, 0.3, 3) if turning else np.zeros(3)
+        starts[trial, :, :3] = Rotation.from_rotvec(turn).as_matrix()
+
+    def equations(poses: Array) -> tuple[Array, Array]:
+        values, by_pose = closure(poses)
+        by_pose[:, :, :3] *= turning
+        return values, by_pose
+
+    found = solve(equations, moved, starts, tolerance=1e-15, unit=closure.unit, damped=True)
+    best: tuple[float, RigidTransform] | None = None
+    for pose in found.points[found.worst <= CLOSED]:
+        T = motion_of(pose[:, :3], pose[:, 3])
         below = float((T.apply(closure.B) - closure.A).mean(axis=0)[2]) < -1e-9
         rank = 10.0 * below + float(T.rotation.magnitude())
         if best is None or rank < best[0] - 1e-6:
             best = rank, T
-        if best[0] < 10.0 and trial > (15 if turning else 0):
-            break
-    return None if best is None else _written(_polished(closure, best[1]))
-
-
-def _jacobian(closure: _Closure, T: RigidTransform) -> Array:
-    """Return the change of what must vanish with a small motion, by central differences."""
-    h = 1e-6
-    columns = [
-        closure.residual(_moved(T, step, closure.size))
-        - closure.residual(_moved(T, -step, closure.size))
-        for step in h * np.eye(6)
-    ]
-    return np.column_stack(columns) / (2.0 * h)
-
-
-def _moved(T: RigidTransform, step: Array, size: float) -> RigidTransform:
-    """Return a pose moved by parts of a size and turned by a rotation vector [rad]."""
-    turn = Rotation.from_rotvec(step[3:])
-    return motion_of((turn * T.rotation).as_matrix(), T.translation + size * step[:3])
+    return None if best is None else _written(closure.nearest(best[1]))
 
 
 def _written(T: RigidTransform) -> Home:
