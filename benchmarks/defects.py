@@ -141,11 +141,12 @@ def replaced(text: str, place: Place, new: str) -> str:
 
 
 def read_package(root: Path) -> dict[Path, str]:
-    """Return the modules of the package by their paths in the tree."""
-    return {
-        path.relative_to(root): path.read_text(encoding="utf-8")
-        for path in sorted((root / "legcal").rglob("*.py"))
-    }
+    """Return the modules of the package, and the bound of benchmarks, by their paths in the tree."""
+    paths = [
+        *sorted((root / "legcal").rglob("*.py")),
+        *sorted((root / "benchmarks").glob("*bound.py")),
+    ]
+    return {path.relative_to(root): path.read_text(encoding="utf-8") for path in paths}
 
 
 def problem(defect: Defect, sources: dict[Path, str]) -> str:
