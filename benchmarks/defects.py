@@ -141,7 +141,7 @@ def replaced(text: str, place: Place, new: str) -> str:
 
 
 def read_package(root: Path) -> dict[Path, str]:
-    """Return the modules of the package, and the bound of benchmarks, by their paths in the tree."""
+    """Return the modules of the package, and the bound of benchmarks, by their paths."""
     paths = [
         *sorted((root / "legcal").rglob("*.py")),
         *sorted((root / "benchmarks").glob("*bound.py")),

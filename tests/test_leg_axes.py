@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from staged_hexapods import exact_session
 
-from legcal.data.axes import LegAxes, axes_from_outlines, join_axes, outline_derivative
-from legcal.data.outlines import Outlines
+from legcal.data import LegAxes, Outlines, axes_from_outlines, join_axes
+from legcal.data.axes import outline_derivative
 from legcal.errors import NotVisible
+from legcal.geometry import Array
 from legcal.geometry.lines import distance_to_line
-from legcal.geometry.types import Array
+from legcal.simulation import OutlineNoise
 from legcal.simulation.cameras import sample_camera
 from legcal.simulation.hexapod import (
     HexapodSession,
@@ -19,8 +20,8 @@ from legcal.simulation.hexapod import (
     hexapod_session,
     perturb,
 )
-from legcal.simulation.observe import OutlineNoise, shifted_outlines
-from legcal.vision.camera import Camera
+from legcal.simulation.observe import shifted_outlines
+from legcal.vision import Camera
 
 LENS = replace(sample_camera(), distortion=np.array([-0.2, 0.1, 0.001, -0.002, 0.0]))
 
@@ -63,11 +64,6 @@ def test_exact_outlines_give_axes_through_both_joint_centres(camera: Camera) -> 
         assert abs(axes.u[i] @ (axes.M[i] - 0.5 * (A + B))) < 0.1 * np.linalg.norm(B - A)
 
 
-def test_the_basis_is_normal_to_the_axis() -> None:
-    axes = exact_session().axes
-    assert np.allclose(np.cross(axes.basis[:, 0], axes.basis[:, 1]), axes.u, atol=1e-12)
-
-
 def test_normals_follow_offsets_as_finite_differences_say() -> None:
     session = _session(LENS)
     outlines = session.outlines or pytest.fail("no outlines")
@@ -101,9 +97,10 @@ def test_the_covariance_of_axes_is_that_of_many_noisy_outlines() -> None:
 
 
 def test_tilt_towards_the_camera_is_known_far_worse_than_the_angle_in_the_image() -> None:
-    covariance = exact_session().axes.covariance[:, :2, :2]
-    sigma = np.sqrt(np.linalg.eigvalsh(covariance))
+    axes = exact_session().axes
+    sigma = np.sqrt(np.linalg.eigvalsh(axes.covariance[:, :2, :2]))
     assert np.all(sigma[:, 1] > 20.0 * sigma[:, 0])
+    assert np.allclose(np.cross(axes.basis[:, 0], axes.basis[:, 1]), axes.u, atol=1e-12)
 
 
 def test_tube_and_rod_of_a_leg_are_joined_with_the_weight_of_their_covariances() -> None:
@@ -123,7 +120,7 @@ def test_tube_and_rod_of_a_leg_are_joined_with_the_weight_of_their_covariances()
     assert np.allclose(joined.covariance, 0.75 * axes.covariance, rtol=1e-6)
 
 
-def test_legs_with_one_used_outline_are_passed_over() -> None:
+def test_legs_with_one_used_outline_are_passed_over_and_none_with_two_is_refused() -> None:
     session = _session(sample_camera())
     outlines = session.outlines or pytest.fail("no outlines")
     used = outlines.used.copy()
@@ -131,10 +128,5 @@ def test_legs_with_one_used_outline_are_passed_over() -> None:
     axes = _axes(session, replace(outlines, used=used))
     assert len(axes) == len(session.axes) - 1
     assert (int(axes.row[0]), int(axes.leg[0])) == (0, int(outlines.leg[2]))
-
-
-def test_no_pair_of_outlines_is_refused() -> None:
-    session = _session(sample_camera())
-    outlines = session.outlines or pytest.fail("no outlines")
     with pytest.raises(NotVisible, match="no leg has both outlines in any image"):
         _axes(session, replace(outlines, used=outlines.edge == 1))

@@ -379,6 +379,13 @@ def test_joints_and_axes_that_views_do_not_tie_together_are_refused_by_name(
     assert all(word in str(refusal.value) for word in words)
 
 
+def test_joints_known_worse_than_the_size_of_the_base_are_refused() -> None:
+    seen, nominal = legs_seen([ALL, ALL]), made_up_base(SQUARE, ACROSS)
+    locate_joints_in_base(nominal, seen_from(SQUARE, ACROSS, seen, sigma=0.1)[0])
+    with pytest.raises(NotIdentifiable, match="can move"):
+        locate_joints_in_base(nominal, seen_from(SQUARE, ACROSS, seen, sigma=5.0)[0])
+
+
 # Step 2: what cameras show of hexapods
 
 

@@ -28,7 +28,12 @@ from legcal.paper.leg_equations import (
     length_of_leg,
 )
 from legcal.paper.motions import axis_frames, moved
-from legcal.paper.offsets import identify_offsets
+from legcal.paper.offsets import (
+    distance_sigma,
+    identify_offsets,
+    leg_end_covariance,
+    leg_ends,
+)
 from legcal.paper.platform import locate_platform_joints
 from legcal.paper.platform_pose import PlatformPoses, locate_platform, register_by_rays
 from legcal.paper.platform_printed import fixed_direction, locate_passive_end, revolute_axis
@@ -83,6 +88,26 @@ def test_a_leg_fixed_to_the_platform_has_no_distance_to_others() -> None:
     q0 = identify_offsets(observed.nominal, directions, 2e-6).parameters.offsets
     assert q0[3] == 0.1
     assert np.abs(q0[:3] - [leg.q0 for leg in observed.true_legs[:3]]).max() < 1e-9
+
+
+def test_the_covariance_of_leg_ends_follows_directions_and_readings() -> None:
+    session, nominal = noisy_session(0, OutlineNoise(), n_poses=8)
+    base = run_base_steps(nominal_of(nominal), session.axes, session.measurements)
+    directions = directions_through_joints(session.axes, session.measurements, base)
+    q0, sigma_q, h = base.machine.parameters.offsets, 1e-3, 1e-6
+    u, e = directions.u, np.swapaxes(directions.basis, 0, 1)
+    ahead = [replace(directions, u=u + h * each) for each in e]
+    ahead.append(replace(directions, reading=directions.reading + h))
+    J = np.stack([leg_ends(d, q0) - leg_ends(directions, q0) for d in ahead], axis=2) / h
+    C = np.zeros((len(u), 3, 3))
+    C[:, :2, :2], C[:, 2, 2] = directions.covariance, sigma_q**2
+    found = leg_end_covariance(directions, q0, sigma_q)
+    np.testing.assert_allclose(found, J @ C @ np.swapaxes(J, 1, 2), rtol=1e-6, atol=1e-12)
+    pairs = np.array([[0, 1], [2, 5]])
+    ends = leg_ends(directions, q0)
+    n = unit(ends[pairs[:, 0]] - ends[pairs[:, 1]])
+    variance = np.einsum("ni,nij,nj->n", n, found[pairs].sum(axis=1), n)
+    np.testing.assert_allclose(distance_sigma(ends, found, pairs), np.sqrt(variance), rtol=1e-9)
 
 
 def test_step_4_corrects_offsets_that_step_3_left_wrong() -> None:

@@ -2,7 +2,7 @@
 
 Three joints not on a line fix it. Joints on one line leave a turn about it, which revolute axes
 across the line fix as lines: often one way, sometimes in several that look nearly alike. In a
-planar mechanism, where all axes are normal to the line, the two sides of the plane end the legs
+planar machine, where all axes are normal to the line, the two sides of the plane end the legs
 in mirrored places: laid on these, the nominal platform contradicts the readings on the wrong one.
 """
 
@@ -96,7 +96,7 @@ def side_of_plane(
 ) -> float:
     """Return the sign with which a normal points up in R_b, zero where nothing shows it.
 
-    ``axes`` are those of one view of a planar mechanism; ``A_camera`` (n, 3) are the joints of
+    ``axes`` are those of one view of a planar machine; ``A_camera`` (n, 3) are the joints of
     ``legs`` (n,) that it locates, and ``normal`` (3,) is that of the plane, of any sign.
     """
     A_Rb, up = machine.parameters.base_joints[legs], np.tile([0.0, 0.0, 1.0], (len(legs), 1))

@@ -92,7 +92,7 @@ def three_legs_at_once(
     A revolute joint on the platform (18) and the axes of a universal joint in a leg without an S
     joint need a view that shows the leg and three legs in all; the end of a passive leg (19) a
     view that shows it and three legs whose length is measured or constant. The revolute axes
-    of a planar mechanism are known from the base.
+    of a planar machine are known from the base.
     """
     with_length = {j for j, leg in enumerate(legs) if leg.kind is not LegKind.PASSIVE}
     missing = set()

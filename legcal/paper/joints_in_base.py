@@ -42,9 +42,11 @@ from legcal.paper.nominal import Criteria, NominalMachine
 from legcal.paper.unknowns import BASE_TURNS, OF_A, Unknowns
 
 _MAX_SIGMA_TURN = 1.0  # [rad] of an axis; beyond, nothing is known of it
-_APART = 1e-3  # of the size of the base: nearer joints count as one, whose distance says nothing
-_MAX_TRIALS = 32  # of places of cameras that look alike
-_DECIDED = 4.5  # half of a squared error: a difference in cost that decides between two places
+_APART = (
+    1e-3  # of the size of the base: nearer joints count as one, whose distance is no information
+)
+_MAX_TRIALS = 32  # of combinations of candidate poses of the cameras
+_MIN_DIFFERENCE = 4.5  # of the cost: three standard deviations decide between two candidates
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,8 +200,8 @@ def _registered(
 ) -> tuple[Solution, tuple[RigidTransform | None, ...]]:
     """Return the rigid solution and the cameras that it fixes.
 
-    Where axes leave several places of a camera, all are tried; where they fit alike, the view says
-    no more than distances.
+    Where axes leave several candidates of a camera, all are tried; where they fit alike, the view
+    gives distances only.
     """
     v_Rb = machine.base_normals
     starts: list[Sequence[RigidTransform | None]] = []
@@ -222,7 +224,7 @@ def _registered(
                 signs[v, axes] = signs_seen(v_Rb[axes], joints.v_camera[v, axes], T)
         try:
             return solve_least_squares(build_rigid(machine, with_signs(joints, signs), start))
-        except DidNotConverge as failure:  # the wrong one of two places may end anywhere
+        except DidNotConverge as failure:  # the wrong one of two candidates may end anywhere
             return failure
 
     choices = list(product(*starts))
@@ -230,12 +232,12 @@ def _registered(
     costs = np.array([found.cost if isinstance(found, Solution) else np.inf for found in solutions])
     best = int(np.argmin(costs))
     start, solution = choices[best], solutions[best]
-    doubtful = np.zeros(len(starts), dtype=np.bool_)
+    ambiguous = np.zeros(len(starts), dtype=np.bool_)
     for choice, cost in zip(choices, costs, strict=True):
-        if cost < costs[best] + _DECIDED:
-            doubtful |= [a is not b for a, b in zip(choice, start, strict=True)]
-    if doubtful.any():
-        start = tuple(None if d else T for T, d in zip(start, doubtful, strict=True))
+        if cost < costs[best] + _MIN_DIFFERENCE:
+            ambiguous |= [a is not b for a, b in zip(choice, start, strict=True)]
+    if ambiguous.any():
+        start = tuple(None if d else T for T, d in zip(start, ambiguous, strict=True))
         solution = trial(start)
     if isinstance(solution, DidNotConverge):
         raise solution
@@ -347,7 +349,7 @@ def _centre_and_axis() -> ca.Function:
 def _centre_in_plane() -> ca.Function:
     """Return (A, step; known, R, t, A_camera, v_camera, G, W) -> W times the error of A, (3,).
 
-    A leg of a planar mechanism: its centre is the one seen if the normal of the plane is; it
+    A leg of a planar machine: its centre is the one seen if the normal of the plane is; it
     follows turns of the normal by G (3, 2).
     """
     local, given, error = _centre_residual(9)

@@ -5,7 +5,7 @@ normal to the revolute axis v of that joint:
 
     (M - A) x u = 0   (6)        v . u = 0   (7)
 
-In a planar mechanism the axes v of a view are one common normal. ``literal`` solves (6), then
+In a planar machine the axes v of a view are one common normal. ``literal`` solves (6), then
 (7), every equation with the same weight. What an image knows badly is the tilt of a leg towards
 the camera: the default weights both by the covariances of the axes, robustly.
 """
@@ -29,7 +29,7 @@ _MAX_SIGMA_TURN = 1.0  # [rad] of an axis; beyond, nothing is known of it
 MAX_REWEIGHTINGS = 100
 _MIN_REWEIGHTINGS = 10
 _CONVERGED = 1e-6  # standard deviations: smaller steps no longer matter
-_OUTLIER = 3.0  # an axis that misses A by this many times the median has half its weight
+_OUTLIER = 3.0  # an axis with a residual of this many times the median has half its weight
 _MIN_THRESHOLD = 1e-3  # standard deviations: smaller residuals are rounding
 _MAX_STEP = 0.2  # [rad] of an axis, and in its distance of a centre
 
@@ -46,7 +46,7 @@ class JointsInCamera:
     # a plane that of each leg and the common normal
     covariance: Array
     diagnostics: tuple[str, ...]  # which legs were left out of which views, and why
-    # (n_views,), planar mechanisms: lengths of legs say from which side the camera sees the plane,
+    # (n_views,), planar machines: lengths of legs decide from which side the camera sees the plane,
     # so that the sign of the normal is known
     sided: BoolArray
 
@@ -127,7 +127,7 @@ def _no_single_point(information: Array, n_images: int) -> str:
 
 
 def _uncertain_centre(A: Array, covariance: Array) -> str:
-    """Return why a centre says nothing, or an empty string."""
+    """Return why a centre is not determined, or an empty string."""
     sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
     distance = float(np.linalg.norm(A))
     if sigma <= _MAX_SIGMA_CENTRE * distance:
@@ -139,7 +139,7 @@ def _uncertain_centre(A: Array, covariance: Array) -> str:
 
 
 def _uncertain_axis(covariance: Array) -> str:
-    """Return why an axis says nothing, or an empty string."""
+    """Return why an axis is not determined, or an empty string."""
     sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
     if sigma <= _MAX_SIGMA_TURN:
         return ""
@@ -159,7 +159,7 @@ def oriented(machine: NominalMachine, joints: JointsInCamera) -> JointsInCamera:
     The nominal base is laid on the joints of each view, and each axis takes the sign with which it
     points to the side of its nominal axis. Where two turns about a line of joints agree alike, the
     sign remains a matter of choice: step 2 by default tries both. That of an axis whose joint is
-    alone in its view does not matter. In a planar mechanism lengths of legs decide afterwards.
+    alone in its view does not matter. In a planar machine lengths of legs decide afterwards.
     """
     nominal, A_Rb = machine.base_normals, machine.parameters.base_joints
     signs = np.ones(joints.located.shape)
@@ -176,7 +176,7 @@ def oriented(machine: NominalMachine, joints: JointsInCamera) -> JointsInCamera:
 def _sided(
     machine: NominalMachine, axes: LegAxes, measurements: Measurements, joints: JointsInCamera
 ) -> JointsInCamera:
-    """Return joints whose normals point up where the lengths of legs say which way that is."""
+    """Return joints whose normals point up where the lengths of legs decide which way that is."""
     signs, sided = np.ones(joints.located.shape), joints.sided.copy()
     view = measurements.view[axes.row]
     for v, with_axis in enumerate(joints.axis_located):
@@ -320,9 +320,9 @@ def _weighted_joints(
 ) -> tuple[Array, Array, Array]:
     """Return A, v of revolute joints and covariances (n, 5, 5), (6) and (7) weighted together.
 
-    The tilt of a leg towards the camera enters the miss of A, in proportion to the distance, and
-    the angle to v: both are weighted by their joint covariance. The derivatives are those at the
-    adjusted directions, which meet in A and are normal to v; at the observed ones, tilts would
+    The tilt of a leg towards the camera enters the residual of A, in proportion to the distance,
+    and the angle to v: both are weighted by their joint covariance. The derivatives are those at
+    the adjusted directions, which meet in A and are normal to v; at the observed ones, tilts would
     pass for turns, and v would come out biased.
     """
     A, v, C = A.copy(), v.copy(), np.zeros((len(A), 5, 5))
@@ -355,7 +355,7 @@ def _until_converged(
 ) -> None:
     """Update the bundles in place whose pools still move; ``update`` returns their steps.
 
-    One that says nothing of its joint would wander off, and is not followed.
+    One that does not determine its joint would diverge, and is left where it is.
     """
     active = np.arange(len(A))
     for k in range(MAX_REWEIGHTINGS):
@@ -382,7 +382,7 @@ def _robust_weights(bundles: Bundles, residual: Array, spread: Array) -> Array:
 def joint_residuals(
     axes: LegAxes, here: IntArray, A: Array, v: Array
 ) -> tuple[Array, Array, Array]:
-    """Return by how much axes miss points A and are not normal to v (k, 3), (6) and (7).
+    """Return the residuals of axes about points A and normals v (k, 3), (6) and (7).
 
     The observed axis at the height s of the point is M + s u + e (beta + s alpha), e = (e1, e2).
     Returns the residuals (k, 3): e . (A - M) [m] and -v . u; their covariance (k, 3, 3); and the
@@ -400,7 +400,7 @@ def joint_residuals(
 
 
 def residual_jacobian(axes: LegAxes, here: IntArray, v: Array, alpha: Array) -> Array:
-    """Return the derivative (k, 3, 5) of the miss by A and turns of v, at u + e alpha."""
+    """Return the derivative (k, 3, 5) of the residuals by A and turns of v, at u + e alpha."""
     N, E, u = normal_basis(v), axes.basis[here], axes.u[here]
     better = u + np.einsum("kia,ki->ka", E, alpha)
     J = np.zeros((len(here), 3, 5))

@@ -132,7 +132,7 @@ class Solution:
     jacobian: csc_array[np.float64]  # (m, n), the same
     n_shared: int  # the first unknowns are shared by many observations
     n_iterations: int  # of IPOPT, over all weights
-    status: str  # what IPOPT says about the end
+    status: str  # of IPOPT at the end
 
     @property
     def cost(self) -> float:
@@ -351,12 +351,12 @@ def _shared_triangle(jacobian: csc_array[np.float64], n_shared: int) -> tuple[Ar
     n_groups = int(group_of_row.max(initial=-1)) + 1
     if n_groups:
         slot = _rank_in_group(group_of_row)
-        n_own = int(place_of_column.max()) + 1
-        filled = np.zeros((n_groups, int(slot.max()) + 1, n_own + n_shared))
-        own, place = column >= n_shared, n_own + column
-        place[own] = place_of_column[column[own] - n_shared]
+        n_local = int(place_of_column.max()) + 1
+        filled = np.zeros((n_groups, int(slot.max()) + 1, n_local + n_shared))
+        local, place = column >= n_shared, n_local + column
+        place[local] = place_of_column[column[local] - n_shared]
         filled[group_of_row[row[~here]], slot[row[~here]], place[~here]] = values[~here]
-        rest = _eliminated(filled[:, :, :n_own], filled[:, :, n_own:])
+        rest = _eliminated(filled[:, :, :n_local], filled[:, :, n_local:])
         shared_rows = np.concatenate([shared_rows, rest])
     reduced = np.asarray(np.linalg.qr(shared_rows, mode="r"))
     missing = np.zeros((n_shared - len(reduced), n_shared))
@@ -368,16 +368,16 @@ def _groups(jacobian: csc_array[np.float64], n_shared: int) -> tuple[IntArray, I
     n_rows, n = jacobian.shape
     if n == n_shared:
         return np.full(n_rows, -1), np.zeros(0, dtype=np.intp)
-    own = jacobian[:, n_shared:]
-    _, group = connected_components(own.T @ own, directed=False)
+    local = jacobian[:, n_shared:]
+    _, group = connected_components(local.T @ local, directed=False)
     group_of_row = np.full(n_rows, -1)
-    entries = own.tocoo()
+    entries = local.tocoo()
     group_of_row[entries.row] = group[entries.col]
     return group_of_row, _rank_in_group(np.asarray(group, np.intp))
 
 
 def _rank_in_group(group: IntArray) -> IntArray:
-    """Return the how-manieth of its group each entry is."""
+    """Return the place of each entry in its group."""
     order = np.argsort(group, kind="stable")
     in_order = group[order]
     rank = np.zeros(len(group), dtype=np.intp)
@@ -385,16 +385,16 @@ def _rank_in_group(group: IntArray) -> IntArray:
     return rank
 
 
-def _eliminated(own: Array, shared: Array) -> Array:
-    """Return what the rows [own, shared] of (k, r, n) groups say about the shared unknowns alone.
+def _eliminated(local: Array, shared: Array) -> Array:
+    """Return what the rows [local, shared] of (k, r, n) groups say about the shared unknowns alone.
 
-    Rows are rotated until as few as possible contain the own unknowns, which are then dropped.
+    Rows are rotated until as few as possible contain the local ones, which are then dropped.
     """
-    n_own, n_shared = own.shape[2], shared.shape[2]
-    if n_own == 0:
+    n_local, n_shared = local.shape[2], shared.shape[2]
+    if n_local == 0:
         return shared.reshape(-1, n_shared)
-    rows = np.asarray(np.linalg.qr(np.concatenate([own, shared], axis=2), mode="r"))
-    left, singular, _ = np.linalg.svd(rows[:, :, :n_own])
-    rotated = np.swapaxes(left, 1, 2) @ rows[:, :, n_own:]
+    rows = np.asarray(np.linalg.qr(np.concatenate([local, shared], axis=2), mode="r"))
+    left, singular, _ = np.linalg.svd(rows[:, :, :n_local])
+    rotated = np.swapaxes(left, 1, 2) @ rows[:, :, n_local:]
     rotated[:, : singular.shape[1]][singular >= _RANK] = 0.0
     return np.asarray(rotated.reshape(-1, n_shared))

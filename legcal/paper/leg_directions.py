@@ -77,7 +77,7 @@ def directions_through_joints(
 ) -> LegDirections:
     """Return u of the legs given that each axis belongs to its base joint.
 
-    One image says little about the tilt of a leg towards the camera, and (13) multiplies that
+    One image determines the tilt of a leg towards the camera poorly, and (13) multiplies that
     error by the leg's length. But A is known from many images, and the middle of the leg from
     this one: an axis through both has a much better direction. This is what conditioning the
     covariance of the axis on "it passes through A" does, and on "it is normal to v" for a leg
@@ -165,7 +165,7 @@ def _conditioned(
 def _known_normals(base: JointsInBase, view: IntArray, leg: IntArray) -> tuple[Array, Array]:
     """Return what legs are normal to (n, 3), zero if nothing, and its covariance (n, 3, 3) [rad^2].
 
-    In R_b, where the view is placed there, this is the axis of step 2; in a planar mechanism z,
+    In R_b, where the view is placed there, this is the axis of step 2; in a planar machine z,
     which is as uncertain as the camera of the view is about it. Otherwise it is that of step 1.
     """
     machine, joints = base.machine, base.in_cameras

@@ -144,7 +144,7 @@ def pairs_of_legs(directions: LegDirections, q0: Array) -> IntArray:
 
 
 def pairs_apart(machine: NominalMachine, directions: LegDirections) -> IntArray:
-    """Return the pairs of :func:`pairs_of_legs` whose distance says something of their offsets.
+    """Return the pairs of :func:`pairs_of_legs` whose distance depends on their offsets.
 
     Two legs that meet in one platform joint are at distance zero whatever their offsets are; a leg
     that is fixed to the platform ends on it whatever its offset is.
@@ -195,7 +195,7 @@ def _constant_distance() -> ca.Function:
 
 
 def _check_any(found: Sequence[object], missing: str) -> None:
-    """Refuse an empty criterion; *missing* says what there is none of."""
+    """Refuse an empty criterion; *missing* is what there is none of."""
     if not found:
         raise NotIdentifiable(
             f"The offsets could not be identified: no {missing}; needed images at different poses "

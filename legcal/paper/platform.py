@@ -152,9 +152,9 @@ class RigidProblem:
 
     def index(self, rows: IntArray) -> IntArray:
         """Return the places of the local unknowns of :mod:`leg_equations`, (k, 15)."""
-        own = np.arange(6) if self.machine.spatial else _IN_PLANE
-        first = len(self.unknowns) + (own.max() + 1) * self.poses.pose[rows, None]
-        steps = np.where(own >= 0, first + own, -1)
+        free = np.arange(6) if self.machine.spatial else _IN_PLANE
+        first = len(self.unknowns) + (free.max() + 1) * self.poses.pose[rows, None]
+        steps = np.where(free >= 0, first + free, -1)
         of_leg = self.unknowns.place[self.directions.leg[rows], OF_B.start :]
         return np.hstack([of_leg, steps])
 
@@ -185,8 +185,8 @@ class RigidProblem:
     def poses_in_base(self, x: Array) -> tuple[Array, Array]:
         """Return R and t of the poses of groups in R_b, from the unknowns of all poses."""
         steps = np.zeros((len(self.poses.R), 6))
-        own = np.arange(6) if self.machine.spatial else _IN_PLANE
-        steps[:, own >= 0] = x.reshape(len(steps), own.max() + 1)
+        free = np.arange(6) if self.machine.spatial else _IN_PLANE
+        steps[:, free >= 0] = x.reshape(len(steps), free.max() + 1)
         numbers = np.unique(self.poses.pose[self.in_base])
         return self.poses.stepped(steps, numbers[numbers >= 0])
 

@@ -25,7 +25,7 @@ _NEXT = "free some space and start the same command again; the runs before are k
 _NEXT_WITHOUT = "free some space, or give an output folder elsewhere, which keeps what is done"
 
 IsRecord = Callable[[Any], bool]
-"""Tells what a study records from anything else."""
+"""Whether a document is what a study records."""
 
 
 @contextmanager
@@ -224,7 +224,7 @@ def _differences(found: Any, expected: Any, name: str = "") -> Iterator[str]:
 
 
 def _is_run(found: Any, is_record: IsRecord) -> bool:
-    """Return whether a document says what a run found, or how it failed."""
+    """Return whether a document is the record of a run, or its failure."""
     if not isinstance(found, dict) or type(found.get("run")) is not int or found["run"] < 0:
         return False
     if found.keys() == {"run", "record"}:

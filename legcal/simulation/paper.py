@@ -268,7 +268,7 @@ def bound_covariance(session: HexapodSession, exact: LegAxes) -> Array:
 
 
 def nominal_of(machine: PaperHexapod) -> NominalMachine:
-    """Return a simulated machine as the steps take a mechanism."""
+    """Return a simulated machine as the steps take it."""
     return point_like_machine(
         machine.leg_names, machine.parameters, machine.sign, machine.frame_legs
     )

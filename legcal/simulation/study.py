@@ -86,7 +86,7 @@ class Study(Protocol):
         """Return whether what a checkpoint has of a run is what :meth:`one_run` returns."""
 
     def summary(self, records: Iterable[Record]) -> Summary:
-        """Return what the records of all runs that did not fail say, read once and in order."""
+        """Summarise the records of all runs that did not fail, read once and in order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ def run_study(
         Folder for the checkpoint, the document and the figures. One that holds a checkpoint of
         the same study is continued; more runs than before are added to those that are there.
     progress : callable
-        Told how many runs are done.
+        Called with the number of runs that are done.
 
     Returns
     -------
@@ -318,7 +318,7 @@ def run_chunk(study: Study, seed: int, runs: Iterable[int]) -> list[dict[str, An
 
 
 def failure_of(error: LegcalError) -> dict[str, str]:
-    """Return what a record says about a failure."""
+    """Return a failure as a record."""
     return {"kind": type(error).__name__, "message": str(error)}
 
 
