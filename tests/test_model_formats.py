@@ -27,7 +27,7 @@ from legcal.machine import (
     write_urdf,
 )
 from legcal.machine.chain import ClosedChain
-from legcal.machine.mjcf import Values, closing_joints, read_bodies
+from legcal.machine.mjcf import MjcfReader
 from legcal.machine.spanning_tree import close_loop
 from legcal.machine.urdf import Problems, parse_xml
 
@@ -183,10 +183,11 @@ def _rotation(quaternion: list[float]) -> Rotation:
 def test_bodies_sites_and_closures_are_where_mujoco_has_them() -> None:
     path, values = MUJOCO / "model.xml", json.loads((MUJOCO / "values.json").read_text())
     root, problems = parse_xml(path, path.read_bytes(), "MJCF file"), Problems(path)
-    tree = read_bodies(root, Values(root, problems))
-    pairs = [close_loop(loop, tree.text, tree.poses)[0] for loop in closing_joints(root, tree)]
+    reader = MjcfReader(root, problems)
+    reader.read_bodies()
+    pairs = [close_loop(loop, reader.tree, reader.poses)[0] for loop in reader.loops()]
     problems.raise_if_any()
-    chain = ClosedChain(tree.text.robot("machine").decode(), [])
+    chain = ClosedChain(reader.tree.robot("machine").decode(), [])
     q = chain.neutral()
     for name, value in values["q"].items():
         if len(value) == 1:
@@ -196,7 +197,7 @@ def test_bodies_sites_and_closures_are_where_mujoco_has_them() -> None:
                 q[chain.q_index(f"{name}_{letter}")] = angle
         else:
             T = RigidTransform.from_components(value[:3], _rotation(value[3:]))
-            moved = tree.poses["f"].inv() * T
+            moved = reader.poses["f"].inv() * T
             at = chain.q_index(name)
             q[at : at + 7] = [*moved.translation, *moved.rotation.as_quat()]
 
@@ -206,7 +207,7 @@ def test_bodies_sites_and_closures_are_where_mujoco_has_them() -> None:
         R = _rotation(quaternion).as_matrix()
         np.testing.assert_allclose(T.rotation.as_matrix(), R, atol=1e-12)
     for name, (position, matrix) in values["sites"].items():
-        body, T_body_site = tree.sites[name]
+        body, T_body_site = reader.sites[name]
         T = chain.pose(q, "world", body) * T_body_site
         np.testing.assert_allclose(T.translation, position, atol=1e-12)
         np.testing.assert_allclose(T.rotation.as_matrix().ravel(), matrix, atol=1e-12)

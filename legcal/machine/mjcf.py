@@ -1,14 +1,16 @@
 """A mechanism as MuJoCo's MJCF writes it: bodies with joints, closed by equality constraints.
 
-``<connect>`` makes a ``3d`` closure and ``<weld>`` a ``6d`` one; actuators and ``<jointpos>``
-sensors on slides tell the motors. What only a simulation needs is left alone: cameras, lights,
-inertias, plugins, adhesion, and geoms other than cylinders and capsules. An element of a body, a
-constraint or a geom type that MJCF does not have is refused, since it may be a misspelt one.
+``<connect>`` makes a ``3d`` closure and ``<weld>`` a ``6d`` one; motors are the joints of actuators
+and the slides of ``<jointpos>`` sensors. What only a simulation needs is left alone: cameras,
+lights, inertias, plugins, adhesion, and geoms other than cylinders and capsules. An element of a
+body, a constraint or a geom type that MJCF does not have is refused, since it may be misspelt.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from lxml import etree
@@ -32,58 +34,476 @@ from legcal.machine.spanning_tree import (
 )
 from legcal.machine.urdf import Problems, Urdf, number_list, parse_urdf, parse_xml
 
+WORLD = "world"
+MAX_PARTS = 5000
 ORIENTATIONS = {"quat": 4, "axisangle": 4, "xyaxes": 6, "zaxis": 3, "euler": 3}
+_Z = (0.0, 0.0, 1.0)
+_LEFT_ALONE = ("inertial", "camera", "light", "plugin", "site")
+_GEOMS = ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")
+_NOT_READ = ("include", "composite", "flexcomp", "attach", "replicate")
+_COUPLINGS = ("joint", "tendon", "flex", "flexvert", "flexstrain")
+_OTHER_DRIVES = ("tendon", "site", "refsite", "cranksite", "slidersite")
+_WORDS = (("closed_loop", "<equality>"), ("the root of the URDF", "<worldbody>"), *DRAWING)
+
 Attributes = Mapping[str, str]
+Defaults = dict[str, dict[str, str]]  # attributes by element
+LinkFrame = tuple[str, RigidTransform]  # a frame in a link
 
 
-@dataclass(frozen=True)
-class Compiler:
-    """The options of ``<compiler>`` that matter for kinematics."""
+class Part(NamedTuple):
+    """An element of a body: the body, the frame it is written in, its default class."""
 
-    degrees: bool = True  # whether angles are in degrees, as they are by default
-    eulerseq: str = "xyz"  # three letters
-    autolimits: bool = True  # whether a range alone limits a joint
-
-    def radians(self, angle: float) -> float:
-        """Return an angle of the file in radians."""
-        return float(np.deg2rad(angle)) if self.degrees else angle
+    element: etree._Element
+    body: str
+    T_body_frame: RigidTransform
+    childclass: str
 
 
-def own_attributes(element: etree._Element) -> dict[str, str]:
-    """Return the attributes that an element has itself."""
-    return {str(key): str(value) for key, value in element.attrib.items()}
+def read_mjcf_source(path: Path, content: bytes) -> Source:
+    """Return the mechanism of an MJCF file."""
+    root = parse_xml(path, content, "MJCF file")
+    n_parts = sum(1 for _ in root.iter("body", "joint", "default", "frame"))
+    if n_parts > MAX_PARTS:
+        raise ModelError(
+            f"{path}: the MJCF file could not be used: found {n_parts} bodies, joints, frames and "
+            f"default classes, needed at most {MAX_PARTS}; give the mechanism alone."
+        )
+    reader = MjcfReader(root, Problems(path))
+    reader.read_bodies()
+    loops = list(reader.loops())
+    motors = reader.motors()
+    reader.problems.raise_if_any()
+    if not loops:
+        raise OutOfClass(
+            f"{path}: this is not a parallel mechanism: found an MJCF file without <connect> or "
+            "<weld> in <equality>, which is a tree without closed loops, needed the closures of "
+            "its loops; add them."
+        )
+    pairs = [close_loop(loop, reader.tree, reader.poses) for loop in loops]
+    name = root.get("model", "").strip() or path.stem
+    urdf = parse_urdf(path, reader.tree.robot(name), travel_needed=False)
+    frames = [ends for ends, _ in pairs]
+    urdf, dropped = _without_loose_bodies(urdf, frames, reader.tree, name)
+    notes = (f"Free bodies that touch no loop were left out: {', '.join(dropped)}.",)
+    values = {joint: x for joint, x in reader.references.items() if joint in urdf.joints}
+    file = MechanismFile(closed_loop=frames, type=[kind for _, kind in pairs], name_mot=motors)
+    return Source(path, file, urdf, True, notes * bool(dropped), values, words=_WORDS)
 
 
-class Values:
-    """What the elements of one MJCF file say, after defaults, with problems noted."""
+class MjcfReader:
+    """One MJCF file: its elements after defaults, and the tree that its bodies make.
+
+    Problems are noted, to be raised together. The configuration of the file, where all joints are
+    at their ``ref``, closes its loops.
+    """
 
     def __init__(self, root: etree._Element, problems: Problems) -> None:
-        self.problems = problems
-        self._defaults: dict[str, dict[str, dict[str, str]]] = {"main": {}}
+        self.root, self.problems = root, problems
+        self.tree = UrdfBuilder()
+        self.poses: dict[str, RigidTransform] = {WORLD: EYE}  # of every body in the world
+        self.references: dict[str, float] = {}  # the values of joints in the file [rad] or [m]
+        self._joints: dict[str, str] = {}  # the type of every joint
+        self.sites: dict[str, LinkFrame] = {}
+        self._names: set[str] = set()  # that no new link or joint may have
+        named = (*root.iterfind("actuator/*"), *root.iterfind("sensor/jointpos"))
+        self._driven = frozenset(str(element.get("joint")) for element in named)
+        self._defaults: dict[str, Defaults] = {"main": {}}
         for top in root.iterfind("default"):
             self._read_defaults(top, "main", {})
-        self.compiler = self._compiler(root)
+        self._degrees, self._eulerseq, self._autolimits = True, "xyz", True
+        for compiler in root.iterfind("compiler"):
+            self._read_compiler(compiler)
 
-    def attributes(self, element: etree._Element, childclass: str) -> dict[str, str]:
-        """Return the attributes of an element over those of its default class."""
-        own = own_attributes(element)
-        name = own.get("class", childclass)
-        if name not in self._defaults:
+    # Bodies
+
+    def read_bodies(self) -> None:
+        """Write all bodies as links and joints."""
+        for element in self.root.iter(*_NOT_READ):
             self.problems.add(
-                element, f"names the default class '{name}', which is not in the file",
-                "correct the name",
-            )  # fmt: skip
-            name = "main"
-        default = dict(self._defaults[name].get(str(element.tag), {}))
+                element, "is not expanded", "save the compiled model with MuJoCo and give that file"
+            )
+        for element in self.root.iterfind("worldbody//*[@name]"):
+            if element.tag in ("body", "joint", "freejoint"):
+                self._names.add(str(element.get("name")))
+        visuals: list[TextCylinder] = []
+        pending: list[Part] = []
+        for world in self.root.findall("worldbody"):
+            part = Part(world, WORLD, EYE, world.get("childclass", "main"))
+            _, bodies, cylinders = self._contents(part)
+            visuals += cylinders
+            pending += bodies
+        self.tree.link(WORLD, tuple(visuals))
+        while pending:
+            pending = self._body(pending.pop(0)) + pending
+
+    def _contents(self, body: Part) -> tuple[list[Part], list[Part], list[TextCylinder]]:
+        """Return joints, bodies and cylinders of a body, also in its frames; note its sites."""
+        joints, bodies, cylinders = list[Part](), list[Part](), list[TextCylinder]()
+        pending = [body._replace(element=part) for part in body.element]
+        while pending:
+            part = pending.pop(0)
+            element, tag = part.element, part.element.tag
+            if tag == "frame":
+                T = part.T_body_frame * self._pose(element, _attributes_of(element))
+                inner = Part(element, part.body, T, self._childclass(part))
+                pending = [inner._replace(element=inside) for inside in element] + pending
+            elif tag == "body":
+                bodies.append(part)
+            elif tag in ("joint", "freejoint"):
+                joints.append(part)
+            elif tag == "geom":
+                cylinder = self._cylinder(part)
+                cylinders += [] if cylinder is None else [cylinder]
+            elif tag == "site" and element.get("name"):
+                self._site(part)
+            elif isinstance(tag, str) and tag not in (*_LEFT_ALONE, *_NOT_READ):
+                self.problems.add(element, "is no element of a body", "correct or remove it")
+        return joints, bodies, cylinders
+
+    def _body(self, part: Part) -> list[Part]:
+        """Write a body with its joints, and return the bodies on it."""
+        element = part.element
+        name = element.get("name", "")
+        if name in self.poses:
+            self.problems.add(
+                element, f"has the name '{name}', which another body has", "give each its own name"
+            )
+        if not name or name in self.poses:
+            name = self._unused(f"body{len(self.poses)}")
+        T_parent_body = part.T_body_frame * self._pose(element, _attributes_of(element))
+        self.poses[name] = self.poses[part.body] * T_parent_body
+        inside = Part(element, name, EYE, self._childclass(part))
+        joints, bodies, cylinders = self._contents(inside)
+        at, T_at_body = part.body, T_parent_body
+        if at == WORLD and self._is_free(joints):
+            self.tree.joint(self._unused(f"{name}_free"), "floating", at, name, T_at_body)
+            at, joints = name, []
+        for i, joint in enumerate(joints):
+            only, last = len(joints) == 1, i + 1 == len(joints)
+            at, T_at_body = self._joint(joint, at, T_at_body, last=last, only=only)
+        if at != name:
+            self.tree.joint(self._unused(f"{name}_fixed"), "fixed", at, name, T_at_body)
+        self.tree.link(name, tuple(cylinders))
+        return bodies
+
+    def _is_free(self, joints: list[Part]) -> bool:
+        """Say whether the joints of a body, none of them driven, leave it all six freedoms."""
+        axes: dict[str, list[Array]] = {"slide": [], "hinge": [], "ball": []}
+        for part in joints:
+            attributes = self._attributes(part)
+            kind = attributes.get("type", "hinge")
+            axis = number_list(attributes.get("axis", "0 0 1"), 3)
+            driven = attributes.get("name") in self._driven
+            if part.element.tag != "joint" or kind not in axes or axis is None or driven:
+                return False
+            axes[kind].append(np.array(axis))
+        turns_freely = len(axes["ball"]) == 1 if axes["ball"] else _span_space(axes["hinge"])
+        return _span_space(axes["slide"]) and turns_freely and len(axes["hinge"]) in (0, 3)
+
+    def _joint(
+        self, part: Part, at: str, T_at_body: RigidTransform, *, last: bool, only: bool
+    ) -> LinkFrame:
+        """Write one joint of a body; return the link after it and the body's frame in that link."""
+        element, attributes = part.element, self._attributes(part)
+        kind = "free" if element.tag == "freejoint" else attributes.get("type", "hinge")
+        name = attributes.get("name", "")
+        if name and name in self._joints:
+            self.problems.add(
+                element, f"has the name '{name}', which another joint has", "give each its own name"
+            )
+        if not name or name in self._joints:
+            name = self._unused(f"{part.body}_{kind}")
+        self._joints[name] = kind
+        if kind == "free":
+            if not only or at != WORLD:
+                self.problems.add(
+                    element,
+                    "frees a body that has other joints or is not on the world itself",
+                    "a free joint stands alone in a body of <worldbody>",
+                )
+            self.tree.joint(name, "floating", at, part.body, T_at_body)
+            return part.body, EYE
+        if kind not in ("hinge", "slide", "ball"):
+            self.problems.add(
+                element, f"has the type '{kind}', needed free, ball, slide or hinge", "correct it"
+            )
+            return at, T_at_body
+        pos = self._numbers(element, attributes, "pos", (3,))
+        pos = np.zeros(3) if pos is None or kind == "slide" else pos
+        T_body_joint = RigidTransform.from_translation(part.T_body_frame.apply(pos))
+        centred = not np.asarray(T_body_joint.translation).any()
+        child = part.body if last and centred else self._unused(f"{name}_link")
+        if kind == "ball":
+            self._ball(name, at, child, T_at_body * T_body_joint)
+        else:
+            self._one_axis(part, attributes, name, kind, (at, child), T_at_body * T_body_joint)
+        if child != part.body:
+            self.tree.link(child)
+        return child, EYE if child == part.body else T_body_joint.inv()
+
+    def _ball(self, name: str, at: str, child: str, T_at_joint: RigidTransform) -> None:
+        """Write a ball joint as three revolutes, perpendicular in the file's configuration."""
+        for axis, letter in zip(np.eye(3), "xyz", strict=True):
+            after = child if letter == "z" else self._unused(f"{name}_{letter}_link")
+            if after != child:
+                self.tree.link(after)
+            joint = self._unused(f"{name}_{letter}")
+            self.tree.joint(joint, "revolute", at, after, T_at_joint, axis)
+            at, T_at_joint = after, EYE
+
+    def _one_axis(
+        self,
+        part: Part,
+        attributes: Attributes,
+        name: str,
+        kind: str,
+        links: tuple[str, str],
+        T_at_joint: RigidTransform,
+    ) -> None:
+        """Write a hinge or a slide, its zero where the value of the file is."""
+        element = part.element
+        given = self._numbers(element, attributes, "axis", (3,))
+        axis = np.array(_Z) if given is None else given
+        if not np.linalg.norm(axis) > 1e-9:
+            self.problems.add(element, "has a zero axis, needed a direction", "correct its axis")
+            axis = np.array(_Z)
+        axis = part.T_body_frame.rotation.apply(axis / np.linalg.norm(axis))
+        ref = self._numbers(element, attributes, "ref", (1,))
+        zero = 0.0 if ref is None else float(ref[0])
+        limits = self._range(element, attributes)
+        if kind == "slide":
+            to_zero = RigidTransform.from_translation(-zero * axis)
+        else:
+            zero = self._radians(zero)
+            to_zero = RigidTransform.from_rotation(Rotation.from_rotvec(-zero * axis))
+            ends = (-FULL_TURN, FULL_TURN)
+            if limits is not None:
+                ends = self._radians(limits[0]), self._radians(limits[1])
+            limits = ends
+        self.references[name] = zero
+        urdf_type = "prismatic" if kind == "slide" else "revolute"
+        self.tree.joint(name, urdf_type, *links, T_at_joint * to_zero, axis, limits)
+
+    def _range(self, element: etree._Element, attributes: Attributes) -> tuple[float, float] | None:
+        """Return the limits of a joint as the file writes them, or None."""
+        numbers = self._numbers(element, attributes, "range", (2,))
+        limited = attributes.get("limited", "auto")
+        if numbers is None or limited == "false" or not numbers.any():
+            return None
+        if limited == "auto" and not self._autolimits:
+            return None
+        lower, upper = float(numbers[0]), float(numbers[1])
+        if not lower < upper:
+            self.problems.add(
+                element, f"has the range {lower:g} to {upper:g}", "give the lower end first"
+            )
+            return None
+        return lower, upper
+
+    def _cylinder(self, part: Part) -> TextCylinder | None:
+        """Return the cylinder of a geom that is a cylinder or a capsule, else None."""
+        element, attributes = part.element, self._attributes(part)
+        kind = attributes.get("type", "sphere")
+        if kind not in _GEOMS:
+            self.problems.add(
+                element, f"has the type '{kind}', needed one of {', '.join(_GEOMS)}", "correct it"
+            )
+        if kind not in ("cylinder", "capsule") or "mesh" in attributes:
+            return None
+        size = self._numbers(element, attributes, "size", (1, 2, 3))
+        T, length = self._between(element, attributes)
+        if T is None:
+            T = self._pose(element, attributes)
+            length = 2.0 * float(size[1]) if size is not None and len(size) > 1 else 0.0
+        if size is None or not (size[0] > 0.0 and length > 0.0):
+            self.problems.add(
+                element,
+                "is a cylinder without a radius and a length above zero",
+                "write size, or fromto and size",
+            )
+            return None
+        return TextCylinder(part.T_body_frame * T, float(size[0]), length)
+
+    def _site(self, part: Part) -> None:
+        """Note a site by its name."""
+        element, name = part.element, str(part.element.get("name"))
+        if name in self.sites:
+            self.problems.add(
+                element, f"has the name '{name}', which another site has", "give each its own name"
+            )
+        attributes = self._attributes(part)
+        T, length = self._between(element, attributes)
+        if T is None or length == 0.0:
+            T = self._pose(element, attributes)
+        self.sites[name] = part.body, part.T_body_frame * T
+
+    def _between(
+        self, element: etree._Element, attributes: Attributes
+    ) -> tuple[RigidTransform | None, float]:
+        """Return the frame between the two points of ``fromto``, z along them, and their gap."""
+        ends = self._numbers(element, attributes, "fromto", (6,))
+        if ends is None:
+            return None, 0.0
+        along: Array = ends[3:] - ends[:3]
+        turn = _z_onto(along) if along.any() else Rotation.identity()
+        middle = 0.5 * (ends[3:] + ends[:3])
+        return RigidTransform.from_components(middle, turn), float(np.linalg.norm(along))
+
+    def _unused(self, name: str) -> str:
+        """Return a name that nothing in the file has, and take it."""
+        found = self.tree.unused(name, self._names)
+        self._names.add(found)
+        return found
+
+    # Closures and motors
+
+    def loops(self) -> Iterator[Loop]:
+        """Give the loops of all ``<equality>`` elements."""
+        names: set[str] = set()
+        for i, element in enumerate(self.root.iterfind("equality/*"), start=1):
+            name_of_class = element.get("class", "main")
+            default = self._default(element, name_of_class).get("equality", {})
+            attributes = {**default, **_attributes_of(element)}
+            if attributes.get("active", "true") == "false":
+                continue
+            if element.tag not in ("connect", "weld"):
+                found = "is no constraint that legcal knows"
+                if element.tag in _COUPLINGS:
+                    found = f"couples <{element.tag}> coordinates, which is not followed"
+                remedy = "close loops with <connect> and <weld> alone"
+                self.problems.add(element, found, remedy)
+                continue
+            name = str(attributes.get("name") or f"{element.tag}{i}")
+            if name in names:
+                self.problems.add(
+                    element, "has a name that another one has", "give each its own name"
+                )
+            names.add(name)
+            n_before = len(self.problems)
+            by_site = "site1" in attributes or "site2" in attributes
+            ends = self._joined_sites(element) if by_site else self._joined_bodies(element)
+            if ends is None or len(self.problems) > n_before:
+                continue
+            (link_1, T_1), (link_2, T_2) = ends
+            if link_1 == link_2:
+                self.problems.add(
+                    element, f"joins the body '{link_1}' to itself", "name two bodies"
+                )
+                continue
+            scale = self._numbers(element, attributes, "torquescale", (1,))
+            is_point = element.tag == "connect" or (scale is not None and scale[0] == 0.0)
+            kind: LoopKind = "point" if is_point else "weld"
+            yield Loop(name, kind, (link_1, link_2), (T_1, T_2))
+
+    def _joined_sites(self, element: etree._Element) -> tuple[LinkFrame, LinkFrame] | None:
+        """Return the two sites that a constraint holds together."""
+        found = []
+        for key in ("site1", "site2"):
+            name = element.get(key, "")
+            if name in self.sites:
+                found.append(self.sites[name])
+            else:
+                self._unknown(element, f"the site '{name}' as {key}", name, self.sites)
+        return (found[0], found[1]) if len(found) == 2 else None
+
+    def _joined_bodies(self, element: etree._Element) -> tuple[LinkFrame, LinkFrame] | None:
+        """Return the frames on two bodies that a constraint holds together."""
+        names = [element.get("body1", ""), element.get("body2", WORLD)]
+        for key, name in zip(("body1", "body2"), names, strict=True):
+            if not name:
+                self.problems.add(element, f"has no {key}", "name the body that it holds")
+            elif name not in self.poses:
+                self._unknown(element, f"the body '{name}' as {key}", name, self.poses)
+        attributes = _attributes_of(element)
+        anchor = self._numbers(element, attributes, "anchor", (3,))
+        if element.tag == "connect" and "anchor" not in attributes:
+            self.problems.add(element, "has no anchor", "write the point in the frame of body1")
+        if any(name not in self.poses for name in names):
+            return None
+        T_one_two = self.poses[names[0]].inv() * self.poses[names[1]]
+        at = np.zeros(3) if anchor is None else anchor
+        if element.tag == "connect":  # the anchor stands in body1
+            T_one = RigidTransform.from_translation(at)
+            T_two = RigidTransform.from_translation(T_one_two.inv().apply(at))
+            return (names[0], T_one), (names[1], T_two)
+        relpose = self._numbers(element, attributes, "relpose", (7,))
+        T_two = RigidTransform.from_translation(at)  # the anchor of a weld stands in body2
+        if relpose is not None and relpose[3:].any():  # MuJoCo brings the anchor to this very place
+            rotation = Rotation.from_quat(np.roll(relpose[3:], -1))
+            T_one = RigidTransform.from_components(relpose[:3], rotation)
+        else:  # the configuration of the file holds
+            T_one = T_one_two * T_two
+        return (names[0], T_one), (names[1], T_two)
+
+    def motors(self) -> list[str]:
+        """Return the joints that have an encoder: driven ones, and slides that are measured."""
+        motors: dict[str, None] = {}
+        named = (*self.root.iterfind("actuator/*"), *self.root.iterfind("sensor/jointpos"))
+        for element in named:
+            other = [key for key in _OTHER_DRIVES if element.get(key) is not None]
+            name = element.get("joint", element.get("jointinparent"))
+            if other and element.tag != "jointpos":
+                self.problems.add(
+                    element,
+                    f"drives by {other[0]}, which is no joint with a reading",
+                    "drive the slide of each leg itself",
+                )
+            drives_no_joint = element.tag == "plugin" or element.get("body") is not None  # suction
+            if name is None and not other and not drives_no_joint:
+                self.problems.add(
+                    element, "names no joint", "name the slide that it drives or measures as joint"
+                )
+            if name is None:
+                continue
+            kind = self._joints.get(name)
+            if kind is None:
+                self._unknown(element, f"the joint '{name}'", name, self._joints)
+            elif kind in ("ball", "free"):
+                self.problems.add(
+                    element,
+                    f"drives or measures the {kind} joint '{name}', which has no one reading",
+                    "remove it",
+                )
+            elif kind == "slide" or element.tag != "jointpos":
+                motors[name] = None
+        return list(motors)
+
+    def _unknown(
+        self, element: etree._Element, what: str, name: str, known: Mapping[str, object]
+    ) -> None:
+        """Note that an element names something that is not in the file."""
+        remedy = closest(name, known).rstrip(".")
+        self.problems.add(element, f"names {what}, which is not in the file", remedy)
+
+    # Attributes, with defaults and compiler options
+
+    def _attributes(self, part: Part) -> dict[str, str]:
+        """Return the attributes of an element over those of its default class."""
+        own = _attributes_of(part.element)
+        classes = self._default(part.element, own.get("class", part.childclass))
+        default = classes.get(str(part.element.tag), {})
         if not ORIENTATIONS.keys().isdisjoint(own):
             default = {k: v for k, v in default.items() if k not in ORIENTATIONS}
         return {**default, **own}
 
-    def has_class(self, name: str) -> bool:
-        """Say whether there is a default class of that name."""
-        return name in self._defaults
+    def _default(self, element: etree._Element, name: str) -> Defaults:
+        """Return a default class; the main one, with a problem, if it is not there."""
+        if name not in self._defaults:
+            self.problems.add(
+                element,
+                f"names the default class '{name}', which is not in the file",
+                "correct the name",
+            )
+            name = "main"
+        return self._defaults[name]
 
-    def numbers(
+    def _childclass(self, part: Part) -> str:
+        """Return the default class that holds within a body or frame."""
+        name = part.element.get("childclass", part.childclass)
+        known = self._default(part.element, name) is self._defaults.get(name)
+        return name if known else part.childclass
+
+    def _numbers(
         self, element: etree._Element, attributes: Attributes, key: str, counts: tuple[int, ...]
     ) -> Array | None:
         """Return the numbers of an attribute; None where it is missing or wrong."""
@@ -101,14 +521,13 @@ class Values:
             return None
         return np.array(found)
 
-    def pose(self, element: etree._Element, attributes: Attributes) -> RigidTransform:
+    def _pose(self, element: etree._Element, attributes: Attributes) -> RigidTransform:
         """Return the motion of ``pos`` and an orientation."""
-        pos = self.numbers(element, attributes, "pos", (3,))
-        return RigidTransform.from_components(
-            np.zeros(3) if pos is None else pos, self.orientation(element, attributes)
-        )
+        pos = self._numbers(element, attributes, "pos", (3,))
+        turn = self._orientation(element, attributes)
+        return RigidTransform.from_components(np.zeros(3) if pos is None else pos, turn)
 
-    def orientation(self, element: etree._Element, attributes: Attributes) -> Rotation:
+    def _orientation(self, element: etree._Element, attributes: Attributes) -> Rotation:
         """Return the rotation of ``quat``, ``axisangle``, ``xyaxes``, ``zaxis`` or ``euler``."""
         written = [key for key in ORIENTATIONS if key in attributes]
         if len(written) > 1:
@@ -118,51 +537,52 @@ class Values:
         if len(written) != 1:
             return Rotation.identity()
         key = written[0]
-        numbers = self.numbers(element, attributes, key, (ORIENTATIONS[key],))
-        if numbers is None:
-            return Rotation.identity()
-        rotation = self._rotation(key, numbers)
-        if rotation is None:
+        numbers = self._numbers(element, attributes, key, (ORIENTATIONS[key],))
+        rotation = None if numbers is None else self._rotation(key, numbers)
+        if numbers is not None and rotation is None:
             self.problems.add(
-                element, f"has {key}={attributes[key]!r}, which gives no orientation",
+                element,
+                f"has {key}={attributes[key]!r}, which gives no orientation",
                 "correct the value",
-            )  # fmt: skip
-            return Rotation.identity()
-        return rotation
+            )
+        return Rotation.identity() if rotation is None else rotation
 
     def _rotation(self, key: str, numbers: Array) -> Rotation | None:
         """Return the rotation of one way to write it, or None where it means none."""
-        if key == "euler":
-            angles = np.array([self.compiler.radians(float(angle)) for angle in numbers])
-            return euler(self.compiler.eulerseq, angles)
-        if key == "quat":
-            return None if not numbers.any() else Rotation.from_quat(np.roll(numbers, -1))
-        if key == "axisangle":
-            if not numbers[:3].any():
+        if key == "euler":  # about the moved axes for small letters, the fixed ones for capitals
+            rotation = Rotation.identity()
+            for letter, angle in zip(self._eulerseq, numbers, strict=True):
+                turn = Rotation.from_euler(letter.lower(), self._radians(float(angle)))
+                rotation = rotation * turn if letter.islower() else turn * rotation
+            return rotation
+        if key == "xyaxes":
+            x, y = numbers[:3], numbers[3:]
+            z = np.cross(x, y)
+            if not np.linalg.norm(z) > 1e-9 * np.linalg.norm(x) * np.linalg.norm(y):
                 return None
-            axis = numbers[:3] / np.linalg.norm(numbers[:3])
-            return Rotation.from_rotvec(self.compiler.radians(float(numbers[3])) * axis)
-        if key == "zaxis":
-            return None if not numbers.any() else _z_onto(numbers)
-        x, y = numbers[:3], numbers[3:]
-        z = np.cross(x, y)
-        if not np.linalg.norm(z) > 1e-9 * np.linalg.norm(x) * np.linalg.norm(y):
+            x, z = x / np.linalg.norm(x), z / np.linalg.norm(z)
+            return Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z]))
+        if not numbers[: 3 if key == "axisangle" else None].any():
             return None
-        x, z = x / np.linalg.norm(x), z / np.linalg.norm(z)
-        return Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z]))
+        if key == "axisangle":
+            axis = numbers[:3] / np.linalg.norm(numbers[:3])
+            return Rotation.from_rotvec(self._radians(float(numbers[3])) * axis)
+        return Rotation.from_quat(np.roll(numbers, -1)) if key == "quat" else _z_onto(numbers)
 
-    def _read_defaults(
-        self, element: etree._Element, name: str, inherited: dict[str, dict[str, str]]
-    ) -> None:
+    def _radians(self, angle: float) -> float:
+        """Return an angle of the file in radians."""
+        return float(np.deg2rad(angle)) if self._degrees else angle
+
+    def _read_defaults(self, element: etree._Element, name: str, inherited: Defaults) -> None:
         """Read a default class and those within it."""
         here = {tag: dict(values) for tag, values in inherited.items()}
         for part in element:
             if part.tag != "default":
-                values = here.setdefault(str(part.tag), {})
-                if not ORIENTATIONS.keys().isdisjoint(own_attributes(part)):
+                values, own = here.setdefault(str(part.tag), {}), _attributes_of(part)
+                if not ORIENTATIONS.keys().isdisjoint(own):
                     for key in ORIENTATIONS:
                         values.pop(key, None)
-                values.update(own_attributes(part))
+                values.update(own)
         if name == "main":
             here = {**self._defaults["main"], **here}
             name = element.get("class", "main")
@@ -179,94 +599,38 @@ class Values:
             else:
                 self._read_defaults(part, inner, here)
 
-    def _compiler(self, root: etree._Element) -> Compiler:
-        """Return the options of all ``<compiler>`` elements; later ones win."""
-        found = Compiler()
-        for element in root.iterfind("compiler"):
-            for key, allowed in (
-                ("angle", ("degree", "radian")),
-                ("coordinate", ("local",)),
-                ("autolimits", ("true", "false")),
-            ):
-                value = element.get(key)
-                if value is not None and value not in allowed:
-                    self.problems.add(
-                        element, f"has {key}='{value}', needed {' or '.join(allowed)}",
-                        "convert the model with MuJoCo first",
-                    )  # fmt: skip
-            sequence = element.get("eulerseq", found.eulerseq)
-            if len(sequence) != 3 or not set(sequence.lower()) <= set("xyz"):
+    def _read_compiler(self, element: etree._Element) -> None:
+        """Read the options of a ``<compiler>`` that matter for kinematics; later ones win."""
+        for key, allowed in (
+            ("angle", ("degree", "radian")),
+            ("coordinate", ("local",)),
+            ("autolimits", ("true", "false")),
+        ):
+            value = element.get(key)
+            if value is not None and value not in allowed:
                 self.problems.add(
-                    element, f"has eulerseq='{sequence}', needed three letters of x, y, z",
-                    "correct the value",
-                )  # fmt: skip
-                sequence = found.eulerseq
-            found = Compiler(
-                element.get("angle", "degree" if found.degrees else "radian") != "radian",
-                sequence,
-                element.get("autolimits", str(found.autolimits).lower()) != "false",
+                    element,
+                    f"has {key}='{value}', needed {' or '.join(allowed)}",
+                    "convert the model with MuJoCo first",
+                )
+        sequence = element.get("eulerseq", self._eulerseq)
+        if len(sequence) != 3 or not set(sequence.lower()) <= set("xyz"):
+            self.problems.add(
+                element,
+                f"has eulerseq='{sequence}', needed three letters of x, y, z",
+                "correct the value",
             )
-        return found
+            sequence = self._eulerseq
+        self._eulerseq = sequence
+        if element.get("angle") is not None:
+            self._degrees = element.get("angle") != "radian"
+        if element.get("autolimits") is not None:
+            self._autolimits = element.get("autolimits") != "false"
 
 
-def euler(sequence: str, angles: Array) -> Rotation:
-    """Return rotations in turn: about the moved axis for small letters, the fixed for capitals."""
-    rotation = Rotation.identity()
-    for letter, angle in zip(sequence, angles, strict=True):
-        turn = Rotation.from_euler(letter.lower(), float(angle))
-        rotation = rotation * turn if letter.islower() else turn * rotation
-    return rotation
-
-
-WORLD = "world"
-
-
-@dataclass
-class MjcfTree:
-    """What is found while the bodies are walked."""
-
-    values: Values
-    text: UrdfBuilder = field(default_factory=UrdfBuilder)  # the URDF
-    poses: dict[str, RigidTransform] = field(default_factory=dict)
-    sites: dict[str, tuple[str, RigidTransform]] = field(default_factory=dict)
-    joints: dict[str, str] = field(default_factory=dict)  # the type of every hinge, slide
-    references: dict[str, float] = field(default_factory=dict)  # the values [rad
-    taken: set[str] = field(default_factory=set)  # names that no new link or joint may have
-    driven: frozenset[str] = frozenset()  # the joints that actuators drive or sensors measure
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """Where in the tree an element stands: its body, the frame it is written in, its class."""
-
-    body: str
-    T_body_frame: RigidTransform
-    childclass: str
-
-
-def unused(tree: MjcfTree, name: str) -> str:
-    """Return a name that nothing in the file has, and take it."""
-    found = tree.text.unused(name, tree.taken)
-    tree.taken.add(found)
-    return found
-
-
-_Z = (0.0, 0.0, 1.0)
-
-
-def is_free(tree: MjcfTree, joints: list[tuple[etree._Element, Place]]) -> bool:
-    """Say whether the joints of a body, none of them driven, leave it all six freedoms."""
-    axes: dict[str, list[Array]] = {"slide": [], "hinge": [], "ball": []}
-    for element, place in joints:
-        attributes = tree.values.attributes(element, place.childclass)
-        kind = attributes.get("type", "hinge")
-        axis = number_list(attributes.get("axis", "0 0 1"), 3)
-        driven = attributes.get("name") in tree.driven
-        if element.tag != "joint" or kind not in axes or axis is None or driven:
-            return False
-        axes[kind].append(np.array(axis))
-    turns_freely = len(axes["ball"]) == 1 if axes["ball"] else _span_space(axes["hinge"])
-    return _span_space(axes["slide"]) and turns_freely and len(axes["hinge"]) in (0, 3)
+def _attributes_of(element: etree._Element) -> dict[str, str]:
+    """Return the attributes that an element has itself."""
+    return {str(key): str(value) for key, value in element.attrib.items()}
 
 
 def _span_space(axes: list[Array]) -> bool:
@@ -274,472 +638,8 @@ def _span_space(axes: list[Array]) -> bool:
     return len(axes) == 3 and int(np.linalg.matrix_rank(np.array(axes), tol=1e-3)) == 3
 
 
-def write_joint(
-    tree: MjcfTree,
-    element: etree._Element,
-    place: Place,
-    at: str,
-    T_at_body: RigidTransform,
-    *,
-    last: bool,
-    only: bool,
-) -> tuple[str, RigidTransform]:
-    """Write one joint of a body; return the link after it and the body's frame in that link."""
-    values = tree.values
-    attributes = values.attributes(element, place.childclass)
-    kind = "free" if element.tag == "freejoint" else attributes.get("type", "hinge")
-    name = attributes.get("name", "")
-    if name and name in tree.joints:
-        values.problems.add(
-            element, f"has the name '{name}', which another joint has", "give each its own name"
-        )
-    if not name or name in tree.joints:
-        name = unused(tree, f"{place.body}_{kind}")
-    tree.joints[name] = kind
-    if kind == "free":
-        if not only or at != WORLD:
-            values.problems.add(
-                element, "frees a body that has other joints or is not on the world itself",
-                "a free joint stands alone in a body of <worldbody>",
-            )  # fmt: skip
-        tree.text.joint(name, "floating", at, place.body, T_at_body)
-        return place.body, EYE
-    if kind not in ("hinge", "slide", "ball"):
-        values.problems.add(
-            element, f"has the type '{kind}', needed free, ball, slide or hinge", "correct it"
-        )
-        return at, T_at_body
-    pos = values.numbers(element, attributes, "pos", (3,))
-    pos = np.zeros(3) if pos is None or kind == "slide" else pos
-    T_body_joint = RigidTransform.from_translation(place.T_body_frame.apply(pos))
-    T_at_joint = T_at_body * T_body_joint
-    centred = not np.asarray(T_body_joint.translation).any()
-    child = place.body if last and centred else unused(tree, f"{name}_link")
-    if kind == "ball":
-        _ball(tree, name, at, child, T_at_joint)
-    else:
-        _one_axis(tree, element, attributes, place, name, kind, at, child, T_at_joint)
-    if child != place.body:
-        tree.text.link(child)
-    return child, EYE if child == place.body else T_body_joint.inv()
-
-
-def _ball(tree: MjcfTree, name: str, at: str, child: str, T_at_joint: RigidTransform) -> None:
-    """Write a ball joint as three revolutes, perpendicular in the configuration of the file."""
-    for i, letter in enumerate("xyz"):
-        after = child if letter == "z" else unused(tree, f"{name}_{letter}_link")
-        if after != child:
-            tree.text.link(after)
-        tree.text.joint(
-            unused(tree, f"{name}_{letter}"),
-            "revolute",
-            at,
-            after,
-            T_at_joint if i == 0 else EYE,
-            np.eye(3)[i],
-        )
-        at = after
-
-
-def _one_axis(
-    tree: MjcfTree,
-    element: etree._Element,
-    attributes: Attributes,
-    place: Place,
-    name: str,
-    kind: str,
-    at: str,
-    child: str,
-    T_at_joint: RigidTransform,
-) -> None:
-    """Write a hinge or a slide, its zero where the value of the file is."""
-    values = tree.values
-    given = values.numbers(element, attributes, "axis", (3,))
-    axis = np.array(_Z) if given is None else given
-    if not np.linalg.norm(axis) > 1e-9:
-        values.problems.add(element, "has a zero axis, needed a direction", "correct its axis")
-        axis = np.array(_Z)
-    axis = place.T_body_frame.rotation.apply(axis / np.linalg.norm(axis))
-    ref = values.numbers(element, attributes, "ref", (1,))
-    zero = 0.0 if ref is None else float(ref[0])
-    limits = _range(tree, element, attributes)
-    if kind == "slide":
-        T_at_joint = T_at_joint * RigidTransform.from_translation(-zero * axis)
-        tree.references[name] = zero
-        tree.text.joint(name, "prismatic", at, child, T_at_joint, axis, limits)
-        return
-    zero = values.compiler.radians(zero)
-    tree.references[name] = zero
-    turn = Rotation.from_rotvec(-zero * axis)
-    T_at_joint = T_at_joint * RigidTransform.from_rotation(turn)
-    turns = (-FULL_TURN, FULL_TURN)
-    if limits is not None:
-        turns = values.compiler.radians(limits[0]), values.compiler.radians(limits[1])
-    tree.text.joint(name, "revolute", at, child, T_at_joint, axis, turns)
-
-
-def _range(
-    tree: MjcfTree, element: etree._Element, attributes: Attributes
-) -> tuple[float, float] | None:
-    """Return the limits of a joint as the file writes them, or None."""
-    numbers = tree.values.numbers(element, attributes, "range", (2,))
-    limited = attributes.get("limited", "auto")
-    if numbers is None or limited == "false" or not numbers.any():
-        return None
-    if limited == "auto" and not tree.values.compiler.autolimits:
-        return None
-    lower, upper = float(numbers[0]), float(numbers[1])
-    if not lower < upper:
-        tree.values.problems.add(
-            element, f"has the range {lower:g} to {upper:g}", "give the lower end first"
-        )
-        return None
-    return lower, upper
-
-
-_LEFT_ALONE = ("inertial", "camera", "light", "plugin", "site")
-_GEOMS = ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")
-_NOT_READ = ("include", "composite", "flexcomp", "attach", "replicate")
-
-
-def read_bodies(root: etree._Element, values: Values) -> MjcfTree:
-    """Return the bodies of a ``<mujoco>`` as links and joints, problems noted in ``values``.
-
-    The configuration of the file, where all joints are at their ``ref``, closes its loops.
-    """
-    named = (*root.iterfind("actuator/*"), *root.iterfind("sensor/jointpos"))
-    tree = MjcfTree(values, driven=frozenset(str(element.get("joint")) for element in named))
-    for element in root.iter(*_NOT_READ):
-        values.problems.add(
-            element, "is not expanded", "save the compiled model with MuJoCo and give that file"
-        )
-    for element in root.iterfind("worldbody//*[@name]"):
-        if element.tag in ("body", "joint", "freejoint"):
-            tree.taken.add(str(element.get("name")))
-    tree.poses[WORLD] = EYE
-    worlds = root.findall("worldbody")
-    visuals: list[TextCylinder] = []
-    bodies: list[tuple[etree._Element, Place]] = []
-    for world in worlds:
-        inside = _contents(tree, world, Place(WORLD, EYE, world.get("childclass", "main")))
-        visuals += inside.cylinders
-        bodies += inside.bodies
-    tree.text.link(WORLD, tuple(visuals))
-    while bodies:
-        element, place = bodies.pop(0)
-        bodies = _body(tree, element, place) + bodies
-    return tree
-
-
-@dataclass
-class _Contents:
-    """What stands directly in a body, also within its ``<frame>`` elements."""
-
-    joints: list[tuple[etree._Element, Place]] = field(default_factory=list)
-    bodies: list[tuple[etree._Element, Place]] = field(default_factory=list)
-    cylinders: list[TextCylinder] = field(default_factory=list)
-
-
-def _contents(tree: MjcfTree, element: etree._Element, place: Place) -> _Contents:
-    """Return the joints, bodies and cylinders of a body and note its sites."""
-    found = _Contents()
-    pending = [(part, place) for part in element]
-    while pending:
-        part, where = pending.pop(0)
-        if part.tag == "frame":
-            T = where.T_body_frame * tree.values.pose(part, own_attributes(part))
-            inner = Place(where.body, T, _class_within(tree, part, where.childclass))
-            pending = [(inside, inner) for inside in part] + pending
-        elif part.tag == "body":
-            found.bodies.append((part, where))
-        elif part.tag in ("joint", "freejoint"):
-            found.joints.append((part, where))
-        elif part.tag == "geom":
-            cylinder = _cylinder(tree, part, where)
-            if cylinder is not None:
-                found.cylinders.append(cylinder)
-        elif part.tag == "site" and part.get("name"):
-            _site(tree, part, where)
-        elif isinstance(part.tag, str) and part.tag not in (*_LEFT_ALONE, *_NOT_READ):
-            tree.values.problems.add(part, "is no element of a body", "correct or remove it")
-    return found
-
-
-def _class_within(tree: MjcfTree, element: etree._Element, outer: str) -> str:
-    """Return the default class that holds within a body or frame."""
-    name = element.get("childclass", outer)
-    if not tree.values.has_class(name):
-        tree.values.problems.add(
-            element, f"names the default class '{name}', which is not in the file",
-            "correct the name",
-        )  # fmt: skip
-        return outer
-    return name
-
-
-def _body(
-    tree: MjcfTree, element: etree._Element, place: Place
-) -> list[tuple[etree._Element, Place]]:
-    """Write a body with its joints, and return the bodies on it."""
-    name = element.get("name", "")
-    if name in tree.poses:
-        tree.values.problems.add(
-            element, f"has the name '{name}', which another body has", "give each its own name"
-        )
-    if not name or name in tree.poses:
-        name = unused(tree, f"body{len(tree.poses)}")
-    T_parent_body = place.T_body_frame * tree.values.pose(element, own_attributes(element))
-    tree.poses[name] = tree.poses[place.body] * T_parent_body
-    inside = _contents(
-        tree, element, Place(name, EYE, _class_within(tree, element, place.childclass))
-    )
-    at, T_at_body = place.body, T_parent_body
-    if at == WORLD and is_free(tree, inside.joints):
-        tree.text.joint(unused(tree, f"{name}_free"), "floating", at, name, T_at_body)
-        at, inside.joints = name, []
-    for i, (joint, where) in enumerate(inside.joints):
-        only = len(inside.joints) == 1
-        at, T_at_body = write_joint(
-            tree, joint, where, at, T_at_body, last=i + 1 == len(inside.joints), only=only
-        )
-    if at != name:
-        tree.text.joint(unused(tree, f"{name}_fixed"), "fixed", at, name, T_at_body)
-    tree.text.link(name, tuple(inside.cylinders))
-    return inside.bodies
-
-
-def _cylinder(tree: MjcfTree, element: etree._Element, place: Place) -> TextCylinder | None:
-    """Return the cylinder of a geom that is a cylinder or a capsule, else None."""
-    values = tree.values
-    attributes = values.attributes(element, place.childclass)
-    kind = attributes.get("type", "sphere")
-    if kind not in _GEOMS:
-        values.problems.add(
-            element, f"has the type '{kind}', needed one of {', '.join(_GEOMS)}", "correct it"
-        )
-    if kind not in ("cylinder", "capsule") or "mesh" in attributes:
-        return None
-    size = values.numbers(element, attributes, "size", (1, 2, 3))
-    ends = values.numbers(element, attributes, "fromto", (6,))
-    length = None
-    T: RigidTransform
-    if ends is not None:
-        along: Array = ends[3:] - ends[:3]
-        length = float(np.linalg.norm(along))
-        if length > 0.0:
-            T = RigidTransform.from_components(0.5 * (ends[3:] + ends[:3]), _z_onto(along))
-    else:
-        T = values.pose(element, attributes)
-        length = 2.0 * float(size[1]) if size is not None and len(size) > 1 else None
-    if size is None or length is None or not (size[0] > 0.0 and length > 0.0):
-        values.problems.add(
-            element, "is a cylinder without a radius and a length above zero",
-            "write size, or fromto and size",
-        )  # fmt: skip
-        return None
-    return TextCylinder(place.T_body_frame * T, float(size[0]), length)
-
-
-def _site(tree: MjcfTree, element: etree._Element, place: Place) -> None:
-    """Note a site by its name."""
-    values = tree.values
-    name = str(element.get("name"))
-    if name in tree.sites:
-        values.problems.add(
-            element, f"has the name '{name}', which another site has", "give each its own name"
-        )
-    attributes = values.attributes(element, place.childclass)
-    ends = values.numbers(element, attributes, "fromto", (6,))
-    if ends is not None and np.linalg.norm(ends[3:] - ends[:3]) > 0.0:
-        T = RigidTransform.from_components(
-            0.5 * (ends[3:] + ends[:3]), _z_onto(ends[3:] - ends[:3])
-        )
-    else:
-        T = values.pose(element, attributes)
-    tree.sites[name] = place.body, place.T_body_frame * T
-
-
-MAX_PARTS = 5000
-_COUPLINGS = ("joint", "tendon", "flex", "flexvert", "flexstrain")
-_WORDS = (("closed_loop", "<equality>"), ("the root of the URDF", "<worldbody>"), *DRAWING)
-_OTHER_DRIVES = ("tendon", "site", "refsite", "cranksite", "slidersite")
-
-
-def read_mjcf_source(path: Path, content: bytes) -> Source:
-    """Return the mechanism of an MJCF file."""
-    root = parse_xml(path, content, "MJCF file")
-    n_parts = sum(1 for _ in root.iter("body", "joint", "default", "frame"))
-    if n_parts > MAX_PARTS:
-        raise ModelError(
-            f"{path}: the MJCF file could not be used: found {n_parts} bodies, joints, frames and "
-            f"default classes, needed at most {MAX_PARTS}; give the mechanism alone."
-        )
-    problems = Problems(path)
-    values = Values(root, problems)
-    tree = read_bodies(root, values)
-    loops = list(closing_joints(root, tree))
-    motors = _motors(root, tree)
-    problems.raise_if_any()
-    if not loops:
-        raise OutOfClass(
-            f"{path}: this is not a parallel mechanism: found an MJCF file without <connect> or "
-            "<weld> in <equality>, which is a tree without closed loops, needed the closures of "
-            "its loops; add them."
-        )
-    pairs = [close_loop(loop, tree.text, tree.poses) for loop in loops]
-    name = root.get("model", "").strip() or path.stem
-    urdf = parse_urdf(path, tree.text.robot(name), travel_needed=False)
-    frames = [ends for ends, _ in pairs]
-    urdf, dropped = _without_loose_bodies(urdf, frames, tree, name)
-    left_out = f"Free bodies that touch no loop were left out: {', '.join(dropped)}."
-    values_there = {name: x for name, x in tree.references.items() if name in urdf.joints}
-    file = MechanismFile(closed_loop=frames, type=[kind for _, kind in pairs], name_mot=motors)
-    notes = (left_out,) * bool(dropped)
-    return Source(path, file, urdf, True, notes, values_there, words=_WORDS)
-
-
-def closing_joints(root: etree._Element, tree: MjcfTree) -> Iterator[Loop]:
-    """Give the loops of all ``<equality>`` elements; problems are noted."""
-    problems = tree.values.problems
-    names: set[str] = set()
-    for i, element in enumerate(root.iterfind("equality/*"), start=1):
-        attributes = {**_equality_default(tree, element), **own_attributes(element)}
-        if attributes.get("active", "true") == "false":
-            continue
-        if element.tag in _COUPLINGS:
-            problems.add(
-                element, f"couples <{element.tag}> coordinates, which is not followed",
-                "close loops with <connect> and <weld> alone",
-            )  # fmt: skip
-        elif element.tag not in ("connect", "weld"):
-            problems.add(
-                element, "is no constraint that legcal knows",
-                "close loops with <connect> and <weld> alone",
-            )  # fmt: skip
-        if element.tag not in ("connect", "weld"):
-            continue
-        name = str(attributes.get("name") or f"{element.tag}{i}")
-        if name in names:
-            problems.add(element, "has a name that another one has", "give each its own name")
-        names.add(name)
-        n_before = len(problems)
-        by_site = "site1" in attributes or "site2" in attributes
-        ends = _sites(element, tree) if by_site else _bodies(element, tree)
-        if ends is None or len(problems) > n_before:
-            continue
-        (link_1, T_1), (link_2, T_2) = ends
-        if link_1 == link_2:
-            problems.add(element, f"joins the body '{link_1}' to itself", "name two bodies")
-            continue
-        scale = tree.values.numbers(element, attributes, "torquescale", (1,))
-        is_point = element.tag == "connect" or (scale is not None and scale[0] == 0.0)
-        kind: LoopKind = "point" if is_point else "weld"
-        yield Loop(name, kind, (link_1, link_2), (T_1, T_2))
-
-
-def _equality_default(tree: MjcfTree, element: etree._Element) -> dict[str, str]:
-    """Return the default attributes of an equality constraint."""
-    stand_in = etree.Element("equality")
-    if element.get("class") is not None:
-        stand_in.set("class", str(element.get("class")))
-    return tree.values.attributes(stand_in, "main")
-
-
-_Ends = tuple[tuple[str, RigidTransform], tuple[str, RigidTransform]]
-
-
-def _sites(element: etree._Element, tree: MjcfTree) -> _Ends | None:
-    """Return the two sites that a constraint holds together."""
-    found = []
-    for key in ("site1", "site2"):
-        name = element.get(key, "")
-        if name in tree.sites:
-            found.append(tree.sites[name])
-        else:
-            tree.values.problems.add(
-                element, f"names the site '{name}' as {key}, which is not in the file",
-                closest(name, tree.sites).rstrip("."),
-            )  # fmt: skip
-    return (found[0], found[1]) if len(found) == 2 else None
-
-
-def _bodies(element: etree._Element, tree: MjcfTree) -> _Ends | None:
-    """Return the frames on two bodies that a constraint holds together."""
-    values = tree.values
-    names = []
-    for key in ("body1", "body2"):
-        name = element.get(key, WORLD if key == "body2" else "")
-        names.append(name)
-        if not name:
-            values.problems.add(element, f"has no {key}", "name the body that it holds")
-        elif name not in tree.poses:
-            values.problems.add(
-                element, f"names the body '{name}' as {key}, which is not in the file",
-                closest(name, tree.poses).rstrip("."),
-            )  # fmt: skip
-    attributes = own_attributes(element)
-    anchor = values.numbers(element, attributes, "anchor", (3,))
-    if element.tag == "connect" and "anchor" not in attributes:
-        values.problems.add(element, "has no anchor", "write the point in the frame of body1")
-    if any(name not in tree.poses for name in names):
-        return None
-    T_one_two = tree.poses[names[0]].inv() * tree.poses[names[1]]
-    at = np.zeros(3) if anchor is None else anchor
-    if element.tag == "connect":  # the anchor stands in body1
-        T_one = RigidTransform.from_translation(at)
-        T_two = RigidTransform.from_translation(T_one_two.inv().apply(at))
-        return (names[0], T_one), (names[1], T_two)
-    relpose = values.numbers(element, attributes, "relpose", (7,))
-    T_two = RigidTransform.from_translation(at)  # the anchor of a weld stands in body2
-    if relpose is not None and relpose[3:].any():  # MuJoCo brings the anchor to this very place
-        rotation = Rotation.from_quat(np.roll(relpose[3:], -1))
-        T_one = RigidTransform.from_components(relpose[:3], rotation)
-    else:  # the configuration of the file holds
-        T_one = T_one_two * T_two
-    return (names[0], T_one), (names[1], T_two)
-
-
-def _motors(root: etree._Element, tree: MjcfTree) -> list[str]:
-    """Return the joints that have an encoder: what is driven, and slides that are measured."""
-    problems = tree.values.problems
-    motors: dict[str, None] = {}
-    for element in (*root.iterfind("actuator/*"), *root.iterfind("sensor/jointpos")):
-        other = [key for key in _OTHER_DRIVES if element.get(key) is not None]
-        name = element.get("joint", element.get("jointinparent"))
-        if other and element.tag != "jointpos":
-            problems.add(
-                element, f"drives by {other[0]}, which is no joint with a reading",
-                "drive the slide of each leg itself",
-            )  # fmt: skip
-        if name is None and not other and not _drives_no_leg(element):
-            problems.add(
-                element, "names no joint", "name the slide that it drives or measures as joint"
-            )
-        if name is None:
-            continue
-        kind = tree.joints.get(name)
-        if kind is None:
-            problems.add(
-                element, f"names the joint '{name}', which is not in the file",
-                closest(name, tree.joints).rstrip("."),
-            )  # fmt: skip
-        elif kind in ("ball", "free"):
-            problems.add(
-                element, f"drives or measures the {kind} joint '{name}', which has no one reading",
-                "remove it",
-            )  # fmt: skip
-        elif kind == "slide" or element.tag != "jointpos":
-            motors[name] = None
-    return list(motors)
-
-
-def _drives_no_leg(element: etree._Element) -> bool:
-    """Say whether an actuator acts on something else than joints: suction of a body, a plugin."""
-    return element.tag == "plugin" or element.get("body") is not None
-
-
 def _without_loose_bodies(
-    urdf: Urdf, frames: list[list[str]], tree: MjcfTree, name: str
+    urdf: Urdf, frames: list[list[str]], tree: UrdfBuilder, name: str
 ) -> tuple[Urdf, list[str]]:
     """Return the tree without free bodies that no closure touches, and their names."""
     loose = {link for links, closed in moving_groups(urdf, frames) if not closed for link in links}
@@ -753,11 +653,11 @@ def _without_loose_bodies(
             f"it ('{other[0]}'), needed one mechanism in the file; remove the other bodies."
         )
     for joint in held:
-        del tree.text.joints[joint.name]
+        del tree.joints[joint.name]
     for link in loose:
-        del tree.text.links[link]
+        del tree.links[link]
     freed = [f"'{j.child}'" for j in held if j.type == "floating"]
-    return parse_urdf(urdf.path, tree.text.robot(name), travel_needed=False), freed
+    return parse_urdf(urdf.path, tree.robot(name), travel_needed=False), freed
 
 
 def _z_onto(direction: Array) -> Rotation:
