@@ -1,29 +1,36 @@
-"""Parameters fixed, freed and given priors by name: what overrides come to."""
+"""Parameters fixed, freed and given priors by name: what overrides come to, and their refusals."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from chosen import HEXAPOD, choose, known
+from dataset_folder import Folder, folder
 
-from legcal import load_mechanism
-from legcal.calibration.joint_fit.choices import NO_CHOICES, Prior, resolve
+from legcal import calibrate, load_dataset, load_mechanism
+from legcal.calibration.joint_fit import (
+    NO_CHOICES,
+    Choices,
+    Prior,
+    known_parameters,
+    resolve,
+)
 from legcal.data.overrides import overrides_of_call
+from legcal.errors import DatasetError, UsageError
 from legcal.machine import parametrization_of
 
+__all__ = ["folder"]
 
-@pytest.mark.parametrize("model", ["hexapod", "hexapod-rod", "3-upu-tilted", "3-rpr", "tricept"])
+
+@pytest.mark.parametrize("model", ["hexapod-rod", "3-upu-tilted", "3-rpr", "tricept"])
 def test_every_parameter_of_a_machine_can_be_named(model: str) -> None:
     parameters = known(model)
     names = parametrization_of(load_mechanism(model), twists=True).names
     assert tuple(parameters.by_name)[: len(names)] == names
     assert choose(free=names, parameters=parameters).free == set(names)
     assert parameters.by_name.keys().isdisjoint(parameters.others)
-
-
-def test_nothing_asked_is_no_choice() -> None:
-    assert choose() == NO_CHOICES
-    assert NO_CHOICES.document() == {}
 
 
 @pytest.mark.parametrize(
@@ -86,6 +93,10 @@ def test_a_parameter_can_be_fixed_away_from_nominal() -> None:
     found = choose(fixed=["leg1.offset=351mm", "leg2.offset", "c2.cx=512.5"])
     assert found.fixed == {"leg1.offset", "leg2.offset", "c1.cx"}
     assert found.values == {"leg1.offset": 0.351, "c1.cx": 512.5}
+    assert found.holds("leg1.offset")
+    assert not found.holds("leg3.offset")
+    assert [found.holds(f"c1.{name}", by_default=True) for name in ("fx", "cx")] == [True, True]
+    assert not choose(free=["c1.fx"]).holds("c1.fx", by_default=True)
 
 
 def test_a_twist_is_an_angle_between_lines() -> None:
@@ -98,31 +109,20 @@ def test_a_twist_is_an_angle_between_lines() -> None:
             assert found.priors["leg1.twist"].mean == pytest.approx(nominal + 0.01)
 
 
-def test_a_prior_says_more_than_to_free_and_a_value_more_than_to_fix() -> None:
+def test_a_prior_wins_over_free_and_a_value_over_fixed() -> None:
     found = choose({"c1.fx": (1290.0, 3.0)}, free=["c1.f?"])
     assert found.free == {"c1.fy"}
     assert set(found.priors) == {"c1.fx"}
     assert choose(fixed=["*.offset", "leg1.offset=0.35"]).values == {"leg1.offset": 0.35}
 
 
-def test_who_holds_what() -> None:
-    found = choose({"c1.fx": (1290.0, 3.0)}, fixed=["leg1.offset"], free=["c1.fy"])
-    assert found.holds("leg1.offset")
-    assert not found.holds("leg2.offset")
-    assert [found.holds(f"c1.{name}", by_default=True) for name in ("fx", "fy", "cx")] == [
-        False,
-        False,
-        True,
-    ]
-
-
-def test_what_a_run_asks_for_wins_over_the_dataset() -> None:
+def test_overrides_of_a_call_win_over_the_dataset() -> None:
     in_file = [
         replace(override, in_file=True)
         for override in overrides_of_call({"leg1.offset": (0.35, 1e-4)}, ["leg2.offset"], ["c1.fx"])
     ]
-    asked = overrides_of_call(["leg2.offset=0.35±0.001"], ["leg1.offset"], ["c1.fx"])
-    found = resolve([*in_file, *asked], HEXAPOD)
+    of_call = overrides_of_call(["leg2.offset=0.35±0.001"], ["leg1.offset"], ["c1.fx"])
+    found = resolve([*in_file, *of_call], HEXAPOD)
     assert found.fixed == {"leg1.offset"}
     assert found.free == {"c1.fx"}
     assert found.priors == {"leg2.offset": Prior(0.35, 0.001)}
@@ -132,6 +132,8 @@ def test_what_a_run_asks_for_wins_over_the_dataset() -> None:
 
 
 def test_what_was_chosen_is_a_document() -> None:
+    assert choose() == NO_CHOICES
+    assert NO_CHOICES.document() == {}
     found = choose({"c1.fx": (1290.0, 3.0)}, ["leg2.offset", "leg1.offset=0.35"], ["c1.k1"])
     assert found.document() == {
         "fixed": ["leg2.offset"],
@@ -141,5 +143,132 @@ def test_what_was_chosen_is_a_document() -> None:
     }
 
 
-def test_the_same_prior_twice_is_one() -> None:
-    assert len(choose(["leg1.offset=0.35±0.1", "leg1.offset=350±100mm"]).priors) == 1
+def chosen(folder: Folder, block: dict[str, Any], **call: Any) -> Choices:
+    folder.entry["parameters"] = block
+    dataset = load_dataset(folder.write())
+    known = known_parameters(dataset.machine, dataset.measurements.views)
+    return resolve([*dataset.overrides, *overrides_of_call(**call)], known)
+
+
+def test_the_block_of_a_dataset_says_what_a_call_can_say(folder: Folder) -> None:
+    block = {
+        "priors": {"leg1.offset": "350±0.1 mm", "c2.fx": {"value": 81.0, "sigma": 0.5}},
+        "fixed": ["leg2.*.z", "leg3.offset=0.35"],
+        "free": ["*.radius.*"],
+    }
+    call: dict[str, Any] = {"priors": {"leg1.offset": (0.35, 1e-4), "c1.fx": (81.0, 0.5)}}
+    call |= {"fixed": block["fixed"], "free": block["free"]}
+    assert load_dataset(folder.path).overrides == ()
+    by_file = chosen(folder, block)
+    assert by_file == chosen(folder, {}, **call)
+    assert by_file.priors["leg1.offset"] == Prior(0.35, 1e-4)
+    assert by_file.notes == ()
+
+
+def test_a_run_that_says_the_same_needs_no_note(folder: Folder) -> None:
+    block = {"priors": {"leg1.offset": "0.35±0.0001"}, "fixed": ["leg2.offset"]}
+    assert chosen(folder, block, priors=["leg1.offset=350±0.1mm"]).notes == ()
+    assert "leg2.offset gave way" in chosen(folder, block, free=["*.offset"]).notes[0]
+
+
+def test_a_call_is_refused_before_any_work(folder: Folder, tmp_path: Path) -> None:
+    before = sorted(folder.path.rglob("*"))
+    for call in ({"free": ["leg9.offset"]}, {"priors": {"leg1.offset": (0.35, 0.0)}}):
+        with pytest.raises(UsageError, match="could not be used"):
+            calibrate(folder.path, output=tmp_path / "out", **call)
+    assert not (tmp_path / "out").exists()
+    assert sorted(folder.path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("value", "found"),
+    [
+        ((0.35, float("inf")), "sigma inf"),
+        ((float("nan"), 0.1), "value nan"),
+        ((10**400, 0.1), "beyond 1e308"),
+        ((True, 0.1), "needed a value and its sigma"),
+        (("0.35", "0.1"), "needed a value and its sigma"),
+        ({"mean": 0.35, "sigma": 0.1}, "needed a value and its sigma"),
+        (0.35, "0.35"),
+        (None, "no value"),
+        ("350±1", "350 m"),
+    ],
+)
+def test_values_that_are_no_prior_are_refused(value: object, found: str) -> None:
+    with pytest.raises(UsageError, match=f"'leg1.offset.*{found}") as refusal:
+        choose({"leg1.offset": value})
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("model", "name", "found"),
+    [
+        ("hexapod", "leg9.offset", "unknown name"),
+        ("hexapod", "*.ofset", "no name matches"),
+        ("hexapod", "leg1.base.x", "definition of R_b"),
+        ("hexapod", "c1.fx=129", "129 px"),
+        ("tricept", "centre.offset", "without an encoder"),
+        ("tricept", "centre.platform.z", "nothing depends"),
+        ("hexapod-rod", "leg6.offset", "leg6.length"),
+    ],
+)
+def test_names_that_are_no_parameters_and_values_out_of_range_are_refused(
+    model: str, name: str, found: str
+) -> None:
+    with pytest.raises(UsageError, match=found):
+        choose(fixed=[name], parameters=known(model))
+
+
+@pytest.mark.parametrize(
+    ("priors", "fixed", "free", "found"),
+    [
+        (["leg1.offset=0.35±0.1", "*.offset=0.35±0.2"], [], [], "leg1.offset .*different priors"),
+        ([], ["leg1.offset=0.35", "leg1.offset=0.36"], [], "leg1.offset .*fixed at two values"),
+        (["c1.fx=1290±3", "c2.fx=1291±3"], [], [], "c1.fx.* c2.fx"),
+    ],
+)
+def test_overrides_that_contradict_each_other_are_refused(
+    priors: list[str], fixed: list[str], free: list[str], found: str
+) -> None:
+    with pytest.raises(UsageError, match=found):
+        choose(priors, fixed, free)
+
+
+def test_all_problems_are_refused_at_once_as_those_of_their_source() -> None:
+    with pytest.raises(UsageError) as refusal:
+        choose(fixed=["leg9.offset", "leg1.base.x"], free=["c9.fx"])
+    assert len(refusal.value.problems) == 3
+    in_file = [replace(o, in_file=True) for o in overrides_of_call(fixed=["leg9.offset"])]
+    with pytest.raises(DatasetError, match="unknown name"):
+        resolve(in_file, HEXAPOD)
+    with pytest.raises(UsageError, match=r"c2\.fx, measured axes"):
+        choose(free=["c2.fx"], parameters=known(axes_given=True))
+
+
+@pytest.mark.parametrize("model", ["hexapod", "3-upu-tilted"])
+def test_a_machine_of_which_all_is_fixed_is_refused(model: str) -> None:
+    parameters = known(model)
+    names = [name for name, p in parameters.by_name.items() if p.kind == "kinematic"]
+    with pytest.raises(UsageError, match="all of its parameters fixed"):
+        choose(fixed=names, parameters=parameters)
+    assert choose(fixed=names[1:], parameters=parameters).fixed == set(names[1:])
+
+
+@pytest.mark.parametrize(
+    ("block", "found"),
+    [
+        ({"prior": {}}, r"parameters\.prior"),
+        ({"priors": {"leg1.offset": {"value": 0.35}}}, r"leg1\.offset"),
+        ({"fixed": "leg1.offset"}, r"parameters\.fixed"),
+        ({"fixed": ["leg1.offset=x"]}, r"parameters\.fixed\.0"),
+        ({"free": [{"leg1": "offset"}]}, r"parameters\.free\.0"),
+        ({"priors": {"leg1.offset": "9±1"}}, r"leg1\.offset .*9 m"),
+        ({"fixed": ["leg1.offset"], "free": ["*.offset"]}, r"leg1\.offset"),
+    ],
+)
+def test_a_malformed_block_of_a_dataset_is_refused(
+    folder: Folder, block: dict[str, Any], found: str
+) -> None:
+    with pytest.raises(DatasetError, match=found) as refusal:
+        chosen(folder, block)
+    assert "dataset.yaml" in str(refusal.value)

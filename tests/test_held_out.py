@@ -1,4 +1,4 @@
-"""Images that a fit has not seen: foretold in pixels, and at the platform, as well as it says."""
+"""Predictions of held-out images, in pixels and at the platform, agree with their covariance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,27 +6,38 @@ from functools import cache
 
 import numpy as np
 import pytest
+from hexapod_session import (
+    PINHOLE,
+    Session,
+    disturbed_start,
+    moved_outlines,
+    noisy_outlines,
+    noisy_readings,
+    simulate,
+)
 from outline_sessions import Noise, StartErrors, design_of, draw_session
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
-from legcal.calibration.joint_fit import held_out as pose_by_outlines
-from legcal.calibration.joint_fit.held_out import (
+from legcal.calibration.joint_fit import (
     HeldOut,
-    PosesByOutlines,
-    Posterior,
+    NoiseModel,
+    Start,
+    build_fit,
     compare_held_out,
-    poses_by_outlines,
+    possible_biases,
+    refine,
+    start_from,
 )
-from legcal.calibration.joint_fit.outline_errors import N_KINDS, NoiseModel, possible_biases
-from legcal.calibration.joint_fit.problem import build_fit
-from legcal.calibration.joint_fit.variables import Start
-from legcal.data.measurements import Measurements
-from legcal.data.outlines import Outlines
-from legcal.geometry import motions_of
+from legcal.calibration.joint_fit import held_out as held_out_module
+from legcal.calibration.joint_fit.held_out import PosesByOutlines, Posterior, poses_by_outlines
+from legcal.calibration.joint_fit.outline_errors import N_KINDS
+from legcal.data import Measurements, Outlines
+from legcal.geometry import Array, IntArray, motions_of
 from legcal.machine import Leg
 
 MACHINES = ("6-spu-coplanar", "3-upu-tilted", "3-rpr")
+N_SEEDS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +75,8 @@ def _compared(truth: Truth, posterior: Posterior, outlines: Outlines) -> HeldOut
     return compare_held_out(posterior, truth.measurements, outlines, truth.poses, 4.5)
 
 
-@pytest.mark.parametrize("name", thinned(MACHINES, ["3-upu-tilted", "3-rpr"]))
-def test_the_true_model_foretells_images_to_their_noise(name: str) -> None:
+@pytest.mark.parametrize("name", thinned(MACHINES, ["3-upu-tilted"]))
+def test_the_true_model_predicts_images_to_their_noise(name: str) -> None:
     truth = _truth(name)
     found = _compared(truth, truth.posterior, truth.outlines)
     assert found.rms_px == pytest.approx(found.expected_px, rel=0.15)
@@ -79,7 +90,7 @@ def test_the_true_model_foretells_images_to_their_noise(name: str) -> None:
     assert 0.2 < np.mean((found.rotation / found.expected_rotation) ** 2) < 1.8
 
 
-@pytest.mark.parametrize("name", MACHINES)
+@pytest.mark.parametrize("name", thinned(MACHINES, ["3-upu-tilted", "3-rpr"]))
 def test_a_wrong_model_does_not(name: str) -> None:
     truth = _truth(name)
     first, *others = truth.posterior.state.legs
@@ -91,8 +102,8 @@ def test_a_wrong_model_does_not(name: str) -> None:
     assert at_platform.displacement > 2.0 * at_platform.expected_displacement
 
 
-@pytest.mark.parametrize("name", MACHINES)
-def test_poses_by_outlines_do_not_depend_on_where_they_are_looked_for(name: str) -> None:
+@pytest.mark.parametrize("name", thinned(MACHINES, ["6-spu-coplanar"]))
+def test_poses_by_outlines_do_not_depend_on_where_the_search_begins(name: str) -> None:
     truth = _truth(name)
     turn = Rotation.from_rotvec([0.0, 0.0, 0.02])
     away = RigidTransform.from_components([4e-3, -3e-3, 0.0], turn)
@@ -114,8 +125,8 @@ def test_poses_that_still_move_are_not_known(monkeypatch: pytest.MonkeyPatch) ->
     away = RigidTransform.from_translation([4e-3, -3e-3, 0.0])
     poses = [away * T for T in truth.poses]
     assert len(_shown(truth, truth.outlines, poses).known) >= 7
-    monkeypatch.setattr(pose_by_outlines, "_ROBUST_STEPS", 0)
-    monkeypatch.setattr(pose_by_outlines, "_MAX_STEPS", 1)
+    monkeypatch.setattr(held_out_module, "_ROBUST_STEPS", 0)
+    monkeypatch.setattr(held_out_module, "_MAX_STEPS", 1)
     assert len(_shown(truth, truth.outlines, poses).known) == 0
 
 
@@ -136,17 +147,78 @@ def test_a_wrong_outline_is_counted_and_left_out() -> None:
     assert found.rms_px == pytest.approx(found.expected_px, rel=0.15)
 
 
-def test_an_image_that_shows_one_leg_says_nothing_at_the_platform() -> None:
+def test_few_outlines_give_nothing_at_the_platform_and_none_no_residuals() -> None:
     truth = _truth("6-spu-coplanar")
     alone = truth.outlines.used & (truth.outlines.leg == 0)
     found = _compared(truth, truth.posterior, replace(truth.outlines, used=alone))
     assert len(found.displacement) == 0
     assert found.at_platform is None
     assert found.rms_px is not None
-
-
-def test_no_outlines_give_no_residuals() -> None:
-    truth = _truth("6-spu-coplanar")
-    nothing = np.zeros(len(truth.outlines), dtype=np.bool_)
-    found = _compared(truth, truth.posterior, replace(truth.outlines, used=nothing))
+    found = _compared(truth, truth.posterior, replace(truth.outlines, used=alone & ~alone))
     assert (found.outlines, found.rms_px, found.at_platform) == (0, None, None)
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    return simulate(12, legs_seen=5, sigma_px=0.05)
+
+
+def _held_out(session: Session, level: float, seed: int) -> HeldOut:
+    """Return what a fourth of the images say of a fit of the others.
+
+    Each edge of each leg errs alike in all images of a view, by *level* [px].
+    """
+    rng = np.random.default_rng(seed)
+    outlines, measurements = noisy_outlines(session, rng), noisy_readings(session, rng)
+    view = measurements.view[outlines.row]
+    edge = np.stack([view, outlines.leg, outlines.edge - 1])
+    errors = level * rng.standard_normal((3, 6, 2))
+    outlines = moved_outlines(outlines, PINHOLE, np.repeat(errors[tuple(edge)][:, None], 2, axis=1))
+    is_held_out = np.arange(measurements.n_rows) % 4 == 2
+    (fitted, shown, start), (held_out, kept, near) = (
+        _of_rows(session, measurements, outlines, rows)
+        for rows in (np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out))
+    )
+    begin = replace(disturbed_start(session), T_Rb_Re=start)
+    solution = refine(session.legs, fitted, shown, begin)
+    assert bool(solution.biases) == (level > 0.0)
+    poses = start_from(solution.legs, held_out, session.legs, (), near, "").T_Rb_Re
+    return compare_held_out(solution.posterior, held_out, kept, poses, 4.5)
+
+
+def _of_rows(
+    session: Session, measurements: Measurements, outlines: Outlines, rows: IntArray
+) -> tuple[Measurements, Outlines, tuple[RigidTransform, ...]]:
+    """Return some of the images, each of a pose of its own, with the start of their poses."""
+    m = measurements
+    images = tuple(m.image[i] for i in rows.tolist())
+    some = replace(m, image=images, view=m.view[rows], pose=np.arange(len(rows)), q=m.q[rows])
+    poses = disturbed_start(session).T_Rb_Re
+    return some, outlines.at(rows), tuple(poses[k] for k in m.pose[rows].tolist())
+
+
+def _ratios(session: Session, level: float) -> Array:
+    """Return found over expected: in pixels, then displacement and rotation of the platform."""
+    ratios = []
+    for seed in range(N_SEEDS):
+        found = _held_out(session, level, seed)
+        assert found.rms_px is not None
+        assert found.expected_px is not None
+        assert len(found.displacement) == found.n_poses == 9
+        ratios += [
+            (found.rms_px / found.expected_px, displacement, rotation)
+            for displacement, rotation in zip(
+                found.displacement / found.expected_displacement,
+                found.rotation / found.expected_rotation,
+                strict=True,
+            )
+        ]
+    return np.asarray(np.sqrt(np.mean(np.square(ratios), axis=0)))
+
+
+@pytest.mark.parametrize("level", thinned([0.0, 0.05, 0.15], [0.0, 0.15]))
+def test_images_are_as_far_off_as_is_expected(session: Session, level: float) -> None:
+    pixels, displacement, rotation = _ratios(session, level)
+    assert pixels == pytest.approx(1.0, abs=0.1)
+    assert displacement == pytest.approx(1.0, abs=0.25)
+    assert rotation == pytest.approx(1.0, abs=0.25)

@@ -1,0 +1,227 @@
+"""The estimation problem by itself: no robot, no camera, against the same written out densely."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from legcal.errors import DidNotConverge
+from legcal.estimation import (
+    Effects,
+    Factor,
+    GaussianPrior,
+    Huber,
+    Problem,
+    PseudoHuber,
+    Rows,
+    Variables,
+    all_free,
+    estimate_variances,
+    information,
+    linearize,
+    minimise,
+    named_covariance,
+)
+from legcal.geometry import Array, IntArray
+
+N_SHARED, N_ELEMENTS, N_EACH = 3, 5, 6
+LOSS = PseudoHuber(0.1**-0.5)
+LEAST_GAIN = 25.0
+
+
+@dataclass(frozen=True, eq=False)
+class Waves:
+    """Sums of waves of shared phases, and of offsets of each group of measurements."""
+
+    phase: Array  # (N_SHARED, 1)
+    offset: Array  # (N_ELEMENTS, 2)
+
+
+def waves(rng: np.random.Generator, unknown: IntArray, noise: float = 0.0) -> Problem[Waves]:
+    """Return the problem of measurements at random places, the first phase with a prior."""
+    n = N_ELEMENTS * N_EACH
+    place, element = rng.uniform(0.0, 6.0, (n, N_SHARED)), np.repeat(np.arange(N_ELEMENTS), N_EACH)
+    slope, shared = rng.normal(size=(n, 2)), np.tile(np.arange(N_SHARED), (n, 1))
+    error = noise * rng.standard_normal(n)
+
+    def predicted(state: Waves) -> Array:
+        by_offset = np.sum(slope * state.offset[element], axis=1)
+        return np.asarray(np.sin(place + state.phase[:, 0]).sum(axis=1) + by_offset)
+
+    measured = predicted(TRUTH) + error
+
+    def rows(state: Waves) -> Rows:
+        J = np.cos(place + state.phase[:, 0])
+        return Rows.of((predicted(state) - measured)[:, None], J[:, None], slope[:, None])
+
+    prior = GaussianPrior(np.zeros(1, dtype=np.intp), TRUTH.phase[0], np.array([0.5]))
+    labels = tuple(f"phase {i}" for i in range(int(unknown.max()) + 1))
+    return Problem(
+        variables=(Variables("phase", unknown, labels=labels, units=("",) * 3, prior=prior),),
+        eliminated=Variables("offset", all_free(N_ELEMENTS, 2)),
+        factors=(
+            Factor(
+                "values", rows, (("phase", shared, slice(None)),), n, 1, element, 10.0, robust=True
+            ),
+        ),
+    )
+
+
+TRUTH = Waves(
+    np.array([[0.3], [-0.2], [0.5]]),
+    np.random.default_rng(7).normal(size=(N_ELEMENTS, 2)),
+)
+AWAY = Waves(TRUTH.phase + 0.1, np.zeros((N_ELEMENTS, 2)))
+
+
+@pytest.mark.parametrize("loss", [PseudoHuber(), PseudoHuber(3.0), Huber(3.0)])
+def test_exact_measurements_are_explained_exactly(loss: PseudoHuber | Huber) -> None:
+    problem = waves(np.random.default_rng(0), all_free(N_SHARED, 1))
+    found = minimise(problem, AWAY, loss)
+    np.testing.assert_allclose(found.state.phase, TRUTH.phase, atol=1e-8)
+    np.testing.assert_allclose(found.state.offset, TRUTH.offset, atol=1e-8)
+
+
+def test_elimination_gives_the_covariance_of_the_whole_system() -> None:
+    problem = waves(np.random.default_rng(1), all_free(N_SHARED, 1), 0.1)
+    found = minimise(problem, AWAY)
+    rows, where = found.linear["values"], problem.places["values"]
+    J = np.zeros((len(rows.r), problem.size))
+    J[:, :N_SHARED] = rows.J[:, 0]
+    for i, k in enumerate(np.repeat(np.arange(N_ELEMENTS), N_EACH).tolist()):
+        J[i, N_SHARED + 2 * k : N_SHARED + 2 * k + 2] = rows.J_element[i, 0]
+    H = J.T @ J
+    H[0, 0] += 0.5**-2
+    assert np.array_equal(where.index, np.tile(np.arange(N_SHARED), (len(J), 1)))
+    covariance = np.linalg.inv(H)[:N_SHARED, :N_SHARED]
+    normal = information(problem, found.state, found.linear)
+    mine = named_covariance(problem, found.state, normal.kept_covariance())
+    np.testing.assert_allclose(mine, covariance, rtol=1e-9)
+
+
+def test_elements_add_to_the_information_one_by_one() -> None:
+    problem = waves(np.random.default_rng(2), all_free(N_SHARED, 1), 0.1)
+    normal = information(problem, TRUTH, linearize(problem, TRUTH))
+    parts = normal.contributions()
+    assert parts.shape == (N_ELEMENTS, N_SHARED, N_SHARED)
+    assert all(np.linalg.matrix_rank(part) <= 2 for part in parts)
+    np.testing.assert_allclose(normal.reduced(), normal.U - parts.sum(axis=0), rtol=1e-9)
+
+
+def test_fixed_numbers_stay_and_tied_ones_move_together() -> None:
+    unknown = np.array([[0], [-1], [0]])
+    problem = waves(np.random.default_rng(3), unknown)
+    assert problem.n_kept == 1
+    moved = problem.moved(AWAY, np.ones(problem.size))
+    np.testing.assert_allclose(moved.phase - AWAY.phase, [[1.0], [0.0], [1.0]])
+    found = minimise(problem, Waves(TRUTH.phase + 0.1 * (unknown >= 0), AWAY.offset))
+    np.testing.assert_allclose(found.state.phase, TRUTH.phase, atol=1e-8)
+
+
+def test_held_directions_do_not_move() -> None:
+    problem = waves(np.random.default_rng(4), all_free(N_SHARED, 1))
+    direction = np.array([[1.0, 1.0, 0.0]]) / np.sqrt(2.0)
+    found = minimise(replace(problem, held=direction), AWAY)
+    change = (found.state.phase - AWAY.phase)[:, 0]
+    assert np.abs(change).max() > 1e-3
+    assert direction[0] @ change == pytest.approx(0.0, abs=1e-12)
+
+
+def test_too_few_steps_are_refused_unless_what_they_found_is_asked_for() -> None:
+    problem = replace(
+        waves(np.random.default_rng(5), all_free(N_SHARED, 1)), name="fit of waves", remedy="wait"
+    )
+    with pytest.raises(DidNotConverge, match=r"The fit of waves did not converge: .*; wait\."):
+        minimise(problem, AWAY, max_iterations=1)
+    first = minimise(problem, AWAY, max_iterations=1, must_converge=False)
+    assert first.iterations == 1
+
+
+def test_loss_is_quadratic_near_and_linear_far() -> None:
+    def value(r: float) -> float:
+        return LOSS.cost(np.array([r * r]))
+
+    assert value(1e-3) == pytest.approx(0.5e-6, rel=1e-6)
+    assert value(2e6) - value(1e6) == pytest.approx(1e6 * LOSS.width, rel=1e-5)
+    assert value(7.0) == pytest.approx(7.0**2 / (1.0 + np.sqrt(1.0 + LOSS.k * 7.0**2)))
+    assert PseudoHuber().cost(np.array([9.0])) == 4.5
+    assert Huber(3.0).cost(np.array([4.0, 100.0])) == 2.0 + 3.0 * (10.0 - 1.5)
+
+
+def test_softened_rows_have_gradient_and_curvature_of_the_loss() -> None:
+    rng = np.random.default_rng(0)
+    r, J = 3.0 * rng.normal(size=(1, 2)), rng.normal(size=(1, 2, 3))
+    soft_r, soft_J = LOSS.softened(r, J)
+
+    def cost(x: Array) -> float:
+        moved = r[0] + J[0] @ x
+        return LOSS.cost(np.array([moved @ moved]))
+
+    eye = 1e-4 * np.eye(3)
+    gradient = [(cost(d) - cost(-d)) / 2e-4 for d in eye]
+    np.testing.assert_allclose(soft_J[0].T @ soft_r[0], gradient, rtol=1e-6)
+    hessian = [
+        [(cost(d + e) - cost(d - e) - cost(e - d) + cost(-d - e)) / 4e-8 for d in eye] for e in eye
+    ]
+    np.testing.assert_allclose(soft_J[0].T @ soft_J[0], hessian, rtol=1e-5, atol=1e-6)
+    assert PseudoHuber().softened(r, J)[1] is J
+
+
+@pytest.mark.parametrize("m", [2, 4])
+def test_efficiency_of_the_loss_agrees_with_monte_carlo(m: int) -> None:
+    assert PseudoHuber().efficiency(m) == pytest.approx(1.0, abs=1e-12)
+    r = np.random.default_rng(0).standard_normal((400_000, m))
+    s = np.sum(r**2, axis=1)
+    w = LOSS.weights(s)
+    slope = np.mean(w - LOSS.k * w**3 * r[:, 0] ** 2)
+    assert LOSS.efficiency(m) == pytest.approx(slope**2 / np.mean((w * r[:, 0]) ** 2), rel=5e-3)
+
+
+def random_effects(rng: np.random.Generator, sigma: tuple[float, float]) -> Effects:
+    """Return what residuals of a regression say of two kinds of effects."""
+    n, n_fitted, kind = 300, 25, np.repeat([0, 1], [30, 20])
+    B = rng.standard_normal((n, len(kind))) * (rng.random((n, len(kind))) < 0.1)
+    fitted = np.linalg.qr(rng.standard_normal((n, n_fitted)))[0]
+    r = B @ (np.array(sigma)[kind] * rng.standard_normal(len(kind))) + rng.standard_normal(n)
+    left = B - fitted @ (fitted.T @ B)
+    return Effects(left.T @ r, left.T @ B, kind)
+
+
+def test_variances_of_random_effects_come_out_of_residuals() -> None:
+    rng = np.random.default_rng(0)
+    for sigma in ((1.0, 0.5), (1.5, 0.0), (0.0, 2.0)):
+        found = [estimate_variances(random_effects(rng, sigma), 0.0)[0] for _ in range(60)]
+        assert np.mean(found, axis=0) == pytest.approx(np.square(sigma), rel=0.15, abs=0.05)
+
+
+def test_white_residuals_have_no_effects_at_all() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(60):
+        variances, gain = estimate_variances(random_effects(rng, (0.0, 0.0)), LEAST_GAIN)
+        assert not variances.any()
+        assert gain < LEAST_GAIN
+
+
+def test_the_slope_is_that_of_the_likelihood() -> None:
+    effects = random_effects(np.random.default_rng(2), (1.0, 0.7))
+    at, step = np.array([0.4, 0.9]), 1e-5
+    numeric = [
+        (effects.log_likelihood(at + step * e) - effects.log_likelihood(at - step * e))
+        / (2.0 * step)
+        for e in np.eye(2)
+    ]
+    np.testing.assert_allclose(effects.slope(at)[0], numeric, rtol=1e-6)
+    assert effects.log_likelihood(np.zeros(2)) == 0.0
+
+
+def test_the_likelihood_is_that_of_the_scores() -> None:
+    effects = random_effects(np.random.default_rng(3), (1.0, 0.7))
+    variances = np.array([1.2, 0.3])
+    D = np.diag(variances[effects.kind])
+
+    def gaussian(covariance: Array) -> float:
+        value = effects.z @ np.linalg.solve(covariance, effects.z)
+        return float(-0.5 * (value + np.linalg.slogdet(covariance)[1]))
+
+    expected = gaussian(effects.K + effects.K @ D @ effects.K) - gaussian(effects.K)
+    assert effects.log_likelihood(variances) == pytest.approx(expected, rel=1e-9)

@@ -1,0 +1,329 @@
+"""Residuals of the joint fit by a second route, all derivatives by differences, steps densely."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from axes_session import axes_session
+from board_session import corners_of, with_board
+from dense_fit import (
+    allowed,
+    by_differences,
+    jacobian,
+    jacobians,
+    projected_move,
+    residuals,
+    violations,
+)
+from machine_session import LENS, PINHOLE, MachineSession, machine_session, shifted
+from thinned import thinned
+
+from legcal.calibration.joint_fit import Choices, FitProblem, Prior, State, build_fit
+from legcal.calibration.joint_fit.outline_errors import N_KINDS, EdgeBiases
+from legcal.data import axes_from_outlines, no_outlines
+from legcal.estimation import Frames, PseudoHuber, linearize, normal_equations, solver
+from legcal.geometry import Array
+from legcal.vision import Camera, outlines_of_axis
+
+K = 0.1
+LOSS = PseudoHuber(K**-0.5)
+CHOICES = {
+    "hexapod": Choices(
+        free=frozenset({"c1.fx", "c1.cy", "c1.k1"}),
+        fixed=frozenset({"leg2.offset", "leg1.radius.leg1_tube"}),
+        priors={"leg1.offset": Prior(0.4, 1e-3)},
+    ),
+    "3-rps": Choices(priors={"leg1.base_axis.1": Prior(0.01, 2e-3)}),
+    "tricept": Choices(priors={"centre.platform_axis.2": Prior(0.0, 1e-3)}),
+    "3-upu-tilted": Choices(free=frozenset({"leg2.twist"})),
+}
+
+
+def _session(name: str) -> MachineSession:
+    n_poses = 5 if name == "3-upu-tilted" else 2
+    return machine_session(name, n_poses=n_poses, camera=PINHOLE if name == "3-rps" else LENS)
+
+
+def _problem(name: str) -> tuple[FitProblem, State]:
+    """Return a fit with every kind of measurement and variable in some machine, off the truth.
+
+    A hexapod shows a board and has unknown intrinsics, 6-SPS axes too, Nategh-Agheli biases. No
+    axis or radius is where it is nominal, and outlines have weights that are not alike.
+    """
+    session, axes, board = _session(name), None, None
+    start = session.start
+    if name == "6-sps":
+        radii = {part: r for (_, part), r in session.legs.radii.items()}
+        rods = np.array([part.endswith("_rod") for part in session.outlines.part])
+        axes = axes_from_outlines(replace(session.outlines, used=rods), session.measurements, radii)
+    if name == "hexapod":
+        board, start = with_board(session, corners_of(session, seed=0))
+    problem = build_fit(
+        session.legs,
+        session.measurements,
+        session.outlines,
+        axes=axes,
+        board=board,
+        choices=CHOICES.get(name, Choices()),
+    )
+    n = len(problem.outlines)
+    if name == "nategh-agheli":
+        shift = np.random.default_rng(0).uniform(-1.0, 1.0, (n, 2, 2))
+        index = np.stack([np.zeros(n, dtype=np.intp), 1 + problem.outlines.leg], axis=1)
+        names = ("all", *problem.legs.names)
+        kind = np.zeros(len(names), dtype=np.intp)
+        problem = problem.with_biases(EdgeBiases(names, kind, np.full(N_KINDS, 0.3), index, shift))
+    T = np.tril(np.random.default_rng(4).uniform(1.0, 3.0, (n, 2, 2)))
+    problem = problem.with_factors(replace(problem.factor("outlines"), whitening=T))
+    x = 1e-3 * np.random.default_rng(2).uniform(-1.0, 1.0, problem.size)
+    return problem, projected_move(problem, problem.begin(start), x)
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, LENS], ids=["pinhole", "lens"])
+def test_offsets_are_those_of_the_camera_s_lines_from_the_cylinder(camera: Camera) -> None:
+    session = machine_session("hexapod", n_poses=2, camera=camera)
+    problem = build_fit(session.legs, session.measurements, session.outlines)
+    state = problem.begin(session.start)
+    state = replace(state, radii=1.01 * state.radii)
+    o, offsets = problem.outlines, problem.offsets(state)
+    cameras, poses = state.camera_pose.motions, state.platform_pose.motions
+    for i in range(0, len(o), 5):
+        T = cameras[o.view[i]]
+        A = T.apply(state.A[o.leg[i]])
+        B = T.apply(poses[o.pose[i]].apply(state.B[o.leg[i]]))
+        u = (B - A) / np.linalg.norm(B - A)
+        both = outlines_of_axis(u, A, float(state.radii[o.radius[i]]))
+        h = both[0 if o.epsilon[i] > 0 else 1]
+        expected = camera.line_offset(np.tile(h, (2, 1)), o.feet[i])
+        np.testing.assert_allclose(offsets[i], expected, rtol=0, atol=1e-9)
+    assert np.abs(offsets).max() > 1.0
+    linear = linearize(problem, state)
+    np.testing.assert_allclose(linear.prior_r, 0.5, rtol=1e-9)  # 1 % off, known to 2 %
+
+
+def test_offsets_are_pixels_by_which_an_outline_is_shifted() -> None:
+    session = _session("hexapod")
+    by = np.random.default_rng(0).uniform(-0.5, 0.5, (len(session.outlines), 2))
+    problem = build_fit(session.legs, session.measurements, shifted(session, session.outlines, by))
+    offsets = problem.offsets(problem.begin(session.truth))
+    np.testing.assert_allclose(np.abs(offsets), np.abs(by), atol=2e-3)
+    exact = build_fit(session.legs, session.measurements, session.outlines)
+    np.testing.assert_allclose(exact.offsets(exact.begin(session.truth)), 0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["hexapod", "nategh-agheli"])
+def test_readings_are_closures_of_legs(name: str) -> None:
+    problem, state = _problem(name)
+    e, poses = problem.readings, state.platform_pose.motions
+    r = linearize(problem, state)["readings"].r[:, 0]
+    legs = [poses[k].apply(state.B[j]) - state.A[j] for k, j in zip(e.pose, e.leg, strict=True)]
+    closure = np.linalg.norm(legs, axis=1) - e.length - state.lengths[e.leg]
+    np.testing.assert_allclose(r * e.sigma, closure, atol=1e-14)
+    q = _session(name).measurements.q[e.pose, e.leg]
+    np.testing.assert_array_equal(e.length, problem.legs.sign[e.leg] * q)
+
+
+def test_axes_are_where_the_predicted_line_passes_the_measured_one() -> None:
+    session = axes_session()
+    start, axes, m = session.start(), session.axes, session.measurements
+    problem = build_fit(session.legs, m, no_outlines(), axes=axes)
+    r, T = linearize(problem, problem.begin(start))["axes"].r, problem.axes.whitening
+    np.testing.assert_allclose(
+        T @ axes.covariance @ np.swapaxes(T, -1, -2),
+        np.tile(np.eye(4), (len(axes), 1, 1)),
+        atol=1e-9,
+    )
+    for i in range(0, len(axes), 7):
+        j, camera = axes.leg[i], start.T_camera_Rb[m.view[axes.row[i]]]
+        A = camera.apply(start.legs[j].A)
+        B = camera.apply(start.T_Rb_Re[m.pose[axes.row[i]]].apply(start.legs[j].B))
+        # The line A + s (B - A) in the axes (e1, e2, u) with the origin M.
+        frame = np.vstack([axes.basis[i], axes.u[i]])
+        p, d = frame @ (A - axes.M[i]), frame @ (B - A)
+        expected = np.concatenate([d[:2] / d[2], p[:2] - p[2] * d[:2] / d[2]])
+        np.testing.assert_allclose(r[i], T[i] @ expected, rtol=1e-9)
+
+
+def test_corners_are_where_the_camera_projects_them() -> None:
+    session = machine_session("3-rps", n_poses=2)
+    seen, start = with_board(session, corners_of(session))
+    problem = build_fit(session.legs, session.measurements, session.outlines, board=seen)
+    board = problem.corners
+    r = linearize(problem, problem.begin(start))["corners"].r * board.sigma[:, None]
+    assert len(board) == 3 * seen.board.n_corners  # one for all images of a view
+    in_base = start.T_Rb_board.apply(board.point)
+    for v, T in enumerate(start.T_camera_Rb):
+        of_view = board.view == v
+        expected = LENS.project(T.apply(in_base[of_view])) - board.pixels[of_view]
+        far = np.abs(expected).max()
+        assert far > 1.0
+        np.testing.assert_allclose(r[of_view], expected, atol=0.1 * far)
+
+
+@pytest.mark.parametrize(
+    "name",
+    thinned(
+        ["hexapod", "nategh-agheli", "6-sps", "3-rps", "3-upu-tilted", "hexapod-rod", "tricept"],
+        ["hexapod", "nategh-agheli", "6-sps", "tricept"],
+    ),
+)
+def test_all_factors_have_the_derivatives_of_finite_differences(name: str) -> None:
+    problem, state = _problem(name)
+    assert len(problem.axes) > 0 or name != "6-sps"
+    assert len(problem.corners) > 0 or name != "hexapod"
+    J = jacobian(problem, linearize(problem, state))
+    unit = np.eye(problem.size)
+    expected = by_differences(problem, state, lambda s: residuals(problem, s), unit)
+    size = np.abs(expected).max(axis=0)
+    # What acts on the constraints alone: axes, twists, constant lengths.
+    idle = [problem.named[i] for i in np.flatnonzero(size[: problem.n_named] == 0.0)]
+    assert all("axis" in n or n.endswith((".twist", ".length")) for n in idle)
+    # Differences of an angle with a prior are rounded by 1e-16 rad over its sigma and the step.
+    assert np.abs((J - expected) / np.maximum(size, 0.1)).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    "name",
+    thinned(
+        ["3-rps", "3-upu-tilted", "tricept", "3-rpr", "hexapod-rod"],
+        ["3-rps", "tricept", "hexapod-rod"],
+    ),
+)
+def test_poses_follow_every_parameter_as_finite_differences_do(name: str) -> None:
+    problem, state = _problem(name)
+    J = jacobian(problem, linearize(problem, state))
+    assert problem.constraint is not None
+    motion = problem.constraint.tangent(problem, state)
+    assert motion is not None
+    n = problem.n_named
+    steps = np.zeros((n, problem.size))
+    steps[:, :n] = np.eye(n)
+    expected = by_differences(
+        problem, state, lambda s: residuals(problem, s), steps, projected_move
+    )
+    steps[:, problem.n_kept :] = motion.Q[:n].reshape(n, -1)
+    size = np.abs(expected).max(axis=0)
+    assert np.all(size > 0.0)
+    assert np.abs((J @ steps.T - expected) / size).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "is_held"),
+    thinned(
+        [
+            *((name, False) for name in ("hexapod", "nategh-agheli", "6-sps", "3-rps", "tricept")),
+            *((name, True) for name in ("hexapod", "3-rps", "tricept", "3-rpr")),
+        ],
+        [("hexapod", False), ("tricept", False), ("3-rpr", True)],
+    ),
+)
+def test_a_step_is_that_of_the_whole_system_inside_the_constraints(
+    name: str, is_held: bool
+) -> None:
+    problem, state = _problem(name)
+    if is_held:
+        held = np.random.default_rng(1).normal(size=(problem.n_kept, 2))
+        problem = replace(problem, held=np.linalg.qr(held)[0].T)
+    linear = linearize(problem, state)
+    H, g = np.zeros((problem.size, problem.size)), np.zeros(problem.size)
+    for kind, J in jacobians(problem, linear).items():
+        is_robust = kind != "priors" and problem.factor(kind).robust
+        r = linear.prior_r[:, None] if kind == "priors" else linear[kind].r
+        for ri, Ji in zip(r, J.reshape(*r.shape, problem.size), strict=True):
+            w, k = (1.0 / np.sqrt(1.0 + K * (ri @ ri)), K) if is_robust else (1.0, 0.0)
+            H += Ji.T @ (w * np.eye(len(ri)) - k * w**3 * np.outer(ri, ri)) @ Ji
+            g += w * Ji.T @ ri
+    N = allowed(problem, state)
+    assert N.shape[1] == problem.n_unknowns - len(problem.held)
+    inside = N.T @ H @ N
+    scale = 1.0 / np.sqrt(np.diag(inside))
+    free = np.linalg.solve(scale[:, None] * inside * scale, scale * (N.T @ g))
+    expected = -N @ (scale * free)
+    step, predicted = normal_equations(problem, state, linear, LOSS).step(0.0)
+    assert predicted == pytest.approx(-0.5 * g @ expected, rel=1e-6)
+    wrong = step - expected
+    assert wrong @ H @ wrong < 1e-10 * predicted
+
+
+@pytest.mark.parametrize("name", ["3-spr", "3-upu-tilted", "tricept"])
+def test_angles_of_axes_follow_their_turns_as_finite_differences_do(name: str) -> None:
+    session = machine_session(name, n_poses=2)
+    problem = build_fit(session.legs, session.measurements, session.outlines)
+    state = problem.begin(session.start)
+    step = np.where(np.arange(problem.size) < problem.n_kinematic, 0.1, 0.0)
+    state = problem.moved(state, step)  # far from nominal, where turns do not simply add up
+    J, h = problem.jacobian(state), 1e-6
+    for j in range(problem.n_named):
+        by_h = np.where(np.arange(problem.size) == j, h, 0.0)
+        ahead, behind = (
+            problem.coordinates(problem.moved(state, sign * by_h)) for sign in (1.0, -1.0)
+        )
+        np.testing.assert_allclose(J[:, j], (ahead - behind) / (2.0 * h), rtol=0.0, atol=2e-9)
+
+
+def test_damping_turns_a_step_towards_the_gradient_and_shortens_it() -> None:
+    problem, state = _problem("3-rps")
+    normal = normal_equations(problem, state, linearize(problem, state), LOSS)
+    sizes = [float(np.linalg.norm(normal.step(damping)[0])) for damping in (0.0, 1e-3, 1.0, 1e3)]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] < 1e-2 * sizes[0]
+    assert all(normal.step(damping)[1] > 0.0 for damping in (0.0, 1e-3, 1.0, 1e3))
+
+
+@pytest.mark.parametrize("name", ["3-rps", "tricept", "3-rpr"])
+def test_constraints_hold_at_every_state_that_the_solver_looks_at(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = machine_session(name)
+    problem = build_fit(session.legs, session.measurements, session.outlines)
+    looked_at: list[State] = []
+
+    def watched(problem: FitProblem, state: State) -> object:
+        looked_at.append(state)
+        return linearize(problem, state)
+
+    monkeypatch.setattr(solver, "linearize", watched)
+    begin = problem.begin(session.start)
+    found = solver.minimise(problem, begin, PseudoHuber(3.0))
+    assert len(looked_at) >= 4
+    for state in looked_at:
+        assert np.abs(violations(problem, state) - _heights(problem, begin)).max() < 1e-12
+        turned = state.platform_pose.R @ np.swapaxes(state.platform_pose.R, 1, 2)
+        assert np.abs(turned - np.eye(3)).max() < 1e-14
+    assert found.cost < 1e-12
+
+
+def _heights(problem: FitProblem, begin: State) -> Array:
+    """Return what the violations of a planar machine are where its platform has its height."""
+    heights = np.zeros_like(violations(problem, begin))
+    if not problem.legs.spatial:
+        heights[-3 * problem.n_elements :][2::3] = begin.platform_pose.t[:, 2]
+    return heights
+
+
+def test_poses_go_back_to_their_constraints_the_shortest_way() -> None:
+    session = _session("3-rps")
+    problem = build_fit(session.legs, session.measurements, session.outlines)
+    state = problem.begin(session.truth)
+    x = np.zeros(problem.size)
+    x[problem.n_kept :] = 1e-6 * np.random.default_rng(0).normal(size=6 * problem.n_elements)
+    back = problem.projected(problem.moved(state, x))
+    done = x[problem.n_kept :].reshape(-1, 6)
+    there, here = back.platform_pose, state.platform_pose
+    left = np.concatenate([_turn(there, here), there.t - here.t], axis=1) - done
+    # What was taken back is normal to what the constraints leave.
+    N = allowed(problem, state)[problem.n_kept :]
+    of_poses = N[:, np.abs(N).max(axis=0) > 0.0]
+    C = by_differences(problem, state, lambda s: violations(problem, s), np.eye(len(x)))
+    free = np.linalg.svd(C[:, problem.n_kept :])[2][C.shape[0] :]
+    assert np.abs(left).max() > 1e-7
+    assert np.abs(free @ left.ravel()).max() < 1e-10
+    assert of_poses.shape[0] == free.shape[1]
+
+
+def _turn(there: Frames, here: Frames) -> Array:
+    """Return the small rotation vectors between poses."""
+    R = there.R @ np.swapaxes(here.R, 1, 2)
+    return 0.5 * np.stack(
+        [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1
+    )

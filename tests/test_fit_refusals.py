@@ -1,0 +1,221 @@
+"""What the joint fit refuses, and its starting values."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from axes_session import axes_session
+from hexapod_session import (
+    FRAME_LEGS,
+    PINHOLE,
+    TRUTH,
+    Session,
+    disturbed_start,
+    geometry_of,
+    moved_outlines,
+    noisy_outlines,
+    simulate,
+)
+
+from legcal.calibration.joint_fit import (
+    Start,
+    cameras_from_hints,
+    fitted_legs,
+    platform_poses,
+    refine,
+    refine_from_best,
+    start_from,
+)
+from legcal.data import LegAxes, Outlines, View, no_outlines
+from legcal.errors import DatasetError, DidNotConverge, LegcalError, NotIdentifiable
+from legcal.files import motion_from_xyz_quat
+from legcal.machine import load_mechanism
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    return simulate(6, legs_seen=5)
+
+
+def at_truth(session: Session) -> Start:
+    """Return a start at the truth, poses by the readings."""
+    legs, poses = geometry_of(TRUTH), session.T_Rb_Re
+    m, cameras = session.measurements, session.T_camera_Rb
+    return start_from(legs, m, session.legs, cameras, poses, "nominal")
+
+
+def one_pose_many_times(n_times: int) -> Session:
+    """Return a session in which three views see the same pose again and again."""
+    once = simulate(1, shared_poses=True)
+    m, n = once.measurements, 3 * n_times
+    measurements = replace(
+        m,
+        image=tuple(f"{i:03d}.png" for i in range(n)),
+        view=np.tile(m.view, n_times),
+        pose=np.arange(n),
+        q=np.tile(m.q, (n_times, 1)),
+    )
+    o = once.outlines
+    row = np.repeat(3 * np.arange(n_times), len(o)) + np.tile(o.row, n_times)
+    outlines = replace(
+        o,
+        row=row,
+        leg=np.tile(o.leg, n_times),
+        edge=np.tile(o.edge, n_times),
+        h=np.tile(o.h, (n_times, 1)),
+        ends=np.tile(o.ends, (n_times, 1, 1)),
+        covariance=np.tile(o.covariance, (n_times, 1, 1)),
+        used=np.tile(o.used, n_times),
+        gamma=np.tile(o.gamma, n_times),
+        by_gamma=np.tile(o.by_gamma, n_times),
+        part=o.part * n_times,
+        reason=o.reason * n_times,
+        source=o.source * n_times,
+    )
+    return replace(once, measurements=measurements, outlines=outlines, T_Rb_Re=once.T_Rb_Re * n)
+
+
+Change = Callable[[Outlines], Outlines]
+
+
+def with_covariance(o: Outlines) -> Outlines:
+    covariance = o.covariance.copy()
+    covariance[3] = [[0.01, 0.02], [0.02, 0.01]]
+    return replace(o, covariance=covariance)
+
+
+def scattered(o: Outlines) -> Outlines:
+    by = np.random.default_rng(0).uniform(-15.0, 15.0, (len(o), 2))
+    return moved_outlines(o, PINHOLE, by)
+
+
+def measured_with_two_gammas(o: Outlines) -> Outlines:
+    return replace(o, gamma=np.where(np.arange(len(o)) == 5, 2.2, 1.0), by_gamma=np.ones(len(o)))
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "found"),
+    [
+        (lambda o: replace(o, used=o.row < 0), NotIdentifiable, "0 outlines and 108 readings"),
+        (lambda o: replace(o, edge=3 - o.edge), DidNotConverge, "right legs and edges|disagree"),
+        (scattered, DidNotConverge, r"disagree with it and the others are \d+.\d px off"),
+        (with_covariance, DatasetError, r"leg\d in c1_000.png .* not positive definite"),
+        (lambda o: replace(o, part=("tube", *o.part[1:])), DatasetError, r"leg\d\.tube"),
+        (measured_with_two_gammas, DatasetError, r"view c1 could not be used.*1 and 2\.2"),
+    ],
+    ids=["none", "swapped edges", "scattered", "covariance", "part", "gammas"],
+)
+def test_outlines_that_cannot_be_fitted_are_refused(
+    session: Session, change: Change, error: type[LegcalError], found: str
+) -> None:
+    m = session.measurements
+    camera = replace(PINHOLE, gamma_is_given=False)
+    m = replace(m, views=tuple(replace(view, camera=camera) for view in m.views))
+    with pytest.raises(error, match=found):
+        refine(session.legs, m, change(session.outlines), disturbed_start(session))
+
+
+@pytest.mark.parametrize(
+    ("few", "found"),
+    [
+        (simulate(1, n_views=2), r"2 images with 16 outlines and 12 readings give \d+ equations"),
+        (one_pose_many_times(6), r"found \d+ of \d+ directions .* leave open .*leg"),
+        (simulate(10), r"found \d+ of \d+ directions .* and that matter"),
+    ],
+    ids=["two images", "one pose", "one leg"],
+)
+def test_images_that_do_not_determine_the_parameters_are_refused(few: Session, found: str) -> None:
+    shown = few.outlines
+    if "matter" in found:
+        shown = noisy_outlines(few, np.random.default_rng(0))
+        shown = replace(shown, used=shown.leg == 0)
+    with pytest.raises(NotIdentifiable, match=found):
+        refine(few.legs, few.measurements, shown, at_truth(few))
+
+
+def in_degrees(axes: LegAxes) -> LegAxes:
+    tilt = 0.3 * np.random.default_rng(0).normal(size=(len(axes), 2))
+    u = axes.u + np.einsum("ni,nia->na", tilt, axes.basis)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    e1 = axes.basis[:, 0] - u * np.sum(u * axes.basis[:, 0], axis=1, keepdims=True)
+    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
+    return replace(axes, u=u, basis=np.stack([e1, np.cross(u, e1)], axis=1))
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "found"),
+    [
+        (
+            lambda a: replace(a, covariance=a.covariance * (a.row != 0)[:, None, None]),
+            DatasetError,
+            "leg1 in row 1 could not be used: its covariance",
+        ),
+        (in_degrees, LegcalError, r"axes disagree with it.*units \(rad, m\)"),
+        (lambda a: a.choose(np.arange(8)), NotIdentifiable, "24 images with 8 axes and 144 read"),
+    ],
+    ids=["covariance", "degrees", "few"],
+)
+def test_axes_that_cannot_be_fitted_are_refused(
+    change: Callable[[LegAxes], LegAxes], error: type[LegcalError], found: str
+) -> None:
+    session = axes_session()
+    measurements, axes = session.noisy(0)
+    with pytest.raises(error, match=found):
+        refine(session.legs, measurements, no_outlines(), session.start(), axes=change(axes))
+
+
+def test_a_start_far_away_is_refused(session: Session) -> None:
+    far = disturbed_start(session, joints=0.1, camera=0.5, angle=2.0)
+    with pytest.raises(DidNotConverge, match=r"still falls by|outlines disagree with it"):
+        refine(session.legs, session.measurements, session.outlines, far)
+    with pytest.raises(DidNotConverge, match=r"still falls|disagree") as refused:
+        refine_from_best(session.legs, session.measurements, session.outlines, [far, far])
+    assert len(refused.value.problems) == 1
+    with pytest.raises(DidNotConverge, match="needs at least one"):
+        refine_from_best(session.legs, session.measurements, session.outlines, [])
+
+
+def test_views_without_a_rough_pose_are_named(session: Session) -> None:
+    T = motion_from_xyz_quat([0.1, 0.2, 0.3], [0.0, 0.0, 0.6, 0.8])
+    with pytest.raises(DatasetError, match="c1, c2, c3 have no T_base_camera"):
+        cameras_from_hints(session.measurements, T)
+    views = tuple(View(v.name, v.camera, T) for v in session.measurements.views)
+    hinted = replace(session.measurements, views=views)
+    for T_camera_Rb in cameras_from_hints(hinted, T):
+        np.testing.assert_allclose(T_camera_Rb.as_matrix(), np.eye(4), atol=1e-15)
+
+
+def test_platform_poses_have_the_lengths_of_the_readings(session: Session) -> None:
+    m = session.measurements
+    start = start_from(
+        geometry_of(TRUTH),
+        m,
+        session.legs,
+        session.T_camera_Rb,
+        disturbed_start(session, camera=0.02, angle=0.1).T_Rb_Re,
+        "nominal",
+    )
+    for found, true in zip(start.T_Rb_Re, session.T_Rb_Re, strict=True):
+        assert np.linalg.norm((found.inv() * true).translation) < 1e-11
+
+
+def test_lengths_that_no_pose_has_give_the_nearest_pose(session: Session) -> None:
+    lengths = session.measurements.q + TRUTH.offsets
+    lengths[0, 2] += 0.4
+    poses = platform_poses(geometry_of(TRUTH), lengths, session.T_Rb_Re, FRAME_LEGS)
+    assert np.all(np.isfinite(poses[0].as_matrix()))
+    np.testing.assert_allclose(poses[1].as_matrix(), session.T_Rb_Re[1].as_matrix(), atol=1e-9)
+
+
+def test_legs_of_a_mechanism_bring_names_signs_axes_and_radii() -> None:
+    machine = load_mechanism("tricept")
+    legs = fitted_legs(machine)
+    assert legs.names == machine.leg_names
+    assert legs.sign.tolist() == machine.sign.tolist()
+    assert legs.frame_legs == tuple(machine.frame_legs)
+    assert legs.spatial
+    assert legs.radii[3, "centre_rod"] == machine.legs[3].radius_of_part["centre_rod"]
+    assert "centre.base_axis.1" in legs.parametrization.names
+    assert "centre.twist" in legs.parametrization.names
+    assert not fitted_legs(load_mechanism("3-rpr")).spatial

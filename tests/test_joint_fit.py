@@ -1,0 +1,629 @@
+"""The joint fit finds the truth: exactly without noise, at the Cramer-Rao bound with it.
+
+Nothing that does not matter shows in the result: the start, names and order, the unit of length.
+"""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from axes_session import AxesSession, axes_session
+from board_session import corners_of, place_of_board, with_board
+from dense_fit import allowed, by_differences, projected_move, residuals
+from hexapod_session import (
+    LENS,
+    Session,
+    disturbed_start,
+    gauge_is_kept,
+    joint_errors,
+    noisy_outlines,
+    noisy_readings,
+    simulate,
+)
+from machine_session import SHIPPED, MachineSession, machine_session
+from scipy.spatial.transform import RigidTransform
+from thinned import thinned
+
+from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.session import Session as IdentifySession
+from legcal.calibration.joint_fit import (
+    BOARD_SCALE,
+    DEFAULT_SETTINGS,
+    Choices,
+    FittedLegs,
+    Prior,
+    RefinementSettings,
+    Solution,
+    Start,
+    State,
+    average_images,
+    bound,
+    build_fit,
+    refine,
+    refine_from_best,
+)
+from legcal.calibration.joint_fit.determinacy import open_directions
+from legcal.calibration.joint_fit.rounds import first_minimum
+from legcal.calibration.joint_fit.variables import with_values
+from legcal.data import LegAxes, Measurements, View, axes_from_outlines, no_outlines
+from legcal.estimation import Frames, information, linearize
+from legcal.geometry import Array
+from legcal.machine import (
+    Leg,
+    LegKind,
+    moved_legs,
+    parameters_of_legs,
+    parametrize,
+    radius_name,
+)
+
+MACHINES = ("3-rps", "tricept", "hexapod-rod", "3-rpr")
+SCALE = 2.5
+
+
+def true_values(session: MachineSession) -> dict[str, float]:
+    """Return the true kinematic parameters, counted from the nominal legs, and radii."""
+    legs = session.legs
+    kinematic = legs.vector(session.truth.legs).tolist()
+    values = dict(zip(legs.parametrization.names, kinematic, strict=True))
+    return values | {radius_name(legs.names[j], part): r for (j, part), r in legs.radii.items()}
+
+
+def errors(session: MachineSession, found: Solution) -> dict[str, float]:
+    truth = true_values(session)
+    return {name: abs(found.values[name] - truth[name]) for name in found.names if name in truth}
+
+
+def shaken_radii(session: MachineSession) -> FittedLegs:
+    """Return the nominal legs with radii that are 2 % wrong."""
+    signs = np.random.default_rng(1).choice([-1.0, 1.0], len(session.legs.radii))
+    radii = {
+        part: r * (1.0 + 0.02 * sign)
+        for (part, r), sign in zip(session.legs.radii.items(), signs.tolist(), strict=True)
+    }
+    return replace(session.legs, radii=radii)
+
+
+@cache
+def fit_of_everything(session: MachineSession, *, known_radii: bool) -> Solution:
+    """Return the fit with true radii, or without knowing any: a prior would pull on them."""
+    legs = session.legs if known_radii else shaken_radii(session)
+    names = frozenset(radius_name(legs.names[j], part) for j, part in legs.radii)
+    choices = Choices(fixed=names) if known_radii else Choices(free=names)
+    return refine(legs, session.measurements, session.outlines, session.start, choices=choices)
+
+
+def far_session(name: str) -> MachineSession:
+    """Return a session that starts 3 mm and 1 deg away, the cameras 1 cm and 2 deg."""
+    return machine_session(name, camera_shift=0.01, camera_turn=float(np.deg2rad(2.0)))
+
+
+def starts_far_away(session: MachineSession) -> bool:
+    """Say whether no parameter that is sought, and no camera, begins near the truth."""
+    parametrization, true_legs = session.legs.parametrization, session.truth.legs
+    away = np.abs(session.legs.vector(session.start.legs) - session.legs.vector(true_legs))
+    least = {"m": 0.0029, "rad": np.deg2rad(0.7)}  # axes turn by 1 deg, both angles by 0.7
+    far = [
+        by > least[unit]
+        for name, unit, by in zip(parametrization.names, parametrization.units, away, strict=True)
+        if not name.endswith(".twist")
+    ]
+    cameras = zip(session.start.T_camera_Rb, session.truth.T_camera_Rb, strict=True)
+    changes = [start * true.inv() for start, true in cameras]
+    turned = [T.rotation.magnitude() > np.deg2rad(1.9) for T in changes]
+    shifts = zip(session.start.T_camera_Rb, session.truth.T_camera_Rb, strict=True)
+    shifted = [np.linalg.norm(a.translation - b.translation) > 0.009 for a, b in shifts]
+    return all((*far, *turned, *shifted))
+
+
+@pytest.mark.parametrize(
+    ("name", "known_radii"), [*((name, False) for name in SHIPPED), ("3-upu", True)]
+)
+def test_exact_outlines_give_the_truth_from_3_mm_and_1_degree_away(
+    name: str, known_radii: bool
+) -> None:
+    session = far_session(name)
+    assert starts_far_away(session)
+    found = fit_of_everything(session, known_radii=known_radii)
+    assert {found.units[n] for n in found.names} <= {"m", "rad"}
+    for parameter, error in errors(session, found).items():
+        assert error < {"m": 1e-8, "rad": 1e-7}[found.units[parameter]], parameter
+    # What is not held is known to a hundredth of a leg at least, some 5 mm. Parameters that far
+    # from any that explain all measurements would cost 1; 1e-12 are 5e-9 m and 1e-8 rad.
+    assert found.chi2 < 1e-12
+    first, true_first = found.T_Rb_Re[0], session.truth.T_Rb_Re[0]
+    for pose, true in zip(found.T_Rb_Re, session.truth.T_Rb_Re, strict=True):
+        # Where joint centres are held, R_e stands otherwise on the platform, and R_b on the base.
+        miss = pose.inv() * true
+        if found.held:
+            miss = (pose * first.inv()).inv() * (true * true_first.inv())
+        assert np.linalg.norm(miss.translation) < 1e-8
+        assert miss.rotation.magnitude() < 1e-7
+
+
+@pytest.mark.parametrize("known_radii", [False, True])
+def test_of_a_3_upu_that_only_translates_all_is_found_that_images_and_readings_show(
+    known_radii: bool,
+) -> None:
+    session = far_session("3-upu")
+    found = fit_of_everything(session, known_radii=known_radii)
+    assert len(found.held) == (6 if known_radii else 7)  # turns of both axes; without radii, size
+    legs, true_legs = found.legs, session.truth.legs
+    R, true_R = (Frames.of(poses)[0] for poses in (found.T_Rb_Re, session.truth.T_Rb_Re))
+    size = np.linalg.norm(legs[1].A) / np.linalg.norm(true_legs[1].A)
+    assert abs(size - 1.0) < 1e-8 if known_radii else abs(size - 1.0) > 1e-3
+    turned = []
+    for leg, true in zip(legs, true_legs, strict=True):
+        assert abs(leg.q0 - true.q0) < 1e-8
+        np.testing.assert_allclose(leg.A / size, true.A, rtol=0, atol=1e-8)
+        arms = R @ leg.B - leg.A, true_R @ true.B - true.A
+        np.testing.assert_allclose(*arms, rtol=0, atol=1e-8)
+        a, b = np.asarray(leg.base_axis), R @ np.asarray(leg.platform_axis)
+        turned.append(np.arccos(abs(a @ np.asarray(true.base_axis))))
+        between = np.linalg.norm(np.cross(a, b), axis=1)
+        assert between.max() < 1e-6  # as far as the written model has them from parallel
+    assert max(turned) > np.deg2rad(0.5)  # held where the nominal ones are, and harmless
+
+
+def test_a_first_fit_stays_near_the_nominal_model_where_nothing_is_known() -> None:
+    session = machine_session("3-upu")
+    problem = build_fit(session.legs, *session.noisy(1))
+    begin = problem.begin(session.start)
+    first = first_minimum(problem, begin, DEFAULT_SETTINGS)
+    turned = [
+        np.arccos(abs(np.asarray(leg.base_axis) @ np.asarray(nominal.base_axis)))
+        for leg, nominal in zip(first.state.legs, session.legs.nominal, strict=True)
+    ]
+    assert max(turned) < np.deg2rad(3.0)
+    held = open_directions(problem, first.state, information(problem, first.state, first.linear))
+    assert len(held.directions) == 7
+    # The knowledge that keeps it there is no measurement, and is not counted.
+    assert len(first.linear.prior_r) == len(problem.priors.mean) < len(problem.named)
+
+
+def session_as_identify_sees_it(session: MachineSession, legs: FittedLegs) -> IdentifySession:
+    """Return what was measured as the analysis of identifiability takes it."""
+    R, t = Frames.of(session.truth.T_Rb_Re)
+    cameras = session.truth.T_camera_Rb
+    radius = [max(r for (j, _), r in legs.radii.items() if j == k) for k in range(len(legs.names))]
+    return IdentifySession(
+        leg_names=legs.names,
+        legs=session.truth.legs,
+        frame_legs=legs.frame_legs,
+        parametrization=parametrize(legs.names, session.truth.legs, legs.frame_legs),
+        radius=np.array(radius),
+        R=R,
+        t=t,
+        R_reached=R,
+        t_reached=t,
+        view=session.measurements.view,
+        pose=session.measurements.pose,
+        seen=np.ones((len(cameras), len(legs.names)), dtype=np.bool_),
+        board=np.zeros(len(cameras), dtype=np.bool_),
+        camera=np.array([T.inv().translation for T in cameras]),
+        focal=np.full(len(cameras), session.measurements.views[0].camera.K[0, 0]),
+        sigma_q=session.measurements.sigma_q,
+    )
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_all_that_identify_calls_determined_is_estimated(name: str) -> None:
+    session = machine_session(name)
+    ranks = Analysis(session_as_identify_sees_it(session, session.legs)).full
+    open_to_identify = {p for direction in ranks.weak for p in direction.parameters}
+    assert ranks.rank == (15 if name == "3-upu" else ranks.of)
+    known = frozenset(true_values(session)) - set(session.legs.parametrization.names)  # radii
+    everything = session.legs, session.measurements, session.outlines
+    problem = build_fit(*everything, choices=Choices(fixed=known))
+    state = problem.begin(session.truth)
+    linear = linearize(problem, state)
+    held = open_directions(problem, state, information(problem, state, linear))
+    assert len(held.directions) == ranks.of - ranks.rank
+    assert set(held.names) == open_to_identify
+
+
+def fisher_covariance(session: MachineSession, choices: Choices) -> tuple[Array, Array]:
+    """Return the covariance of the named unknowns at the truth, and the same by differences."""
+    problem = build_fit(session.legs, session.measurements, session.outlines, choices=choices)
+    state = problem.begin(session.truth)
+    steps = allowed(problem, state).T
+
+    def at(moved: State) -> Array:
+        values = problem.coordinates(moved)
+        return np.concatenate([values, residuals(problem, moved)])
+
+    by = by_differences(problem, state, at, steps, projected_move)
+    values, J = by[: len(problem.named)], by[len(problem.named) :]
+    unit = np.linalg.norm(J, axis=0)
+    R = np.asarray(np.linalg.qr(J / unit, mode="r"))
+    root = np.linalg.solve(np.swapaxes(R, 0, 1), (values / unit).T)
+    expected = root.T @ root
+    return bound(problem, session.truth), expected
+
+
+@pytest.mark.parametrize(
+    ("name", "choices"),
+    [
+        ("hexapod", Choices(free=frozenset({"c1.fx", "c1.cx"}), fixed=frozenset({"leg2.offset"}))),
+        pytest.param(
+            "3-rps",
+            Choices(priors={"leg2.base_axis.1": Prior(0.0, 1e-3)}),
+            marks=pytest.mark.slow,
+        ),
+        ("tricept", Choices(free=frozenset({"leg1.radius.leg1_rod"}))),
+        pytest.param(
+            "hexapod-rod",
+            Choices(priors={"leg6.length": Prior(0.4, 1e-4)}),
+            marks=pytest.mark.slow,
+        ),
+        ("3-rpr", Choices()),
+    ],
+)
+def test_the_covariance_is_the_inverse_of_the_fisher_matrix_by_differences(
+    name: str, choices: Choices
+) -> None:
+    found, expected = fisher_covariance(machine_session(name, n_poses=3), choices)
+    sigma = np.sqrt(np.diag(expected))
+    assert np.abs((found - expected) / np.outer(sigma, sigma)).max() < 1e-4
+
+
+def test_values_are_set_whatever_basis_an_axis_has() -> None:
+    session = machine_session("3-upu")
+    legs, truth = session.legs, session.legs.vector(session.truth.legs)
+    at = dict(enumerate(truth.tolist()))
+    # Nominal axes near the place where the basis of their angles changes.
+    moved = with_values(legs.nominal, legs, at)
+    np.testing.assert_allclose(legs.vector(moved), truth, rtol=0, atol=1e-15)
+    for leg, true in zip(moved, session.truth.legs, strict=True):
+        np.testing.assert_allclose(
+            np.asarray(leg.base_axis), np.asarray(true.base_axis), rtol=0, atol=1e-12
+        )
+        np.testing.assert_allclose(
+            np.asarray(leg.platform_axis), np.asarray(true.platform_axis), rtol=0, atol=1e-12
+        )
+
+
+@pytest.fixture(scope="module")
+def small() -> Session:
+    return simulate(6, legs_seen=5)
+
+
+@pytest.mark.parametrize(
+    "session",
+    [simulate(12), simulate(6, camera=LENS, legs_seen=5), simulate(8, shared_poses=True)],
+    ids=["pinhole", "lens", "shared poses"],
+)
+def test_a_hexapod_is_found_from_5_mm_and_3_degrees_away(session: Session) -> None:
+    start = disturbed_start(session, joints=0.005, camera=0.02, angle=np.deg2rad(3.0))
+    assert np.abs(joint_errors(parameters_of_legs(start.legs))).min() > 0.0045
+    found = refine(session.legs, session.measurements, session.outlines, start)
+    assert np.abs(joint_errors(found.parameters)).max() < 1e-9
+    assert gauge_is_kept(found.parameters)
+    assert found.outlines.used.all()
+    for pose, true in zip(found.T_Rb_Re, session.T_Rb_Re, strict=True):
+        assert np.linalg.norm((pose.inv() * true).translation) < 1e-9
+        assert (pose.inv() * true).rotation.magnitude() < 1e-8
+
+
+def test_a_leg_that_no_image_shows_is_found_from_its_encoder_whatever_its_sign() -> None:
+    session, sign = simulate(12), np.array([1, -1, 1, 1, -1, 1])
+    shown = replace(session.outlines, used=session.outlines.leg != 2)
+    measurements = replace(session.measurements, q=sign * session.measurements.q)
+    legs = replace(session.legs, sign=sign)
+    found = refine(legs, measurements, shown, disturbed_start(session))
+    assert np.abs(joint_errors(found.parameters)).max() < 1e-9
+    assert (2, "rod") not in found.radii
+
+
+@pytest.mark.parametrize("n_left", [0, 1])
+def test_a_view_with_hardly_an_outline_neither_helps_nor_harms(n_left: int) -> None:
+    session = simulate(10, legs_seen=5)
+    used = session.outlines.used.copy()
+    used[np.flatnonzero(session.measurements.view[session.outlines.row] == 2)[n_left:]] = False
+    outlines = replace(session.outlines, used=used)
+    found = refine(session.legs, session.measurements, outlines, disturbed_start(session))
+    assert np.abs(joint_errors(found.parameters)).max() < 1e-9
+
+
+def test_a_passive_leg_needs_no_reading() -> None:
+    session = simulate(10, legs_seen=6)
+    q = session.measurements.q.copy()
+    q[:, 3] = np.nan
+    start = disturbed_start(session)
+    legs = list(start.legs)
+    legs[3] = replace(legs[3], kind=LegKind.PASSIVE)
+    start = replace(start, legs=tuple(legs))
+    fitted = replace(session.legs, nominal=start.legs)
+    found = refine(fitted, replace(session.measurements, q=q), session.outlines, start)
+    error = joint_errors(found.parameters)
+    assert np.isnan(error[-3])
+    assert np.nanmax(np.abs(error)) < 1e-9
+    assert "leg4.offset" not in found.names
+    assert found.kinematic_covariance.shape == (29, 29)
+
+
+def test_encoders_carry_the_scale_so_that_a_wrong_radius_is_found() -> None:
+    session = simulate(15, radius=1.01 * 0.010, sigma_px=0.01)
+    start = disturbed_start(session)
+    solution = refine(session.legs, session.measurements, session.outlines, start)
+    # The prior, 2 % of the radius, pulls a little; what it costs is within sigma.
+    sigma_radii = solution.sigma[-len(solution.radii) :]
+    assert all(name.split(".")[1] == "radius" for name in solution.names[-len(sigma_radii) :])
+    for radius, sigma in zip(solution.radii.values(), sigma_radii, strict=True):
+        assert radius == pytest.approx(0.0101, abs=3e-6)
+        assert sigma < 1e-5
+    assert np.abs(joint_errors(solution.parameters)).max() < 20e-6
+
+
+@pytest.mark.parametrize("n", thinned([12, 30], [12]))
+def test_errors_agree_with_the_covariance(n: int) -> None:
+    session = simulate(6, legs_seen=5)
+    start = disturbed_start(session)
+    normalised, z, scales, chi2 = [], [], [], []
+    for seed in range(n):
+        rng = np.random.default_rng(seed)
+        measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
+        found = refine(session.legs, measurements, outlines, start)
+        error = joint_errors(found.parameters)
+        normalised.append(error @ np.linalg.solve(found.kinematic_covariance, error) / len(error))
+        z.append(error / found.sigma[: len(error)])
+        scales.append(found.noise.scale)
+        chi2.append(found.chi2 / found.dof)
+    # The mean of n chi-squares of 30 degrees, over 30: 1 with standard deviation 0.26 / sqrt(n);
+    # the noise is estimated from some 200 residuals a run, which widens it a little.
+    assert np.mean(normalised) == pytest.approx(1.0, abs=1.1 / np.sqrt(n))
+    assert 0.75 < np.mean(np.square(z)) < 1.3
+    assert np.mean(scales) == pytest.approx(1.0, abs=0.05)
+    assert np.mean(chi2) == pytest.approx(1.0, abs=0.08)
+
+
+def test_the_result_is_reproduced_and_outlines_in_another_order_change_nothing(
+    small: Session,
+) -> None:
+    rng = np.random.default_rng(5)
+    measurements, outlines = noisy_readings(small, rng), noisy_outlines(small, rng)
+    start = disturbed_start(small)
+    shuffled = outlines.at(np.arange(len(outlines)))
+    order = rng.permutation(len(outlines))
+    names = ("row", "leg", "edge", "h", "ends", "covariance", "used")
+    shuffled = replace(shuffled, **{name: getattr(outlines, name)[order] for name in names})
+    found, again, other = (
+        vector(refine(small.legs, measurements, o, start)) for o in (outlines, outlines, shuffled)
+    )
+    np.testing.assert_array_equal(again, found)
+    np.testing.assert_allclose(other, found, rtol=0, atol=1e-12)
+
+
+def vector(found: Solution) -> Array:
+    p = found.parameters
+    return np.concatenate([p.base_joints.ravel(), p.platform_joints.ravel(), p.offsets])
+
+
+def test_the_better_start_wins_and_is_named_and_between_equal_ones_the_first(
+    small: Session,
+) -> None:
+    rng = np.random.default_rng(5)
+    noisy = noisy_readings(small, rng), noisy_outlines(small, rng)
+    good = disturbed_start(small)
+    bad = replace(disturbed_start(small, joints=0.1, camera=0.5, angle=2.0), label="staged")
+    settings = RefinementSettings(max_iterations=40)
+    for starts in ([good, bad], [bad, good]):
+        found = refine_from_best(small.legs, *noisy, starts, settings)
+        assert found.start == "nominal"
+        assert any("staged" in note for note in found.notes)
+        assert any("nominal led to a cost of" in note for note in found.notes)
+    equal = replace(disturbed_start(small, seed=9), label="staged")
+    assert refine_from_best(small.legs, *noisy, [good, equal]).start == "nominal"
+    assert refine_from_best(small.legs, *noisy, [equal, good]).start == "staged"
+
+
+def noisy(name: str) -> MachineSession:
+    session = machine_session(name)
+    measurements, outlines = session.noisy(0)
+    return replace(session, measurements=measurements, outlines=outlines)
+
+
+@cache
+def fitted(session: MachineSession) -> Solution:
+    return refine(session.legs, session.measurements, session.outlines, session.start)
+
+
+@cache
+def noisy_fit(name: str) -> tuple[MachineSession, Solution]:
+    session = noisy(name)
+    return session, fitted(session)
+
+
+@pytest.mark.parametrize("name", thinned(MACHINES, ["tricept"]))
+def test_where_the_fit_starts_does_not_show_in_the_result(name: str) -> None:
+    session, one = noisy_fit(name)
+    legs = session.legs
+    units = np.array(legs.parametrization.units)
+    step = np.random.default_rng(5).choice([-1.0, 1.0], len(units))
+    step *= np.where(units == "m", 0.003, np.deg2rad(1.0))
+    elsewhere = moved_legs(legs.nominal, legs.parametrization.place, step)
+    other = fitted(replace(session, start=replace(session.start, legs=elsewhere)))
+    assert len(one.names) >= len(units) - 1  # the twist of a Tricept is fixed
+    away = np.array([other.values[n] - one.values[n] for n in one.names])
+    assert np.abs(away / one.sigma).max() < 1e-3
+    assert other.cost == pytest.approx(one.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", thinned(MACHINES, ["tricept", "3-rpr"]))
+def test_relabelling_legs_relabels_the_result(name: str) -> None:
+    session, found = noisy_fit(name)
+    legs, n = session.legs, session.legs.n_legs
+    order = np.roll(np.arange(n), 1)  # new leg i is old leg order[i]
+    new = np.argsort(order)
+    relabelled = FittedLegs(
+        tuple(legs.names[i] for i in order),
+        tuple(legs.nominal[i] for i in order),
+        legs.sign[order],
+        tuple(int(new[i]) for i in legs.frame_legs),
+        {(int(new[i]), part): r for (i, part), r in legs.radii.items()},
+    )
+    m, start = session.measurements, session.start
+    again = refine(
+        relabelled,
+        replace(m, q=m.q[:, order]),
+        replace(session.outlines, leg=new[session.outlines.leg]),
+        replace(start, legs=tuple(start.legs[i] for i in order)),
+    )
+    assert set(again.names) == set(found.names)
+    sigma = dict(zip(found.names, found.sigma.tolist(), strict=True))
+    for parameter, s in zip(again.names, again.sigma.tolist(), strict=True):
+        assert abs(again.values[parameter] - found.values[parameter]) < 1e-3 * s
+        assert s == pytest.approx(sigma[parameter], rel=1e-4)
+
+
+@pytest.mark.parametrize("name", thinned(MACHINES, ["tricept"]))
+def test_a_machine_in_another_size_gives_the_same_in_that_size(name: str) -> None:
+    session, found = noisy_fit(name)
+    again = fitted(scaled(session))
+    assert again.names == found.names
+    unit = np.where([found.units[n] == "m" for n in found.names], SCALE, 1.0)
+    values, others = (
+        np.array([solution.values[n] for n in found.names]) for solution in (found, again)
+    )
+    assert np.abs((others / unit - values) / found.sigma).max() < 1e-3
+    np.testing.assert_allclose(again.sigma / unit, found.sigma, rtol=1e-4)
+    assert again.rms_px == pytest.approx(found.rms_px)
+
+
+def scaled(session: MachineSession) -> MachineSession:
+    """Return a session in which all lengths are larger; images stay as they are."""
+    m, legs, start = session.measurements, session.legs, session.start
+
+    def motion(T: RigidTransform) -> RigidTransform:
+        return RigidTransform.from_components(SCALE * T.translation, T.rotation)
+
+    return replace(
+        session,
+        measurements=replace(m, q=SCALE * m.q, sigma_q=SCALE * m.sigma_q),
+        legs=replace(
+            legs,
+            nominal=larger(legs.nominal),
+            radii={part: SCALE * r for part, r in legs.radii.items()},
+        ),
+        start=Start(
+            larger(start.legs),
+            tuple(map(motion, start.T_camera_Rb)),
+            tuple(map(motion, start.T_Rb_Re)),
+            start.label,
+        ),
+    )
+
+
+def larger(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
+    return tuple(replace(leg, A=SCALE * leg.A, B=SCALE * leg.B, q0=SCALE * leg.q0) for leg in legs)
+
+
+def fitted_axes(session: AxesSession, measurements: Measurements, axes: LegAxes) -> Solution:
+    return refine(session.legs, measurements, no_outlines(), session.start(), axes=axes)
+
+
+@pytest.mark.parametrize("coplanar", [False, True])
+def test_exact_axes_give_the_truth(coplanar: bool) -> None:
+    session, joints = axes_session(coplanar=coplanar), 0.005
+    start = session.start(joints=joints)
+    assert np.abs(session.errors(parameters_of_legs(start.legs))).min() > 0.9 * joints
+    found = refine(session.legs, session.measurements, no_outlines(), start, axes=session.axes)
+    assert np.abs(session.errors(found.parameters)).max() < 1e-9
+    assert found.rms_px is None
+    assert found.rms_axes == pytest.approx(0.0, abs=1e-5)
+    assert found.radii == {}
+
+
+def test_axes_beside_outlines_add_to_what_is_known() -> None:
+    session = simulate(6, legs_seen=5)
+    radii = {part: r for (_, part), r in session.legs.radii.items()}
+    axes = axes_from_outlines(session.outlines, session.measurements, radii)
+    arguments = (session.legs, session.measurements, session.outlines, disturbed_start(session))
+    alone, both = refine(*arguments), refine(*arguments, axes=axes)
+    assert np.abs(joint_errors(both.parameters)).max() < 1e-9
+    assert np.all(both.sigma[:30] < alone.sigma[:30])
+    assert both.dof == alone.dof + 4 * len(axes)
+
+
+@pytest.mark.parametrize("coplanar", thinned([False, True], [True]))
+def test_errors_reach_the_bound_and_agree_with_their_sigmas(coplanar: bool) -> None:
+    session, n = axes_session(coplanar=coplanar), 40
+    problem = build_fit(session.legs, session.measurements, no_outlines(), axes=session.axes)
+    least = bound(problem, session.truth)
+    solutions = [fitted_axes(session, *session.noisy(seed)) for seed in range(n)]
+    errors = np.array([session.errors(found.parameters) for found in solutions])
+    sigmas = np.array([found.sigma for found in solutions])
+    claimed = [
+        error @ np.linalg.solve(found.covariance, error) / 30
+        for error, found in zip(errors, solutions, strict=True)
+    ]
+    to_bound = np.einsum("na,ab,nb->n", errors, np.linalg.inv(least), errors) / 30
+    # The mean of 40 chi-squares of 30 degrees, over 30: 1 with a standard deviation of 0.041.
+    assert np.mean(to_bound) == pytest.approx(1.0, abs=0.12)
+    assert np.mean(claimed) == pytest.approx(1.0, abs=0.12)
+    # Parameters share few large errors, so that their own mean squares spread more.
+    assert np.mean((errors / sigmas) ** 2) == pytest.approx(1.0, abs=0.3)
+    assert np.mean([found.chi2 / found.dof for found in solutions]) == pytest.approx(1.0, abs=0.02)
+    assert np.mean([found.rms_axes or 0.0 for found in solutions]) < 1.0
+    # What the robust loss does not keep, and no more.
+    assert np.all(sigmas.mean(axis=0) > np.sqrt(np.diag(least)))
+    assert sigmas.mean() < 1.02 * np.sqrt(np.diag(least)).mean()
+
+
+def test_the_mean_of_images_of_one_pose_holds_what_they_hold() -> None:
+    session = axes_session(5, 3)
+    m, axes = session.measurements, session.axes
+    mean = average_images(axes, m)
+    assert len(mean) == len(axes) / 3
+    assert np.array_equal(np.unique(m.pose[mean.row]), np.arange(m.n_poses))
+    all_images, together = (
+        bound(build_fit(session.legs, m, no_outlines(), axes=some), session.truth)
+        for some in (axes, mean)
+    )
+    assert np.allclose(together, all_images, rtol=1e-6)
+
+
+def in_the_hand(session: MachineSession, start: Start) -> tuple[Measurements, Start]:
+    """Return the session with a camera position of its own for every image."""
+    m = session.measurements
+    views = tuple(View(f"hand-{i + 1}", m.views[v].camera) for i, v in enumerate(m.view.tolist()))
+    cameras = tuple(start.T_camera_Rb[v] for v in m.view.tolist())
+    return (
+        replace(m, views=views, view=np.arange(m.n_rows)),
+        replace(start, T_camera_Rb=cameras),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "by_hand"), [("hexapod", False), ("3-rps", True), ("3-rpr", True)]
+)
+def test_a_fit_with_a_board_is_exact_without_noise(name: str, by_hand: bool) -> None:
+    session = machine_session(name)
+    seen, start = with_board(session, corners_of(session))
+    measurements = session.measurements
+    if by_hand:
+        measurements, start = in_the_hand(session, start)
+    solution = refine(session.legs, measurements, session.outlines, start, board=seen)
+    assert max(errors(session, solution).values()) < 1e-8
+    assert solution.T_Rb_board is not None
+    apart = place_of_board(session).inv() * solution.T_Rb_board
+    assert np.linalg.norm(apart.translation) < 1e-8
+    assert solution.values[BOARD_SCALE] == pytest.approx(1.0, abs=1e-8)
+    assert solution.status[BOARD_SCALE] == "estimated"
+
+
+def test_corners_join_cameras_and_help_to_find_intrinsics() -> None:
+    session = machine_session("3-rps")
+    measurements, outlines = session.noisy(1)
+    seen, start = with_board(session, corners_of(session, seed=2))
+    free = Choices(free=frozenset({"c1.fx", "c1.fy"}))
+    alone = refine(session.legs, measurements, outlines, session.start, choices=free)
+    joined = refine(session.legs, measurements, outlines, start, board=seen, choices=free)
+    sigma = dict(zip(joined.names, joined.sigma.tolist(), strict=True))
+    ratios = [sigma[name] / s for name, s in zip(alone.names, alone.sigma, strict=True)]
+    assert np.median(ratios) < 0.9
+    assert sigma["c1.fx"] < alone.sigma[alone.names.index("c1.fx")]
+    assert abs(joined.values["c1.fx"] - 1290.0) < 4.0 * sigma["c1.fx"]
+    pulls = [error / sigma[name] for name, error in errors(session, joined).items()]
+    assert np.sqrt(np.mean(np.square(pulls))) < 3.0

@@ -1,0 +1,561 @@
+"""Errors of measurements: outliers rejected, noise, common-mode biases and gammas estimated."""
+
+import csv
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from axes_session import axes_session
+from board_session import BOARD, corners_of, with_board
+from dense_fit import jacobian, residuals
+from hexapod_session import (
+    PINHOLE,
+    Session,
+    disturbed_start,
+    joint_errors,
+    moved_outlines,
+    noisy_outlines,
+    noisy_readings,
+    simulate,
+)
+from machine_session import MachineSession, machine_session, shifted
+from simulated import settings
+from thinned import thinned
+
+import legcal
+from legcal.calibration.joint_fit import (
+    BOARD_SCALE,
+    DEFAULT_SETTINGS,
+    KINDS,
+    EstimatedGamma,
+    FitProblem,
+    RefinementSettings,
+    Solution,
+    State,
+    build_fit,
+    known_gammas,
+    next_gammas,
+    observed_outlines,
+    possible_biases,
+    refine,
+)
+from legcal.calibration.joint_fit.outline_errors import (
+    GAMMA_RANGE,
+    GAMMA_TOLERANCE,
+    LIMB_SIGMA,
+    MAX_GAMMA_STEP,
+    N_KINDS,
+    RECOVERED_SHARE,
+    EdgeBiases,
+    estimated_biases,
+)
+from legcal.calibration.joint_fit.rounds import (
+    NO_CHANGES,
+    Changes,
+    check_convergence,
+    with_edge_biases,
+)
+from legcal.calibration.outline_detection import detect
+from legcal.data import Measurements, Outlines, no_outlines
+from legcal.errors import DidNotConverge
+from legcal.estimation import linearize, scores_of_block
+from legcal.geometry import Array, BoolArray
+from legcal.simulation.dataset import simulate as simulate_folder
+from legcal.vision import EPSILON
+
+SHARE = 0.2  # of outlines that are wrong
+N_SEEDS = 2
+LOG_GAMMA = 0.6
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    return simulate(8, legs_seen=5, sigma_px=0.05)
+
+
+@cache
+def _session(name: str) -> MachineSession:
+    return machine_session(name, n_poses=12)
+
+
+def _errors(session: MachineSession, found: Solution) -> Array:
+    """Return the errors of the kinematic parameters [m, rad]."""
+    legs = session.legs
+    return legs.vector(found.legs) - legs.vector(session.truth.legs)
+
+
+@cache
+def _clean(name: str, seed: int) -> Solution:
+    session = _session(name)
+    return refine(session.legs, *session.noisy(seed), session.start)
+
+
+def single(session: MachineSession, rng: np.random.Generator) -> BoolArray:
+    """Return outlines here and there."""
+    return np.asarray(rng.random(len(session.outlines)) < SHARE)
+
+
+def pairs(session: MachineSession, rng: np.random.Generator) -> BoolArray:
+    """Return both edges of legs here and there."""
+    return np.repeat(rng.random(len(session.outlines) // 2) < SHARE, 2)
+
+
+def whole_legs(session: MachineSession, rng: np.random.Generator) -> BoolArray:
+    """Return all outlines of whole legs in images."""
+    key = session.outlines.row * session.legs.n_legs + session.outlines.leg
+    return np.asarray((rng.random(key.max() + 1) < SHARE)[key])
+
+
+CASES = [
+    ("hexapod", single),
+    ("3-rpr", single),
+    ("3-upu-tilted", pairs),
+    ("hexapod", whole_legs),
+    ("tricept", whole_legs),
+]
+
+
+@pytest.mark.parametrize(("name", "which"), thinned(CASES, [CASES[2], CASES[4]]))
+def test_a_fifth_of_the_outlines_wrong_costs_less_than_half_the_accuracy(
+    name: str, which: Callable[[MachineSession, np.random.Generator], BoolArray]
+) -> None:
+    session = _session(name)
+    of_sigma = []
+    for seed in range(N_SEEDS):
+        measurements, outlines = session.noisy(seed)
+        rng = np.random.default_rng(100 + seed)
+        wrong = which(session, rng)
+        assert 0.1 < wrong.mean() < 0.3
+        dirty = shifted(session, outlines, _shifts(session, wrong, rng, alone=which is single))
+        found = refine(session.legs, measurements, dirty, session.start)
+        clean = _clean(name, seed)
+        sigma = np.sqrt(np.diag(clean.kinematic_covariance))
+        free = sigma > 0.0  # all but twists
+        of_sigma.append([_errors(session, s)[free] / sigma[free] for s in (clean, found)])
+        assert not found.outlines.used[wrong].any()
+        assert (~found.outlines.used[~wrong]).sum() <= 2
+        assert all("px" in found.outlines.reason[i] for i in np.flatnonzero(wrong))
+    of_clean, of_dirty = np.sqrt(np.mean(np.square(of_sigma), axis=(0, 2)))
+    assert of_clean < 1.5
+    assert of_dirty < 1.5 * of_clean
+
+
+def _shifts(
+    session: MachineSession, wrong: BoolArray, rng: np.random.Generator, *, alone: bool
+) -> Array:
+    """Return how far ends are moved, 2 to 30 px: edges of a leg in an image together or alone."""
+    o = session.outlines
+    group = np.arange(len(o)) if alone else o.row * session.legs.n_legs + o.leg
+    n = int(group.max()) + 1
+    size = rng.uniform(2.0, 30.0, n) * rng.choice([-1.0, 1.0], n)
+    sign = np.where(o.edge == 1, 1.0, -1.0)
+    return np.where(wrong, size[group] * sign, 0.0)[:, None] * np.ones(2)
+
+
+def test_a_wrong_axis_hardly_bends_the_answer() -> None:
+    session = axes_session()
+    measurements, axes = session.noisy(0)
+    M = axes.M.copy()
+    M[4] += [0.0, 0.0, 0.05]  # 500 sigma
+    clean, bent = (
+        refine(session.legs, measurements, no_outlines(), session.start(), axes=some)
+        for some in (axes, replace(axes, M=M))
+    )
+    moved = session.errors(bent.parameters) - session.errors(clean.parameters)
+    assert np.abs(moved / clean.sigma).max() < 2.0
+    assert bent.chi2 > clean.chi2 + 1e4
+
+
+def find(outlines: Outlines, row: int, leg: int, edge: int) -> int:
+    found = (outlines.row == row) & (outlines.leg == leg) & (outlines.edge == edge)
+    return int(np.flatnonzero(found)[0])
+
+
+def test_a_rejected_outline_carries_how_far_it_is_and_the_edge_that_it_lies_on() -> None:
+    session = simulate(8)
+    o, names = session.outlines, session.legs.names
+    one, two = np.unique(o.leg[o.row == 2])[:2].tolist()
+    other = int(o.leg[o.row == 5][0])
+    swaps = {  # outlines that show another line, and what their reasons end with
+        find(o, 2, one, 1): (find(o, 2, two, 2), f" px, lies on edge 2 of {names[two]}.rod"),
+        find(o, 5, other, 1): (find(o, 5, other, 2), f" px, lies on edge 2 of {names[other]}.rod"),
+    }
+    shift = np.zeros((len(o), 2))
+    shift[99] = 5.4
+    outlines = moved_outlines(o, PINHOLE, shift)
+    h, ends = outlines.h.copy(), outlines.ends.copy()
+    for wrong, (right, _) in swaps.items():
+        h[wrong], ends[wrong] = o.h[right], o.ends[right]
+    outlines = replace(outlines, h=h, ends=ends)
+    found = refine(session.legs, session.measurements, outlines, disturbed_start(session))
+    assert set(np.flatnonzero(~found.outlines.used)) == {*swaps, 99}
+    assert found.outlines.reason[99] == "disagrees with the fit by 5.4 px"
+    for wrong, (_, reason) in swaps.items():
+        assert found.outlines.reason[wrong].startswith("disagrees with the fit by ")
+        assert found.outlines.reason[wrong].endswith(reason)
+    assert np.abs(joint_errors(found.parameters)).max() < 1e-9
+
+
+def test_errors_of_corners_are_found_in_their_residuals() -> None:
+    session = machine_session("hexapod")
+    measurements, outlines = session.noisy(3)
+    corners = corners_of(session, seed=4)
+    claimed = [
+        refine(
+            session.legs,
+            measurements,
+            outlines,
+            with_board(session, corners)[1],
+            board=with_board(session, replace(corners, sigma_px=factor * corners.sigma_px))[0],
+        ).sigma
+        for factor in (0.2, 5.0)
+    ]
+    np.testing.assert_allclose(claimed[0], claimed[1], rtol=0.05)
+
+
+def test_a_few_wrong_corners_do_little() -> None:
+    session = machine_session("hexapod")
+    measurements, outlines = session.noisy(5)
+    corners = corners_of(session, seed=6)
+    wrong = corners.corner % 9 == 0
+    px = corners.px + np.where(wrong[:, None], [3.0, -4.0], 0.0)
+    seen, start = with_board(session, corners)
+    right = refine(session.legs, measurements, outlines, start, board=seen)
+    bent = refine(
+        session.legs,
+        measurements,
+        outlines,
+        start,
+        board=replace(seen, corners=replace(corners, px=px)),
+    )
+    assert np.abs((_errors(session, bent) - _errors(session, right)) / right.sigma[:30]).max() < 1.0
+    assert {corner for _, corner in bent.rejected_corners} == {*range(0, BOARD.n_corners, 9)}
+    assert any("disagree with the fit and were left out" in note for note in bent.notes)
+
+
+def test_rejected_corners_and_a_board_in_no_image_are_left_out() -> None:
+    session = machine_session("hexapod")
+    corners = corners_of(session)
+    none = replace(corners, used=np.zeros(len(corners), dtype=np.bool_))
+    seen, start = with_board(session, none)
+    solution = refine(session.legs, session.measurements, session.outlines, start, board=seen)
+    assert (solution.T_Rb_board, solution.rms_corners_px) == (None, None)
+    assert BOARD_SCALE not in solution.values
+
+
+def biases_of(session: Session) -> EdgeBiases:
+    """Return all biases that the outlines of a session may share."""
+    observed = observed_outlines(session.outlines, session.measurements, session.legs)
+    return possible_biases(observed, session.legs.names)
+
+
+def shared_errors(
+    session: Session, rng: np.random.Generator, level: float, slope: float
+) -> Outlines:
+    """Return outlines whose edges err alike in all images of a view, and change with place."""
+    possible = biases_of(session)
+    sigma = np.array([0.0, 0.0, level, level, slope, slope])
+    values = sigma[possible.kind] * rng.standard_normal(len(possible))
+    shift = np.einsum("nc,nce->ne", values[possible.index], possible.shift)
+    return moved_outlines(noisy_outlines(session, rng), PINHOLE, shift)
+
+
+def scores_of(problem: FitProblem, state: State, possible: EdgeBiases) -> tuple[Array, Array]:
+    """Return the scores of all biases that outlines may share, and their covariance."""
+    possible_problem, there = with_edge_biases(problem, state, possible)
+    return scores_of_block(possible_problem, there, "biases")
+
+
+def test_scores_are_those_of_the_residuals_of_a_fit(session: Session) -> None:
+    rng = np.random.default_rng(4)
+    measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
+    problem = build_fit(session.legs, measurements, outlines)
+    state = problem.begin(disturbed_start(session, joints=1e-5, camera=1e-5, angle=1e-5))
+    whitening = np.asarray(problem.factor("outlines").whitening)
+    possible = biases_of(session)
+    z, K = scores_of(problem, state, possible)
+    linear = linearize(problem, state)
+    # All at once: outlines, readings and priors, without elimination.
+    J_all, r_all = jacobian(problem, linear), residuals(problem, state)
+    B = np.zeros((len(problem.outlines), 2, len(possible)))
+    shift = np.einsum("nij,ncj->nci", whitening, possible.shift)
+    for c in range(shift.shape[1]):
+        B[np.arange(len(B)), :, possible.index[:, c]] += shift[:, c]
+    B_all = np.zeros((len(r_all), len(possible)))
+    B_all[: 2 * len(B)] = B.reshape(-1, len(possible))
+    scale = np.linalg.norm(J_all, axis=0)
+    basis = np.linalg.svd(J_all / scale, full_matrices=False)[0]
+    left = B_all - basis @ (basis.T @ B_all)
+    np.testing.assert_allclose(K, left.T @ B_all, atol=1e-6 * np.abs(K).max())
+    np.testing.assert_allclose(z, left.T @ r_all, atol=1e-6 * np.abs(z).max())
+
+
+def test_scores_do_not_depend_on_the_biases_that_are_fitted(session: Session) -> None:
+    rng = np.random.default_rng(5)
+    measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
+    problem = build_fit(session.legs, measurements, outlines)
+    state = problem.begin(disturbed_start(session, joints=0.0, camera=0.0, angle=0.0))
+    possible = biases_of(session)
+    without = scores_of(problem, state, possible)
+    some = possible.of_sizes(np.array([0.0, 0.1, 0.2, 0.0, 0.1, 0.0]))
+    with_some, there = with_edge_biases(problem, state, some)
+    there = replace(there, biases=0.1 * rng.standard_normal(len(some)))
+    for one, other in zip(
+        without,
+        scores_of(with_some, there, possible),
+        strict=True,
+    ):
+        np.testing.assert_allclose(other, one, atol=1e-7 * np.abs(one).max())
+
+
+def test_biases_have_different_names(session: Session) -> None:
+    possible = biases_of(session)
+    assert len(set(possible.names)) == len(possible.names) == len(possible.kind)
+    assert {"all.bias", "c1.tilt", "leg1.rod.bias"} <= set(possible.names)
+    assert {"c1.leg5.rod.inward.bias", "c1.leg5.rod.sideways.tilt_x"} <= set(possible.names)
+    assert len(possible.of_sizes(np.zeros(N_KINDS))) == 0
+
+
+def test_shared_errors_are_found_and_weighed(session: Session) -> None:
+    start = disturbed_start(session)
+    normalised, sizes = [], []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        measurements = noisy_readings(session, rng)
+        outlines = shared_errors(session, rng, 0.06, 0.03)
+        found = refine(session.legs, measurements, outlines, start)
+        error = joint_errors(found.parameters)
+        normalised.append(error @ np.linalg.solve(found.kinematic_covariance, error) / len(error))
+        sizes.append(found.noise.scale)
+        assert {"bias", "tilt", "bias_x"} <= {name.rsplit(".", 1)[1] for name in found.biases}
+    assert np.mean(sizes) == pytest.approx(1.0, abs=0.1)
+    assert 0.7 < np.mean(normalised) < 1.5
+
+
+def test_independent_errors_are_not_taken_for_shared_ones(session: Session) -> None:
+    start = disturbed_start(session)
+    for seed in range(3):
+        rng = np.random.default_rng(100 + seed)
+        measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
+        found = refine(session.legs, measurements, outlines, start)
+        assert found.biases == {}
+        assert found.noise.bias_px == found.noise.tilt_px == 0.0
+
+
+def test_residuals_of_known_biases_give_their_sizes(session: Session) -> None:
+    possible = biases_of(session)
+    sigma, found = np.array([0.0, 0.0, 0.06, 0.04, 0.03, 0.0]), []
+    problem = build_fit(session.legs, session.measurements, session.outlines)
+    state = problem.begin(disturbed_start(session, joints=0.0, camera=0.0, angle=0.0))
+    K = scores_of(problem, state, possible)[1]
+    rng, value, vector = np.random.default_rng(0), *np.linalg.eigh(K)
+    root = vector * np.sqrt(np.maximum(value, 0.0))
+    for _ in range(25):
+        b = sigma[possible.kind] * rng.standard_normal(len(possible))
+        z = K @ b + root @ rng.standard_normal(len(possible))
+        found.append(estimated_biases(possible, z, K).sigma ** 2)
+    found_sigma = np.sqrt(np.mean(found, axis=0))[: len(KINDS)]
+    assert found_sigma == pytest.approx(sigma, rel=0.15, abs=0.03)
+
+
+def _fit_in_rounds(session: Session, level: float, n_rounds: int) -> Solution:
+    """Return a fit to outlines whose errors are shared by parts in views, in some rounds."""
+    rng = np.random.default_rng(3)
+    outlines = shared_errors(session, rng, level, 0.5 * level)
+    measurements, start = noisy_readings(session, rng), disturbed_start(session)
+    settings = RefinementSettings(noise_rounds=n_rounds)
+    return refine(session.legs, measurements, outlines, start, settings)
+
+
+def test_a_fit_that_still_changes_a_lot_is_refused(session: Session) -> None:
+    with pytest.raises(DidNotConverge, match=r"could not settle.*needed hardly any change"):
+        _fit_in_rounds(session, 0.2, 1)
+
+
+def test_a_fit_that_still_changes_a_little_says_so(session: Session) -> None:
+    (note,) = _fit_in_rounds(session, 0.2, 4).notes or ("",)
+    assert "not quite settled" in note
+    assert " px to 0." in note
+
+
+@pytest.mark.parametrize("level", thinned([0.0, 0.03, 0.2], [0.03]))
+def test_a_fit_with_the_usual_rounds_converges(session: Session, level: float) -> None:
+    assert _fit_in_rounds(session, level, DEFAULT_SETTINGS.noise_rounds).notes == ()
+
+
+def test_inliers_that_change_have_not_converged() -> None:
+    sizes, claimed = np.array([1.0, 0.0, 0.0]), np.broadcast_to(0.01 * np.eye(2), (100, 2, 2))
+    assert check_convergence(Changes(sizes, sizes, 1, 100), claimed, DEFAULT_SETTINGS) == ()
+    assert check_convergence(NO_CHANGES, claimed, DEFAULT_SETTINGS) == ()
+    (note,) = check_convergence(Changes(sizes, sizes, 4, 100), claimed, DEFAULT_SETTINGS)
+    assert "rejected 4 outlines anew, with 100 accepted" in note
+    with pytest.raises(DidNotConverge, match="rejected 6 outlines anew"):
+        check_convergence(Changes(sizes, sizes, 6, 100), claimed, DEFAULT_SETTINGS)
+
+
+def without_gamma(measurements: Measurements) -> Measurements:
+    """Return measurements of views of one camera whose gamma is not given."""
+    camera = replace(PINHOLE, gamma_is_given=False)
+    views = tuple(replace(view, camera=camera) for view in measurements.views)
+    return replace(measurements, views=views)
+
+
+def encoded(session: Session, log_gamma: float = LOG_GAMMA, seed: int = 3) -> Outlines:
+    """Return noisy outlines that were measured with a gamma of one, of a camera with another."""
+    rng = np.random.default_rng(seed)
+    outlines = noisy_outlines(session, rng)
+    by_gamma = rng.normal(0.0, 0.2, len(outlines))
+    inward = -by_gamma * log_gamma * EPSILON[outlines.edge - 1]
+    # Normals of moved_outlines point to one side of the leg: to the inside of one of both edges.
+    small = moved_outlines(outlines, PINHOLE, np.full((len(outlines), 2), 1e-3))
+    xy = PINHOLE.undistort(small.ends[:, 0])
+    side = np.sign(np.sum(outlines.h * np.column_stack([xy, np.ones(len(xy))]), axis=1))
+    moved = moved_outlines(outlines, PINHOLE, np.repeat((side * inward)[:, None], 2, axis=1))
+    return replace(moved, gamma=np.ones(len(moved)), by_gamma=by_gamma)
+
+
+def test_gamma_of_a_camera_is_found_by_its_outlines(session: Session) -> None:
+    measurements = without_gamma(session.measurements)
+    outlines = encoded(session)
+    start = disturbed_start(session)
+    found = refine(session.legs, measurements, outlines, start)
+    (gamma,) = found.gammas
+    assert gamma.views == ("c1", "c2", "c3")
+    assert gamma.measured_with == 1.0
+    assert gamma.fitted_sigma < 0.02
+    of_fit, unseen = gamma.fitted_sigma / RECOVERED_SHARE, np.log(gamma.gamma)  # as much again
+    assert gamma.sigma == pytest.approx(np.sqrt(of_fit**2 + unseen**2 + LIMB_SIGMA**2))
+    assert np.log(gamma.gamma) == pytest.approx(LOG_GAMMA, abs=0.06)  # the fit's own three sigmas
+    assert any("The gamma of the camera of views c1, c2, c3 is not told" in n for n in found.notes)
+    assert not any("gamma" in name for name in found.biases)
+    as_linear = refine(session.legs, session.measurements, outlines, start)
+    right, wrong = (np.sqrt(np.mean(joint_errors(s.parameters) ** 2)) for s in (found, as_linear))
+    assert right < wrong
+    assert found.rms_px is not None
+    assert as_linear.rms_px is not None
+    assert found.rms_px < 0.7 * as_linear.rms_px
+
+
+def test_view_whose_gamma_is_given_keeps_it(session: Session) -> None:
+    views = without_gamma(session.measurements).views
+    told = replace(views[0], camera=PINHOLE)
+    measurements = replace(session.measurements, views=(told, *views[1:]))
+    found = refine(session.legs, measurements, encoded(session), disturbed_start(session))
+    (gamma,) = found.gammas
+    assert gamma.views == ("c2", "c3")
+
+
+def test_used_outlines_say_with_which_gamma_they_were_measured(session: Session) -> None:
+    outlines = encoded(session)
+    outlines = replace(outlines, gamma=np.full(len(outlines), 1.8))
+    found = known_gammas(outlines, without_gamma(session.measurements))
+    assert found == dict.fromkeys(("c1", "c2", "c3"), 1.8)
+    assert known_gammas(outlines, session.measurements) == {}
+    rejected = replace(outlines, used=np.zeros(len(outlines), dtype=np.bool_))
+    assert known_gammas(rejected, without_gamma(session.measurements)) == {}
+
+
+def test_pull_of_a_gamma_is_that_of_its_sigma(session: Session) -> None:
+    measurements = without_gamma(session.measurements)
+    start, pulls = disturbed_start(session, joints=0.0, camera=0.0, angle=0.0), []
+    for seed in range(4):
+        found = refine(session.legs, measurements, encoded(session, seed=seed), start).gammas[0]
+        pulls.append((np.log(found.gamma) - LOG_GAMMA) / found.fitted_sigma)
+    assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 1.8
+
+
+def test_gammas_that_are_given_or_of_which_nothing_is_known_are_not_estimated(
+    session: Session,
+) -> None:
+    outlines, start = encoded(session, log_gamma=0.0), disturbed_start(session)
+    bare = replace(outlines, gamma=np.zeros(0), by_gamma=np.zeros(0))
+    given = refine(session.legs, session.measurements, outlines, start)
+    for measurements in (session.measurements, without_gamma(session.measurements)):
+        found = refine(session.legs, measurements, bare, start)
+        assert found.gammas == given.gammas == ()
+        assert found.values == given.values
+        np.testing.assert_array_equal(found.covariance, given.covariance)
+
+
+def test_each_camera_has_its_own_gamma(session: Session) -> None:
+    cameras = [
+        replace(PINHOLE, K=PINHOLE.K + 1e-9 * np.diag([k, k, 0.0]), gamma_is_given=k < 2)
+        for k in range(3)
+    ]
+    views = tuple(
+        replace(view, camera=camera)
+        for view, camera in zip(session.measurements.views, cameras, strict=True)
+    )
+    measurements = replace(session.measurements, views=views)
+    of_last = measurements.view[session.outlines.row] == 2
+    outlines = encoded(session)
+    linear = encoded(session, log_gamma=0.0)
+    h = np.where(of_last[:, None], outlines.h, linear.h)
+    ends = np.where(of_last[:, None, None], outlines.ends, linear.ends)
+    mixed = replace(outlines, h=h, ends=ends)
+    (gamma,) = refine(session.legs, measurements, mixed, disturbed_start(session)).gammas
+    assert gamma.views == ("c3",)
+    assert np.log(gamma.gamma) == pytest.approx(LOG_GAMMA, abs=0.1)
+
+
+@pytest.mark.parametrize("share", [0.35, 0.6, 1.0])
+@pytest.mark.parametrize("true", [1.0, 1.6, 2.2])
+def test_search_of_a_gamma_converges(true: float, share: float) -> None:
+    read, found = 1.0, list[tuple[EstimatedGamma, ...]]()
+    for _ in range(4):
+        seen = share * np.log(true / read)
+        found.append((EstimatedGamma(("c1", "c2"), read * float(np.exp(seen)), 0.05, read),))
+        gammas = next_gammas(found)
+        if not gammas:
+            break
+        assert set(gammas) == {"c1", "c2"}
+        assert GAMMA_RANGE[0] <= gammas["c1"] <= GAMMA_RANGE[1]
+        assert abs(np.log(gammas["c1"] / read)) <= MAX_GAMMA_STEP + 1e-12
+        read = gammas["c1"]
+    assert gammas == {}
+    assert abs(np.log(true / read)) <= GAMMA_TOLERANCE / share + 1e-12
+
+
+def test_note_on_a_gamma_says_how_well_it_is_known_and_names_few_views() -> None:
+    clear = str(EstimatedGamma(("c1",), 2.1, 0.05, 2.0))
+    assert clear.startswith("The gamma of the camera of view c1 is not told: found 2.10 +- 0.43 by")
+    vague = str(EstimatedGamma(tuple(f"c{k}" for k in range(8)), 1.2, 0.4, 1.0))
+    assert "of views c0, c1, c2, c3, c4 and 3 more is not told, and its outlines hardly" in vague
+
+
+@pytest.mark.parametrize(
+    ("gamma", "sigma", "measured_with", "expected"),
+    [
+        (0.6, 0.05, 1.0, {}),  # no camera has these
+        (4.5, 0.05, 2.9, {}),
+        (0.6, 0.05, 1.5, {"c1": 1.0}),
+        (1.3, 0.2, 1.0, {}),  # may be chance
+        (1.3, 0.1, 1.0, {"c1": pytest.approx(1.3**2)}),
+    ],
+)
+def test_next_gamma_is_significant_and_one_that_cameras_have(
+    gamma: float, sigma: float, measured_with: float, expected: dict[str, float]
+) -> None:
+    found = EstimatedGamma(("c1",), gamma, sigma, measured_with)
+    assert next_gammas([(found,)]) == expected
+
+
+@pytest.mark.slow
+def test_photographs_without_a_gamma_are_read_with_the_one_they_show(tmp_path: Path) -> None:
+    session = settings(level="photographs", poses=5, views=3, seed=1, tell_gamma=False)
+    data = simulate_folder("hexapod", tmp_path / "data", session).folder
+    assert "gamma" not in (data / "dataset.yaml").read_text()
+    assert any("c1, c2, c3 is not told and was taken as 1" in n for n in detect(data).notes)
+    found = legcal.calibrate(data)
+    (gamma,) = found.solution.gammas
+    assert abs(np.log(gamma.gamma / 2.2)) < 3.0 * gamma.sigma
+    assert gamma.gamma > 1.4
+    assert gamma.measured_with > 1.3
+    with (data / "observations.csv").open(newline="") as file:
+        read = {row["gamma"] for row in csv.DictReader(file)} - {""}
+    assert {float(cell) for cell in read} == {gamma.measured_with}
+    again = legcal.calibrate(data)  # by the table, which knows with what it was measured
+    assert again.solution.gammas[0].gamma == pytest.approx(gamma.gamma, rel=1e-6)

@@ -1,0 +1,188 @@
+"""Effects of errors in what counts as known are those of fits with them; focal lengths too."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hexapod_session import (
+    LENS,
+    PINHOLE,
+    RADIUS,
+    Session,
+    disturbed_start,
+    noisy_outlines,
+    noisy_readings,
+    simulate,
+)
+from machine_session import machine_session
+
+from legcal.calibration.joint_fit import NO_CHOICES, Choices, Prior, Solution, refine
+from legcal.data import Measurements, Outlines
+from legcal.geometry import Array
+from legcal.machine import moved_legs
+from legcal.vision import Camera, with_intrinsics
+
+PART = 1e-3  # of the errors whose effects are reported
+RADII = [f"leg{j}.radius.rod" for j in range(1, 7)]
+FOCAL = "a focal length 1 % longer"
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    return simulate(8, camera=LENS)
+
+
+def with_camera(
+    measurements: Measurements, outlines: Outlines, camera: Camera
+) -> tuple[Measurements, Outlines]:
+    """Return the same pixels, taken for those of another camera."""
+    views = tuple(replace(view, camera=camera) for view in measurements.views)
+    xy = camera.undistort(outlines.ends)
+    rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+    h = np.cross(rays[:, 0], rays[:, 1])
+    h /= np.linalg.norm(h, axis=1, keepdims=True)
+    h *= np.sign(np.sum(h * outlines.h, axis=1, keepdims=True))
+    return replace(measurements, views=views), replace(outlines, h=h)
+
+
+def _fit(session: Session, choices: Choices = NO_CHOICES, camera: Camera | None = None) -> Solution:
+    data = session.measurements, session.outlines
+    if camera is not None:
+        data = with_camera(*data, camera)
+    return refine(session.legs, *data, disturbed_start(session), choices=choices)
+
+
+def _steps(found: Solution) -> dict[str, Array]:
+    return {s.what: s.steps[:, 0] for s in found.sensitivities}
+
+
+def _assert_moved(found: Solution, mistaken: Solution, what: str) -> None:
+    """Check that a fit with a part of an error is moved by that part of its effect."""
+    step, names = _steps(found)[what], found.parametrization.names
+    moved = np.array([mistaken.values[n] - found.values[n] for n in names]) / PART
+    assert np.linalg.norm(step) > 1e-8
+    np.testing.assert_allclose(moved, step, atol=0.02 * float(np.abs(step).max()))
+
+
+@pytest.mark.parametrize(
+    ("what", "changes"),
+    [
+        (FOCAL, {"fx": 12.9, "fy": 12.9}),
+        ("a principal point 0.1 px further right", {"cx": 0.1}),
+        ("a principal point 0.1 px further down", {"cy": 0.1}),
+    ],
+)
+def test_a_wrong_camera_moves_the_fit_as_predicted(
+    session: Session, what: str, changes: dict[str, float]
+) -> None:
+    camera = {"fx": 1290.0, "fy": 1290.0, "cx": 518.0, "cy": 380.0}
+    wrong = {name: camera[name] + PART * step for name, step in changes.items()}
+    _assert_moved(_fit(session), _fit(session, camera=with_intrinsics(LENS, wrong)), what)
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_wrong_radii_move_the_fit_as_predicted(session: Session, stated: bool) -> None:
+    def choices(radius: float) -> Choices:
+        if stated:
+            return Choices(priors=dict.fromkeys(RADII, Prior(radius, 1e-6)))
+        return Choices(fixed=frozenset(RADII), values=dict.fromkeys(RADII, radius))
+
+    found, mistaken = (_fit(session, choices(RADIUS * (1.0 + p))) for p in (0.0, 0.01 * PART))
+    _assert_moved(found, mistaken, "radii 1 % larger")
+
+
+def test_a_wrong_prior_of_a_camera_moves_the_fit_as_predicted(session: Session) -> None:
+    def choices(focal: float) -> Choices:
+        return Choices(priors={"c1.fx": Prior(focal, 1.0), "c1.fy": Prior(focal, 1.0)})
+
+    found, mistaken = (_fit(session, choices(f)) for f in (1290.0, 1290.0 + 12.9 * PART))
+    _assert_moved(found, mistaken, FOCAL)
+
+
+def test_what_is_estimated_does_not_count_as_known(session: Session) -> None:
+    choices = Choices(free=frozenset(["c1.fx", "c1.fy", *RADII]))
+    assert set(_steps(_fit(session, choices))) == {
+        "a principal point 0.1 px further right",
+        "a principal point 0.1 px further down",
+    }
+
+
+def _assert_moved_to(was: Array, moved: Array, expected: Array) -> None:
+    largest = float(np.abs(expected - was).max())
+    np.testing.assert_allclose(moved, expected, atol=0.03 * largest)
+
+
+@pytest.mark.parametrize("name", ["3-rpr", "tricept"])
+def test_legs_on_constraints_move_as_predicted(name: str) -> None:
+    session = machine_session(name)
+    camera = session.measurements.views[0].camera
+    wrong = with_intrinsics(camera, {"fx": 1290.0 + 0.0129, "fy": 1280.0 + 0.0128})
+    data = session.measurements, session.outlines
+    found = refine(session.legs, *data, session.start)
+    mistaken = refine(session.legs, *with_camera(*data, wrong), session.start)
+    step = _steps(found)[FOCAL]
+    assert np.linalg.norm(step) > 1e-6
+    predicted = moved_legs(found.legs, found.parametrization.place, PART * step)
+    _assert_moved_to(*map(session.legs.vector, (found.legs, mistaken.legs, predicted)))
+
+
+@pytest.mark.parametrize("model", ["3-upu-tilted", "tricept"])
+def test_a_wrong_twist_moves_the_fit_as_predicted(model: str) -> None:
+    session = machine_session(model)
+    data = (session.legs, *session.noisy(0), session.start)
+    found, part = refine(*data), 0.1
+    effect = next(s for s in found.sensitivities if "twist" in s.what)
+    name = next(n for n in found.parametrization.names if n.endswith(".twist"))
+    twist = found.values[name] + part * np.radians(0.1)
+    mistaken = refine(*data, choices=Choices(fixed=frozenset({name}), values={name: twist}))
+    predicted = moved_legs(found.legs, found.parametrization.place, part * effect.steps[:, 0])
+    _assert_moved_to(*map(session.legs.vector, (found.legs, mistaken.legs, predicted)))
+
+
+def fitted(
+    session: Session, seed: int, factor: float, free: frozenset[str] = frozenset()
+) -> Solution:
+    """Return the fit of noisy data with a wrong focal length."""
+    rng = np.random.default_rng(seed)
+    measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
+    camera = session.measurements.views[0].camera
+    scaled = {key: factor * camera.K[i, i] for i, key in enumerate(("fx", "fy"))}
+    camera = with_intrinsics(camera, scaled)
+    measurements, outlines = with_camera(measurements, outlines, camera)
+    choices = Choices(frozenset(), free, {})
+    return refine(session.legs, measurements, outlines, disturbed_start(session), choices=choices)
+
+
+def notes_on_focal_lengths(solution: Solution) -> list[str]:
+    return [note for note in solution.notes if "focal length" in note]
+
+
+@pytest.mark.parametrize(("camera", "factor"), [(PINHOLE, 0.99), (LENS, 1.01)])
+def test_a_focal_length_wrong_by_one_percent_is_noticed(camera: Camera, factor: float) -> None:
+    solution = fitted(simulate(12, camera=camera), 0, factor)
+    (note,) = notes_on_focal_lengths(solution)
+    assert solution.focal_doubt == pytest.approx(0.01, abs=0.004)
+    found = float(note.partition("found fx = ")[2].partition(" +-")[0])
+    assert found == pytest.approx(1290.0, abs=5.0)
+    assert note.startswith("The focal length of c1 does not agree with the measurements")
+    assert f"given {1290.0 * factor:.1f} px" in note
+
+
+def test_a_right_focal_length_is_left_alone() -> None:
+    session = simulate(8)
+    for seed in range(4):
+        solution = fitted(session, seed, 1.0)
+        assert notes_on_focal_lengths(solution) == []
+        assert solution.focal_doubt == 0.0
+
+
+def test_nothing_is_said_where_the_noise_hides_it() -> None:
+    assert notes_on_focal_lengths(fitted(simulate(12, sigma_px=1.0), 0, 1.01)) == []
+
+
+def test_a_focal_length_that_is_estimated_is_not_tested() -> None:
+    solution = fitted(simulate(12), 0, 1.01, frozenset({"c1.fx", "c1.fy"}))
+    assert notes_on_focal_lengths(solution) == []
+    sigma = solution.sigma[solution.names.index("c1.fx")]
+    assert abs(solution.values["c1.fx"] - 1290.0) < 4.0 * sigma
+    assert sigma < 4.0

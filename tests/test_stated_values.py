@@ -1,0 +1,353 @@
+"""Fixed, freed and prior values act in the fit; those that contradict measurements are refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from board_session import BOARD, corners_of, with_board
+from machine_session import LENS, MachineSession, machine_session, shifted
+from thinned import thinned
+
+from legcal.calibration.joint_fit import (
+    BOARD_SCALE,
+    NO_CHOICES,
+    Choices,
+    Prior,
+    Solution,
+    refine,
+)
+from legcal.data import View
+from legcal.errors import DidNotConverge, NotIdentifiable
+from legcal.vision import Board, with_intrinsics
+
+
+@pytest.fixture(scope="module")
+def session() -> MachineSession:
+    return machine_session("hexapod", n_poses=6)
+
+
+@pytest.fixture(scope="module")
+def noisy() -> MachineSession:
+    exact = machine_session("hexapod", n_poses=10)
+    measurements, outlines = exact.noisy(4)
+    return replace(exact, measurements=measurements, outlines=outlines)
+
+
+def fitted(session: MachineSession, choices: Choices = NO_CHOICES) -> Solution:
+    return refine(
+        session.legs, session.measurements, session.outlines, session.start, choices=choices
+    )
+
+
+def true_values(session: MachineSession) -> dict[str, float]:
+    legs = session.legs
+    truth = legs.vector(session.truth.legs).tolist()
+    return dict(zip(legs.parametrization.names, truth, strict=True))
+
+
+def fixed_at(values: dict[str, float]) -> Choices:
+    return Choices(fixed=frozenset(values), values=values)
+
+
+def assert_exact(session: MachineSession, found: Solution, tolerance: float = 1e-8) -> None:
+    away = session.legs.vector(found.legs) - session.legs.vector(session.truth.legs)
+    assert np.abs(away).max() < tolerance
+
+
+def with_wrong_cameras(session: MachineSession, number: float, key: str) -> MachineSession:
+    """Return a session whose camera files have another number; pixels stay as they are."""
+    camera = with_intrinsics(LENS, {key: number})
+    views = tuple(View(view.name, camera) for view in session.measurements.views)
+    xy = camera.undistort(session.outlines.ends)
+    rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+    h = np.cross(rays[:, 0], rays[:, 1])
+    h *= np.sign(np.sum(h * session.outlines.h, axis=1, keepdims=True))
+    h /= np.linalg.norm(h, axis=1, keepdims=True)
+    measurements = replace(session.measurements, views=views)
+    return replace(session, measurements=measurements, outlines=replace(session.outlines, h=h))
+
+
+def test_fixed_parameters_stay_at_nominal_or_at_their_values(session: MachineSession) -> None:
+    names = frozenset({"leg2.offset", "leg4.base.x", "leg1.radius.leg1_tube"})
+    at_truth = replace(session, legs=replace(session.legs, nominal=session.truth.legs))
+    found, true = fitted(at_truth, Choices(fixed=names)), true_values(at_truth)
+    assert_exact(at_truth, found)
+    for name in ("leg2.offset", "leg4.base.x"):
+        assert found.values[name] == true[name]
+    assert found.radii[0, "leg1_tube"] == session.legs.radii[0, "leg1_tube"]
+    assert all(found.status[name] == "fixed" for name in names)
+    assert names.isdisjoint(found.names)
+    parameters = session.legs.parametrization.names
+    at = [parameters.index("leg2.offset"), parameters.index("leg4.base.x")]
+    assert not found.kinematic_covariance[at].any()
+    assert found.kinematic_covariance[parameters.index("leg1.offset")].any()
+    value = true_values(session)["leg3.offset"]
+    found = fitted(session, fixed_at({"leg3.offset": value}))
+    assert found.values["leg3.offset"] == pytest.approx(value, abs=1e-15)
+    assert_exact(session, found)
+
+
+@pytest.mark.parametrize("name", ["leg2.base_axis.1", "leg1.platform_axis.2"])
+def test_an_axis_fixed_at_an_angle_stays_there(name: str) -> None:
+    session = machine_session("3-rps" if "base" in name else "3-spr")
+    value = true_values(session)[name]
+    found = fitted(session, fixed_at({name: value}))
+    assert found.values[name] == pytest.approx(value, abs=1e-12)
+    assert found.status[name] == "fixed"
+    assert_exact(session, found, 1e-7)
+
+
+def test_a_tight_prior_pins_and_a_loose_one_adds_information(noisy: MachineSession) -> None:
+    plain = fitted(noisy)
+    at = plain.names.index("leg1.offset")
+    mean, sigma = plain.values["leg1.offset"], float(plain.sigma[at])
+    pinned = fitted(noisy, Choices(priors={"leg1.offset": Prior(mean + sigma, 1e-9)}))
+    assert pinned.values["leg1.offset"] == pytest.approx(mean + sigma, abs=1e-10)
+    assert pinned.sigma[at] == pytest.approx(1e-9, rel=1e-3)
+    # A prior as good as the data goes half the way, and the variance is half.
+    half = fitted(noisy, Choices(priors={"leg1.offset": Prior(mean + sigma, sigma)}))
+    assert half.values["leg1.offset"] == pytest.approx(mean + 0.5 * sigma, abs=0.1 * sigma)
+    assert half.sigma[at] == pytest.approx(np.sqrt(0.5) * sigma, rel=0.02)
+    assert half.dof == plain.dof + 1
+
+
+def test_a_freed_radius_has_no_prior(session: MachineSession) -> None:
+    radii = {part: 1.04 * r for part, r in session.legs.radii.items()}
+    wrong = replace(session, legs=replace(session.legs, radii=radii))
+    names = [f"{session.legs.names[j]}.radius.{part}" for j, part in radii]
+    found = fitted(wrong, Choices(free=frozenset(names)))
+    for part, radius in session.legs.radii.items():
+        assert found.radii[part] == pytest.approx(radius, abs=1e-9)
+    # With the priors, two hundredths and two sigmas off, a little of them is left.
+    with_priors = fitted(wrong)
+    off = [abs(with_priors.radii[part] - r) for part, r in session.legs.radii.items()]
+    assert min(off) > 1e-9
+
+
+@pytest.mark.parametrize(
+    ("key", "wrong", "true"), [("fx", 1303.0, 1290.0), ("cx", 520.0, 518.0), ("k1", -0.10, -0.12)]
+)
+def test_a_freed_intrinsic_is_found(
+    session: MachineSession, key: str, wrong: float, true: float
+) -> None:
+    wrong_cameras = with_wrong_cameras(session, wrong, key)
+    found = fitted(wrong_cameras, Choices(free=frozenset({f"c1.{key}"})))
+    assert found.status[f"c1.{key}"] == "estimated"
+    assert found.values[f"c1.{key}"] == pytest.approx(true, rel=1e-6)
+    assert_exact(session, found, 1e-7)
+    # Equal cameras are one camera.
+    assert len({camera.K[0, 0] for camera in found.cameras}) == 1
+
+
+def test_an_intrinsic_fixed_at_its_value_is_used(session: MachineSession) -> None:
+    wrong_cameras = with_wrong_cameras(session, 1303.0, "fx")
+    found = fitted(wrong_cameras, fixed_at({"c1.fx": 1290.0}))
+    assert found.cameras[0].K[0, 0] == 1290.0
+    assert_exact(session, found)
+
+
+def test_a_freed_intrinsic_that_nothing_determines_is_refused(session: MachineSession) -> None:
+    with pytest.raises(NotIdentifiable, match=r"leave open .*of camera c1"):
+        fitted(session, Choices(free=frozenset({"c1.k1", "c1.k2", "c1.k3", "c1.fx", "c1.fy",
+                                                "c1.p1", "c1.p2", "c1.cx", "c1.cy"})))  # fmt: skip
+
+
+def test_priors_determine_what_images_do_not() -> None:
+    session = machine_session("3-upu")
+    free = fitted(session)
+    assert free.status["leg2.base.x"] == "weak"
+    name = "leg2.base.x"
+    known = Choices(priors={name: Prior(true_values(session)[name], 1e-5)})
+    found = fitted(session, known)
+    assert len(found.held) == len(free.held) - 1
+    assert found.status[name] == "estimated"
+    assert found.values[name] == pytest.approx(true_values(session)[name], abs=1e-5)
+
+
+def test_what_is_held_stays_at_nominal() -> None:
+    session = machine_session("3-upu")
+    found = fitted(session)
+    legs = session.legs
+    names = legs.parametrization.names
+    change = legs.vector(found.legs) - legs.vector(legs.nominal)
+    pairs = [
+        [names.index(f"leg{j}.{side}_axis.{angle}") for side in ("base", "platform")]
+        for j in (1, 2, 3)
+        for angle in (1, 2)
+    ]
+    # Base and platform axes part, as the truth wants, and their means stay.
+    assert np.abs(change[pairs].sum(axis=1)).max() < 1e-3
+    assert np.abs(change[pairs]).max() > 5e-3
+    assert sum("axis" in words for words in found.held) == 6
+    weak = {name for name, status in found.status.items() if status == "weak"}
+    assert weak.isdisjoint(found.names)
+
+
+def test_two_priors_that_contradict_each_other_are_refused() -> None:
+    session = machine_session("3-upu", n_poses=5)
+    found = [true_values(session)[n] for n in ("leg2.base.x", "leg3.base.y")]
+    choices = Choices(
+        priors={
+            "leg2.base.x": Prior(found[0], 1e-5),
+            "leg3.base.y": Prior(found[1] + 0.005, 1e-5),
+        }
+    )
+    with pytest.raises(DidNotConverge, match=r"prior of leg\d\.base\.\w contradicts"):
+        fitted(session, choices)
+
+
+@pytest.mark.parametrize(
+    ("values", "found"),
+    [
+        ({"leg1.offset": 0.0042}, "they say about {true:.3g}"),
+        ({"leg1.offset": -0.15}, "they say about {true:.3g}"),
+        ({"leg2.offset": 0.0, "leg3.base.x": 2e-3, "leg4.platform.y": 0.0}, "leg3.base.x"),
+    ],
+)
+def test_wrong_fixed_values_are_refused_with_those_of_the_measurements(
+    noisy: MachineSession, values: dict[str, float], found: str
+) -> None:
+    true = true_values(noisy)
+    with pytest.raises(DidNotConverge) as refusal:
+        fitted(noisy, fixed_at({name: true[name] + away for name, away in values.items()}))
+    (problem,) = refusal.value.problems
+    wrong = max(values, key=lambda name: abs(values[name]))
+    assert problem.startswith(f"The fixed value of {wrong} contradicts the measurements")
+    assert found.format(true=true[wrong]) in problem
+
+
+@pytest.mark.parametrize(
+    ("choices", "found"),
+    [
+        (fixed_at({"leg1.radius.leg1_tube": 1.2 * 0.0125}), r"fixed value of leg1\.radius\.leg1_"),
+        (fixed_at({"c1.fx": 1303.0}), r"fixed value of c1\.fx .*they say about 1290 px"),
+        (Choices(priors={"leg1.offset": Prior(0.5, 1e-4)}), r"prior of leg1\.offset contradicts"),
+    ],
+    ids=["radius", "intrinsic", "prior"],
+)
+def test_other_stated_values_that_contradict_measurements_are_refused(
+    noisy: MachineSession, choices: Choices, found: str
+) -> None:
+    with pytest.raises(DidNotConverge, match=found):
+        fitted(noisy, choices)
+
+
+@pytest.mark.parametrize("scale", thinned([1.0, 4.0], [4.0]))
+@pytest.mark.parametrize("part", ["offset", "platform", "radius"])
+def test_right_fixed_values_are_accepted_whatever_outlines_claim(part: str, scale: float) -> None:
+    exact = machine_session("hexapod", n_poses=10)
+    measurements, outlines = exact.noisy(5)
+    claimed = replace(outlines, covariance=outlines.covariance / scale**2)
+    session = replace(exact, measurements=measurements, outlines=claimed)
+    radii = {f"{exact.legs.names[j]}.radius.{p}": r for (j, p), r in exact.legs.radii.items()}
+    values = {n: v for n, v in (true_values(exact) | radii).items() if f".{part}" in n}
+    found = fitted(session, fixed_at({n: v for n, v in values.items() if "axis" not in n}))
+    assert found.notes == ()
+
+
+def test_right_fixed_values_are_accepted_beside_wrong_outlines(noisy: MachineSession) -> None:
+    rng = np.random.default_rng(7)
+    n = len(noisy.outlines)
+    wrong = rng.random(n) < 0.2
+    sign = np.where(rng.random(n) < 0.5, 1.0, -1.0)
+    offsets = (wrong * sign * rng.uniform(2.0, 30.0, n))[:, None] * np.ones(2)
+    outlines = shifted(noisy, noisy.outlines, offsets)
+    true = true_values(noisy)
+    choices = fixed_at({name: true[name] for name in ("leg1.offset", "leg2.base.x")})
+    found = fitted(replace(noisy, outlines=outlines), choices)
+    (note,) = found.notes
+    assert note.startswith(f"The fit left out {wrong.sum()} of {n} outlines that disagree")
+
+
+def test_a_leg_most_of_whose_outlines_disagree_is_named(noisy: MachineSession) -> None:
+    own = np.flatnonzero(noisy.outlines.leg == 3)
+    offsets = np.zeros((len(noisy.outlines), 2))
+    offsets[own[: 2 * len(own) // 3]] = 12.0 * (-1.0) ** np.arange(2 * len(own) // 3)[:, None]
+    outlines = shifted(noisy, noisy.outlines, offsets)
+    choices = Choices(priors={"leg4.offset": Prior(true_values(noisy)["leg4.offset"], 1e-3)})
+    found = fitted(replace(noisy, outlines=outlines), choices)
+    (note,) = found.notes
+    assert f"{2 * len(own) // 3} of {len(own)} of leg4" in note
+    assert "what was stated of leg4.offset" in note
+    assert "leg3" not in note
+
+
+def test_a_fit_that_priors_keep_from_converging_names_them() -> None:
+    session = machine_session("3-upu")
+    choices = Choices(
+        priors={
+            name: Prior(0.0, 1e-4)
+            for name in session.legs.parametrization.names
+            if ".base." in name
+        }
+    )
+    with pytest.raises(DidNotConverge) as found:
+        fitted(session, choices)
+    assert "leg2.base.x" in found.value.problems[0]
+
+
+def test_a_prior_far_off_is_named_with_that_of_the_measurements() -> None:
+    session = machine_session("tricept")
+    true = true_values(session)["centre.twist"]
+    choices = Choices(priors={"centre.twist": Prior(true - 1.4, 2e-4)})
+    with pytest.raises(DidNotConverge, match=r"prior of centre\.twist contradicts"):
+        fitted(session, choices)
+
+
+@pytest.mark.parametrize(("factor", "way"), [(0.9, "10 % smaller"), (1.1, "10 % larger")])
+def test_a_wrong_encoder_scale_shows_in_the_radii(factor: float, way: str) -> None:
+    session = machine_session("hexapod", n_poses=10)
+    measurements, outlines = session.noisy(6)
+    measurements = replace(measurements, q=factor * measurements.q)
+    found = fitted(replace(session, measurements=measurements, outlines=outlines))
+    assert any(note.startswith(f"All radii come out {way}") for note in found.notes)
+
+
+def test_one_wrong_radius_is_no_wrong_scale(noisy: MachineSession) -> None:
+    radii = {part: r * (1.1 if part[0] == 0 else 1.0) for part, r in noisy.legs.radii.items()}
+    found = fitted(replace(noisy, legs=replace(noisy.legs, radii=radii)))
+    assert found.notes == ()
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.02])
+def test_a_board_of_other_dimensions_is_refused(factor: float) -> None:
+    session = machine_session("hexapod")
+    measurements, outlines = session.noisy(7)
+    seen, start = with_board(session, corners_of(session, seed=8))
+    wrong = replace(seen, board=Board("chessboard", 7, 6, factor * BOARD.side))
+    with pytest.raises(DidNotConverge, match=r"board does not fit .* measure the bo") as refusal:
+        refine(session.legs, measurements, outlines, start, board=wrong)
+    size = float(str(refusal.value).split("found that it is ")[1].split(" times")[0])
+    assert size == pytest.approx(1.0 / factor, rel=3e-3)
+
+
+def test_the_size_of_a_board_can_be_left_to_the_fit_or_known_or_fixed() -> None:
+    session = machine_session("hexapod")
+    measurements, outlines = session.noisy(9)
+    seen, start = with_board(session, corners_of(session, seed=10))
+    wrong = replace(seen, board=Board("chessboard", 7, 6, 0.98 * BOARD.side))
+    everything = session.legs, measurements, outlines, start
+    found = refine(*everything, board=wrong, choices=Choices(free=frozenset({BOARD_SCALE})))
+    assert found.values[BOARD_SCALE] == pytest.approx(1.0 / 0.98, abs=2e-3)
+    known = Choices(priors={BOARD_SCALE: Prior(1.0 / 0.98, 1e-4)})
+    assert refine(*everything, board=wrong, choices=known).values[BOARD_SCALE] == pytest.approx(
+        1.0 / 0.98, abs=3e-4
+    )
+    fixed = Choices(fixed=frozenset({BOARD_SCALE}))
+    held = refine(*everything, board=seen, choices=fixed)
+    assert BOARD_SCALE not in held.names
+    assert held.T_Rb_board is not None
+    stated = Choices(priors={BOARD_SCALE: Prior(1.0, 1e-3)})
+    with pytest.raises(DidNotConverge, match=rf"prior of {BOARD_SCALE} contradicts"):
+        refine(*everything, board=wrong, choices=stated)
+
+
+def test_a_size_that_little_is_known_of_is_not_refused() -> None:
+    """One view that shows the board says nothing of its size that its distance could not."""
+    session = machine_session("3-rpr")
+    measurements, outlines = session.noisy(13)
+    corners = corners_of(session, seed=14)
+    once = replace(corners, used=corners.used & (measurements.view[corners.row] == 0))
+    seen, start = with_board(session, once)
+    solution = refine(session.legs, measurements, outlines, start, board=seen)
+    assert solution.values[BOARD_SCALE] == pytest.approx(1.0, abs=5e-3)
