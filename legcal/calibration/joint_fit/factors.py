@@ -153,10 +153,7 @@ class ObservedOutlines:
     def offsets(self, keys: tuple[str, ...], state: State) -> Array:
         """Return how far both ends are from the predicted outline, (n, 2) [px]."""
         local, *_ = self._local(keys, state)
-        r = outline_residual().values(local, self.constants)
-        return np.asarray(
-            r - np.einsum("nc,ncq->nq", state.biases[self.bias_index], self.bias_shift)
-        )
+        return self._corrected(outline_residual().values(local, self.constants), state)
 
     def rows(self, keys: tuple[str, ...], state: State) -> Rows:
         """Return these offsets with their derivatives."""
@@ -164,13 +161,18 @@ class ObservedOutlines:
         r, slope = outline_residual().evaluate(local, self.constants)
         if not self.bias_index.shape[1] and not keys:
             return Rows(r, slope[..., :7], ends.with_others)
-        r = r - np.einsum("nc,ncq->nq", state.biases[self.bias_index], self.bias_shift)
         along = slope[..., 7:].reshape(len(self), 2, 2, 2)  # by (end, coordinate)
         others = [
             -np.swapaxes(self.bias_shift, 1, 2),
             np.einsum("nqec,neck->nqk", along, by_intrinsics),
         ]
-        return Rows(r, np.concatenate([slope[..., :7], *others], axis=-1), ends.with_others)
+        slope = np.concatenate([slope[..., :7], *others], axis=-1)
+        return Rows(self._corrected(r, state), slope, ends.with_others)
+
+    def _corrected(self, r: Array, state: State) -> Array:
+        """Return offsets (n, 2) without common-mode biases."""
+        r = r - np.einsum("nc,ncq->nq", state.biases[self.bias_index], self.bias_shift)
+        return np.asarray(r)
 
     def _local(self, keys: tuple[str, ...], state: State) -> tuple[Array, _Ends, Array]:
         ends = _ends_in_camera(state, self.leg, self.view, self.pose)
