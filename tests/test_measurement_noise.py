@@ -260,13 +260,8 @@ def canny_errors(
         Bar(np.array([x - lean, 0.16, 0.8]), np.array([x + lean, -0.16, 0.84]), 0.011, 170.0)
         for x, lean in places
     ]
-    looks = {
-        "blur": 0.5,
-        "noise": 1.0,
-        "supersample": 3,
-        "light": Light(ambient=1.0, diffuse=0.0),
-    } | looks
-    pixels = np.rint(change(render(camera, bars, 40.0, looks.pop("light"), **looks)))
+    scene: dict[str, Any] = {"light": FLAT, "blur": 0.5, "noise": 1.0, "supersample": 3, **looks}
+    pixels = np.rint(change(render(camera, bars, 40.0, **scene)))
     rng, one, n = np.random.default_rng(0), np.zeros(1, dtype=np.intp), len(bars)
     A, B = (np.array([getattr(b, end) for b in bars])[None] for end in "AB")
     m = Measurements((View("c1", camera),), ("a.png",), one, one, np.zeros((1, n)), 1e-6)
