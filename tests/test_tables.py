@@ -220,6 +220,12 @@ def test_legs_that_a_view_leaves_out_are_rejected() -> None:
         (outlines_of(3, rejected=0.0), 2, {"residual": "-1"}, ("column residual", "'-1'")),
         (outlines_of(3, rejected=0.0), 2, {"contrast": "inf"}, ("column contrast", "'inf'")),
         (outlines_of(3, rejected=0.0), 2, {"by_gamma": "nan"}, ("column by_gamma", "'nan'")),
+        (
+            outlines_of(3, rejected=0.0),
+            2,
+            {"s00": "1", "s01": "2", "s11": "1"},
+            ("columns s00, s01, s11", "(1, 2, 1)"),
+        ),
         (outlines_of(3), 1, {"verdict": "rejected", "a": "left"}, ("column a", "'left'")),
         (axes_of(), 5, {"z": "-1e300"}, ("column z", "-1000 to 1000 m")),
         (axes_of(), 5, {"psi": "1.5707963"}, ("columns psi, theta", "(x, 0, z)")),
