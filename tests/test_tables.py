@@ -15,11 +15,21 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from outline_tables import LEG_NAMES, LEGS, assert_same, outlines_of, recorded
 
-from legcal.data import LegAxes, Outlines, View, axes_of_table, no_outlines, write_observations
+from legcal.data import (
+    LegAxes,
+    Outlines,
+    View,
+    axes_from_outlines,
+    axes_of_table,
+    join_axes,
+    no_outlines,
+    write_observations,
+)
 from legcal.data.axes import read_axes, write_axes
 from legcal.data.measurements import row_names
 from legcal.data.outlines import ENCODING, QUALITY, read_observations, reject_unused_legs
 from legcal.errors import DatasetError
+from legcal.geometry import Array
 
 FAST = settings(
     deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -167,6 +177,41 @@ def test_rows_without_image_are_named_by_label_or_else_by_number(tmp_path: Path)
         rows = list(csv.DictReader(file))
     assert [row["image"] for row in rows[::3]] == ["i/2.png", "i/1.png", "a", "b"]
     assert rows[2]["leg"] == "leg, C"
+
+
+def test_joined_axes_do_not_depend_on_the_points_that_state_them() -> None:
+    rng = np.random.default_rng(2)
+    exact = axes_of().choose(np.zeros(2, dtype=np.intp))  # one line, seen twice
+    root = rng.normal(size=(2, 4, 4)) * 1e-3
+    spread = np.einsum("ni,nia->na", rng.normal(size=(2, 2)) * 1e-3, exact.basis)
+    two = replace(exact, M=exact.M + spread, covariance=root @ np.swapaxes(root, 1, 2))
+    along = 0.4  # from one point of the second axis to another: beta grows by that times alpha
+    lever = np.kron([[1.0, 0.0], [along, 1.0]], np.eye(2))
+    moved = replace(
+        two,
+        M=two.M + [[0.0], [along]] * two.u,
+        covariance=np.stack([two.covariance[0], lever @ two.covariance[1] @ lever.T]),
+    )
+    one, other = (join_axes(axes, axes.row) for axes in (two, moved))
+    assert len(one) == 1
+    for name in ("u", "M", "covariance"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-7, atol=1e-12)
+    assert np.abs(one.M - two.M[0]).max() > 1e-5
+
+
+def test_the_covariance_of_an_axis_is_that_of_both_of_its_outlines() -> None:
+    outlines = outlines_of(5, rejected=0.0)
+    radii = {cylinder.link: cylinder.radius for leg in LEGS for cylinder in leg.cylinders}
+
+    def covariance(*edges: int) -> Array:
+        known = np.isin(outlines.edge, edges)[:, None, None]
+        some = replace(outlines, covariance=np.where(known, outlines.covariance, 0.0))
+        return axes_from_outlines(some, MEASUREMENTS, radii).covariance
+
+    floor, one, two, both = covariance(), covariance(1), covariance(2), covariance(1, 2)
+    np.testing.assert_allclose(both, one + two - floor, rtol=1e-6, atol=1e-12 * both.max())
+    for alone in (one, two):
+        assert np.all(np.trace(alone, axis1=1, axis2=2) > 10.0 * np.trace(floor, axis1=1, axis2=2))
 
 
 # --- corrected by hand

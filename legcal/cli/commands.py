@@ -341,8 +341,8 @@ def new(
         "leg_radius": leg_radius,
         "tilt": tilt,
     }
-    asked = machine.described(table, family=family, unit=unit, name=name, dimensions=dimensions)
-    created = machine.create_model(asked, output, force=force)
+    model = machine.described(table, family=family, unit=unit, name=name, dimensions=dimensions)
+    created = machine.create_model(model, output, force=force)
     description = machine.describe(created.machine)
     paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
     written = f"written: {paths['yaml']} {paths['urdf']}"

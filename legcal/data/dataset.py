@@ -6,35 +6,25 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, Strict, field_validator
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.axes import LegAxes, read_axes
 from legcal.data.corners import Corners, read_corners
+from legcal.data.dataset_file import (
+    ViewEntry,
+    find_dataset_file,
+    hand_held_problems,
+    read_dataset_file,
+)
 from legcal.data.measurements import Measurements, View, read_measurements
 from legcal.data.outlines import Outlines, read_observations
-from legcal.data.overrides import Override, read_override
+from legcal.data.overrides import Override
 from legcal.errors import DatasetError
-from legcal.files import (
-    FileSchema,
-    MotionEntry,
-    Name,
-    Number,
-    Stated,
-    Version,
-    closest,
-    describe,
-    parse_yaml,
-    path_problem,
-    read_prior,
-    read_text,
-    validate,
-)
+from legcal.files import closest, describe, path_problem
 from legcal.geometry import Image
-from legcal.machine import DATASET_YAML, Machine, load_mechanism, shipped_folders, shipped_names
+from legcal.machine import Machine, load_mechanism, shipped_folders, shipped_names
 from legcal.vision import Board, Camera, image_problem, parse_board, read_camera, read_image
 
 AXES_NAME = "axes.csv"
@@ -42,8 +32,6 @@ CORNERS_NAME = "corners.csv"
 OBSERVATIONS_NAME = "observations.csv"
 CACHE_NAME = ".legcal-cache.json"
 MIN_CORNERS = 4  # in an image that must place its camera
-ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
-GAMMAS = (0.2, 5.0)  # no camera encodes light more strongly
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +39,8 @@ class Dataset:
     """Everything that a calibration starts from."""
 
     folder: Path  # the dataset folder
-    yaml_path: Path  # ``dataset.yaml`` and the table of measurements
-    table_path: Path  # ``dataset.yaml`` and the table of measurements
+    yaml_path: Path  # ``dataset.yaml``
+    table_path: Path  # the table of measurements
     camera_paths: tuple[Path, ...]  # the camera file of each view
     machine: Machine  # the nominal model
     measurements: Measurements  # the rows of the table, in its order
@@ -114,79 +102,6 @@ class ImageReader:
         return read_image(path, self.cameras[k], self.places[k])
 
 
-class ViewEntry(FileSchema):
-    """One camera position."""
-
-    camera: str
-    gamma: Annotated[Number, Field(ge=GAMMAS[0], le=GAMMAS[1])] | None = None  # not known
-    T_base_camera: MotionEntry | None = None
-    hand_held: Annotated[bool, Strict()] = False
-    legs: Annotated[list[str], Field(min_length=1)] | None = None
-
-    @field_validator("legs")
-    @classmethod
-    def _names_each_leg_once(cls, legs: list[str] | None) -> list[str] | None:
-        twice = sorted({name for name in legs or () if (legs or []).count(name) > 1})
-        if twice:
-            raise ValueError(f"found {', '.join(twice)} twice, needed each leg once; remove one.")
-        return legs
-
-
-def _can_be_fixed(text: str) -> str:
-    """Refuse a value that a parameter cannot be fixed at."""
-    read_override("fixed", text, "")
-    return text
-
-
-class ParametersEntry(FileSchema):
-    """What is known of parameters, which are left as they are and which are looked for."""
-
-    priors: dict[Name, Annotated[Stated, BeforeValidator(read_prior)]] = Field(default_factory=dict)
-    fixed: list[Annotated[Name, AfterValidator(_can_be_fixed)]] = Field(default_factory=list)
-    free: list[Name] = Field(default_factory=list)
-
-    def overrides(self, path: Path) -> tuple[Override, ...]:
-        """Return what the block asks for; ``path`` is that of the file, for messages."""
-        block = f"{path}: parameters"
-        return (
-            *(
-                read_override("prior", name, f"{block}.priors.{name}", stated, in_file=True)
-                for name, stated in self.priors.items()
-            ),
-            *(
-                read_override("fixed", text, f"{block}.fixed '{text}'", in_file=True)
-                for text in self.fixed
-            ),
-            *(
-                read_override("free", text, f"{block}.free '{text}'", in_file=True)
-                for text in self.free
-            ),
-        )
-
-
-class DatasetEntry(FileSchema):
-    """The whole of ``dataset.yaml``."""
-
-    legcal_dataset: Version
-    mechanism: str
-    measurements: str
-    encoder_sigma: Annotated[Number, Field(gt=0.0)]
-    views: Annotated[dict[Name, ViewEntry], Field(min_length=1)]
-    parameters: ParametersEntry = Field(default_factory=ParametersEntry)
-    board: dict[str, Any] | None = None  # read by its kind
-
-    @field_validator("encoder_sigma")
-    @classmethod
-    def _is_that_of_an_encoder(cls, sigma: float) -> float:
-        least, most = ENCODER_SIGMAS
-        if not least <= sigma <= most:
-            raise ValueError(
-                f"found {sigma:g} m, needed {least:g} to {most:g} m; give one standard deviation "
-                "of a reading in metres."
-            )
-        return sigma
-
-
 def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     """Read a dataset and check everything in it that can be checked without decoding images.
 
@@ -210,9 +125,9 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     ModelError, OutOfClass
         If the mechanism does not load.
     """
-    yaml_path = _dataset_file(Path(folder))
+    yaml_path = find_dataset_file(Path(folder))
     folder = yaml_path.parent
-    entry = _read_entry(yaml_path)
+    entry = read_dataset_file(yaml_path)
     board, T_base_board = None, None
     if entry.board is not None:
         board, T_base_board = parse_board(entry.board, yaml_path)
@@ -269,38 +184,6 @@ def _refuse_two_tables(folder: Path) -> None:
             f"{folder}: the observations could not be read: found {AXES_NAME} and "
             f"{OBSERVATIONS_NAME}, needed one of them; remove the one that is not to be used."
         )
-
-
-def _dataset_file(given: Path) -> Path:
-    """Return the path of dataset.yaml."""
-    path = (
-        given
-        if given.suffix in (".yaml", ".yml") and not os.path.isdir(given)
-        else given / DATASET_YAML
-    )
-    if not os.path.isdir(path.parent):
-        raise DatasetError(
-            f"{given}: the dataset could not be read: found no such folder, needed a folder with a "
-            f"{DATASET_YAML}; check the path."
-        )
-    if not os.path.exists(path):
-        raise DatasetError(
-            f"{given}: the dataset could not be read: found no {path.name} in the folder, needed "
-            "one; give the folder of a dataset."
-        )
-    return path
-
-
-def _read_entry(path: Path) -> DatasetEntry:
-    """Return what dataset.yaml says."""
-    found = parse_yaml(read_text(path, "dataset file"), path, "dataset file")
-    version = found.get("legcal_dataset", 1)
-    if version != 1 or isinstance(version, bool):
-        raise DatasetError(
-            f"{path}: the dataset could not be read: found legcal_dataset {describe(version)}, "
-            "needed version 1; use the legcal that wrote it, or write the file as version 1."
-        )
-    return validate(DatasetEntry, found, path)
 
 
 def _read_cameras(paths: tuple[Path, ...], problems: list[str]) -> dict[Path, Camera]:
@@ -372,10 +255,10 @@ def read_given_axes(
     axes = read_axes(path, leg_names, measurements)
     views = [measurements.views[v] for v in measurements.view[axes.row].tolist()]
     names = [leg_names[leg] for leg in axes.leg.tolist()]
-    wanted = [
+    is_used = [
         view.legs is None or name in view.legs for view, name in zip(views, names, strict=True)
     ]
-    used = np.flatnonzero(wanted)
+    used = np.flatnonzero(is_used)
     if len(used) == 0:
         raise DatasetError(
             f"{path}: the axes could not be used: found only legs that their views leave out, "
@@ -452,25 +335,6 @@ def row_problems(dataset: Dataset, hand_held: Sequence[int]) -> list[str]:
         elif path is not None and (os.path.exists(path) or row not in given):
             found = dataset.image_problem(row)
             problems += [found] if found else []
-    return problems
-
-
-def hand_held_problems(path: Path, views: Mapping[str, ViewEntry], *, has_board: bool) -> list[str]:
-    """Return what keeps views from being hand-held."""
-    held = {name: view for name, view in views.items() if view.hand_held}
-    problems = [
-        f"{path}: views.{name}.hand_held could not be used: found no board, needed a calibration "
-        "board on the base in every image of a camera that is held in the hand; describe it in "
-        "the block board."
-        for name in held
-        if not has_board
-    ]
-    problems += [
-        f"{path}: views.{name}.T_base_camera could not be used: found one pose of a camera that is "
-        "held in the hand, needed none, the board tells the pose of every image; remove it."
-        for name, view in held.items()
-        if view.T_base_camera is not None
-    ]
     return problems
 
 

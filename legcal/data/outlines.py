@@ -184,7 +184,7 @@ def format_observations(
             outlines.covariance.reshape(-1, 4)[:, [0, 1, 3]],
         ]
     ).tolist()
-    told = np.array([getattr(outlines, name) for name in (*QUALITY, *ENCODING)]).T.tolist()
+    measured = np.array([getattr(outlines, name) for name in (*QUALITY, *ENCODING)]).T.tolist()
     rows = (
         [
             *names[row],
@@ -195,7 +195,7 @@ def format_observations(
             VERDICTS[0 if outlines.used[i] else 1],
             outlines.reason[i],
             outlines.source[i],
-            *told[i],
+            *measured[i],
         ]
         for i, row in enumerate(outlines.row.tolist())
     )
@@ -251,7 +251,7 @@ def read_observations(
     inexact = ~(np.abs(norm - 1.0) <= UNIT_EXACT)
     with np.errstate(invalid="ignore"):
         numbers[inexact, :3] /= norm[inexact, None]
-    told = [np.where(edited, np.nan, table.number(name)) for name in (*QUALITY, *ENCODING)]
+    measured = [np.where(edited, np.nan, table.number(name)) for name in (*QUALITY, *ENCODING)]
     outlines = Outlines(
         row,
         leg,
@@ -263,7 +263,7 @@ def read_observations(
         used,
         table.text("reason"),
         table.text("source"),
-        *told,  # what detection found, which an edited row no longer is
+        *measured,  # what detection found, which an edited row no longer is
     )
     outlines = _order_ends(outlines, measurements)
     _refuse_ends_off_line(table, outlines, measurements)

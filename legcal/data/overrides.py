@@ -1,4 +1,4 @@
-"""Overrides: what a dataset or a call asks of parameters by name, to fix, free or give a prior."""
+"""Overrides: parameters that a dataset or a call fixes, frees or gives a prior by name."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _WORDS: Mapping[Action, str] = {
 
 @dataclass(frozen=True)
 class Override:
-    """What somebody asks of one parameter, or of all that a pattern matches."""
+    """An override of one parameter, or of all that a pattern matches."""
 
     name: str  # or a pattern
     action: Action  # what to do with it
-    where: str  # where this was said: the start of a sentence about it
+    where: str  # its place, as the start of a sentence about it
     stated: Stated | None = None  # the prior, or the value that it is fixed at
-    in_file: bool = False  # said in ``dataset.yaml``, which gives way to what is asked for in a run
+    in_file: bool = False  # given in ``dataset.yaml``, over which those of a run take precedence
 
 
 def overrides_of_call(

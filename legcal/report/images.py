@@ -69,7 +69,7 @@ def detection_table(document: dict[str, Any], output: Path) -> RenderableType:
         for name, view in views.items()
     ]
     numbers = ("images", "legs found", "outlines used", *(key for key, _, _ in shown))
-    told = ", ".join(f"{n} {why}" for why, n in rejected.most_common())
+    reasons = ", ".join(f"{n} {why}" for why, n in rejected.most_common())
     return report(
         heading(
             document["mechanism"],
@@ -77,7 +77,7 @@ def detection_table(document: dict[str, Any], output: Path) -> RenderableType:
             f"{document['images']} images",
         ),
         table("view", *(f">{name}" for name in numbers), rows=rows),
-        f"Not used: {told}." if told else None,
+        f"Not used: {reasons}." if reasons else None,
         [
             *(Text(view["problem"], style="red") for view in views.values() if view["problem"]),
             *(Text(f"note: {note}", style="dim") for note in document["notes"]),

@@ -206,7 +206,7 @@ def pixels_in_image(camera: Camera, points: Array) -> tuple[Array, BoolArray]:
     return pixels, near & np.all((pixels >= _BORDER_PX) & (pixels <= limit), axis=-1)
 
 
-@lru_cache(maxsize=64)  # a camera is asked for the same at every place that it might stand at
+@lru_cache(maxsize=64)  # the same at every candidate place of a camera
 def field_of_view(camera: Camera) -> tuple[Array, Array]:
     """Return the least and the largest (x, y) of the sensor plane on the image's border."""
     x, y = camera.width - 1.0, camera.height - 1.0

@@ -1,0 +1,154 @@
+"""The file dataset.yaml: its schema, and what contradicts itself in it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field, Strict, field_validator
+
+from legcal.data.overrides import Override, read_override
+from legcal.errors import DatasetError
+from legcal.files import (
+    FileSchema,
+    MotionEntry,
+    Name,
+    Number,
+    Stated,
+    Version,
+    describe,
+    parse_yaml,
+    read_prior,
+    read_text,
+    validate,
+)
+from legcal.machine import DATASET_YAML
+
+ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
+GAMMAS = (0.2, 5.0)  # no camera encodes light more strongly
+
+
+class ViewEntry(FileSchema):
+    """One camera position."""
+
+    camera: str
+    gamma: Annotated[Number, Field(ge=GAMMAS[0], le=GAMMAS[1])] | None = None  # not known
+    T_base_camera: MotionEntry | None = None
+    hand_held: Annotated[bool, Strict()] = False
+    legs: Annotated[list[str], Field(min_length=1)] | None = None
+
+    @field_validator("legs")
+    @classmethod
+    def _names_each_leg_once(cls, legs: list[str] | None) -> list[str] | None:
+        twice = sorted({name for name in legs or () if (legs or []).count(name) > 1})
+        if twice:
+            raise ValueError(f"found {', '.join(twice)} twice, needed each leg once; remove one.")
+        return legs
+
+
+def _can_be_fixed(text: str) -> str:
+    """Refuse a value that a parameter cannot be fixed at."""
+    read_override("fixed", text, "")
+    return text
+
+
+class ParametersEntry(FileSchema):
+    """What is known of parameters, which are left as they are and which are looked for."""
+
+    priors: dict[Name, Annotated[Stated, BeforeValidator(read_prior)]] = Field(default_factory=dict)
+    fixed: list[Annotated[Name, AfterValidator(_can_be_fixed)]] = Field(default_factory=list)
+    free: list[Name] = Field(default_factory=list)
+
+    def overrides(self, path: Path) -> tuple[Override, ...]:
+        """Return what the block asks for; ``path`` is that of the file, for messages."""
+        block = f"{path}: parameters"
+        return (
+            *(
+                read_override("prior", name, f"{block}.priors.{name}", stated, in_file=True)
+                for name, stated in self.priors.items()
+            ),
+            *(
+                read_override("fixed", text, f"{block}.fixed '{text}'", in_file=True)
+                for text in self.fixed
+            ),
+            *(
+                read_override("free", text, f"{block}.free '{text}'", in_file=True)
+                for text in self.free
+            ),
+        )
+
+
+class DatasetEntry(FileSchema):
+    """The whole of ``dataset.yaml``."""
+
+    legcal_dataset: Version
+    mechanism: str
+    measurements: str
+    encoder_sigma: Annotated[Number, Field(gt=0.0)]
+    views: Annotated[dict[Name, ViewEntry], Field(min_length=1)]
+    parameters: ParametersEntry = Field(default_factory=ParametersEntry)
+    board: dict[str, Any] | None = None  # read by its kind
+
+    @field_validator("encoder_sigma")
+    @classmethod
+    def _is_that_of_an_encoder(cls, sigma: float) -> float:
+        least, most = ENCODER_SIGMAS
+        if not least <= sigma <= most:
+            raise ValueError(
+                f"found {sigma:g} m, needed {least:g} to {most:g} m; give one standard deviation "
+                "of a reading in metres."
+            )
+        return sigma
+
+
+def find_dataset_file(given: Path) -> Path:
+    """Return the path of dataset.yaml."""
+    path = (
+        given
+        if given.suffix in (".yaml", ".yml") and not os.path.isdir(given)
+        else given / DATASET_YAML
+    )
+    if not os.path.isdir(path.parent):
+        raise DatasetError(
+            f"{given}: the dataset could not be read: found no such folder, needed a folder with a "
+            f"{DATASET_YAML}; check the path."
+        )
+    if not os.path.exists(path):
+        raise DatasetError(
+            f"{given}: the dataset could not be read: found no {path.name} in the folder, needed "
+            "one; give the folder of a dataset."
+        )
+    return path
+
+
+def read_dataset_file(path: Path) -> DatasetEntry:
+    """Return the checked content of dataset.yaml."""
+    found = parse_yaml(read_text(path, "dataset file"), path, "dataset file")
+    version = found.get("legcal_dataset", 1)
+    if version != 1 or isinstance(version, bool):
+        raise DatasetError(
+            f"{path}: the dataset could not be read: found legcal_dataset {describe(version)}, "
+            "needed version 1; use the legcal that wrote it, or write the file as version 1."
+        )
+    return validate(DatasetEntry, found, path)
+
+
+def hand_held_problems(path: Path, views: Mapping[str, ViewEntry], *, has_board: bool) -> list[str]:
+    """Return what keeps views from being hand-held."""
+    held = {name: view for name, view in views.items() if view.hand_held}
+    problems = [
+        f"{path}: views.{name}.hand_held could not be used: found no board, needed a calibration "
+        "board on the base in every image of a camera that is held in the hand; describe it in "
+        "the block board."
+        for name in held
+        if not has_board
+    ]
+    problems += [
+        f"{path}: views.{name}.T_base_camera could not be used: found one pose of a camera that is "
+        "held in the hand, needed none, the board tells the pose of every image; remove it."
+        for name, view in held.items()
+        if view.T_base_camera is not None
+    ]
+    return problems
