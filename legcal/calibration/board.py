@@ -29,7 +29,7 @@ from legcal.perception import FAR_OFF, camera_poses, detect_corners, require_boa
 from legcal.vision import Board
 
 Poses = Sequence[RigidTransform | None]  # one a view
-_FAR, _TURNED = FAR_OFF
+_MAX_DISTANCE, _MAX_ANGLE = FAR_OFF
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,11 +41,11 @@ class BoardViews:
     T_board_camera: tuple[RigidTransform | None, ...]  # None where a view does not show it
     view_of_row: tuple[str, ...]
 
-    def seen(self, rows: IntArray) -> BoardCorners:
+    def at(self, rows: IntArray) -> BoardCorners:
         """Return the board in some of the images."""
         return BoardCorners(self.board, self.corners.at(rows))
 
-    def judged(self, solution: Solution) -> Corners:
+    def reject_outliers(self, solution: Solution) -> Corners:
         """Return the corners of all images, those that a fit left out rejected."""
         left_out = set(solution.rejected_corners)
         if not left_out:
@@ -65,20 +65,20 @@ class BoardViews:
         )
         return corners.reject(wrong, "disagrees with the fit")
 
-    def by_view(self, T_x_camera: Poses) -> dict[int, RigidTransform]:
-        """Return where each camera that shows the board has it, T_x_board, x any frame."""
+    def poses_by_view(self, T_x_camera: Poses) -> dict[int, RigidTransform]:
+        """Return T_x_board by each camera that shows the board, x any frame."""
         return {
             v: camera * T.inv()
             for v, (camera, T) in enumerate(zip(T_x_camera, self.T_board_camera, strict=True))
             if camera is not None and T is not None
         }
 
-    def placed(self, T_x_camera: Poses) -> RigidTransform | None:
-        """Return where most cameras have the board, T_x_board; None if none shows it.
+    def pose_by_cameras(self, T_x_camera: Poses) -> RigidTransform | None:
+        """Return T_x_board on which most cameras agree; None if none shows the board.
 
-        Those that disagree with most others are left out: one wrong pose must not turn all.
+        Outliers are left out: one wrong camera pose must not turn all others.
         """
-        found = list(self.by_view(T_x_camera).values())
+        found = list(self.poses_by_view(T_x_camera).values())
         if not found:
             return None
         agreeing = [[other for other in found if _agree(one, other, reach=2.0)] for one in found]
@@ -138,24 +138,24 @@ def base_of_board(dataset: Dataset, board: BoardViews, hints: Poses) -> RigidTra
     DatasetError
         If the dataset has the board where none of these cameras sees it.
     """
-    given, by_cameras = dataset.T_base_board, board.placed(hints)
+    given, by_cameras = dataset.T_base_board, board.pose_by_cameras(hints)
     if given is None or by_cameras is None:
         return by_cameras if given is None else given
     # Wrong poses beside a right one are named when the images have placed their cameras.
-    if not any(_agree(given, place) for place in board.by_view(hints).values()):
+    if not any(_agree(given, place) for place in board.poses_by_view(hints).values()):
         far, turned = _apart(given, by_cameras)
         raise DatasetError(
             f"{dataset.yaml_path}: board.T_base_board and the T_base_camera of the views "
             f"could not be used together: found the board {1e3 * far:.0f} mm and "
             f"{np.degrees(turned):.1f} deg from where these cameras see it, needed "
-            f"{1e3 * _FAR:.0f} mm and {np.degrees(_TURNED):.0f} deg; correct the pose of the "
-            "board, those of the cameras, or the dimensions of the board."
+            f"{1e3 * _MAX_DISTANCE:.0f} mm and {np.degrees(_MAX_ANGLE):.0f} deg; correct the pose "
+            "of the board, those of the cameras, or the dimensions of the board."
         )
     return given
 
 
 def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -> list[str]:
-    """Return what is odd about the board: views without it, and a place that cannot be."""
+    """Return notes on views that do not show the board, and on a wrong T_base_board."""
     if corners is None:
         return []
     measurements, notes = dataset.measurements, []
@@ -221,4 +221,4 @@ def _apart(one: RigidTransform, other: RigidTransform) -> tuple[float, float]:
 def _agree(one: RigidTransform, other: RigidTransform, reach: float = 1.0) -> bool:
     """Say whether two places of the board are as near as hints are good."""
     far, turned = _apart(one, other)
-    return far <= reach * _FAR and turned <= reach * _TURNED
+    return far <= reach * _MAX_DISTANCE and turned <= reach * _MAX_ANGLE

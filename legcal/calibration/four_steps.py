@@ -103,7 +103,7 @@ def starts(
         cameras = _start_cameras(part, outlines, first, second, steps)
         start = start_from(legs, part.measurements, part.fitted_legs, cameras, part.T_Rb_Re, label)
         if board is not None:
-            T_Rb_board = board.placed([T.inv() for T in cameras])
+            T_Rb_board = board.pose_by_cameras([T.inv() for T in cameras])
             start = start if T_Rb_board is None else replace(start, T_Rb_board=T_Rb_board)
         found.append(start)
     return found

@@ -150,6 +150,7 @@ def calibrate(
         If ``output`` holds something else, or ``priors``, ``fixed`` and ``free`` name what is no
         parameter or contradict each other.
     """
+    # 1. Load and identify.
     if output is not None:
         check_destination(output_path(output))
     overrides = overrides_of_call(priors, fixed, free)
@@ -158,6 +159,7 @@ def calibrate(
     fitted, held_out = _split(dataset, holdout)
     identify_notes = check_identifiable(dataset_at(dataset, fitted), choices)
 
+    # 2 to 5. Recognise, measure, four steps, joint fit, measure again.
     key = outline_key(dataset, choices)
     with worker_pool(workers) as pool:
         session = start_session(dataset, pool, progress, fingerprint=key if use_cache else "")
@@ -165,6 +167,7 @@ def calibrate(
     cache_notes = _store_outlines(session, estimate, key)
     prediction = _compare_held_out(session, estimate, held_out) if len(held_out) else None
 
+    # 6. Judge and write.
     found = estimate.in_file_order()
     notes = [
         *dataset.notes,
@@ -178,8 +181,14 @@ def calibrate(
         *found.solution.notes,
         *_camera_notes(dataset, found.solution),
     ]
-    calibration = judge(dataset_at(dataset, fitted), found.solution, found.steps, notes)
-    calibration = replace(calibration, corners=found.corners, held_out=prediction)
+    calibration = judge(
+        dataset_at(dataset, fitted),
+        found.solution,
+        found.steps,
+        notes,
+        corners=found.corners,
+        held_out=prediction,
+    )
     if output is not None:
         write_result(calibration, Path(output))
     return calibration
@@ -233,23 +242,27 @@ def estimate_session(session: Session, file_rows: IntArray, options: Options) ->
 def _estimate(session: Session, rows: IntArray, options: Options) -> Estimate:
     """Search the images that have no outlines yet, and fit some."""
     placement, board = nominal_scene(session)
+    part = session.part(rows)
     # Outlines that are kept were measured with some gamma: others of their camera must be as well.
     kept_gammas = known_gammas(session.photographs.keep, session.measurements)
     photographs = session.photographs.with_gammas(kept_gammas)
     if len(photographs.detect) == 0:  # outlines, or axes, are given
-        estimate = _fit(session.part(rows), given_outlines(photographs), placement, board, options)
+        estimate = _fit(part, given_outlines(photographs), placement, board, options)
         return replace(
             estimate, image_notes=session.plan.notes, fit_notes=_notes_on_images(estimate)
         )
+    # Recognise and measure.
     T_board_camera = None if board is None else board.T_board_camera
     seen = observe(photographs, placement, session.progress, T_board_camera, together=False)
     seen.placement.require_one()
     other_radii = bool(seen.placement.radii.factor)
     if other_radii:
         session = replace(session, machine=seen.photographs.machine)
+        part = session.part(rows)
     if options.every_leg and (seen.left_out or seen.placement.unplaced):
         _refuse_too_few(session, rows, seen, options.choices)
-    first = _fit(session.part(rows), seen.outlines, seen.placement, board, options)
+    # Four steps and joint fit; measure again near it, and fit again.
+    first = _fit(part, seen.outlines, seen.placement, board, options)
     estimate = _measure_again(session, first, seen, board, options)
     return replace(
         estimate,
@@ -294,11 +307,11 @@ def _fit(
         seen,
         starts(part, seen, placement, steps, board),
         axes=part.axes,
-        board=None if board is None else board.seen(part.rows),
+        board=None if board is None else board.at(part.rows),
         choices=choices,
     )
     part.progress("Joint fit", 1, 1)
-    corners = None if board is None else board.judged(solution)
+    corners = None if board is None else board.reject_outliers(solution)
     return Estimate(part, outlines, steps, solution, corners)
 
 

@@ -64,7 +64,15 @@ class Calibration:
     corners: Corners | None = None
 
 
-def judge(dataset: Dataset, solution: Solution, steps: Steps, notes: Sequence[str]) -> Calibration:
+def judge(
+    dataset: Dataset,
+    solution: Solution,
+    steps: Steps,
+    notes: Sequence[str],
+    *,
+    corners: Corners | None = None,
+    held_out: HeldOut | None = None,
+) -> Calibration:
     """Return the calibration with its verdict.
 
     The improvement that the fit predicts is the distance between the nominal and the
@@ -85,7 +93,7 @@ def judge(dataset: Dataset, solution: Solution, steps: Steps, notes: Sequence[st
         verdict = _verdict_on_parameters(dataset, solution)
     else:
         verdict = _verdict_on_platform(platform, solution.focal_doubt)
-    return Calibration(dataset, solution, steps, platform, verdict, tuple(notes))
+    return Calibration(dataset, solution, steps, platform, verdict, tuple(notes), held_out, corners)
 
 
 def _verdict_on_platform(platform: PlatformAccuracy, focal_doubt: float) -> Verdict:

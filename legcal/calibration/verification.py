@@ -211,7 +211,7 @@ def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
         different = f"the legs {', '.join(calibrated.leg_names)}, not {', '.join(given.leg_names)}"
     else:
         calibrated = calibrated.with_leg_order(given.leg_names)
-        different = _difference(calibrated, given)
+        different = _model_difference(calibrated, given)
     if different:
         raise DatasetError(
             f"{earlier.folder}: the earlier result could not be tested with {dataset.folder}: "
@@ -221,7 +221,7 @@ def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
     return replace(dataset, machine=calibrated, overrides=())
 
 
-def _difference(calibrated: Machine, given: Machine) -> str:
+def _model_difference(calibrated: Machine, given: Machine) -> str:
     """Return what differs between two models of the same legs, nothing if they are one machine."""
     for one, other in zip(calibrated.legs, given.legs, strict=True):
         here, there = (f"{leg.name} ({leg.kind}, {leg.type})" for leg in (one, other))
