@@ -88,7 +88,7 @@ def test_exact_outlines_give_all_that_is_determined_from_3_mm_and_1_degree(name:
         if leg.base_joint == "R" and leg.base_axis is not None and truth.base_axis is not None:
             assert leg.base_axis @ truth.base_axis > 0.9
     passive = [leg.kind is LegKind.PASSIVE for leg in observed.true_legs]
-    assert np.isnan(found.parameters.offsets).tolist() == passive
+    assert np.isnan(found.machine.offsets).tolist() == passive
     assert np.isnan(found.base.base_axes[:, 0]).tolist() == (~observed.nominal.revolute).tolist()
 
 
@@ -156,7 +156,7 @@ def test_ranks_of_9_tell_where_it_is_exact_and_offsets_are_so_everywhere() -> No
             observed = shipped(name)
             found = observed.run("literal")
             q0 = np.array([leg.q0 for leg in observed.true_legs])
-            assert np.nanmax(np.abs(found.parameters.offsets - q0)) < 1e-8
+            assert np.nanmax(np.abs(found.machine.offsets - q0)) < 1e-8
             assert np.abs(found.base.A_Rb - observed.A_Rb).max() > 1e-7
 
 
