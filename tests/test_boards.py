@@ -33,7 +33,15 @@ from legcal.perception import (
 )
 from legcal.progress import no_progress
 from legcal.simulation.board import INK, BoardPrint
-from legcal.vision import Board, Camera, board_document, charuco_board, parse_board
+from legcal.vision import (
+    Board,
+    Camera,
+    board_document,
+    charuco_board,
+    enlarged,
+    parse_board,
+    reduced,
+)
 from legcal.workers import in_turn
 
 PATH = Path("dataset.yaml")
@@ -188,6 +196,17 @@ def test_corners_of_a_blurred_picture_have_larger_sigmas() -> None:
     error = px - seen_at(board, T)[number]
     assert np.median(sigma) > 1.15 * np.median(find_corners(board, sharp)[2])
     assert np.sqrt(np.mean((error / sigma[:, None]) ** 2)) < 1.6
+
+
+def test_pixels_of_an_enlarged_image_are_put_back_where_they_were() -> None:
+    """Corners of small boards are searched in an enlarged image."""
+    x, y = np.meshgrid(np.arange(60.0), np.arange(40.0))
+    spot = 200.0 * np.exp(-0.5 * ((x - 31.3) ** 2 + (y - 17.8) ** 2) / 9.0)
+    image = enlarged(spot.astype(np.uint8), 2)
+    assert image.shape == (80, 120)
+    v, u = np.indices(image.shape)
+    centroid = np.array([(u * image).sum(), (v * image).sum()]) / image.sum(dtype=np.float64)
+    assert reduced(centroid, 2) == pytest.approx([31.3, 17.8], abs=0.03)
 
 
 def test_gamma_does_not_move_corners() -> None:

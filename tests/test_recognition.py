@@ -1,250 +1,453 @@
-"""Cameras and legs from bars of known geometry: right, or refused, never guessed."""
+"""Cameras and legs recognised from edge pairs of known geometry: right, or refused, never guessed.
 
+Hypotheses of two pairs, scores and steps of poses, the search of a camera, and the fit of a view.
+"""
+
+from dataclasses import replace
 from typing import ClassVar
 
-import cv2
+import leg_pictures as lp
 import numpy as np
 import pytest
-from numpy.random import Generator
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal import load_mechanism
-from legcal.data.measurements import Measurements, View
-from legcal.geometry.types import Array, Image
-from legcal.machine import Machine, forward_kinematics
-from legcal.perception import recognition as recognising
-from legcal.perception.camera_search import Candidates, place_camera, place_near
-from legcal.perception.lines import EdgePairs, EdgeSegments, find_edge_pairs, find_segments
+from legcal.data import Measurements, Outlines, View
+from legcal.geometry import Array, Image
+from legcal.machine import Cylinder
+from legcal.perception import recognition
+from legcal.perception.camera_search import (
+    Candidates,
+    is_mirrored,
+    may_be_mirrored,
+    mirrored,
+    place_camera,
+    place_near,
+)
 from legcal.perception.pair_matching import (
-    LegSegments,
     Picture,
     Poses,
+    _equations,
+    _moved,
+    distances,
+    exchanged,
     gauss_newton_step,
     leg_segments,
     match_pairs,
 )
-from legcal.perception.placement import Placement, Search
-from legcal.perception.pose_hypotheses import pose_hypotheses
-from legcal.perception.recognition import recognise
-from legcal.vision.camera import Camera
-from legcal.vision.cylinder import outlines_of_axis
+from legcal.perception.placement import Group, Search, group_views
+from legcal.perception.pose_hypotheses import MAX_POSES, pose_hypotheses
+from legcal.perception.radii import estimate_radii
+from legcal.perception.view_fit import (
+    ViewFit,
+    fit_view,
+    min_evidence,
+    reversed_pose,
+    sideways_sigmas,
+)
+from legcal.vision import Camera, outlines_of_axis
 
-PIXEL = 2.0 / 1000.0
-CORNERS = np.array([[-0.52, -0.4], [0.52, 0.4]])
-CAMERA = Camera(np.array([[500.0, 0.0, 260.0], [0.0, 500.0, 200.0], [0.0, 0.0, 1.0]]), 520, 400)
-
-
-@pytest.fixture(scope="module")
-def hexapod() -> Machine:
-    return load_mechanism("hexapod")
-
-
-def looking_at(place: Array, target: Array, roll: float) -> RigidTransform:
-    """Return T_base_camera of a camera that looks at a point."""
-    z = (target - place) / np.linalg.norm(target - place)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    R = Rotation.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
-    return RigidTransform.from_components(place, R * Rotation.from_rotvec([0.0, 0.0, roll]))
+CAMERA = Camera(np.array([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]]), 640, 480)
+HARD = {"missing": 0.2, "n_clutter": 8, "noise": 0.4}
 
 
-def bars_of(
-    targets: LegSegments, T_base_camera: RigidTransform, rng: Generator, clutter: int
-) -> EdgePairs:
-    """Return the bars that an ideal picture shows, with half a pixel of noise, and others."""
-    X = T_base_camera.inv().apply(targets.ends.reshape(-1, 3)).reshape(-1, 2, 3)
-    xy = X[..., :2] / X[..., 2:]
-    along = xy[:, 1] - xy[:, 0]
-    length = np.linalg.norm(along, axis=1)
-    along /= length[:, None]
-    normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    u = X[:, 1] - X[:, 0]
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    h = outlines_of_axis(u, X[:, 0], targets.radius)  # (n, 2, 3)
-    rays = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1)
-    offset = (
-        -np.einsum("nei,nki->nke", h, rays) / np.einsum("nex,nx->ne", h[..., :2], normal)[:, None]
-    )
-    width = np.abs(offset[..., 1] - offset[..., 0])
-    noise = 0.25 * PIXEL
-    n = clutter
-    angle = rng.uniform(0.0, np.pi, n)
-    bars = EdgePairs(
-        np.concatenate([xy.mean(axis=1), rng.uniform(CORNERS[0], CORNERS[1], (n, 2))]),
-        np.concatenate([along, np.stack([np.cos(angle), np.sin(angle)], axis=1)]),
-        np.concatenate([0.45 * length, rng.uniform(0.03, 0.2, n)]),
-        np.concatenate([width, np.tile(rng.uniform(0.01, 0.06, (n, 1)), 2)]),
-        np.concatenate([length, rng.uniform(0.03, 0.4, n)]),
-        PIXEL,
-    )
-    moved = bars.middle + noise * rng.standard_normal(bars.middle.shape)
-    bars = EdgePairs(moved, bars.along, bars.half_length, bars.width, bars.merit, PIXEL)
-    return bars.take(np.argsort(-bars.merit, kind="stable"))
-
-
-def pictures_of(
-    machine: Machine,
-    T_base_camera: RigidTransform,
-    readings: Array,
-    rng: Generator,
-    clutter: int = 10,
-    hidden: int = 0,
-) -> list[Picture]:
-    """Return what pictures at some readings show, some of the legs being hidden in each."""
-    cylinders = [leg.cylinders for leg in machine.legs]
-    n_legs = len(machine.legs)
-    found = []
-    for q in readings:
-        B = forward_kinematics(machine, q).apply(machine.B_platform)
-        seen = np.sort(rng.permutation(n_legs)[: n_legs - hidden])
-        shown = leg_segments(machine.A_base, B, cylinders, seen)
-        every = leg_segments(machine.A_base, B, cylinders, np.arange(n_legs))
-        found.append(Picture(bars_of(shown, T_base_camera, rng, clutter), every, CORNERS))
-    return found
-
-
-def readings_of(machine: Machine, n: int, rng: Generator) -> Array:
-    """Return readings all over the travel."""
-    travel = np.array([leg.travel for leg in machine.legs if leg.prismatic])
-    return np.asarray(
-        rng.uniform(0.2, 0.8, (n, len(travel))) * np.ptp(travel, axis=1) + travel[:, 0]
-    )
-
-
-def apart(placed: Candidates, T_base_camera: RigidTransform) -> tuple[float, float]:
-    """Return how far the first pose is from the true one: part of the distance, angle [deg]."""
-    off = T_base_camera.inv() * placed.pose()
-    distance = float(np.linalg.norm(T_base_camera.translation))
-    angle = float(np.degrees(off.rotation.magnitude()))
-    return float(np.linalg.norm(off.translation)) / distance, angle
-
-
-CENTRE = np.array([0.0, 0.0, 0.18])
-
-
-@pytest.mark.parametrize(("seed", "hidden"), [(0, 0), (1, 3), (2, 2), (3, 1)])
-def test_a_camera_is_placed_at_any_roll_in_clutter_with_legs_hidden(
-    hexapod: Machine, seed: int, hidden: int
-) -> None:
+def _scene(
+    seed: int, n_legs: int = 6, n: int = 3, **difficulty: float
+) -> tuple[list[Picture], RigidTransform]:
+    """Return pictures of a machine at n poses of its platform, and T_base_camera."""
     rng = np.random.default_rng(seed)
-    turn = rng.uniform(0.0, 2.0 * np.pi)
-    place = np.array([1.0 * np.cos(turn), 1.0 * np.sin(turn), rng.uniform(0.1, 0.6)])
-    T = looking_at(place, CENTRE, rng.uniform(-np.pi, np.pi))
-    pictures = pictures_of(hexapod, T, readings_of(hexapod, 5, rng), rng, 12, hidden)
-    placed = place_camera(pictures, 6)
-    assert placed.is_convincing
-    distance, angle = apart(placed, T)
-    assert distance < 0.03
-    assert angle < 2.0
+    T, made = lp.camera(rng), lp.machine(n_legs, rng)
+    platforms = [lp.platform(rng) for _ in range(n)]
+    return lp.pictures(made, T, platforms, rng, **difficulty), T  # type: ignore[arg-type]
 
 
-def test_a_model_a_centimetre_off_is_recognised_all_the_same(hexapod: Machine) -> None:
-    rng = np.random.default_rng(5)
-    T = looking_at(np.array([0.7, -0.8, 0.3]), CENTRE, 0.3)
-    pictures = pictures_of(hexapod, T, readings_of(hexapod, 6, rng), rng)
-    leg = pictures[0].targets.leg
-    error = rng.uniform(-0.01, 0.01, (6, 2, 3))
-    moved = [
-        Picture(
-            p.pairs, LegSegments(leg, p.targets.ends + error[leg], *_rest(p.targets)), p.corners
+def _pose(T_base_camera: RigidTransform, n_legs: int = 6) -> Poses:
+    return Poses.one(T_base_camera, np.zeros((n_legs, 2, 3)))
+
+
+def _moved_machine(picture: Picture, G: RigidTransform) -> Picture:
+    ends = G.apply(picture.targets.ends.reshape(-1, 3)).reshape(-1, 2, 3)
+    return replace(picture, targets=replace(picture.targets, ends=ends))
+
+
+def _is_right(placed: Candidates, T: RigidTransform) -> bool:
+    away, angle = lp.apart(T, placed.pose())
+    return angle < np.deg2rad(5.0) and away < 0.1
+
+
+MOTION = RigidTransform.from_components([0.3, -0.2, 0.5], Rotation.from_rotvec([0.4, 1.0, -0.3]))
+
+
+# Poses hypothesised from two pairs.
+
+
+def test_one_of_the_hypotheses_is_near_the_camera() -> None:
+    near = []
+    for seed in range(12):
+        n_legs = 3 + seed % 4
+        (picture,), T = _scene(seed, n_legs, 1, missing=0.2, n_clutter=6, noise=0.4)
+        poses = pose_hypotheses(picture, n_legs)
+        assert len(poses) <= MAX_POSES
+        np.testing.assert_allclose(np.linalg.det(poses.R), 1.0, atol=1e-9)
+        true, middle = T.inv(), np.array([0.0, 0.0, 0.2])
+        trace = np.einsum("kij,ij->k", poses.R, true.rotation.as_matrix())
+        angle = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
+        off = poses.R @ middle + poses.t - true.apply(middle)
+        away = np.linalg.norm(off, axis=1) / np.linalg.norm(true.apply(middle))
+        near.append(np.min(angle / np.deg2rad(16.0) + away / 0.16, initial=np.inf) < 1.0)
+    assert np.mean(near) >= 0.85
+
+
+def test_hypotheses_move_with_the_frame_of_the_machine_and_put_two_legs_on_pairs() -> None:
+    (picture,), _ = _scene(4, 5, 1)
+    moved = _moved_machine(picture, MOTION)
+    one, two = pose_hypotheses(picture, 5), pose_hypotheses(moved, 5)
+    scores = [match_pairs(p, s, 0.05).score for p, s in ((picture, one), (moved, two))]
+    assert np.mean((scores[0] > 0.1).sum(axis=1) >= 2) > 0.5
+    assert abs(len(one) - len(two)) <= 0.02 * len(one)
+    assert len(np.unique(one.R.round(9), axis=0)) > 0.7 * len(one)  # two turns of each
+    assert max(scores[0].sum(axis=1)) == pytest.approx(max(scores[1].sum(axis=1)), abs=0.05)
+    trace = np.einsum("kij,lij->kl", one.R[:200], two.R @ MOTION.rotation.as_matrix())
+    assert np.mean(trace.max(axis=1) > 3.0 - 1e-3) > 0.9
+    one_pair = replace(picture, pairs=picture.pairs.take(np.array([0])))
+    one_leg = replace(
+        picture, targets=lp.pieces(*(x[:1] for x in np.ones((2, 1, 3)) * [[[0]], [[1]]]))
+    )
+    assert len(pose_hypotheses(one_pair, 5)) == len(pose_hypotheses(one_leg, 5)) == 0
+
+
+# Scores of poses, and steps towards the pairs.
+
+
+def test_segments_lie_on_their_legs_and_make_up_all_that_is_seen_of_them() -> None:
+    rng = np.random.default_rng(0)
+    made = lp.machine(6, rng)
+    A, B = made.A, made.posed(lp.platform(rng))
+    cylinders: list[tuple[Cylinder, ...]] = [lp.CYLINDERS] * 5 + [()]
+    targets = leg_segments(A, B, cylinders, np.arange(1, 6))
+    assert set(targets.leg.tolist()) == {1, 2, 3, 4}
+    np.testing.assert_allclose(np.bincount(targets.leg, targets.share)[1:], 1.0)
+    at = A[targets.leg][:, None] + targets.place[..., None] * (B - A)[targets.leg][:, None]
+    np.testing.assert_allclose(targets.ends, at, atol=1e-12)
+    assert np.all((targets.place[:, 0] > 0.0) & (np.diff(targets.place, axis=1)[:, 0] > 0.0))
+    assert np.all(targets.place[:, 1] < 1.0)
+    assert set(targets.radius.tolist()) == {lp.TUBE, lp.ROD}
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_true_pose_matches_and_a_scaled_or_shifted_one_does_not(seed: int) -> None:
+    pictures, T = _scene(seed)
+    matches = [match_pairs(picture, _pose(T), 2e-3) for picture in pictures]
+    score = np.concatenate([m.score[0][m.visible[0] > 0.9] for m in matches])
+    assert np.median(score) > 0.9
+    assert np.mean(score > 0.5) > 0.8  # pairs of edges of crossing legs may be taken as well
+    away = _pose(T)
+    away = replace(away, t=away.t + np.array([0.05, 0.0, 0.0]))
+    assert all(match_pairs(p, away, 2e-3).score.mean() < 0.2 for p in pictures)
+    for picture, m in zip(pictures, matches, strict=True):  # a third farther and thinner
+        wide = replace(
+            picture, targets=replace(picture.targets, radius=1.33 * picture.targets.radius)
         )
-        for p in pictures
-    ]
-    placed = place_camera(moved, 6)
-    assert placed.is_convincing
-    distance, angle = apart(placed, T)
-    assert distance < 0.06
-    assert angle < 4.0
+        assert match_pairs(wide, _pose(T), 2e-3).score.sum() < 0.4 * m.score.sum()
 
 
-def _rest(targets: LegSegments) -> tuple[Array, Array, Array]:
-    return targets.place, targets.radius, targets.share
+def test_a_pair_counts_for_the_segment_that_it_suits_best() -> None:
+    (picture, *_), T = _scene(0)
+    doubled = replace(picture.targets, **{
+        name: np.concatenate([getattr(picture.targets, name)] * 2) for name in vars(picture.targets)
+    })  # fmt: skip
+    n = len(picture.targets)
+    doubled.ends[n:] += 1.5e-3  # as good a pose, but for these segments
+    m = match_pairs(replace(picture, targets=doubled), _pose(T), 0.01)
+    both = (m.score[0, :n] > 0.5) & (m.score[0, n:] > 0.1) & (m.pair[0, :n] == m.pair[0, n:])
+    assert both.sum() > 5
+    better = np.maximum(m.score[0, :n], m.score[0, n:])[both]
+    exclusive = (m.exclusive_score[0, :n] + m.exclusive_score[0, n:])[both]
+    assert np.mean(np.abs(exclusive - better) < 1e-6) > 0.7
+    assert np.all(exclusive <= better + 1e-6)
 
 
-def test_symmetric_readings_are_ambiguous_and_other_readings_or_a_rough_pose_decide(
-    hexapod: Machine,
-) -> None:
-    rng = np.random.default_rng(7)
-    T = looking_at(np.array([0.9, 0.2, 0.4]), CENTRE, 0.1)
-    travel = np.array([leg.travel for leg in hexapod.legs])
-    level = np.outer([0.2, 0.5, 0.8], np.ptp(travel, axis=1)) + travel[:, 0]
-    pictures = pictures_of(hexapod, T, level, rng, clutter=4)
+def test_scores_depend_on_no_frame_and_not_on_other_poses() -> None:
+    (picture, *_), T = _scene(1)
+    poses = Poses.joined([_pose(T)] * 300)
+    poses = replace(poses, t=poses.t + np.linspace(0.0, 0.1, 300)[:, None] * [1.0, 0.0, 0.0])
+    together = match_pairs(picture, poses, 0.01)
+    for i in (0, 127, 128, 299):
+        alone = match_pairs(picture, poses.take(np.array([i])), 0.01)
+        np.testing.assert_allclose(alone.score[0], together.score[i], atol=1e-6)
+    moved = match_pairs(_moved_machine(picture, MOTION), _pose(MOTION * T), 0.01)
+    np.testing.assert_allclose(moved.score[0], together.score[0], atol=1e-4)
+    C = RigidTransform.from_components([0.1, 0.2, -0.1], Rotation.from_rotvec([0.2, -0.5, 0.3]))
+    joined = replace(picture, R=C.rotation.as_matrix(), t=C.translation)
+    other = match_pairs(joined, _pose(T * C), 0.01)
+    np.testing.assert_allclose(other.score[0], together.score[0], atol=1e-4)
+    for angle in (np.pi, 1.2):  # behind the camera, beside the picture
+        away = T * RigidTransform.from_rotation(Rotation.from_euler("y", angle))
+        assert not match_pairs(picture, _pose(away), 0.01).visible.any()
+    empty = replace(picture, pairs=picture.pairs.take(np.zeros(0, dtype=np.intp)))
+    nothing = match_pairs(empty, _pose(T), 0.01)
+    assert not nothing.score.any()
+    still = gauss_newton_step([empty], _pose(T), [nothing], 0.01, 0.006)
+    np.testing.assert_allclose(still.t, _pose(T).t)
+
+
+@pytest.mark.parametrize("joined", [False, True])
+def test_derivatives_of_residuals_are_those_by_differences(joined: bool) -> None:
+    (picture, *_), T = _scene(3)
+    C = RigidTransform.identity()
+    if joined:
+        C = RigidTransform.from_components([0.1, 0.2, -0.1], Rotation.from_rotvec([0.2, 0.5, 0.3]))
+        picture = replace(picture, R=C.rotation.as_matrix(), t=C.translation)
+    poses = _pose(T * C)
+    rng = np.random.default_rng(0)
+    poses = replace(poses, shift=rng.uniform(-5e-3, 5e-3, poses.shift.shape))
+    found = match_pairs(picture, poses, 0.02)
+    matched = found.score[0] > 0.3
+    assert matched.sum() > 5
+    J, J_leg, _, weight = _equations(picture, poses, found, 0.01)
+    assert np.all(weight[0, matched] > 0.0)
+
+    def residual(at: Poses) -> Array:
+        return np.asarray(_equations(picture, at, found, 0.01)[2][0])
+
+    # Fixed while a segment moves are its place along the pair, which matters by the product of two
+    # small residuals, and how obliquely its plane is seen, which matters a little for the width.
+    step, centre = 1e-6, np.full((1, 3), 1e3)
+    scale = np.abs(J[0, matched]).max()
+    for k in range(6):
+        xi = step * np.eye(6)[k][None]
+        ahead, back = (residual(_moved(poses, s * xi, poses.shift, centre)) for s in (1.0, -1.0))
+        error = np.abs(((ahead - back) / (2.0 * step))[matched] - J[0, matched, :, k])
+        assert error[:, :2].max() < 0.03 * scale
+        assert np.median(error[:, 2]) < 0.3
+        assert error[:, 3].max() < 1e-4 * scale
+    for k in range(6):
+        shift = poses.shift.copy()
+        shift.reshape(1, -1, 6)[..., k] += step
+        change = ((residual(replace(poses, shift=shift)) - residual(poses)) / step)[matched]
+        error = np.abs(change[:, :2] - J_leg[0, matched, :2, k])
+        assert error.max() < 0.05 * np.abs(J_leg[0, matched]).max()
+    assert not J_leg[0, :, 2:].any()  # neither width nor place moves joints
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_steps_lead_back_to_the_true_pose(seed: int) -> None:
+    pictures, T = _scene(seed, noise=0.3)
+    rng = np.random.default_rng(seed)
+    off = RigidTransform.from_components(
+        rng.uniform(-0.01, 0.01, 3), Rotation.from_rotvec(rng.uniform(-0.02, 0.02, 3))
+    )
+    poses = _pose(T * off)
+    for tolerance in (0.03, 0.02, 0.01, 0.006, 0.004):
+        matches = [match_pairs(picture, poses, tolerance) for picture in pictures]
+        poses = gauss_newton_step(pictures, poses, matches, tolerance)
+    away, angle = lp.apart(T, poses.T_base_camera())
+    assert away < 0.025
+    assert angle < 0.01 < lp.apart(T, T * off)[1]
+    np.testing.assert_allclose(poses.R[0] @ poses.R[0].T, np.eye(3), atol=1e-12)
+
+
+def test_a_joint_that_is_elsewhere_is_found_in_the_picture() -> None:
+    rng = np.random.default_rng(5)
+    made, T, where = lp.machine(6, rng), lp.camera(rng), lp.platform(rng)
+    A, B = made.A.copy(), made.posed(where)
+    x = T.rotation.apply([1.0, 0.0, 0.0])
+    A[2] = A[2] + 8e-3 * x
+    picture = lp.picture((made.A, B), (A, B), T, rng)
+    poses = _pose(T)
+    for tolerance in (0.02, 0.01, 0.005, 0.003):
+        matches = match_pairs(picture, poses, tolerance)
+        poses = gauss_newton_step([picture], poses, [matches], tolerance, 0.02)
+    sideways = np.cross(B[2] - A[2], T.rotation.apply([0.0, 0.0, 1.0]))
+    sideways /= np.linalg.norm(sideways)
+    assert abs(poses.shift[0, 2, 0] @ sideways) > 0.5 * abs(8e-3 * x @ sideways)
+    assert np.abs(np.delete(poses.shift[0], 2, axis=0)).max() < 3e-3
+    away = T * RigidTransform.from_translation([5e-3, 0.0, 0.0])
+    (picture, *_), T = _scene(0)
+    matches = match_pairs(picture, _pose(T), 2e-3)
+    good = matches.score[0] > 0.9
+    away = T * RigidTransform.from_translation([5e-3, 0.0, 0.0])
+    assert np.median(distances(picture, _pose(T), matches)[0, good]) < 2e-4
+    off = distances(picture, _pose(away), matches)[0, good]
+    assert 2e-3 < off.max() < 6e-3
+
+
+@pytest.mark.parametrize(("factor", "legs"), [(1.25, [1]), (0.8, [1]), (1.25, [0, 1, 2, 3, 4, 5])])
+def test_radii_that_pictures_contradict_are_estimated(factor: float, legs: list[int]) -> None:
+    pictures, T = _scene(2, n=8)
+    stated = []  # the model has the radii of some legs wrong
+    for p in pictures:
+        wrong = np.where(np.isin(p.targets.leg, legs), 1.0 / factor, 1.0)
+        stated.append(replace(p, targets=replace(p.targets, radius=wrong * p.targets.radius)))
+    radii = estimate_radii([(0, stated, _pose(T))])
+    assert radii.factor
+    assert {leg for leg, _ in radii.factor} <= set(legs)
+    assert list(radii.factor.values()) == pytest.approx([factor] * len(radii.factor), rel=0.03)
+    assert (radii.common > 0.0) == (len(legs) == 6)
+    assert not estimate_radii([(0, pictures, _pose(T))]).factor
+
+
+# The camera of a view.
+
+
+@pytest.mark.parametrize("n_legs", [3, 4, 6])
+def test_cameras_are_placed_among_clutter_and_missing_legs(n_legs: int) -> None:
+    for seed in range(2):
+        pictures, T = _scene(seed, n_legs, 4, joint_error=2e-3, **HARD)
+        placed = place_camera(pictures, n_legs)
+        assert placed.is_convincing
+        assert _is_right(placed, T)
+        assert np.all(np.diff(placed.score) <= 0.0)
+        assert np.isfinite(placed.leg_error).any()
+
+
+@pytest.mark.slow
+def test_no_wrong_pose_is_convincing() -> None:
+    right = []
+    for seed in range(60):
+        n_legs, n = 3 + seed % 4, 1 + seed % 5
+        coarse = 10e-3 if seed % 7 == 0 else 2e-3
+        pictures, T = _scene(100 + seed, n_legs, n, joint_error=coarse, **HARD)
+        placed = place_camera(pictures, n_legs)
+        right.append(placed.is_convincing)
+        if placed.is_convincing:
+            assert _is_right(placed, T), seed
+    assert np.mean(right) > 0.75
+
+
+def test_a_model_that_is_wrong_by_ten_millimetres_suffices() -> None:
+    pictures, T = _scene(8, 6, 5, joint_error=10e-3, **HARD)
     placed = place_camera(pictures, 6)
+    assert placed.is_convincing
+    away, angle = lp.apart(T, placed.pose())
+    assert angle < np.deg2rad(6.0)
+    assert away < 0.15
+
+
+def test_views_with_known_relative_poses_are_placed_together() -> None:
+    rng = np.random.default_rng(5)
+    made, joined = lp.machine(6, rng), []
+    for _ in range(4):  # one image each
+        T = lp.camera(rng)
+        [picture] = lp.pictures(made, T, [lp.platform(rng)], rng, joint_error=2e-3, noise=0.4)
+        T_camera_board = T.inv() * MOTION
+        R, t = T_camera_board.rotation.as_matrix(), T_camera_board.translation
+        joined.append(replace(picture, R=R, t=t))
+    placed = place_camera(joined, 6)
+    assert placed.is_convincing
+    assert _is_right(placed, MOTION)
+
+
+def test_the_rough_pose_of_a_group_is_that_of_its_frame_whichever_view_has_it() -> None:
+    rng = np.random.default_rng(0)
+    T_base_camera = [lp.camera(rng) for _ in range(3)]
+    joined = [MOTION.inv() * T for T in T_base_camera]
+    measurements = Measurements(
+        tuple(View(f"c{v}", CAMERA) for v in range(3)), ("a", "b", "c"), np.arange(3),
+        np.zeros(3, np.intp), np.zeros((3, 6)), 1e-6,
+    )  # fmt: skip
+    for v in range(3):
+        hints = [T if w == v else None for w, T in enumerate(T_base_camera)]
+        (group,) = group_views(measurements, np.arange(3), hints, joined)
+        assert group.hint is not None
+        np.testing.assert_allclose(group.hint.as_matrix(), MOTION.as_matrix(), atol=1e-12)
+
+
+def test_a_symmetric_machine_at_a_symmetric_reading_is_ambiguous_and_others_resolve_it() -> None:
+    rng = np.random.default_rng(2)
+    T, made = lp.camera(rng), lp.machine(3)
+    home = lp.pictures(made, T, [lp.platform()] * 3, rng)
+    placed = place_camera(home, 3)
     assert placed.is_enough
     assert not placed.is_convincing
-    near = place_near(pictures, T, 6)
+    other = placed.pose(1).inv() * placed.pose(0)
+    assert other.rotation.magnitude() == pytest.approx(2.0 * np.pi / 3.0, abs=0.05)
+    near = place_near(home, T, 3)
     assert near.is_convincing
-    assert apart(near, T)[1] < 2.0
-    more = pictures_of(hexapod, T, readings_of(hexapod, 3, rng), rng, clutter=4)
-    decided = place_camera([*pictures, *more], 6)
-    assert decided.is_convincing
-    assert apart(decided, T)[1] < 2.0
+    assert _is_right(near, T)
+    more = lp.pictures(made, T, [lp.platform(rng) for _ in range(3)], rng)
+    resolved = place_camera([*home, *more], 3)
+    assert resolved.is_convincing
+    assert _is_right(resolved, T)
 
 
-def test_bars_of_nothing_place_no_camera(hexapod: Machine) -> None:
-    rng = np.random.default_rng(3)
-    T = looking_at(np.array([0.9, 0.2, 0.4]), CENTRE, 0.0)
-    pictures = pictures_of(hexapod, T, readings_of(hexapod, 4, rng), rng, clutter=25, hidden=6)
-    assert not place_camera(pictures, 6).is_convincing
-
-
-def test_starts_lay_legs_on_bars(hexapod: Machine) -> None:
-    rng = np.random.default_rng(4)
-    T = looking_at(np.array([0.8, 0.6, 0.3]), CENTRE, 1.0)
-    picture = pictures_of(hexapod, T, readings_of(hexapod, 1, rng), rng, clutter=0)[0]
-    starts = pose_hypotheses(picture, 6)
-    assert np.allclose(starts.R @ starts.R.swapaxes(1, 2), np.eye(3), atol=1e-9)
-    assert np.all(np.linalg.det(starts.R) > 0.0)
-    cosine = 0.5 * (np.einsum("nij,ij->n", starts.R, T.inv().rotation.as_matrix()) - 1.0)
-    assert np.degrees(np.arccos(np.clip(cosine.max(), -1.0, 1.0))) < 15.0
-
-
-def test_steps_end_at_the_true_pose_and_shifts_are_found(hexapod: Machine) -> None:
-    rng = np.random.default_rng(8)
-    T = looking_at(np.array([0.8, -0.5, 0.3]), CENTRE, 0.0)
-    pictures = pictures_of(hexapod, T, readings_of(hexapod, 3, rng), rng, clutter=0)
-    start = T * RigidTransform.from_rotation(Rotation.from_rotvec([0.01, -0.01, 0.02]))
-    inverse = start.inv()
-    poses = Poses.rigid(inverse.rotation.as_matrix()[None], inverse.translation[None], 6)
-    values = []
-    for _ in range(8):
-        found = [match_pairs(picture, poses, 0.05) for picture in pictures]
-        values.append(sum(float(one.score.sum()) for one in found))
-        poses = gauss_newton_step(pictures, poses, found, 0.05)
-    off = (
-        T.inv() * RigidTransform.from_components(poses.t[0], Rotation.from_matrix(poses.R[0])).inv()
+def test_a_rough_pose_is_improved_and_that_of_another_place_is_not_clear() -> None:
+    pictures, T = _scene(4, 6, 4, joint_error=2e-3, **HARD)
+    off = RigidTransform.from_components(
+        [0.02, -0.02, 0.03], Rotation.from_rotvec([0.03, -0.02, 0])
     )
-    assert values[-1] > values[0]
-    assert np.degrees(off.rotation.magnitude()) < 0.3
+    placed = place_near(pictures, T * off, 6)
+    assert placed.hinted
+    assert placed.is_convincing
+    assert _is_right(placed, T)
+    assert lp.apart(T, placed.pose())[1] < 0.5 * lp.apart(T, T * off)[1]
+    other = RigidTransform.from_rotation(Rotation.from_euler("z", 1.9)) * T
+    assert not place_near(pictures, other, 6).is_clear
+    pictures, T = _scene(11, 3, 1, joint_error=2e-3)  # a single image of three legs
+    assert not place_camera(pictures, 3).is_clear
+    assert _is_right(place_near(pictures, T, 3), T)
 
 
-def test_a_bright_bar_gives_two_edges_and_one_bar() -> None:
-    camera = Camera(np.array([[500.0, 0.0, 160.0], [0.0, 500.0, 120.0], [0.0, 0.0, 1.0]]), 320, 240)
-    y, x = np.mgrid[0:240, 0:320]
-    across = (x - 160.0) * np.cos(0.3) + (y - 120.0) * np.sin(0.3)
-    along = -(x - 160.0) * np.sin(0.3) + (y - 120.0) * np.cos(0.3)
-    grey = np.where((np.abs(across) < 10.0) & (np.abs(along) < 90.0), 180.0, 40.0)
-    lens = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 0.6)
-    segments = find_segments(np.asarray(lens, dtype=np.float32), camera)
-    middle = segments.ends.mean(axis=1)
-    direction = segments.ends[:, 1] - segments.ends[:, 0]
-    bright = np.stack([direction[:, 1], -direction[:, 0]], axis=1)
-    long = np.linalg.norm(direction, axis=1) > 150.0 / 500.0
-    assert np.count_nonzero(long) == 2
-    assert np.all(np.sum(bright * middle, axis=1)[long] < 0.0)  # towards the middle of the bar
-    bars = find_edge_pairs(segments)
-    assert bars.width[0] * 500.0 == pytest.approx(20.0, abs=1.0)
-    assert np.abs(bars.along[0] @ [-np.sin(0.3), np.cos(0.3)]) > 0.9999
+def test_pictures_of_other_things_give_no_pose() -> None:
+    (empty,), _ = _scene(0, n=1, missing=1.1)
+    for pictures in ([empty], [empty, empty]):
+        placed = place_camera(pictures, 6)
+        assert len(placed.poses) == 0
+        assert [placed.is_enough, placed.is_clear, placed.is_convincing] == [False] * 3
+    (clutter,), _ = _scene(0, n=1, missing=1.1, n_clutter=12)
+    assert not place_camera([clutter] * 2, 6).is_convincing
 
 
-def test_an_empty_picture_has_neither_edges_nor_bars() -> None:
-    camera = Camera(np.array([[500.0, 0.0, 160.0], [0.0, 500.0, 120.0], [0.0, 0.0, 1.0]]), 320, 240)
-    segments = find_segments(np.zeros((240, 320), dtype=np.float32), camera)
-    assert len(segments) == 0
-    assert len(find_edge_pairs(EdgeSegments(segments.ends, segments.covered, segments.pixel))) == 0
+@pytest.mark.parametrize("missing", [0.2, 0.45])
+def test_mirrored_pictures_are_recognised_as_such(missing: float) -> None:
+    for seed in (20,):
+        pictures, _ = _scene(seed, 6, 3, joint_error=2e-3, **{**HARD, "missing": missing})
+        own, other = place_camera(pictures, 6), place_camera(mirrored(pictures), 6)
+        assert own.is_convincing
+        assert may_be_mirrored(other)
+        assert is_mirrored(other, own) or not other.is_convincing
+        assert not is_mirrored(own, other)
 
 
-class _Known(Search):
+def test_mirrored_pictures_of_a_planar_machine_are_accepted() -> None:
+    rng = np.random.default_rng(3)
+    spatial, T, flat = lp.machine(4, rng), lp.camera(rng), np.array([1.0, 1.0, 0.0])
+    made = lp.MachineSpec(flat * spatial.A, flat * spatial.B)
+    steps = [RigidTransform.from_translation([*rng.uniform(-0.05, 0.05, 2), 0.0]) for _ in range(4)]
+    pictures = lp.pictures(made, T, steps, rng)
+    own, other = place_camera(pictures, 4), place_camera(mirrored(pictures), 4)
+    assert own.is_enough
+    assert other.is_enough
+    assert not is_mirrored(own, other)
+    assert not is_mirrored(other, own)
+
+
+def test_a_flat_machine_is_seen_alike_with_near_and_far_exchanged() -> None:
+    rng = np.random.default_rng(4)
+    X = np.append(rng.uniform(-0.2, 0.2, (16, 2)), np.zeros((16, 1)), axis=1)
+    R = Rotation.random(5, rng=rng).as_matrix()
+    far = np.array([0.3, -0.2, 200.0])
+    poses = Poses.rigid(R, far - R @ X.mean(axis=0), 4)
+    other = exchanged(poses, X)
+    assert np.allclose(np.linalg.det(other.R), 1.0)
+    here, there = (X @ p.R.swapaxes(1, 2) + p.t[:, None] for p in (poses, other))
+    assert np.abs(here[..., :2] / here[..., 2:] - there[..., :2] / there[..., 2:]).max() < 1e-5
+    assert np.abs(here[..., 2] + there[..., 2] - 2.0 * far[2]).max() < 1e-3
+    again = exchanged(other, X)
+    np.testing.assert_allclose(again.R, poses.R, atol=1e-9)
+    np.testing.assert_allclose(again.t, poses.t, atol=1e-6)
+
+
+@pytest.mark.parametrize(("rival", "accepted"), [(2.0, True), (2.6, False)])
+def test_few_legs_suffice_only_without_a_rival(rival: float, accepted: bool) -> None:
+    poses = Poses.rigid(np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), 6)
+    support, expected = np.array([[0.9] * 4, [rival / 4] * 4]), np.full((2, 4), 6.0)
+    placed = Candidates(poses, support, expected, support.sum(axis=1), np.zeros(6))
+    assert 0.12 < placed.share < 0.2
+    assert placed.is_convincing == accepted
+    assert not placed.is_clear
+
+
+class _Made(Search):
     """A search whose pictures are made already."""
 
     made: ClassVar[list[Picture]] = []
@@ -253,52 +456,128 @@ class _Known(Search):
         return self.made[row]
 
 
-def _recognised(
-    machine: Machine, pictures: list[Picture], hint: RigidTransform | None
-) -> Placement:
-    """Return what is recognised in the pictures of one view by bars alone: there are no images."""
-    n, n_legs = len(pictures), machine.n_legs
-    rows, names = np.arange(n), tuple(f"{k}.png" for k in range(n))
-    measurements = Measurements(
-        (View("c1", CAMERA),), names, np.zeros(n, dtype=np.intp), rows, np.zeros((n, n_legs)), 1e-6
-    )
-    nowhere, cylinders = np.zeros((n, n_legs, 3)), [leg.cylinders for leg in machine.legs]
-    wanted = np.ones((1, n_legs), dtype=np.bool_)
-    search = _Known(_no_image, measurements, nowhere, nowhere, cylinders, wanted, machine.leg_names)
-    _Known.made[:] = pictures
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            recognising, "_decided_by_outlines", lambda s, groups, placed, p, g: placed[g]
-        )
-        return recognise(search, rows, [hint])
-
-
 def _no_image(row: int) -> Image:
     raise AssertionError(row)
 
 
-@pytest.mark.parametrize("hidden", [2, 3])
-def test_many_images_with_a_rough_pose_and_hidden_legs_are_placed(
-    hexapod: Machine, hidden: int
-) -> None:
-    rng = np.random.default_rng(hidden)
-    T = looking_at(np.array([0.8, -0.5, 0.35]), CENTRE, 0.4)
-    pictures = pictures_of(hexapod, T, readings_of(hexapod, 15, rng), rng, 10, hidden)
-    found = _recognised(hexapod, pictures, T).T_base_camera[0]
-    assert found is not None
-    assert np.degrees((T.inv() * found).rotation.magnitude()) < 2.0
+def _search(kind: type[Search], made: lp.MachineSpec, B: Array) -> Search:
+    n, n_legs = len(B), made.n_legs
+    rows = np.arange(n)
+    measurements = Measurements(
+        (View("c1", CAMERA),), tuple(f"{row}.png" for row in rows), np.zeros(n, np.intp), rows,
+        np.zeros((n, n_legs)), 1e-6,
+    )  # fmt: skip
+    A = np.broadcast_to(made.A, B.shape)
+    wanted = np.ones((1, n_legs), dtype=np.bool_)
+    return kind(_no_image, measurements, A, B, [lp.CYLINDERS] * n_legs, wanted, ["leg"] * n_legs)
 
 
-@pytest.mark.parametrize("spread", [0.05, 0.1])
-def test_a_rough_pose_turned_by_a_symmetry_of_the_machine_is_not_believed(
-    hexapod: Machine, spread: float
-) -> None:
+def test_a_wrong_rough_pose_gives_way_to_a_better_one(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(1)
-    T = looking_at(np.array([0.9, 0.3, 0.35]), CENTRE, 0.2)
-    travel = np.array([leg.travel for leg in hexapod.legs])
-    share = 0.5 + spread * rng.uniform(-1.0, 1.0, (3, 6))
-    pictures = pictures_of(hexapod, T, travel[:, 0] + share * np.ptp(travel, axis=1), rng, 10, 0)
+    T, made = lp.camera(rng), lp.machine(6)
+    spread = [
+        RigidTransform.from_components(
+            [*rng.uniform(-0.03, 0.03, 2), 0.38], Rotation.from_rotvec(rng.uniform(-0.1, 0.1, 3))
+        )
+        for _ in range(4)
+    ]
+    _Made.made[:] = lp.pictures(made, T, spread, rng, n_clutter=6)
     turned = RigidTransform.from_rotation(Rotation.from_euler("z", 120.0, degrees=True)) * T
-    found = _recognised(hexapod, pictures, turned).T_base_camera[0]
-    assert found is not None
-    assert np.degrees((T.inv() * found).rotation.magnitude()) < 2.0
+    search = _search(_Made, made, np.array([made.posed(P) for P in spread]))
+    monkeypatch.setattr(  # there are no images to measure outlines in
+        recognition, "_decided_by_outlines", lambda s, groups, placed, p, g: placed[g]
+    )
+    for hint in (T, turned):
+        placement = recognition.recognise(search, np.arange(4), [hint])
+        placed = placement.T_base_camera[0]
+        assert placed is not None
+        assert lp.apart(T, placed)[1] < np.deg2rad(2.0)
+
+
+# The fit of a view to outlines.
+
+N_LEGS, N_IMAGES = 6, 4
+SIGMA = 0.1  # of outlines [px]
+
+
+def _outlines(search: Search, T: RigidTransform, A: Array, B: Array, noise: Array) -> Outlines:
+    """Return both outlines of all tubes, with normal offsets (rows, legs, edges, ends) [px]."""
+    row, leg, edge = (x.ravel() for x in np.indices((N_IMAGES, N_LEGS, 2)))
+    n = len(row)
+    X = T.inv().apply(np.stack([A[row, leg], B[row, leg]], 1).reshape(-1, 3)).reshape(-1, 2, 3)
+    u = X[:, 1] - X[:, 0]
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    h = outlines_of_axis(u, X[:, 0], lp.TUBE)[np.arange(n), edge]
+    along = X[:, :1] + np.array([0.03, 0.2])[:, None] * u[:, None]
+    xy = along[..., :2] / along[..., 2:]
+    normal = h[:, :2] / np.linalg.norm(h[:, :2], axis=1, keepdims=True)
+    off = (np.einsum("nkx,nx->nk", xy, h[:, :2]) + h[:, 2:]) / np.hypot(*h[:, :2].T)[:, None]
+    ends = CAMERA.distort(xy - off[..., None] * normal[:, None])
+    ends = ends + noise[row, leg, edge][..., None] * normal[:, None]
+    return Outlines(
+        row, leg, ("tube",) * n, edge + 1, np.full((n, 3), np.nan), ends,
+        np.tile(SIGMA**2 * np.eye(2), (n, 1, 1)), np.ones(n, dtype=np.bool_), ("",) * n,
+        ("detected",) * n,
+    )  # fmt: skip
+
+
+def _fitted(
+    seed: int, *, joints: float = 0.0, moved: float = 0.0, without: int = -1
+) -> tuple[ViewFit | None, Search, Group, RigidTransform]:
+    """Fit a view that starts three degrees off; leg 2 of image 1 is moved sideways [px]."""
+    rng = np.random.default_rng(seed)
+    made, T = lp.machine(N_LEGS, rng), lp.camera(rng)
+    B = np.array([made.posed(lp.platform(rng)) for _ in range(N_IMAGES)])
+    search = _search(Search, made, B)
+    (group,) = group_views(search.measurements, np.arange(N_IMAGES), [None], None)
+    noise = np.zeros((N_IMAGES, N_LEGS, 2, 2))
+    noise[1, 2] = moved
+    off = RigidTransform.from_components(
+        [0.02, -0.01, 0.02], Rotation.from_rotvec([0.0, 0.05, 0.0])
+    )
+    shift = joints * rng.normal(size=(2, N_LEGS, 3))
+    outlines = _outlines(search, T, search.A_base + shift[0], search.B_base + shift[1], noise)
+    used = (outlines.leg != without) & (without < N_LEGS)
+    outlines = replace(outlines, used=used)
+    return fit_view(search, group, T * off, np.zeros((N_LEGS, 2, 3)), outlines), search, group, T
+
+
+def test_exact_outlines_give_back_the_camera() -> None:
+    for seed in range(3):
+        fit, _, group, T = _fitted(seed)
+        assert fit is not None
+        assert max(lp.apart(T, fit.T_base_group)) < 1e-3
+        assert not fit.outliers.any()
+        assert np.abs(fit.offset).max() < 2e-4
+        assert fit.evidence == pytest.approx(2.0 * 2 * N_IMAGES * N_LEGS, rel=0.01)
+        assert fit.evidence > min_evidence(group)
+        assert fit.is_good
+    assert _fitted(0, without=N_LEGS)[0] is None  # no outline is used
+
+
+def test_the_camera_is_as_far_off_as_its_covariance_says() -> None:
+    ratios = []
+    for seed in range(8):
+        fit, _, _, T = _fitted(seed, joints=2e-3)
+        assert fit is not None
+        ratios.append(lp.apart(T, fit.T_base_group)[1] / fit.turn_sigma)
+    assert 0.2 < np.sqrt(np.mean(np.square(ratios))) < 3.0
+
+
+def test_a_leg_that_is_elsewhere_in_one_image_is_an_outlier() -> None:
+    fit, _, _, T = _fitted(1, joints=1e-3, moved=25.0)
+    assert fit is not None
+    wrong = zip(fit.row[fit.outliers].tolist(), fit.leg[fit.outliers].tolist(), strict=True)
+    assert set(wrong) == {(1, 2)}
+    assert lp.apart(T, fit.T_base_group)[1] < np.deg2rad(1.0)
+
+
+def test_legs_without_outlines_are_known_less_well() -> None:
+    fit, search, group, T = _fitted(2, without=4)
+    assert fit is not None
+    sigma = sideways_sigmas(search, group, fit)
+    assert np.isfinite(sigma).all()
+    assert sigma[:, 4].min() > 1.5 * np.median(sigma[:, [0, 1, 2, 3, 5]])
+    there = reversed_pose(search, group, T)
+    assert max(lp.apart(T, reversed_pose(search, group, there))) < 1e-9
+    assert lp.apart(T, there)[1] > np.deg2rad(10.0)

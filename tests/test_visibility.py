@@ -1,4 +1,4 @@
-"""What simulated cameras see of legs: silhouettes by a second route, and what hides them."""
+"""What simulated cameras see of legs: silhouettes, and where solids and borders hide them."""
 
 from functools import cache
 
@@ -133,13 +133,6 @@ def test_a_thick_tube_covers_the_rod_in_it() -> None:
     assert hidden.span(length)[0] < tube.end < hidden.span(length)[1]
 
 
-def test_cylinders_of_one_radius_are_one_part() -> None:
-    leg = posed_machine("hexapod").legs[0]
-    radii = {c.radius for c in leg.cylinders}
-    assert (len(leg.cylinders), len(radii)) == (2, 1)
-    assert all(len(view.stretches) <= 1 for view in seen_at_home())
-
-
 @pytest.mark.parametrize("name", thinned(SHIPPED, ["hexapod", "3-rpr", "3-upu", "tricept"]))
 def test_cameras_around_any_machine_see_its_legs_and_all_of_it(name: str) -> None:
     machine, camera = posed_machine(name), sample_camera()
@@ -178,44 +171,20 @@ def test_a_place_between_the_joints_or_in_a_leg_is_inside_the_machine() -> None:
     assert not flat.encloses(np.array([0.0, 0.0, 0.5]))
 
 
-# --- outlines of cylinders by two routes that know nothing of each other
-
-
-PLACES = st.tuples(*[st.floats(-1.0, 1.0)] * 5, st.floats(0.3, 3.0), st.floats(0.001, 0.2))
-
-
-def _cylinder(numbers: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    u = np.array(numbers[:3]) + np.array([0.0, 1.5, 0.0])
-    A = np.array([numbers[3], numbers[4], numbers[5]])
-    return u / np.linalg.norm(u), A, np.array(numbers[6])
-
-
-@given(PLACES)
-@settings(max_examples=200, deadline=None)
-def test_tangents_to_the_circle_are_the_tangent_planes_of_eq_3(numbers: tuple[float, ...]) -> None:
-    u, A, R = _cylinder(numbers)
-    if np.linalg.norm(np.cross(u, A)) < 1.01 * R:
-        return
-    h, _ = silhouette(u, A, R)
-    assert np.allclose(h, outlines_of_axis(u, A, R), rtol=0.0, atol=1e-12)
-
-
-@given(PLACES)
+@given(st.tuples(*[st.floats(-1.0, 1.0)] * 5, st.floats(0.3, 3.0), st.floats(0.001, 0.2)))
 @settings(max_examples=100, deadline=None)
-def test_generating_lines_lie_on_the_cylinder_and_in_their_plane(
-    numbers: tuple[float, ...],
-) -> None:
-    u, A, R = _cylinder(numbers)
+def test_silhouettes_are_the_tangent_planes_of_eq_3(numbers: tuple[float, ...]) -> None:
+    """By tangents to a circle, which know nothing of moments."""
+    u = np.array(numbers[:3]) + np.array([0.0, 1.5, 0.0])
+    u /= np.linalg.norm(u)
+    A, R = np.array(numbers[3:6]), np.array(numbers[6])
     if np.linalg.norm(np.cross(u, A)) < 1.01 * R:
         return
     h, offsets = silhouette(u, A, R)
+    assert np.allclose(h, outlines_of_axis(u, A, R), rtol=0.0, atol=1e-12)
     assert np.allclose(np.linalg.norm(offsets, axis=-1), R, rtol=1e-12)
     assert np.allclose(offsets @ u, 0.0, atol=1e-14)
-    points = A + 0.3 * u + offsets
-    assert np.allclose(np.sum(h * points, axis=-1), 0.0, atol=1e-12)
+    assert np.allclose(np.sum(h * (A + 0.3 * u + offsets), axis=-1), 0.0, atol=1e-12)
     assert np.allclose(np.sum(h * offsets, axis=-1), [-R, R], atol=1e-12)  # epsilon +1, -1
-
-
-def test_a_camera_inside_a_leg_sees_no_silhouette() -> None:
     with pytest.raises(NotVisible, match=r"5\.0 mm from its axis"):
         contact_offsets(np.array([0.0, 1.0, 0.0]), np.array([0.005, 0.0, 0.0]), np.array(0.01))

@@ -62,7 +62,7 @@ class _Round(NamedTuple):
     inverse: Array  # (n_edges, N_ALONG * N_UNKNOWNS, N_ALONG * N_UNKNOWNS)
 
 
-def fit_lines(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> FittedLines:
+def fit_jointly(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> FittedLines:
     """Fit the blocks (n,) that lie on the lines of their edges, of each outline together.
 
     From a rough blur [px]; ``depth`` is the distance from the outlines at which blocks end [px].

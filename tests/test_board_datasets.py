@@ -1,0 +1,213 @@
+"""Datasets with a board: views of a camera in the hand, and the table ``corners.csv``."""
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from boards import CHARUCO, LENS
+from dataset_folder import Folder, folder
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from legcal.data import (
+    Corners,
+    Measurements,
+    View,
+    canonical_order,
+    load_dataset,
+    write_corners,
+)
+from legcal.data.corners import COLUMNS, read_corners
+from legcal.errors import DatasetError
+
+__all__ = ["folder"]
+BOARD = {"kind": "charuco", "squares_x": 4, "squares_y": 3, "square": 0.03, "marker": 0.02,
+         "dictionary": "DICT_4X4_50"}  # fmt: skip
+IN_HAND = ("c1-1,images/c1_1.png", "c1-2,images/c1_2.png")
+
+
+def _hold(folder: Folder, view: str) -> None:
+    folder.entry["board"] = dict(BOARD)
+    folder.entry["views"][view]["hand_held"] = True
+    folder.entry["views"][view].pop("T_base_camera", None)
+
+
+def _lines(place: str, n: int = 6) -> list[str]:
+    return [f"{place},{k},{5 + k},6,0.1,used,,detected" for k in range(n)]
+
+
+def _write(path: Path, lines: list[str]) -> None:
+    path.write_text("\n".join([",".join(COLUMNS), *lines]) + "\n")
+
+
+def test_every_image_of_a_hand_held_view_is_a_view_in_the_order_of_rows(folder: Folder) -> None:
+    _hold(folder, "c1")
+    pose = {"xyz": [0.1, 0.0, 0.0], "quat_xyzw": [0.0, 0.0, 0.0, 1.0]}
+    folder.entry["board"] |= {"T_base_board": pose}
+    _write(folder.path / "corners.csv", [line for place in IN_HAND for line in _lines(place)])
+    dataset = load_dataset(folder.write())
+    m = dataset.measurements
+    assert [view.name for view in m.views] == ["c1-1", "c1-2", "c2"]
+    assert m.view.tolist() == [0, 1, 2, 2]
+    assert len(dataset.camera_paths) == 3
+    assert m.views[0].T_base_camera is None
+    assert dataset.T_base_board is not None
+    assert dataset.T_base_board.translation == pytest.approx([0.1, 0.0, 0.0])
+    assert dataset.corners is not None
+    assert np.bincount(dataset.corners.row).tolist() == [6, 6]
+
+
+def test_hand_held_views_count_in_the_order_of_the_table(folder: Folder) -> None:
+    _hold(folder, "c2")
+    folder.rows.reverse()
+    m = load_dataset(folder.write()).measurements
+    assert [m.views[v].name for v in m.view] == ["c2-1", "c2-2", "c1", "c1"]
+    assert m.image[0].endswith("c2_2.png")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("no board", ("views.c1.hand_held", "no board")),
+        ("a pose", ("views.c1.T_base_camera", "one pose")),
+        ("a name", ("views.c1-2", "hand-held")),
+        ("3 corners", ("row 2", "found 3 corners")),
+        ("0 corners", ("row 2", "found no corners")),
+        ("no image", ("row 2, column image", "neither an image")),
+        ("corners alone", ("corners.csv", "no board")),
+        ("a number", ("views.c1.hand_held", "found 3", "true or false")),
+        ("a wrong board", ("dataset.yaml", "board.square", "30 m")),
+        ("a word", ("dataset.yaml", "board", "'charuco'", "mapping")),
+    ],
+)
+def test_what_no_board_can_place_is_refused(
+    folder: Folder, change: str, words: tuple[str, ...]
+) -> None:
+    entry, views = folder.entry, folder.entry["views"]
+    pose = views["c1"]["T_base_camera"]
+    if change != "corners alone":
+        _hold(folder, "c1")
+    if change == "no board":
+        del entry["board"]
+    elif change == "a pose":
+        views["c1"]["T_base_camera"] = pose
+    elif change == "a name":
+        views["c1-2"] = views.pop("c2")
+        for row in folder.rows[2:]:
+            row["view"] = "c1-2"
+    elif change.endswith("corners"):
+        n = int(change[0])
+        lines = [*_lines(IN_HAND[0]), *_lines("c2,images/c2_1.png"), *_lines(IN_HAND[1], n)]
+        _write(folder.path / "corners.csv", lines)
+    elif change == "no image":
+        folder.rows[1]["image"] = ""
+    elif change == "corners alone":
+        _write(folder.path / "corners.csv", _lines("c1,images/c1_1.png"))
+    else:
+        wrong: dict[str, Any] = {
+            "a number": BOARD, "a wrong board": BOARD | {"square": 30}, "a word": "charuco"
+        }  # fmt: skip
+        entry["board"] = wrong[change]
+        views["c1"]["hand_held"] = 3 if change == "a number" else True
+    with pytest.raises(DatasetError) as caught:
+        load_dataset(folder.write())
+    assert [word for word in words if word not in str(caught.value)] == []
+
+
+# The table of corners.
+
+MEASUREMENTS = Measurements(
+    views=(View("c2", LENS), View("c1", LENS)),
+    image=("a.png", "b.png", "c.png"),
+    view=np.array([0, 0, 1]),
+    pose=np.arange(3),
+    q=np.zeros((3, 1)),
+    sigma_q=1e-6,
+)
+KEYS = st.lists(
+    st.tuples(st.integers(0, 2), st.integers(0, CHARUCO.n_corners - 1)),
+    min_size=1,
+    max_size=8,
+    unique=True,
+)
+
+
+@st.composite
+def tables(draw: st.DrawFn) -> Corners:
+    row, corner = np.array(draw(KEYS), dtype=np.intp).T
+    n = len(row)
+    number = st.floats(-0.5, 340.0)
+    px = np.array(draw(st.lists(st.tuples(number, number), min_size=n, max_size=n)))
+    sigma = np.array(draw(st.lists(st.floats(1e-3, 5.0), min_size=n, max_size=n)))
+    used = np.array(draw(st.lists(st.booleans(), min_size=n, max_size=n)))
+    reason = tuple("" if u else 'far, "off"' for u in used)
+    source = tuple(draw(st.lists(st.sampled_from(["detected", "edited"]), min_size=n, max_size=n)))
+    return Corners(row, corner, px, sigma, used, reason, source)
+
+
+def _same(one: Corners, other: Corners) -> bool:
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in vars(one))
+
+
+@settings(max_examples=40)
+@given(tables())
+def test_corners_are_read_as_they_were_written_and_put_in_order(corners: Corners) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "corners.csv"
+        write_corners(path, corners, MEASUREMENTS)
+        assert _same(read_corners(path, CHARUCO, MEASUREMENTS), corners)
+    order = canonical_order(MEASUREMENTS, ["leg1"])
+    back = order.restore(order.reorder(corners))
+    assert _same(back, corners.choose(np.lexsort([corners.corner, corners.row])))
+
+
+def _read(tmp_path: Path, *lines: str) -> Corners:
+    _write(tmp_path / "corners.csv", list(lines))
+    return read_corners(tmp_path / "corners.csv", CHARUCO, MEASUREMENTS)
+
+
+def test_an_edited_corner_wins_and_a_rejected_one_needs_no_place(tmp_path: Path) -> None:
+    corners = _read(
+        tmp_path,
+        "c2,a.png,3,10.0,20.0,0.1,used,,detected",
+        "c2,a.png,4,11.0,20.0,0.1,used,,detected",
+        "c2,a.png,3,10.5,20.5,0.2,used,,edited",
+        "c2,a.png,5,,,,rejected,hidden,edited",
+    )
+    assert corners.corner.tolist() == [4, 3, 5]
+    assert corners.px[:2, 0].tolist() == [11.0, 10.5]
+    assert corners.used.tolist() == [True, True, False]
+    write_corners(tmp_path / "again.csv", corners, MEASUREMENTS)
+    assert "c2,a.png,5,,,,rejected,hidden,edited" in (tmp_path / "again.csv").read_text()
+
+
+FIRST = "c1,c.png,0,5.0,5.0,0.1,used,,detected"
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("c9,a.png,3,1,2,0.1,used,,detected", ("column view", "'c9'")),
+        ("c2,c.png,3,1,2,0.1,used,,detected", ("column image", "'c.png'")),
+        ("c2,a.png,15,1,2,0.1,used,,detected", ("column corner", "'15'", "0 to 14")),
+        ("c2,a.png,1.0,1,2,0.1,used,,detected", ("column corner", "'1.0'")),
+        ("c2,a.png,3,x,2,0.1,used,,detected", ("column u", "'x'")),
+        ("c2,a.png,3,1,,0.1,used,,detected", ("column v", "empty cell")),
+        ("c2,a.png,3,1,nan,0.1,used,,detected", ("column v", "'nan'")),
+        ("c2,a.png,3,470,2,0.1,used,,detected", ("column u", "470 px", "inside the image")),
+        ("c2,a.png,3,1,2,0,used,,detected", ("column sigma", "'0'")),
+        ("c2,a.png,3,1,2,0.1,good,,detected", ("column verdict", "used or rejected")),
+        ("c2,a.png,3,1,2,0.1,used,,me", ("column source", "detected or edited")),
+        ("c2,a.png,3,1,2,0.1,used", ("7 cells", "needed 9")),
+        (FIRST, ("the same image and corner in row 1",)),
+    ],
+)
+def test_a_wrong_cell_is_named(tmp_path: Path, line: str, words: tuple[str, ...]) -> None:
+    with pytest.raises(DatasetError) as caught:
+        _read(tmp_path, FIRST, line)
+    (problem,) = caught.value.problems
+    assert [word for word in ("row 2 (line 3)", *words) if word not in problem] == []
+    with pytest.raises(DatasetError, match="found a header and no row"):
+        _read(tmp_path)

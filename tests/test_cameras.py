@@ -1,0 +1,390 @@
+"""Cameras: distortion both ways, their files, and cylinders seen by them (eqs 1 to 5)."""
+
+import json
+from pathlib import Path
+from typing import Any, get_args
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from legcal.cli.commands import Model
+from legcal.errors import DatasetError, NotVisible
+from legcal.geometry import Array, distance_to_line, moment
+from legcal.vision import (
+    DISTORTION_MODELS,
+    EPSILON,
+    Camera,
+    DistortionModel,
+    axis_of_outlines,
+    camera_info,
+    outlines_of_axis,
+    point_with_zero_y,
+    read_camera,
+)
+
+FAST = settings(deadline=None, max_examples=40)
+SIZE = 1024, 768
+K = np.array([[1290.0, 2.5, 518.3], [0.0, 1310.0, 379.6], [0.0, 0.0, 1.0]])
+PLUMB_BOB = [-0.25, 0.08, 1e-3, -8e-4, 0.01]
+RATIONAL = [0.3, 0.1, 1e-3, -5e-4, 0.02, 0.4, 0.05, 0.01]
+FISHEYE = [0.03, -0.01, 0.004, -0.002]
+LENSES: list[tuple[DistortionModel, list[float]]] = [
+    ("plumb_bob", []),
+    ("plumb_bob", PLUMB_BOB),
+    ("plumb_bob", PLUMB_BOB[:4]),
+    ("rational_polynomial", RATIONAL),
+    ("equidistant", FISHEYE),
+    ("equidistant", [0.0] * 4),
+]
+CAMERAS = [Camera(K, *SIZE, np.array(D), model) for model, D in LENSES]
+EACH = pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: f"{c.model}-{len(c.distortion)}")
+PINHOLE = CAMERAS[0]
+
+
+def field(n: int = 7) -> Array:
+    """Points of the sensor plane all over the image."""
+    x, y = np.meshgrid(np.linspace(-0.4, 0.38, n), np.linspace(-0.28, 0.29, n))
+    return np.stack([x, y], axis=-1)
+
+
+def test_every_distortion_model_is_in_the_table_the_type_and_the_command() -> None:
+    names = tuple(DISTORTION_MODELS)
+    assert names == get_args(DistortionModel) == tuple(model.value for model in Model)
+    assert {model for model, _ in LENSES} == set(names)
+    for model in DISTORTION_MODELS.values():
+        assert max(model.counts) == len(model.coefficients)
+
+
+@EACH
+def test_undistort_undoes_distort_all_over_the_image(camera: Camera) -> None:
+    pixels = camera.distort(field())
+    assert pixels.shape == (7, 7, 2)
+    np.testing.assert_allclose(camera.undistort(pixels), field(), atol=1e-11)
+    rays = np.concatenate([field(), np.ones((7, 7, 1))], axis=-1)
+    np.testing.assert_allclose(camera.project(0.9 * rays), pixels, atol=1e-9)
+    step = np.array([3e-4, -2e-4])
+    moved = camera.distort(field() + step) - camera.distort(field() - step)
+    np.testing.assert_allclose(camera.pixels_per_unit(field()) @ (2.0 * step), moved, atol=1e-5)
+    P, dP = np.array([[0.1, -0.05, 0.8], [-0.2, 0.1, 0.9]]), np.array([1e-5, -2e-5, 3e-5])
+    pixels, by_point = camera.project_with_derivative(P)
+    np.testing.assert_allclose(pixels, camera.project(P), atol=1e-9)
+    np.testing.assert_allclose(
+        2.0 * by_point @ dP, camera.project(P + dP) - camera.project(P - dP), atol=1e-5
+    )
+
+
+@FAST
+@given(
+    st.tuples(st.floats(-0.3, 0.3), st.floats(-0.1, 0.1)),
+    st.tuples(st.floats(-2e-3, 2e-3), st.floats(-2e-3, 2e-3)),
+    st.tuples(st.floats(-0.35, 0.35), st.floats(-0.3, 0.3)),
+)
+def test_undistort_undoes_distort_for_any_ordinary_lens(
+    radial: tuple[float, float], tangential: tuple[float, float], point: tuple[float, float]
+) -> None:
+    camera = Camera(K, *SIZE, np.array([*radial, *tangential, 0.0]))
+    xy = np.array(point)
+    np.testing.assert_allclose(camera.undistort(camera.distort(xy)), xy, atol=1e-10)
+
+
+def test_lenses_without_coefficients_project_by_their_definition() -> None:
+    P = np.array([0.1, -0.2, 0.8])
+    np.testing.assert_allclose(PINHOLE.project(P), (K @ P / P[2])[:2], atol=1e-12)
+    np.testing.assert_allclose(
+        PINHOLE.pixels_per_unit(field()), np.broadcast_to(K[:2, :2], (7, 7, 2, 2))
+    )
+    zero = Camera(K, *SIZE, np.zeros(5))
+    assert not zero.has_distortion
+    np.testing.assert_array_equal(zero.distort(field()), PINHOLE.distort(field()))
+    pixel = CAMERAS[-1].distort(np.array([np.tan(0.35), 0.0]))  # grows with the angle
+    np.testing.assert_allclose(pixel, [K[0, 0] * 0.35 + K[0, 2], K[1, 2]], atol=1e-9)
+
+
+@EACH
+@pytest.mark.parametrize("offset", [-0.5, 1.0])
+def test_line_offset_is_the_distance_to_the_line_as_the_lens_bends_it(
+    camera: Camera, offset: float
+) -> None:
+    direction = np.array([0.6, 0.8])
+    h = np.array([-0.8, 0.6, 0.05])
+    on_line = -h[2] * h[:2] + 0.2 * direction
+    xy = on_line + h[:2] * offset / 1300.0
+    s = np.linspace(0.18, 0.22, 8_001)[:, None]
+    curve = camera.distort(-h[2] * h[:2] + s * direction)
+    nearest = np.linalg.norm(curve - camera.distort(xy), axis=-1).min()
+    assert camera.line_offset(h, xy) == pytest.approx(np.sign(offset) * nearest, abs=2e-3)
+    assert camera.line_offset(5.0 * h, xy) == pytest.approx(camera.line_offset(h, xy), rel=1e-12)
+
+
+# Files.
+
+
+def ros(**changes: Any) -> dict[str, Any]:
+    """The content of a ROS camera_info file; D and K are its coefficients and matrix."""
+    D, matrix = changes.pop("D", PLUMB_BOB), changes.pop("K", K.tolist())
+    content = {
+        "image_width": SIZE[0],
+        "image_height": SIZE[1],
+        "camera_matrix": {"rows": 3, "cols": 3, "data": [x for row in matrix for x in row]},
+        "distortion_model": "plumb_bob",
+        "distortion_coefficients": {"rows": 1, "cols": len(D), "data": D},
+    }
+    return {key: value for key, value in {**content, **changes}.items() if value is not ...}
+
+
+def kalibr(**changes: Any) -> dict[str, Any]:
+    """The content of a Kalibr camchain of one camera."""
+    camera = {
+        "cam_overlaps": [],
+        "camera_model": "pinhole",
+        "distortion_coeffs": PLUMB_BOB[:4],
+        "distortion_model": "radtan",
+        "intrinsics": [1290.0, 1310.0, 518.3, 379.6],
+        "resolution": list(SIZE),
+    }
+    return {"cam0": {k: v for k, v in {**camera, **changes}.items() if v is not ...}}
+
+
+def write(folder: Path, content: object) -> Path:
+    path = folder / "camera.yaml"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        path.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
+    return path
+
+
+def write_opencv(path: Path, D: list[float], matrix: object = K, **more: int) -> Path:
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", SIZE[0])
+    storage.write("image_height", SIZE[1])
+    storage.write("camera_matrix", np.array(matrix, dtype=np.float64))
+    storage.write("distortion_coefficients", np.array([D], dtype=np.float64).T)
+    for name, value in more.items():
+        storage.write(name, value)
+    storage.release()
+    return path
+
+
+def assert_camera(camera: Camera, model: str, D: list[float], skew: float = 2.5) -> None:
+    np.testing.assert_array_equal(camera.K, [[1290.0, skew, 518.3], *K[1:]])
+    np.testing.assert_array_equal(camera.distortion, D)
+    assert (camera.model, camera.width, camera.height) == (model, *SIZE)
+
+
+@pytest.mark.parametrize(("model", "D"), LENSES[1:])
+def test_ros_files_are_read_and_written(
+    tmp_path: Path, model: DistortionModel, D: list[float]
+) -> None:
+    camera = read_camera(write(tmp_path, ros(distortion_model=model, D=D)))
+    assert_camera(camera, model, D)
+    assert_camera(read_camera(write(tmp_path, camera_info(camera, "any"))), model, D)
+    text = yaml.safe_dump(ros()).replace("0.08", "8e-2")  # YAML takes it for a text
+    assert_camera(read_camera(write(tmp_path, text)), "plumb_bob", PLUMB_BOB)
+
+
+@pytest.mark.parametrize("suffix", ["yaml", "xml", "json"])
+@pytest.mark.parametrize(
+    ("model", "D", "more"),
+    [
+        ("plumb_bob", PLUMB_BOB, {}),
+        ("rational_polynomial", RATIONAL, {}),
+        ("equidistant", FISHEYE, {"fisheye_model": 1}),
+    ],
+)
+def test_opencv_files_are_read(
+    tmp_path: Path, suffix: str, model: str, D: list[float], more: dict[str, int]
+) -> None:
+    path = write_opencv(tmp_path / f"camera.{suffix}", D, **more)
+    assert_camera(read_camera(path), model, D)
+
+
+def test_thin_prism_and_tilt_are_left_out_only_where_they_are_zero(tmp_path: Path) -> None:
+    path = write_opencv(tmp_path / "camera.yaml", [*RATIONAL, 0, 0, 0, 0, 0, 0])
+    assert_camera(read_camera(path), "rational_polynomial", RATIONAL)
+    path = write_opencv(tmp_path / "camera.yaml", [*RATIONAL, 0.01, 0, 0, 0])
+    with pytest.raises(DatasetError, match="found 12 coefficients, needed 8"):
+        read_camera(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "model", "written", "D"),
+    [
+        ("radtan", "plumb_bob", PLUMB_BOB[:4], PLUMB_BOB[:4]),
+        ("equidistant", "equidistant", FISHEYE, FISHEYE),
+        ("none", "plumb_bob", [], []),
+        ("none", "plumb_bob", ..., []),
+        ("none", "plumb_bob", [0.0] * 4, []),
+    ],
+)
+def test_kalibr_files_are_read(
+    tmp_path: Path, name: str, model: str, written: object, D: list[float]
+) -> None:
+    path = write(tmp_path, kalibr(distortion_model=name, distortion_coeffs=written))
+    assert_camera(read_camera(path), model, D, skew=0.0)
+
+
+BOMB = "a: &a [1,1,1,1,1,1,1,1,1]\n" + "".join(
+    f"{b}: &{b} [{','.join([f'*{a}'] * 7)}]\n" for a, b in zip("abcdef", "bcdefg", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (ros(distortion_model="thin_prism"), ("distortion_model", "'thin_prism'")),
+        (ros(distortion_model="equidistant"), ("5 coefficients", "4 for equidistant")),
+        (ros(distortion_model="rational_polynomial"), ("5 coefficients", "needed 8")),
+        (ros(D=PLUMB_BOB[:3]), ("3 coefficients", "0 or 4 or 5 for plumb_bob")),
+        (ros(image_height=-768), ("image_height", "-768")),
+        (ros(image_width=...), ("image_width",)),
+        (ros(K=K[:2].tolist()), ("camera_matrix", "6 numbers", "needed 9")),
+        (ros(D=["a", 0, 0, 0, 0]), ("distortion_coefficients.data.0", "'a'")),
+        (ros(D=[float("nan"), 0, 0, 0, 0]), ("nan", "finite")),
+        (ros(K=[[float("inf"), 0, 5], *K[1:].tolist()]), ("inf", "finite")),
+        (ros(K=[*K[:2].tolist(), [0.0, 0.0, 2.0]]), ("[[fx, s, cx], [0, fy, cy], [0, 0, 1]]",)),
+        (ros(K=[[-1290.0, 0, 500], *K[1:].tolist()]), ("fx = -1290", "above 0 px")),
+        (ros(K=[[1290.0, 0, -1], *K[1:].tolist()]), ("cx = -1", "1024 x 768")),
+        (ros(camera_matrix=7), ("camera_matrix", "found 7")),
+        (ros(camera_matrix={"rows": 1, "cols": 2, "data": [1, 2]}), ("1 x 2", "3 x 3")),
+        (kalibr(camera_model="omni"), ("cam0.camera_model", "'omni'", "'pinhole'")),
+        (kalibr(distortion_model="fov"), ("cam0.distortion_model", "'fov'")),
+        (kalibr(distortion_coeffs=[0.1]), ("1 coefficients", "4 for radtan")),
+        (kalibr(distortion_model="none"), ("4 coefficients", "0 for none")),
+        (kalibr(intrinsics=[1, 2, 3]), ("cam0.intrinsics", "3 numbers")),
+        (kalibr(intrinsics=[1290, 1290, 2000, 300]), ("cx = 2000", "1024 x 768")),
+        ({**kalibr(), "cam1": kalibr()["cam0"]}, ("2 cameras", "cam0, cam1", "needed one")),
+        ({"fx": 1, "fy": 2}, ("the keys fx, fy", "ROS camera_info")),
+        ([1, 2], ("[1, 2]", "'key: value'")),
+        ("", ("nothing", "'key: value'")),
+        ("a: [1, 2", ("line 1, column 9",)),
+        ("a: 1\nb: 2\na: 3", ("line 3, column 1", "'a' twice")),
+        ("a: !!python/object/apply:os.system [ls]", ("constructor",)),
+        ("%YAML:1.0\n---\nimage_width: [[[", ("storage that OpenCV cannot parse",)),
+        ("<?xml version='1.0'?><opencv_storage><a>", ("storage that OpenCV cannot parse",)),
+        ("%YAML:1.0\n---\nimage_width: 5\n", ("camera_matrix",)),
+        (BOMB, ("more than 100000 values",)),
+        ("a: &a [*a]", ("more than 100000 values",)),
+        (b"a: \xff\xfe\xfd", ("UTF-8",)),
+        (b"%YAML:1.0\n# \xff", ("UTF-8",)),
+    ],
+)
+def test_files_that_are_not_cameras_are_refused(
+    tmp_path: Path, content: object, words: tuple[str, ...]
+) -> None:
+    path = write(tmp_path, content)
+    with pytest.raises(DatasetError) as caught:
+        read_camera(path)
+    text = "\n".join(caught.value.problems)
+    assert [word for word in (str(path), *words) if word not in text] == []
+
+
+def test_every_problem_is_listed_at_once(tmp_path: Path) -> None:
+    singular = [[0.0, 0.0, 518.3], [0.0, -3.0, 900.0], [0.0, 0.0, 1.0]]
+    with pytest.raises(DatasetError) as caught:
+        read_camera(write(tmp_path, ros(K=singular, D=PLUMB_BOB[:3])))
+    text = "\n".join(caught.value.problems)
+    assert len(caught.value.problems) == 4
+    for words in ("3 coefficients", "fx = 0, so that it is singular", "fy = -3", "cy = 900"):
+        assert words in text
+    path = write_opencv(tmp_path / "camera.yaml", PLUMB_BOB, np.zeros((3, 3)))
+    with pytest.raises(DatasetError, match="fx = 0, so that it is singular"):
+        read_camera(path)
+    with pytest.raises(DatasetError, match="found a folder"):
+        read_camera(tmp_path)
+
+
+# A cylinder in the camera frame.
+
+SEEDS = st.integers(0, 2**32 - 1)
+TRUTH = Path(__file__).parent / "data" / "hexapod-truth" / "truth.json"
+
+
+def cylinder(seed: int) -> tuple[Array, Array, float]:
+    """A direction, a point and a radius of a cylinder that leaves the camera centre outside."""
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=3)
+    M = rng.normal(size=3) * [0.3, 0.3, 0.1] + [0.0, 0.0, 0.9]
+    u /= np.linalg.norm(u)
+    radius = float(rng.uniform(0.001, 0.9) * distance_to_line(np.zeros(3), u, M))
+    return u, M, radius
+
+
+@FAST
+@given(SEEDS, st.floats(-2.0, 2.0))
+def test_eq03_outlines_are_the_planes_that_touch_the_cylinder(seed: int, s: float) -> None:
+    u, M, radius = cylinder(seed)
+    h = outlines_of_axis(u, M, radius)
+    np.testing.assert_allclose(np.linalg.norm(h, axis=-1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(h @ (M + s * u), EPSILON * radius, atol=1e-12)
+    for one, epsilon in zip(h, EPSILON, strict=True):
+        P = M - epsilon * radius * one  # on the generating line, of which it is the moment
+        assert distance_to_line(P, u, M) == pytest.approx(radius)
+        m = moment(u, P)
+        np.testing.assert_allclose(one, m / np.linalg.norm(m), atol=1e-9)
+    np.testing.assert_allclose(outlines_of_axis(-u, M, radius), -h[::-1], atol=1e-12)
+
+
+@FAST
+@given(SEEDS, st.floats(1e-3, 1e3))
+def test_eq05_outlines_give_back_the_axis_at_any_scale(seed: int, scale: float) -> None:
+    u, M, radius = cylinder(seed)
+    h1, h2 = outlines_of_axis(u, M, radius)
+    np.testing.assert_allclose(outlines_of_axis(u, scale * M, scale * radius), [h1, h2], atol=1e-9)
+    u_hat, M_hat = axis_of_outlines(h1, h2, radius)
+    np.testing.assert_allclose(u_hat, u, atol=1e-9)
+    assert distance_to_line(M_hat, u, M) < 1e-9
+    assert M_hat @ u_hat == pytest.approx(0.0, abs=1e-9)  # nearest to the camera
+    np.testing.assert_allclose(
+        axis_of_outlines(h1, h2, scale * radius)[1], scale * M_hat, rtol=1e-12
+    )
+    u_hat, M_hat = axis_of_outlines(-h2, -h1, radius)
+    np.testing.assert_allclose(u_hat, -u, atol=1e-9)
+    assert distance_to_line(M_hat, u, M) < 1e-9
+    assume(abs(u[1]) > 1e-3)
+    P = point_with_zero_y(u, M)
+    assert P[1] == pytest.approx(0.0, abs=1e-9)
+    assert distance_to_line(P, u, M) < 1e-9
+
+
+def test_outlines_turn_with_the_camera_and_many_are_those_of_each() -> None:
+    cylinders = [cylinder(seed) for seed in range(6)]
+    u, M = (np.array([c[i] for c in cylinders]).reshape(2, 3, 3) for i in (0, 1))
+    radius = np.array([c[2] for c in cylinders]).reshape(2, 3)
+    h = outlines_of_axis(u, M, radius)
+    np.testing.assert_allclose(h[1, 2], outlines_of_axis(*cylinders[5]), atol=1e-15)
+    R = Rotation.random(rng=np.random.default_rng(0)).as_matrix()
+    np.testing.assert_allclose(outlines_of_axis(u @ R.T, M @ R.T, radius), h @ R.T, atol=1e-12)
+    u_hat, M_hat = axis_of_outlines(h[..., 0, :], h[..., 1, :], radius)
+    np.testing.assert_allclose(u_hat, u, atol=1e-9)
+    np.testing.assert_allclose(np.cross(M_hat - M, u), 0.0, atol=1e-9)
+
+
+def test_eqs_hold_on_the_rendered_hexapod() -> None:
+    truth = json.loads(TRUTH.read_text())
+    legs = [leg for image in truth["images"] for leg in image["legs"]]
+    u, M, h1, h2 = (np.array([leg[name] for leg in legs]) for name in ("u", "M", "h1", "h2"))
+    radius = np.array([leg["R"] for leg in legs], dtype=np.float64)
+    np.testing.assert_allclose(outlines_of_axis(u, M, radius), np.stack([h1, h2], 1), atol=1e-9)
+    u_hat, M_hat = axis_of_outlines(h1, h2, radius)
+    np.testing.assert_allclose(u_hat, u, atol=1e-9)
+    M_zero = np.array([leg["M_LS"] for leg in legs])
+    np.testing.assert_allclose(point_with_zero_y(u_hat, M_hat), M_zero, rtol=1e-6, atol=1e-3)
+
+
+@pytest.mark.parametrize("distance", [0.0, 0.01])
+def test_what_no_camera_sees_is_refused(distance: float) -> None:
+    u, M = np.array([0.0, 0.0, 1.0]), np.array([distance, 0.0, 0.5])
+    with pytest.raises(NotVisible, match=r"camera centre is \d+\.\d mm from an axis"):
+        outlines_of_axis(u, M, 0.01)
+    h = np.array([0.6, 0.0, 0.8])
+    for sign in (1.0, -1.0):
+        with pytest.raises(NotVisible, match="its two outlines coincide"):
+            axis_of_outlines(h, sign * h, 0.01)
+    with pytest.raises(NotVisible, match="parallel to the image x axis"):
+        point_with_zero_y(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.1, 1.0]))

@@ -1,0 +1,556 @@
+"""Sub-pixel lines: pixels beside an outline, the limb model, and blocks fitted to it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import ndtr
+
+from legcal.geometry.types import Array, BoolArray
+from legcal.perception import line_fit as pool
+from legcal.perception.blocks import (
+    COMMON_BIAS,
+    TILT_BIAS,
+    Blocks,
+    Line,
+    estimate_blur,
+    fit_blocks,
+    fit_lines,
+)
+from legcal.perception.light import MAX_NOISE_RATIO, Samples, evened_weights, to_light
+from legcal.perception.limb import (
+    HALF,
+    LESS_HALF,
+    N_AMPLITUDES,
+    N_POWERS,
+    RAMP,
+    SQUARE,
+    STEP,
+    THREE_HALVES,
+    basis,
+    powers,
+    profile_functions,
+)
+from legcal.perception.line_fit import fit_jointly
+from legcal.perception.profiles import Edge, Profiles, read_profiles
+from legcal.vision.camera import Camera
+from legcal.vision.visibility import Band
+
+# Pixels and their distances.
+
+LENS = Camera(
+    np.array([[500.0, 0.0, 200.0], [0.0, 500.0, 150.0], [0.0, 0.0, 1.0]]),
+    400,
+    300,
+    np.array([-0.2, 0.05, 0.001, -0.001, 0.0]),
+)
+V = np.array([1.5, -2.0])
+DEEP = 3.5
+
+
+def edge_at(angle: float, epsilon: float = 1.0, length: float = 200.0) -> Edge:
+    """Return an outline through the middle of the image, at an angle to its rows."""
+    along = np.array([np.cos(angle), np.sin(angle)])
+    normal = np.array([-along[1], along[0]])
+    band = Band(-0.5 * length / 500.0 * along, along, normal, 500.0, length)
+    return Edge(band, V, epsilon, 20.0, np.zeros(10, dtype=np.bool_))
+
+
+def numbered(axis: int) -> Samples:
+    """Return an image that holds the column (0) or the row (1) of every pixel."""
+    return np.asarray(np.indices((300, 400))[1 - axis], dtype=np.float32)
+
+
+def read(
+    edges: list[Edge], axis: int = 0, inner: float = DEEP, most: int | None = None
+) -> Profiles:
+    depths = DEEP, np.full(len(edges), inner)
+    return read_profiles(numbered(axis), LENS, edges, [e.v for e in edges], depths, 8, most)
+
+
+@pytest.mark.parametrize("angle", [0.1, 1.5, 2.4, 5.0])
+@pytest.mark.parametrize("epsilon", [1.0, -1.0])
+def test_distances_are_those_of_the_pixels_that_are_read(angle: float, epsilon: float) -> None:
+    one = edge_at(angle, epsilon)
+    columns, rows = read([one], 0), read([one], 1)
+    xy = LENS.undistort(np.stack([columns.grey, rows.grey], axis=-1).astype(np.float64))
+    h = one.band.line(*V)
+    distance = epsilon * LENS.line_offset(np.broadcast_to(h, (*xy.shape[:-1], 3)), xy)
+    seen = columns.inside
+    assert np.count_nonzero(seen) > 500
+    np.testing.assert_allclose(columns.d[seen], distance[seen], atol=0.02)
+    assert distance[seen].min() < -DEEP + 0.3
+    assert distance[seen].max() > DEEP - 0.3
+    t, _ = one.band.coordinates(xy)
+    np.testing.assert_allclose(columns.position, t.mean(axis=1) / one.band.length, atol=0.02)
+
+
+def test_gain_is_how_far_an_outline_moves_in_the_image() -> None:
+    one = edge_at(0.8)
+    h = np.stack([one.band.line(*(V + move)) for move in (0.0, 1.0)])
+    found = read([one])
+    on_line = one.band.points(found.position * one.band.length, V[0] + np.diff(V) * found.position)
+    moved = [LENS.line_offset(np.broadcast_to(line, (len(on_line), 3)), on_line) for line in h]
+    np.testing.assert_allclose(found.gain, moved[0] - moved[1], atol=5e-3)
+
+
+def test_outlines_are_read_together_as_they_are_alone() -> None:
+    edges = [edge_at(0.3), edge_at(1.2, -1.0, 120.0), edge_at(2.0)]
+    together = read(edges)
+    for k, one in enumerate(edges):
+        alone, own = read([one]), slice(together.bounds[k], together.bounds[k + 1])
+        seen, of_one = together.inside[own], alone.inside
+        np.testing.assert_allclose(together.position[own], alone.position, atol=1e-3)
+        np.testing.assert_array_equal(seen.sum(axis=1), of_one.sum(axis=1))
+        np.testing.assert_allclose(together.d[own][seen], alone.d[of_one], atol=5e-3)
+        np.testing.assert_array_equal(together.grey[own][seen], alone.grey[of_one])
+
+
+def test_hidden_stretches_and_other_blocks_are_left_out() -> None:
+    one = edge_at(1.3)
+    one.hidden[2:5] = True
+    every, found = read([edge_at(1.3)]), read([one])
+    assert not np.any((found.position > 0.2) & (found.position < 0.5))
+    assert len(found.position) == np.count_nonzero(
+        (every.position <= 0.2) | (every.position >= 0.5)
+    )
+    n = len(every.position) // 2
+    np.testing.assert_array_equal(read([edge_at(1.3)], most=n).position, every.position[::2])
+
+
+def test_no_pixels_are_read_deeper_inside_than_asked() -> None:
+    found = read([edge_at(0.4)], inner=1.0)
+    assert found.d[found.inside].max() <= 1.0
+    assert found.d[found.inside].min() < -3.0
+
+
+# Pixels by their noise.
+
+N_BLOCKS, ROWS, REACH, NOISY_BLUR = 40, 8, 6, 0.6
+BOUNDS = np.array([0, N_BLOCKS // 2, N_BLOCKS])
+
+
+def noisy_blocks(sides: Array, rng: np.random.Generator) -> tuple[Samples, Samples]:
+    """Return distances and light of blocks across a step, noisy on its sides by edge (2, 2)."""
+    row = np.arange(-REACH, REACH + 1.0) + rng.uniform(-0.5, 0.5, (N_BLOCKS, ROWS, 1))
+    d = row.reshape(N_BLOCKS, -1).astype(np.float32)
+    rise = ndtr(d / NOISY_BLUR)
+    outer, inner = np.repeat(sides, N_BLOCKS // 2, axis=0).T[..., None]
+    noise = np.sqrt(outer**2 + (inner**2 - outer**2) * rise) * rng.normal(size=d.shape)
+    return d, (20.0 + 100.0 * rise + 2.0 * d + noise).astype(np.float32)
+
+
+def evened(d: Samples, light: Samples, weight: Samples, kept: BoolArray | None = None) -> Samples:
+    """Return the weights of noisy_blocks that lie on their edges."""
+    kept = np.ones(len(d), dtype=np.bool_) if kept is None else kept
+    return evened_weights(d, light, weight, BOUNDS, kept, NOISY_BLUR)
+
+
+def test_both_sides_are_equally_noisy_when_weighted() -> None:
+    sides = np.array([[2.0, 8.0], [6.0, 3.0]])
+    d, light = noisy_blocks(sides, np.random.default_rng(1))
+    unused = np.ones_like(d)
+    unused[:, ::3] = 0.0
+    weight = evened(d, light, np.ones_like(d))
+    for k, (outer, inner) in enumerate(sides):
+        of_edge = slice(BOUNDS[k], BOUNDS[k + 1])
+        far_out, far_in = (
+            np.median(weight[of_edge][side > 3.0]) for side in (-d[of_edge], d[of_edge])
+        )
+        assert far_out * outer == pytest.approx(far_in * inner, rel=0.1)
+    assert np.median(weight[np.abs(d) < 0.05]) == pytest.approx(1.0, abs=0.1)
+    assert np.array_equal(evened(d, light, unused) > 0.0, unused > 0.0)
+    kept = np.ones(N_BLOCKS, dtype=np.bool_)
+    kept[: BOUNDS[1] - 2] = False  # too few blocks of the first edge
+    weight = evened(d, light, np.ones_like(d), kept)
+    assert np.array_equal(weight[: BOUNDS[1]], np.ones_like(d[: BOUNDS[1]]))
+    assert np.max(weight[BOUNDS[1] :]) > 1.2
+
+
+def test_equal_noise_and_smooth_shading_leave_pixels_equal() -> None:
+    d, light = noisy_blocks(np.full((2, 2), 4.0), np.random.default_rng(2))
+    assert evened(d, light, np.ones_like(d)) == pytest.approx(np.ones_like(d), rel=0.1)
+    shaded = light + np.where(d > 0.0, 4.0 * d - 0.5 * d**2, 0.0).astype(np.float32)
+    assert evened(d, shaded, np.ones_like(d)) == pytest.approx(np.ones_like(d), rel=0.15)
+    d, light = noisy_blocks(np.array([[0.0, 200.0], [0.0, 200.0]]), np.random.default_rng(6))
+    weight = evened(d, light, np.ones_like(d))  # a side without noise
+    assert np.max(weight) / np.min(weight) <= MAX_NOISE_RATIO * 1.001
+
+
+# Blocks one by one, and lines through them.
+
+HALF_WIDTH_PX = 14.0
+
+
+def column(value: float, n: int) -> Samples:
+    return np.full((n, 1), value, dtype=np.float32)
+
+
+def limb_blocks(
+    shift: float, blur: float, amplitude: list[float], noise: float, n: int = 200
+) -> tuple[Samples, Samples]:
+    """Return distances from a line and the grey levels of outlines ``shift`` further inside."""
+    rng = np.random.default_rng(1)
+    d = rng.uniform(-4.0, 4.0, (n, 120)).astype(np.float32)
+    values, _ = basis(d - np.float32(shift), column(HALF_WIDTH_PX, n), blur)
+    grey = np.einsum("nkm,k->nm", values, amplitude) + noise * rng.standard_normal(d.shape)
+    return d, grey.astype(np.float32)
+
+
+@pytest.mark.parametrize("x", [-1.5, -0.2, 0.0, 0.7, 3.0])
+def test_limb_is_a_blurred_square_root(x: float) -> None:
+    blur, half_width = 0.7, 1e6  # so wide that sqrt(rho (2 - rho)) is sqrt(2 rho)
+    values, _ = basis(np.array([[x]], dtype=np.float32), column(half_width, 1), blur)
+
+    def integrand(depth: float) -> float:
+        weight = np.exp(-0.5 * ((x - depth) / blur) ** 2) / (blur * np.sqrt(2.0 * np.pi))
+        return float(np.sqrt(2.0 * depth / half_width) * weight)
+
+    expected, _ = quad(integrand, 0.0, 12.0, points=[max(x, 0.0)], limit=200)
+    assert values[0, 3, 0] == pytest.approx(expected, rel=3e-3, abs=1e-6)
+
+
+def test_slopes_are_the_derivatives_of_the_basis() -> None:
+    d = np.linspace(-5.0, 5.0, 201, dtype=np.float32)[None]
+    step = np.float32(0.02)
+    before, after = (basis(d + s, column(HALF_WIDTH_PX, 1), 0.6)[0] for s in (-step, step))
+    _, slopes = basis(d, column(HALF_WIDTH_PX, 1), 0.6)
+    np.testing.assert_allclose((after - before) / (2 * step), slopes, atol=2e-2)
+
+
+@pytest.mark.parametrize(
+    "amplitude",
+    [
+        [20.0, 0.0, 120.0, 60.0, -30.0],
+        [200.0, 4.0, -150.0, 40.0, 0.0],
+        [60.0, 0.0, -30.0, 200.0, 0.0],
+    ],
+    ids=["bright on dark", "dark on bright", "darker at the limb, then brighter"],
+)
+def test_shift_of_an_outline_is_found_whatever_its_contrast(amplitude: list[float]) -> None:
+    d, grey = limb_blocks(0.15, 0.6, amplitude, noise=0.5)
+    weight = np.ones(d.shape, dtype=np.float32)
+    moved = np.zeros(len(d))
+    for _ in range(5):
+        at = d - moved[:, None].astype(np.float32)
+        fit = fit_blocks(at, grey, weight, column(HALF_WIDTH_PX, len(d)), 0.6)
+        moved += fit.shift
+    assert np.median(moved) == pytest.approx(0.15, abs=0.01)
+
+
+def test_claimed_variance_is_the_scatter_of_the_blocks() -> None:
+    d, grey = limb_blocks(0.0, 0.6, [20.0, 0.0, 120.0, 60.0, 0.0], noise=3.0)
+    weight = np.ones(d.shape, dtype=np.float32)
+    fit = fit_blocks(d, grey, weight, column(HALF_WIDTH_PX, len(d)), 0.6)
+    assert np.std(fit.shift) == pytest.approx(np.sqrt(np.median(fit.variance)), rel=0.2)
+    assert np.sqrt(np.median(fit.noise)) == pytest.approx(3.0, rel=0.05)
+
+
+def test_flat_blocks_say_nothing() -> None:
+    d, grey = limb_blocks(0.0, 0.6, [50.0, 0.0, 0.0, 0.0, 0.0], noise=2.0)
+    weight = np.ones(d.shape, dtype=np.float32)
+    fit = fit_blocks(d, grey, weight, column(HALF_WIDTH_PX, len(d)), 0.6)
+    assert np.median(fit.variance) > 0.2
+    hidden = fit_blocks(d, grey, 0.0 * weight, column(HALF_WIDTH_PX, len(d)), 0.6)
+    assert np.all(np.isinf(hidden.variance))
+
+
+@pytest.mark.parametrize("blur", [0.4, 0.7, 1.2])
+def test_blur_is_estimated_from_the_picture(blur: float) -> None:
+    d, grey = limb_blocks(0.1, blur, [20.0, 0.0, 120.0, 60.0, 0.0], noise=1.0, n=60)
+    weight = np.ones(d.shape, dtype=np.float32)
+    estimate = estimate_blur(d, grey, weight, column(HALF_WIDTH_PX, len(d)), np.ones(len(d)))
+    assert estimate == pytest.approx(blur, rel=0.1)
+
+
+def fit_straight(position: Array, shift: Array, variance: Array) -> Line | None:
+    return fit_lines(np.array([0, len(position)]), position, shift, variance)[0]
+
+
+def fitted(line: Line | None) -> Line:
+    assert line is not None
+    return line
+
+
+def test_line_through_exact_blocks_is_exact() -> None:
+    position = np.linspace(0.1, 0.9, 30)
+    line = fitted(fit_straight(position, 0.5 - 0.8 * position, np.full(30, 1e-4)))
+    np.testing.assert_allclose(line.ends, [0.5, -0.3], atol=1e-9)
+    assert line.first == pytest.approx(0.1)
+    assert line.last == pytest.approx(0.9)
+    assert line.inlier_share == 1.0
+
+
+def test_an_occlusion_does_not_move_the_line_and_is_left_out() -> None:
+    rng = np.random.default_rng(0)
+    position = np.linspace(0.0, 1.0, 50)
+    shift = 0.2 + 0.02 * rng.standard_normal(50)
+    shift[20:35] += 0.7
+    line = fitted(fit_straight(position, shift, np.full(50, 4e-4)))
+    np.testing.assert_allclose(line.ends, 0.2, atol=0.03)
+    assert not np.any(line.kept[20:35])
+    assert line.inlier_share == pytest.approx(0.7, abs=0.03)
+
+
+def test_ends_that_bend_away_are_not_part_of_the_piece() -> None:
+    position = np.linspace(0.0, 1.0, 41)
+    shift = np.where(position > 0.9, 0.8, 0.0)
+    line = fitted(fit_straight(position, shift, np.full(41, 1e-4)))
+    assert line.last == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize("position_range", [(0.0, 1.0), (0.3, 0.6)])
+def test_covariance_agrees_with_monte_carlo(position_range: tuple[float, float]) -> None:
+    rng = np.random.default_rng(2)
+    position = np.linspace(*position_range, 40)
+    lines = [
+        fitted(fit_straight(position, 0.1 * rng.standard_normal(40), np.full(40, 0.01)))
+        for _ in range(400)
+    ]
+    ends = np.array([[(1 - p) * f.ends[0] + p * f.ends[1] for p in position_range] for f in lines])
+    claimed = np.mean([f.covariance for f in lines], axis=0)
+    bias = COMMON_BIAS**2 + TILT_BIAS**2 * np.eye(2)
+    seen = np.cov(ends.T) + bias
+    np.testing.assert_allclose(np.diag(claimed), np.diag(seen), rtol=0.5)
+    assert np.all(np.diag(claimed) > 0.8 * np.diag(seen))
+
+
+def test_covariance_never_claims_more_than_the_model_is_good_for() -> None:
+    position = np.linspace(0.0, 1.0, 64)
+    line = fitted(fit_straight(position, np.zeros(64), np.full(64, 1e-8)))
+    assert np.all(np.diag(line.covariance) >= COMMON_BIAS**2)
+
+
+def test_blocks_that_share_their_errors_count_for_fewer() -> None:
+    rng = np.random.default_rng(3)
+    position = np.linspace(0.0, 1.0, 64)
+    white = 0.1 * rng.standard_normal(64)
+    smooth = np.repeat(white[:16], 4)
+    independent = fitted(fit_straight(position, white, np.full(64, 0.01))).covariance
+    shared = fitted(fit_straight(position, smooth, np.full(64, 0.01))).covariance
+    assert np.trace(shared) > 1.5 * np.trace(independent)
+
+
+def test_too_few_blocks_give_no_line() -> None:
+    position = np.linspace(0.0, 1.0, 10)
+    variance = np.where(np.arange(10) < 3, 1e-3, np.inf)
+    assert fit_straight(position, np.zeros(10), variance) is None
+    assert fit_straight(np.full(10, 0.5), np.zeros(10), np.full(10, 1e-3)) is None
+
+
+def test_lines_of_several_outlines_are_those_of_each() -> None:
+    rng = np.random.default_rng(4)
+    counts = [50, 3, 0, 21, 12, 8]
+    position = np.concatenate([np.linspace(0.0, 1.0, n) for n in counts])
+    shift = 0.3 * position + 0.05 * rng.standard_normal(len(position))
+    shift[10:20] += 0.8
+    variance = rng.uniform(1e-4, 4e-3, len(position))
+    variance[rng.random(len(position)) < 0.1] = np.inf
+    variance[-8:-3] = np.inf
+    bounds = np.cumsum([0, *counts])
+    lines = fit_lines(bounds, position, shift, variance)
+    assert [line is None for line in lines] == [False, True, True, False, False, True]
+    for line, first, last in zip(lines, bounds[:-1], bounds[1:], strict=True):
+        own = slice(first, last)
+        alone = fit_straight(position[own], shift[own], variance[own])
+        assert (line is None) == (alone is None)
+        if line is not None and alone is not None:
+            np.testing.assert_allclose(line.ends, alone.ends, atol=1e-12)
+            np.testing.assert_array_equal(line.kept, alone.kept)
+            np.testing.assert_allclose(line.covariance, alone.covariance, rtol=1e-9)
+
+
+# All blocks of outlines together.
+
+HALF_WIDTH, DEPTH = 15.0, 3.5
+BRIGHT = np.array([20.0, 0.0, 120.0, 90.0, -60.0, 0.0, 0.0])
+DARK = np.array([180.0, 5.0, 30.0, -20.0, 60.0, 10.0, 0.0])
+GLINT = np.array([20.0, 0.0, 60.0, 60.0, -120.0, 40.0, 0.0])
+LIMB = np.array([20.0, 0.0, 20.0, 0.0, 150.0, 0.0, 0.0])
+
+
+def single(value: float, n: int) -> Array:
+    return np.full(n, value)
+
+
+def outline(
+    amplitude: Array,
+    shift: tuple[float, float],
+    blur: float,
+    noise: float = 0.0,
+    seed: int = 0,
+    n: int = 40,
+    change: float = 0.0,
+) -> Blocks:
+    """Return the blocks of an outline that lies ``shift`` further inside at both ends."""
+    rng = np.random.default_rng(seed)
+    position = (np.arange(n) + 0.5) / n
+    d = rng.uniform(-DEPTH, DEPTH, (n, 104))
+    at = d - (shift[0] + (shift[1] - shift[0]) * position)[:, None]
+    values, _, _ = profile_functions(single(HALF_WIDTH, 1), single(blur, 1), DEPTH)
+    brightness = 1.0 + change * (position - 0.5)
+    of_block = brightness[:, None] * amplitude
+    grey = np.einsum("nmp,kp,nk->nm", powers(at / blur), values[0], of_block)
+    grey = grey + noise * rng.standard_normal(grey.shape)
+    one: Samples = np.ones(d.shape, dtype=np.float32)
+    zeros = np.zeros(n)
+    return Blocks(
+        d.astype(np.float32), grey.astype(np.float32), one, np.ones(n), np.array([0, n]), position,
+        np.full((n, 1), HALF_WIDTH, dtype=np.float32), np.full(n, -np.inf, dtype=np.float32),
+        zeros, zeros.copy(), zeros.copy(), [None],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("column", "power"), [(HALF, 0.5), (RAMP, 1.0), (THREE_HALVES, 1.5), (SQUARE, 2.0)]
+)
+@pytest.mark.parametrize("z", [-1.5, -0.2, 0.0, 0.7, 3.0])
+def test_powers_are_means_over_a_gaussian(z: float, column: int, power: float) -> None:
+    def integrand(x: float) -> float:
+        return float(x**power * np.exp(-0.5 * (x - z) ** 2) / np.sqrt(2.0 * np.pi))
+
+    expected, _ = quad(integrand, 0.0, 15.0, points=[max(z, 0.0)], limit=200)
+    assert powers(np.array(z))[column] == pytest.approx(expected, rel=2e-3, abs=1e-5)
+
+
+def test_powers_are_each_others_derivatives() -> None:
+    z, step = np.linspace(-6.0, 20.0, 500), 1.0 / 16.0
+    slope = (powers(z + step) - powers(z - step)) / (2.0 * step)
+    values = powers(z)
+    for column, factor, of in ((RAMP, 1.0, STEP), (SQUARE, 2.0, RAMP), (HALF, 0.5, LESS_HALF)):
+        np.testing.assert_allclose(slope[:, column], factor * values[:, of], atol=1e-2)
+
+
+@pytest.mark.parametrize("blur", [0.35, 1.1])
+def test_slopes_and_widenings_are_derivatives_of_profiles(blur: float) -> None:
+    d, half_width = np.linspace(-4.0, 4.0, 81), single(HALF_WIDTH, 1)
+
+    def profile(d: Array, blur: float) -> Array:
+        values, _, _ = profile_functions(half_width, single(blur, 1), DEPTH)
+        return np.asarray(values[0] @ powers(d / blur).T)
+
+    _, slopes, widenings = profile_functions(half_width, single(blur, 1), DEPTH)
+    U = powers(d / blur).T
+    step = 0.02
+    by_distance = (profile(d + step, blur) - profile(d - step, blur)) / (2.0 * step)
+    np.testing.assert_allclose(by_distance, slopes[0] @ U, atol=0.1)
+    by_blur = (profile(d, blur * np.exp(step)) - profile(d, blur * np.exp(-step))) / (2.0 * step)
+    np.testing.assert_allclose(by_blur, widenings[0] @ U, atol=0.06)
+    assert slopes.shape == (1, N_AMPLITUDES, N_POWERS)
+
+
+@pytest.mark.parametrize("amplitude", [BRIGHT, DARK, GLINT], ids=["bright", "dark", "glint"])
+@pytest.mark.parametrize("blur", [0.4, 0.9])
+@pytest.mark.parametrize("change", [0.0, 0.6])
+def test_exact_profiles_give_line_and_blur(amplitude: Array, blur: float, change: float) -> None:
+    blocks = outline(amplitude, (0.12, -0.06), blur, noise=0.3, change=change)
+    found = fit_jointly(blocks, np.ones(40, dtype=np.bool_), 1.15 * blur, DEPTH)
+    spread = np.sqrt(np.diag(found.covariance[0]))
+    assert np.all(np.abs(found.ends[0] - [0.12, -0.06]) < 0.01 + 2.5 * spread)
+    assert np.all(spread < 0.1)
+    assert found.blur == pytest.approx(blur, rel=0.06)
+
+
+def test_covariance_covers_the_errors_and_knows_low_contrast() -> None:
+    pulls, sigma = [], []
+    for contrast in (1.0, 0.1):
+        found = [
+            fit_jointly(
+                outline(contrast * BRIGHT, (0.05, 0.0), 0.5, noise=3.0, seed=seed),
+                np.ones(40, dtype=np.bool_),
+                0.5,
+                DEPTH,
+            )
+            for seed in range(25)
+        ]
+        error = np.array([f.ends[0] - [0.05, 0.0] for f in found])
+        spread = np.array([np.sqrt(np.diag(f.covariance[0])) for f in found])
+        pulls.append(float(np.sqrt(np.mean((error / spread) ** 2))))
+        sigma.append(float(np.median(spread)))
+    assert max(pulls) < 1.4
+    assert sigma[1] > 2.0 * sigma[0]
+
+
+def test_blocks_of_something_else_do_not_move_the_line() -> None:
+    clean = outline(BRIGHT, (0.1, 0.1), 0.5, noise=0.5)
+    other = outline(BRIGHT, (0.1, 0.1), 0.5, noise=0.5)
+    other.grey[10:16] = 120.0 - 30.0 * other.d[10:16]
+    everything = np.ones(40, dtype=np.bool_)
+    one, two = (fit_jointly(blocks, everything, 0.5, DEPTH).ends for blocks in (clean, other))
+    np.testing.assert_allclose(one, two, atol=0.02)
+
+
+def test_outlines_without_blocks_stay_where_they_are() -> None:
+    blocks = outline(BRIGHT, (0.1, 0.1), 0.5)
+    found = fit_jointly(blocks, np.zeros(40, dtype=np.bool_), 0.5, DEPTH)
+    np.testing.assert_array_equal(found.ends, np.zeros((1, 2)))
+    assert np.all(np.diag(found.covariance[0]) >= 1.0)
+    assert found.blur == 0.5
+    assert np.isnan(found.by_gamma).all()
+
+
+@pytest.mark.parametrize("amplitude", [BRIGHT, DARK, GLINT], ids=["bright", "dark", "glint"])
+def test_sums_over_pixels_serve_places_and_blurs_nearby(
+    amplitude: Array, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocks, every = outline(amplitude, (0.1, -0.05), 0.5, noise=0.2), np.ones(40, dtype=np.bool_)
+    found = fit_jointly(blocks, every, 0.54, DEPTH)
+    monkeypatch.setattr(pool, "MAX_MOVE_OF_PRODUCTS", (0.0, 0.0))  # sums anew in every round
+    anew = fit_jointly(blocks, every, 0.54, DEPTH)
+    np.testing.assert_allclose(found.ends, anew.ends, atol=8e-3)
+    np.testing.assert_allclose(found.covariance, anew.covariance, rtol=0.2)
+    assert found.blur == pytest.approx(anew.blur, rel=5e-3)
+
+
+def test_outlines_that_have_converged_do_not_depend_on_others() -> None:
+    slow, quick = outline(GLINT, (0.2, -0.2), 0.5, noise=0.3), outline(BRIGHT, (0.0, 0.0), 0.5)
+    both = replace(
+        slow,
+        bounds=np.array([0, 40, 80]),
+        lines=[None, None],
+        **{
+            name: np.concatenate([getattr(slow, name), getattr(quick, name)])
+            for name in (
+                "d", "grey", "weight", "gain", "position", "half_width", "moved", "contrast",
+                "sharp",
+            )
+        },
+    )  # fmt: skip
+    found = fit_jointly(both, np.ones(80, dtype=np.bool_), 0.5, DEPTH)
+    np.testing.assert_allclose(found.ends, [[0.2, -0.2], [0.0, 0.0]], atol=0.02)
+
+
+def read_with(blocks: Blocks, gamma: float) -> Blocks:
+    """Return the same blocks as a camera of gamma 2.2 encodes them, read with a gamma."""
+    encoded = (255.0 * (np.maximum(blocks.grey, 0.0) / 255.0) ** (1.0 / 2.2)).astype(np.float32)
+    light, weight = to_light(encoded, blocks.weight > 0.0, gamma)
+    return replace(blocks, grey=light, weight=weight)
+
+
+@pytest.mark.parametrize("amplitude", [BRIGHT, DARK], ids=["bright", "dark"])
+@pytest.mark.parametrize(("gamma", "tolerance"), [(1.0, 0.4), (2.2, 0.15)])
+def test_outlines_know_how_far_they_move_with_gamma(
+    amplitude: Array, gamma: float, tolerance: float
+) -> None:
+    blocks, every = outline(amplitude, (0.1, 0.1), 0.6, noise=0.2), np.ones(40, dtype=np.bool_)
+    less, here, more = (
+        fit_jointly(read_with(blocks, gamma * np.exp(step)), every, 0.6, DEPTH)
+        for step in (-0.1, 0.0, 0.1)
+    )
+    moved = float(more.ends.mean() - less.ends.mean()) / 0.2
+    assert abs(moved) > 0.05
+    assert (moved > 0.0) == (amplitude is BRIGHT)
+    assert here.by_gamma[0] == pytest.approx(moved, rel=tolerance)
+
+
+def test_lines_near_a_limb_that_rises_from_the_background_stay_there() -> None:
+    """Blocks by themselves hardly know where it is, and together no better than they say."""
+    blocks = outline(LIMB, (0.0, 0.0), 0.55, noise=1.0)
+    blocks.fit(0.55, 2)
+    assert blocks.lines[0] is not None
+    assert np.abs(blocks.lines[0].ends).max() > 0.1
+    blocks.unmove()
+    np.testing.assert_array_equal(blocks.lines[0].ends, [0.0, 0.0])
+    found = fit_jointly(blocks, blocks.kept(), 0.55, DEPTH)
+    assert np.all(np.abs(found.ends[0]) < 3.0 * np.sqrt(np.diag(found.covariance[0])))
