@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from legcal.errors import UsageError
-from legcal.files import EXAMPLE, Stated, describe, read_prior, read_value
+from legcal.files import EXAMPLE, Quantity, describe, read_prior, read_value
 
 Action = Literal["prior", "fixed", "free"]
 _WORDS: Mapping[Action, str] = {
@@ -24,7 +24,7 @@ class Override:
     name: str  # or a pattern
     action: Action  # what to do with it
     where: str  # its place, as the start of a sentence about it
-    stated: Stated | None = None  # the prior, or the value that it is fixed at
+    stated: Quantity | None = None  # the prior, or the value that it is fixed at
     in_file: bool = False  # given in ``dataset.yaml``, over which those of a run take precedence
 
 

@@ -1,6 +1,6 @@
 from .folder import TEMPORARY_SUFFIX as TEMPORARY_SUFFIX
 from .folder import OutputKind as OutputKind
-from .folder import OwnYaml as OwnYaml
+from .folder import YamlOutput as YamlOutput
 from .folder import check_destination as check_destination
 from .folder import check_path as check_path
 from .folder import existing_parent as existing_parent
@@ -21,7 +21,7 @@ from .quantity import ANGLE as ANGLE
 from .quantity import EXAMPLE as EXAMPLE
 from .quantity import LENGTH as LENGTH
 from .quantity import PIXELS as PIXELS
-from .quantity import Stated as Stated
+from .quantity import Quantity as Quantity
 from .quantity import parse_quantity as parse_quantity
 from .quantity import read_prior as read_prior
 from .quantity import read_value as read_value

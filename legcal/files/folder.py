@@ -60,7 +60,7 @@ def path_problem(folder: Path, named: str) -> str | None:
 
 
 @dataclass(frozen=True)
-class OwnYaml:
+class YamlOutput:
     """A kind of file."""
 
     noun: str  # what is written, with its article, for sentences: "the camera"

@@ -38,8 +38,8 @@ def parse_quantity(text: str, units: Mapping[str, float], what: str) -> float:
     return value * units.get(unit, 1.0)
 
 
-SMALLEST_SIGMA = 1e-9  # [m, rad, px]; what is known better is fixed
-LARGEST_SIGMA = 1e6  # [m, rad, px]; tells nothing of any parameter
+MIN_SIGMA = 1e-9  # [m, rad, px]; what is known better is fixed
+MAX_SIGMA = 1e6  # [m, rad, px]; no prior
 
 _DIMENSIONS = {"m": LENGTH, "rad": ANGLE, "px": PIXELS}
 _SIZES = {unit: size for units in _DIMENSIONS.values() for unit, size in units.items()}
@@ -48,17 +48,17 @@ EXAMPLE = "0.4200±0.0001 or 420±0.1 mm"
 
 
 @dataclass(frozen=True)
-class Stated:
-    """A number as somebody stated it."""
+class Quantity:
+    """A number with its dimension, and the sigma of a prior."""
 
     value: float  # in SI units or pixels
     sigma: float | None = None  # its standard deviation; None where there is none
     dimension: str = ""  # what its unit is one of; "" where none was written
 
 
-def read_prior(value: object) -> Stated:
+def read_prior(value: object) -> Quantity:
     """Return a prior given as text, as (value, sigma) or as {value, sigma}."""
-    if isinstance(value, Stated):
+    if isinstance(value, Quantity):
         return value
     if isinstance(value, str):
         return _read_prior_text(value)
@@ -76,7 +76,7 @@ def read_prior(value: object) -> Stated:
         ) from error
 
 
-def _read_prior_text(text: str) -> Stated:
+def _read_prior_text(text: str) -> Quantity:
     """Return the prior that a text states; a unit at its end counts for both numbers."""
     match = _PRIOR.fullmatch(text)
     if match is None:
@@ -99,7 +99,7 @@ def _read_prior_text(text: str) -> Stated:
     return _prior(mean.value, spread.value, mean.dimension)
 
 
-def read_value(text: str) -> Stated:
+def read_value(text: str) -> Quantity:
     """Return the number that a text states, with its unit if there is one."""
     match = _VALUE.fullmatch(text)
     if match is None or not math.isfinite(float(match[1])):
@@ -113,7 +113,7 @@ def read_value(text: str) -> Stated:
             f"found the unknown unit '{unit}', needed one of {', '.join(_SIZES)}; leave it out "
             "for SI units and pixels."
         )
-    return Stated(_in_si(float(match[1]), unit), None, _DIMENSION.get(unit, ""))
+    return Quantity(_in_si(float(match[1]), unit), None, _DIMENSION.get(unit, ""))
 
 
 def _in_si(number: float, unit: str) -> float:
@@ -123,7 +123,7 @@ def _in_si(number: float, unit: str) -> float:
     return number / per_one if math.isclose(per_one * size, 1.0, rel_tol=1e-12) else number * size
 
 
-def _prior(value: float, sigma: float, dimension: str = "") -> Stated:
+def _prior(value: float, sigma: float, dimension: str = "") -> Quantity:
     """Return a prior if its numbers make one."""
     if not math.isfinite(value):
         raise ValueError(f"found the value {value:g}, needed a finite one; correct it.")
@@ -132,17 +132,17 @@ def _prior(value: float, sigma: float, dimension: str = "") -> Stated:
             f"found the sigma {sigma:g}, needed a finite one above zero; give one standard "
             "deviation, or fix the parameter."
         )
-    if sigma < SMALLEST_SIGMA:
+    if sigma < MIN_SIGMA:
         raise ValueError(
-            f"found the sigma {sigma:g}, needed at least {SMALLEST_SIGMA:g}; fix the parameter at "
+            f"found the sigma {sigma:g}, needed at least {MIN_SIGMA:g}; fix the parameter at "
             "the value instead."
         )
-    if sigma > LARGEST_SIGMA:
+    if sigma > MAX_SIGMA:
         raise ValueError(
-            f"found the sigma {sigma:g}, needed at most {LARGEST_SIGMA:g}; free the parameter or "
+            f"found the sigma {sigma:g}, needed at most {MAX_SIGMA:g}; free the parameter or "
             "leave the prior out."
         )
-    return Stated(value, sigma, dimension)
+    return Quantity(value, sigma, dimension)
 
 
 def _is_number(value: object) -> bool:

@@ -37,7 +37,7 @@ ON_THE_CHAIN = 7  # draws of eight, where following is quick
 MAX_FAILED = 20  # configurations in vain, if they are the first
 STRIDE = 0.15  # [rad], and of a leg length
 INSIDE = 1e-12  # [m]
-WORKSPACE_POSES = 100  # that stand for the workspace wherever errors over it are told
+WORKSPACE_POSES = 100  # that stand for the workspace wherever errors over it are reported
 WORKSPACE_SEED = 20020721
 
 # Poses of any legs, many at once and without a chain
@@ -258,7 +258,7 @@ def random_poses(
 class _Drive:
     """Legs whose motors draw their lengths at many poses; of redundant motors as many as needed.
 
-    Those are taken that say most beside each other, of what the other demands leave open.
+    Those are taken that say most beside each other, of what the constraints leave open.
     """
 
     def __init__(self, legs: Sequence[Leg], frame_legs: Sequence[int], R: Array, t: Array) -> None:
@@ -325,7 +325,7 @@ class _Drive:
         return poses[:, :, :3], poses[:, :, 3]
 
     def is_closed(self, R: Array, t: Array, wanted: Array) -> BoolArray:
-        """Return which poses meet what legs and lengths demand."""
+        """Return at which poses the equations of legs and lengths hold."""
         found = self.equations(R, t)
         goal = np.where(found.measured, (wanted - self.q0)[:, found.leg], 0.0)
         redundant = len(found.leg) > len(self.columns)

@@ -260,20 +260,20 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
     }
 
 
-def _unit(table: Table, told: str | None) -> str:
-    """Return the unit that the column states, or the one that was told."""
+def _unit(table: Table, given: str | None) -> str:
+    """Return the unit of the column, or the given one."""
     stated = sorted(set(filter(None, table.text("unit"))))
     if len(stated) > 1:
         raise DatasetError(
             f"{table.path}: the unit could not be decided: found {' and '.join(stated)}, needed "
             "the same in all lines; correct the column 'unit'."
         )
-    if not stated and told is None:
+    if not stated and given is None:
         raise DatasetError(
             f"{table.path}: the lengths could not be understood: found no unit, needed m or mm; "
             "add a column 'unit', or give --unit mm."
         )
-    return stated[0] if stated else str(told)
+    return stated[0] if stated else str(given)
 
 
 UNITS = {"m": 0, "mm": -3}
@@ -347,11 +347,11 @@ def _contradictions(file: TableFile, source: str) -> list[str]:
                 f"{source}: {key} could not be used: found {len(value)} entries and {n} "
                 "base_joints, needed one for each leg; correct their number."
             )
-    told = (file.type or "").split("-")
-    if len(told) == 2 and int(told[0]) != n:
+    parts = (file.type or "").split("-")
+    if len(parts) == 2 and int(parts[0]) != n:
         problems.append(
             f"{source}: type {file.type} could not be used: found {n} base_joints, needed "
-            f"{int(told[0])}; correct the type or the rows."
+            f"{int(parts[0])}; correct the type or the rows."
         )
     if not 2 <= n <= MAX_LEGS:
         remedy = "add rows" if n < 2 else "leave out passive legs"

@@ -28,7 +28,7 @@ class Family:
     """The dimensions of a machine, lengths in ``unit`` and angles in degrees."""
 
     family: str  # number and type of the legs, ``6-UPS``
-    unit: str | None = None  # unit of the lengths; it must be stated
+    unit: str | None = None  # unit of the lengths; required
     base_radius: float | None = None  # radii of the circles on which the joint centres lie
     platform_radius: float | None = None  # radii of the circles on which the joint centres lie
     height: float | None = None  # height of the platform over the base at home
@@ -42,53 +42,53 @@ class Family:
     name: str | None = None  # name of the model; the family in small letters by default
 
 
-def describe_family(asked: Family) -> Description:
+def describe_family(given: Family) -> Description:
     """Return the machine of a family."""
-    match = _FAMILY.fullmatch(asked.family)
+    match = _FAMILY.fullmatch(given.family)
     letters = None if match is None else leg_type(match[2])
     if match is None or letters is None or not 2 <= int(match[1]) <= MAX_LEGS:
         raise UsageError(
-            f"The family could not be understood: found '{asked.family}', needed a number of legs "
+            f"The family could not be understood: found '{given.family}', needed a number of legs "
             f"from 2 to {MAX_LEGS} and their type, such as 6-UPS: {NEEDED_TYPE}; correct --family."
         )
     in_plane = letters.is_planar
-    problems = _problems(asked, in_plane) + _pointless(asked, int(match[1]), letters, in_plane)
+    problems = _problems(given, in_plane) + _pointless(given, int(match[1]), letters, in_plane)
     if problems:
         raise UsageError(problems)
-    unit = str(asked.unit)
+    unit = str(given.unit)
 
     def metres(value: float | None) -> float:
         return 0.0 if value is None else in_metres(value, unit)
 
     count = int(match[1])
-    base_angles, platform_angles = _angles(count, asked)
-    A = metres(asked.base_radius) * _ring(base_angles)
-    B = metres(asked.platform_radius) * _ring(platform_angles)
-    turn = asked.turn if asked.turn is not None else TURN_IN_PLANE * in_plane
+    base_angles, platform_angles = _angles(count, given)
+    A = metres(given.base_radius) * _ring(base_angles)
+    B = metres(given.platform_radius) * _ring(platform_angles)
+    turn = given.turn if given.turn is not None else TURN_IN_PLANE * in_plane
     z_turn = Rotation.from_euler("z", turn, degrees=True)
-    T = RigidTransform.from_components([0.0, 0.0, metres(asked.height)], z_turn)
-    tilt = float(np.radians(asked.tilt))
+    T = RigidTransform.from_components([0.0, 0.0, metres(given.height)], z_turn)
+    tilt = float(np.radians(given.tilt))
     legs = []
     for j in range(count):
         vector = T.apply(B[j]) - A[j]
         axes = _tilted_axes(letters, vector, A[j], tilt)
         length = float(np.linalg.norm(vector))
         legs.append(
-            _leg(asked, f"leg{j + 1}", letters, (A[j], B[j]), length, axes, T)
+            _leg(given, f"leg{j + 1}", letters, (A[j], B[j]), length, axes, T)
         )  # fmt: skip
-    home = Home((0.0, 0.0, metres(asked.height)), _quaternion(z_turn))
-    name = asked.name or asked.family.lower()
-    return Description(name, f"--family {asked.family}", unit, tuple(legs), home, None)
+    home = Home((0.0, 0.0, metres(given.height)), _quaternion(z_turn))
+    name = given.name or given.family.lower()
+    return Description(name, f"--family {given.family}", unit, tuple(legs), home, None)
 
 
-def _problems(asked: Family, in_plane: bool) -> list[str]:
+def _problems(given: Family, in_plane: bool) -> list[str]:
     """Return what is missing or impossible among the dimensions."""
-    where = f"The family {asked.family} could not be built"
+    where = f"The family {given.family} could not be built"
     needed = {
-        "--base-radius": asked.base_radius,
-        "--platform-radius": asked.platform_radius,
-        **({} if in_plane else {"--height": asked.height}),
-        "--unit": asked.unit,
+        "--base-radius": given.base_radius,
+        "--platform-radius": given.platform_radius,
+        **({} if in_plane else {"--height": given.height}),
+        "--unit": given.unit,
     }
     missing = [option for option, value in needed.items() if value is None]
     problems = []
@@ -98,69 +98,69 @@ def _problems(asked: Family, in_plane: bool) -> list[str]:
             f"{', '.join(needed)}; for example --base-radius 300 --platform-radius 150"
             f"{'' if in_plane else ' --height 400'} --unit mm."
         )
-    if asked.unit not in (None, "m", "mm"):
-        problems.append(f"{where}: found the unit '{asked.unit}', needed m or mm; correct --unit.")
-    for option, value in (*needed.items(), ("--leg-radius", asked.leg_radius)):
+    if given.unit not in (None, "m", "mm"):
+        problems.append(f"{where}: found the unit '{given.unit}', needed m or mm; correct --unit.")
+    for option, value in (*needed.items(), ("--leg-radius", given.leg_radius)):
         if isinstance(value, float | int) and not 0.0 < value < 1e9:
             problems.append(f"{where}: found {option} {value:g}, needed a positive length; fix it.")
     for option, angle in (
-        ("--base-spread", asked.base_spread),
-        ("--platform-spread", asked.platform_spread),
+        ("--base-spread", given.base_spread),
+        ("--platform-spread", given.platform_spread),
     ):
         if angle is not None and not 0.0 < angle < 120.0:
             problems.append(
                 f"{where}: found {option} {angle:g} deg, needed an angle between 0 and 120 deg; "
                 "mend it."
             )
-    if not abs(asked.tilt) <= 80.0:
+    if not abs(given.tilt) <= 80.0:
         problems.append(
-            f"{where}: found --tilt {asked.tilt:g} deg, needed at most 80 deg either way; mend it."
+            f"{where}: found --tilt {given.tilt:g} deg, needed at most 80 deg either way; mend it."
         )
-    if asked.turn is not None and not abs(asked.turn) <= 180.0:
+    if given.turn is not None and not abs(given.turn) <= 180.0:
         problems.append(
-            f"{where}: found --turn {asked.turn:g} deg, needed at most 180 deg either way; mend it."
+            f"{where}: found --turn {given.turn:g} deg, needed at most 180 deg either way; mend it."
         )
-    if asked.travel is not None and not -1e9 < asked.travel[0] < asked.travel[1] < 1e9:
+    if given.travel is not None and not -1e9 < given.travel[0] < given.travel[1] < 1e9:
         problems.append(
-            f"{where}: found --travel {asked.travel[0]:g} {asked.travel[1]:g}, needed the lower "
+            f"{where}: found --travel {given.travel[0]:g} {given.travel[1]:g}, needed the lower "
             "reading first; swap them."
         )
-    if asked.offset is not None and not abs(asked.offset) < 1e9:
-        problems.append(f"{where}: found --offset {asked.offset:g}, needed a length; mend it.")
-    if asked.name is not None:
+    if given.offset is not None and not abs(given.offset) < 1e9:
+        problems.append(f"{where}: found --offset {given.offset:g}, needed a length; mend it.")
+    if given.name is not None:
         try:
-            plain_name(asked.name)
+            plain_name(given.name)
         except ValueError as error:
             problems.append(f"{where}: the name could not be used: {error}")
     return problems
 
 
-def _pointless(asked: Family, count: int, letters: LegType, in_plane: bool) -> list[str]:
+def _pointless(given: Family, count: int, letters: LegType, in_plane: bool) -> list[str]:
     """Return which given dimensions a machine of this family does not have."""
     no_axes = not (letters.base.has_axis or letters.platform.has_axis)
     found = {
-        "--height": in_plane and bool(asked.height) and "a planar machine",
-        "--tilt": (in_plane or no_axes) and bool(asked.tilt) and "axes that cannot tilt",
-        "--base-spread": count != 6 and asked.base_spread is not None and f"{count} legs",
-        "--platform-spread": count != 6 and asked.platform_spread is not None and f"{count} legs",
-        "--offset": not letters.has_slider and asked.offset is not None and "legs without P",
-        "--travel": not letters.has_slider and asked.travel is not None and "legs without P",
+        "--height": in_plane and bool(given.height) and "a planar machine",
+        "--tilt": (in_plane or no_axes) and bool(given.tilt) and "axes that cannot tilt",
+        "--base-spread": count != 6 and given.base_spread is not None and f"{count} legs",
+        "--platform-spread": count != 6 and given.platform_spread is not None and f"{count} legs",
+        "--offset": not letters.has_slider and given.offset is not None and "legs without P",
+        "--travel": not letters.has_slider and given.travel is not None and "legs without P",
     }
     return [
-        f"The family {asked.family} could not be built: found {option} for {what}, needed none; "
+        f"The family {given.family} could not be built: found {option} for {what}, needed none; "
         "leave it out."
         for option, what in found.items()
         if what
     ]
 
 
-def _angles(count: int, asked: Family) -> tuple[Array, Array]:
+def _angles(count: int, given: Family) -> tuple[Array, Array]:
     """Return the angles of the joints on base and platform [rad]."""
     if count != 6:
         even = 2.0 * np.pi * np.arange(count) / count
         return even, even
     half = np.array([0.5, -0.5])
-    spreads = (SPREAD if s is None else s for s in (asked.base_spread, asked.platform_spread))
+    spreads = (SPREAD if s is None else s for s in (given.base_spread, given.platform_spread))
     on_base, on_platform = (spread * np.tile(half, 3) for spread in spreads)
     base = np.array([0.0, 120.0, 120.0, 240.0, 240.0, 360.0]) + on_base
     platform = np.repeat([60.0, 180.0, 300.0], 2) - on_platform
@@ -190,7 +190,7 @@ def _tilted_axes(
 
 
 def _leg(
-    asked: Family,
+    given: Family,
     name: str,
     letters: LegType,
     joints: tuple[Array, Array],
@@ -199,19 +199,19 @@ def _leg(
     T: RigidTransform,
 ) -> LegEntry:
     """Return a leg of a length at home [m]."""
-    unit = str(asked.unit)
+    unit = str(given.unit)
     kind = LegKind.ACTUATED if letters.has_slider else LegKind.CONSTANT
     radius = _default(RADIUS * length)
-    if asked.leg_radius is not None:
-        radius = in_metres(asked.leg_radius, unit)
+    if given.leg_radius is not None:
+        radius = in_metres(given.leg_radius, unit)
     offset: float | None = None
     travel: tuple[float, float] | None = None
     if letters.has_slider:
         offset, travel = _default(SHORTEST * length), (0.0, _default(STROKE * length))
-        if asked.offset is not None:
-            offset = in_metres(asked.offset, unit)
-        if asked.travel is not None:
-            travel = in_metres(asked.travel[0], unit), in_metres(asked.travel[1], unit)
+        if given.offset is not None:
+            offset = in_metres(given.offset, unit)
+        if given.travel is not None:
+            travel = in_metres(given.travel[0], unit), in_metres(given.travel[1], unit)
     at_platform = None if axes[1] is None else np.asarray(T.rotation.inv().apply(axes[1]))
     return LegEntry(
         name, letters, kind, *joints, offset, travel, radius, radius, axes[0], at_platform

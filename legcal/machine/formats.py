@@ -90,7 +90,7 @@ def read_source(model: str | Path) -> Source:
 
 
 def _read_xml(path: Path) -> Source:
-    """Return the mechanism of an XML file, whose outermost element tells the format."""
+    """Return the mechanism of an XML file, by the format of its outermost element."""
     beside = yaml_of_urdf(path)
     if beside is not None and path.suffix.lower() != ".mjcf":
         return read_yaml_source(beside)

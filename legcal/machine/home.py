@@ -45,7 +45,7 @@ def closed_home(machine: Machine, home: RigidTransform | None) -> tuple[RigidTra
 
 
 def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
-    """Return the pose nearest to home that meets every demand of legs and plane.
+    """Return the pose nearest to home that meets every constraint of legs and plane.
 
     Files give home with few digits; sliders absorb that, but rods, revolute axes and universal
     joints in a row cannot.
@@ -110,8 +110,8 @@ def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> Rig
     """Return the closed pose nearest to home once the legs have other numbers, None if none is.
 
     *legs* are those of the machine in R_b and R_e as they are to be; both frames stay where they
-    are. Home may miss what they demand by *max_error* leg lengths; it stays where they demand
-    nothing else.
+    are. Their residuals at home may be *max_error* leg lengths; it stays where they have no
+    constraints.
     """
     changed = tuple(
         replace(

@@ -45,7 +45,7 @@ RANDOM_ANGLES, FEW_RESTARTS = (
     6,
     2,
 )  # other angles of all legs, and of those that do not close from there
-DEPENDENT = 1e-7  # of the largest singular value: demands that say the same
+DEPENDENT = 1e-7  # of the largest singular value: equations that say the same
 MAX_POSE_ERROR = 0.01  # of a leg length: how far a given pose may be from a closed one
 
 
@@ -324,7 +324,7 @@ def solve_poses(
     lengthening: Array | None = None,
     steps: int = 60,
 ) -> SolvedPoses:
-    """Return the poses near R, t of R_e in R_b where legs meet what readings and joints demand.
+    """Return the poses near R, t of R_e in R_b where the equations of legs hold at readings.
 
     *lengthening* (k, n_legs) is s q of actuated legs [m], NaN where unknown; without it poses move
     to the nearest at which the constraints hold. Where no pose meets all (parameters far from the
@@ -390,7 +390,7 @@ def close_at(
 
     Sliders are set from the distance of their joints, so that no leg is ever flipped; joint angles
     are solved from ``start``, and from seeded random ones for legs that do not close from there.
-    The pose must meet what the legs demand. Without *hold* it need meet that but for rounding: the
+    The pose must meet the constraints. Without *hold* it need meet them but for rounding: the
     platform is let go at the end and moves by what the axes of the model are off.
 
     Raises

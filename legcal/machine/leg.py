@@ -307,7 +307,9 @@ class KinematicParameters:
     base_joints: Array  # (n_legs, 3) A in R_b [m]
     platform_joints: Array  # (n_legs, 3) B in R_e [m]
     offsets: Array  # (n_legs,) q0, or the length of constant legs [m]
-    passive: tuple[int, ...] = ()  # legs whose offset is no parameter, since no reading tells it
+    passive: tuple[
+        int, ...
+    ] = ()  # legs whose offset is no parameter, since no reading depends on it
 
 
 def parameters_of_legs(legs: Sequence[Leg]) -> KinematicParameters:

@@ -235,16 +235,16 @@ def model_paths(name: str, output: Path) -> tuple[Path, Path]:
 
 
 def _write(machine: Assembled, source: str, output: Path) -> Created:
-    """Write and load the files aside, then move them to their places."""
+    """Write and load the files in a temporary folder, then move them to their places."""
     made = [path for path in (output, *output.parents) if not path.exists()]
     output.mkdir(parents=True, exist_ok=True)
     try:
-        with temporary_folder(output, machine.name) as aside:
-            written = model_paths(machine.name, aside)
+        with temporary_folder(output, machine.name) as temporary:
+            written = model_paths(machine.name, temporary)
             for path, text in zip(written, (yaml_text(machine), urdf_text(machine)), strict=True):
                 path.parent.mkdir()
                 path.write_bytes(text.encode())
-            _load(written[0], aside, source)
+            _load(written[0], temporary, source)
             places = model_paths(machine.name, output)
             for path in places:
                 if not path.parent.is_dir():
@@ -260,10 +260,10 @@ def _write(machine: Assembled, source: str, output: Path) -> Created:
     return Created(load_mechanism(places[0]), *places)
 
 
-def _load(path: Path, aside: Path, source: str) -> None:
-    """Load the files where they were written aside; problems name the source instead."""
+def _load(path: Path, temporary: Path, source: str) -> None:
+    """Load the files in the temporary folder; problems name the source instead."""
     try:
         load_mechanism(path)
     except LegcalError as error:
-        told = [p.replace(f"{aside}{os.sep}", f"{source}: ") for p in error.problems]
-        raise type(error)(told) from error
+        problems = [p.replace(f"{temporary}{os.sep}", f"{source}: ") for p in error.problems]
+        raise type(error)(problems) from error

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from legcal.files import Document, OwnYaml
+from legcal.files import Document, YamlOutput
 from legcal.geometry import Array
 from legcal.vision import CALIBRATED, Board, Camera, camera_info, intrinsic_names, intrinsic_values
 
-CAMERA_FILE = OwnYaml(
+CAMERA_FILE = YamlOutput(
     "the camera", "camera file", CALIBRATED, "a new file or one that this command wrote"
 )
 _DIGITS = 6  # of figures that describe the calibration
