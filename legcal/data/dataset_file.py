@@ -16,7 +16,7 @@ from legcal.files import (
     MotionEntry,
     Name,
     Number,
-    Stated,
+    Quantity,
     Version,
     describe,
     parse_yaml,
@@ -57,7 +57,9 @@ def _can_be_fixed(text: str) -> str:
 class ParametersEntry(FileSchema):
     """What is known of parameters, which are left as they are and which are looked for."""
 
-    priors: dict[Name, Annotated[Stated, BeforeValidator(read_prior)]] = Field(default_factory=dict)
+    priors: dict[Name, Annotated[Quantity, BeforeValidator(read_prior)]] = Field(
+        default_factory=dict
+    )
     fixed: list[Annotated[Name, AfterValidator(_can_be_fixed)]] = Field(default_factory=list)
     free: list[Name] = Field(default_factory=list)
 
