@@ -139,6 +139,8 @@ def _check_leg(leg: Leg, spec: LegSpec, layout: LegLayout) -> None:
     if spec.kind != "constant" and spec.ends[1] != "":
         _close(ends.pop("platform"), (-0.15, 0.0))
     assert not ends
+    for cylinder in leg.cylinders:  # along a leg of 0.7 m, from A
+        _close(cylinder.span(0.7), (0.0, 0.2) if cylinder.side == "base" else (0.55, 0.7))
 
 
 def _same_poses(one: Machine, other: Machine) -> None:
