@@ -31,7 +31,7 @@ from legcal.calibration.location.frames import (
 )
 from legcal.calibration.location.observations import Noise, motions_by_readings
 from legcal.calibration.location.search import search, solve_by_kronecker, solve_by_opencv
-from legcal.geometry import Array, rotation_matrices
+from legcal.geometry import Array, nearest_rotation, rotation_matrices
 from legcal.machine import forward_kinematics
 
 STATED = (np.array([SIGMA_POSITION, SIGMA_ANGLE]), (True, True))
@@ -104,6 +104,15 @@ def test_our_closed_form_is_that_of_opencv(base: RigidTransform, tool: RigidTran
     apart = np.abs(solve_by_kronecker(pairs) - theirs)
     assert apart[:, :, :3].max() < 1e-9
     assert apart[:, :, 3].max() < 1e-3
+
+
+def test_the_nearest_rotation_is_never_a_mirror() -> None:
+    matrices = np.random.default_rng(1).normal(size=(20, 3, 3))
+    found = nearest_rotation(matrices)
+    np.testing.assert_allclose(np.linalg.det(found), 1.0)
+    others = rotation_matrices(np.random.default_rng(2).normal(size=(200, 1, 3)))
+    apart = np.linalg.norm(matrices - found, axis=(1, 2))
+    assert np.all(apart < np.linalg.norm(matrices - others, axis=(2, 3)))
 
 
 def test_nothing_changes_where_opencv_has_no_solver(monkeypatch: pytest.MonkeyPatch) -> None:
