@@ -86,6 +86,20 @@ def test_distances_are_those_of_the_pixels_that_are_read(angle: float, epsilon: 
     np.testing.assert_allclose(columns.position, t.mean(axis=1) / one.band.length, atol=0.02)
 
 
+@pytest.mark.parametrize(("angle", "place"), [(np.pi / 2, (399.0, 150.0)), (0.0, (200.0, 299.0))])
+def test_pixels_beyond_the_border_are_not_read(angle: float, place: tuple[float, float]) -> None:
+    one = edge_at(angle)
+    there = LENS.undistort(np.array(place))
+    one = replace(one, band=replace(one.band, origin=one.band.origin + there))
+    columns, rows = read([one], 0), read([one], 1)
+    xy = LENS.undistort(np.stack([columns.grey, rows.grey], axis=-1).astype(np.float64))
+    h = one.band.line(*V)
+    distance = LENS.line_offset(np.broadcast_to(h, (*xy.shape[:-1], 3)), xy)
+    seen = columns.inside
+    assert np.count_nonzero(seen) > 50
+    np.testing.assert_allclose(columns.d[seen], distance[seen], atol=0.05)
+
+
 def test_gain_is_how_far_an_outline_moves_in_the_image() -> None:
     one = edge_at(0.8)
     h = np.stack([one.band.line(*(V + move)) for move in (0.0, 1.0)])
