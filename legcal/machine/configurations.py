@@ -73,7 +73,7 @@ class Configurations(NamedTuple):
 
 
 def random_configurations(
-    machine: Machine, count: int, rng: np.random.Generator | int
+    mechanism: Machine, count: int, rng: np.random.Generator | int
 ) -> Configurations:
     """Return random closed configurations with every slider inside its travel.
 
@@ -83,7 +83,7 @@ def random_configurations(
 
     Parameters
     ----------
-    machine : Machine
+    mechanism : Machine
         The machine.
     count : int
         How many.
@@ -101,8 +101,8 @@ def random_configurations(
         If too few are reached.
     """
     chance = np.random.default_rng(rng)
-    draw = _drawn if machine.is_determined else _wandered
-    found = list(draw(machine, count, chance))
+    draw = _drawn if mechanism.is_determined else _wandered
+    found = list(draw(mechanism, count, chance))
     if len(found) < count:
         raise DidNotConverge(
             f"{machine.yaml_path}: random poses could not be drawn: found {len(found)} of "
@@ -110,9 +110,9 @@ def random_configurations(
             "legcal.home and the limits of the sliders."
         )
     return Configurations(
-        np.array(found).reshape(count, machine.chain.nq),
-        np.array([joint_values(machine, c) for c in found]).reshape(count, machine.n_legs),
-        [platform_pose(machine, c) for c in found],
+        np.array(found).reshape(count, mechanism.chain.nq),
+        np.array([joint_values(mechanism, c) for c in found]).reshape(count, mechanism.n_legs),
+        [platform_pose(mechanism, c) for c in found],
     )
 
 

@@ -50,13 +50,13 @@ MAX_POSE_ERROR = 0.01  # of a leg length: how far a given pose may be from a clo
 
 
 def forward_kinematics(
-    machine: Machine, q: Array, start: RigidTransform | None = None
+    mechanism: Machine, q: Array, start: RigidTransform | None = None
 ) -> RigidTransform:
     """Return the platform pose at motor readings.
 
     Parameters
     ----------
-    machine : Machine
+    mechanism : Machine
         The machine.
     q : (n_legs,) array
         Readings [m]; those of legs without a motor are ignored and may be NaN.
@@ -77,7 +77,7 @@ def forward_kinematics(
     UsageError
         If the readings are too few or not finite.
     """
-    return Follower(machine, start).move_to(q)
+    return Follower(mechanism, start).move_to(q)
 
 
 class Follower:
@@ -85,7 +85,7 @@ class Follower:
 
     Parameters
     ----------
-    machine : Machine
+    mechanism : Machine
         The machine.
     start : RigidTransform, optional
         T_base_platform of a pose in the wanted assembly mode; ``mechanism.home`` without it.
@@ -105,23 +105,23 @@ class Follower:
         If the legs do not reach the start.
     """
 
-    def __init__(self, machine: Machine, start: RigidTransform | None = None) -> None:
-        _check_determined(machine)
-        self._mechanism = machine
-        self.configuration = machine.home_configuration
+    def __init__(self, mechanism: Machine, start: RigidTransform | None = None) -> None:
+        _check_determined(mechanism)
+        self._machine = mechanism
+        self.configuration = mechanism.home_configuration
         if start is not None:
-            settled, problem = project_pose(machine, start)
+            settled, problem = project_pose(mechanism, start)
             if problem is not None:
                 raise UsageError(
                     f"The pose could not be followed from its start: found {problem} there, needed "
                     "a pose that the legs allow; correct the start."
                 )
-            self.configuration = close_at(machine, settled, self.configuration, hold=False)
+            self.configuration = close_at(mechanism, settled, self.configuration, hold=False)
 
     @property
     def pose(self) -> RigidTransform:
         """T_base_platform at the last readings."""
-        return platform_pose(self._mechanism, self.configuration)
+        return platform_pose(self._machine, self.configuration)
 
     def move_to(self, q: Array) -> RigidTransform:
         """Return the platform pose at readings, followed from the last ones.
@@ -139,8 +139,8 @@ class Follower:
         UsageError
             If the readings are too few or not finite.
         """
-        readings = _readings(self._mechanism, np.asarray(q, dtype=np.float64)[None])[0]
-        self.configuration = follow(self._mechanism, self.configuration, readings)
+        readings = _readings(self._machine, np.asarray(q, dtype=np.float64)[None])[0]
+        self.configuration = follow(self._machine, self.configuration, readings)
         return self.pose
 
 
@@ -184,7 +184,7 @@ def followed_poses(
         yield platform_pose(machine, configuration), None
 
 
-def inverse_kinematics(machine: Machine, T_base_platform: RigidTransform) -> Array:
+def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the joint value of every leg at a pose, q = sign (|AB| - q0).
 
     A length is a distance, so that no leg is ever flipped. Values outside the travel are
@@ -192,7 +192,7 @@ def inverse_kinematics(machine: Machine, T_base_platform: RigidTransform) -> Arr
 
     Parameters
     ----------
-    machine : Machine
+    mechanism : Machine
         The machine.
     T_base_platform : RigidTransform
         Pose of the platform link in the base link.
@@ -208,14 +208,14 @@ def inverse_kinematics(machine: Machine, T_base_platform: RigidTransform) -> Arr
         If the legs or the plane of motion do not allow the pose: a rod that is too short or too
         long, a revolute axis that is not perpendicular to its leg, a leg that would be twisted.
     """
-    problem = violated_constraint(machine, T_base_platform)
+    problem = violated_constraint(mechanism, T_base_platform)
     if problem is not None:
         raise UsageError(
             f"The platform cannot stand there: {problem}, needed a pose that every leg "
             "allows; choose one that keeps it."
         )
-    q = readings_at(machine, T_base_platform)
-    q[[leg.kind is LegKind.CONSTANT for leg in machine.legs]] = 0.0
+    q = readings_at(mechanism, T_base_platform)
+    q[[leg.kind is LegKind.CONSTANT for leg in mechanism.legs]] = 0.0
     return q
 
 

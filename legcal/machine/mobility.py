@@ -109,7 +109,7 @@ def _column_units(machine: Machine) -> Array:
     return units
 
 
-def singularity(machine: Machine, T_base_platform: RigidTransform) -> float:
+def singularity(mechanism: Machine, T_base_platform: RigidTransform) -> float:
     """Return the smallest singular value of the dimensionless Jacobian of the legs' equations.
 
     Rows are the lengths of actuated and constant legs and all other demands, counted at the end
@@ -119,7 +119,7 @@ def singularity(machine: Machine, T_base_platform: RigidTransform) -> float:
 
     Parameters
     ----------
-    machine : Machine
+    mechanism : Machine
         The machine.
     T_base_platform : RigidTransform
         A pose; its readings need not be inside the travel.
@@ -130,7 +130,7 @@ def singularity(machine: Machine, T_base_platform: RigidTransform) -> float:
         Zero at a singular pose, and wherever the motors do not determine the pose; of the order
         of the platform's size in leg lengths at a good one.
     """
-    jacobian = dimensionless(machine, T_base_platform)
+    jacobian = dimensionless(mechanism, T_base_platform)
     if len(jacobian) < 6:
         return 0.0
     return float(np.linalg.svd(jacobian, compute_uv=False)[5])

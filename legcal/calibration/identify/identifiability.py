@@ -89,7 +89,7 @@ def answer(
 
 
 def identifiability(
-    machine: Machine,
+    mechanism: Machine,
     views: Sequence[Sequence[str]] = (),
     images: int = 15,
     *,
@@ -100,7 +100,7 @@ def identifiability(
 
     Parameters
     ----------
-    machine : Machine
+    mechanism : Machine
         The nominal model.
     views : sequence of sequences of str
         Names of the legs that each camera position shows; without any, the smallest sets of
@@ -132,20 +132,20 @@ def identifiability(
     mean leg length (angles count at that length). Well-determined directions lie below a
     tenth of it, undetermined ones above a multiple.
     """
-    legs = read_views(views, machine.leg_names, images)
+    legs = read_views(views, mechanism.leg_names, images)
     if hand_held:
-        return _judge_hand_held(machine, legs, images, board=board)
+        return _judge_hand_held(mechanism, legs, images, board=board)
     recommendation = None
     if not legs:
-        recommendation = recommend(machine, images, board=board)
-        names = recommendation[0].views if recommendation else (machine.leg_names,)
-        legs = read_views(names, machine.leg_names, images)
-    session = planned_session(machine, legs, images, board=board)
+        recommendation = recommend(mechanism, images, board=board)
+        names = recommendation[0].views if recommendation else (mechanism.leg_names,)
+        legs = read_views(names, mechanism.leg_names, images)
+    session = planned_session(mechanism, legs, images, board=board)
     replanning = Replanning(
-        lambda more: planned_session(machine, legs, more, board=board),
-        lambda: recommend(machine, max(images, ENOUGH_IMAGES), board=board),
+        lambda more: planned_session(mechanism, legs, more, board=board),
+        lambda: recommend(mechanism, max(images, ENOUGH_IMAGES), board=board),
     )
-    return _judge(machine, Analysis(session), recommendation, replanning)
+    return _judge(mechanism, Analysis(session), recommendation, replanning)
 
 
 def identifiability_of_dataset(
