@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from axes_session import axes_session
-from board_session import corners_of, with_board
+from board_session import SIGMA_PX, corners_of, with_board
 from dense_fit import (
     allowed,
     by_differences,
@@ -151,6 +151,7 @@ def test_corners_are_where_the_camera_projects_them() -> None:
     board = problem.corners
     r = linearize(problem, problem.begin(start))["corners"].r * board.sigma[:, None]
     assert len(board) == 3 * seen.board.n_corners  # one for all images of a view
+    np.testing.assert_allclose(board.sigma, SIGMA_PX / np.sqrt(2))  # of two images
     in_base = start.T_Rb_board.apply(board.point)
     for v, T in enumerate(start.T_camera_Rb):
         of_view = board.view == v
