@@ -3,7 +3,7 @@
     python benchmarks/example.py
 
 Platform errors of eq (20) at the 45 poses: of the nominal model, of what the four steps give
-alone (default criteria, and the criteria as printed), and of the fit of everything; beside the
+alone (default criteria, and the criteria as printed), and of the joint fit; beside the
 error that the fit predicts, and the normalised squared error of its parameters.
 """
 
@@ -57,7 +57,7 @@ def main() -> None:
         "nominal model": machine.parameters,
         "four steps, criteria as printed": steps["literal"],
         "four steps, default criteria": steps["default"],
-        "fit of everything": solution.parameters,
+        "joint fit": solution.parameters,
     }
     for name, parameters in rows.items():
         dX, dE = platform_error(calibration, parameters, truth)

@@ -1,4 +1,4 @@
-"""Build time, solve time and memory of the fit of everything, beside what SciPy needs for it.
+"""Build time, solve time and memory of the joint fit, beside what SciPy needs for it.
 
 Run from the project's folder: ``python benchmarks/refinement.py [--scipy-images 45 450]``. The
 session is that of the tests: a hexapod, three views, four legs seen in each image, outlines with

@@ -34,7 +34,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
-from legcal.perception.camera_search import JOINT_ERROR, place_camera, refined, scores
+from legcal.perception.camera_search import NOMINAL_JOINT_ERROR, place_camera, refined, scores
 from legcal.perception.detection import measure_outlines
 from legcal.perception.light import to_grey
 from legcal.perception.lines import EdgePairs, find_edge_pairs, find_segments
@@ -148,7 +148,7 @@ def has_doubt(scene: Scene) -> bool:
     T = truth.T_base_camera.inv()
     true = Poses.rigid(T.rotation.as_matrix()[None], T.translation[None], n_legs)
     others = place_camera(pictures, n_legs).poses
-    poses = refined(pictures, Poses.joined([true, others]), IDEAL, JOINT_ERROR)
+    poses = refined(pictures, Poses.joined([true, others]), IDEAL, NOMINAL_JOINT_ERROR)
     support = scores(pictures, poses, IDEAL[-1])
     apart = [not _same(_pose(poses, i), truth.T_base_camera) for i in range(len(poses))]
     return bool(np.max(support[apart], initial=0.0) >= AS_WELL * support[0])

@@ -1,7 +1,7 @@
 """Calibrate parallel robots from photographs of their legs.
 
 The method is Renaud, Andreff, Gogu, Martinet, *On vision-based kinematic calibration of
-n-leg parallel mechanisms* (IFAC 2002), followed by one fit of everything in the image.
+n-leg parallel mechanisms* (IFAC 2002), followed by one joint fit in the image.
 
 Notation, the same everywhere (the letters are the paper's):
 

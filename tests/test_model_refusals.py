@@ -433,7 +433,9 @@ def test_every_robot_of_the_corpus_is_refused_in_one_sentence() -> None:
         found = files("example-robot-data") or []
     except PackageNotFoundError:
         pytest.skip("example-robot-data is not installed: pip install 'legcal[corpus]'")
-    for robot in sorted(Path(str(f.locate())) for f in found if f.suffix == ".urdf"):
+    robots = sorted(Path(str(f.locate())) for f in found if f.suffix == ".urdf")
+    assert robots, "the distribution lists no URDF"
+    for robot in robots:
         with pytest.raises(LegcalError) as refusal:
             load_mechanism(robot)
         for problem in refusal.value.problems:

@@ -453,11 +453,11 @@ def outline_key(dataset: Dataset, choices: Choices) -> str:
 
 def _store_outlines(session: Session, estimate: Estimate, key: str) -> list[str]:
     """Leave outlines and notes on images beside the dataset; return a note if that fails."""
-    if estimate.other_radii or len(session.plan.detect) == 0:
+    plan = estimate.part.plan  # not that of the session, where stored outlines were of no use
+    if estimate.other_radii or len(plan.detect) == 0:
         return []
     outlines = session.order.restore(estimate.outlines)
-    given, notes = session.plan.given, estimate.image_notes
-    note = store_outlines(session.dataset, outlines, key, given, notes)
+    note = store_outlines(session.dataset, outlines, key, plan.given, estimate.image_notes)
     return [note] if note else []
 
 

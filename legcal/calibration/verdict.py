@@ -36,7 +36,7 @@ class Calibration:
     Attributes
     ----------
     dataset : Dataset
-        What it was computed from; its ``mechanism`` is the nominal model.
+        What it was computed from; its ``machine`` is the nominal model.
     solution : Solution
         The joint fit: parameters, covariance, cameras, platform poses, radii.
     steps : Steps

@@ -1,7 +1,7 @@
 """One estimation problem for everything: variables, factors, one solver, information.
 
 Every estimate from measurements is the minimum of a :class:`Problem`; this room knows neither
-images nor robots (section 4 of the paper is one client, :mod:`legcal.calibration.joint_fit`):
+images nor robots (:mod:`legcal.calibration.joint_fit` is its largest client):
 
 **State** A dataclass of the client with one field for each block of variables, of any type.
 

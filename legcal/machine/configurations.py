@@ -105,7 +105,7 @@ def random_configurations(
     found = list(draw(mechanism, count, chance))
     if len(found) < count:
         raise DidNotConverge(
-            f"{machine.yaml_path}: random poses could not be drawn: found {len(found)} of "
+            f"{mechanism.yaml_path}: random poses could not be drawn: found {len(found)} of "
             f"{count} inside the travel in {MAX_DRAWS} tries for each, needed all; check "
             "legcal.home and the limits of the sliders."
         )

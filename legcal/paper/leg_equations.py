@@ -59,6 +59,8 @@ def constraint_of_leg(
         residual = ca.dot(frame[:, 0], u)
     elif about is EquationKind.DIRECTION_1:
         residual = frame[:, 1:].T @ u
+    elif about is not EquationKind.TWIST:
+        raise NotImplementedError(f"the steps have no equation for {about}")
     else:
         base = turned_frame(leg.local[4:6], a)[:, 0]
         outer = frame[:, 1 if platform_joint is JointType.FIXED else 0]

@@ -37,7 +37,7 @@ HINTED_MIN_SUPPORT = 1.6  # the same near a rough pose
 
 TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis [m]
 LAST_TOLERANCES = (0.01, 0.007, 0.005, 0.004, 0.003)  # with the joints known better
-JOINT_ERROR = 6e-3  # standard deviation of the joint centres of the nominal model [m]
+NOMINAL_JOINT_ERROR = 6e-3  # standard deviation of the joint centres of the nominal model [m]
 START_PICTURES = 1, 1, 2, 4  # whose pairs suggest poses, until one is clear
 SOME_PICTURES = 8  # that judge which poses are worth a comparison with all
 N_KEPT = (400, 40, 12, 6)  # poses: those of a picture, its refined ones, of some pictures, of all
@@ -156,18 +156,18 @@ def place_camera(
         poses = Poses.joined([best.poses, *suggested])
         if len(poses) == 0:
             continue
-        poses = refined(best_first[:done], poses, TOLERANCES[2:4], JOINT_ERROR)
+        poses = refined(best_first[:done], poses, TOLERANCES[2:4], NOMINAL_JOINT_ERROR)
         some = best_first[: max(SOME_PICTURES, done)]
         score = scores(some, poses, TOLERANCES[3])
         poses = poses.take(_distinct(poses, score, N_KEPT[2]))
         poses = Poses.joined(
             [poses, _reversed(some, poses.take(np.arange(min(N_REVERSED, len(poses)))))]
         )
-        poses = refined(some, poses, TOLERANCES[3:], JOINT_ERROR)
+        poses = refined(some, poses, TOLERANCES[3:], NOMINAL_JOINT_ERROR)
         score = scores(some, poses, TOLERANCES[-1])
         poses = poses.take(_best(score, N_KEPT[3]))
         poses = Poses.joined([poses, _polished(some[:POLISHING], poses)])
-        best = _candidates(pictures, refined(pictures, poses, LAST_TOLERANCES, JOINT_ERROR))
+        best = _candidates(pictures, refined(pictures, poses, LAST_TOLERANCES, NOMINAL_JOINT_ERROR))
         if best.is_clear:
             break
     return best
@@ -182,7 +182,7 @@ def _polished(pictures: Sequence[Picture], poses: Poses) -> Poses:
     found = []
     for i in range(min(N_POLISHED, len(poses))):
         around = _around(pictures, poses.R[i], poses.t[i], n_legs)
-        around = refined(pictures, around, POLISH, JOINT_ERROR)
+        around = refined(pictures, around, POLISH, NOMINAL_JOINT_ERROR)
         score = scores(pictures, around, POLISH[-1])
         found.append(around.take(_best(score, 1)))
     return Poses.joined([*found, poses.take(np.zeros(0, dtype=np.intp))])
@@ -213,7 +213,7 @@ def place_near(
     R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
     poses = Poses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
     poses = refined(pictures, poses, TOLERANCES[:3])
-    poses = refined(pictures, poses, (*TOLERANCES[2:], *LAST_TOLERANCES), JOINT_ERROR)
+    poses = refined(pictures, poses, (*TOLERANCES[2:], *LAST_TOLERANCES), NOMINAL_JOINT_ERROR)
     found = _candidates(pictures, poses)
     return replace(found, hinted=True)
 
@@ -242,7 +242,7 @@ def _candidates(pictures: Sequence[Picture], poses: Poses) -> Candidates:
     shares = [picture.targets.share for picture in pictures]
     support = np.stack([v @ s for v, s in zip(values, shares, strict=True)], axis=1)
     expected = np.stack([f.visible @ s for f, s in zip(found, shares, strict=True)], axis=1)
-    cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / JOINT_ERROR**2
+    cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / NOMINAL_JOINT_ERROR**2
     score = support.sum(axis=1) - SHIFT_COST * cost
     order = _different(pictures, poses, found, [v >= MIN_MATCH_SCORE for v in values], score)
     best = poses.take(order[:1])

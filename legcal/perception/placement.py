@@ -25,7 +25,9 @@ from legcal.vision import Camera
 Load = Callable[[int], Image]  # of a row, 8 or 16 bit, grey or colour (BGR)
 Joined = Sequence[RigidTransform | None] | None  # T_board_camera of views that show a board
 
-JOINT_ERROR = 4e-3  # of predicted joint centres: the nominal model's joints and platform pose [m]
+PREDICTED_JOINT_ERROR = (
+    4e-3  # of predicted joint centres: the nominal model's joints and platform pose [m]
+)
 PIXEL_ERROR = 3.0  # added to every window [px]
 NEAR_FIT_PX = 3.0  # how far outlines may be from a joint fit
 NEAR_IMAGES = 6  # of a group that are searched where a rough pose is given, at first
@@ -93,7 +95,7 @@ class Placement:
     A_base: Array  # (n_rows, n_legs, 3) where the view of each row sees them, in the base link [m]
     B_base: Array
     T_base_camera: tuple[RigidTransform | None, ...]  # of each view; None: not known
-    joint_error: float | Array = JOINT_ERROR  # (n_views, n_legs) [m]
+    joint_error: float | Array = PREDICTED_JOINT_ERROR  # (n_views, n_legs) [m]
     pixel_error: float = PIXEL_ERROR  # [px]
     window: Array | None = None  # (n_rows, n_legs) [px]; NaN: not looked for
     blur: tuple[float, ...] = ()  # of each view near a fit [px]; NaN or (): not known

@@ -53,7 +53,7 @@ TIMES, MORE = 1.6, 3.0
 TIMES_AGREED, MORE_AGREED = 1.5, 0.0  # the same where edge pairs are convincing by themselves
 WITHOUT_RIVAL = 4.0  # times the evidence for others, from which on no more is needed either
 TIMES_ALONE, MORE_ALONE = 2.5, 6.0  # and of a single image
-JOINT_ERROR = 3e-3  # of the legs as a pose has them [m]
+POSE_JOINT_ERROR = 3e-3  # of the legs as a pose has them [m]
 SAME_PX, SAME_PART = 3.0, 0.7  # of outlines that two poses share: how near, how many of them
 
 
@@ -274,7 +274,7 @@ def _measure_at(search: Search, group: Group, candidates: Candidates, i: int) ->
     T: list[RigidTransform | None] = [None] * n_views
     for v in group.views:
         T[v] = candidates.pose(i) * group.T_group_camera[v]
-    placement = Placement(search.A_base, search.B_base, tuple(T), JOINT_ERROR)
+    placement = Placement(search.A_base, search.B_base, tuple(T), POSE_JOINT_ERROR)
     shifts = np.broadcast_to(shift, (n_views, *shift.shape)).copy()
     placement = placement.shifted(search, shifts)
     outlines, _ = measure_outlines(search, placement, group.rows)

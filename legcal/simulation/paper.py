@@ -229,7 +229,7 @@ def default_steps(session: HexapodSession, nominal: PaperHexapod) -> KinematicPa
 
 
 def one_fit(session: HexapodSession, nominal: PaperHexapod) -> KinematicParameters:
-    """Return what one fit of everything finds, started from the nominal model and rough cameras.
+    """Return what the joint fit finds, started from the nominal model and rough cameras.
 
     ``legcal calibrate`` also starts from what the steps find and keeps the better of both; here the
     fit is compared with the steps, and does without them.
