@@ -24,7 +24,7 @@ from legcal.data import (
     Measurements,
 )
 from legcal.errors import DatasetError, NotVisible
-from legcal.geometry import IntArray
+from legcal.geometry import IntArray, pose_distance
 from legcal.perception import FAR_OFF, camera_poses, detect_corners, require_board
 from legcal.vision import Board
 
@@ -143,7 +143,7 @@ def base_of_board(dataset: Dataset, board: BoardViews, hints: Poses) -> RigidTra
         return by_cameras if given is None else given
     # Wrong poses beside a right one are named when the images have placed their cameras.
     if not any(_agree(given, place) for place in board.poses_by_view(hints).values()):
-        far, turned = _apart(given, by_cameras)
+        far, turned = pose_distance(given, by_cameras)
         raise DatasetError(
             f"{dataset.yaml_path}: board.T_base_board and the T_base_camera of the views "
             f"could not be used together: found the board {1e3 * far:.0f} mm and "
@@ -172,7 +172,7 @@ def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -
     if given is not None and found is not None:
         place = dataset.machine.T_base_Rb * found
         if not _agree(given, place):
-            far, turned = _apart(given, place)
+            far, turned = pose_distance(given, place)
             notes.append(
                 f"The calibration board stands {1e3 * far:.0f} mm and {np.degrees(turned):.1f} deg "
                 "from where T_base_board of the dataset has it, far more than base joints can be "
@@ -212,13 +212,7 @@ def in_one_camera(
     )
 
 
-def _apart(one: RigidTransform, other: RigidTransform) -> tuple[float, float]:
-    """Return distance [m] and angle [rad] between two poses."""
-    off = one.inv() * other
-    return float(np.linalg.norm(off.translation)), float(off.rotation.magnitude())
-
-
 def _agree(one: RigidTransform, other: RigidTransform, reach: float = 1.0) -> bool:
     """Say whether two places of the board are as near as hints are good."""
-    far, turned = _apart(one, other)
+    far, turned = pose_distance(one, other)
     return far <= reach * _MAX_DISTANCE and turned <= reach * _MAX_ANGLE

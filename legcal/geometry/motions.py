@@ -49,6 +49,12 @@ def motion_of(
     return RigidTransform(matrix, normalize=False, copy=False)
 
 
+def pose_distance(one: RigidTransform, other: RigidTransform) -> tuple[float, float]:
+    """Return distance [m] and angle [rad] between two poses."""
+    off = one.inv() * other
+    return float(np.linalg.norm(off.translation)), float(off.rotation.magnitude())
+
+
 def product(*motions: RigidTransform) -> RigidTransform:
     """Return the product of motions, as ``*`` does, quickly; see :func:`motion_of`."""
     matrix = motions[0].as_matrix()

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data import Measurements, Outlines, is_edited
-from legcal.geometry import BoolArray, IntArray
+from legcal.geometry import BoolArray, IntArray, pose_distance
 from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped
 from legcal.perception.detection import NOT_PLACED
 from legcal.perception.lines import EdgePairs
@@ -406,7 +406,7 @@ def _left_out_legs(search: Search, placement: Placement, v: int, rows: Sequence[
 def _far_off(hint: RigidTransform, T_base_camera: RigidTransform, reach: float = 1.0) -> bool:
     """Say whether a rough pose is farther from a pose than rough ones are."""
     distance = float(np.linalg.norm(T_base_camera.translation))
-    apart, angle = _apart(hint, T_base_camera)
+    apart, angle = pose_distance(hint, T_base_camera)
     nearest, part = reach * FAR_OFF[0], reach * FAR_OFF_PART
     return apart > max(nearest, part * distance) or angle > reach * FAR_OFF[1]
 
@@ -426,7 +426,7 @@ def hint_notes(
     for name, hint, T in zip(names, hints, cameras, strict=True):
         if hint is None or T is None or not _far_off(hint, T, reach):
             continue
-        apart, angle = _apart(hint, T)
+        apart, angle = pose_distance(hint, T)
         x, y, z = T.translation
         other = next(
             (
@@ -447,9 +447,3 @@ def hint_notes(
             f"{y:.3f}, {z:.3f}]), needed a rough pose; {remedy}."
         )
     return notes
-
-
-def _apart(one: RigidTransform, other: RigidTransform) -> tuple[float, float]:
-    """Return distance [m] and angle [rad] between two poses."""
-    off = one.inv() * other
-    return float(np.linalg.norm(off.translation)), float(off.rotation.magnitude())
