@@ -297,6 +297,7 @@ def test_cameras_are_placed_among_clutter_and_missing_legs(n_legs: int) -> None:
         assert placed.is_convincing
         assert _is_right(placed, T)
         assert np.all(np.diff(placed.score) <= 0.0)
+        assert placed.support.shape == placed.expected.shape == (len(placed.poses), 4)
         assert np.isfinite(placed.leg_error).any()
 
 
@@ -307,6 +308,20 @@ def test_a_model_that_is_wrong_by_ten_millimetres_suffices() -> None:
     away, angle = lp.apart(T, placed.pose())
     assert angle < np.deg2rad(6.0)
     assert away < 0.15
+
+
+@pytest.mark.slow
+def test_no_wrong_pose_is_convincing() -> None:
+    right = []
+    for seed in range(60):
+        error = 10e-3 if seed % 7 == 0 else 2e-3
+        n_legs, n = 3 + seed % 4, 1 + seed % 5
+        pictures, T = _scene(100 + seed, n_legs, n, joint_error=error, **HARD)
+        placed = place_camera(pictures, n_legs)
+        right.append(placed.is_convincing)
+        if placed.is_convincing:
+            assert _is_right(placed, T), seed
+    assert np.mean(right) > 0.75
 
 
 def test_views_with_known_relative_poses_are_placed_together() -> None:
@@ -365,12 +380,15 @@ def test_a_rough_pose_is_improved_and_that_of_another_place_is_not_clear() -> No
     assert placed.hinted
     assert placed.is_convincing
     assert _is_right(placed, T)
+    assert np.all(placed.leg_error[np.isfinite(placed.leg_error)] < 6e-3)  # from its edge pairs
     assert lp.apart(T, placed.pose())[1] < 0.5 * lp.apart(T, T * off)[1]
     other = RigidTransform.from_rotation(Rotation.from_euler("z", 1.9)) * T
     assert not place_near(pictures, other, 6).is_clear
     pictures, T = _scene(11, 3, 1, joint_error=2e-3)  # a single image of three legs
     assert not place_camera(pictures, 3).is_clear
-    assert _is_right(place_near(pictures, T, 3), T)
+    near = place_near(pictures, T, 3)
+    assert near.is_convincing
+    assert _is_right(near, T)
 
 
 def test_pictures_of_other_things_give_no_pose() -> None:
