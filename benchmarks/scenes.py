@@ -7,7 +7,7 @@ A scene is a random shipped machine with errors against its nominal model, seen 
 in random light among clutter and behind occluders, in 1 to 8 images at random readings (see
 ``random_scenes.py``). No rough camera pose and no legs are given. Results are lines of JSON, one a
 scene; scenes that the file has already are not made again. ``--only`` writes the images of a
-scene with all true outlines (thin), the bars (grey), and the outlines that were used (thick,
+scene with all true outlines (thin), the pairs (grey), and the outlines that were used (thick,
 one colour a leg).
 
 Columns of the table: views placed right, refused as ambiguous or for want of legs (of both: where
@@ -35,10 +35,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
 from legcal.perception.camera_search import NOMINAL_JOINT_ERROR, place_camera, refined, scores
+from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
 from legcal.perception.detection import measure_outlines
 from legcal.perception.light import to_grey
-from legcal.perception.lines import EdgePairs, find_edge_pairs, find_segments
-from legcal.perception.pair_matching import Picture, Poses, leg_segments
+from legcal.perception.pair_matching import CameraPoses, Picture, leg_segments
 from legcal.perception.placement import Placement, Search, group_views
 from legcal.perception.recognition import recognise
 from legcal.perception.view_fit import refine_views
@@ -146,22 +146,22 @@ def has_doubt(scene: Scene) -> bool:
     n_legs = len(given.leg_names)
     pictures = ideal_pictures(scene)
     T = truth.T_base_camera.inv()
-    true = Poses.rigid(T.rotation.as_matrix()[None], T.translation[None], n_legs)
+    true = CameraPoses.rigid(T.rotation.as_matrix()[None], T.translation[None], n_legs)
     others = place_camera(pictures, n_legs).poses
-    poses = refined(pictures, Poses.joined([true, others]), IDEAL, NOMINAL_JOINT_ERROR)
+    poses = refined(pictures, CameraPoses.joined([true, others]), IDEAL, NOMINAL_JOINT_ERROR)
     support = scores(pictures, poses, IDEAL[-1])
     apart = [not _same(_pose(poses, i), truth.T_base_camera) for i in range(len(poses))]
     return bool(np.max(support[apart], initial=0.0) >= AS_WELL * support[0])
 
 
-def _pose(poses: Poses, i: int) -> RigidTransform:
+def _pose(poses: CameraPoses, i: int) -> RigidTransform:
     """Return T_base_camera of a pose."""
     R = Rotation.from_matrix(poses.R[i])
     return RigidTransform.from_components(poses.t[i], R).inv()
 
 
 def ideal_pictures(scene: Scene) -> list[Picture]:
-    """Return pictures whose bars are exactly the visible stretches of the true legs."""
+    """Return pictures whose pairs are exactly the visible stretches of the true legs."""
     truth, given, camera = scene.truth, scene.given, scene.given.camera
     T, pixel = truth.T_base_camera.inv(), 1.0 / float(camera.K[0, 0])
     legs = np.arange(len(given.leg_names))
@@ -179,7 +179,7 @@ def ideal_pictures(scene: Scene) -> list[Picture]:
         xy = np.array(ends).reshape(-1, 2, 2)
         step = xy[:, 1] - xy[:, 0]
         length = np.linalg.norm(step, axis=1)
-        bars = EdgePairs(
+        pairs = CandidatePairs(
             xy.mean(axis=1),
             step / length[:, None],
             0.5 * length,
@@ -188,7 +188,7 @@ def ideal_pictures(scene: Scene) -> list[Picture]:
             pixel,
         )
         targets = leg_segments(given.A_base[row], given.B_base[row], given.cylinders, legs)
-        pictures.append(Picture(bars, targets, np.array(field_of_view(camera))))
+        pictures.append(Picture(pairs, targets, np.array(field_of_view(camera))))
     return pictures
 
 
@@ -258,8 +258,8 @@ def look(seed: int, folder: Path) -> dict[str, Any]:
     given, truth = scene.given, scene.truth
     for row, image in enumerate(given.images):
         picture = _eight_bits(image)
-        bars = find_edge_pairs(find_segments(to_grey(image), given.camera))
-        for middle, along, half in zip(bars.middle, bars.along, bars.half_length, strict=True):
+        pairs = find_candidate_pairs(find_segments(to_grey(image), given.camera))
+        for middle, along, half in zip(pairs.middle, pairs.along, pairs.half_length, strict=True):
             ends = np.stack([middle - half * along, middle + half * along])
             _line(picture, given.camera.distort(ends), (150, 150, 150), 1)
         for leg, name in enumerate(given.leg_names):

@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
 from legcal.machine import Cylinder
-from legcal.perception.lines import EdgeSegments, find_edge_pairs
+from legcal.perception.candidate_pairs import EdgeSegments, find_candidate_pairs
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
 from legcal.vision.cylinder import outlines_of_axis
 
@@ -132,7 +132,7 @@ def picture(
         step = lines[..., 1, :] - lines[..., 0, :]
         part = rng.uniform(0.0, 0.15, (*step.shape[:2], 2, 1)) * [[1.0], [-1.0]]
         lines = lines + part * step[..., None, :] + noise * PIXEL * rng.normal(size=lines.shape)
-    return Picture(find_edge_pairs(segments(lines)), pieces(*nominal), CORNERS)
+    return Picture(find_candidate_pairs(segments(lines)), pieces(*nominal), CORNERS)
 
 
 def pictures(

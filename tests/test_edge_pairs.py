@@ -6,15 +6,15 @@ import pytest
 from rendering import Bar, Light, render
 
 from legcal.geometry.types import Array
-from legcal.perception.light import Grey, to_grey
-from legcal.perception.lines import (
+from legcal.perception.candidate_pairs import (
     MAX_WIDTH,
     MIN_OVERLAP,
     MIN_WIDTH,
     EdgeSegments,
-    find_edge_pairs,
+    find_candidate_pairs,
     find_segments,
 )
+from legcal.perception.light import Grey, to_grey
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 
@@ -129,7 +129,7 @@ def test_the_outlines_of_legs_are_bars_with_their_axes_and_widths(seed: int) -> 
     targets = lp.pieces(made.A, made.posed(lp.platform(rng)))
     for k in range(len(targets)):
         lines = lp.edges(targets, T)[k]
-        bars = find_edge_pairs(lp.segments(lines))
+        bars = find_candidate_pairs(lp.segments(lines))
         assert len(bars) == 1
         X = T.inv().apply(targets.ends[k])
         ends = X[:, :2] / X[:, 2:]
@@ -153,7 +153,7 @@ def test_edges_that_are_too_near_or_too_far_apart_or_too_short_are_no_bars() -> 
         (MAX_WIDTH - 5.0, 400.0, 1),
         (40.0, 50.0, 0),  # more a square than a bar
     ):
-        assert len(find_edge_pairs(lp.segments(_edges(width, length)))) == n
+        assert len(find_candidate_pairs(lp.segments(_edges(width, length)))) == n
 
 
 def test_edges_beside_each_other_must_overlap_and_be_nearly_parallel() -> None:
@@ -161,29 +161,29 @@ def test_edges_beside_each_other_must_overlap_and_be_nearly_parallel() -> None:
     for part, n in ((0.9 * (1.0 - MIN_OVERLAP), 1), (1.1 * (1.0 - MIN_OVERLAP), 0)):
         moved = lines.copy()
         moved[1, :, 0] += part * 80.0 * lp.PIXEL
-        assert len(find_edge_pairs(lp.segments(moved))) == n
+        assert len(find_candidate_pairs(lp.segments(moved))) == n
     skew = lines.copy()
     skew[1, 1, 1] -= 20.0 * lp.PIXEL
-    assert len(find_edge_pairs(lp.segments(skew))) == 0
+    assert len(find_candidate_pairs(lp.segments(skew))) == 0
 
 
 def test_a_pair_at_which_light_changes_the_same_way_twice_counts_less() -> None:
     opposite, same = (
-        find_edge_pairs(lp.segments(_edges(12.0, 80.0, same_way=way))) for way in (False, True)
+        find_candidate_pairs(lp.segments(_edges(12.0, 80.0, same_way=way))) for way in (False, True)
     )
     assert 0.0 < same.merit[0] < opposite.merit[0]
-    turned = find_edge_pairs(lp.segments(_edges(12.0, 80.0, turn=1.6)))
+    turned = find_candidate_pairs(lp.segments(_edges(12.0, 80.0, turn=1.6)))
     assert abs(float(turned.along[0] @ [np.cos(1.6), np.sin(1.6)])) == pytest.approx(1.0)
     np.testing.assert_allclose(turned.merit, opposite.merit)
     np.testing.assert_allclose(turned.width, opposite.width)
     nothing = find_segments(np.full((240, 320), 90.0, dtype=np.float32), _camera())
-    assert len(nothing) == len(find_edge_pairs(nothing)) == 0
+    assert len(nothing) == len(find_candidate_pairs(nothing)) == 0
 
 
 def test_the_best_bars_come_first_and_copies_of_a_bar_are_left_out() -> None:
     short, long = _edges(12.0, 40.0) + 60.0 * lp.PIXEL, _edges(10.0, 90.0, turn=1.2)
     copy = long + 0.5 * lp.PIXEL
-    bars = find_edge_pairs(lp.segments(np.concatenate([short, long, copy])))
+    bars = find_candidate_pairs(lp.segments(np.concatenate([short, long, copy])))
     assert np.all(np.diff(bars.merit) <= 0.0)
     assert len(bars) == 2
     assert len(bars.take(np.array([1]))) == 1

@@ -7,9 +7,9 @@ import pytest
 
 from legcal.geometry.types import Array
 from legcal.perception.blocks import Line
-from legcal.perception.edge_pairs import EdgePair
-from legcal.perception.edges import MeasuredEdge
-from legcal.perception.outline import NARROW_BIAS, WRONG_WIDTH, Verdict, verdict
+from legcal.perception.outline import NARROW_BIAS, WRONG_WIDTH, PartVerdict, verdict
+from legcal.perception.part_edges import EdgePair
+from legcal.perception.subpixel_edges import MeasuredEdge
 
 WIDTH = np.array([20.0, 18.0])  # by the radius [px]
 LENGTH = 200.0
@@ -31,7 +31,7 @@ def _judged(
     *,
     alone: bool = False,
     window: float | None = None,
-) -> Verdict:
+) -> PartVerdict:
     """Judge edges whose pair was found at a distance that is off [px]."""
     v = np.stack([np.zeros(2), WIDTH + off])
     pair = EdgePair(v, np.ones(2, dtype=np.bool_), np.full(2, alone))

@@ -8,7 +8,7 @@ from scipy.integrate import quad
 from scipy.special import ndtr
 
 from legcal.geometry.types import Array, BoolArray
-from legcal.perception import line_fit as pool
+from legcal.perception import pooled_fit as pool
 from legcal.perception.blocks import (
     COMMON_BIAS,
     TILT_BIAS,
@@ -32,7 +32,7 @@ from legcal.perception.limb import (
     powers,
     profile_functions,
 )
-from legcal.perception.line_fit import fit_jointly
+from legcal.perception.pooled_fit import fit_pooled
 from legcal.perception.profiles import Edge, Profiles, read_profiles
 from legcal.vision.camera import Camera
 from legcal.vision.visibility import Band
@@ -459,7 +459,7 @@ def test_slopes_and_widenings_are_derivatives_of_profiles(blur: float) -> None:
 @pytest.mark.parametrize("change", [0.0, 0.6])
 def test_exact_profiles_give_line_and_blur(amplitude: Array, blur: float, change: float) -> None:
     blocks = outline(amplitude, (0.12, -0.06), blur, noise=0.3, change=change)
-    found = fit_jointly(blocks, np.ones(40, dtype=np.bool_), 1.15 * blur, DEPTH)
+    found = fit_pooled(blocks, np.ones(40, dtype=np.bool_), 1.15 * blur, DEPTH)
     spread = np.sqrt(np.diag(found.covariance[0]))
     assert np.all(np.abs(found.ends[0] - [0.12, -0.06]) < 0.01 + 2.5 * spread)
     assert np.all(spread < 0.1)
@@ -470,7 +470,7 @@ def test_covariance_covers_the_errors_and_knows_low_contrast() -> None:
     pulls, sigma = [], []
     for contrast in (1.0, 0.1):
         found = [
-            fit_jointly(
+            fit_pooled(
                 outline(contrast * BRIGHT, (0.05, 0.0), 0.5, noise=3.0, seed=seed),
                 np.ones(40, dtype=np.bool_),
                 0.5,
@@ -491,13 +491,13 @@ def test_blocks_of_something_else_do_not_move_the_line() -> None:
     other = outline(BRIGHT, (0.1, 0.1), 0.5, noise=0.5)
     other.grey[10:16] = 120.0 - 30.0 * other.d[10:16]
     everything = np.ones(40, dtype=np.bool_)
-    one, two = (fit_jointly(blocks, everything, 0.5, DEPTH).ends for blocks in (clean, other))
+    one, two = (fit_pooled(blocks, everything, 0.5, DEPTH).ends for blocks in (clean, other))
     np.testing.assert_allclose(one, two, atol=0.02)
 
 
 def test_outlines_without_blocks_stay_where_they_are() -> None:
     blocks = outline(BRIGHT, (0.1, 0.1), 0.5)
-    found = fit_jointly(blocks, np.zeros(40, dtype=np.bool_), 0.5, DEPTH)
+    found = fit_pooled(blocks, np.zeros(40, dtype=np.bool_), 0.5, DEPTH)
     np.testing.assert_array_equal(found.ends, np.zeros((1, 2)))
     assert np.all(np.diag(found.covariance[0]) >= 1.0)
     assert found.blur == 0.5
@@ -509,9 +509,9 @@ def test_sums_over_pixels_serve_places_and_blurs_nearby(
     amplitude: Array, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     blocks, every = outline(amplitude, (0.1, -0.05), 0.5, noise=0.2), np.ones(40, dtype=np.bool_)
-    found = fit_jointly(blocks, every, 0.54, DEPTH)
+    found = fit_pooled(blocks, every, 0.54, DEPTH)
     monkeypatch.setattr(pool, "MAX_MOVE_OF_PRODUCTS", (0.0, 0.0))  # sums anew in every round
-    anew = fit_jointly(blocks, every, 0.54, DEPTH)
+    anew = fit_pooled(blocks, every, 0.54, DEPTH)
     np.testing.assert_allclose(found.ends, anew.ends, atol=8e-3)
     np.testing.assert_allclose(found.covariance, anew.covariance, rtol=0.2)
     assert found.blur == pytest.approx(anew.blur, rel=5e-3)
@@ -531,7 +531,7 @@ def test_outlines_that_have_converged_do_not_depend_on_others() -> None:
             )
         },
     )  # fmt: skip
-    found = fit_jointly(both, np.ones(80, dtype=np.bool_), 0.5, DEPTH)
+    found = fit_pooled(both, np.ones(80, dtype=np.bool_), 0.5, DEPTH)
     np.testing.assert_allclose(found.ends, [[0.2, -0.2], [0.0, 0.0]], atol=0.02)
 
 
@@ -549,7 +549,7 @@ def test_outlines_know_how_far_they_move_with_gamma(
 ) -> None:
     blocks, every = outline(amplitude, (0.1, 0.1), 0.6, noise=0.2), np.ones(40, dtype=np.bool_)
     less, here, more = (
-        fit_jointly(read_with(blocks, gamma * np.exp(step)), every, 0.6, DEPTH)
+        fit_pooled(read_with(blocks, gamma * np.exp(step)), every, 0.6, DEPTH)
         for step in (-0.1, 0.0, 0.1)
     )
     moved = float(more.ends.mean() - less.ends.mean()) / 0.2
@@ -566,5 +566,5 @@ def test_lines_near_a_limb_that_rises_from_the_background_stay_there() -> None:
     assert np.abs(blocks.lines[0].ends).max() > 0.1
     blocks.unmove()
     np.testing.assert_array_equal(blocks.lines[0].ends, [0.0, 0.0])
-    found = fit_jointly(blocks, blocks.kept(), 0.55, DEPTH)
+    found = fit_pooled(blocks, blocks.kept(), 0.55, DEPTH)
     assert np.all(np.abs(found.ends[0]) < 3.0 * np.sqrt(np.diag(found.covariance[0])))

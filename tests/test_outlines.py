@@ -15,7 +15,7 @@ from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
 from legcal.machine import Cylinder
 from legcal.perception.detection import measure_outlines
-from legcal.perception.edge_pairs import MIN_LONE_SCORE, _alone
+from legcal.perception.part_edges import MIN_LONE_SCORE, _alone
 from legcal.perception.placement import Placement, Search
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis

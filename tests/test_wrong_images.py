@@ -25,7 +25,7 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry import BoolArray
 from legcal.perception.diagnostics import (
     NOTHING_LIKE,
-    Explanation,
+    ImageExplanation,
     OutlineCount,
     _best,
     _usual,
@@ -36,7 +36,7 @@ from legcal.perception.diagnostics import (
 from legcal.perception.image_quality import Exposure, expose, image_defects
 from legcal.perception.light import to_grey
 from legcal.perception.overview import Detection
-from legcal.perception.photographs import Observations, observe
+from legcal.perception.photographs import ImageObservations, observe
 from legcal.progress import no_progress
 from legcal.workers import in_turn
 
@@ -171,7 +171,7 @@ def _session(made: Spoiled) -> Session:
     return start_session(dataset, in_turn, no_progress)
 
 
-def _observed(made: Spoiled) -> Observations:
+def _observed(made: Spoiled) -> ImageObservations:
     session = _session(made)
     scene, _ = nominal_scene(session)
     return observe(session.photographs, scene, no_progress)
@@ -225,10 +225,12 @@ def test_an_image_alone_in_its_view_is_judged_by_those_of_other_views(tmp_path: 
     search = photographs.search(nominal_scene(session)[0])
     usual = _usual(search, observed.placement, found, [alone], in_turn)
     assert usual[1] > 0.3
-    reason, note = image_verdict(session.measurements, alone, Explanation(0.0), usual, found)
+    reason, note = image_verdict(session.measurements, alone, ImageExplanation(0.0), usual, found)
     assert reason == NOTHING_LIKE
     assert "was left out: found 1 of 12 outlines where its reading has the legs" in note
-    reason, note = image_verdict(session.measurements, alone, Explanation(usual[1]), usual, found)
+    reason, note = image_verdict(
+        session.measurements, alone, ImageExplanation(usual[1]), usual, found
+    )
     assert reason == ""
     assert "found 1 of 12 outlines where its reading has the legs, in other images most" in note
 

@@ -66,7 +66,7 @@ from legcal.geometry import IntArray
 from legcal.machine import Machine
 from legcal.paper import Criteria, Transformation
 from legcal.perception import (
-    Observations,
+    ImageObservations,
     Placement,
     detection_settings,
     given_outlines,
@@ -318,7 +318,7 @@ def _fit(
 def _measure_again(
     session: Session,
     estimate: Estimate,
-    seen: Observations,
+    seen: ImageObservations,
     board: BoardViews | None,
     options: Options,
 ) -> Estimate:
@@ -363,7 +363,7 @@ def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
     return machine.with_cylinders(cylinders)
 
 
-def _fitted_placement(session: Session, solution: Solution, seen: Observations) -> Placement:
+def _fitted_placement(session: Session, solution: Solution, seen: ImageObservations) -> Placement:
     """Return where a fit puts the legs, R_b laid on the nominal one; no camera is placed anew."""
     T_base_Rb = session.machine.T_base_Rb
     A = T_base_Rb.apply(np.array([leg.A for leg in solution.legs]))
@@ -406,7 +406,9 @@ def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
     return (*hints, *_outlier_images(estimate).values())
 
 
-def _refuse_too_few(session: Session, rows: IntArray, seen: Observations, choices: Choices) -> None:
+def _refuse_too_few(
+    session: Session, rows: IntArray, seen: ImageObservations, choices: Choices
+) -> None:
     """Raise NotIdentifiable if the images that are left do not determine the parameters."""
     cameras, notes = seen.placement.T_base_camera, seen.placement.all_notes
     left = [

@@ -2,13 +2,11 @@ from .board_corners import describe_image as describe_image
 from .board_corners import detect_corners as detect_corners
 from .board_corners import find_corners as find_corners
 from .board_corners import require_board as require_board
-from .board_poses import PlanePose as PlanePose
 from .board_poses import camera_poses as camera_poses
 from .board_poses import plane_poses as plane_poses
 from .diagnostics import BEFORE_FIT as BEFORE_FIT
 from .diagnostics import FAR_OFF as FAR_OFF
 from .diagnostics import hint_notes as hint_notes
-from .edge_pairs import Part as Part
 from .light import Grey as Grey
 from .outline import HIDDEN as HIDDEN
 from .outline import MIN_LENGTH as MIN_LENGTH
@@ -26,7 +24,8 @@ from .overview import check_detection_destination as check_detection_destination
 from .overview import detection_document as detection_document
 from .overview import picture_names as picture_names
 from .overview import write_detection as write_detection
-from .photographs import Observations as Observations
+from .part_edges import LegPart as LegPart
+from .photographs import ImageObservations as ImageObservations
 from .photographs import Photographs as Photographs
 from .photographs import detection_settings as detection_settings
 from .photographs import given_outlines as given_outlines

@@ -14,11 +14,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception.lines import EdgePairs
+from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.pair_matching import (
+    CameraPoses,
     PairMatches,
     Picture,
-    Poses,
     distances,
     exchanged,
     gauss_newton_step,
@@ -63,10 +63,10 @@ MIRROR_LEAD, MIRROR_PART = 0.3, 0.06  # of mirrored pictures: legs of all images
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class PoseCandidates:
     """Poses of a camera, best first, each far from the better ones or with legs on other pairs."""
 
-    poses: Poses  # T_camera_base
+    poses: CameraPoses  # T_camera_base
     support: Array  # (n, n_pictures) legs that agree, by how well and how much of them
     expected: Array  # (n, n_pictures) legs that each picture would show
     score: Array  # (n,) support of all pictures, less what the shifts of the joints cost: legs
@@ -138,7 +138,7 @@ class Candidates:
 
 def place_camera(
     pictures: Sequence[Picture], n_legs: int, starts: Sequence[int] = START_PICTURES
-) -> Candidates:
+) -> PoseCandidates:
     """Return the camera poses on which most legs of all pictures of a view agree.
 
     Pictures are of one camera pose at different readings; ``starts`` says how many more of them
@@ -146,34 +146,34 @@ def place_camera(
     """
     merits = [float(p.pairs.merit[:8].sum()) if len(p.pairs) else 0.0 for p in pictures]
     best_first = [pictures[k] for k in np.argsort(-np.array(merits), kind="stable").tolist()]
-    best = _candidates(pictures, Poses.none(n_legs))
+    best = _candidates(pictures, CameraPoses.none(n_legs))
     done = 0
     for n in starts:
         if done >= len(pictures):
             break
         suggested = [_starts(picture, n_legs) for picture in best_first[done : done + n]]
         done += n
-        poses = Poses.joined([best.poses, *suggested])
+        poses = CameraPoses.joined([best.poses, *suggested])
         if len(poses) == 0:
             continue
         poses = refined(best_first[:done], poses, TOLERANCES[2:4], NOMINAL_JOINT_ERROR)
         some = best_first[: max(SOME_PICTURES, done)]
         score = scores(some, poses, TOLERANCES[3])
         poses = poses.take(_distinct(poses, score, N_KEPT[2]))
-        poses = Poses.joined(
+        poses = CameraPoses.joined(
             [poses, _reversed(some, poses.take(np.arange(min(N_REVERSED, len(poses)))))]
         )
         poses = refined(some, poses, TOLERANCES[3:], NOMINAL_JOINT_ERROR)
         score = scores(some, poses, TOLERANCES[-1])
         poses = poses.take(_best(score, N_KEPT[3]))
-        poses = Poses.joined([poses, _polished(some[:POLISHING], poses)])
+        poses = CameraPoses.joined([poses, _polished(some[:POLISHING], poses)])
         best = _candidates(pictures, refined(pictures, poses, LAST_TOLERANCES, NOMINAL_JOINT_ERROR))
         if best.is_clear:
             break
     return best
 
 
-def _polished(pictures: Sequence[Picture], poses: Poses) -> Poses:
+def _polished(pictures: Sequence[Picture], poses: CameraPoses) -> CameraPoses:
     """Return for each of the best poses the best one around it that steps lead to.
 
     A leg on a wrong pair keeps a pose, and the joints moved for it, from where all legs agree.
@@ -185,45 +185,47 @@ def _polished(pictures: Sequence[Picture], poses: Poses) -> Poses:
         around = refined(pictures, around, POLISH, NOMINAL_JOINT_ERROR)
         score = scores(pictures, around, POLISH[-1])
         found.append(around.take(_best(score, 1)))
-    return Poses.joined([*found, poses.take(np.zeros(0, dtype=np.intp))])
+    return CameraPoses.joined([*found, poses.take(np.zeros(0, dtype=np.intp))])
 
 
-def _reversed(pictures: Sequence[Picture], poses: Poses) -> Poses:
+def _reversed(pictures: Sequence[Picture], poses: CameraPoses) -> CameraPoses:
     """Return the poses that show a flat machine alike from far: near and far exchanged."""
     ends = np.concatenate([picture.targets.ends.reshape(-1, 3) for picture in pictures])
     return exchanged(poses, ends) if len(ends) else poses
 
 
-def _around(pictures: Sequence[Picture], R: Array, t: Array, n_legs: int) -> Poses:
+def _around(pictures: Sequence[Picture], R: Array, t: Array, n_legs: int) -> CameraPoses:
     """Return poses around one: the machine turned a little, further, nearer, or as it is."""
     ends = np.concatenate([picture.targets.ends.reshape(-1, 3) for picture in pictures])
     middle = ends.mean(axis=0) if len(ends) else np.zeros(3)
     turns = POLISH_TURN * np.concatenate([np.zeros((3, 3)), np.eye(3), -np.eye(3)])
     further = 1.0 + POLISH_FURTHER * np.array([0.0, 1.0, -1.0, *np.zeros(6)])
     new = Rotation.from_rotvec(turns).as_matrix() @ R
-    return Poses.rigid(new, further[:, None] * (R @ middle + t) - new @ middle, n_legs)
+    return CameraPoses.rigid(new, further[:, None] * (R @ middle + t) - new @ middle, n_legs)
 
 
 def place_near(
     pictures: Sequence[Picture], T_base_camera: RigidTransform, n_legs: int
-) -> Candidates:
+) -> PoseCandidates:
     """Return the camera pose near a rough one on which the pictures of a view agree."""
     T = T_base_camera.inv()
     turns = NEAR_STARTS * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
-    poses = Poses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
+    poses = CameraPoses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
     poses = refined(pictures, poses, TOLERANCES[:3])
     poses = refined(pictures, poses, (*TOLERANCES[2:], *LAST_TOLERANCES), NOMINAL_JOINT_ERROR)
     found = _candidates(pictures, poses)
     return replace(found, hinted=True)
 
 
-def with_first(placed: Candidates, i: int, pose: Poses, pictures: Sequence[Picture]) -> Candidates:
+def with_first(
+    placed: PoseCandidates, i: int, pose: CameraPoses, pictures: Sequence[Picture]
+) -> PoseCandidates:
     """Return poses with the i-th one first, where outlines put it."""
     order = np.array([i, *(k for k in range(len(placed.poses)) if k != i)], dtype=np.intp)
     return replace(
         placed,
-        poses=Poses.joined([pose, placed.poses.take(order[1:])]),
+        poses=CameraPoses.joined([pose, placed.poses.take(order[1:])]),
         support=placed.support[order],
         expected=placed.expected[order],
         score=placed.score[order],
@@ -231,12 +233,12 @@ def with_first(placed: Candidates, i: int, pose: Poses, pictures: Sequence[Pictu
     )
 
 
-def _candidates(pictures: Sequence[Picture], poses: Poses) -> Candidates:
+def _candidates(pictures: Sequence[Picture], poses: CameraPoses) -> PoseCandidates:
     """Return poses with their support, best first, without those that say the same."""
     n_legs = poses.shift.shape[1]
     if len(poses) == 0:
         empty = np.zeros((0, len(pictures)))
-        return Candidates(poses, empty, empty, np.zeros(0), np.full(n_legs, np.inf))
+        return PoseCandidates(poses, empty, empty, np.zeros(0), np.full(n_legs, np.inf))
     found = [match_pairs(picture, poses, FINAL_TOLERANCE) for picture in pictures]
     values = [one.exclusive_score for one in found]
     shares = [picture.targets.share for picture in pictures]
@@ -247,12 +249,12 @@ def _candidates(pictures: Sequence[Picture], poses: Poses) -> Candidates:
     order = _different(pictures, poses, found, [v >= MIN_MATCH_SCORE for v in values], score)
     best = poses.take(order[:1])
     error = _leg_error(pictures, best)
-    return Candidates(poses.take(order), support[order], expected[order], score[order], error)
+    return PoseCandidates(poses.take(order), support[order], expected[order], score[order], error)
 
 
 def _different(
     pictures: Sequence[Picture],
-    poses: Poses,
+    poses: CameraPoses,
     found: Sequence[PairMatches],
     matched: Sequence[BoolArray],
     score: Array,
@@ -279,7 +281,7 @@ def _different(
     return np.array(kept, dtype=np.intp)
 
 
-def _one_leg(pairs: EdgePairs) -> BoolArray:
+def _one_leg(pairs: CandidatePairs) -> BoolArray:
     """Return which pairs (n, n) may be of one leg: they continue each other or overlap."""
     apart = np.abs(
         np.einsum("ijx,ix->ij", pairs.middle[None] - pairs.middle[:, None], pairs.normal)
@@ -288,7 +290,7 @@ def _one_leg(pairs: EdgePairs) -> BoolArray:
     return np.asarray(near & (np.abs(pairs.along @ pairs.along.T) >= np.cos(SAME_LEG[0])))
 
 
-def _leg_error(pictures: Sequence[Picture], pose: Poses) -> Array:
+def _leg_error(pictures: Sequence[Picture], pose: CameraPoses) -> Array:
     """Return the root mean square distance (n_legs,) of legs from their pairs [m]."""
     n_legs = pose.shift.shape[1]
     square, count = np.zeros(n_legs), np.zeros(n_legs)
@@ -305,14 +307,14 @@ def _leg_error(pictures: Sequence[Picture], pose: Poses) -> Array:
     return np.where(count > 0, error, np.inf)
 
 
-def _starts(picture: Picture, n_legs: int) -> Poses:
+def _starts(picture: Picture, n_legs: int) -> CameraPoses:
     """Return the poses that suit a picture best, among those that two of its pairs suggest."""
     poses = pose_hypotheses(picture, n_legs)
     if len(poses) == 0:
         return poses
     # From the frame of the picture to that of the poses.
     back = picture.R.T
-    poses = Poses.rigid(back @ poses.R, (poses.t - picture.t) @ picture.R, n_legs)
+    poses = CameraPoses.rigid(back @ poses.R, (poses.t - picture.t) @ picture.R, n_legs)
     poses = poses.take(_best(scores([picture], poses, TOLERANCES[0]), N_KEPT[0]))
     poses = refined([picture], poses, TOLERANCES[:3])
     score = scores([picture], poses, TOLERANCES[2])
@@ -321,10 +323,10 @@ def _starts(picture: Picture, n_legs: int) -> Poses:
 
 def refined(
     pictures: Sequence[Picture],
-    poses: Poses,
+    poses: CameraPoses,
     tolerances: Sequence[float],
     joint_error: float = 0.0,
-) -> Poses:
+) -> CameraPoses:
     """Return poses after a step towards the pairs for each of some tolerances."""
     for tolerance in tolerances:
         found = [match_pairs(picture, poses, tolerance) for picture in pictures]
@@ -332,7 +334,7 @@ def refined(
     return poses
 
 
-def scores(pictures: Sequence[Picture], poses: Poses, tolerance: float) -> Array:
+def scores(pictures: Sequence[Picture], poses: CameraPoses, tolerance: float) -> Array:
     """Return how many legs agree with each pose in all pictures together, (n_poses,)."""
     found = [match_pairs(picture, poses, tolerance).exclusive_score for picture in pictures]
     shares = [picture.targets.share for picture in pictures]
@@ -344,7 +346,7 @@ def _best(score: Array, n: int) -> IntArray:
     return np.argsort(-score, kind="stable")[:n]
 
 
-def _distinct(poses: Poses, score: Array, n: int) -> IntArray:
+def _distinct(poses: CameraPoses, score: Array, n: int) -> IntArray:
     """Return the best poses that differ from better ones."""
     kept: list[int] = []
     for i in np.argsort(-score, kind="stable").tolist():
@@ -355,7 +357,7 @@ def _distinct(poses: Poses, score: Array, n: int) -> IntArray:
     return np.array(kept, dtype=np.intp)
 
 
-def _near(poses: Poses, some: list[int], i: int, angle: float, part: float) -> BoolArray:
+def _near(poses: CameraPoses, some: list[int], i: int, angle: float, part: float) -> BoolArray:
     """Return which of some poses are within an angle and a part of the distance of pose i."""
     trace = np.einsum("kij,ij->k", poses.R[some], poses.R[i])
     turn = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
@@ -365,7 +367,7 @@ def _near(poses: Poses, some: list[int], i: int, angle: float, part: float) -> B
     return np.asarray((turn < angle) & (apart < part * np.linalg.norm(poses.t[i])))
 
 
-def flipped(pairs: EdgePairs, corners: Array, flip: Array) -> EdgePairs:
+def flipped(pairs: CandidatePairs, corners: Array, flip: Array) -> CandidatePairs:
     """Return the pairs of the image with its pixels in the opposite order along some axes.
 
     ``corners`` (2, 2) are of the sensor plane; ``flip`` (2,) is -1 along axes that are turned.
@@ -379,12 +381,12 @@ def mirrored(pictures: Sequence[Picture]) -> list[Picture]:
     return [replace(p, pairs=flipped(p.pairs, p.corners, LEFT_RIGHT)) for p in pictures]
 
 
-def may_be_mirrored(own: Candidates) -> bool:
+def may_be_mirrored(own: PoseCandidates) -> bool:
     """Say whether a placed view needs to be held against its mirror image."""
     return not own.is_convincing or own.share < NOT_MIRRORED_SUPPORT
 
 
-def is_mirrored(own: Candidates, other: Candidates) -> bool:
+def is_mirrored(own: PoseCandidates, other: PoseCandidates) -> bool:
     """Say whether mirrored pictures explain a view better than its own ones do.
 
     Those of a machine with a plane of symmetry, as all planar ones, explain it about as well.

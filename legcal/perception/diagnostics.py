@@ -18,10 +18,10 @@ from scipy.spatial.transform import RigidTransform
 from legcal.data import Measurements, Outlines, is_edited
 from legcal.geometry import BoolArray, IntArray, pose_distance
 from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped
+from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.detection import NOT_PLACED
-from legcal.perception.lines import EdgePairs
 from legcal.perception.outline import HIDDEN, OUTSIDE
-from legcal.perception.pair_matching import Picture, Poses, leg_segments, match_pairs
+from legcal.perception.pair_matching import CameraPoses, Picture, leg_segments, match_pairs
 from legcal.perception.placement import Placement, Search, corners_of
 from legcal.workers import Run
 
@@ -48,7 +48,7 @@ FAR_OFF_PART = 0.06  # of the distance of the camera, where that is more
 BEFORE_FIT = 2.5  # times more, while the cameras are only where legs were recognised
 
 
-class Explanation(NamedTuple):
+class ImageExplanation(NamedTuple):
     """What an image shows."""
 
     own: float  # share of the legs, by visible length, that are where its reading has them
@@ -149,7 +149,7 @@ def _without_views(
 def image_verdict(
     measurements: Measurements,
     row: int,
-    explanation: Explanation,
+    explanation: ImageExplanation,
     usual: Mapping[int, float],
     found: Mapping[int, OutlineCount],
 ) -> tuple[str, str]:
@@ -192,7 +192,7 @@ def explain(
     row: int,
     *,
     suspects: Collection[int] = (),
-) -> Explanation:
+) -> ImageExplanation:
     """Return what an image of a placed view shows whose legs are not where its reading has them.
 
     ``usual`` is the share of the legs that good images of each view show, by :func:`share_shown`;
@@ -239,7 +239,7 @@ def explain(
     share, why, remedy = max(tried, key=lambda one: one[0])
     factor, more = MIN_GAIN
     least = max(MIN_SHARE, MIN_SHARE_OF_USUAL * usual.get(view, 0.0), factor * own, own + more)
-    return Explanation(own, why, remedy) if share >= least else Explanation(own)
+    return ImageExplanation(own, why, remedy) if share >= least else ImageExplanation(own)
 
 
 def _best(
@@ -270,7 +270,7 @@ def _other_readings(search: Search, row: int) -> list[int]:
 
 
 def _picture(
-    search: Search, pairs: EdgePairs, row: int, view: int, legs: IntArray | None = None
+    search: Search, pairs: CandidatePairs, row: int, view: int, legs: IntArray | None = None
 ) -> Picture:
     """Return pairs with what a view should show at the reading of a row."""
     wanted = np.flatnonzero(search.wanted[view]) if legs is None else legs
@@ -285,7 +285,7 @@ def _share(
     T = placement.T_base_camera[view]
     if T is None or len(picture.targets) == 0:
         return 0.0
-    pose = Poses.one(T, placement.shift[view])
+    pose = CameraPoses.one(T, placement.shift[view])
     seen = match_pairs(picture, pose, tolerance)
     share = picture.targets.share
     visible = float((seen.visible @ share)[0])

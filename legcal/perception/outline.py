@@ -14,10 +14,10 @@ import numpy as np
 
 from legcal.data import Outlines, join_outlines
 from legcal.geometry import Array, IntArray
-from legcal.perception.edge_pairs import EdgePair, Part, block_positions, find_pairs
-from legcal.perception.edges import MeasuredEdge, measure_edges
 from legcal.perception.light import Grey
+from legcal.perception.part_edges import EdgePair, LegPart, block_positions, find_pairs
 from legcal.perception.profiles import Edge
+from legcal.perception.subpixel_edges import MeasuredEdge, measure_edges
 from legcal.vision import EPSILON, Camera, PredictedLeg, band_of_leg, hidden_by
 
 OUTSIDE = "outside the image"  # a reason
@@ -81,7 +81,7 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
     return join_outlines(tables), blur
 
 
-def find_parts(search: ImageSearch) -> tuple[list[Part], list[Outlines]]:
+def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[Outlines]]:
     """Find the edges of all parts in one image to about a pixel.
 
     Return the parts to measure, and the rejected outlines of the others.
@@ -91,7 +91,7 @@ def find_parts(search: ImageSearch) -> tuple[list[Part], list[Outlines]]:
     def reject(leg: PredictedLeg, part: str, why: str) -> None:
         rejected.append(part_outlines(search, leg.leg, part, (why, why)))
 
-    searched: list[tuple[Part, Array]] = []  # with the predicted outlines (2, 3)
+    searched: list[tuple[LegPart, Array]] = []  # with the predicted outlines (2, 3)
     for leg in search.legs:
         window = float(search.window[leg.leg])
         if math.isnan(window):
@@ -114,9 +114,9 @@ def find_parts(search: ImageSearch) -> tuple[list[Part], list[Outlines]]:
             else:
                 guided = search.guided and window <= MAX_GUIDED_WINDOW * width
                 free = np.zeros(len(block_positions(band)), dtype=np.bool_)
-                part = Part(leg, segment, band, predicted, free, window, guided)
+                part = LegPart(leg, segment, band, predicted, free, window, guided)
                 searched.append((part, h))
-    free_parts: list[Part] = []
+    free_parts: list[LegPart] = []
     for (part, _), front in zip(searched, _in_front(search.legs, searched), strict=True):
         hidden = np.any(front >= 0, axis=0)
         width = float(np.mean(part.predicted[1] - part.predicted[0]))
@@ -126,7 +126,7 @@ def find_parts(search: ImageSearch) -> tuple[list[Part], list[Outlines]]:
             reject(part.leg, part.segment.link, why)
         else:
             free_parts.append(replace(part, hidden=hidden))
-    parts: list[Part] = []
+    parts: list[LegPart] = []
     pairs = find_pairs(search.grey, search.camera, free_parts)
     for part, pair in zip(free_parts, pairs, strict=True):
         if pair is None:
@@ -143,7 +143,7 @@ def part_outlines(
     reasons: tuple[str, str],
     lines: Sequence[tuple[Array, Array, Array] | None] = (None, None),
     *,
-    found: Part | None = None,
+    found: LegPart | None = None,
     **quality: Array,
 ) -> Outlines:
     """Return both outlines of a part, NaN where there is no line.
@@ -181,7 +181,7 @@ def _min_length(width: float) -> float:
 
 
 def _in_front(
-    legs: Sequence[PredictedLeg], searched: Sequence[tuple[Part, Array]]
+    legs: Sequence[PredictedLeg], searched: Sequence[tuple[LegPart, Array]]
 ) -> list[IntArray]:
     """Return which leg hides the outlines (2, n_blocks) of each part, -1 where they are free."""
     if not searched:
@@ -201,7 +201,7 @@ def _in_front(
 
 def _with_verdict(
     search: ImageSearch,
-    part: Part,
+    part: LegPart,
     measured: tuple[MeasuredEdge | None, MeasuredEdge | None],
     *,
     near_fit: bool,
@@ -240,7 +240,7 @@ def _with_verdict(
     )
 
 
-class Verdict(NamedTuple):
+class PartVerdict(NamedTuple):
     """Which outlines of a part are used."""
 
     reasons: tuple[str, str]  # why each outline cannot be trusted, "" if it can
@@ -255,7 +255,7 @@ def verdict(
     window: float | None = None,
     *,
     near_fit: bool = False,
-) -> Verdict:
+) -> PartVerdict:
     """Judge both edges of a part, predicted at offsets (2, 2) [px] of a band of a length [px].
 
     Two edges confirm each other by their distance, as they were measured or at least as they were
@@ -291,10 +291,12 @@ def verdict(
         reason or ("" if alone else f"its other outline: {partner}")
         for reason, partner, alone in zip(reasons, reasons[::-1], stands, strict=True)
     )
-    return Verdict((first, second))
+    return PartVerdict((first, second))
 
 
-def _by_width(one: MeasuredEdge, two: MeasuredEdge, expected: Array, *, near_fit: bool) -> Verdict:
+def _by_width(
+    one: MeasuredEdge, two: MeasuredEdge, expected: Array, *, near_fit: bool
+) -> PartVerdict:
     """Judge two edges that may be trusted but for their distance."""
     widths = two.v - one.v
     sigma_one, sigma_two = one.sigma, two.sigma
@@ -304,7 +306,7 @@ def _by_width(one: MeasuredEdge, two: MeasuredEdge, expected: Array, *, near_fit
         tolerance = np.minimum(tolerance, near)
     mismatch = np.abs(widths - expected) / tolerance
     if mismatch.max() <= 1.0:
-        return Verdict(("", ""))
+        return PartVerdict(("", ""))
     i = int(np.argmax(mismatch))
     reason = f"{WRONG_WIDTH}, {widths[i]:.1f} px for {expected[i]:.1f} px"
     better, ratio = (
@@ -316,14 +318,17 @@ def _by_width(one: MeasuredEdge, two: MeasuredEdge, expected: Array, *, near_fit
         or ratio > MAX_SIGMA_RATIO
         or not _is_clear_step(better)
     ):
-        return Verdict((reason, reason))
+        return PartVerdict((reason, reason))
     bias = NARROW_BIAS * float(np.abs(widths - expected).max())
-    return Verdict(("", reason) if better is one else (reason, ""), bias)
+    return PartVerdict(("", reason) if better is one else (reason, ""), bias)
 
 
 def _by_place(
-    measured: tuple[MeasuredEdge, MeasuredEdge], predicted: Array, window: float, judged: Verdict
-) -> Verdict:
+    measured: tuple[MeasuredEdge, MeasuredEdge],
+    predicted: Array,
+    window: float,
+    judged: PartVerdict,
+) -> PartVerdict:
     """Judge two edges at a wrong distance, one of which is where an outline should be."""
     off = [_off(edge, at) for edge, at in zip(measured, predicted, strict=True)]
     near = int(np.argmin(off))
@@ -331,7 +336,7 @@ def _by_place(
         MAX_LONE_OFFSET * window, MAX_LONE_RATIO * off[1 - near]
     ) or not _is_clear_step(measured[near]):
         return judged
-    return Verdict((judged.reasons[0] if near else "", "" if near else judged.reasons[1]))
+    return PartVerdict((judged.reasons[0] if near else "", "" if near else judged.reasons[1]))
 
 
 def _off(edge: MeasuredEdge, predicted: Array) -> float:

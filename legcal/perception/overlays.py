@@ -19,23 +19,23 @@ from legcal.geometry import Array, Image
 from legcal.perception.outline import OUTSIDE
 from legcal.vision import Camera, PredictedLeg, band_of_leg
 
-Kind = Literal["edge 1", "edge 2", "axis", "rejected", "predicted"]
+MarkKind = Literal["edge 1", "edge 2", "axis", "rejected", "predicted"]
 N_POINTS = 40  # of a curve
 OTHER_FAILS = "other outline fails"
 
-Picture = NDArray[np.uint8]
+Canvas = NDArray[np.uint8]
 
 SCREEN = 1600  # longer side from which on a picture is not enlarged [px]
 MAX_ENLARGEMENT = 4
 PER_LINE, PER_LETTER = 1000.0, 75.0  # longer sides in a line's width, and in a letter's height
-COLOURS: dict[Kind, tuple[int, int, int]] = {  # blue, green, red
+COLOURS: dict[MarkKind, tuple[int, int, int]] = {  # blue, green, red
     "edge 1": (80, 230, 60),
     "edge 2": (255, 170, 40),
     "axis": (0, 225, 255),
     "rejected": (70, 70, 255),
     "predicted": (30, 150, 255),
 }
-_MEANING: dict[Kind, str] = {
+_MEANING: dict[MarkKind, str] = {
     "edge 1": "edge 1",
     "edge 2": "edge 2",
     "axis": "axis",
@@ -59,7 +59,7 @@ _ON_TEXT, _OUTSIDE = 4.0, 10.0  # times the area on other texts, and outside the
 class Mark(NamedTuple):
     """A curve of the picture."""
 
-    kind: Kind
+    kind: MarkKind
     points: Array  # (n, 2) [px]
 
 
@@ -137,7 +137,7 @@ def _part_marks(
     found = np.all(np.isfinite(pair.h), axis=1) & np.all(np.isfinite(pair.ends), axis=(1, 2))
     used = pair.used & found
     for i in np.flatnonzero(found).tolist():
-        kind: Kind = "rejected"
+        kind: MarkKind = "rejected"
         if pair.used[i]:
             kind = "edge 1" if pair.edge[i] == 1 else "edge 2"
         ends = camera.undistort(pair.ends[i])
@@ -175,7 +175,7 @@ def _prediction(camera: Camera, leg: PredictedLeg, i: int) -> list[Mark]:
     ]
 
 
-def draw(image: Image, parts: Sequence[PartMarks], caption: str) -> Picture:
+def draw(image: Image, parts: Sequence[PartMarks], caption: str) -> Canvas:
     """Return a grey image with lines, names and reasons over it, and a legend below, BGR.
 
     The caption stands in the legend.
@@ -205,7 +205,7 @@ def draw(image: Image, parts: Sequence[PartMarks], caption: str) -> Picture:
     return np.vstack([picture, _legend(picture.shape[1], letter, width, caption)])
 
 
-def _draw_curve(picture: Picture, mark: Mark, width: int) -> None:
+def _draw_curve(picture: Canvas, mark: Mark, width: int) -> None:
     """Draw a curve; predictions are dashed, axes thin."""
     colour = COLOURS[mark.kind]
     if mark.kind == "predicted":
@@ -217,7 +217,7 @@ def _draw_curve(picture: Picture, mark: Mark, width: int) -> None:
         _polyline(picture, mark.points, colour, width)
 
 
-def _polyline(picture: Picture, points: Array, colour: tuple[int, int, int], width: int) -> None:
+def _polyline(picture: Canvas, points: Array, colour: tuple[int, int, int], width: int) -> None:
     fixed = np.rint(points * 2**_FRACTION_BITS).astype(np.int32)
     cv2.polylines(picture, [fixed], False, colour, width, cv2.LINE_AA, _FRACTION_BITS)
 
@@ -235,7 +235,7 @@ def _dashes(points: Array, width: int) -> list[Array]:
 
 
 def _label(
-    picture: Picture, places: LabelPlaces, part: PartMarks, marks: Sequence[Mark], letter: float
+    picture: Canvas, places: LabelPlaces, part: PartMarks, marks: Sequence[Mark], letter: float
 ) -> None:
     """Write the name of a part beside it, and why an outline of it is not used."""
     kinds = {mark.kind for mark in marks}
@@ -265,7 +265,7 @@ def _lettering(letter: float) -> tuple[float, int]:
     return letter / _LETTER, max(1, round(letter / 12.0))
 
 
-def _legend(width: int, letter: float, line: int, caption: str) -> Picture:
+def _legend(width: int, letter: float, line: int, caption: str) -> Canvas:
     """Return the strip below a picture: what it shows, and what the colours mean."""
     height = round(3.6 * letter)
     strip = np.full((height, width, 3), _DARK, dtype=np.uint8)

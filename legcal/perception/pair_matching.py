@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry import Array, IntArray, cross, cross_matrices, rotation_matrices
 from legcal.machine import Cylinder
-from legcal.perception.lines import EdgePairs
+from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.vision import visible_segments
 
 MIN_DEPTH = 0.02  # depth of the nearest point of a leg [m]
@@ -73,7 +73,7 @@ def leg_segments(
 
 
 @dataclass(frozen=True, eq=False)
-class Poses:
+class CameraPoses:
     """Candidate camera poses T_camera_base."""
 
     R: Array  # (n, 3, 3)
@@ -81,23 +81,23 @@ class Poses:
     shift: Array  # (n, n_legs, 2, 3) of A and B against the model, in the base link [m]
 
     @classmethod
-    def rigid(cls, R: Array, t: Array, n_legs: int) -> "Poses":
+    def rigid(cls, R: Array, t: Array, n_legs: int) -> "CameraPoses":
         """Return poses at which all legs are where the model has them."""
         return cls(R, t, np.zeros((len(R), n_legs, 2, 3)))
 
     @classmethod
-    def none(cls, n_legs: int) -> "Poses":
+    def none(cls, n_legs: int) -> "CameraPoses":
         """Return no pose."""
         return cls.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
 
     @classmethod
-    def one(cls, T_base_camera: RigidTransform, shift: Array) -> "Poses":
+    def one(cls, T_base_camera: RigidTransform, shift: Array) -> "CameraPoses":
         """Return one pose, with shifts (n_legs, 2, 3)."""
         T = T_base_camera.inv()
         return cls(T.rotation.as_matrix()[None], T.translation[None], shift[None])
 
     @classmethod
-    def joined(cls, parts: "Sequence[Poses]") -> "Poses":
+    def joined(cls, parts: "Sequence[CameraPoses]") -> "CameraPoses":
         """Return all poses of some sets."""
         return cls(
             *(np.concatenate([getattr(p, name) for p in parts]) for name in ("R", "t", "shift"))
@@ -112,16 +112,16 @@ class Poses:
         """Return the number of poses."""
         return len(self.R)
 
-    def take(self, chosen: IntArray) -> "Poses":
+    def take(self, chosen: IntArray) -> "CameraPoses":
         """Return some of the poses."""
-        return Poses(self.R[chosen], self.t[chosen], self.shift[chosen])
+        return CameraPoses(self.R[chosen], self.t[chosen], self.shift[chosen])
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
     """What is known of a picture: its edge pairs, and the legs that it may show."""
 
-    pairs: EdgePairs
+    pairs: CandidatePairs
     targets: LegSegments  # segments of legs at its reading
     corners: Array  # (2, 2) least and greatest x and y of the sensor plane that it shows
     # Its camera frame, where poses are those of another one that is fixed to it: X_camera = R X + t
@@ -144,7 +144,7 @@ class PairMatches(NamedTuple):
         return np.where(np.any(same & better, axis=2), 0.0, self.score)
 
 
-def match_pairs(picture: Picture, poses: Poses, tolerance: float) -> PairMatches:
+def match_pairs(picture: Picture, poses: CameraPoses, tolerance: float) -> PairMatches:
     """Match poses to a picture; ``tolerance`` is how far axes may be from pairs [m]."""
     n, n_targets = len(poses), len(picture.targets)
     if n == 0 or n_targets == 0 or len(picture.pairs) == 0:
@@ -158,7 +158,7 @@ def match_pairs(picture: Picture, poses: Poses, tolerance: float) -> PairMatches
     return PairMatches(value, pair, visible)
 
 
-def _in_picture(picture: Picture, poses: Poses) -> tuple[Array, Array, Array, Array]:
+def _in_picture(picture: Picture, poses: CameraPoses) -> tuple[Array, Array, Array, Array]:
     """Return ends X (n, T, 2, 3) [m], points (n, T, 2, 2), widths (n, T, 2), and what is shown."""
     targets = picture.targets
     ends = np.broadcast_to(targets.ends, (len(poses), *targets.ends.shape))
@@ -190,7 +190,9 @@ def _shown(xy: Array, corners: Array) -> Array:
     return np.asarray(np.clip(np.minimum(leave, 1.0) - np.maximum(enter, 0.0), 0.0, 1.0))
 
 
-def _match_chunk(picture: Picture, poses: Poses, tolerance: float) -> tuple[Array, IntArray, Array]:
+def _match_chunk(
+    picture: Picture, poses: CameraPoses, tolerance: float
+) -> tuple[Array, IntArray, Array]:
     """Return score, pair and visible of :class:`PairMatches`."""
     pairs = picture.pairs
     X, xy, width, visible = _in_picture(picture, poses)
@@ -226,24 +228,24 @@ def _match_chunk(picture: Picture, poses: Poses, tolerance: float) -> tuple[Arra
     return np.where(visible > 0.0, found, 0.0).astype(np.float64), best, visible
 
 
-def _tolerances(pairs: EdgePairs, X: Array, tolerance: float) -> Array:
+def _tolerances(pairs: CandidatePairs, X: Array, tolerance: float) -> Array:
     """Return a tolerance [m] on the sensor plane at segments X (n, T, 2, 3), (n, T)."""
     depth = np.maximum(X[..., 2].mean(axis=-1), MIN_DEPTH)
     return np.asarray(tolerance / depth + TOLERANCE_PIXELS * pairs.pixel)
 
 
-def pair_widths(pairs: EdgePairs) -> Array:
+def pair_widths(pairs: CandidatePairs) -> Array:
     """Return the widths of pairs (n,) in their middle, as wide as legs are that look like this."""
     return np.asarray(pairs.width.mean(axis=1) + WIDTH_BIAS_PIXELS * pairs.pixel)
 
 
 def gauss_newton_step(
     pictures: Sequence[Picture],
-    poses: Poses,
+    poses: CameraPoses,
     matches: Sequence[PairMatches],
     tolerance: float,
     joint_error: float = 0.0,
-) -> Poses:
+) -> CameraPoses:
     """Return poses after one Gauss-Newton step towards the pairs that they match.
 
     By pictures of one camera and matches with each, for a tolerance as in :func:`match_pairs`;
@@ -282,7 +284,7 @@ def gauss_newton_step(
     return _moved(poses, xi, poses.shift + change.reshape(poses.shift.shape), centre)
 
 
-def _centre(pictures: Sequence[Picture], poses: Poses) -> Array:
+def _centre(pictures: Sequence[Picture], poses: CameraPoses) -> Array:
     """Return the middle of the legs in the frame of each pose, (n, 3) [m]."""
     ends = [p.targets.ends.reshape(-1, 3) for p in pictures if len(p.targets)]
     middle = np.concatenate(ends).mean(axis=0) if ends else np.zeros(3)
@@ -301,7 +303,7 @@ def _step_prior(centre: Array) -> Array:
 
 
 def _equations(
-    picture: Picture, poses: Poses, found: PairMatches, tolerance: float
+    picture: Picture, poses: CameraPoses, found: PairMatches, tolerance: float
 ) -> tuple[Array, Array, Array, Array]:
     """Return residuals of each segment: two of its line, one of its width, one of its place.
 
@@ -372,7 +374,7 @@ def _of_offset(xy: Array, normal: Array, z: Array) -> Array:
     return np.asarray(np.concatenate([across, in_depth], axis=-1) / z[..., None])
 
 
-def distances(picture: Picture, poses: Poses, found: PairMatches) -> Array:
+def distances(picture: Picture, poses: CameraPoses, found: PairMatches) -> Array:
     """Return how far segments are from the pairs that agree with them, (n_poses, n_targets) [m].
 
     Sideways, at the ends of the pairs and at the depth of the segments.
@@ -382,7 +384,7 @@ def distances(picture: Picture, poses: Poses, found: PairMatches) -> Array:
     return np.asarray(np.abs(residual[..., :2]).max(axis=-1) * X[..., 2].mean(axis=-1))
 
 
-def _moved(poses: Poses, xi: Array, shift: Array, centre: Array) -> Poses:
+def _moved(poses: CameraPoses, xi: Array, shift: Array, centre: Array) -> CameraPoses:
     """Return poses moved by rotation vectors and translations in their frame, (n, 6), not far."""
     turned = np.linalg.norm(xi[:, :3], axis=1) / MAX_TURN
     moved = np.linalg.norm(np.cross(xi[:, :3], centre) + xi[:, 3:], axis=1)
@@ -390,10 +392,10 @@ def _moved(poses: Poses, xi: Array, shift: Array, centre: Array) -> Poses:
     xi = xi / np.maximum(np.maximum(turned, moved / (MAX_DISPLACEMENT * distance)), 1.0)[:, None]
     turn = rotation_matrices(xi[:, :3])
     t = np.einsum("nij,nj->ni", turn, poses.t) + xi[:, 3:]
-    return Poses(turn @ poses.R, t, shift)
+    return CameraPoses(turn @ poses.R, t, shift)
 
 
-def exchanged(poses: Poses, X: Array) -> Poses:
+def exchanged(poses: CameraPoses, X: Array) -> CameraPoses:
     """Return the poses that show points X (m, 3) of a flat machine alike as seen from far.
 
     The machine is reflected in its own plane, which leaves a flat one as it is, and in the plane
@@ -406,4 +408,4 @@ def exchanged(poses: Poses, X: Array) -> Poses:
     in_plane = np.eye(3) - 2.0 * np.outer(normal, normal)
     in_depth = np.eye(3) - 2.0 * facing[:, :, None] * facing[:, None, :]
     turned = in_depth @ poses.R @ in_plane
-    return Poses.rigid(turned, at - turned @ middle, poses.shift.shape[1])
+    return CameraPoses.rigid(turned, at - turned @ middle, poses.shift.shape[1])

@@ -26,6 +26,7 @@ from legcal.data import (
 )
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Cylinder, Machine
+from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.detection import measure_outlines
 from legcal.perception.diagnostics import (
     diagnose,
@@ -34,7 +35,6 @@ from legcal.perception.diagnostics import (
 )
 from legcal.perception.image_quality import Exposure, expose, image_defects
 from legcal.perception.light import to_grey
-from legcal.perception.lines import EdgePairs
 from legcal.perception.outline import WRONG_WIDTH, Method
 from legcal.perception.placement import (
     NEAR_FIT_PX,
@@ -44,7 +44,7 @@ from legcal.perception.placement import (
     Search,
     group_views,
 )
-from legcal.perception.radii import Part, radius_notes
+from legcal.perception.radii import LegRadius, radius_notes
 from legcal.perception.recognition import recognise
 from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
@@ -87,7 +87,9 @@ class Photographs:
             dtype=np.bool_,
         )
 
-    def search(self, nominal: Placement, pairs: Mapping[int, EdgePairs] | None = None) -> Search:
+    def search(
+        self, nominal: Placement, pairs: Mapping[int, CandidatePairs] | None = None
+    ) -> Search:
         """Return what is searched for by a model, in images some of whose edge pairs are known."""
         return Search(
             self.load,
@@ -122,7 +124,7 @@ class Photographs:
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
+class ImageObservations:
     """What the images show."""
 
     photographs: Photographs  # the images, and the mechanism with the radii that they show
@@ -154,7 +156,7 @@ def observe(
     joined: Joined = None,
     *,
     together: bool = True,
-) -> Observations:
+) -> ImageObservations:
     """Place the cameras, measure the outlines, and leave out the images that are wrong.
 
     ``joined`` are T_board_camera of views that show a calibration board, which are placed together;
@@ -165,7 +167,7 @@ def observe(
     search = photographs.search(nominal, pairs)
     hints = nominal.T_base_camera
 
-    def recognised(suspects: Collection[Part] = ()) -> Placement:
+    def recognised(suspects: Collection[LegRadius] = ()) -> Placement:
         return _recognised(photographs, search, usable, hints, report, joined, suspects)
 
     placement = recognised()
@@ -200,7 +202,9 @@ def observe(
     view, known = photographs.measurements.view, ~np.isnan(blur)
     of_views = [blur[known & (view == v)] for v in range(len(photographs.measurements.views))]
     usual = tuple(float(np.median(own)) if len(own) else np.nan for own in of_views)
-    return Observations(photographs, placement, reject_images(outlines, reasons), reasons, usual)
+    return ImageObservations(
+        photographs, placement, reject_images(outlines, reasons), reasons, usual
+    )
 
 
 def place(
@@ -237,7 +241,7 @@ def _recognised(
     hints: Sequence[RigidTransform | None],
     report: Report,
     joined: Joined,
-    suspects: Collection[Part] = (),
+    suspects: Collection[LegRadius] = (),
 ) -> Placement:
     """Return what is recognised in some images, with notes on radii."""
     progress = _counted(report, "Recognising legs", len(rows))
@@ -274,13 +278,13 @@ def _measured(
 
 def _inspect_images(
     photographs: Photographs, nominal: Placement, report: Report, joined: Joined
-) -> tuple[dict[int, str], dict[int, EdgePairs]]:
+) -> tuple[dict[int, str], dict[int, CandidatePairs]]:
     """Return why images show nothing, and edge pairs of those recognised first, by row."""
     rows, measurements = photographs.detect.tolist(), photographs.measurements
     hints = nominal.T_base_camera
     groups = group_views(measurements, photographs.detect, hints, joined)
     first = {r for g in groups for r in (g.rows if g.hint is None else g.some)}
-    exposures, pairs = dict[int, Exposure](), dict[int, EdgePairs]()
+    exposures, pairs = dict[int, Exposure](), dict[int, CandidatePairs]()
     count = _counted(report, "Looking at images", len(rows))
     look = partial(_inspect, photographs.search(nominal), first)
     for row, (exposure, own) in zip(rows, photographs.run(look, rows), strict=True):
@@ -294,7 +298,9 @@ def _inspect_images(
     return image_defects(exposures, view, {row: camera[v] for row, v in view.items()}), pairs
 
 
-def _inspect(search: Search, rows: Collection[int], row: int) -> tuple[Exposure, EdgePairs | None]:
+def _inspect(
+    search: Search, rows: Collection[int], row: int
+) -> tuple[Exposure, CandidatePairs | None]:
     """Return how an image was exposed, and the edge pairs of those that are to be recognised."""
     image = search.load(row)
     view = int(search.measurements.view[row])
@@ -302,7 +308,7 @@ def _inspect(search: Search, rows: Collection[int], row: int) -> tuple[Exposure,
     return expose(to_grey(image)), pairs
 
 
-def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[Part]:
+def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[LegRadius]:
     """Return the parts of legs, by leg and radius, of which hardly an outline can be used.
 
     One that is used although the width of its part is wrong speaks for no radius.

@@ -16,8 +16,8 @@ from legcal.data import Measurements
 from legcal.errors import NotVisible
 from legcal.geometry import Array, BoolArray, Image, IntArray
 from legcal.machine import Cylinder
+from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
 from legcal.perception.light import to_grey
-from legcal.perception.lines import EdgePairs, find_edge_pairs, find_segments
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
 from legcal.perception.radii import NO_RADIUS_FACTORS, RadiusFactors
 from legcal.vision import Camera
@@ -44,7 +44,7 @@ class Search:
     cylinders: Sequence[Sequence[Cylinder]]  # what can be seen of each leg
     wanted: BoolArray  # (n_views, n_legs) legs that each view is stated to show
     leg_names: Sequence[str]
-    edge_pairs: Mapping[int, EdgePairs] = field(default_factory=dict)  # of rows seen before
+    edge_pairs: Mapping[int, CandidatePairs] = field(default_factory=dict)  # of rows seen before
 
     @property
     def n_legs(self) -> int:
@@ -57,12 +57,12 @@ class Search:
         camera = self.measurements.views[view].camera
         return Picture(self.pairs(row, view), self.targets(row, view), corners_of(camera))
 
-    def pairs(self, row: int, view: int) -> EdgePairs:
+    def pairs(self, row: int, view: int) -> CandidatePairs:
         """Return the edge pairs of an image as if the camera of a view had taken it."""
         if view == int(self.measurements.view[row]) and row in self.edge_pairs:
             return self.edge_pairs[row]
         camera = self.measurements.views[view].camera
-        return find_edge_pairs(find_segments(to_grey(self.load(row)), camera))
+        return find_candidate_pairs(find_segments(to_grey(self.load(row)), camera))
 
     def targets(self, row: int, view: int) -> LegSegments:
         """Return the legs at the reading of a row that a view is stated to show."""

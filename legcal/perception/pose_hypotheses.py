@@ -10,8 +10,14 @@ from typing import NamedTuple
 import numpy as np
 
 from legcal.geometry import Array, IntArray
-from legcal.perception.lines import EdgePairs
-from legcal.perception.pair_matching import WIDTH_ERROR, LegSegments, Picture, Poses, pair_widths
+from legcal.perception.candidate_pairs import CandidatePairs
+from legcal.perception.pair_matching import (
+    WIDTH_ERROR,
+    CameraPoses,
+    LegSegments,
+    Picture,
+    pair_widths,
+)
 
 N_FIRST, N_SECOND = 20, 40  # best pairs that are tried as the first one, and as the second
 LEANS = np.deg2rad([-55.0, -33.0, -11.0, 11.0, 33.0, 55.0])
@@ -34,13 +40,13 @@ class _Firsts(NamedTuple):
     target: IntArray  # (n,)
 
 
-def pose_hypotheses(picture: Picture, n_legs: int) -> Poses:
+def pose_hypotheses(picture: Picture, n_legs: int) -> CameraPoses:
     """Return camera poses that put two legs where two pairs of a picture are."""
     pairs, targets = (
         picture.pairs.take(np.arange(min(N_SECOND, len(picture.pairs)))),
         picture.targets,
     )
-    nothing = Poses.none(n_legs)
+    nothing = CameraPoses.none(n_legs)
     if len(pairs) < 2 or len(set(targets.leg.tolist())) < 2:
         return nothing
     firsts = _firsts(pairs, targets)
@@ -86,7 +92,7 @@ def pose_hypotheses(picture: Picture, n_legs: int) -> Poses:
     R = U_c[f] @ _about_x(cosine[good], sine[good]) @ U_b[f].swapaxes(1, 2)
     where = firsts.P[f] + place[:, None] * firsts.u[f]
     t = where - np.einsum("nij,nj->ni", R, middle[firsts.target[f]])
-    return Poses.rigid(R, t, n_legs)
+    return CameraPoses.rigid(R, t, n_legs)
 
 
 def _turns(
@@ -114,7 +120,7 @@ def _turns(
     return f, k, m, np.cos(turn), np.sin(turn)
 
 
-def _firsts(pairs: EdgePairs, targets: LegSegments) -> _Firsts:
+def _firsts(pairs: CandidatePairs, targets: LegSegments) -> _Firsts:
     """Take the best pairs for every segment, with all leans that their edges allow."""
     n = min(N_FIRST, len(pairs))
     first = pairs.take(np.arange(n))
@@ -144,12 +150,12 @@ def _firsts(pairs: EdgePairs, targets: LegSegments) -> _Firsts:
     return _Firsts(np.concatenate([u, -u]), *(np.concatenate([x, x]) for x in (P, tolerance, i, j)))
 
 
-def _rays(pairs: EdgePairs) -> Array:
+def _rays(pairs: CandidatePairs) -> Array:
     """Return the points (x, y, 1) of the middles, (n, 3)."""
     return np.concatenate([pairs.middle, np.ones((len(pairs), 1))], axis=1)
 
 
-def _planes(pairs: EdgePairs) -> Array:
+def _planes(pairs: CandidatePairs) -> Array:
     """Return the unit normals (n, 3) of the planes of the axes and the camera centre."""
     along = np.concatenate([pairs.along, np.zeros((len(pairs), 1))], axis=1)
     planes = np.cross(along, _rays(pairs))

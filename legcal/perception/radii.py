@@ -15,9 +15,9 @@ import numpy as np
 from legcal.geometry import Array
 from legcal.machine import Cylinder
 from legcal.perception.pair_matching import (
+    CameraPoses,
     PairMatches,
     Picture,
-    Poses,
     gauss_newton_step,
     match_pairs,
 )
@@ -37,14 +37,14 @@ CONSISTENT = 0.09  # logarithms from views of one part, or of parts that are wro
 MIN_SHARE_ALIKE = 0.75  # of the parts that must be wrong alike, to be all
 MAX_ITERATIONS = 4  # of correcting radii and placing cameras by them
 
-Part = tuple[int, float]  # leg, and radius in the model [m]
+LegRadius = tuple[int, float]  # leg, and radius in the model [m]
 
 
 @dataclass(frozen=True, eq=False)
 class RadiusFactors:
     """Factors of radii that pictures show, by leg and radius in the model."""
 
-    factor: dict[Part, float]  # by how much they differ from the model; others are left out
+    factor: dict[LegRadius, float]  # by how much they differ from the model; others are left out
     common: float = 0.0  # the factor of all parts, if they differ alike; 0 otherwise
 
     def corrected(self, cylinders: Sequence[Sequence[Cylinder]]) -> list[tuple[Cylinder, ...]]:
@@ -61,7 +61,7 @@ class RadiusFactors:
                 return factor
         return self.common or 1.0
 
-    def only(self, suspects: Collection[Part]) -> "RadiusFactors":
+    def only(self, suspects: Collection[LegRadius]) -> "RadiusFactors":
         """Return the factors of some parts; of all only where most of them are among these."""
         mine = {
             part: factor
@@ -98,7 +98,7 @@ NO_RADIUS_FACTORS = RadiusFactors({})
 
 
 def estimate_radii(
-    views: Iterable[tuple[int, Sequence[Picture], Poses]],
+    views: Iterable[tuple[int, Sequence[Picture], CameraPoses]],
     different: float = MIN_CHANGE,
     *,
     alone: bool = False,
@@ -109,7 +109,7 @@ def estimate_radii(
     logarithm of the factor from which on a radius is another one, ``alone`` that all parts cannot
     differ alike.
     """
-    samples: dict[Part, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    samples: dict[LegRadius, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for view, pictures, placed in views:
         pose = _by_lines(pictures, placed)
         for picture in pictures:
@@ -137,7 +137,7 @@ def estimate_radii(
 def _agreed(views: Sequence[Sequence[float]]) -> tuple[float, float] | None:
     """Return the logarithm on which views of a part agree, and its standard error.
 
-    EdgePairs of a part that something hides, or of wrong edges, do not agree with each other.
+    Pairs of a part that something hides, or of wrong edges, do not agree with each other.
     """
     middles: list[float] = []
     enough = [np.array(values) for values in views if len(values) >= MIN_PAIRS]
@@ -166,16 +166,16 @@ def _densest(values: Array) -> float:
     return float(np.median(ordered[first : first + most]))
 
 
-def _by_lines(pictures: Sequence[Picture], placed: Poses) -> Poses:
+def _by_lines(pictures: Sequence[Picture], placed: CameraPoses) -> CameraPoses:
     """Return a pose by where pairs are, which widths hardly move: joints stay as in the model."""
-    pose = Poses.rigid(placed.R[:1], placed.t[:1], placed.shift.shape[1])
+    pose = CameraPoses.rigid(placed.R[:1], placed.t[:1], placed.shift.shape[1])
     for tolerance in TOLERANCES:
         found = [_whatever_the_width(picture, pose, tolerance) for picture in pictures]
         pose = gauss_newton_step(pictures, pose, found, tolerance)
     return pose
 
 
-def _whatever_the_width(picture: Picture, pose: Poses, tolerance: float) -> PairMatches:
+def _whatever_the_width(picture: Picture, pose: CameraPoses, tolerance: float) -> PairMatches:
     """Return the best pairs of segments with any radius; farther factors must be clearly better."""
     targets = picture.targets
     best = match_pairs(picture, pose, tolerance)
@@ -191,7 +191,7 @@ def _whatever_the_width(picture: Picture, pose: Poses, tolerance: float) -> Pair
     return best
 
 
-def _logarithms(picture: Picture, pose: Poses) -> list[tuple[Part, float]]:
+def _logarithms(picture: Picture, pose: CameraPoses) -> list[tuple[LegRadius, float]]:
     """Return the logarithms of the widths of a picture's pairs against the model's."""
     targets = picture.targets
     if len(targets) == 0 or len(picture.pairs) == 0:

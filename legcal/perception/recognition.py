@@ -17,7 +17,7 @@ from legcal.data import Outlines
 from legcal.geometry import Array, IntArray
 from legcal.perception.camera_search import (
     START_PICTURES,
-    Candidates,
+    PoseCandidates,
     is_mirrored,
     may_be_mirrored,
     mirrored,
@@ -26,13 +26,13 @@ from legcal.perception.camera_search import (
     with_first,
 )
 from legcal.perception.detection import measure_outlines
-from legcal.perception.pair_matching import Picture, Poses
+from legcal.perception.pair_matching import CameraPoses, Picture
 from legcal.perception.placement import Group, Joined, Placement, Search, group_views
 from legcal.perception.radii import (
     CONVERGED,
     MAX_ITERATIONS,
     NO_RADIUS_FACTORS,
-    Part,
+    LegRadius,
     RadiusFactors,
     estimate_radii,
 )
@@ -63,7 +63,7 @@ def recognise(
     hints: Sequence[RigidTransform | None],
     joined: Joined = None,
     *,
-    suspects: Collection[Part] = (),
+    suspects: Collection[LegRadius] = (),
     progress: Callable[[int], None] | None = None,
     run: Run = in_turn,
 ) -> Placement:
@@ -116,18 +116,18 @@ def _pictures(
 
 def _anywhere(
     groups: Sequence[Sequence[Picture]], n_legs: int, starts: Sequence[int], run: Run
-) -> list[Candidates]:
+) -> list[PoseCandidates]:
     """Return the cameras of groups by pictures of them, searched for anywhere."""
     return list(run(partial(_place, groups, n_legs, starts), range(len(groups))))
 
 
 def _place(
     groups: Sequence[Sequence[Picture]], n_legs: int, starts: Sequence[int], group: int
-) -> Candidates:
+) -> PoseCandidates:
     return place_camera(groups[group], n_legs, starts)
 
 
-def _better(near: Candidates, anywhere: Candidates) -> Candidates:
+def _better(near: PoseCandidates, anywhere: PoseCandidates) -> PoseCandidates:
     """Return the pose with the greater support, that near a rough pose if they are alike."""
     if len(anywhere.poses) == 0 or not anywhere.is_convincing:
         return near
@@ -141,10 +141,10 @@ def _by_other_radii(
     search: Search,
     groups: Sequence[Group],
     pictures: dict[int, Picture],
-    placed: list[Candidates],
-    suspects: Collection[Part],
+    placed: list[PoseCandidates],
+    suspects: Collection[LegRadius],
     run: Run,
-) -> tuple[Search, dict[int, Picture], list[Candidates], RadiusFactors]:
+) -> tuple[Search, dict[int, Picture], list[PoseCandidates], RadiusFactors]:
     """Return everything by the radii that the images show of suspects parts, corrected in turns."""
     as_given = search, pictures, placed, NO_RADIUS_FACTORS
     radii = _first_radii(search, groups, placed, pictures, run).only(suspects)
@@ -166,7 +166,7 @@ def _by_other_radii(
 def _first_radii(
     search: Search,
     groups: Sequence[Group],
-    placed: Sequence[Candidates],
+    placed: Sequence[PoseCandidates],
     pictures: Pictures,
     run: Run,
 ) -> RadiusFactors:
@@ -186,15 +186,15 @@ def _first_radii(
 
 
 def _for_radii(
-    groups: Sequence[Group], placed: Sequence[Candidates], pictures: Pictures
-) -> Iterator[tuple[int, list[Picture], Poses]]:
+    groups: Sequence[Group], placed: Sequence[PoseCandidates], pictures: Pictures
+) -> Iterator[tuple[int, list[Picture], CameraPoses]]:
     """Return a few pictures of each group that was placed."""
     for g, (group, one) in enumerate(zip(groups, placed, strict=True)):
         if one.is_convincing:
             yield g, group.pictures(pictures, group.some), one.poses
 
 
-def _mean_support(placed: Sequence[Candidates]) -> float:
+def _mean_support(placed: Sequence[PoseCandidates]) -> float:
     """Return how many legs agree in a picture, over all groups that were placed."""
     return sum(float(one.support[0].mean()) for one in placed if one.is_convincing)
 
@@ -202,10 +202,10 @@ def _mean_support(placed: Sequence[Candidates]) -> float:
 def _placed_again(
     search: Search,
     groups: Sequence[Group],
-    placed: Sequence[Candidates],
+    placed: Sequence[PoseCandidates],
     pictures: Pictures,
     run: Run,
-) -> list[Candidates]:
+) -> list[PoseCandidates]:
     """Return the cameras by other radii: near where they were, or anywhere if they were not."""
     found = list(placed)
     unplaced_groups = [g for g, one in enumerate(placed) if not one.is_convincing]
@@ -238,10 +238,10 @@ class _Trial:
 def _decided_by_outlines(
     search: Search,
     groups: Sequence[Group],
-    placed: Sequence[Candidates],
+    placed: Sequence[PoseCandidates],
     pictures: Pictures,
     g: int,
-) -> Candidates:
+) -> PoseCandidates:
     """Return the poses of a group, first the one that outlines support if pairs are ambiguous."""
     group, candidates = groups[g], placed[g]
     near = candidates.hinted and candidates.is_convincing
@@ -263,12 +263,12 @@ def _decided_by_outlines(
     fit = trials[best].fit
     if fit is None or not _is_decided(trials, candidates, few):
         return replace(candidates, by_outlines=False)
-    pose = Poses.one(fit.T_base_group, fit.shift)
+    pose = CameraPoses.one(fit.T_base_group, fit.shift)
     of_group = group.pictures(pictures, [r for r in group.rows if r in pictures])
     return replace(with_first(candidates, best, pose, of_group), by_outlines=True)
 
 
-def _measure_at(search: Search, group: Group, candidates: Candidates, i: int) -> _Trial:
+def _measure_at(search: Search, group: Group, candidates: PoseCandidates, i: int) -> _Trial:
     """Measure outlines at a pose, and fit it to them."""
     shift, n_views = candidates.poses.shift[i], len(search.measurements.views)
     T: list[RigidTransform | None] = [None] * n_views
@@ -287,7 +287,7 @@ def _best(trials: Sequence[_Trial]) -> int:
     return int(np.argmax([trial.evidence for trial in trials]))
 
 
-def _is_decided(trials: Sequence[_Trial], candidates: Candidates, group: Group) -> bool:
+def _is_decided(trials: Sequence[_Trial], candidates: PoseCandidates, group: Group) -> bool:
     """Say whether outlines speak for one pose, and not nearly as much for another one."""
     best = _best(trials)
     others = [
@@ -333,7 +333,7 @@ def _gap(one: Array, other: Array) -> float:
 def _gathered(
     search: Search,
     groups: Sequence[Group],
-    found: Sequence[Candidates],
+    found: Sequence[PoseCandidates],
     pictures: Pictures,
     hints: Sequence[RigidTransform | None],
     radii: RadiusFactors,
@@ -369,7 +369,7 @@ def _gathered(
     return replace(placement.shifted(search, shift), unplaced=unplaced)
 
 
-def _problem(name: str, placed: Candidates, hinted: bool, *, is_mirrored: bool) -> str:
+def _problem(name: str, placed: PoseCandidates, hinted: bool, *, is_mirrored: bool) -> str:
     """Say why a view could not be placed."""
     if is_mirrored:
         return (

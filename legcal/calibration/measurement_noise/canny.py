@@ -20,7 +20,7 @@ from legcal.perception import (
     MIN_LONE_KEPT,
     Grey,
     ImageSearch,
-    Part,
+    LegPart,
     find_parts,
     part_outlines,
 )
@@ -79,7 +79,7 @@ def edge_points(grey: Grey) -> Array:
     return np.column_stack([column, row]).astype(np.float64)
 
 
-def _measured(search: ImageSearch, part: Part, xy: Array) -> Outlines:
+def _measured(search: ImageSearch, part: LegPart, xy: Array) -> Outlines:
     """Measure both outlines of a part from all edge points of the image, and judge them."""
     t, v = part.band.coordinates(xy)
     n = len(part.hidden)
@@ -127,7 +127,7 @@ def _least_squares(t: Array, v: Array, length: float) -> Array:
     return np.asarray(centre[1] + slope * (np.array([0.0, length]) - centre[0]))
 
 
-def _reasons(part: Part, lines: Sequence[_Line | None]) -> tuple[str, str]:
+def _reasons(part: LegPart, lines: Sequence[_Line | None]) -> tuple[str, str]:
     """Return why each outline is not to be used, "" if it is."""
     least = max(MIN_LENGTH[0], MIN_LENGTH[1] * 2.0 * part.half_width)
     reasons = []

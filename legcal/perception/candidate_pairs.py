@@ -1,4 +1,4 @@
-"""Straight edges of a whole picture, and pairs of them that may be the outlines of a cylinder.
+"""Line segments of a whole image, and pairs of them that may be the two outlines of a cylinder.
 
 A cylinder shows two nearly parallel edges, one where the picture gets brighter across it and one
 where it gets darker; a lit one before something grey may do the same at both. How thick it
@@ -149,7 +149,7 @@ def _fitted(pieces: Array, length: Array, label: IntArray) -> tuple[Array, Array
 
 
 @dataclass(frozen=True, eq=False)
-class EdgePairs:
+class CandidatePairs:
     """Candidate cylinders of a picture, best first, on its sensor plane."""
 
     middle: Array  # (n, 2) of the axis
@@ -168,9 +168,9 @@ class EdgePairs:
         """Unit normals (n, 2) of the axes."""
         return np.stack([-self.along[:, 1], self.along[:, 0]], axis=1)
 
-    def take(self, chosen: IntArray | BoolArray) -> "EdgePairs":
+    def take(self, chosen: IntArray | BoolArray) -> "CandidatePairs":
         """Return some of the pairs."""
-        return EdgePairs(
+        return CandidatePairs(
             self.middle[chosen],
             self.along[chosen],
             self.half_length[chosen],
@@ -180,7 +180,7 @@ class EdgePairs:
         )
 
 
-def find_edge_pairs(segments: EdgeSegments, most: int = MAX_PAIRS) -> EdgePairs:
+def find_candidate_pairs(segments: EdgeSegments, most: int = MAX_PAIRS) -> CandidatePairs:
     """Return the best pairs of edges that may be a cylinder."""
     ends, pixel = segments.ends, segments.pixel
     i, j = np.triu_indices(len(ends), 1)
@@ -227,7 +227,7 @@ def find_edge_pairs(segments: EdgeSegments, most: int = MAX_PAIRS) -> EdgePairs:
     chosen = chosen[_distinct(start[chosen], stop[chosen], width.mean(axis=0)[chosen])][:most]
     start, stop = start[chosen], stop[chosen]
     full = np.linalg.norm(stop - start, axis=1)
-    return EdgePairs(
+    return CandidatePairs(
         0.5 * (start + stop),
         (stop - start) / full[:, None],
         0.5 * full,

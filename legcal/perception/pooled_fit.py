@@ -1,4 +1,4 @@
-"""Lines of outlines by all blocks of an image together, with the blur and covariance.
+"""Lines of outlines fitted to the pooled blocks of an image, with the blur and covariance.
 
 The blocks of an outline share amplitudes that change slowly along it, a line, and a blur that is
 nearly that of the whole image; each block adds a little of its own, which is eliminated. Sums over
@@ -43,7 +43,7 @@ ONE, OTHER = (0, 1, 2, 1, 2, 2), (0, 0, 0, 1, 1, 2)  # pairs of polynomials
 SHIFT, BLUR, N_UNKNOWNS = N_AMPLITUDES, N_AMPLITUDES + 1, N_AMPLITUDES + 2  # unknowns of a block
 
 
-class FittedLines(NamedTuple):
+class PooledLines(NamedTuple):
     """Lines of outlines, by how far they lie inside those on which the blocks had converged."""
 
     ends: Array  # (n_edges, 2) where the band begins and where it ends [px of the band]
@@ -62,7 +62,7 @@ class _Round(NamedTuple):
     inverse: Array  # (n_edges, N_ALONG * N_UNKNOWNS, N_ALONG * N_UNKNOWNS)
 
 
-def fit_jointly(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> FittedLines:
+def fit_pooled(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> PooledLines:
     """Fit the blocks (n,) that lie on the lines of their edges, of each outline together.
 
     From a rough blur [px]; ``depth`` is the distance from the outlines at which blocks end [px].
@@ -71,7 +71,7 @@ def fit_jointly(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> F
     n = len(pool.half_width)
     if n == 0 or not np.any(pool.seen):
         nothing = np.full(n, np.nan)
-        return FittedLines(np.zeros((n, 2)), np.tile(np.eye(2), (n, 1, 1)), blur, nothing)
+        return PooledLines(np.zeros((n, 2)), np.tile(np.eye(2), (n, 1, 1)), blur, nothing)
     start = _Round(
         np.zeros((n, N_ALONG, N_AMPLITUDES)),
         np.zeros((n, 2)),
@@ -88,7 +88,7 @@ def fit_jointly(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> F
     line = [SHIFT, N_UNKNOWNS + SHIFT]
     covariance = at_ends @ found.inverse[:, line][:, :, line] @ at_ends.T
     by_gamma = _shifts_by_gamma(pool, found, sigma)
-    return FittedLines(found.line @ at_ends.T, covariance, float(np.exp(even)), by_gamma)
+    return PooledLines(found.line @ at_ends.T, covariance, float(np.exp(even)), by_gamma)
 
 
 def _even_blur(found: _Round, seen: BoolArray) -> tuple[float, float]:

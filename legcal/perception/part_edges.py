@@ -1,6 +1,6 @@
-"""The pair of edges that are the two outlines of a part, near an aligned prediction.
+"""The two edges of a part of a leg, found to a pixel near where they are predicted.
 
-Both edges are looked for apart, as straight lines near their predictions on which many blocks
+Each edge is searched by itself, as straight lines near their predictions on which many blocks
 of the picture have an edge; then the pair is chosen whose distance suits the radius at
 both ends. Shading inside the leg and clutter beside it make lines as well, seldom at that
 distance. Where one side of a leg is as bright as what is behind it there is no pair: an edge
@@ -51,7 +51,7 @@ class EdgePair:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class LegPart:
     """A part of a leg where it is predicted in an image, and its edges once they are found."""
 
     leg: PredictedLeg
@@ -85,7 +85,7 @@ class Part:
         return self.predicted if np.any(is_near & self.edges.found) else self.edges.v
 
 
-def find_pairs(grey: Grey, camera: Camera, parts: Sequence[Part]) -> list[EdgePair | None]:
+def find_pairs(grey: Grey, camera: Camera, parts: Sequence[LegPart]) -> list[EdgePair | None]:
     """Find both edges of parts; None where no two edges are convincing, nor one alone."""
     if not parts:
         return []
@@ -93,7 +93,7 @@ def find_pairs(grey: Grey, camera: Camera, parts: Sequence[Part]) -> list[EdgePa
     return [_pair(*one) for one in zip(parts, lines[::2], lines[1::2], strict=True)]
 
 
-def _pair(part: Part, *lines: tuple[Array, Array]) -> EdgePair | None:
+def _pair(part: LegPart, *lines: tuple[Array, Array]) -> EdgePair | None:
     """Return the two outlines of a part among lines near each of them."""
     predicted = part.predicted
     together = _best_pair(lines[0], lines[1], predicted[1] - predicted[0], part.window)
@@ -148,7 +148,7 @@ def block_positions(band: Band) -> Array:
     return np.asarray((np.arange(n) + 0.5) * (band.length / n))
 
 
-def _edge_lines(grey: Grey, camera: Camera, parts: Sequence[Part]) -> list[tuple[Array, Array]]:
+def _edge_lines(grey: Grey, camera: Camera, parts: Sequence[LegPart]) -> list[tuple[Array, Array]]:
     """Return lines near both edges of each part: shifts at both ends (n, 2) [px], scores (n,)."""
     halves = [int(np.ceil(part.window)) for part in parts]
     reach = max(halves) + MARGIN

@@ -15,7 +15,7 @@ import numpy as np
 from legcal.geometry import Array
 from legcal.perception.blocks import Blocks, Line, depth_for_blur, estimate_blur
 from legcal.perception.light import Grey
-from legcal.perception.line_fit import FittedLines, fit_jointly
+from legcal.perception.pooled_fit import PooledLines, fit_pooled
 from legcal.perception.profiles import Edge
 from legcal.vision import Camera
 
@@ -87,7 +87,7 @@ def measure_edges(
             blocks.unmove()
         kept = blocks.kept()
         blocks.even_noise(kept, tried)
-        joint = fit_jointly(blocks, kept, tried, depth_for_blur(tried))
+        joint = fit_pooled(blocks, kept, tried, depth_for_blur(tried))
         blur = joint.blur
         if abs(np.log(blur / tried)) < BLUR_CONVERGED:
             break
@@ -99,7 +99,7 @@ def _measured(
     v: Sequence[Array],
     blocks: Blocks,
     blur: float,
-    joint: FittedLines | None,
+    joint: PooledLines | None,
 ) -> list[MeasuredEdge | None]:
     """Return the lines of edges by their blocks, one by one or all together."""
     found: list[MeasuredEdge | None] = []
