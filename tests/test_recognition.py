@@ -16,7 +16,7 @@ from legcal.geometry import Array, Image
 from legcal.machine import Cylinder
 from legcal.perception import recognition
 from legcal.perception.camera_search import (
-    Candidates,
+    PoseCandidates,
     is_mirrored,
     may_be_mirrored,
     mirrored,
@@ -24,8 +24,8 @@ from legcal.perception.camera_search import (
     place_near,
 )
 from legcal.perception.pair_matching import (
+    CameraPoses,
     Picture,
-    Poses,
     _equations,
     _moved,
     distances,
@@ -60,8 +60,8 @@ def _scene(
     return lp.pictures(made, T, platforms, rng, **difficulty), T  # type: ignore[arg-type]
 
 
-def _pose(T_base_camera: RigidTransform, n_legs: int = 6) -> Poses:
-    return Poses.one(T_base_camera, np.zeros((n_legs, 2, 3)))
+def _pose(T_base_camera: RigidTransform, n_legs: int = 6) -> CameraPoses:
+    return CameraPoses.one(T_base_camera, np.zeros((n_legs, 2, 3)))
 
 
 def _moved_machine(picture: Picture, G: RigidTransform) -> Picture:
@@ -69,7 +69,7 @@ def _moved_machine(picture: Picture, G: RigidTransform) -> Picture:
     return replace(picture, targets=replace(picture.targets, ends=ends))
 
 
-def _is_right(placed: Candidates, T: RigidTransform) -> bool:
+def _is_right(placed: PoseCandidates, T: RigidTransform) -> bool:
     away, angle = lp.apart(T, placed.pose())
     return angle < np.deg2rad(5.0) and away < 0.1
 
@@ -168,7 +168,7 @@ def test_a_pair_counts_for_the_segment_that_it_suits_best() -> None:
 
 def test_scores_depend_on_no_frame_and_not_on_other_poses() -> None:
     (picture, *_), T = _scene(1)
-    poses = Poses.joined([_pose(T)] * 300)
+    poses = CameraPoses.joined([_pose(T)] * 300)
     poses = replace(poses, t=poses.t + np.linspace(0.0, 0.1, 300)[:, None] * [1.0, 0.0, 0.0])
     together = match_pairs(picture, poses, 0.01)
     for i in (0, 127, 128, 299):
@@ -206,7 +206,7 @@ def test_derivatives_of_residuals_are_those_by_differences(joined: bool) -> None
     J, J_leg, _, weight = _equations(picture, poses, found, 0.01)
     assert np.all(weight[0, matched] > 0.0)
 
-    def residual(at: Poses) -> Array:
+    def residual(at: CameraPoses) -> Array:
         return np.asarray(_equations(picture, at, found, 0.01)[2][0])
 
     # Fixed while a segment moves are its place along the pair, which matters by the product of two
@@ -429,7 +429,7 @@ def test_a_flat_machine_is_seen_alike_with_near_and_far_exchanged() -> None:
     X = np.append(rng.uniform(-0.2, 0.2, (16, 2)), np.zeros((16, 1)), axis=1)
     R = Rotation.random(5, rng=rng).as_matrix()
     far = np.array([0.3, -0.2, 200.0])
-    poses = Poses.rigid(R, far - R @ X.mean(axis=0), 4)
+    poses = CameraPoses.rigid(R, far - R @ X.mean(axis=0), 4)
     other = exchanged(poses, X)
     assert np.allclose(np.linalg.det(other.R), 1.0)
     here, there = (X @ p.R.swapaxes(1, 2) + p.t[:, None] for p in (poses, other))
@@ -442,9 +442,9 @@ def test_a_flat_machine_is_seen_alike_with_near_and_far_exchanged() -> None:
 
 @pytest.mark.parametrize(("rival", "accepted"), [(2.0, True), (2.6, False)])
 def test_few_legs_suffice_only_without_a_rival(rival: float, accepted: bool) -> None:
-    poses = Poses.rigid(np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), 6)
+    poses = CameraPoses.rigid(np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), 6)
     support, expected = np.array([[0.9] * 4, [rival / 4] * 4]), np.full((2, 4), 6.0)
-    placed = Candidates(poses, support, expected, support.sum(axis=1), np.zeros(6))
+    placed = PoseCandidates(poses, support, expected, support.sum(axis=1), np.zeros(6))
     assert 0.12 < placed.share < 0.2
     assert placed.is_convincing == accepted
     assert not placed.is_clear
