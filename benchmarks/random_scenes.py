@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.session import nominal_poses
+from legcal.calibration.ordered_dataset import nominal_poses
 from legcal.data.measurements import Measurements, View
 from legcal.geometry.types import Array, BoolArray, Image
 from legcal.machine import Cylinder as Visible

@@ -17,8 +17,8 @@ import numpy as np
 
 from legcal.errors import LegcalError
 from legcal.machine import KinematicParameters
+from legcal.paper import Criteria
 from legcal.paper.four_steps import run_steps
-from legcal.paper.nominal import Criteria
 from legcal.simulation.hexapod import (
     PaperHexapod,
     cameras_around,

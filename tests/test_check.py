@@ -171,15 +171,15 @@ def test_priors_of_intrinsics_belong_to_the_whole_camera(result: Path, images: P
 def test_notes_on_images_are_passed_on_once(
     result: Path, images: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from legcal.calibration.pipeline import estimate_session
+    from legcal.calibration.pipeline import estimate_parameters
 
     left_out, outlier = "view c1, image k01: was left out.", "view c1, image k02: disagrees."
 
     def noted(*arguments: Any) -> Any:
-        found = estimate_session(*arguments)
+        found = estimate_parameters(*arguments)
         return replace(found, image_notes=(left_out, outlier), fit_notes=(outlier,))
 
-    monkeypatch.setattr("legcal.calibration.verification.estimate_session", noted)
+    monkeypatch.setattr("legcal.calibration.verification.estimate_parameters", noted)
     found = check(images, result)
     assert [note for note in found.notes if "view c1, image" in note] == [left_out, outlier]
     assert set(found.document()["notes"]) >= {left_out, outlier, *found.solution.notes}

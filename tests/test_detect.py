@@ -16,8 +16,8 @@ from repeated_images import SIZE, RepeatedImages, repeated_images
 from scipy.spatial.transform import RigidTransform
 
 from legcal import cli, detect, load_dataset
+from legcal.data.image_tables import canonical_order
 from legcal.data.outlines import QUALITY, Outlines, read_observations
-from legcal.data.rows import canonical_order
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
 from legcal.machine import Cylinder

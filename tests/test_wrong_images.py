@@ -17,9 +17,9 @@ from spoiled import Picture, Spoiled, spoiled
 from legcal import calibrate, detect, load_dataset, simulate
 from legcal.calibration import Calibration
 from legcal.calibration.joint_fit import DISAGREES
+from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.calibration.outlier_images import outlier_images
-from legcal.calibration.pipeline import nominal_scene
-from legcal.calibration.session import Session, start_session
+from legcal.calibration.pipeline import rough_placement
 from legcal.data import Outlines
 from legcal.errors import NotIdentifiable
 from legcal.geometry import BoolArray
@@ -166,14 +166,14 @@ def test_nothing_else_is_said_and_the_other_images_are_used(
             assert detected.outlines.used[own].mean() > 0.5
 
 
-def _session(made: Spoiled) -> Session:
+def _session(made: Spoiled) -> OrderedDataset:
     dataset = load_dataset(made.write())
-    return start_session(dataset, in_turn, no_progress)
+    return order_dataset(dataset, in_turn, no_progress)
 
 
 def _observed(made: Spoiled) -> ImageObservations:
     session = _session(made)
-    scene, _ = nominal_scene(session)
+    scene, _ = rough_placement(session)
     return observe(session.photographs, scene, no_progress)
 
 
@@ -181,7 +181,7 @@ def test_images_are_read_once_to_be_looked_at_and_once_to_be_measured(tmp_path: 
     made = spoiled(tmp_path / "read", 4, ("c1", "c2"))
     del made.entry["views"]["c2"]["T_base_camera"]
     session = _session(made)
-    scene, _ = nominal_scene(session)
+    scene, _ = rough_placement(session)
     photographs, read = session.photographs, list[int]()
 
     def load(row: int) -> Any:
@@ -222,7 +222,7 @@ def test_an_image_alone_in_its_view_is_judged_by_those_of_other_views(tmp_path: 
     (alone,) = np.flatnonzero(view == 1)[:1].tolist()
     found = {row: OutlineCount(11, 12) for row in np.flatnonzero(view == 0).tolist()}
     found[alone] = OutlineCount(1, 12)
-    search = photographs.search(nominal_scene(session)[0])
+    search = photographs.search(rough_placement(session)[0])
     usual = _usual(search, observed.placement, found, [alone], in_turn)
     assert usual[1] > 0.3
     reason, note = image_verdict(session.measurements, alone, ImageExplanation(0.0), usual, found)

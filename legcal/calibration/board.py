@@ -1,4 +1,4 @@
-"""The calibration board of a session: how it ties cameras to each other before any fit.
+"""The calibration board of a dataset: how it ties cameras to each other before any fit.
 
 The board is fixed to the base. Each camera that shows it is placed against it, so that one rough
 camera pose, or a rough pose of the board, places all of them, and the four steps may take all views
@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.joint_fit import BoardCorners, Solution
-from legcal.calibration.session import Session
+from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.data import (
     CORNERS_NAME,
     MIN_CORNERS,
@@ -96,8 +96,8 @@ class BoardViews:
         )
 
 
-def observe_board(session: Session) -> BoardViews | None:
-    """Return what the images of a session show of its board, None if it has none.
+def observe_board(data: OrderedDataset) -> BoardViews | None:
+    """Return what the images of a dataset show of its board, None if it has none.
 
     Raises
     ------
@@ -106,17 +106,17 @@ def observe_board(session: Session) -> BoardViews | None:
     DatasetError
         If what is shown cannot be the board that the dataset describes, or it has moved.
     """
-    dataset, measurements = session.dataset, session.measurements
+    dataset, measurements = data.dataset, data.measurements
     if dataset.board is None:
         return None
     used = [measurements.views[v] for v in np.unique(measurements.view).tolist()]
     needed = {view.name for view in used if view.hand_held}
     if dataset.corners is not None:
-        corners = session.order.reorder(dataset.corners)
+        corners = data.order.reorder(dataset.corners)
     else:
         rows = [row for row, image in enumerate(measurements.image) if image]
-        load = dataset.image_reader(session.order.rows.tolist())
-        corners = detect_corners(dataset.board, load, rows, session.pool, session.progress)
+        load = dataset.image_reader(data.order.rows.tolist())
+        corners = detect_corners(dataset.board, load, rows, data.pool, data.progress)
         shown = needed if len(corners) else {view.name for view in used}
         require_board(dataset.board, corners, load, measurements, shown)
     T_board_camera, corners = camera_poses(corners, dataset.board, measurements, needed)

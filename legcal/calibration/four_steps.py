@@ -1,4 +1,4 @@
-"""The four steps of a session (sections 3.2 to 3.5), and the starts of its joint fit."""
+"""The four steps on a dataset (sections 3.2 to 3.5), and the starts of its joint fit."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.board import BoardViews, Poses, in_one_camera
 from legcal.calibration.joint_fit import Start, start_from
-from legcal.calibration.session import Options, Session
+from legcal.calibration.ordered_dataset import Options, OrderedDataset
 from legcal.data import Order, Outlines, axes_from_outlines, few_views, inverse
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.machine import Leg, geometries
@@ -36,7 +36,7 @@ class Steps:
 
 
 def four_steps(
-    part: Session, outlines: Outlines, board: BoardViews | None, options: Options
+    data: OrderedDataset, outlines: Outlines, board: BoardViews | None, options: Options
 ) -> Steps:
     """Return what the four steps give, or why they give nothing: the joint fit may do without.
 
@@ -44,12 +44,12 @@ def four_steps(
     """
     if options.criteria is None:
         return Steps(None, None, "They were left out.")
-    part.progress("Four steps", 0, 1)
-    axes, measurements = part.axes, part.measurements
+    data.progress("Four steps", 0, 1)
+    axes, measurements = data.axes, data.measurements
     try:
-        nominal = nominal_machine(part.machine)
+        nominal = nominal_machine(data.machine)
         if axes is None:
-            radii = {p: r for leg in part.machine.legs for p, r in leg.radius_of_part.items()}
+            radii = {p: r for leg in data.machine.legs for p, r in leg.radius_of_part.items()}
             axes = axes_from_outlines(outlines, measurements, radii)
         if board is not None:
             axes, measurements, T_first_camera, new_view = in_one_camera(
@@ -75,11 +75,11 @@ def four_steps(
     except (NotIdentifiable, NotVisible, DidNotConverge) as failure:
         return Steps(None, None, str(failure))
     finally:
-        part.progress("Four steps", 1, 1)
+        data.progress("Four steps", 1, 1)
 
 
 def starts(
-    part: Session,
+    data: OrderedDataset,
     outlines: Outlines,
     placement: Placement,
     steps: Steps,
@@ -92,7 +92,7 @@ def starts(
     NotIdentifiable
         If neither placement nor steps locate a camera that is needed.
     """
-    machine = part.machine
+    machine = data.machine
     rough = [None if T is None else T.inv() * machine.T_base_Rb for T in placement.T_base_camera]
     staged = [None if T is None else T.inv() for T in steps.T_Rb_camera or [None] * len(rough)]
     by_label = {"nominal": (geometries(machine), rough, staged)}
@@ -100,8 +100,8 @@ def starts(
         by_label["staged"] = (steps.legs, staged, rough)
     found = []
     for label, (legs, first, second) in by_label.items():
-        cameras = _start_cameras(part, outlines, first, second, steps)
-        start = start_from(legs, part.measurements, part.fitted_legs, cameras, part.T_Rb_Re, label)
+        cameras = _start_cameras(data, outlines, first, second, steps)
+        start = start_from(legs, data.measurements, data.fitted_legs, cameras, data.T_Rb_Re, label)
         if board is not None:
             T_Rb_board = board.pose_by_cameras([T.inv() for T in cameras])
             start = start if T_Rb_board is None else replace(start, T_Rb_board=T_Rb_board)
@@ -110,15 +110,15 @@ def starts(
 
 
 def _start_cameras(
-    part: Session, outlines: Outlines, first: Poses, second: Poses, steps: Steps
+    data: OrderedDataset, outlines: Outlines, first: Poses, second: Poses, steps: Steps
 ) -> list[RigidTransform]:
     """Return a camera pose for every view, the first choice where there is one."""
     cameras = [a if a is not None else b for a, b in zip(first, second, strict=True)]
-    shown = outlines.row[outlines.used] if part.axes is None else part.axes.row
-    needed = set(part.measurements.view[shown].tolist())
+    shown = outlines.row[outlines.used] if data.axes is None else data.axes.row
+    needed = set(data.measurements.view[shown].tolist())
     unknown = [
         view.name
-        for v, view in enumerate(part.measurements.views)
+        for v, view in enumerate(data.measurements.views)
         if v in needed and cameras[v] is None
     ]
     if unknown:
@@ -127,6 +127,6 @@ def _start_cameras(
             "T_base_camera, and the four steps do not locate it "
             f"({steps.failure or 'fewer than three base joints are seen'}); needed one of them; "
             "add a rough T_base_camera to dataset.yaml"
-            + (", or T_base_board to its block board." if part.dataset.board else ".")
+            + (", or T_base_board to its block board." if data.dataset.board else ".")
         )
     return [T if T is not None else RigidTransform.identity() for T in cameras]

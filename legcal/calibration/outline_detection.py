@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration.pipeline import nominal_scene
-from legcal.calibration.session import Session, start_session
+from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
+from legcal.calibration.pipeline import rough_placement
 from legcal.data import (
     Dataset,
     few_views,
@@ -83,8 +83,8 @@ def detect(
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     images = _rows_with_image(dataset)
     with worker_pool(workers) as pool:
-        session = start_session(dataset, pool, progress)
-        detection = _detected(session, images)
+        data = order_dataset(dataset, pool, progress)
+        detection = _detected(data, images)
         if output is not None:
             write_detection(detection, Path(output), pool, progress)
     return detection
@@ -108,21 +108,21 @@ def _rows_with_image(dataset: Dataset) -> IntArray:
     return np.array(rows, dtype=np.intp)
 
 
-def _detected(session: Session, images: IntArray) -> Detection:
+def _detected(data: OrderedDataset, images: IntArray) -> Detection:
     """Recognise and measure, and return what was found in the order of the files."""
-    dataset, order, photographs = session.dataset, session.order, session.photographs
-    scene, board = nominal_scene(session)
+    dataset, order, photographs = data.dataset, data.order, data.photographs
+    scene, board = rough_placement(data)
     outlines, cylinders = given_outlines(photographs), photographs.cylinders
     unplaced, notes = dict[str, str](), list[str]()
     if len(photographs.detect):
         T_board_camera = None if board is None else board.T_board_camera
-        seen = observe(photographs, scene, session.progress, T_board_camera)
+        seen = observe(photographs, scene, data.progress, T_board_camera)
         cameras, cylinders = seen.placement.T_base_camera, seen.photographs.cylinders
         placed = np.array([T is not None for T in cameras])
         row = seen.outlines.row
-        kept = placed[session.measurements.view[row]] | ~np.isin(row, photographs.detect)
+        kept = placed[data.measurements.view[row]] | ~np.isin(row, photographs.detect)
         outlines, unplaced = seen.outlines.choose(kept), seen.placement.unplaced
-        notes = _notes(session, seen.placement)
+        notes = _notes(data, seen.placement)
         # Legs of a view that could not be placed are drawn where its rough pose has them.
         drawn = tuple(
             T if T is not None else rough
@@ -140,13 +140,13 @@ def _detected(session: Session, images: IntArray) -> Detection:
         T_base_camera=tuple(scene.T_base_camera[v] for v in views.tolist()),
         rows=images,
         unplaced=unplaced,
-        notes=(*dataset.notes, *notes, *session.unreached_notes()),
+        notes=(*dataset.notes, *notes, *data.unreached_notes()),
     )
 
 
-def _notes(session: Session, placement: Placement) -> list[str]:
+def _notes(data: OrderedDataset, placement: Placement) -> list[str]:
     """Return what is to be said of the cameras and the images."""
-    views = session.measurements.views
+    views = data.measurements.views
     hints = [view.T_base_camera for view in views]
     notes = hint_notes([view.name for view in views], hints, placement.T_base_camera, BEFORE_FIT)
     without_gamma = [view.name for view in views if not view.camera.gamma_is_given]

@@ -6,19 +6,20 @@
 3. Four steps: joint centres, offsets and axes (3.2 to 3.5), where the images suffice.
 4. Joint fit of all parameters, started from the nominal model and from the steps.
 5. Measure again: all photographs are searched close to that fit and measured with all care, so
-   that nothing depends on where the search began, and 3 and 4 are repeated; once more where
-   outlines show the gamma of a camera that is not given.
+   that nothing depends on where the search began, and 3 and 4 are repeated. Where outlines show
+   the gamma of a camera that is not given, this is done again, up to ``MAX_GAMMA_ROUNDS`` times.
 6. Judge what the platform gains, and write the result.
 
 Where a dataset has a table of axes in place of images, 2 and 5 have nothing to do. Held-out images
-are searched like the others, and not fitted. Everything from 2 to 5 works in canonical order;
-:meth:`Estimate.in_file_order` is where a result gets back the order of the files.
+are searched like the others, and not fitted. Phases 2 to 5 work in canonical order;
+:meth:`Estimate.in_file_order` restores the order of the files.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -42,9 +43,9 @@ from legcal.calibration.joint_fit import (
     refine_from_best,
     resolve,
 )
+from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.outlier_images import outlier_images
 from legcal.calibration.result_folder import write_result
-from legcal.calibration.session import Options, Session, start_session
 from legcal.calibration.verdict import Calibration, judge
 from legcal.data import (
     Corners,
@@ -83,6 +84,37 @@ TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal 
 # predicts looks like other radii, so that residuals never show it [px].
 LIMB_BIAS = {"bias of many edges": 0.02}
 MIN_FOUND_AGAIN = 0.5  # of the outlines of an image
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What the images show and what was fitted to it, in canonical order."""
+
+    fitted: OrderedDataset  # the images that were fitted
+    outlines: Outlines  # of all images
+    steps: Steps
+    solution: Solution
+    corners: Corners | None  # of the calibration board in all images; None without a board
+    image_notes: tuple[str, ...] = ()  # on the images by themselves
+    fit_notes: tuple[str, ...] = ()  # on the images by the fit
+    other_radii: bool = False  # whether the images show other radii than the model has
+
+    @cached_property
+    def outliers(self) -> dict[int, str]:
+        """Notes on images that contradict the fit, by their row."""
+        return outlier_images(self.fitted.measurements, self.fitted.machine, self.solution)
+
+    def in_file_order(self) -> Estimate:
+        """Return the same with legs, views and images in the order of the files."""
+        dataset, order = self.fitted.in_file_order()
+        restore = self.fitted.order.restore  # of tables of all images
+        return replace(
+            self,
+            outlines=restore(self.outlines),
+            steps=self.steps.in_file_order(order),
+            solution=in_file_order(self.solution, order, dataset),
+            corners=None if self.corners is None else restore(self.corners),
+        )
 
 
 def calibrate(
@@ -162,10 +194,10 @@ def calibrate(
     # 2 to 5. Recognise, measure, four steps, joint fit, measure again.
     key = outline_key(dataset, choices)
     with worker_pool(workers) as pool:
-        session = start_session(dataset, pool, progress, fingerprint=key if use_cache else "")
-        estimate = estimate_session(session, fitted, Options(choices, criteria, transformation))
-    cache_notes = _store_outlines(session, estimate, key)
-    prediction = _compare_held_out(session, estimate, held_out) if len(held_out) else None
+        data = order_dataset(dataset, pool, progress, fingerprint=key if use_cache else "")
+        estimate = estimate_parameters(data, fitted, Options(choices, criteria, transformation))
+    cache_notes = _store_outlines(data, estimate, key)
+    prediction = _compare_held_out(data, estimate, held_out) if len(held_out) else None
 
     # 6. Judge and write.
     found = estimate.in_file_order()
@@ -176,7 +208,7 @@ def calibrate(
         *choices.notes,
         *identify_notes,
         *cache_notes,
-        *found.part.unreached_notes(),
+        *found.fitted.unreached_notes(),
         *board_notes(dataset, found.solution, found.corners),
         *found.solution.notes,
         *_camera_notes(dataset, found.solution),
@@ -194,33 +226,7 @@ def calibrate(
     return calibration
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """What the images show and what was fitted to it, in canonical order."""
-
-    part: Session  # the images that were fitted
-    outlines: Outlines  # of all images
-    steps: Steps
-    solution: Solution
-    corners: Corners | None  # of the calibration board in all images; None without a board
-    image_notes: tuple[str, ...] = ()  # on the images by themselves
-    fit_notes: tuple[str, ...] = ()  # on the images by the fit
-    other_radii: bool = False  # whether the images show other radii than the model has
-
-    def in_file_order(self) -> Estimate:
-        """Return the same with legs, views and images in the order of the files."""
-        fitted, order = self.part.part_of_files()
-        restore = self.part.order.restore  # of tables of all images
-        return replace(
-            self,
-            outlines=restore(self.outlines),
-            steps=self.steps.in_file_order(order),
-            solution=in_file_order(self.solution, order, fitted),
-            corners=None if self.corners is None else restore(self.corners),
-        )
-
-
-def estimate_session(session: Session, file_rows: IntArray, options: Options) -> Estimate:
+def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Options) -> Estimate:
     """Recognise and measure all images, and fit some of them: phases 2 to 5 of the method.
 
     Raises
@@ -228,42 +234,41 @@ def estimate_session(session: Session, file_rows: IntArray, options: Options) ->
     NotVisible, NotIdentifiable, DidNotConverge
         As the phases.
     """
-    rows = session.rows_of(file_rows)
+    rows = data.rows_of(file_rows)
     try:
-        return _estimate(session, rows, options)
+        return _estimate(data, rows, options)
     except NotIdentifiable:
-        if not session.plan.is_cached:
+        if not data.plan.is_cached:
             raise
     # Outlines that an earlier run left do not always determine the cameras; images do.
-    session = replace(session, plan=plan_dataset(session.dataset, ""))
-    return _estimate(session, rows, options)
+    data = replace(data, plan=plan_dataset(data.dataset, ""))
+    return _estimate(data, rows, options)
 
 
-def _estimate(session: Session, rows: IntArray, options: Options) -> Estimate:
-    """Search the images that have no outlines yet, and fit some."""
-    placement, board = nominal_scene(session)
-    part = session.part(rows)
+def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimate:
+    """Go through the phases; images whose outlines are given are not searched."""
+    placement, board = rough_placement(data)
+    fitted = data.at(rows)
     # Outlines that are kept were measured with some gamma: others of their camera must be as well.
-    kept_gammas = known_gammas(session.photographs.keep, session.measurements)
-    photographs = session.photographs.with_gammas(kept_gammas)
+    kept_gammas = known_gammas(data.photographs.keep, data.measurements)
+    photographs = data.photographs.with_gammas(kept_gammas)
     if len(photographs.detect) == 0:  # outlines, or axes, are given
-        estimate = _fit(part, given_outlines(photographs), placement, board, options)
-        return replace(
-            estimate, image_notes=session.plan.notes, fit_notes=_notes_on_images(estimate)
-        )
-    # Recognise and measure.
+        estimate = _fit(fitted, given_outlines(photographs), placement, board, options)
+        return replace(estimate, image_notes=data.plan.notes, fit_notes=_notes_on_images(estimate))
+    # 2. Recognise, and measure the outlines.
     T_board_camera = None if board is None else board.T_board_camera
-    seen = observe(photographs, placement, session.progress, T_board_camera, together=False)
+    seen = observe(photographs, placement, data.progress, T_board_camera, together=False)
     seen.placement.require_one()
     other_radii = bool(seen.placement.radii.factor)
     if other_radii:
-        session = replace(session, machine=seen.photographs.machine)
-        part = session.part(rows)
+        data = replace(data, machine=seen.photographs.machine)
+        fitted = data.at(rows)
     if options.every_leg and (seen.left_out or seen.placement.unplaced):
-        _refuse_too_few(session, rows, seen, options.choices)
-    # Four steps and joint fit; measure again near it, and fit again.
-    first = _fit(part, seen.outlines, seen.placement, board, options)
-    estimate = _measure_again(session, first, seen, board, options)
+        _refuse_too_few(data, rows, seen, options.choices)
+    # 3 and 4. Four steps and joint fit.
+    first = _fit(fitted, seen.outlines, seen.placement, board, options)
+    # 5. Measure again near that fit, and fit again.
+    estimate = _measure_again(data, first, seen, board, options)
     return replace(
         estimate,
         image_notes=(*seen.placement.all_notes, *_not_found_again(first, estimate)),
@@ -272,12 +277,12 @@ def _estimate(session: Session, rows: IntArray, options: Options) -> Estimate:
     )
 
 
-def nominal_scene(session: Session) -> tuple[Placement, BoardViews | None]:
+def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]:
     """Return where the nominal model has the legs, with rough cameras, and what shows the board."""
-    placement = nominal_placement(session.machine, session.measurements, session.T_base_platform)
-    board = observe_board(session)
+    placement = nominal_placement(data.machine, data.measurements, data.T_base_platform)
+    board = observe_board(data)
     if board is not None:
-        T_base_board = base_of_board(session.dataset, board, placement.T_base_camera)
+        T_base_board = base_of_board(data.dataset, board, placement.T_base_camera)
         if T_base_board is not None:
             cameras = board.cameras(T_base_board, placement.T_base_camera)
             placement = replace(placement, T_base_camera=cameras)
@@ -285,45 +290,45 @@ def nominal_scene(session: Session) -> tuple[Placement, BoardViews | None]:
 
 
 def _fit(
-    part: Session,
+    fitted: OrderedDataset,
     outlines: Outlines,
     placement: Placement,
     board: BoardViews | None,
     options: Options,
 ) -> Estimate:
     """Run the four steps, then the joint fit, with the outlines of all images."""
-    seen = outlines.at(part.rows)
-    seen = reject_unused_legs(seen, part.measurements, part.machine.leg_names)
+    seen = outlines.at(fitted.rows)
+    seen = reject_unused_legs(seen, fitted.measurements, fitted.machine.leg_names)
     if options.every_leg:
-        _refuse_unseen_legs(part, seen)
-    steps = four_steps(part, seen, board, options)
-    part.progress("Joint fit", 0, 1)
+        _refuse_unseen_legs(fitted, seen)
+    steps = four_steps(fitted, seen, board, options)
+    fitted.progress("Joint fit", 0, 1)
     choices = options.choices
-    if any(part.measurements.image) and "detected" in seen.source:
+    if any(fitted.measurements.image) and "detected" in seen.source:
         choices = replace(choices, least_shared_px={**LIMB_BIAS, **choices.least_shared_px})
     solution = refine_from_best(
-        part.fitted_legs,
-        part.measurements,
+        fitted.fitted_legs,
+        fitted.measurements,
         seen,
-        starts(part, seen, placement, steps, board),
-        axes=part.axes,
-        board=None if board is None else board.at(part.rows),
+        starts(fitted, seen, placement, steps, board),
+        axes=fitted.axes,
+        board=None if board is None else board.at(fitted.rows),
         choices=choices,
     )
-    part.progress("Joint fit", 1, 1)
+    fitted.progress("Joint fit", 1, 1)
     corners = None if board is None else board.reject_outliers(solution)
-    return Estimate(part, outlines, steps, solution, corners)
+    return Estimate(fitted, outlines, steps, solution, corners)
 
 
 def _measure_again(
-    session: Session,
+    data: OrderedDataset,
     estimate: Estimate,
     seen: ImageObservations,
     board: BoardViews | None,
     options: Options,
 ) -> Estimate:
     """Search the photographs again close to the fit, and fit again."""
-    cameras, view = seen.placement.T_base_camera, session.measurements.view
+    cameras, view = seen.placement.T_base_camera, data.measurements.view
     rows = [
         row
         for row in seen.photographs.detect.tolist()
@@ -336,9 +341,9 @@ def _measure_again(
     given = known_gammas(again.keep, again.measurements)
     gammas: list[tuple[EstimatedGamma, ...]] = []
     for _ in range(1 + MAX_GAMMA_ROUNDS):
-        placement = _fitted_placement(session, estimate.solution, seen)
-        outlines = measure_photographs(again, placement, session.progress)
-        estimate = _fit(estimate.part, outlines, placement, board, options)
+        placement = _fitted_placement(data, estimate.solution, seen)
+        outlines = measure_photographs(again, placement, data.progress)
+        estimate = _fit(estimate.fitted, outlines, placement, board, options)
         gammas.append(estimate.solution.gammas)
         others = {name: gamma for name, gamma in next_gammas(gammas).items() if name not in given}
         if not others:
@@ -363,13 +368,15 @@ def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
     return machine.with_cylinders(cylinders)
 
 
-def _fitted_placement(session: Session, solution: Solution, seen: ImageObservations) -> Placement:
+def _fitted_placement(
+    data: OrderedDataset, solution: Solution, seen: ImageObservations
+) -> Placement:
     """Return where a fit puts the legs, R_b laid on the nominal one; no camera is placed anew."""
-    T_base_Rb = session.machine.T_base_Rb
+    T_base_Rb = data.machine.T_base_Rb
     A = T_base_Rb.apply(np.array([leg.A for leg in solution.legs]))
     B = np.array([leg.B for leg in solution.legs])
-    placed = np.array([(T_base_Rb * T).apply(B) for T in session.poses_by(solution.legs)])
-    pose = session.measurements.pose
+    placed = np.array([(T_base_Rb * T).apply(B) for T in data.poses_by(solution.legs)])
+    pose = data.measurements.pose
     cameras = tuple(
         None if known is None else T_base_Rb * T.inv()
         for known, T in zip(seen.placement.T_base_camera, solution.T_camera_Rb, strict=True)
@@ -378,70 +385,65 @@ def _fitted_placement(session: Session, solution: Solution, seen: ImageObservati
     return Placement.of_fit(A_base, placed[pose], cameras, seen.blur)
 
 
-def _outlier_images(estimate: Estimate) -> dict[int, str]:
-    part = estimate.part
-    return outlier_images(part.measurements, part.machine, estimate.solution)
-
-
 def _not_found_again(first: Estimate, again: Estimate) -> list[str]:
     """Return the notes of a first fit on images in which hardly anything is found near it."""
-    after, o = _outlier_images(again), again.solution.outlines
+    after, o = again.outliers, again.solution.outlines
     return [
         note
-        for row, note in _outlier_images(first).items()
+        for row, note in first.outliers.items()
         if row not in after and o.used[o.row == row].mean() < MIN_FOUND_AGAIN
     ]
 
 
 def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
     """Return rough camera poses that the fit contradicts, and images that contradict the fit."""
-    part, o = estimate.part, estimate.solution.outlines
-    shown = set(part.measurements.view[o.row[o.used]].tolist())
-    views = part.measurements.views
+    fitted, o = estimate.fitted, estimate.solution.outlines
+    shown = set(fitted.measurements.view[o.row[o.used]].tolist())
+    views = fitted.measurements.views
     cameras = [
-        part.machine.T_base_Rb * T.inv() if v in shown else None
+        fitted.machine.T_base_Rb * T.inv() if v in shown else None
         for v, T in enumerate(estimate.solution.T_camera_Rb)
     ]
     hints = hint_notes([view.name for view in views], [v.T_base_camera for v in views], cameras)
-    return (*hints, *_outlier_images(estimate).values())
+    return (*hints, *estimate.outliers.values())
 
 
 def _refuse_too_few(
-    session: Session, rows: IntArray, seen: ImageObservations, choices: Choices
+    data: OrderedDataset, rows: IntArray, seen: ImageObservations, choices: Choices
 ) -> None:
     """Raise NotIdentifiable if the images that are left do not determine the parameters."""
     cameras, notes = seen.placement.T_base_camera, seen.placement.all_notes
     left = [
         row
         for row in rows.tolist()
-        if row not in seen.left_out and cameras[session.measurements.view[row]] is not None
+        if row not in seen.left_out and cameras[data.measurements.view[row]] is not None
     ]
     if not left:
         raise NotVisible(list(notes))
     try:
-        check_identifiable(session.part(np.array(left)).part_of_files()[0], choices)
+        check_identifiable(data.at(np.array(left)).in_file_order()[0], choices)
     except NotIdentifiable as failure:
         raise NotIdentifiable([*failure.problems, *notes]) from None
 
 
-def _refuse_unseen_legs(part: Session, outlines: Outlines) -> None:
+def _refuse_unseen_legs(fitted: OrderedDataset, outlines: Outlines) -> None:
     """Raise NotVisible if no image shows a leg that its view says it does."""
-    if part.axes is not None:
+    if fitted.axes is not None:
         return
     shown = set(outlines.leg[outlines.used].tolist())
-    views = [part.measurements.views[v] for v in np.unique(part.measurements.view).tolist()]
+    views = [fitted.measurements.views[v] for v in np.unique(fitted.measurements.view).tolist()]
     unseen = [
         leg.name
-        for j, leg in enumerate(part.machine.legs)
+        for j, leg in enumerate(fitted.machine.legs)
         if j not in shown
         and leg.cylinders
         and any(view.legs is None or leg.name in view.legs for view in views)
     ]
     if unseen:
         raise NotVisible(
-            f"{part.dataset.folder}: the machine could not be calibrated: found no used outline of "
-            f"{', '.join(unseen)} in any image, needed some of every leg; add images that show it, "
-            "or name the legs of each view in dataset.yaml to leave it to the readings."
+            f"{fitted.dataset.folder}: the machine could not be calibrated: found no used outline "
+            f"of {', '.join(unseen)} in any image, needed some of every leg; add images that show "
+            "it, or name the legs of each view in dataset.yaml to leave it to the readings."
         )
 
 
@@ -453,13 +455,13 @@ def outline_key(dataset: Dataset, choices: Choices) -> str:
     return fingerprint(dataset, detection_settings() | choices.document())
 
 
-def _store_outlines(session: Session, estimate: Estimate, key: str) -> list[str]:
+def _store_outlines(data: OrderedDataset, estimate: Estimate, key: str) -> list[str]:
     """Leave outlines and notes on images beside the dataset; return a note if that fails."""
-    plan = estimate.part.plan  # not that of the session, where stored outlines were of no use
+    plan = estimate.fitted.plan  # other than that of the data where stored outlines did not suffice
     if estimate.other_radii or len(plan.detect) == 0:
         return []
-    outlines = session.order.restore(estimate.outlines)
-    note = store_outlines(session.dataset, outlines, key, plan.given, estimate.image_notes)
+    outlines = data.order.restore(estimate.outlines)
+    note = store_outlines(data.dataset, outlines, key, plan.given, estimate.image_notes)
     return [note] if note else []
 
 
@@ -500,9 +502,9 @@ def _split(dataset: Dataset, holdout: float | None) -> tuple[IntArray, IntArray]
     return split_images(dataset, holdout)
 
 
-def _compare_held_out(session: Session, estimate: Estimate, file_rows: IntArray) -> HeldOut:
+def _compare_held_out(data: OrderedDataset, estimate: Estimate, file_rows: IntArray) -> HeldOut:
     """Return how well the fit predicts the held-out images."""
-    held_out, solution = session.part(session.rows_of(file_rows)), estimate.solution
+    held_out, solution = data.at(data.rows_of(file_rows)), estimate.solution
     outlines = estimate.outlines.at(held_out.rows)
     outlines = reject_unused_legs(outlines, held_out.measurements, held_out.machine.leg_names)
     poses = held_out.poses_by(solution.legs)

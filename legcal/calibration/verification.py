@@ -30,9 +30,9 @@ from legcal.calibration.joint_fit import (
     Solution,
     known_parameters,
 )
-from legcal.calibration.pipeline import estimate_session, outline_key
+from legcal.calibration.ordered_dataset import Options, order_dataset
+from legcal.calibration.pipeline import estimate_parameters, outline_key
 from legcal.calibration.result_folder import EarlierResult, read_result
-from legcal.calibration.session import Options, start_session
 from legcal.data import Dataset, load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.estimation import Frames
@@ -189,9 +189,9 @@ def check(
     prior = _Prior.of(dataset.machine, earlier)
     choices = _choices(dataset, earlier, prior)
     with worker_pool(workers) as pool:
-        session = start_session(dataset, pool, progress, fingerprint=outline_key(dataset, choices))
+        data = order_dataset(dataset, pool, progress, fingerprint=outline_key(dataset, choices))
         every_row = np.arange(dataset.measurements.n_rows)
-        found = estimate_session(session, every_row, Options(choices, every_leg=False))
+        found = estimate_parameters(data, every_row, Options(choices, every_leg=False))
     if dataset.axes is None and not found.outlines.used.any():
         refusal = (
             f"{dataset.folder}: the earlier result could not be tested: found no used outline in "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -10,21 +9,7 @@ import typer
 
 from legcal.cli.options import DatasetArgument, JsonOption, image_workers, show
 from legcal.errors import UsageError
-
-
-class Criteria(StrEnum):
-    """What the four steps minimise."""
-
-    DEFAULT = "default"
-    LITERAL = "literal"
-
-
-class Transformation(StrEnum):
-    """How the four steps compute where the platform is, eq (18)."""
-
-    POINTS = "points"
-    CROSS_PRODUCT = "cross_product"
-
+from legcal.paper import Criteria, Transformation
 
 _TESTS = "Tests of a result"
 _PARAMETERS = "Parameters by name (or a pattern: '*.offset'); each may be repeated"
@@ -40,7 +25,7 @@ def calibrate(
     criteria: Annotated[
         Criteria,
         typer.Option(help="What the four steps minimise: legcal's criteria, or the paper's."),
-    ] = Criteria.DEFAULT,
+    ] = "default",
     transformation: Annotated[
         Transformation | None,
         typer.Option(
@@ -111,7 +96,7 @@ def calibrate(
             "--free": free,
             "--holdout": holdout,
             "--fresh": fresh or None,
-            "--criteria": None if criteria is Criteria.DEFAULT else criteria,
+            "--criteria": None if criteria == "default" else criteria,
             "--transformation": transformation,
         }
         named = [name for name, value in others.items() if value is not None]
@@ -139,8 +124,8 @@ def calibrate(
             dataset,
             output=output,
             progress=progress,
-            criteria=criteria.value,
-            transformation=None if transformation is None else transformation.value,
+            criteria=criteria,
+            transformation=transformation,
             use_cache=not fresh,
             workers=image_workers(),
             priors=prior or (),

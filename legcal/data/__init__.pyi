@@ -22,6 +22,11 @@ from .dataset import ImageReader as ImageReader
 from .dataset import load_dataset as load_dataset
 from .holdout import dataset_at as dataset_at
 from .holdout import split_images as split_images
+from .image_tables import Order as Order
+from .image_tables import canonical_order as canonical_order
+from .image_tables import inverse as inverse
+from .image_tables import measurements_at as measurements_at
+from .image_tables import reorder_measurements as reorder_measurements
 from .measurements import Measurements as Measurements
 from .measurements import View as View
 from .measurements import few as few
@@ -30,7 +35,6 @@ from .measurements import reading_columns as reading_columns
 from .measurements import readings_in as readings_in
 from .measurements import row_names as row_names
 from .outlines import OUTLINE_COLUMNS as OUTLINE_COLUMNS
-from .outlines import QUALITY as QUALITY
 from .outlines import Outlines as Outlines
 from .outlines import is_edited as is_edited
 from .outlines import join_outlines as join_outlines
@@ -41,9 +45,3 @@ from .outlines import write_observations as write_observations
 from .overrides import Action as Action
 from .overrides import Override as Override
 from .overrides import overrides_of_call as overrides_of_call
-from .rows import Order as Order
-from .rows import Rows as Rows
-from .rows import canonical_order as canonical_order
-from .rows import inverse as inverse
-from .rows import measurements_at as measurements_at
-from .rows import reorder_measurements as reorder_measurements

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.data.image_tables import ImageTable
 from legcal.data.measurements import (
     Measurements,
     find_legs,
@@ -23,7 +24,6 @@ from legcal.data.measurements import (
     refuse_unknown_rows,
 )
 from legcal.data.outlines import Outlines
-from legcal.data.rows import Rows
 from legcal.errors import NotVisible
 from legcal.files import Column, format_table, read_table, write_atomically
 from legcal.geometry import Array, IntArray, nearest_point_to_line, normal_basis
@@ -81,7 +81,7 @@ _FLOOR_PX = 1e-3  # no outline is known better: keeps weights finite, whatever a
 
 
 @dataclass(frozen=True, eq=False)
-class LegAxes(Rows):
+class LegAxes(ImageTable):
     """Axes of legs in camera frames, oriented from base to platform: the input of steps 1 to 4.
 
     An axis is known as ``u + alpha1 e1 + alpha2 e2`` through ``M + beta1 e1 + beta2 e2``.

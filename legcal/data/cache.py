@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from legcal.data.dataset import CACHE_NAME, OBSERVATIONS_NAME, Dataset
+from legcal.data.image_tables import canonical_order, reorder_measurements
 from legcal.data.measurements import places
 from legcal.data.outlines import (
     Outlines,
@@ -23,7 +24,6 @@ from legcal.data.outlines import (
     no_outlines,
     write_observations,
 )
-from legcal.data.rows import canonical_order, reorder_measurements
 from legcal.files import FileSchema, write_atomically
 from legcal.geometry import BoolArray, IntArray
 from legcal.version import __version__

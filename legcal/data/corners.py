@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.data.image_tables import ImageTable
 from legcal.data.measurements import Measurements, find_rows, places, refuse_unknown_rows
 from legcal.data.outlines import SOURCES, UNLESS_REJECTED, VERDICT_COLUMNS, VERDICTS
-from legcal.data.rows import Rows
 from legcal.files import Column, format_table, read_table, write_atomically
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.vision import Board
@@ -25,7 +25,7 @@ SIGMA_RANGE = (1e-6, 100.0)  # [px]: no corner is known better, and worse says n
 
 
 @dataclass(frozen=True, eq=False)
-class Corners(Rows):
+class Corners(ImageTable):
     """Corners of the board in images, one row a corner."""
 
     corner: IntArray  # (n,) index into Board.points

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from legcal.data.dataset import Dataset
-from legcal.data.rows import canonical_order, measurements_at
+from legcal.data.image_tables import canonical_order, measurements_at
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.geometry import BoolArray, IntArray
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.data.image_tables import ImageTable
 from legcal.data.measurements import (
     Measurements,
     find_legs,
@@ -22,7 +23,6 @@ from legcal.data.measurements import (
     refuse_unknown_legs,
     refuse_unknown_rows,
 )
-from legcal.data.rows import Rows
 from legcal.files import (
     Column,
     Table,
@@ -73,7 +73,7 @@ def _unknown() -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Outlines(Rows):
+class Outlines(ImageTable):
     """Outlines of cylinders in images, one row an outline (eqs 2, 3, 5).
 
     What tells how well an outline was seen and how it depends on the gamma may be left out; it is

@@ -2,11 +2,11 @@ from .conditions import Condition as Condition
 from .conditions import count_conditions as count_conditions
 from .conditions import three_legs_at_once as three_legs_at_once
 from .conditions import two_directions as two_directions
+from .criteria import Criteria as Criteria
+from .criteria import Transformation as Transformation
 from .four_steps import run_base_steps as run_base_steps
 from .four_steps import run_platform_steps as run_platform_steps
 from .four_steps import run_steps as run_steps
-from .nominal import Criteria as Criteria
 from .nominal import NominalMachine as NominalMachine
-from .nominal import Transformation as Transformation
 from .nominal import nominal_machine as nominal_machine
 from .nominal import point_like_machine as point_like_machine

@@ -8,6 +8,7 @@ import numpy as np
 
 from legcal.data import LegAxes, Measurements
 from legcal.machine import KinematicParameters, Leg
+from legcal.paper.criteria import Criteria, Transformation
 from legcal.paper.joints_in_base import JointsInBase, locate_joints_in_base
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
 from legcal.paper.leg_directions import (
@@ -15,7 +16,7 @@ from legcal.paper.leg_directions import (
     find_outliers,
     observed_directions,
 )
-from legcal.paper.nominal import Criteria, NominalMachine, Transformation
+from legcal.paper.nominal import NominalMachine
 from legcal.paper.offsets import identify_offsets
 from legcal.paper.platform import locate_platform_joints
 

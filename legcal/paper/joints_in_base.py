@@ -27,6 +27,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, components
 from legcal.paper.camera_poses import camera_poses, signs_seen
+from legcal.paper.criteria import Criteria
 from legcal.paper.joints_in_camera import JointsInCamera, with_signs
 from legcal.paper.least_squares import LeastSquares, Solution, Term, solve_least_squares
 from legcal.paper.motions import (
@@ -38,7 +39,7 @@ from legcal.paper.motions import (
     turned_points,
     whitener,
 )
-from legcal.paper.nominal import Criteria, NominalMachine
+from legcal.paper.nominal import NominalMachine
 from legcal.paper.unknowns import BASE_TURNS, OF_A, Unknowns
 
 _MAX_SIGMA_TURN = 1.0  # [rad] of an axis; beyond, nothing is known of it

@@ -21,7 +21,8 @@ from legcal.data import LegAxes, Measurements
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis
 from legcal.paper.camera_poses import camera_poses, side_of_plane, signs_seen
-from legcal.paper.nominal import Criteria, NominalMachine
+from legcal.paper.criteria import Criteria
+from legcal.paper.nominal import NominalMachine
 
 _SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
 _MAX_SIGMA_CENTRE = 0.1  # of the distance to the camera

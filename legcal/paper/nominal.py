@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +24,6 @@ from legcal.machine import (
     parameters_of_legs,
     point_like_legs,
 )
-
-Criteria = Literal["default", "literal"]
-Transformation = Literal["points", "cross_product"]  # how (18) is solved
 
 
 @dataclass(frozen=True, eq=False)

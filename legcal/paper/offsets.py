@@ -21,9 +21,10 @@ import numpy as np
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, IntArray
+from legcal.paper.criteria import Criteria
 from legcal.paper.least_squares import LeastSquares, Solution, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
-from legcal.paper.nominal import Criteria, NominalMachine
+from legcal.paper.nominal import NominalMachine
 from legcal.paper.unknowns import LENGTH, Unknowns
 
 _REWEIGHTINGS = 2

@@ -27,10 +27,10 @@ from legcal.geometry import (
     register_groups,
     register_in_plane,
 )
+from legcal.paper.criteria import Transformation
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
 from legcal.paper.motions import moved, moved_points
-from legcal.paper.nominal import Transformation
 
 _FLAT = 1e-3  # of their largest distance from their centre: how far points of a line are off it
 

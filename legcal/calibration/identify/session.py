@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.session import nominal_poses
+from legcal.calibration.ordered_dataset import nominal_poses
 from legcal.data import Dataset
 from legcal.estimation import Frames
 from legcal.geometry import Array, BoolArray, IntArray

@@ -18,7 +18,7 @@ from legcal.calibration.measurement_noise.repeatability import (
     group_rows,
     leg_orientations,
 )
-from legcal.calibration.session import start_session
+from legcal.calibration.ordered_dataset import order_dataset
 from legcal.data import Dataset, Measurements, Outlines, load_dataset, no_outlines
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible
 from legcal.geometry import Array, BoolArray
@@ -82,14 +82,14 @@ def measure_noise(
     """
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     with worker_pool(workers) as executor:
-        session = start_session(dataset, executor, progress)
-        machine, measurements = session.machine, session.measurements
-        paths = [dataset.image_path(row) for row in session.order.rows.tolist()]
+        data = order_dataset(dataset, executor, progress)
+        machine, measurements = data.machine, data.measurements
+        paths = [dataset.image_path(row) for row in data.order.rows.tolist()]
         has_image = np.array(
             [path is not None and os.path.exists(path) for path in paths], dtype=np.bool_
         )
         repeats = find_repeats(measurements, has_image, dataset.table_path)
-        every = replace(session.photographs, detect=np.flatnonzero(has_image), keep=no_outlines())
+        every = replace(data.photographs, detect=np.flatnonzero(has_image), keep=no_outlines())
         placement, outlines = _search(every, repeats, progress)
     methods = []
     for name, table in outlines.items():

@@ -1,4 +1,4 @@
-"""A session: the images and readings of a dataset in canonical order, where every job starts.
+"""A dataset in canonical order: images and readings as every job takes them.
 
 Rows, views and legs are sorted once, here, so that no result depends on the order of the files, and
 never reordered after. A job puts its result back into the order of the files where it ends.
@@ -50,7 +50,7 @@ _MAX_NAMED = 3  # images in a note
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """What is estimated of a session, and how."""
+    """What is estimated, and how."""
 
     choices: Choices  # of the parameters
     criteria: Criteria | None = None  # of the four steps; None leaves them out
@@ -59,7 +59,7 @@ class Options:
 
 
 @dataclass(frozen=True, eq=False)
-class Session:
+class OrderedDataset:
     """A dataset in canonical order, with all of its images or some."""
 
     dataset: Dataset  # all images, in the order of its files
@@ -127,7 +127,7 @@ class Session:
         """Return the rows here of images that are given by their rows in the files."""
         return np.sort(inverse(self.order.rows)[file_rows])
 
-    def part(self, rows: IntArray) -> Session:
+    def at(self, rows: IntArray) -> OrderedDataset:
         """Return some of the images, by their rows here, rising."""
         return replace(
             self,
@@ -136,23 +136,23 @@ class Session:
             rows=self.rows[rows],
         )
 
-    def part_of_files(self) -> tuple[Dataset, Order]:
+    def in_file_order(self) -> tuple[Dataset, Order]:
         """Return the images that are here in the order of the files, and the order of these."""
         file_rows = self.order.rows[self.rows]
         order = replace(self.order, rows=inverse(np.argsort(file_rows)))
         return dataset_at(self.dataset, np.sort(file_rows)), order
 
 
-def start_session(
+def order_dataset(
     dataset: Dataset, pool: Run, progress: Report, *, fingerprint: str = ""
-) -> Session:
+) -> OrderedDataset:
     """Put a dataset into canonical order, and see which images are to be searched.
 
     Outlines that an earlier run stored are used if they have this fingerprint.
     """
     names = dataset.machine.leg_names
     order = canonical_order(dataset.measurements, names)
-    return Session(
+    return OrderedDataset(
         dataset=dataset,
         order=order,
         plan=plan_dataset(dataset, fingerprint),

@@ -1,8 +1,8 @@
 """Tables of what images show: rows chosen, joined, put in order, and brought to other images.
 
 A table (outlines, axes, corners) has one entry a row in each of its fields, and names in ``row``
-the image that shows it, a row of the measurements. Sessions are put into canonical order where
-they are loaded, so that results do not depend on the order of files.
+the image that shows it, a row of the measurements. Jobs put datasets into canonical order before
+they begin, so that results do not depend on the order of files.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from legcal.geometry import BoolArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class ImageTable:
     """A table whose fields are arrays or tuples with one entry a row."""
 
     row: IntArray  # (n,) of the measurements
@@ -85,7 +85,7 @@ class Rows:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
-_Table = TypeVar("_Table", bound=Rows)
+_Table = TypeVar("_Table", bound=ImageTable)
 
 
 @dataclass(frozen=True, eq=False)
