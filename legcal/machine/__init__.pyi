@@ -38,7 +38,6 @@ from .kinematics import forward_kinematics as forward_kinematics
 from .kinematics import forward_kinematics_many as forward_kinematics_many
 from .kinematics import inverse_kinematics as inverse_kinematics
 from .kinematics import joint_values as joint_values
-from .kinematics import leg_vectors as leg_vectors
 from .kinematics import platform_in_base as platform_in_base
 from .kinematics import platform_pose as platform_pose
 from .kinematics import pose_differences as pose_differences
@@ -63,6 +62,7 @@ from .mobility import leg_scale as leg_scale
 from .mobility import singularity as singularity
 from .model import Machine as Machine
 from .model import describe as describe
+from .model import leg_vectors as leg_vectors
 from .model_builder import create_model as create_model
 from .model_writer import Axes as Axes
 from .model_writer import calibrated_axis as calibrated_axis

@@ -62,11 +62,18 @@ class ClosedChain:
                 "it reads; correct the URDF."
             ) from error
         self._data: Any = self._model.createData()
+        self._frames: dict[str, int] = {}  # by their names, as far as asked for
         self._anchors = [self._anchor(closure) for closure in self.closures]
         self._anchor_data = [anchor.createData() for anchor in self._anchors]
         self.nq: int = self._model.nq
         self.nv: int = self._model.nv
         self.n_rows = sum(closure.rows for closure in self.closures)
+        self._joints = {
+            name: (int(joint.idx_q), int(joint.idx_v))
+            for name, joint in zip(self._model.names, self._model.joints, strict=True)
+        }
+        self._placed_at = self._linearized_at = b""  # the configurations of Pinocchio's work space
+        self._linear = np.zeros(0), np.zeros((0, 0))  # what linearize returned last
 
     def __reduce__(self) -> tuple[type["ClosedChain"], tuple[object, ...]]:
         return ClosedChain, (self.text, self.closures, self.normals)
@@ -84,7 +91,7 @@ class ClosedChain:
 
         What opens across a plane counts here, in contrast to :meth:`linearize`.
         """
-        pin.forwardKinematics(self._model, self._data, configuration)
+        self._place(configuration)
         pieces = []
         for anchor, data in zip(self._anchors, self._anchor_data, strict=True):
             anchor.calc(self._model, self._data, data)
@@ -96,7 +103,9 @@ class ClosedChain:
 
         Three rows [m] for a point, six [m, rad] for a frame, in the order of the closures.
         """
-        model, data = self._model, self._data
+        model, data, here = self._model, self._data, configuration.tobytes()
+        if here == self._linearized_at == self._placed_at:
+            return self._linear
         pin.computeJointJacobians(model, data, configuration)
         residual, jacobian = np.empty(self.n_rows), np.empty((self.n_rows, self.nv))
         row = 0
@@ -114,6 +123,8 @@ class ClosedChain:
                 residual[rows], block = held @ residual[rows], held @ block
             jacobian[rows] = block
             row = rows.stop
+        residual.flags.writeable = jacobian.flags.writeable = False
+        self._placed_at, self._linearized_at, self._linear = here, here, (residual, jacobian)
         return residual, jacobian
 
     def placement(self, configuration: Array, base: str, frame: str) -> tuple[Array, Array]:
@@ -121,19 +132,19 @@ class ClosedChain:
 
         The same as :meth:`pose` without the cost of the type, for inner loops.
         """
-        pin.forwardKinematics(self._model, self._data, configuration)
+        self._place(configuration)
         M = self._placement(base).actInv(self._placement(frame))
         return M.rotation, M.translation
 
     def turns(self, configuration: Array, base: str, frames: Sequence[str]) -> Array:
         """Return the rotations (n, 3, 3) of frames in another one at a configuration."""
-        pin.forwardKinematics(self._model, self._data, configuration)
+        self._place(configuration)
         R = self._placement(base).rotation.T
         return np.array([R @ self._placement(frame).rotation for frame in frames])
 
     def pose(self, configuration: Array, base: str, frame: str) -> RigidTransform:
         """Return T_base_frame between two frames at a configuration."""
-        pin.forwardKinematics(self._model, self._data, configuration)
+        self._place(configuration)
         M = self._placement(base).actInv(self._placement(frame))
         return motion_of(M.rotation, M.translation)
 
@@ -162,11 +173,11 @@ class ClosedChain:
 
     def q_index(self, joint: str) -> int:
         """Return where the value of a joint stands in a configuration."""
-        return int(self._model.joints[self._model.getJointId(joint)].idx_q)
+        return self._joints[joint][0]
 
     def v_index(self, joint: str) -> int:
         """Return where the rate of a joint stands in a tangent vector."""
-        return int(self._model.joints[self._model.getJointId(joint)].idx_v)
+        return self._joints[joint][1]
 
     def rotation_columns(self) -> IntArray:
         """Return the tangent coordinates that are angles."""
@@ -193,7 +204,7 @@ class ClosedChain:
 
         A planar joint takes the part of the motion that lies in its plane.
         """
-        pin.forwardKinematics(self._model, self._data, configuration)
+        self._place(configuration)
         index = self._model.getJointId(joint)
         before = self._data.oMi[self._model.parents[index]] * self._model.jointPlacements[index]
         after = self._data.oMi[index].actInv(self._placement(platform))
@@ -213,16 +224,27 @@ class ClosedChain:
             placed[start : start + 7] = pin.SE3ToXYZQUAT(motion)
         return placed
 
+    def _place(self, configuration: Array) -> None:
+        """Place all joints, unless they are where they should be."""
+        here = configuration.tobytes()
+        if here != self._placed_at:
+            pin.forwardKinematics(self._model, self._data, configuration)
+            self._placed_at = here
+
     def _frame(self, name: str) -> int:
         """Return the index of a link's frame, or of a joint's where no link has the name."""
+        if name in self._frames:
+            return self._frames[name]
         if self._model.existBodyName(name):
-            return int(self._model.getFrameId(name, pin.BODY))
-        if not self._model.existFrame(name):
+            self._frames[name] = int(self._model.getFrameId(name, pin.BODY))
+        elif self._model.existFrame(name):
+            self._frames[name] = int(self._model.getFrameId(name))
+        else:
             raise ModelError(
                 f"the frame '{name}' could not be found: the URDF has no link or joint of that "
                 "name, needed one; correct closed_loop."
             )
-        return int(self._model.getFrameId(name))
+        return self._frames[name]
 
     def _placement(self, name: str) -> Any:
         """Return the placement of a frame in the world at the last kinematics."""

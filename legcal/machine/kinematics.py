@@ -32,7 +32,7 @@ from legcal.machine.mobility import (
     excludes_singularity,
     leg_scale,
 )
-from legcal.machine.model import Machine
+from legcal.machine.model import Machine, leg_vectors
 from legcal.machine.solver import Equations, Retraction, moved, newton, solve, walk_in_steps
 
 POSE_TOLERANCE = 1e-11  # [m, rad]: where a held platform is
@@ -275,11 +275,6 @@ def pose_differences(
     return displacement, np.asarray(Rotation.from_matrix(between).magnitude())
 
 
-def leg_vectors(machine: Machine, T_base_platform: RigidTransform) -> Array:
-    """Return the vectors from base to platform joint of every leg, (n_legs, 3), base link [m]."""
-    return np.asarray(T_base_platform.apply(machine.B_platform)) - machine.A_base
-
-
 def readings_at(machine: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the joint value of every leg at a pose, q = sign (|AB| - q0), (n_legs,) [m]."""
     lengths = np.linalg.norm(leg_vectors(machine, T_base_platform), axis=1)
@@ -362,7 +357,10 @@ def project_pose(
         return T, None
     scale = leg_scale(machine, T)
     first = constraints_at(machine, T)
-    if np.abs(first.values).max() > max_error * scale:
+    worst = np.abs(first.values).max()
+    if worst <= TOLERANCE * scale:
+        return T, None
+    if worst > max_error * scale:
         return T, describe_worst(machine, first)
 
     def equations(poses: Array) -> tuple[Array, Array]:
@@ -605,7 +603,7 @@ def follow_pose(
     machine: Machine, T: RigidTransform, first: Array, last: Array, min_step: float
 ) -> tuple[RigidTransform, float]:
     """Return the pose followed from T at first to last readings, and which part of it is done."""
-    pose, known = T.as_matrix()[None, :3], dimensionless(machine, T)
+    pose, known = T.as_matrix()[:3], dimensionless(machine, T)
     motors = list(machine.motors)
 
     def attempt(part: float) -> bool:
@@ -618,7 +616,7 @@ def follow_pose(
             found.values[:, found.measured] -= lengthening
             return found.values, found.by_pose
 
-        scale = leg_scale(machine, motion_of(pose[0, :, :3], pose[0, :, 3]))
+        scale = leg_scale(machine, motion_of(pose[:, :3], pose[:, 3]))
         unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
         found = newton(
             equations,
@@ -641,11 +639,11 @@ def follow_pose(
             signs = [float(np.sign(np.linalg.det(J))) for J in (known, jacobian)]
             if not signs[0] == signs[1] != 0.0:
                 return False
-        pose, known = found.points, jacobian
+        pose, known = found.points[0], jacobian
         return True
 
     done = walk_in_steps(attempt, min_step)
-    return motion_of(pose[0, :, :3], pose[0, :, 3]), done
+    return motion_of(pose[:, :3], pose[:, 3]), done
 
 
 def _closed_from(
@@ -654,7 +652,7 @@ def _closed_from(
     """Return the configuration closed with the motors held, None if not near, and its Jacobian."""
     equations, retract = _held(machine, None, 1.0, free)
     found = newton(
-        equations, retract, configuration[None], tolerance=0.01 * CLOSED, contraction=CONTRACTION
+        equations, retract, configuration, tolerance=0.01 * CLOSED, contraction=CONTRACTION
     )
     return found.points[0] if found.worst[0] < CLOSED else None, found.jacobian[0]
 

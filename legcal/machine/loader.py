@@ -17,7 +17,7 @@ from legcal.machine.cylinders import at_visible_heights, visual_cylinders, with_
 from legcal.machine.equations import leg_equations
 from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home, legs_outside
-from legcal.machine.kinematics import leg_vectors, platform_pose, readings_at, slider_columns
+from legcal.machine.kinematics import platform_pose, readings_at, slider_columns
 from legcal.machine.leg import (
     MAX_LEGS,
     MAX_LENGTH,
@@ -30,7 +30,7 @@ from legcal.machine.leg import (
     LegKind,
 )
 from legcal.machine.mobility import CONFIGURATIONS, generic_configurations, mobility, singularity
-from legcal.machine.model import Machine
+from legcal.machine.model import Machine, leg_vectors
 from legcal.machine.parameters import n_frame_legs
 from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.spanning_tree import Source

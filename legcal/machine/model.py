@@ -142,6 +142,12 @@ def _fixed(array: Array) -> Array:
     return array
 
 
+def leg_vectors(machine: Machine, T_base_platform: RigidTransform) -> Array:
+    """Return the vectors from base to platform joint of every leg, (n_legs, 3), base link [m]."""
+    matrix = T_base_platform.as_matrix()  # RigidTransform.apply is slow on few points
+    return np.asarray(machine.B_platform @ matrix[:3, :3].T + matrix[:3, 3] - machine.A_base)
+
+
 def describe(machine: Machine) -> dict[str, Any]:
     """Return the document of ``legcal inspect --json``: legs with types, frames, mobility.
 

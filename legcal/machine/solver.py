@@ -56,8 +56,8 @@ def solve(
     counts. Steps are damped from the first if *damped*, else where one does not lead downhill.
     Points that hardly improve in more than *max_stalled* steps are given up.
     """
-    points = points.copy()
     values, jacobian = equations(points)
+    points, values, jacobian = points.copy(), values.copy(), jacobian.copy()
     cost = np.einsum("km,km->k", values, values)
     damping = np.minimum(INITIAL_DAMPING if damped else 0.0, cost)
     size = np.zeros(len(points))
@@ -68,9 +68,10 @@ def solve(
         moving &= worst > tolerance
         if not moving.any():
             break
+        rows = _rows(moving)
         step = np.zeros((len(points), jacobian.shape[2]))
-        step[moving] = _damped(jacobian[moving] * unit, values[moving], damping[moving], rank)
-        size[moving] = np.abs(step[moving]).max(axis=1, initial=0.0)
+        step[rows] = _damped(jacobian[rows] * unit, values[rows], damping[rows], rank)
+        size[rows] = np.abs(step[rows]).max(axis=1, initial=0.0)
         trial = retract(points, step * unit)
         ahead, slopes = equations(trial)
         ahead_cost = np.einsum("km,km->k", ahead, ahead)
@@ -78,10 +79,9 @@ def solve(
         if max_stalled is not None:
             stalled = np.where(better, np.where(ahead_cost > 0.9 * cost, stalled + 1, 0), stalled)
             moving &= stalled <= max_stalled
-        points[better], values[better], jacobian[better] = (
-            trial[better], ahead[better], slopes[better]
-        )  # fmt: skip
-        cost[better] = ahead_cost[better]
+        rows = _rows(better)
+        points[rows], values[rows], jacobian[rows] = trial[rows], ahead[rows], slopes[rows]
+        cost[rows] = ahead_cost[rows]
         at_rest = (worst < 100.0 * tolerance) | (size < MIN_STEP) | (damping > MAX_DAMPING)
         moving &= better | ~at_rest
         damping = np.where(better, 0.1 * damping, np.maximum(10.0 * damping, 1e-8))
@@ -91,7 +91,7 @@ def solve(
 def newton(
     equations: Equations,
     retract: Retraction,
-    points: Array,
+    point: Array,
     *,
     tolerance: float,
     contraction: float,
@@ -99,34 +99,29 @@ def newton(
     unit: Array | float = 1.0,
     steps: int = 12,
 ) -> Solved:
-    """Return the points to which steps lead that shrink from one to the next.
+    """Return where steps from one point lead, each smaller than the one before.
 
-    *first* bounds the first step by the same *contraction*. What did not shrink has not converged,
-    unless its residual is below the tolerance.
+    *first* bounds the first step by the same *contraction*. Where steps do not shrink it has not
+    converged, unless its residual is below the tolerance.
     """
+    points = point[None]
     values, jacobian = equations(points)
-    previous = np.full(len(points), first)
-    converged, moving = np.zeros(len(points), np.bool_), np.ones(len(points), np.bool_)
+    size = first
+    converged = False
     for _ in range(steps):
-        ok = np.abs(values).max(axis=1, initial=0.0) < tolerance
-        converged |= moving & ok
-        moving &= ~ok
-        if not moving.any():
+        converged = float(np.abs(values).max(initial=0.0)) < tolerance
+        if converged:
             break
-        step = np.zeros((len(points), jacobian.shape[2]))
-        step[moving] = -_least(jacobian[moving] * unit, values[moving], RANK)
-        size = np.abs(step).max(axis=1, initial=0.0)
-        moving &= size <= contraction * previous
-        if not moving.any():
+        step = -_shortest(jacobian[0] * unit, values[0], RANK)
+        previous, size = size, float(np.abs(step).max(initial=0.0))
+        if not size <= contraction * previous:
             break
-        step[~moving] = 0.0
-        points = retract(points, step * unit)
-        previous = np.where(moving, size, previous)
+        points = retract(points, (step * unit)[None])
         values, jacobian = equations(points)
-        still = moving & (size < tolerance)
-        converged |= still
-        moving &= ~still
-    return Solved(points, values, jacobian, previous, converged)
+        converged = size < tolerance
+        if converged:
+            break
+    return Solved(points, values, jacobian, np.array([size]), np.array([converged]))
 
 
 def walk_in_steps(attempt: Callable[[float], bool], min_step: float) -> float:
@@ -158,32 +153,41 @@ def moved(poses: Array, step: Array) -> Array:
     return np.concatenate([R, (poses[:, :, 3] + step[:, 3:])[..., None]], axis=2)
 
 
+def _rows(chosen: BoolArray) -> BoolArray | slice:
+    """Return an index of the chosen rows that makes no copies where all are."""
+    return slice(None) if chosen.all() else chosen
+
+
 def _damped(jacobian: Array, values: Array, damping: Array, rank: float) -> Array:
     """Return steps (k, n), damped by parts of the mean eigenvalue."""
-    n = jacobian.shape[2]
-    step = np.zeros((len(values), n))
     free = damping < MIN_DAMPING
+    if free.all():
+        return -_least(jacobian, values, rank)
+    transposed = np.swapaxes(jacobian, 1, 2)
+    normal = transposed @ jacobian
+    diagonal = np.einsum("knn->kn", normal)
+    mean = np.maximum(diagonal.mean(axis=1), 1e-12)
+    diagonal += np.where(free, 1.0, damping * mean)[:, None]
+    step = -np.linalg.solve(normal, transposed @ values[..., None])[..., 0]
     if free.any():
         step[free] = -_least(jacobian[free], values[free], rank)
-    if not free.all():
-        J = jacobian[~free]
-        normal = np.swapaxes(J, 1, 2) @ J
-        mean = np.maximum(np.trace(normal, axis1=1, axis2=2) / max(n, 1), 1e-12)
-        normal += (damping[~free] * mean)[:, None, None] * np.eye(n)
-        gradient = np.einsum("kmn,km->kn", J, values[~free])
-        step[~free] = -np.linalg.solve(normal, gradient[..., None])[..., 0]
-    return step
+    return np.asarray(step)
 
 
 def _least(jacobian: Array, values: Array, rank: float) -> Array:
     """Return the shortest least-squares solutions (k, n) of linear equations."""
-    if len(values) == 1 and jacobian.shape[1] == jacobian.shape[2]:
+    if len(values) == 1:
+        return _shortest(jacobian[0], values[0], rank)[None]
+    return np.asarray((np.linalg.pinv(jacobian, rcond=rank) @ values[..., None])[..., 0])
+
+
+def _shortest(jacobian: Array, values: Array, rank: float) -> Array:
+    """Return the shortest least-squares solution (n,) of one set of linear equations."""
+    if jacobian.shape[0] == jacobian.shape[1]:
         try:
-            change = np.linalg.solve(jacobian, values[..., None])[..., 0]
+            change = np.linalg.solve(jacobian, values)
             if np.abs(change).max(initial=0.0) < 1.0:
                 return np.asarray(change)
         except np.linalg.LinAlgError:
             pass
-    if len(values) == 1:
-        return np.asarray(np.linalg.lstsq(jacobian[0], values[0], rcond=rank)[0][None])
-    return np.asarray((np.linalg.pinv(jacobian, rcond=rank) @ values[..., None])[..., 0])
+    return np.asarray(np.linalg.lstsq(jacobian, values, rcond=rank)[0])
