@@ -10,13 +10,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from legcal.files import motion_to_xyz_quat
 from legcal.geometry import Array, BoolArray
-from legcal.simulation.solids import Box, Material, PlacedSolid, PosedMachine, Solid
+from legcal.simulation.solids import Box, Material, PlacedSolid, PosedMachine, Solid, triangles
 from legcal.simulation.visibility import pixels_in_image
 from legcal.vision import (
     APRIL_TAGS,
@@ -158,9 +157,7 @@ class PlacedBoard:
 
     def beside(self, posed: PosedMachine) -> PosedMachine:
         """Return a machine in a pose together with the plate."""
-        size = self.plate.solid.shape
-        assert isinstance(size, Box)
-        mesh = trimesh.creation.box(size.size)
+        mesh = triangles(self.plate.solid.shape)
         return replace(
             posed,
             solids=(*posed.solids, self.plate),

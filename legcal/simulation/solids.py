@@ -10,10 +10,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import trimesh
 from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
-from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from legcal.errors import ModelError
 from legcal.geometry import Array, BoolArray, IntArray, distance_to_line, product
@@ -459,7 +457,7 @@ def pose_machine(
     machine: Machine, solids: Sequence[Solid], poses: Configurations
 ) -> tuple[PosedMachine, ...]:
     """Return a machine in every pose."""
-    meshes = [_triangles(solid.shape) for solid in solids]
+    meshes = [triangles(solid.shape) for solid in solids]
     faces, first = [], 0
     for mesh in meshes:
         faces.append(mesh.faces + first)
@@ -477,13 +475,18 @@ def pose_machine(
 
 
 @lru_cache(maxsize=8)  # many cameras may look at one machine, and thousands wait for theirs
-def _caster(posed: PosedMachine) -> RayMeshIntersector:
+def _caster(posed: PosedMachine) -> Any:
     """Return what casts rays at a machine."""
+    import trimesh  # 30 MB and half a second: only where there are solids
+    from trimesh.ray.ray_pyembree import RayMeshIntersector
+
     return RayMeshIntersector(trimesh.Trimesh(posed.vertices, posed.faces, process=False))
 
 
-def _triangles(shape: Shape) -> Any:
+def triangles(shape: Shape) -> Any:
     """Return a shape as triangles."""
+    import trimesh
+
     if isinstance(shape, Cylinder):
         return trimesh.creation.cylinder(shape.radius, shape.length, sections=_SECTIONS)
     if isinstance(shape, Sphere):
@@ -502,5 +505,5 @@ def _is_in(shape: Shape, point: Array) -> bool:
         return bool(np.linalg.norm(point) < shape.radius)
     if isinstance(shape, Box):
         return bool(np.all(np.abs(point) < 0.5 * np.asarray(shape.size)))
-    mesh = _triangles(shape)
+    mesh = triangles(shape)
     return bool(mesh.is_watertight and mesh.contains(point[None])[0])
