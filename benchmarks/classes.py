@@ -23,9 +23,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from legcal import LegcalError, calibrate, evaluate, load_dataset
-from legcal.simulation.dataset import simulate
-from legcal.simulation.request import Level
-from legcal.simulation.settings import SimulationSettings
+from legcal.simulation import Level, SimulationSettings, simulate
 
 MODELS = Path(__file__).parents[1] / "models"
 HEADER = (

@@ -20,8 +20,7 @@ from honesty import honesty
 
 from legcal import Appearance, LegcalError, calibrate, load_dataset, load_mechanism
 from legcal.data.dataset import Dataset
-from legcal.simulation.dataset import simulate
-from legcal.simulation.settings import SimulationSettings
+from legcal.simulation import SimulationSettings, simulate
 
 ENCODED = 2.2
 HEADER = (

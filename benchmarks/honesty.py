@@ -26,8 +26,7 @@ from legcal.calibration.verdict import Calibration
 from legcal.geometry import components
 from legcal.geometry.types import Array
 from legcal.machine import Machine, geometries, pose_sensitivity, vector_of
-from legcal.simulation.dataset import simulate
-from legcal.simulation.settings import SimulationSettings
+from legcal.simulation import SimulationSettings, simulate
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "examples/hexapod", ROOT / "tests/data/hexapod-truth/models/hexapod.yaml"

@@ -12,9 +12,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array, Image
 from legcal.perception.light import Grey, to_grey
-from legcal.simulation.rendering.appearance import Appearance, Light
+from legcal.simulation import Appearance, Light, prepare_view
 from legcal.simulation.rendering.rays import in_view
-from legcal.simulation.rendering.scene import Canvas, develop, prepare_view
+from legcal.simulation.rendering.scene import Canvas, develop
 from legcal.simulation.solids import Cylinder, Material, PlacedSolid, Solid
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis

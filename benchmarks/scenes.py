@@ -42,7 +42,8 @@ from legcal.perception.pair_matching import CameraPoses, Picture, leg_segments
 from legcal.perception.placement import Placement, Search, group_views
 from legcal.perception.recognition import recognise
 from legcal.perception.view_fit import refine_views
-from legcal.simulation.visibility import field_of_view, silhouette
+from legcal.simulation import silhouette
+from legcal.simulation.visibility import field_of_view
 
 WRONG_PX = 3.0  # an outline this far from the true one is another edge
 SAME_TURN, SAME_PLACE = np.deg2rad(10.0), 0.15  # of one camera: angle, part of the distance

@@ -19,16 +19,18 @@ from legcal.errors import LegcalError
 from legcal.machine import KinematicParameters
 from legcal.paper import Criteria
 from legcal.paper.four_steps import run_steps
-from legcal.simulation.hexapod import (
+from legcal.simulation import (
+    OutlineNoise,
     PaperHexapod,
-    cameras_around,
+    TableNoise,
     extreme_poses,
-    hexapod,
+    hexapod_cameras,
     hexapod_session,
+    nominal_of,
+    paper_hexapod,
     perturb,
+    platform_errors,
 )
-from legcal.simulation.observe import OutlineNoise, TableNoise
-from legcal.simulation.paper import nominal_of, platform_errors
 
 NOISES: dict[str, OutlineNoise | TableNoise] = {
     "outlines, 0.001 px a point, 300 points": OutlineNoise(1e-3, 300),
@@ -57,11 +59,11 @@ def _print_times() -> None:
     print(f"{'images':>8} {'median':>10} {'an image':>10} {'memory':>10}")
     for n_images, n_runs in ((45, 7), (450, 3)):
         rng = np.random.default_rng(0)
-        machine = perturb(hexapod(), rng, 0.002)
+        machine = perturb(paper_hexapod(), rng, 0.002)
         nominal = perturb(machine, rng, 0.002)
         session = hexapod_session(
             machine,
-            cameras_around(machine, rng),
+            hexapod_cameras(machine, rng),
             rng,
             noise=OutlineNoise(0.2, 100),
             n_poses=n_images // 3,
@@ -97,9 +99,9 @@ def _errors(
 ) -> dict[str, tuple[float, float]]:
     """Return the platform errors of the nominal model and of each criterion that ends."""
     rng = np.random.default_rng(seed)
-    machine = perturb(hexapod(), rng, 0.002, coplanar=coplanar)
+    machine = perturb(paper_hexapod(), rng, 0.002, coplanar=coplanar)
     nominal = perturb(machine, rng, 0.002)
-    views = cameras_around(machine, rng)
+    views = hexapod_cameras(machine, rng)
     n_images = 3 if isinstance(noise, TableNoise) else 1
     session = hexapod_session(machine, views, rng, noise=noise, n_images=n_images)
     found = {"nominal": _platform_error(machine, nominal.parameters)}

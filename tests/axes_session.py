@@ -16,8 +16,14 @@ from legcal.machine import (
     point_like_legs,
     to_vector,
 )
-from legcal.simulation.hexapod import PAPER_VIEWS, cameras_around, hexapod, hexapod_session, perturb
-from legcal.simulation.observe import TableNoise
+from legcal.simulation import (
+    PAPER_VIEWS,
+    TableNoise,
+    hexapod_cameras,
+    hexapod_session,
+    paper_hexapod,
+    perturb,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +84,8 @@ def axes_session(
 ) -> AxesSession:
     """Return a session of a hexapod 2 mm off its drawing, seen with the noise of Table 1."""
     rng = np.random.default_rng(3)
-    machine = perturb(hexapod(), rng, 0.002, coplanar=coplanar)
-    cameras = cameras_around(machine, rng, legs=legs)
+    machine = perturb(paper_hexapod(), rng, 0.002, coplanar=coplanar)
+    cameras = hexapod_cameras(machine, rng, legs=legs)
     session = hexapod_session(
         machine, cameras, rng, noise=TableNoise(), noisy=False, n_poses=n_poses, n_images=n_images
     )

@@ -9,9 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.camera_calibration.adjustment import BoardCorners
 from legcal.geometry.types import Array
-from legcal.simulation.board import PlacedBoard
-from legcal.simulation.rendering.appearance import Appearance
-from legcal.simulation.rendering.scene import render
+from legcal.simulation import Appearance, PlacedBoard, render
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import ImageSize

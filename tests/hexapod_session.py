@@ -18,8 +18,7 @@ from legcal.machine import (
     from_vector,
     to_vector,
 )
-from legcal.simulation.observe import outlines_of, plain_scene
-from legcal.simulation.visibility import Viewpoint
+from legcal.simulation import Viewpoint, outlines_of, plain_scene
 from legcal.vision.camera import Camera
 
 FRAME_LEGS = (0, 2, 4)

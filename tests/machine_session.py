@@ -27,14 +27,8 @@ from legcal.machine import (
     moved_legs,
     platform_in_base,
 )
-from legcal.simulation.observe import (
-    OutlineNoise,
-    moved_outlines,
-    noisy_outlines,
-    outlines_of,
-    plain_scene,
-)
-from legcal.simulation.visibility import Viewpoint
+from legcal.simulation import OutlineNoise, Viewpoint, noisy_outlines, outlines_of, plain_scene
+from legcal.simulation.observe import moved_outlines
 from legcal.vision.camera import Camera
 
 K = np.array([[1290.0, 0.0, 518.0], [0.0, 1280.0, 380.0], [0.0, 0.0, 1.0]])

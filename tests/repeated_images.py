@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.files import motion_to_xyz_quat
 from legcal.geometry.types import Array
 from legcal.machine import Machine, load_mechanism, random_configurations
-from legcal.simulation.cameras import look_at
+from legcal.simulation import look_at
 from legcal.vision.camera import Camera
 from legcal.vision.visibility import visible_segments
 

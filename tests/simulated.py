@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.simulation.request import Level
-from legcal.simulation.settings import SimulationSettings
+from legcal.simulation import Level, SimulationSettings
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import camera_info
 

@@ -9,17 +9,18 @@ from legcal.geometry import Array
 from legcal.machine import KinematicParameters, from_vector, to_vector
 from legcal.paper import Criteria, run_steps
 from legcal.paper.four_steps import StagedResult
-from legcal.simulation import OutlineNoise, TableNoise
-from legcal.simulation.hexapod import (
+from legcal.simulation import (
     PAPER_VIEWS,
     HexapodSession,
+    OutlineNoise,
     PaperHexapod,
-    cameras_around,
-    hexapod,
+    TableNoise,
+    hexapod_cameras,
     hexapod_session,
+    nominal_of,
+    paper_hexapod,
     perturb,
 )
-from legcal.simulation.paper import nominal_of
 
 
 @cache
@@ -34,10 +35,10 @@ def exact_session(
 ) -> HexapodSession:
     """Return a session without noise of a hexapod 2 mm off its drawing."""
     rng = np.random.default_rng(seed)
-    machine = perturb(hexapod(), rng, 0.002, coplanar=coplanar)
+    machine = perturb(paper_hexapod(), rng, 0.002, coplanar=coplanar)
     return hexapod_session(
         machine,
-        cameras_around(machine, rng, legs=legs),
+        hexapod_cameras(machine, rng, legs=legs),
         rng,
         noise=noise or OutlineNoise(),
         noisy=False,
@@ -52,11 +53,11 @@ def noisy_session(
 ) -> tuple[HexapodSession, PaperHexapod]:
     """Return a session with noise, and a nominal machine up to 2 mm wrong in every parameter."""
     rng = np.random.default_rng(seed)
-    machine = perturb(hexapod(), rng, 0.002, coplanar=coplanar)
+    machine = perturb(paper_hexapod(), rng, 0.002, coplanar=coplanar)
     nominal = perturb(machine, rng, 0.002)
     session = hexapod_session(
         machine,
-        cameras_around(machine, rng),
+        hexapod_cameras(machine, rng),
         rng,
         noise=noise,
         n_poses=n_poses,

@@ -33,8 +33,7 @@ from legcal.machine import (
     turns_between,
     vector_of,
 )
-from legcal.simulation import OutlineNoise
-from legcal.simulation.observe import shifted_outlines
+from legcal.simulation import OutlineNoise, shifted_outlines
 
 MODEL = "3-rpr"
 EXACT = 1e-4  # [px]: errors of outlines to which others are added

@@ -31,8 +31,7 @@ from legcal.paper.leg_directions import directions_through_joints
 from legcal.paper.platform import RigidProblem, build_rigid
 from legcal.paper.platform_printed import build_mean_distances
 from legcal.paper.unknowns import Unknowns
-from legcal.simulation.hexapod import PaperHexapod
-from legcal.simulation.paper import nominal_of
+from legcal.simulation import PaperHexapod, nominal_of
 
 MODELS = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
 WEAK_JOINT = ((0, 1, 2, 3, 4), (0, 1, 2, 3, 4), (4, 5))

@@ -11,16 +11,16 @@ from legcal.data.axes import outline_derivative
 from legcal.errors import NotVisible
 from legcal.geometry import Array
 from legcal.geometry.lines import distance_to_line
-from legcal.simulation import OutlineNoise
-from legcal.simulation.cameras import sample_camera
-from legcal.simulation.hexapod import (
+from legcal.simulation import (
     HexapodSession,
-    cameras_around,
-    hexapod,
+    OutlineNoise,
+    hexapod_cameras,
     hexapod_session,
+    paper_hexapod,
     perturb,
+    sample_camera,
+    shifted_outlines,
 )
-from legcal.simulation.observe import shifted_outlines
 from legcal.vision import Camera
 
 LENS = replace(sample_camera(), distortion=np.array([-0.2, 0.1, 0.001, -0.002, 0.0]))
@@ -28,8 +28,8 @@ LENS = replace(sample_camera(), distortion=np.array([-0.2, 0.1, 0.001, -0.002, 0
 
 def _session(camera: Camera, n_poses: int = 2) -> HexapodSession:
     rng = np.random.default_rng(3)
-    machine = perturb(hexapod(), rng, 0.002)
-    views = cameras_around(machine, rng, camera=camera)
+    machine = perturb(paper_hexapod(), rng, 0.002)
+    views = hexapod_cameras(machine, rng, camera=camera)
     return hexapod_session(machine, views, rng, noise=OutlineNoise(), noisy=False, n_poses=n_poses)
 
 

@@ -63,7 +63,7 @@ from legcal.data import Measurements, Outlines, no_outlines
 from legcal.errors import DidNotConverge
 from legcal.estimation import linearize, scores_of_block
 from legcal.geometry import Array, BoolArray
-from legcal.simulation.dataset import simulate as simulate_folder
+from legcal.simulation import simulate as simulate_folder
 from legcal.vision import EPSILON
 
 SHARE = 0.2  # of outlines that are wrong

@@ -52,8 +52,7 @@ from legcal.machine import (
     shipped_names,
     vector_of,
 )
-from legcal.simulation import Record, run_study
-from legcal.simulation.study import child_seed
+from legcal.simulation import Record, child_seed, run_study
 
 NOISE = Noise()
 N_POSES = 5

@@ -26,8 +26,7 @@ from legcal.paper.joints_in_camera import (
     turned,
 )
 from legcal.paper.leg_directions import directions_through_joints, observed_directions
-from legcal.simulation import OutlineNoise
-from legcal.simulation.paper import nominal_of
+from legcal.simulation import OutlineNoise, nominal_of
 
 # Step 1: joints and axes in the cameras
 

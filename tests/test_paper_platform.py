@@ -37,8 +37,7 @@ from legcal.paper.offsets import (
 from legcal.paper.platform import locate_platform_joints
 from legcal.paper.platform_pose import PlatformPoses, locate_platform, register_by_rays
 from legcal.paper.platform_printed import fixed_direction, locate_passive_end, revolute_axis
-from legcal.simulation import OutlineNoise
-from legcal.simulation.paper import nominal_of
+from legcal.simulation import OutlineNoise, nominal_of
 
 TRANSFORMATIONS: tuple[Transformation, ...] = ("points", "cross_product")
 

@@ -29,17 +29,19 @@ from legcal.paper.platform import RigidProblem, build_rigid
 from legcal.paper.platform_pose import build_rays
 from legcal.paper.platform_printed import build_mean_distances
 from legcal.paper.unknowns import Unknowns
-from legcal.simulation import OutlineNoise, TableNoise
-from legcal.simulation.hexapod import (
+from legcal.simulation import (
     PAPER_VIEWS,
-    cameras_around,
+    OutlineNoise,
+    TableNoise,
     extreme_poses,
-    hexapod,
+    hexapod_cameras,
     hexapod_session,
+    nominal_of,
+    paper_hexapod,
     perturb,
+    platform_errors,
+    shifted_outlines,
 )
-from legcal.simulation.observe import shifted_outlines
-from legcal.simulation.paper import nominal_of, platform_errors
 
 LIKE_HEXAPOD = ("nategh-agheli", "6-sps")
 FULL_RANK = ("3-rpr", "3-spr", "3-upu-tilted")  # of (9): in a plane, or three joints and no axis
@@ -112,7 +114,7 @@ def test_exact_recovery_of_hexapods_from_5_mm(seed: int, options: dict[str, Any]
 @pytest.mark.parametrize("criteria", ["default", "literal"])
 def test_legs_that_meet_in_one_platform_joint_are_no_pair(criteria: Criteria) -> None:
     rng = np.random.default_rng(0)
-    machine = perturb(hexapod(), rng, 0.002)
+    machine = perturb(paper_hexapod(), rng, 0.002)
     machine, nominal = (
         replace(
             m,
@@ -122,7 +124,7 @@ def test_legs_that_meet_in_one_platform_joint_are_no_pair(criteria: Criteria) ->
         )
         for m in (machine, five_millimetres_away(machine))
     )
-    cameras = cameras_around(machine, rng)
+    cameras = hexapod_cameras(machine, rng)
     session = hexapod_session(machine, cameras, rng, noise=OutlineNoise(), noisy=False, n_poses=6)
     found = staged(session, nominal, criteria).parameters
     assert np.abs(found.offsets - machine.parameters.offsets).max() < 1e-8
@@ -193,11 +195,11 @@ def test_literal_criteria_never_move_z_from_a_coplanar_nominal_model() -> None:
     session = exact_session()
     true = session.machine.parameters
     assert np.abs(true.base_joints[:, 2]).max() > 5e-4
-    literal = staged(session, hexapod(), "literal").parameters
+    literal = staged(session, paper_hexapod(), "literal").parameters
     for joints in (literal.base_joints, literal.platform_joints):
         assert np.abs(joints[:, 2]).max() < 1e-9
     assert errors(literal, session.machine).max() > 5e-4
-    assert errors(staged(session, hexapod()).parameters, session.machine).max() < 1e-9
+    assert errors(staged(session, paper_hexapod()).parameters, session.machine).max() < 1e-9
 
 
 def test_literal_criteria_accept_a_mirror_image_that_the_rigid_ones_correct() -> None:

@@ -16,10 +16,8 @@ from legcal.data.outlines import read_observations
 from legcal.errors import UsageError
 from legcal.geometry import Array
 from legcal.machine import Machine, load_mechanism
-from legcal.simulation import Appearance, Level, simulate
-from legcal.simulation.rendering.appearance import Light
+from legcal.simulation import Appearance, Level, Light, prepare_view, render, simulate
 from legcal.simulation.rendering.rays import PixelRays
-from legcal.simulation.rendering.scene import prepare_view, render
 from legcal.simulation.solids import (
     Box,
     Cylinder,

@@ -25,9 +25,11 @@ from legcal.errors import DatasetError, LegcalError, NotVisible, OutOfResources,
 from legcal.machine import LegKind, load_mechanism
 from legcal.report import simulation_table
 from legcal.simulation import (
+    Distribution,
     Level,
     ParameterErrors,
     Request,
+    Sampling,
     SimulatedDataset,
     SimulationSettings,
     Spread,
@@ -37,8 +39,7 @@ from legcal.simulation import (
     summary_document,
 )
 from legcal.simulation.folder import TRUTH_NAME, check_dataset_destination, dataset_folder
-from legcal.simulation.request import Sampling
-from legcal.simulation.settings import Distribution, read_appearance
+from legcal.simulation.settings import read_appearance
 
 FEW = settings(poses=1, views=1)
 

@@ -27,18 +27,10 @@ from legcal.machine import (
     singularity,
 )
 from legcal.machine.mobility import determinant_sign
+from legcal.simulation import Sampling, commanded_poses, draw_poses, write_true_model
 from legcal.simulation import poses as module
-from legcal.simulation.poses import (
-    JITTER,
-    Feasibility,
-    are_extreme,
-    commanded_poses,
-    draw_poses,
-    given_poses,
-)
-from legcal.simulation.request import Sampling
+from legcal.simulation.poses import JITTER, Feasibility, are_extreme, given_poses
 from legcal.simulation.settings import DEFAULT_ERRORS
-from legcal.simulation.truth import write_true_model
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 LONG_TRAVEL = "nategh-agheli"  # whose legs cannot all be near the ends of their travel

@@ -12,23 +12,24 @@ from staged_hexapods import exact_session
 from legcal.errors import DidNotConverge
 from legcal.geometry.lines import moment
 from legcal.machine import load_mechanism, to_vector
-from legcal.simulation.cameras import look_at, sample_camera
-from legcal.simulation.hexapod import (
-    cameras_around,
+from legcal.simulation import (
+    OutlineNoise,
+    TableNoise,
     extreme_poses,
-    follow_from_home,
-    hexapod,
+    hexapod_cameras,
     hexapod_session,
-    leg_vectors,
+    look_at,
+    paper_hexapod,
     perturb,
-    poses_with_lengths,
+    sample_camera,
+    shifted_outlines,
 )
-from legcal.simulation.observe import OutlineNoise, TableNoise, shifted_outlines
+from legcal.simulation.hexapod import follow_from_home, leg_vectors, poses_with_lengths
 from legcal.simulation.poses import JITTER
 
 
 def test_the_hexapod_in_memory_is_the_shipped_one() -> None:
-    shipped, machine = load_mechanism("hexapod"), hexapod()
+    shipped, machine = load_mechanism("hexapod"), paper_hexapod()
     assert tuple(machine.frame_legs) == tuple(shipped.frame_legs)
     assert np.array_equal(machine.sign, shipped.sign)
     found = to_vector(machine.parameters, machine.frame_legs)
@@ -45,7 +46,7 @@ def test_the_hexapod_in_memory_is_the_shipped_one() -> None:
 @settings(max_examples=10, deadline=None)
 def test_forward_kinematics_returns_the_lengths_it_was_given(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    machine = perturb(hexapod(), rng, 0.002)
+    machine = perturb(paper_hexapod(), rng, 0.002)
     lengths = rng.uniform(0.40, 0.44, (1, 6))
     start = RigidTransform.concatenate([machine.home])
     pose = poses_with_lengths(machine.parameters, lengths, start)
@@ -54,7 +55,7 @@ def test_forward_kinematics_returns_the_lengths_it_was_given(seed: int) -> None:
 
 
 def test_extreme_poses_have_every_leg_near_an_end_of_its_travel() -> None:
-    machine = hexapod()
+    machine = paper_hexapod()
     poses = extreme_poses(machine, 10, np.random.default_rng(1))
     lengths = np.linalg.norm(leg_vectors(machine.parameters, poses), axis=-1)
     part = (lengths - machine.travel[:, 0]) / np.ptp(machine.travel, axis=1)
@@ -65,7 +66,7 @@ def test_extreme_poses_have_every_leg_near_an_end_of_its_travel() -> None:
 
 
 def test_poses_followed_from_home_have_their_lengths_and_others_stay_on_the_way() -> None:
-    machine = hexapod()
+    machine = paper_hexapod()
     lengths = np.array([np.full(6, 0.42), [0.40, 0.41, 0.42, 0.43, 0.42, 0.41], np.full(6, 5.0)])
     lengths[2, ::2] = 0.01
     poses, reached = follow_from_home(machine, lengths)
@@ -76,7 +77,7 @@ def test_poses_followed_from_home_have_their_lengths_and_others_stay_on_the_way(
 
 
 def test_poses_solved_together_are_those_solved_alone() -> None:
-    machine = perturb(hexapod(), np.random.default_rng(4), 0.002)
+    machine = perturb(paper_hexapod(), np.random.default_rng(4), 0.002)
     lengths = np.random.default_rng(1).uniform(0.40, 0.44, (5, 6))
     start = RigidTransform.concatenate([machine.home] * 5)
     together = poses_with_lengths(machine.parameters, lengths, start).as_matrix()
@@ -91,10 +92,10 @@ def test_poses_solved_together_are_those_solved_alone() -> None:
 @pytest.mark.parametrize("uniform", [True, False])
 def test_errors_of_readings_have_their_standard_deviation_and_shape(uniform: bool) -> None:
     rng = np.random.default_rng(0)
-    machine = hexapod()
+    machine = paper_hexapod()
     session = hexapod_session(
         machine,
-        cameras_around(machine, rng),
+        hexapod_cameras(machine, rng),
         rng,
         noise=TableNoise(),
         sigma_q=1e-5,
@@ -112,7 +113,7 @@ def test_a_machine_that_reaches_no_pose_of_its_travel_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("legcal.simulation.hexapod._MAX_ROUNDS", 20)
-    machine = replace(hexapod(), travel=np.tile([[0.1, 0.1], [0.9, 0.9]], (3, 1)))
+    machine = replace(paper_hexapod(), travel=np.tile([[0.1, 0.1], [0.9, 0.9]], (3, 1)))
     with pytest.raises(DidNotConverge, match="Only 0 of 2 random poses"):
         extreme_poses(machine, 2, np.random.default_rng(0))
 

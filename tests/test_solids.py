@@ -10,17 +10,8 @@ from yourdfpy import URDF
 
 from legcal.errors import ModelError
 from legcal.machine import Machine, load_mechanism
-from legcal.simulation.poses import draw_poses
-from legcal.simulation.solids import (
-    Box,
-    Cylinder,
-    Mesh,
-    Sphere,
-    dressed,
-    link_poses,
-    placed,
-    solids_of,
-)
+from legcal.simulation import draw_poses, dressed
+from legcal.simulation.solids import Box, Cylinder, Mesh, Sphere, link_poses, placed, solids_of
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted(p.stem for p in (ROOT / "models").glob("*.yaml"))

@@ -14,17 +14,20 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge, UsageError
 from legcal.geometry import Array
 from legcal.machine import KinematicParameters, from_vector, to_vector
-from legcal.simulation import PaperStudy, TableNoise, run_study
-from legcal.simulation.hexapod import (
+from legcal.simulation import (
     HexapodSession,
     PaperHexapod,
-    hexapod,
-    noncoplanar_hexapod,
-    random_poses,
+    PaperStudy,
+    TableNoise,
+    child_seed,
+    paper_hexapod,
+    platform_errors,
+    run_study,
 )
-from legcal.simulation.paper import ESTIMATORS, expected_errors, expected_norm, platform_errors
+from legcal.simulation.hexapod import noncoplanar_hexapod, random_poses
+from legcal.simulation.paper import ESTIMATORS, expected_errors, expected_norm
 from legcal.simulation.paper_report import SCALARS, Means
-from legcal.simulation.study import StudyResult, child_seed
+from legcal.simulation.study import StudyResult
 
 N_RUNS = 2
 STUDY = PaperStudy(n_poses=8)
@@ -56,7 +59,7 @@ def _changed(machine: PaperHexapod, change: Array) -> KinematicParameters:
 
 
 def test_the_second_machine_has_joints_out_of_the_planes() -> None:
-    flat, raised = (m.parameters for m in (hexapod(), noncoplanar_hexapod()))
+    flat, raised = (m.parameters for m in (paper_hexapod(), noncoplanar_hexapod()))
     up = np.outer([0.0, 0.03] * 3, [0.0, 0.0, 1.0])
     assert np.array_equal(raised.base_joints - flat.base_joints, up)
     assert np.array_equal(raised.platform_joints - flat.platform_joints, -up)
@@ -72,7 +75,7 @@ def test_eq20_of_the_truth_is_zero_and_of_equal_offsets_the_travel_of_a_lift() -
 
 
 def test_the_norm_of_small_euler_angles_is_nearly_the_angle_of_the_rotation() -> None:
-    machine = hexapod()
+    machine = paper_hexapod()
     change = np.random.default_rng(1).uniform(-2e-3, 2e-3, 30)
     errors = platform_errors(machine, _changed(machine, change), _poses(machine))
     assert errors.angle > 1e-3

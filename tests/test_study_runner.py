@@ -16,9 +16,9 @@ import pytest
 from toy_studies import Deadly, Draws, Mistaken
 
 from legcal.errors import DidNotConverge, OutOfResources, UsageError
-from legcal.simulation import run_study
+from legcal.simulation import child_seed, run_study
 from legcal.simulation.checkpoint import CHECKPOINT_NAME, header, open_checkpoint
-from legcal.simulation.study import DOCUMENT_NAME, child_seed
+from legcal.simulation.study import DOCUMENT_NAME
 
 PROGRAM = Path(__file__).with_name("toy_studies.py")
 

@@ -13,16 +13,19 @@ import legcal
 from legcal.errors import NotVisible
 from legcal.geometry import Array
 from legcal.machine import Configurations, Machine
-from legcal.simulation.cameras import cameras_around, look_at, sample_camera
-from legcal.simulation.solids import Box, PosedMachine, Solid, dressed, pose_machine, solids_of
-from legcal.simulation.visibility import (
-    MIN_SHARE,
+from legcal.simulation import (
     LegView,
-    contact_offsets,
+    cameras_around,
+    dressed,
     legs_in_image,
+    look_at,
+    pose_machine,
+    sample_camera,
     silhouette,
     take_images,
 )
+from legcal.simulation.solids import Box, PosedMachine, Solid, solids_of
+from legcal.simulation.visibility import MIN_SHARE, contact_offsets
 from legcal.vision import outlines_of_axis
 
 SHIPPED = (

@@ -36,10 +36,16 @@ from legcal.machine import (
     write_calibrated_yaml,
     write_urdf,
 )
-from legcal.simulation import ParameterErrors, SimulationSettings, Spread, draw_poses
-from legcal.simulation.request import Level
-from legcal.simulation.settings import Distribution
-from legcal.simulation.truth import draw_errors, write_true_model
+from legcal.simulation import (
+    Distribution,
+    Level,
+    ParameterErrors,
+    SimulationSettings,
+    Spread,
+    draw_poses,
+    write_true_model,
+)
+from legcal.simulation.truth import draw_errors
 
 ORIGIN = re.compile(rb"""(<origin\b[^>]*?\bxyz\s*=\s*["'])([^"']*)(["'])""")
 ORIGINS = re.compile(rb'(<origin xyz=")[^"]*(" rpy=")[^"]*(")')

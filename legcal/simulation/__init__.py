@@ -1,8 +1,8 @@
 """Simulated measurements of machines whose truth is known (section 4.3), and studies on them.
 
-In: a model, :class:`SimulationSettings` or the options of the command line. Out: a
-:class:`Session` in memory (readings, outlines or axes, corners, the truth) or the folder of a
-dataset; for studies, records of many runs. The room stands beside the others: it may import all of
+In: a model, :class:`SimulationSettings` or the options of the command line. Out: the folder of a
+:class:`SimulatedDataset` with the truth beside it; the 6-SPU of section 4.3 and its sessions in
+memory; for studies, records of many runs. The room stands beside the others: it may import all of
 them but report and command line, and only the command line and benchmarks import it, so that the
 method cannot see the truth.
 """

@@ -37,7 +37,7 @@ from legcal.simulation.observe import corners_of
 from legcal.simulation.poses import are_extreme
 from legcal.simulation.request import Level
 from legcal.simulation.session import (
-    Session,
+    SimulatedSession,
     Streams,
     exact_outlines,
     photographs,
@@ -177,7 +177,7 @@ def simulate(
 
 def _write_photographs(
     folder: Path,
-    session: Session,
+    session: SimulatedSession,
     settings: SimulationSettings,
     chance: Streams,
     workers: int,

@@ -39,7 +39,7 @@ from legcal.files import (
     result_folder,
 )
 from legcal.machine import LegKind, Machine, main_cylinders
-from legcal.simulation.session import Session
+from legcal.simulation.session import SimulatedSession
 from legcal.simulation.settings import SimulationSettings
 from legcal.version import __version__
 from legcal.vision import camera_info
@@ -104,7 +104,7 @@ def write_session(
 
 def write_truth(
     path: Path,
-    session: Session,
+    session: SimulatedSession,
     settings: SimulationSettings,
     files: Sequence[str],  # the other files of the dataset
 ) -> None:

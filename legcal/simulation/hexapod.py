@@ -75,7 +75,7 @@ class PaperHexapod:
         return {part: float(R) for part, R in zip(self.parts, self.radius, strict=True)}
 
 
-def hexapod(scale: float = 1.0) -> PaperHexapod:
+def paper_hexapod(scale: float = 1.0) -> PaperHexapod:
     """Return the coplanar 6-SPU hexapod of ``models/hexapod.yaml``, lengths times ``scale``."""
     base_angles = np.deg2rad([210.0, -54.0, -30.0, 66.0, 90.0, 186.0])
     platform_angles = np.deg2rad([210.0, 234.0, -30.0, -6.0, 90.0, 114.0])
@@ -107,7 +107,7 @@ def noncoplanar_hexapod() -> PaperHexapod:
 
     They are 30 mm higher at the base and 30 mm lower at the platform.
     """
-    machine = hexapod()
+    machine = paper_hexapod()
     A, B = machine.parameters.base_joints.copy(), machine.parameters.platform_joints.copy()
     A[1::2, 2] += RAISED
     B[1::2, 2] -= RAISED
@@ -233,7 +233,7 @@ class LegCamera:
     legs: tuple[int, ...]  # the legs that its images show
 
 
-def cameras_around(
+def hexapod_cameras(
     machine: PaperHexapod,
     rng: np.random.Generator,
     *,

@@ -37,13 +37,13 @@ from legcal.simulation.hexapod import (
     RAISED,
     HexapodSession,
     PaperHexapod,
-    cameras_around,
     follow_from_home,
-    hexapod,
+    hexapod_cameras,
     hexapod_session,
     leg_vectors,
     noncoplanar_hexapod,
     observed,
+    paper_hexapod,
     perturb,
     poses_with_lengths,
     random_poses,
@@ -52,7 +52,7 @@ from legcal.simulation.observe import TableNoise
 from legcal.simulation.paper_report import BOUND, INITIAL, SCALARS, PaperSummary
 from legcal.simulation.study import Record, failure_of
 
-MACHINES = {"coplanar": hexapod, "noncoplanar": noncoplanar_hexapod}
+MACHINES = {"coplanar": paper_hexapod, "noncoplanar": noncoplanar_hexapod}
 _N_PARAMETERS = 30  # of a 6-SPU
 
 
@@ -111,7 +111,7 @@ class PaperStudy:
         nominal = perturb(machine, rng, self.initial_error)
         session = hexapod_session(
             machine,
-            cameras_around(machine, rng),
+            hexapod_cameras(machine, rng),
             rng,
             noise=self.noise,
             sigma_q=self.reading_error / np.sqrt(3.0),

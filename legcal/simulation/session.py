@@ -66,7 +66,7 @@ def streams(seed: int) -> dict[str, np.random.Generator]:
 
 
 @dataclass(frozen=True, eq=False)
-class Session:
+class SimulatedSession:
     """What is measured of a simulated machine, and the truth behind it."""
 
     measurements: Measurements
@@ -89,7 +89,7 @@ def simulate_session(
     settings: SimulationSettings,
     chance: Streams,
     progress: Report = no_progress,
-) -> Session:
+) -> SimulatedSession:
     """Return a session of a true machine of which the nominal model is known."""
     cameras, given = _cameras(settings)
     shared = settings.shared_poses or not isinstance(settings.poses, int)
@@ -156,7 +156,7 @@ def simulate_session(
     measurements = _recorded(
         truth, poses, labels, scene, settings, chance, hints=settings.hints and not groups
     )
-    return Session(
+    return SimulatedSession(
         measurements, outlines, axes, corners, truth, poses, labels, posed_machines, scene,
         len(images) - len(rows), placed, groups,
     )  # fmt: skip
@@ -285,7 +285,7 @@ def _recorded(
 
 
 def photographs(
-    session: Session, appearance: Appearance, rng: np.random.Generator, workers: int = 1
+    session: SimulatedSession, appearance: Appearance, rng: np.random.Generator, workers: int = 1
 ) -> Generator[tuple[int, bytes]]:
     """Yield row and PNG of all images of a session."""
     views, images = session.scene.views, session.scene.images
