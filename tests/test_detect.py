@@ -16,6 +16,7 @@ from repeated_images import SIZE, RepeatedImages, repeated_images
 from scipy.spatial.transform import RigidTransform
 
 from legcal import cli, detect, load_dataset
+from legcal.calibration.detection import Detection, _caption, _counted_reason
 from legcal.data.image_tables import canonical_order
 from legcal.data.outlines import QUALITY, Outlines, read_observations
 from legcal.errors import UsageError
@@ -30,7 +31,6 @@ from legcal.perception.overlays import (
     marks_of_image,
     short_reason,
 )
-from legcal.perception.overview import HIDDEN_LEG, Detection, _caption, picture_names, reason_class
 from legcal.perception.photographs import ImageObservations, Photographs, observe
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
@@ -241,7 +241,7 @@ def test_images_of_the_same_name_have_pictures_of_their_own(found: Detection) ->
     views = (replace(measurements.views[0], name="../left cam"), *measurements.views[1:])
     images = ("images/a.png", "more/A.png", "b/c.png", "b/d.png", "images/a.png")
     renamed = replace(measurements, views=views, image=images)
-    pictures = picture_names(replace(found, dataset=replace(found.dataset, measurements=renamed)))
+    pictures = replace(found, dataset=replace(found.dataset, measurements=renamed)).overlay_files
     assert list(pictures.values()) == [
         "overlays/_left_cam/images_a.png.jpg",
         "overlays/_left_cam/more_A.png.jpg",
@@ -414,5 +414,5 @@ def test_reasons_are_counted_without_their_figures() -> None:
         "width inconsistent with the radius"
     )
     assert short_reason("its other outline: edge hardly visible") == "other outline fails"
-    assert reason_class("hidden by leg3") == HIDDEN_LEG
-    assert reason_class("") == "no reason given"
+    assert _counted_reason("hidden by leg3") == "hidden by another leg"
+    assert _counted_reason("") == "no reason given"

@@ -15,7 +15,7 @@ from simulated import settings
 from spoiled import Picture, Spoiled, spoiled
 
 from legcal import calibrate, detect, load_dataset, simulate
-from legcal.calibration import Calibration
+from legcal.calibration import Calibration, Detection
 from legcal.calibration.joint_fit import DISAGREES
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.calibration.outlier_images import outlier_images
@@ -35,7 +35,6 @@ from legcal.perception.diagnostics import (
 )
 from legcal.perception.image_quality import Exposure, expose, image_defects
 from legcal.perception.light import to_grey
-from legcal.perception.overview import Detection
 from legcal.perception.photographs import ImageObservations, observe
 from legcal.progress import no_progress
 from legcal.workers import in_turn

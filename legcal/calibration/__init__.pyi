@@ -1,6 +1,8 @@
 from .camera_calibration.calibration import calibrate_camera as calibrate_camera
 from .camera_calibration.document import CameraCalibration as CameraCalibration
 from .change_detection import Explanation as Explanation
+from .detection import DETECTION_PAGE as DETECTION_PAGE
+from .detection import Detection as Detection
 from .documents import Holdout as Holdout
 from .documents import PlatformBlock as PlatformBlock
 from .documents import Result as Result

@@ -12,6 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.calibration.detection import (
+    DETECTION,
+    Detection,
+    check_detection_destination,
+    write_detection,
+)
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.calibration.pipeline import rough_placement
 from legcal.data import (
@@ -26,14 +32,10 @@ from legcal.files import output_path
 from legcal.geometry import IntArray
 from legcal.perception import (
     BEFORE_FIT,
-    DETECTION,
-    Detection,
     Placement,
-    check_detection_destination,
     given_outlines,
     hint_notes,
     observe,
-    write_detection,
 )
 from legcal.progress import Report, no_progress
 from legcal.workers import worker_pool

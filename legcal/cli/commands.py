@@ -85,15 +85,13 @@ def detect(
 ) -> None:
     """Find the outlines of the legs and show them over the images, to see what went wrong."""
     from legcal import calibration, report
-    from legcal.perception import detection_document, picture_names
 
     with report.progress_on_stderr() as progress:
         found = calibration.detect(
             dataset, output=output, progress=progress, workers=image_workers(workers)
         )
-    document = detection_document(found, picture_names(found))
-    show(as_json, lambda: document, lambda: report.detection_table(document, output))
-    if found.unplaced or document["used"] == 0:
+    show(as_json, lambda: found.document, lambda: report.detection_table(found, output))
+    if found.unplaced or not found.outlines.used.any():
         raise typer.Exit(1)
 
 

@@ -8,7 +8,7 @@ the measurement alone near any Placement, as that of a joint fit (``Placement.of
 
 The seam inside is :func:`measure`: what one image should show in (:class:`ImageSearch`), all its
 outlines with covariance and verdict out. Calibration boards (:func:`detect_corners`,
-:func:`camera_poses`) and what people look at (:func:`write_detection`) stand beside.
+:func:`camera_poses`) and overlays (:func:`draw`) stand beside.
 """
 
 import lazy_loader

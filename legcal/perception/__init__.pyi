@@ -17,13 +17,10 @@ from .outline import Method as Method
 from .outline import find_parts as find_parts
 from .outline import measure as measure
 from .outline import part_outlines as part_outlines
-from .overview import DETECTION as DETECTION
-from .overview import PAGE as PAGE
-from .overview import Detection as Detection
-from .overview import check_detection_destination as check_detection_destination
-from .overview import detection_document as detection_document
-from .overview import picture_names as picture_names
-from .overview import write_detection as write_detection
+from .overlays import PartMarks as PartMarks
+from .overlays import draw as draw
+from .overlays import marks_of_image as marks_of_image
+from .overlays import short_reason as short_reason
 from .part_edges import LegPart as LegPart
 from .photographs import ImageObservations as ImageObservations
 from .photographs import Photographs as Photographs

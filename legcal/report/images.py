@@ -11,8 +11,7 @@ import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
-from legcal.calibration import CameraCalibration
-from legcal.perception import PAGE
+from legcal.calibration import DETECTION_PAGE, CameraCalibration, Detection
 from legcal.report.render import heading, report, table
 from legcal.vision import intrinsic_unit
 
@@ -49,8 +48,9 @@ def camera_table(found: CameraCalibration, output: Path) -> RenderableType:
     )
 
 
-def detection_table(document: dict[str, Any], output: Path) -> RenderableType:
-    """Return the document of ``detect``, and where it was written."""
+def detection_table(found: Detection, output: Path) -> RenderableType:
+    """Return the figures of ``detect``, and where they were written."""
+    document = found.document
     views, rejected = document["views"], Counter[str]()
     for view in views.values():
         rejected.update(view["rejected"])
@@ -81,7 +81,7 @@ def detection_table(document: dict[str, Any], output: Path) -> RenderableType:
         [
             *(Text(view["problem"], style="red") for view in views.values() if view["problem"]),
             *(Text(f"note: {note}", style="dim") for note in document["notes"]),
-            f"Look at {output / PAGE}.",
+            f"Look at {output / DETECTION_PAGE}.",
         ],
     )
 

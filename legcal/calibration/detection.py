@@ -1,4 +1,8 @@
-"""The result of ``legcal detect``: figures of every view, and the folder that people look at."""
+"""The result of ``legcal detect``: figures of every view, and the folder that people look at.
+
+:class:`Detection` has all outlines and its document; :func:`write_detection` writes the folder with
+the table of outlines, a page (HTML) and an overlay of every image.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +10,10 @@ import hashlib
 import json
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,19 +36,17 @@ from legcal.errors import OutOfResources, UsageError
 from legcal.files import Document, OutputKind, check_destination, path_problem, result_folder
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Cylinder
-from legcal.perception.outline import HIDDEN, OUTSIDE
-from legcal.perception.overlays import PartMarks, draw, marks_of_image, short_reason
+from legcal.perception import HIDDEN, OUTSIDE, PartMarks, draw, marks_of_image, short_reason
 from legcal.progress import Report
 from legcal.vision import PredictedLeg, predict_legs
 from legcal.workers import Run
 
-HIDDEN_LEG = "hidden by another leg"
 DETECTION = OutputKind("detection", "detection.json", "legcal_detection")
-PAGE = "index.html"
-PICTURES = "overlays"
-QUALITY_JPEG = 88
-_SAFE = re.compile(r"[^A-Za-z0-9_.-]+")
-_LONGEST = 80  # letters of a name
+DETECTION_PAGE = "index.html"
+OVERLAYS = "overlays"  # the subfolder
+JPEG_QUALITY = 88  # percent
+_UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")  # in names of files
+_MAX_NAME = 80  # letters of such a name
 _HEAD = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
 body {{ font: 15px/1.45 system-ui, sans-serif; margin: 1.5em; color: #222; }}
@@ -56,9 +58,9 @@ figure {{ margin: 0; }} figcaption {{ font-size: 13px; }} img {{ width: 100%; }}
 .bad {{ color: #b00; }} .dim {{ color: #777; }}
 </style></head><body>
 """
-_COLUMNS = ("view", "images", "legs found", "of visible", "outlines used", "of", "contrast",
+_TABLE_HEADINGS = ("view", "images", "legs found", "of visible", "outlines used", "of", "contrast",
             "length [px]", "residual [px]", "rejected")  # fmt: skip
-_HOW = (
+_HOW_TO_CORRECT = (
     "To correct an outline, edit its row in observations.csv: set its verdict, or its line "
     "(a, b, c) and ends, and its source to edited; then copy the file into the dataset."
 )
@@ -122,10 +124,61 @@ class Detection:
         )
         return [leg for leg in found if used is None or legs[leg.leg].name in used]
 
+    @cached_property
+    def overlay_files(self) -> dict[int, str]:
+        """The file of each row's overlay, relative to the folder: by view and image."""
+        measurements = self.dataset.measurements
+        folders = _unique_names(view.name for view in measurements.views)
+        files: dict[int, str] = {}
+        for v, folder in enumerate(folders):
+            rows = [row for row in self.rows.tolist() if measurements.view[row] == v]
+            images = [measurements.image[row] for row in rows]
+            stems = [Path(image).stem for image in images]
+            if len({stem.lower() for stem in stems}) < len(stems):
+                stems = images
+            for row, stem in zip(rows, _unique_names(stems), strict=True):
+                files[row] = f"{OVERLAYS}/{folder}/{stem}.jpg"
+        return files
 
-def reason_class(reason: str) -> str:
-    """Return what kind of reason it is, as it is counted."""
-    return HIDDEN_LEG if reason.startswith(HIDDEN) else short_reason(reason) or "no reason given"
+    @cached_property
+    def document(self) -> dict[str, Any]:
+        """What ``--json`` prints; files are relative to the folder."""
+        names = row_names(self.dataset.measurements)
+        return DetectionDocument(
+            legcal_detection=1,
+            mechanism=self.dataset.machine.name,
+            views=_view_figures(self),
+            images=len(self.rows),
+            outlines=len(self.outlines),
+            used=int(np.count_nonzero(self.outlines.used)),
+            overlays=[
+                Overlay(view=self.view_of(row), image=names[row], file=file)
+                for row, file in self.overlay_files.items()
+            ],
+            notes=list(self.notes),
+        ).document()
+
+
+def _unique_names(names: Iterable[str]) -> list[str]:
+    """Return names of files that are distinct on every file system."""
+    found: list[str] = []
+    taken: set[str] = set()
+    for name in names:
+        plain = _UNSAFE.sub("_", name).lstrip(".")[:_MAX_NAME] or "_"
+        k, chosen = 1, plain
+        while chosen.lower() in taken:
+            k += 1
+            chosen = f"{plain}-{k}"
+        taken.add(chosen.lower())
+        found.append(chosen)
+    return found
+
+
+def _counted_reason(reason: str) -> str:
+    """Return a reason without its figures and names, as it is counted."""
+    if reason.startswith(HIDDEN):
+        return "hidden by another leg"
+    return short_reason(reason) or "no reason given"
 
 
 class ViewFigures(Document):
@@ -137,15 +190,15 @@ class ViewFigures(Document):
     outlines: int
     used: int
     edited: int
-    contrast: float | None  # medians of the used outlines
-    length: float | None
-    residual: float | None
+    contrast: float | None  # median of the used outlines, as the next ones [grey levels]
+    length: float | None  # [px]
+    residual: float | None  # [px]
     rejected: dict[str, int]  # by reason, the most first
     problem: str | None  # why its camera could not be placed
 
 
 class Overlay(Document):
-    """The picture of an image."""
+    """The overlay of an image."""
 
     view: str
     image: str
@@ -165,7 +218,7 @@ class DetectionDocument(Document):
     notes: list[str]
 
 
-def view_figures(detection: Detection) -> dict[str, ViewFigures]:
+def _view_figures(detection: Detection) -> dict[str, ViewFigures]:
     """Return the figures of every view that has images or outlines.
 
     Legs are counted in each image that should show them: neither outside nor hidden. They are found
@@ -180,7 +233,7 @@ def view_figures(detection: Detection) -> dict[str, ViewFigures]:
         used, reasons = outlines.used, outlines.reason
         hidden = [why == OUTSIDE or why.startswith(HIDDEN) for why in reasons]
         rejected = Counter(
-            reason_class(why) for why, ok in zip(reasons, used, strict=True) if not ok
+            _counted_reason(why) for why, ok in zip(reasons, used, strict=True) if not ok
         )
         found[name] = ViewFigures(
             images=int(np.count_nonzero(measurements.view[detection.rows] == v)),
@@ -189,9 +242,9 @@ def view_figures(detection: Detection) -> dict[str, ViewFigures]:
             outlines=len(outlines),
             used=int(np.count_nonzero(used)),
             edited=int(np.count_nonzero(is_edited(outlines))),
-            contrast=_median(outlines, "contrast"),
-            length=_median(outlines, "length"),
-            residual=_median(outlines, "residual"),
+            contrast=_median(outlines.contrast[used]),
+            length=_median(outlines.length[used]),
+            residual=_median(outlines.residual[used]),
             rejected=dict(rejected.most_common()),
             problem=detection.unplaced.get(name) or None,
         )
@@ -199,43 +252,40 @@ def view_figures(detection: Detection) -> dict[str, ViewFigures]:
 
 
 def _count_legs(outlines: Outlines, chosen: BoolArray) -> int:
-    """Return in how many images legs have one of the chosen outlines, summed over the legs."""
-    places = zip(outlines.row[chosen].tolist(), outlines.leg[chosen].tolist(), strict=True)
-    return len(set(places))
+    """Return how many legs in images have one of the chosen outlines."""
+    return len(set(zip(outlines.row[chosen].tolist(), outlines.leg[chosen].tolist(), strict=True)))
 
 
-def _median(outlines: Outlines, name: str) -> float | None:
-    values = getattr(outlines, name)[outlines.used]
+def _median(values: Array) -> float | None:
     values = values[np.isfinite(values)]
     return float(np.median(values)) if len(values) else None
 
 
-def overlay_page(
-    detection: Detection, document: Mapping[str, Any], pictures: Mapping[int, str]
-) -> str:
-    """Return the text of ``index.html``; pictures of rows are relative to the page."""
+def _page(detection: Detection) -> str:
+    """Return the text of ``index.html``."""
+    document, files = detection.document, detection.overlay_files
     title = f"Outlines of {detection.dataset.machine.name}"
     parts = [_HEAD.format(title=escape(title)), f"<h1>{escape(title)}</h1>\n"]
     parts.append(
         f"<p>{document['used']} of {document['outlines']} outlines in {document['images']} images "
-        f"are used.</p>\n{_table(document['views'])}<p class=dim>{escape(_HOW)}</p>\n"
+        f"are used.</p>\n{_table(document['views'])}<p class=dim>{escape(_HOW_TO_CORRECT)}</p>\n"
     )
     parts += [f"<p>{escape(note)}</p>\n" for note in document["notes"]]
     names = row_names(detection.dataset.measurements)
     for view, figures in document["views"].items():
-        rows = [row for row in pictures if detection.view_of(row) == view]
+        rows = [row for row in files if detection.view_of(row) == view]
         parts.append(f'<h2 id="{escape(view)}">{escape(view)}</h2>\n')
         if figures["problem"]:
             parts.append(f"<p class=bad>{escape(figures['problem'])}</p>\n")
         parts.append("<div class=views>\n")
-        parts += [_figure(names[row], pictures[row], _said(detection, row)) for row in rows]
+        parts += [_figure(names[row], files[row], _summary(detection, row)) for row in rows]
         parts.append("</div>\n")
     return "".join([*parts, "</body></html>\n"])
 
 
 def _table(views: Mapping[str, Any]) -> str:
     """Return the figures of the views as a table."""
-    rows = ["<tr>" + "".join(f"<th>{name}</th>" for name in _COLUMNS) + "</tr>"]
+    rows = ["<tr>" + "".join(f"<th>{name}</th>" for name in _TABLE_HEADINGS) + "</tr>"]
     for name, view in views.items():
         rejected = ", ".join(f"{n} {escape(why)}" for why, n in view["rejected"].items())
         cells = (
@@ -258,29 +308,29 @@ def _number(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
-def _figure(name: str, file: str, said: str) -> str:
-    """Return a picture with its name and what was found."""
-    place = quote(file)
+def _figure(name: str, file: str, summary: str) -> str:
+    """Return an overlay with the name of its image and what was found."""
+    url = quote(file)
     return (
-        f'<figure><a href="{place}"><img loading=lazy src="{place}" alt=""></a>'
-        f"<figcaption>{escape(name)}: {said}</figcaption></figure>\n"
+        f'<figure><a href="{url}"><img loading=lazy src="{url}" alt=""></a>'
+        f"<figcaption>{escape(name)}: {summary}</figcaption></figure>\n"
     )
 
 
-def _said(detection: Detection, row: int) -> str:
-    """Return what was found in the image of a row."""
+def _summary(detection: Detection, row: int) -> str:
+    """Return what was found in the image of a row, and why legs are rejected (HTML)."""
     outlines, legs = detection.outlines, detection.dataset.machine.leg_names
     here = np.flatnonzero(outlines.row == row).tolist()
-    said = f"{np.count_nonzero(outlines.used[here])} of {len(here)} used"
-    wrong: dict[str, list[str]] = {}
+    used = f"{np.count_nonzero(outlines.used[here])} of {len(here)} used"
+    rejected: dict[str, list[str]] = {}
     for i in here:
         if not outlines.used[i] and outlines.reason[i] != OUTSIDE:
             name = legs[outlines.leg[i]]
-            names = wrong.setdefault(reason_class(outlines.reason[i]), [])
+            names = rejected.setdefault(_counted_reason(outlines.reason[i]), [])
             if name not in names:
                 names.append(name)
-    told = "; ".join(f"{', '.join(names)}: {why}" for why, names in wrong.items())
-    return said + (f" <span class=bad>({escape(told)})</span>" if told else "")
+    reasons = "; ".join(f"{', '.join(names)}: {why}" for why, names in rejected.items())
+    return used + (f" <span class=bad>({escape(reasons)})</span>" if reasons else "")
 
 
 def check_detection_destination(destination: Path, dataset: Path | None) -> None:
@@ -307,10 +357,8 @@ def check_detection_destination(destination: Path, dataset: Path | None) -> None
         )
 
 
-def write_detection(
-    detection: Detection, destination: Path, run: Run, progress: Report
-) -> dict[str, Any]:
-    """Write the folder, all of it or nothing, and return its document.
+def write_detection(detection: Detection, destination: Path, run: Run, progress: Report) -> None:
+    """Write the folder, all of it or nothing.
 
     Raises UsageError as :func:`check_detection_destination` does, and OutOfResources if the files
     cannot be written.
@@ -318,78 +366,23 @@ def write_detection(
     dataset = detection.dataset
     check_detection_destination(destination, dataset.folder)
     earlier = _own_files(destination)
-    pictures = picture_names(detection)
     with result_folder(destination, DETECTION, earlier, replaceable=earlier) as folder:
         table = folder / OBSERVATIONS_NAME
         names = dataset.machine.leg_names
         write_observations(table, detection.outlines, dataset.measurements, names)
-        _draw_all(detection, folder, pictures, run, progress)
-        document = detection_document(detection, pictures)
-        (folder / PAGE).write_text(
-            overlay_page(detection, document, pictures), encoding="utf-8", newline="\n"
-        )
+        _draw_all(detection, folder, run, progress)
+        (folder / DETECTION_PAGE).write_text(_page(detection), encoding="utf-8", newline="\n")
         files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
         record = {
-            **document,
+            **detection.document,
             "table": hashlib.sha256(table.read_bytes()).hexdigest(),
             "files": [*files, DETECTION.marker],
         }
         (folder / DETECTION.marker).write_text(json.dumps(record, indent=1) + "\n", "utf-8")
-    return document
 
 
-def detection_document(detection: Detection, pictures: Mapping[int, str]) -> dict[str, Any]:
-    """Return what ``--json`` prints; *pictures* are the files of rows, relative to the folder."""
-    outlines = detection.outlines
-    names = row_names(detection.dataset.measurements)
-    return DetectionDocument(
-        legcal_detection=1,
-        mechanism=detection.dataset.machine.name,
-        views=view_figures(detection),
-        images=len(detection.rows),
-        outlines=len(outlines),
-        used=int(np.count_nonzero(outlines.used)),
-        overlays=[
-            Overlay(view=detection.view_of(row), image=names[row], file=file)
-            for row, file in pictures.items()
-        ],
-        notes=list(detection.notes),
-    ).document()
-
-
-def picture_names(detection: Detection) -> dict[int, str]:
-    """Return the file of each row's picture, relative to the folder: by view and image."""
-    measurements = detection.dataset.measurements
-    folders = _unique([view.name for view in measurements.views])
-    found: dict[int, str] = {}
-    for v, folder in enumerate(folders):
-        rows = [row for row in detection.rows.tolist() if measurements.view[row] == v]
-        images = [measurements.image[row] for row in rows]
-        stems = [Path(image).stem for image in images]
-        if len({stem.lower() for stem in stems}) < len(stems):
-            stems = images
-        for row, stem in zip(rows, _unique(stems), strict=True):
-            found[row] = f"{PICTURES}/{folder}/{stem}.jpg"
-    return found
-
-
-def _unique(names: Sequence[str]) -> list[str]:
-    """Return names that can be those of files, each another one whatever the file system."""
-    found: list[str] = []
-    taken: set[str] = set()
-    for name in names:
-        plain = _SAFE.sub("_", name).lstrip(".")[:_LONGEST] or "_"
-        k, chosen = 1, plain
-        while chosen.lower() in taken:
-            k += 1
-            chosen = f"{plain}-{k}"
-        taken.add(chosen.lower())
-        found.append(chosen)
-    return found
-
-
-class _Drawn(NamedTuple):
-    """What is drawn of every row, and where; it travels to worker processes."""
+class _Drawings(NamedTuple):
+    """What is drawn over each image, and where it is written; it travels to worker processes."""
 
     load: ImageReader
     marks: tuple[tuple[PartMarks, ...], ...]
@@ -397,34 +390,33 @@ class _Drawn(NamedTuple):
     files: tuple[Path, ...]
 
 
-def _draw_all(
-    detection: Detection, folder: Path, pictures: Mapping[int, str], run: Run, progress: Report
-) -> None:
-    """Write the picture of every row that has an image."""
-    rows = list(pictures)
-    for file in pictures.values():
-        (folder / file).parent.mkdir(parents=True, exist_ok=True)
-    drawn = _Drawn(
+def _draw_all(detection: Detection, folder: Path, run: Run, progress: Report) -> None:
+    """Write the overlay of every row that has an image."""
+    rows = list(detection.overlay_files)
+    files = tuple(folder / file for file in detection.overlay_files.values())
+    for file in files:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    drawings = _Drawings(
         detection.dataset.image_reader(rows),
         tuple(tuple(_marks(detection, row)) for row in rows),
         tuple(_caption(detection, row) for row in rows),
-        tuple(folder / file for file in pictures.values()),
+        files,
     )
     progress("Drawing overlays", 0, len(rows))
-    for done, _ in enumerate(run(partial(_write_picture, drawn), range(len(rows))), start=1):
+    for done, _ in enumerate(run(partial(_write_overlay, drawings), range(len(rows))), start=1):
         progress("Drawing overlays", done, len(rows))
 
 
-def _write_picture(drawn: _Drawn, k: int) -> None:
-    """Draw picture k and write it."""
-    picture = draw(drawn.load(k), drawn.marks[k], drawn.captions[k])
-    ok, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY_JPEG])
+def _write_overlay(drawings: _Drawings, k: int) -> None:
+    """Draw overlay k and write it."""
+    picture = draw(drawings.load(k), drawings.marks[k], drawings.captions[k])
+    ok, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not ok:
         raise OutOfResources(
-            f"{drawn.files[k].name}: the picture could not be written: found that it cannot be "
+            f"{drawings.files[k].name}: the picture could not be written: found that it cannot be "
             "encoded, needed enough memory; try again with fewer workers."
         )
-    drawn.files[k].write_bytes(content.tobytes())
+    drawings.files[k].write_bytes(content.tobytes())
 
 
 def _marks(detection: Detection, row: int) -> list[PartMarks]:
@@ -440,16 +432,16 @@ def _marks(detection: Detection, row: int) -> list[PartMarks]:
 
 
 def _caption(detection: Detection, row: int) -> str:
-    """Return what stands below the picture of a row."""
+    """Return what stands below the overlay of a row."""
     view, outlines = detection.view_of(row), detection.outlines
     measurements = detection.dataset.measurements
     here = outlines.used[outlines.row == row]
-    said = f"{np.count_nonzero(here)} of {len(here)} outlines used"
+    found = f"{np.count_nonzero(here)} of {len(here)} outlines used"
     if view in detection.unplaced:
-        said = "the camera could not be placed"
+        found = "the camera could not be placed"
         if detection.T_base_camera[int(measurements.view[row])] is not None:
-            said += ": legs are drawn where it was expected"
-    text = f"{view}  {measurements.image[row]}  {said}"
+            found += ": legs are drawn where it was expected"
+    text = f"{view}  {measurements.image[row]}  {found}"
     return text.encode("ascii", "replace").decode()
 
 
@@ -476,5 +468,5 @@ def _is_place(name: Path) -> bool:
     """Say whether a path is one where a detection is written."""
     if ".." in name.parts:
         return False
-    own = {Path(OBSERVATIONS_NAME), Path(PAGE), Path(DETECTION.marker)}
-    return name in own or (name.parts[0] == PICTURES and name.suffix == ".jpg")
+    own = {Path(OBSERVATIONS_NAME), Path(DETECTION_PAGE), Path(DETECTION.marker)}
+    return name in own or (name.parts[0] == OVERLAYS and name.suffix == ".jpg")
