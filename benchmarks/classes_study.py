@@ -48,14 +48,14 @@ from outline_study import (
     printed,
     run,
 )
-from rich.console import Group, RenderableType
-from rich.text import Text
+from rich.console import RenderableType
 
 from legcal.calibration import Choices, Solution, Start, refine
 from legcal.errors import DidNotConverge, LegcalError
 from legcal.geometry import components
 from legcal.machine import Leg, radius_name, vector_of
 from legcal.paper import Criteria
+from legcal.report import report
 from legcal.simulation import Record, failure_of, has_keys, is_failure, is_number
 
 NOMINAL, FIT = "nominal", "fit"
@@ -120,7 +120,7 @@ class ClassesStudy(OutlineStudy):
         said = [line for found in machines for line in remarks(found)]
         worth = printed(WORTH, [(found["machine"], *worth_cells(found)) for found in machines])
         platform = [(found["machine"], *platform_cells(found)) for found in machines]
-        return Group(worth, Text(), printed(ESTIMATORS, platform, [*NOTES, *said, *self.readings]))
+        return report(worth, printed(ESTIMATORS, platform, [*NOTES, *said, *self.readings]))
 
     def files(self, machines: Sequence[Found]) -> dict[str, bytes]:
         """Return the page with both tables."""

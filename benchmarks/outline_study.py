@@ -26,13 +26,13 @@ from outline_sessions import (
     design_of,
     draw_session,
 )
-from rich.console import Console, Group, RenderableType
-from rich.table import Table
+from rich.console import Console, RenderableType
 from rich.text import Text
 
 from legcal.cli.options import print_failure
 from legcal.errors import LegcalError, UsageError
 from legcal.processors import processors
+from legcal.report import report, table
 from legcal.simulation import (
     Record,
     failure_of,
@@ -177,10 +177,6 @@ class OutlineSummary:
             "readings": list(self.study.readings),
         }
 
-    def table(self) -> RenderableType:
-        """Return the tables for people."""
-        return self.study.table(self.machines)
-
     def files(self) -> dict[str, bytes]:
         """Return the files that belong to it."""
         return self.study.files(self.machines)
@@ -194,15 +190,10 @@ def failures_of(records: Iterable[Record]) -> dict[str, int]:
 
 def printed(
     columns: Sequence[str], rows: Iterable[Sequence[str]], notes: Iterable[str] = ()
-) -> Group:
+) -> RenderableType:
     """Return a table of machines with notes below."""
-    table = Table(box=None, pad_edge=False)
-    table.add_column("machine", no_wrap=True)
-    for column in columns:
-        table.add_column(Text(column), justify="right", no_wrap=True)
-    for row in rows:
-        table.add_row(*row)
-    return Group(table, Text(), *(Text(f"- {line}", style="dim") for line in notes))
+    found = table("machine", *(f">{column}" for column in columns), rows=rows)
+    return report(found, [Text(f"- {line}", style="dim") for line in notes])
 
 
 def run(kind: type[OutlineStudy], description: str | None) -> int:
@@ -216,8 +207,9 @@ def run(kind: type[OutlineStudy], description: str | None) -> int:
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
     try:
+        study = kind(tuple(asked.machine))
         result = run_study(
-            kind(tuple(asked.machine)),
+            study,
             asked.runs,
             seed=asked.seed,
             workers=asked.workers,
@@ -232,5 +224,5 @@ def run(kind: type[OutlineStudy], description: str | None) -> int:
     if asked.json:
         print(json.dumps(result.document(), allow_nan=False))
     else:
-        Console(highlight=False).print(result.summary.table())
+        Console(highlight=False).print(study.table(result.document()["machines"]))
     return 0

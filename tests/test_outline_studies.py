@@ -501,7 +501,7 @@ def test_a_study_goes_on_where_it_was(
     result = run_study(study, n_runs, output=folder)
     assert (folder / "runs.jsonl").read_text().splitlines(keepends=True) == lines
     assert (folder / "study.json").read_bytes() == before
-    told = _printed(result.summary.table())
+    told = _printed(study.table(result.document()["machines"]))
     assert "…" not in told
     assert all(word in told for word in words)
     with pytest.raises(UsageError, match="other settings"):
@@ -560,14 +560,15 @@ def test_a_step_or_a_fit_that_fails_is_counted_with_its_reason(
         (found,) = result.document()["machines"]
         assert not found["met"]
         assert 2 in (found.get("refused"), found.get("failed"))
-        assert "DidNotConverge" in _printed(result.summary.table())
+        assert "DidNotConverge" in _printed(study.table(result.document()["machines"]))
     monkeypatch.setattr(classes_study, "staged_legs", steps_fail)
     monkeypatch.setattr(classes_study, "one_fit", fit_fails)
-    result = run_study(_quick(ClassesStudy), 2)
+    classes = _quick(ClassesStudy)
+    result = run_study(classes, 2)
     (found,) = result.document()["machines"]
     assert found["estimators"][FIT]["failures"] == {"DidNotConverge": 2}
     assert found["estimators"]["nominal"]["runs"] == 2
-    told = " ".join(_printed(result.summary.table()).split())
+    told = " ".join(_printed(classes.table(result.document()["machines"])).split())
     assert "failed in 2 of 2 sessions with NotIdentifiable, the first time: Nothing" in told
 
 
@@ -590,7 +591,7 @@ def test_convergence_counts_the_truth_as_right_and_another_answer_as_wrong(
     assert 0.0 < found["worst_sigma"] <= 5.0
     assert found["before"]["dX_mm"] > 50.0 * found["after"]["dX_mm"]
     assert found["after"]["dX_mm"] < 5.0 * found["predicted"]["dX_mm"]
-    told = _printed(result.summary.table())
+    told = _printed(study.table(result.document()["machines"]))
     assert "1 sigma" in told
     assert "…" not in told
     line = json.loads((tmp_path / "out" / "runs.jsonl").read_text().splitlines()[1])

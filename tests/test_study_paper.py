@@ -14,6 +14,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge, UsageError
 from legcal.geometry import Array
 from legcal.machine import KinematicParameters, from_vector, to_vector
+from legcal.report import study_table
 from legcal.simulation import (
     HexapodSession,
     PaperHexapod,
@@ -46,7 +47,7 @@ def _poses(machine: PaperHexapod, n: int = 10) -> RigidTransform:
 
 def _printed(result: StudyResult) -> str:
     printed = io.StringIO()
-    Console(file=printed, width=80).print(result.summary.table())
+    Console(file=printed, width=80).print(study_table(result.document()))
     return printed.getvalue()
 
 

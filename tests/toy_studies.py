@@ -26,9 +26,6 @@ class Total:
     def document(self) -> dict[str, Any]:
         return {"total": self.total, "n": self.n}
 
-    def table(self) -> str:
-        return f"{self.total} of {self.n}"
-
     def files(self) -> dict[str, bytes]:
         return {"total.txt": str(self.total).encode()}
 

@@ -13,9 +13,7 @@ from legcal.cli.options import JsonOption, WorkersOption, print_json, print_tabl
 from legcal.errors import UsageError
 from legcal.processors import processors
 
-RunsOption = Annotated[int, typer.Option(help="Number of runs.")]
-SeedOption = Annotated[int, typer.Option(help="Seed of all runs.")]
-OutputOption = Annotated[
+OutputFolder = Annotated[
     Path | None,
     typer.Option(
         "--output",
@@ -25,27 +23,18 @@ OutputOption = Annotated[
         "goes on from what is there.",
     ),
 ]
-MachineOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--machine",
-        metavar="NAME",
-        help="A machine of the benchmark; may be repeated, all without it.",
-    ),
-]
 
-_BENCHMARKS = {  # studies of earlier versions: the program, its number of runs, what it measures
-    "bound": (
-        "bound.py", 2000, "errors of a calibration, and its sigmas, beside the Cramer-Rao bound"
-    ),
+_BENCHMARKS = {  # that replace studies of earlier versions, and what they measure
+    "bound": ("bound.py", "errors of a calibration, and its sigmas, beside the Cramer-Rao bound"),
     "convergence": (
-        "convergence.py", 100, "where calibrations end that start 5 mm and 3 deg off in everything"
+        "convergence.py",
+        "where calibrations end that start 5 mm and 3 deg off in everything",
     ),
     "classes": (
-        "classes_study.py", 200, "shipped machines by the four steps and by the fit, beside the "
-        "bound"
+        "classes_study.py",
+        "shipped machines by the four steps and by the fit, beside the bound",
     ),
-}  # fmt: skip
+}
 
 study = typer.Typer(
     help="Measure on many simulated machines what is claimed; their truth is known.",
@@ -55,10 +44,10 @@ study = typer.Typer(
 
 @study.command()
 def paper(
-    runs: RunsOption = 100,
-    seed: SeedOption = 0,
+    runs: Annotated[int, typer.Option(help="Number of runs.")] = 100,
+    seed: Annotated[int, typer.Option(help="Seed of all runs.")] = 0,
     workers: WorkersOption = None,
-    output: OutputOption = None,
+    output: OutputFolder = None,
     radians: Annotated[
         bool, typer.Option("--radians", help="Take the angles of Table 1 as radians, as printed.")
     ] = False,
@@ -88,31 +77,22 @@ def paper(
     print_table(Group(result.summary.table(), *where))
 
 
-def _name_benchmark(name: str, program: str, n_runs: int) -> Callable[..., None]:
-    """Return the command of a study that is a benchmark now: it takes the options and names it."""
+def _name_benchmark(name: str, program: str) -> Callable[[typer.Context], None]:
+    """Return the command of a study that is a benchmark now: it names the command to run."""
 
-    def command(
-        runs: RunsOption = n_runs,
-        machine: MachineOption = None,
-        seed: SeedOption = 0,
-        workers: WorkersOption = None,
-        output: OutputOption = None,
-        as_json: JsonOption = False,
-    ) -> None:
-        words = ["python", f"benchmarks/{program}", "--runs", f"{runs}", "--seed", f"{seed}"]
-        words += [word for one in machine or () for word in ("--machine", one)]
-        words += [] if workers is None else ["--workers", f"{workers}"]
-        words += [] if output is None else ["-o", str(output)]
-        words += ["--json"] * as_json
+    def command(context: typer.Context) -> None:
+        words = shlex.join(["python", f"benchmarks/{program}", *context.args])
         raise UsageError(
             f"The study {name} could not be run: found a command of an earlier version, needed the "
-            f"benchmark of the source tree; run {shlex.join(words)}."
+            f"benchmark of the source tree; run {words}."
         )
 
     return command
 
 
-for _name, (_program, _n_runs, _what) in _BENCHMARKS.items():
-    study.command(_name, help=f"Name the benchmark: {_what}.")(
-        _name_benchmark(_name, _program, _n_runs)
-    )
+for _name, (_program, _what) in _BENCHMARKS.items():
+    study.command(
+        _name,
+        help=f"Name the benchmark: {_what}.",
+        context_settings={"ignore_unknown_options": True, "allow_extra_args": True},
+    )(_name_benchmark(_name, _program))

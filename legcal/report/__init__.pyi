@@ -11,3 +11,4 @@ from .noise import noise_table as noise_table
 from .progress_bars import progress_on_stderr as progress_on_stderr
 from .render import report as report
 from .render import table as table
+from .study import study_table as study_table

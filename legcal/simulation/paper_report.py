@@ -1,4 +1,4 @@
-"""What the evaluation of section 4.3 found: means over runs, the table, and figure 4."""
+"""What the evaluation of section 4.3 found: means over runs, and figure 4."""
 
 from __future__ import annotations
 
@@ -9,9 +9,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from rich.console import Group, RenderableType
-from rich.table import Table
-from rich.text import Text
 
 from legcal.geometry import Array
 from legcal.machine import parametrize, point_like_legs, to_vector
@@ -23,13 +20,6 @@ if TYPE_CHECKING:
 
 INITIAL, BOUND = "initial", "bound"
 SCALARS = ("dX", "dE", "angle", "of_bound_squared")
-LABELS = {
-    "initial": "before",
-    "literal": "steps as printed",
-    "default": "legcal's steps",
-    "fit": "one fit",
-    "bound": "Cramer-Rao bound",
-}
 JOINTS = {"coplanar": "coplanar", "noncoplanar": "non-coplanar"}
 
 PRINTED_BEFORE = {"dX_mm": 1.0, "dE_deg": 0.12}
@@ -75,9 +65,7 @@ READINGS = (
     "deviation of the mean over runs.",
 )
 
-_COLUMNS = ("dX [mm]", "dE [deg]", "parameters [mm]", "of bound", "runs")
-_LARGE = 10.0  # in the unit of its column
-_DRAWN = ("literal", "default", "fit")
+_DRAWN = {"literal": "steps as printed", "default": "legcal's steps", "fit": "one fit"}
 _BAR, _LIMIT, _LINE = "#4c78a8", "#e45756", "#8a8a8a"
 _LETTERS = {"base": "A", "platform": "B", "offset": "q0"}
 _ERROR_AXIS, _TRUTH_AXIS = "mean error [mm]", "true value [mm]"
@@ -209,66 +197,9 @@ class PaperSummary:
             "readings": list(self.readings),
         }
 
-    def table(self) -> RenderableType:
-        """Return errors before and after calibration, beside the figures that the paper prints."""
-        table = Table(box=None, pad_edge=False)
-        table.add_column("joints", no_wrap=True)
-        for column in _COLUMNS:
-            table.add_column(Text(column), justify="right")
-        for name in self.truths:
-            table.add_row(JOINTS[name])
-            for means in self.means:
-                if means.machine == name:
-                    table.add_row(f" {LABELS[means.estimator]}", *_cells(means))
-        table.add_row("paper, as printed")
-        for label, printed in ((" before", PRINTED_BEFORE), (" after", PRINTED_AFTER)):
-            table.add_row(label, *_printed_cells(printed))
-        failures = [
-            f"{LABELS[means.estimator]}, {JOINTS[means.machine]} joints: {means.n_failed} of "
-            f"{means.n + means.n_failed} runs failed ({', '.join(sorted(means.failures))}) and are "
-            "not in the means."
-            for means in self.means
-            if means.n_failed
-        ]
-        notes = [*failures, CONTEXT, *self.readings]
-        return Group(table, Text(), *(Text(f"- {line}", style="dim") for line in notes))
-
     def files(self) -> dict[str, bytes]:
         """Return figure 4, to look at in a browser and as a picture."""
         return {"fig4.html": _as_html(self), "fig4.png": _as_png(self)}
-
-
-def _cells(means: Means) -> tuple[str, ...]:
-    """Return the figures of a row."""
-    if means.n == 0:
-        return ("all failed", "", "", "", "0")
-    dX, dE = means.scalars[:2].tolist()
-    return (
-        _with_sigma(1e3 * dX, 1e3 * float(means.uncertainties[0]), digits=3),
-        f"{np.degrees(dE):.4f}",
-        _range(1e3 * means.parameters.min(), 1e3 * means.parameters.max()),
-        "1" if means.estimator == BOUND else _with_sigma(*means.of_bound, digits=2),
-        f"{means.n}",
-    )
-
-
-def _printed_cells(printed: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the figures of a row that the paper prints."""
-    between = _range(*printed["parameters_mm"]) if "parameters_mm" in printed else ""
-    runs = f"{printed.get('runs', '')}"
-    return (f"{printed['dX_mm']:g}", f"{printed['dE_deg']:g}", between, "", runs)
-
-
-def _range(lowest: float, highest: float) -> str:
-    """Return the least and the largest error of a parameter."""
-    digits = 3 if highest < _LARGE else 1
-    return f"{lowest:.{digits}f} to {highest:.{digits}f}"
-
-
-def _with_sigma(mean: float, sigma: float, *, digits: int) -> str:
-    """Return a mean and its standard deviation; large ones with fewer digits."""
-    shown = digits if mean < _LARGE else digits - 2
-    return f"{mean:.{shown}f} +- {sigma:.{shown}f}"
 
 
 # Figure 4
@@ -292,7 +223,7 @@ def _panels(found: PaperSummary) -> list[list[_Panel]]:
         means, limit = by_name[machine, estimator], by_name[machine, BOUND]
         failed = f" ({means.n_failed} of {means.n + means.n_failed} runs failed)"
         return _Panel(
-            f"{LABELS[estimator]}, {JOINTS[machine]} joints{failed * bool(means.n_failed)}",
+            f"{_DRAWN[estimator]}, {JOINTS[machine]} joints{failed * bool(means.n_failed)}",
             1e3 * means.parameters,
             1e3 * limit.parameters,
             1e3 * found.truths[machine],

@@ -20,7 +20,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from joblib import Parallel, delayed, parallel_config
@@ -38,9 +38,6 @@ from legcal.simulation.checkpoint import (
     open_checkpoint,
 )
 
-if TYPE_CHECKING:
-    from rich.console import RenderableType
-
 DOCUMENT_NAME = "study.json"
 MOST_RUNS = 1_000_000
 _LARGEST_CHUNK = 10  # runs between two lines of the checkpoint reaching the disk
@@ -56,9 +53,6 @@ class Summary(Protocol):
 
     def document(self) -> dict[str, Any]:
         """Return it as a JSON document."""
-
-    def table(self) -> RenderableType:
-        """Return it for people."""
 
     def files(self) -> dict[str, bytes]:
         """Return the files that belong to it, such as figures, by name."""
