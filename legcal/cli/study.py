@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from legcal.cli.options import JsonOption, WorkersOption, print_json, print_table
+from legcal.cli.options import JsonOption, WorkersOption, print_table, show
 from legcal.errors import UsageError
 from legcal.processors import processors
 
@@ -54,7 +54,7 @@ def paper(
     as_json: JsonOption = False,
 ) -> None:
     """Repeat section 4.3 of the paper: calibrations of a 6-SPU, before and after."""
-    from legcal.report import progress_on_stderr
+    from legcal.report import progress_on_stderr, study_table
     from legcal.simulation import PaperStudy, TableNoise, run_study
 
     noise = TableNoise.in_radians() if radians else TableNoise()
@@ -67,14 +67,10 @@ def paper(
             output=output,
             progress=progress,
         )
-    if as_json:
-        print_json(result.document())
-        return
-    from rich.console import Group
-    from rich.text import Text
-
-    where = [Text(f"\nRuns, document and figures: {output}")] if output is not None else []
-    print_table(Group(result.summary.table(), *where))
+    document = result.document()
+    show(as_json, lambda: document, lambda: study_table(document))
+    if output is not None and not as_json:
+        print_table(f"\nRuns, document and figures: {output}")
 
 
 def _name_benchmark(name: str, program: str) -> Callable[[typer.Context], None]:
