@@ -7,7 +7,7 @@ import numpy as np
 from boards import before
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.camera_calibration.adjustment import BoardCorners
+from legcal.calibration.camera_calibration.adjustment import BoardImages
 from legcal.geometry.types import Array
 from legcal.simulation import Appearance, PlacedBoard, render
 from legcal.vision.board import Board
@@ -35,7 +35,7 @@ CAMERAS = {
 
 def seen_corners(
     camera: Camera, n_images: int, seed: int, *, tilt: float = 0.6, noise: float = NOISE_PX
-) -> BoardCorners:
+) -> BoardImages:
     """Return the corners of a board in random places, all over the image."""
     rng = np.random.default_rng(seed)
     middle = RigidTransform.from_translation(-BOARD.points.mean(axis=0))
@@ -58,7 +58,7 @@ def seen_corners(
         points.append(BOARD.points[inside])
         px.append(at[inside])
     exact = np.concatenate(px)
-    return BoardCorners(
+    return BoardImages(
         np.concatenate(image).astype(np.intp),
         np.concatenate(points),
         exact + noise * rng.standard_normal(exact.shape),

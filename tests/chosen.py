@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from legcal import load_mechanism
-from legcal.calibration.joint_fit.choices import (
+from legcal.calibration.joint_fit.parameter_choices import (
     Choices,
     KnownParameters,
     known_parameters,

@@ -8,7 +8,11 @@ import numpy as np
 from machine_session import PINHOLE, MachineSession, machine_session
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.identify.session import Session, at_base_joints, at_platform_joints
+from legcal.calibration.identify.predicted_observations import (
+    PredictedObservations,
+    at_base_joints,
+    at_platform_joints,
+)
 from legcal.data import LegAxes, Measurements, View, axes_from_outlines
 from legcal.geometry import Array, BoolArray, normal_basis
 from legcal.machine import (
@@ -103,7 +107,7 @@ def _observed(session: MachineSession) -> Observed:
     )
 
 
-def planned(session: Session, sign: Array) -> Observed:
+def planned(session: PredictedObservations, sign: Array) -> Observed:
     """Return exactly what a planned session will show, nominal legs being 3 mm and 1 deg off."""
     row, leg = np.nonzero(session.seen[session.view])
     pose = session.pose[row]

@@ -14,9 +14,9 @@ from camera_sessions import CAMERAS, NOISE_PX, PINHOLE, SIZE, drawings, photogra
 
 from legcal import calibrate_camera, cli
 from legcal.calibration import CameraCalibration
-from legcal.calibration.camera_calibration.adjustment import BoardCorners, RobustFit, robust_fit
+from legcal.calibration.camera_calibration.adjustment import BoardImages, RobustFit, robust_fit
 from legcal.calibration.camera_calibration.diagnostics import refuse_undetermined, warnings
-from legcal.calibration.joint_fit.choices import Prior, known_parameters, resolve
+from legcal.calibration.joint_fit.parameter_choices import Prior, known_parameters, resolve
 from legcal.data.measurements import View
 from legcal.data.overrides import overrides_of_call
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible, UsageError
@@ -31,7 +31,7 @@ CHARUCO = Board("charuco", 7, 5, 0.04, marker=0.029, dictionary="DICT_4X4_50")
 N_IMAGES = 3
 
 
-def fitted(seen: BoardCorners, model: DistortionModel = "plumb_bob") -> RobustFit:
+def fitted(seen: BoardImages, model: DistortionModel = "plumb_bob") -> RobustFit:
     found = robust_fit(seen, SIZE, model)
     assert found is not None
     return found
@@ -96,7 +96,7 @@ def test_claims_of_corners_are_believed_relative_to_each_other() -> None:
     worse = np.arange(len(seen.px)) % 2 == 0
     sigma = np.where(worse, 1.0, NOISE_PX)
     px = seen.px + np.where(worse, 1.0, 0.0)[:, None] * rng.standard_normal(seen.px.shape)
-    alone = fitted(BoardCorners(seen.image[~worse], seen.points[~worse], px[~worse], sigma[~worse]))
+    alone = fitted(BoardImages(seen.image[~worse], seen.points[~worse], px[~worse], sigma[~worse]))
     both = fitted(replace(seen, px=px, sigma_px=sigma))
     assert np.abs(pulls(both)).max() < 3.5
     assert np.all(sigmas(both) < 4.0 * sigmas(alone))
@@ -136,7 +136,7 @@ def test_what_images_hardly_determine_is_warned_of_with_figures() -> None:
     middle = np.all(np.abs(good.px - [320.0, 240.0]) < [150.0, 110.0], axis=1)
     keep = middle & (np.bincount(good.image[middle], minlength=14)[good.image] >= 12)
     _, image = np.unique(good.image[keep], return_inverse=True)
-    part = BoardCorners(image, good.points[keep], good.px[keep], good.sigma_px[keep])
+    part = BoardImages(image, good.points[keep], good.px[keep], good.sigma_px[keep])
     said = " ".join(warnings(fitted(part)))
     hull = cv2.contourArea(cv2.convexHull(part.px.astype(np.float32))) / (640 * 480)
     assert int(said.split("Corners cover ")[1].split(" %")[0]) == round(100 * hull)

@@ -15,7 +15,7 @@ from simulated import settings
 
 import legcal
 from legcal import calibrate, simulate
-from legcal.calibration.joint_fit.choices import known_parameters
+from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.verdict import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
 from legcal.machine import Machine

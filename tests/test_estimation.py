@@ -13,7 +13,7 @@ from legcal.estimation import (
     Huber,
     Problem,
     PseudoHuber,
-    Rows,
+    Residuals,
     Variables,
     all_free,
     estimate_variances,
@@ -50,9 +50,9 @@ def waves(rng: np.random.Generator, unknown: IntArray, noise: float = 0.0) -> Pr
 
     measured = predicted(TRUTH) + error
 
-    def rows(state: Waves) -> Rows:
+    def rows(state: Waves) -> Residuals:
         J = np.cos(place + state.phase[:, 0])
-        return Rows.of((predicted(state) - measured)[:, None], J[:, None], slope[:, None])
+        return Residuals.of((predicted(state) - measured)[:, None], J[:, None], slope[:, None])
 
     prior = GaussianPrior(np.zeros(1, dtype=np.intp), TRUTH.phase[0], np.array([0.5]))
     labels = tuple(f"phase {i}" for i in range(int(unknown.max()) + 1))

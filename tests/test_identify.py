@@ -27,9 +27,12 @@ from legcal.calibration.identify.identifiability import (
     check_identifiable,
     identifiability_of_dataset,
 )
-from legcal.calibration.identify.session import planned_session, recorded_session
+from legcal.calibration.identify.predicted_observations import (
+    planned_observations,
+    recorded_observations,
+)
 from legcal.calibration.identify.steps import locate_joints
-from legcal.calibration.joint_fit.choices import Choices, Prior
+from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.data import Dataset, load_dataset
 from legcal.data.corners import found_corners
 from legcal.data.holdout import dataset_at
@@ -134,10 +137,10 @@ def test_only_a_board_lets_the_steps_use_a_camera_in_the_hand() -> None:
     assert "views 1 to 15: legs 1, 2, 3, 4 in 1 image each" in said(found)
     # Step 1 with a board: joints in its frame, one for each leg, from all images together
     views = [tuple(range(6))] * 8
-    located = locate_joints(planned_session(loaded("hexapod"), views, 1, board=True))
+    located = locate_joints(planned_observations(loaded("hexapod"), views, 1, board=True))
     assert located.joint.shape == (1, 6)
     assert np.all(located.joint)
-    assert not np.any(locate_joints(planned_session(loaded("hexapod"), views, 1)).joint)
+    assert not np.any(locate_joints(planned_observations(loaded("hexapod"), views, 1)).joint)
 
 
 def test_smallest_views_with_a_board_suffice_with_it() -> None:
@@ -272,11 +275,11 @@ def test_a_dataset_is_judged_by_itself() -> None:
 def test_a_dataset_with_a_board_is_judged_with_it() -> None:
     """Everywhere until somebody has looked for it, then in the views that show it."""
     with_board = replace(example(), board=Board("chessboard", 9, 6, 0.03))
-    assert not recorded_session(example()).board.any()
-    assert recorded_session(with_board).board.all()
+    assert not recorded_observations(example()).board.any()
+    assert recorded_observations(with_board).board.all()
     row = np.flatnonzero(example().measurements.view == 1)[:1]
     one = found_corners(row, np.array([0]), np.array([[10.0, 20.0]]), np.array([0.05]))
-    shown = recorded_session(replace(with_board, corners=one)).board
+    shown = recorded_observations(replace(with_board, corners=one)).board
     np.testing.assert_array_equal(shown, [False, True, False])
     found = identifiability_of_dataset(with_board)
     assert found.board.present

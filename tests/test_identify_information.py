@@ -24,16 +24,16 @@ from legcal.calibration.identify.information import (
     leg_equations,
     problem_of,
 )
-from legcal.calibration.identify.ranks import Analysis
-from legcal.calibration.identify.session import (
+from legcal.calibration.identify.predicted_observations import (
     SIGMA_PX,
-    Session,
+    PredictedObservations,
     at_base_joints,
     at_platform_joints,
     looking_at,
-    planned_session,
-    recorded_session,
+    planned_observations,
+    recorded_observations,
 )
+from legcal.calibration.identify.ranks import Analysis
 from legcal.data import load_dataset
 from legcal.errors import DidNotConverge
 from legcal.estimation import (
@@ -63,7 +63,7 @@ TYPES = [f"{base}{platform}" for base, platform in product("RUS", "RUS")]
 STEP = 1e-6
 
 
-def random_session(seed: int, n_legs: int = 4, n_views: int = 2) -> Session:
+def random_session(seed: int, n_legs: int = 4, n_views: int = 2) -> PredictedObservations:
     """Return a session of one pose with random legs of random types."""
     rng = np.random.default_rng(seed)
     R, t = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
@@ -71,7 +71,7 @@ def random_session(seed: int, n_legs: int = 4, n_views: int = 2) -> Session:
     joints = rng.choice(TYPES, n_legs)
     legs = tuple(closed_leg(j, R, t, rng, LegKind(k)) for j, k in zip(joints, kinds, strict=True))
     names = tuple(f"leg{j + 1}" for j in range(n_legs))
-    return Session(
+    return PredictedObservations(
         leg_names=names,
         legs=legs,
         frame_legs=(0, 1, 2),
@@ -91,11 +91,11 @@ def random_session(seed: int, n_legs: int = 4, n_views: int = 2) -> Session:
     )
 
 
-def turns(session: Session) -> Array:
+def turns(session: PredictedObservations) -> Array:
     return np.repeat([1.0 / session.mean_length, 1.0], 3)
 
 
-def offsets_of_axes(session: Session, step: Array, x: Array, camera: Array) -> Array:
+def offsets_of_axes(session: PredictedObservations, step: Array, x: Array, camera: Array) -> Array:
     """Return how far each leg's axis has moved at its old ends, in a moved camera, (n, 2, 3).
 
     The axis is drawn in the camera's frame and cut with the planes across the old axis.
@@ -114,7 +114,7 @@ def offsets_of_axes(session: Session, step: Array, x: Array, camera: Array) -> A
     return np.array(moved)
 
 
-def leg_values(session: Session, step: Array, x: Array) -> Array:
+def leg_values(session: PredictedObservations, step: Array, x: Array) -> Array:
     """Return what all legs demand, in standard deviations, after a step of pose and parameters."""
     parameters = np.append(step, 0.0)
     R = Rotation.from_rotvec(x[:3]).as_matrix() @ session.R[0]
@@ -224,10 +224,10 @@ def test_views_with_a_board_have_one_camera_in_common(seed: int, shown: list[boo
 
 def test_the_square_root_is_that_of_the_information_of_the_problem() -> None:
     """Where nothing is exact, so that squares do not lose it in rounding."""
-    session = planned_session(legcal.load_mechanism("hexapod"), [range(6)] * 2, 8)
+    session = planned_observations(legcal.load_mechanism("hexapod"), [range(6)] * 2, 8)
     analysis = Analysis(replace(session, sigma_q=1e-4))
     problem, state = problem_of(
-        analysis.session, analysis.images, analysis.equations, analysis.prior
+        analysis.predicted, analysis.images, analysis.equations, analysis.prior
     )
     parameters = problem.where("parameters")
     root = marginal_rows(information_rows(problem, state), parameters)
@@ -277,12 +277,12 @@ def test_intrinsics_move_outlines_as_motions_of_the_leg_do(seed: int, number: in
 
 @cache
 def example() -> Analysis:
-    return Analysis(recorded_session(load_dataset(HEXAPOD, check_images=False)))
+    return Analysis(recorded_observations(load_dataset(HEXAPOD, check_images=False)))
 
 
 def intrinsics_sigma(owners: list[str], analysis: Analysis) -> Array:
-    a, R = analysis, looking_at(analysis.session)
-    found = expected_intrinsics(a.session, a.images, a.equations, a.prior, R, owners)
+    a, R = analysis, looking_at(analysis.predicted)
+    found = expected_intrinsics(a.predicted, a.images, a.equations, a.prior, R, owners)
     assert [camera.camera for camera in found] == list(dict.fromkeys(owners))
     sigma = [[camera.sigma[name] for name in INTRINSICS] for camera in found]
     return np.array(sigma, dtype=np.float64)
@@ -293,7 +293,7 @@ def test_intrinsics_are_known_less_by_fewer_images_and_where_radii_are_larger() 
     one, three = (intrinsics_sigma(o, example()) for o in (["c"] * 3, ["a", "b", "c"]))
     assert np.all((one > 0.1) & (one < 3.0))
     assert not np.any(three <= one)
-    scaled = replace(example().session, radius=2.0 * example().session.radius)
+    scaled = replace(example().predicted, radius=2.0 * example().predicted.radius)
     wide, narrow = Analysis(scaled), example().images[:, :, 1::2]
     depth = wide.images[:, :, 1::2][narrow != 0.0] / narrow[narrow != 0.0]
     np.testing.assert_allclose(depth, 2.0)
@@ -302,7 +302,7 @@ def test_intrinsics_are_known_less_by_fewer_images_and_where_radii_are_larger() 
 
 def test_a_dataset_gives_its_own_readings_cameras_and_legs() -> None:
     dataset = load_dataset(HEXAPOD, check_images=False)
-    session, m = example().session, dataset.measurements
+    session, m = example().predicted, dataset.measurements
     assert (session.n_views, len(session.view), len(session.t)) == (3, m.n_rows, m.n_poses)
     q = (session.length - dataset.machine.q0) * dataset.machine.sign
     np.testing.assert_allclose(q, m.q[m.first_rows], atol=1e-5)
@@ -319,7 +319,7 @@ def test_planned_poses_close_every_leg_inside_its_travel(
     """Pinocchio closes the loops of the nominal machine; ours is a micrometre away from it."""
     folder = tmp_path_factory.getbasetemp() / name.replace(" ", "_")
     machine = legcal.load_mechanism(write_machine(folder / "m", MACHINES[name](), Layout()))
-    session = planned_session(machine, [range(machine.n_legs)], 8)
+    session = planned_observations(machine, [range(machine.n_legs)], 8)
     assert len(session.t) == 8
     for j, (leg, nominal) in enumerate(zip(session.legs, machine.legs, strict=True)):
         found = linearize_leg(leg, session.R, session.t)
@@ -346,7 +346,7 @@ def test_planned_poses_close_every_leg_inside_its_travel(
 def test_planned_cameras_stand_outside_and_no_two_in_one_place() -> None:
     machine = legcal.load_mechanism("hexapod")
     views = [(0, 1, 2, 3), (0, 1, 2, 3), (0, 1, 2, 3, 4, 5), (0, 1, 2, 3, 4, 5), (3,)]
-    session = planned_session(machine, views, 3)
+    session = planned_observations(machine, views, 3)
     apart = np.linalg.norm(session.camera[:, None] - session.camera, axis=2)
     assert apart[~np.eye(5, dtype=bool)].min() > 0.01
     points = np.concatenate([session.A, (session.arm + session.t[:, None]).reshape(-1, 3)])
@@ -354,7 +354,7 @@ def test_planned_cameras_stand_outside_and_no_two_in_one_place() -> None:
     away = session.camera - points.mean(axis=0)
     assert np.linalg.norm(away, axis=1).min() > 2.0 * reach
     assert away[4] @ (session.A[3] - session.A.mean(axis=0)) > 0.0  # that of leg 4 on its side
-    planar = planned_session(legcal.load_mechanism("3-rpr"), [range(3)] * 3, 3)
+    planar = planned_observations(legcal.load_mechanism("3-rpr"), [range(3)] * 3, 3)
     away = planar.camera - planar.A.mean(axis=0)  # from along the normal, tilted
     slant = away[:, 2] / np.linalg.norm(away, axis=1)
     assert np.all((slant > 0.7) & (slant < 0.99))
@@ -373,7 +373,7 @@ def test_poses_out_of_reach_are_refused_and_rare_ones_found(
         "legcal.machine.configurations._Drive.is_regular",
         lambda _self, _R, t: rng.random(len(t)) < 0.75,  # in each of five steps
     )
-    assert len(planned_session(machine, [range(6)], 60).t) == 60
+    assert len(planned_observations(machine, [range(6)], 60).t) == 60
 
 
 def test_more_motors_than_freedoms_are_followed(tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -18,8 +18,11 @@ from thinned import thinned
 import legcal
 from legcal import identifiability
 from legcal.calibration import Identifiability
+from legcal.calibration.identify.predicted_observations import (
+    PredictedObservations,
+    planned_observations,
+)
 from legcal.calibration.identify.ranks import Analysis
-from legcal.calibration.identify.session import Session, planned_session
 from legcal.geometry import Array, cross_matrices
 from legcal.machine import Leg, LegKind, Machine
 from legcal.paper import joints_in_base, offsets
@@ -173,7 +176,7 @@ def _rank(J: Array) -> int:
     return int(np.linalg.matrix_rank(J, tol=1e-7)) if J.size else 0
 
 
-def shared_poses(session: Session) -> Session:
+def shared_poses(session: PredictedObservations) -> PredictedObservations:
     """Return the session in which all views show the poses of the first."""
     n = int((session.view == 0).sum())
     pose = np.tile(np.arange(n), session.n_views)
@@ -209,7 +212,7 @@ def test_default_ranks_are_those_of_the_problems_that_the_steps_solve(
         rank_of_first(step3, 6),
         rank_of_first(step4, 12, known=slice(12, 18)),
     ]
-    planned = planned_session(model("hexapod"), views)
+    planned = planned_observations(model("hexapod"), views)
     found = Analysis(shared_poses(planned) if shared else planned).step_ranks
     assert [s.rank for s in found if s.criteria == "default"] == built
 
@@ -235,7 +238,7 @@ def test_printed_ranks_are_those_of_the_problems_that_the_steps_solve(coplanar: 
 
 def test_the_joint_fit_determines_as_much_as_rows_are_more_than_unknowns() -> None:
     """Six readings a pose and four rows a leg, for the motions of platform and cameras."""
-    planned = planned_session(model("hexapod"), ((0, 1), (2, 3), (4, 5)), 1)
+    planned = planned_observations(model("hexapod"), ((0, 1), (2, 3), (4, 5)), 1)
     alone, together = (Analysis(s).full.rank for s in (planned, shared_poses(planned)))
     assert (alone, together) == (3 * (6 + 8) - 3 * (6 + 6), (6 + 3 * 8) - (6 + 3 * 6))
     for seen, most in ((1, 0), (3, 6), (4, 10)):
@@ -249,7 +252,7 @@ def test_what_is_determined_and_what_is_not_lie_far_apart(name: str) -> None:
     """The limit of one leg length is no fine line: nothing lies within a factor of five of it."""
     every = tuple(range(model(name).n_legs))
     for views in ([every] * 3, [every[:3], every[-3:], every]):
-        session = planned_session(model(name), views)
+        session = planned_observations(model(name), views)
         singular = np.linalg.svd(Analysis(session).information, compute_uv=False)
         sigma = 1.0 / np.maximum(singular, 1e-30) / session.mean_length
         assert not np.any((sigma > 0.2) & (sigma < 5.0)), sigma
@@ -390,7 +393,7 @@ def test_a_direction_hides_what_moving_its_parameters_does_to_the_platform() -> 
     weak = next(d for d in found.staged.weak if d.direction == "z of base joint 6")
     assert weak.parameters == ("leg6.base.z",)
     assert weak.components == pytest.approx((1e-3,))
-    session = planned_session(model("hexapod"), WEAK_JOINT)
+    session = planned_observations(model("hexapod"), WEAK_JOINT)
     B = np.array([leg.B for leg in session.legs])
     moved = []
     for R, t in zip(session.R, session.t, strict=True):
@@ -410,7 +413,7 @@ def test_a_direction_hides_what_moving_its_parameters_does_to_the_platform() -> 
 
 def test_the_platform_is_predicted_as_the_whole_covariance_says() -> None:
     """sigma of the platform: the motion by parameters times the inverse of their information."""
-    analysis = Analysis(planned_session(model("hexapod"), VIEWS[0]))
+    analysis = Analysis(planned_observations(model("hexapod"), VIEWS[0]))
     by_metres, root = analysis.motion.by_metres, analysis.information
     assert by_metres is not None
     covariance = by_metres @ np.linalg.inv(root.T @ root) @ np.swapaxes(by_metres, 1, 2)

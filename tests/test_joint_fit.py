@@ -25,8 +25,8 @@ from machine_session import SHIPPED, MachineSession, machine_session
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
+from legcal.calibration.identify.predicted_observations import PredictedObservations
 from legcal.calibration.identify.ranks import Analysis
-from legcal.calibration.identify.session import Session as IdentifySession
 from legcal.calibration.joint_fit import (
     BOARD_SCALE,
     DEFAULT_SETTINGS,
@@ -182,12 +182,12 @@ def test_a_first_fit_stays_near_the_nominal_model_where_nothing_is_known() -> No
     assert len(first.linear.prior_r) == len(problem.priors.mean) < len(problem.named)
 
 
-def session_as_identify_sees_it(session: MachineSession, legs: FittedLegs) -> IdentifySession:
+def session_as_identify_sees_it(session: MachineSession, legs: FittedLegs) -> PredictedObservations:
     """Return what was measured as the analysis of identifiability takes it."""
     R, t = Frames.of(session.truth.T_Rb_Re)
     cameras = session.truth.T_camera_Rb
     radius = [max(r for (j, _), r in legs.radii.items() if j == k) for k in range(len(legs.names))]
-    return IdentifySession(
+    return PredictedObservations(
         leg_names=legs.names,
         legs=session.truth.legs,
         frame_legs=legs.frame_legs,

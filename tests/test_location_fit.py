@@ -20,7 +20,7 @@ from located import (
 )
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.location.fit import Fit, fit
+from legcal.calibration.location.fit import FrameFit, fit
 from legcal.calibration.location.frames import (
     PosePairs,
     jacobian,
@@ -29,7 +29,7 @@ from legcal.calibration.location.frames import (
     residuals,
     tool_motions,
 )
-from legcal.calibration.location.observations import Noise, motions_by_readings
+from legcal.calibration.location.observations import PoseNoise, motions_by_readings
 from legcal.calibration.location.search import search, solve_by_kronecker, solve_by_opencv
 from legcal.geometry import Array, nearest_rotation, rotation_matrices
 from legcal.machine import forward_kinematics
@@ -49,11 +49,11 @@ motions = st.builds(RigidTransform.from_components, vectors, rotations | half_tu
 FEW = settings(max_examples=4, deadline=None)
 
 
-def of(noise: tuple[Array, tuple[bool, bool]], n: int) -> Noise:
-    return Noise(np.ones((n, 2)), *noise)
+def of(noise: tuple[Array, tuple[bool, bool]], n: int) -> PoseNoise:
+    return PoseNoise(np.ones((n, 2)), *noise)
 
 
-def fitted(pairs: PosePairs, noise: tuple[Array, tuple[bool, bool]] = STATED) -> Fit:
+def fitted(pairs: PosePairs, noise: tuple[Array, tuple[bool, bool]] = STATED) -> FrameFit:
     return fit(pairs, search(pairs, 3).frames[0], of(noise, len(pairs)))
 
 

@@ -17,7 +17,7 @@ from rich.console import Console
 from scipy.spatial.transform import RigidTransform
 
 from legcal import cli, measure_noise
-from legcal.calibration import QUANTITIES, Noise, Spread
+from legcal.calibration import QUANTITIES, DatasetNoise, PooledSpread
 from legcal.calibration.measurement_noise.canny import canny_parts, edge_points
 from legcal.calibration.measurement_noise.comparison import find_repeats, noise_notes
 from legcal.calibration.measurement_noise.repeatability import (
@@ -46,7 +46,7 @@ LENS = np.array([-0.3, 0.1, 0.001, -0.002, 0.0])
 # Statistics of repeats
 
 
-def pooled(samples: list[Sample]) -> Spread:
+def pooled(samples: list[Sample]) -> PooledSpread:
     spread = pool(samples)
     assert spread is not None
     return spread
@@ -353,7 +353,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> RepeatedImages:
 
 
 @pytest.fixture(scope="module")
-def found(rendered: RepeatedImages) -> Noise:
+def found(rendered: RepeatedImages) -> DatasetNoise:
     return measure_noise(rendered.path)
 
 
@@ -377,7 +377,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
 
 def test_json_is_one_document_whatever_the_order_and_the_folder_stays_as_it_was(
     spoiled: RepeatedImages,
-    found: Noise,
+    found: DatasetNoise,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -391,7 +391,7 @@ def test_json_is_one_document_whatever_the_order_and_the_folder_stays_as_it_was(
         assert stage in printed.err
 
 
-def test_every_leg_has_standard_deviations_by_both_methods(found: Noise) -> None:
+def test_every_leg_has_standard_deviations_by_both_methods(found: DatasetNoise) -> None:
     """A detection that is missed leaves fewer repeats; the largest is the upper bound, named."""
     document = found.document()
     assert (document["images"], document["orientations"]) == (6, 2)
@@ -424,7 +424,7 @@ def test_every_leg_has_standard_deviations_by_both_methods(found: Noise) -> None
                 assert values[at["view"], at["pose"]] == bound
 
 
-def test_differences_of_methods_are_counted_outwards(found: Noise) -> None:
+def test_differences_of_methods_are_counted_outwards(found: DatasetNoise) -> None:
     """Canny puts both edges of a shaded leg inwards: counted to one side they would cancel."""
     every, by_leg = found.difference(), [found.difference(name) for name in found.leg_names]
     assert every is not None
@@ -433,7 +433,9 @@ def test_differences_of_methods_are_counted_outwards(found: Noise) -> None:
     assert all(one is not None and one[0] < 0.0 for one in by_leg)
 
 
-def test_an_edge_that_jumps_between_images_is_named(rendered: RepeatedImages, found: Noise) -> None:
+def test_an_edge_that_jumps_between_images_is_named(
+    rendered: RepeatedImages, found: DatasetNoise
+) -> None:
     measurements = load_dataset(rendered.path).measurements
     assert not any("jumps" in note for note in noise_notes(measurements, found.methods))
     detector, canny = found.methods
@@ -447,13 +449,13 @@ def test_an_edge_that_jumps_between_images_is_named(rendered: RepeatedImages, fo
     assert f"leg3 in c1/{measurements.pose_labels[first.pose]} ({jumping.sd:.3f} px)" in note
 
 
-def shown(noise: Noise) -> str:
+def shown(noise: DatasetNoise) -> str:
     console = Console(width=80, record=True, file=StringIO())
     console.print(noise_table(noise))
     return console.export_text()
 
 
-def test_the_table_fits_80_columns_and_says_what_repeats_do_not_show(found: Noise) -> None:
+def test_the_table_fits_80_columns_and_says_what_repeats_do_not_show(found: DatasetNoise) -> None:
     text = shown(found)
     assert max(len(line) for line in text.splitlines()) <= 80
     flowing = " ".join(text.split())

@@ -13,12 +13,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from staged_hexapods import exact_session, five_millimetres_away, noisy_session, staged
 from staged_machines import planned, shipped
 
-from legcal.calibration.identify.session import planned_session
+from legcal.calibration.identify.predicted_observations import planned_observations
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, IntArray, normal_basis
 from legcal.machine import EquationKind, LegKind, leg_equations, load_mechanism
 from legcal.paper import Transformation, platform, run_base_steps, run_platform_steps
-from legcal.paper.least_squares import LeastSquares, Solution, solve_least_squares
+from legcal.paper.gibbs import axis_frames, moved
+from legcal.paper.least_squares import IpoptSolution, LeastSquares, solve_least_squares
 from legcal.paper.leg_directions import LegDirections, directions_through_joints
 from legcal.paper.leg_equations import (
     N_UNKNOWNS,
@@ -27,7 +28,6 @@ from legcal.paper.leg_equations import (
     direction_of_leg,
     length_of_leg,
 )
-from legcal.paper.motions import axis_frames, moved
 from legcal.paper.offsets import (
     distance_sigma,
     identify_offsets,
@@ -177,7 +177,7 @@ def test_platform_joints_that_images_do_not_tie_together_are_refused(
 
 def test_axes_that_no_three_legs_at_once_show_are_refused_in_geometric_words() -> None:
     machine = load_mechanism("3-spr")
-    session = planned_session(machine, ((0, 1), (1, 2), (0, 2)), 8)
+    session = planned_observations(machine, ((0, 1), (1, 2), (0, 2)), 8)
     observed = planned(session, machine.sign)
     with pytest.raises(NotIdentifiable, match="no pose shows three legs of known length at once"):
         observed.run("literal")
@@ -191,7 +191,7 @@ def test_axes_stay_near_nominal_where_step_4_does_not_converge_without_that(
 ) -> None:
     calls = list[int]()
 
-    def fails_once(problem: LeastSquares) -> Solution:
+    def fails_once(problem: LeastSquares) -> IpoptSolution:
         calls.append(len(problem.terms))
         if len(calls) == 2:
             raise DidNotConverge("The platform joints (step 4) could not be computed.")

@@ -11,8 +11,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge
 from legcal.geometry import normal_basis, register_groups, register_in_plane, register_points
+from legcal.paper.gibbs import moved, moved_points, turned_axis, turned_axis_slope, turns_of
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
-from legcal.paper.motions import moved, moved_points, turned_axis, turned_axis_slope, turns_of
 
 
 def _line(outlier: float, robust: bool) -> LeastSquares:

@@ -13,8 +13,8 @@ from staged_hexapods import errors, exact_session, five_millimetres_away, noisy_
 from staged_machines import Observed, planned, shipped
 from thinned import thinned
 
+from legcal.calibration.identify.predicted_observations import planned_observations
 from legcal.calibration.identify.ranks import Analysis, determined
-from legcal.calibration.identify.session import planned_session
 from legcal.data import LegAxes, axes_from_outlines
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array
@@ -22,7 +22,7 @@ from legcal.machine import LegKind, from_vector, load_mechanism, parametrize, to
 from legcal.paper import Criteria, Transformation, run_base_steps
 from legcal.paper.joints_in_base import build_rigid as build_base
 from legcal.paper.joints_in_base import build_scalar_products
-from legcal.paper.least_squares import LeastSquares, Solution
+from legcal.paper.least_squares import IpoptSolution, LeastSquares
 from legcal.paper.leg_directions import directions_through_joints, observed_directions
 from legcal.paper.offsets import build_consecutive, build_constant_distances, leg_ends
 from legcal.paper.platform import RigidProblem, build_rigid
@@ -55,7 +55,7 @@ TRANSFORMATIONS: tuple[Transformation, ...] = ("points", "cross_product")
 def open_space(observed: Observed, name: str) -> Array:
     """Return an orthonormal basis (w, p) of what the staged ranks leave open, turns as metres."""
     machine = load_mechanism(name)
-    ranks = Analysis(planned_session(machine, [tuple(range(machine.n_legs))] * 3, 6)).staged
+    ranks = Analysis(planned_observations(machine, [tuple(range(machine.n_legs))] * 3, 6)).staged
     assert ranks.complete
     nominal = observed.nominal
     names = parametrize(nominal.leg_names, observed.true_legs, nominal.frame_legs).names
@@ -151,7 +151,9 @@ def test_literal_steps_are_exact_where_their_equations_have_full_rank(
 def test_ranks_of_9_tell_where_it_is_exact_and_offsets_are_so_everywhere() -> None:
     for name in (*FULL_RANK, *EVEN):
         machine = load_mechanism(name)
-        ranks = Analysis(planned_session(machine, [tuple(range(machine.n_legs))], 4)).step_ranks
+        ranks = Analysis(
+            planned_observations(machine, [tuple(range(machine.n_legs))], 4)
+        ).step_ranks
         (rank,) = [r for r in ranks if (r.name, r.criteria) == ("base_joints", "literal")]
         assert (rank.rank == rank.of) == (name in FULL_RANK)
         if name in EVEN:  # 3 mm in z, or 1 degree in the axes, are not seen by even equations
@@ -253,7 +255,7 @@ def test_steps_find_what_ranks_call_determined_and_refuse_the_rest(
     name: str, views: tuple[tuple[int, ...], ...]
 ) -> None:
     machine = load_mechanism(name)
-    session = planned_session(machine, views, 8)
+    session = planned_observations(machine, views, 8)
     analysis, observed = Analysis(session), planned(session, machine.sign)
     full = {r.name: r.rank == r.of for r in analysis.step_ranks if r.criteria == "default"}
     assert full["joints_in_cameras"]
@@ -275,7 +277,7 @@ def test_steps_find_what_ranks_call_determined_and_refuse_the_rest(
 @pytest.mark.parametrize("name", ["3-rpr", "3-spr", "3-upu", "3-upu-tilted", "tricept"])
 def test_the_rigid_criterion_has_the_rank_that_is_predicted(name: str) -> None:
     machine = load_mechanism(name)
-    session = planned_session(machine, [tuple(range(machine.n_legs))], 8)
+    session = planned_observations(machine, [tuple(range(machine.n_legs))], 8)
     (rank,) = [
         r
         for r in Analysis(session).step_ranks
@@ -285,7 +287,9 @@ def test_the_rigid_criterion_has_the_rank_that_is_predicted(name: str) -> None:
     rigid = rigid_problem(observed)
     problem = build_rigid(rigid)
     J, residuals = problem.jacobian(problem.start), problem.residuals(problem.start)
-    information = Solution(problem.start, residuals, J, len(rigid.unknowns), 0, "").information()
+    information = IpoptSolution(
+        problem.start, residuals, J, len(rigid.unknowns), 0, ""
+    ).information()
     kept = [i for i, name in enumerate(rigid.unknowns.names) if "offset" not in name]
     metre = np.where(rigid.unknowns.is_angle, 1.0 / session.mean_length, 1.0)
     assert len(kept) == rank.of

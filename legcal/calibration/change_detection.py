@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, frame_on_points, normal_basis
+from legcal.geometry import Array, frame_on_points, normal_basis, whitener
 from legcal.machine import Leg, LegKind, Parametrization, twist_after, vector_of
 
 _STEP = 1e-6  # [m or rad]
@@ -121,7 +121,7 @@ def judge_movement(
     ``found`` is a :func:`difference`, ``significance`` the probability of a false alarm.
     """
     directions, values, covariance = found
-    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+    whitening = whitener(covariance)
     residual = whitening @ values
     statistic, k = float(residual @ residual), len(residual)
     p_value = _p_value(statistic, k, noise_dof)

@@ -6,7 +6,7 @@ from .problem import Frames as Frames
 from .problem import GaussianPrior as GaussianPrior
 from .problem import Linearization as Linearization
 from .problem import Problem as Problem
-from .problem import Rows as Rows
+from .problem import Residuals as Residuals
 from .problem import Tangent as Tangent
 from .problem import Variables as Variables
 from .problem import add as add
@@ -25,7 +25,7 @@ from .square_root import eliminate as eliminate
 from .square_root import grouped as grouped
 from .square_root import information_rows as information_rows
 from .square_root import marginal_rows as marginal_rows
-from .uncertainty import WeakDirection as WeakDirection
+from .uncertainty import WorstDirection as WorstDirection
 from .uncertainty import explained_share as explained_share
 from .uncertainty import marginal as marginal
 from .uncertainty import named_covariance as named_covariance

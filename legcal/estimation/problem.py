@@ -117,7 +117,7 @@ def fixed_at_start(n: int, d: int) -> IntArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class Residuals:
     """Residuals r (n, q) of n measurements, and slopes (n, q, l) by what they depend on directly.
 
     ``chain`` turns slopes into derivatives by kept variables and by eliminated ones; it is called
@@ -129,7 +129,7 @@ class Rows:
     chain: Callable[[Array], tuple[Array, Array]]
 
     @classmethod
-    def of(cls, r: Array, J: Array, J_element: Array | None = None) -> Rows:
+    def of(cls, r: Array, J: Array, J_element: Array | None = None) -> Residuals:
         """Return rows whose derivatives by kept and by eliminated variables are known."""
         own, m = np.zeros((*r.shape, 0)) if J_element is None else J_element, J.shape[-1]
         return cls(
@@ -155,13 +155,13 @@ class Rows:
         """Squared norms of the residuals, (n,)."""
         return np.asarray(np.einsum("nq,nq->n", self.r, self.r))
 
-    def whitened(self, T: Array) -> Rows:
+    def whitened(self, T: Array) -> Residuals:
         """Return the rows times T (n, q, q), or (n, 1, 1), or one number."""
         if T.ndim == 0:
-            return Rows(float(T) * self.r, float(T) * self.slope, self.chain)
+            return Residuals(float(T) * self.r, float(T) * self.slope, self.chain)
         if T.shape[1:] == (1, 1):
-            return Rows(T[:, 0] * self.r, T * self.slope, self.chain)
-        return Rows((T @ self.r[..., None])[..., 0], T @ self.slope, self.chain)
+            return Residuals(T[:, 0] * self.r, T * self.slope, self.chain)
+        return Residuals((T @ self.r[..., None])[..., 0], T @ self.slope, self.chain)
 
 
 Touch = tuple[str, IntArray, slice]  # block, element(s) of each measurement, numbers of these
@@ -172,7 +172,7 @@ class Factor(Generic[S]):
     """Measurements of one kind: residuals of the variables that they touch."""
 
     name: str
-    rows: Callable[[S], Rows]  # residuals with derivatives, not whitened
+    rows: Callable[[S], Residuals]  # residuals with derivatives, not whitened
     touches: tuple[Touch, ...]  # kept variables, in the order of the columns of J
     n: int  # measurements
     n_rows: int  # residuals of each
@@ -180,7 +180,7 @@ class Factor(Generic[S]):
     whitening: Array | float = 1.0  # (n, q, q) T with T C T^T = 1; zero leaves one out
     robust: bool = False  # whether the loss is on it, or plain squares
 
-    def linearize(self, state: S) -> Rows:
+    def linearize(self, state: S) -> Residuals:
         """Return whitened rows at a state."""
         return self.rows(state).whitened(np.asarray(self.whitening))
 
@@ -450,11 +450,11 @@ class Problem(Generic[S]):
 class Linearization:
     """Whitened residuals with derivatives of all factors and priors at a state."""
 
-    rows: Mapping[str, Rows]
+    rows: Mapping[str, Residuals]
     prior_r: Array  # (n_priors,)
     prior_J: Array  # (n_priors, n_kept)
 
-    def __getitem__(self, name: str) -> Rows:
+    def __getitem__(self, name: str) -> Residuals:
         return self.rows[name]
 
 

@@ -22,7 +22,7 @@ from legcal.estimation.problem import (
     Linearization,
     Places,
     Problem,
-    Rows,
+    Residuals,
     S,
     Tangent,
     linearize,
@@ -293,7 +293,7 @@ def normal_equations(
     for factor in problem.factors:
         rows = linear[factor.name]
         if factor.robust and np.isfinite(loss.width):
-            rows = Rows(*loss.softened(rows.r, rows.slope), rows.chain)
+            rows = Residuals(*loss.softened(rows.r, rows.slope), rows.chain)
         weighted[factor.name] = rows
     return _of_rows(problem, state, linear, weighted)
 
@@ -321,7 +321,7 @@ def information(
 
 
 def _of_rows(
-    problem: Problem[S], state: S, linear: Linearization, weighted: dict[str, Rows]
+    problem: Problem[S], state: S, linear: Linearization, weighted: dict[str, Residuals]
 ) -> NormalEquations:
     """Return normal equations, with motions inside the constraints in place of elements."""
     places = problem.places
@@ -347,7 +347,7 @@ def _of_rows(
 
 
 def _sums(
-    kinds: list[tuple[Places, Rows]], problem: Problem[S]
+    kinds: list[tuple[Places, Residuals]], problem: Problem[S]
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the blocks U, W, V of J^T J and both parts of J^T r, all measurements added up."""
     n_kept, n_elements, d = problem.n_kept, problem.n_elements, problem.d_element

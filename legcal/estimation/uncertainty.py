@@ -19,7 +19,7 @@ _MIN_COMPONENT = 0.3  # components of a direction that are named, relative to th
 
 
 @dataclass(frozen=True, eq=False)
-class WeakDirection:
+class WorstDirection:
     """A combination of parameters that is known worst."""
 
     sigma: float  # standard deviation along it, in the unit of the scaled parameters
@@ -31,7 +31,7 @@ class WeakDirection:
 
 def worst_directions(
     covariance: Array, names: tuple[str, ...], unit: Array, n_directions: int = 3
-) -> tuple[WeakDirection, ...]:
+) -> tuple[WorstDirection, ...]:
     """Return the directions known worst, worst first; parameters count in *unit* (n,) each."""
     variance, vector = np.linalg.eigh(covariance / unit[:, None] / unit)
     found = []
@@ -40,7 +40,7 @@ def worst_directions(
         order = np.argsort(-np.abs(v), kind="stable")
         named = [j for j in order if abs(v[j]) >= _MIN_COMPONENT * abs(v[order[0]])][:4]
         sigma = float(np.sqrt(max(variance[-1 - i], 0.0)))
-        found.append(WeakDirection(sigma, tuple((names[j], float(v[j])) for j in named)))
+        found.append(WorstDirection(sigma, tuple((names[j], float(v[j])) for j in named)))
     return tuple(found)
 
 

@@ -1,3 +1,4 @@
+from .covariances import whitener as whitener
 from .lines import distance_to_line as distance_to_line
 from .lines import moment as moment
 from .lines import nearest_point_to_line as nearest_point_to_line

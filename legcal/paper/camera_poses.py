@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data import LegAxes, Measurements
 from legcal.geometry import Array, IntArray, register_points
-from legcal.paper.motions import axis_frames
+from legcal.paper.gibbs import axis_frames
 from legcal.paper.nominal import NominalMachine
 
 _ON_A_LINE = 0.05  # spread of joints across their line, in that along it

@@ -25,20 +25,19 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, NotIdentifiable
-from legcal.geometry import Array, BoolArray, IntArray, components
+from legcal.geometry import Array, BoolArray, IntArray, components, whitener
 from legcal.paper.camera_poses import camera_poses, signs_seen
 from legcal.paper.criteria import Criteria
-from legcal.paper.joints_in_camera import JointsInCamera, with_signs
-from legcal.paper.least_squares import LeastSquares, Solution, Term, solve_least_squares
-from legcal.paper.motions import (
+from legcal.paper.gibbs import (
     axis_frames,
     moved,
     moved_points,
     turned_axis_slope,
     turned_frame,
     turned_points,
-    whitener,
 )
+from legcal.paper.joints_in_camera import JointsInCamera, with_signs
+from legcal.paper.least_squares import IpoptSolution, LeastSquares, Term, solve_least_squares
 from legcal.paper.nominal import NominalMachine
 from legcal.paper.unknowns import BASE_TURNS, OF_A, Unknowns
 
@@ -198,7 +197,7 @@ def _candidates(
 
 def _registered(
     machine: NominalMachine, joints: JointsInCamera
-) -> tuple[Solution, tuple[RigidTransform | None, ...]]:
+) -> tuple[IpoptSolution, tuple[RigidTransform | None, ...]]:
     """Return the rigid solution and the cameras that it fixes.
 
     Where axes leave several candidates of a camera, all are tried; where they fit alike, the view
@@ -217,7 +216,7 @@ def _registered(
         else:
             starts.append([None])
 
-    def trial(start: Sequence[RigidTransform | None]) -> Solution | DidNotConverge:
+    def trial(start: Sequence[RigidTransform | None]) -> IpoptSolution | DidNotConverge:
         signs = np.ones(joints.located.shape)
         for v, T in enumerate(start):
             if T is not None:
@@ -230,7 +229,9 @@ def _registered(
 
     choices = list(product(*starts))
     solutions = [trial(choice) for choice in choices]
-    costs = np.array([found.cost if isinstance(found, Solution) else np.inf for found in solutions])
+    costs = np.array(
+        [found.cost if isinstance(found, IpoptSolution) else np.inf for found in solutions]
+    )
     best = int(np.argmin(costs))
     start, solution = choices[best], solutions[best]
     ambiguous = np.zeros(len(starts), dtype=np.bool_)
@@ -418,7 +419,7 @@ def _check_products(machine: NominalMachine, joints: JointsInCamera) -> None:
 
 
 def _check_identifiable(
-    machine: NominalMachine, joints: JointsInCamera, solution: Solution
+    machine: NominalMachine, joints: JointsInCamera, solution: IpoptSolution
 ) -> None:
     """Refuse when base joints or axes can move without any camera noticing.
 

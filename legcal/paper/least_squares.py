@@ -124,7 +124,7 @@ class LeastSquares:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class IpoptSolution:
     """A converged least-squares problem."""
 
     x: Array  # (n,)
@@ -139,7 +139,7 @@ class Solution:
         """Half the sum of squared residuals."""
         return 0.5 * float(self.residuals @ self.residuals)
 
-    def without_last(self, n_rows: int) -> Solution:
+    def without_last(self, n_rows: int) -> IpoptSolution:
         """Return what is left without the last residuals, at the same place."""
         n_kept = len(self.residuals) - n_rows
         return replace(self, residuals=self.residuals[:n_kept], jacobian=self.jacobian[:n_kept])
@@ -167,7 +167,7 @@ class Solution:
         return np.asarray(np.abs(null).max(axis=0, initial=0.0) > 1e-3)
 
 
-def solve_least_squares(problem: LeastSquares) -> Solution:
+def solve_least_squares(problem: LeastSquares) -> IpoptSolution:
     """Minimise half the sum of squared residuals with IPOPT and a Gauss-Newton Hessian.
 
     Unknowns are counted from the start in units of what one residual unit shows: tolerances do
@@ -200,7 +200,7 @@ def solve_least_squares(problem: LeastSquares) -> Solution:
         z, status = _dense(found["x"]), str(stats["return_status"])
         n_iterations += int(stats["iter_count"])
     x = problem.start + scale * z
-    return Solution(
+    return IpoptSolution(
         x=x,
         residuals=root_weight * _dense(compiled.residuals(x, observed)),
         jacobian=csc_array(diags_array(root_weight) @ _sparse(compiled.jacobian(x, observed))),

@@ -3,7 +3,7 @@
 They are those of :mod:`legcal.machine.equations`, with all numbers of a leg and the platform pose
 unknown; a test compares both. The local unknowns of every function are the numbers of a leg from
 its third on (B, length, turns of the axes at base and platform, change of the twist), then the step
-of the platform pose (see :func:`~legcal.paper.motions.moved_points`).
+of the platform pose (see :func:`~legcal.paper.gibbs.moved_points`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import casadi as ca
 
 from legcal.machine import EquationKind, JointType, VectorOps, axis_in_leg, twist_residual
-from legcal.paper.motions import moved_points, turned_frame, turned_points
+from legcal.paper.gibbs import moved_points, turned_frame, turned_points
 
 N_UNKNOWNS = 15
 

@@ -22,7 +22,7 @@ import numpy as np
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, IntArray
 from legcal.paper.criteria import Criteria
-from legcal.paper.least_squares import LeastSquares, Solution, Term, solve_least_squares
+from legcal.paper.least_squares import IpoptSolution, LeastSquares, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
 from legcal.paper.nominal import NominalMachine
 from legcal.paper.unknowns import LENGTH, Unknowns
@@ -208,7 +208,7 @@ def _check_identifiable(
     machine: NominalMachine,
     directions: LegDirections,
     pairs: IntArray,
-    solution: Solution,
+    solution: IpoptSolution,
     largest_sigma: float = np.inf,
 ) -> None:
     """Refuse when an offset can change without any distance noticing."""

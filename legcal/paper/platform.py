@@ -26,14 +26,13 @@ import casadi as ca
 import numpy as np
 
 from legcal.errors import DidNotConverge, NotIdentifiable
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray, whitener
 from legcal.machine import EquationKind, JointType, leg_equations
 from legcal.paper.criteria import Criteria, Transformation
 from legcal.paper.joints_in_base import JointsInBase
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
 from legcal.paper.leg_equations import constraint_of_leg, direction_of_leg, length_of_leg
-from legcal.paper.motions import whitener
 from legcal.paper.nominal import NominalMachine
 from legcal.paper.offsets import (
     distance_of_ends,

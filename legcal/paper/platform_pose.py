@@ -28,9 +28,9 @@ from legcal.geometry import (
     register_in_plane,
 )
 from legcal.paper.criteria import Transformation
+from legcal.paper.gibbs import moved, moved_points
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
-from legcal.paper.motions import moved, moved_points
 
 _FLAT = 1e-3  # of their largest distance from their centre: how far points of a line are off it
 

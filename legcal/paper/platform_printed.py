@@ -19,11 +19,11 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, frame_on_points
 from legcal.machine import EquationKind, JointType, Leg, LegKind, tied_twist, twist_after
 from legcal.paper.criteria import Transformation
+from legcal.paper.gibbs import axis_frames
 from legcal.paper.joints_in_base import JointsInBase, distance_of_joints
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
 from legcal.paper.leg_equations import closure_of_leg
-from legcal.paper.motions import axis_frames
 from legcal.paper.nominal import NominalMachine
 from legcal.paper.offsets import leg_ends, pairs_of_legs
 from legcal.paper.platform_pose import PlatformPoses, locate_platform, register_by_rays

@@ -1,7 +1,7 @@
 """The unknowns of a step: some of the kinematic parameters of the legs, counted from a start.
 
 Joint centres and lengths are unknown as they are [m], axes by two turns from where the step starts
-(:func:`~legcal.paper.motions.turned_axis`), twists by their change [rad].
+(:func:`~legcal.paper.gibbs.turned_axis`), twists by their change [rad].
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import N_LOCAL, Leg, LegKind, Parametrization, parametrize, tied_twist
-from legcal.paper.motions import axis_frames, turned_axis, turns_of
+from legcal.paper.gibbs import axis_frames, turned_axis, turns_of
 from legcal.paper.nominal import NominalMachine
 
 # Columns among the twelve numbers of a leg

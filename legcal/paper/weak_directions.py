@@ -23,8 +23,8 @@ from legcal.machine import (
     sparse_basis,
     split_by_motion,
 )
+from legcal.paper.gibbs import turned_axis_slope, turns_of
 from legcal.paper.least_squares import Term
-from legcal.paper.motions import turned_axis_slope, turns_of
 from legcal.paper.nominal import NominalMachine
 from legcal.paper.unknowns import BASE_TURNS, PLATFORM_TURNS, Unknowns
 

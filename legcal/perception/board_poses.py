@@ -17,22 +17,10 @@ from scipy.stats import chi2
 
 from legcal.data import MIN_CORNERS, Corners, Measurements, few, row_names
 from legcal.errors import DatasetError, NotVisible
-from legcal.estimation import (
-    Factor,
-    Frames,
-    Huber,
-    Problem,
-    Rows,
-    Variables,
-    all_free,
-    minimise,
-    normal_equations,
-)
 from legcal.geometry import Array, BoolArray
+from legcal.perception.board_adjustment import BoardImages, adjust_board
 from legcal.vision import Board, Camera
 
-MAX_ITERATIONS = 50
-HUBER = Huber(3.0)  # standard deviations from which a corner counts less and less
 SAME_ANGLE, SIMILAR_ANGLE = 1e-3, np.deg2rad(3.0)  # between poses of one plane: of an image, a view
 MAX_RESIDUAL_PX, MAX_RESIDUAL_SIGMA = 1.0, 5.0  # root mean square of corners of this board
 OUTLIER_PX, OUTLIER_SIGMA = 0.3, 6.0  # a corner further off than both is rejected
@@ -49,11 +37,6 @@ class PlanePose:
     cost: float  # half the sum of squares of whitened residuals, large ones by Huber's loss
     residual_px: Array  # (n, 2) pixels less where the points should be seen [px]
     information: Array  # (6, 6) of a rotation vector [rad] and a displacement [m] of the plane
-
-
-@dataclass(frozen=True, eq=False)
-class _State:
-    pose: Frames  # T_camera_plane
 
 
 def plane_poses(
@@ -87,28 +70,11 @@ def _refine(
     camera: Camera, points: Array, px: Array, sigma_px: Array, start: RigidTransform
 ) -> PlanePose | None:
     """Return the pose of least cost near a start; None if it puts points behind the camera."""
-
-    def rows(state: _State) -> Rows:
-        arm = points @ state.pose.R[0].T
-        P = arm + state.pose.t
-        if P[:, 2].min() <= 0.0:
-            return Rows.of(np.full(px.shape, np.inf), np.zeros((len(px), 2, 6)))
-        predicted, by_point = camera.project_with_derivative(P)
-        turning = np.cross(arm[:, None, :], by_point)
-        return Rows.of(predicted - px, np.concatenate([turning, by_point], axis=-1))
-
-    n = len(px)
-    touches = (("pose", np.zeros(n, dtype=np.intp), slice(None)),)
-    whitening = 1.0 / sigma_px[:, None, None]
-    corners = Factor[_State]("corners", rows, touches, n, 2, whitening=whitening, robust=True)
-    problem = Problem((Variables("pose", all_free(1, 6), Frames.moved),), None, (corners,))
-    state = _State(Frames.of([start]))
-    if not np.all(np.isfinite(rows(state).r)):
+    one = BoardImages(np.zeros(len(px), dtype=np.intp), points, px, sigma_px)
+    found = adjust_board(camera, [start], one)
+    if found is None:
         return None
-    best = minimise(problem, state, HUBER, max_iterations=MAX_ITERATIONS, must_converge=False)
-    normal = normal_equations(problem, best.state, best.linear, HUBER)
-    residual_px = -best.linear["corners"].r * sigma_px[:, None]
-    return PlanePose(best.state.pose.motions[0], best.cost, residual_px, normal.U)
+    return PlanePose(found.T_camera_board[0], found.cost, found.residual, found.information[0])
 
 
 def _distinct(poses: list[PlanePose], angle: float) -> list[PlanePose]:

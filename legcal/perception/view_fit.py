@@ -29,13 +29,13 @@ from legcal.estimation import (
     Linearization,
     NormalEquations,
     Problem,
-    Rows,
+    Residuals,
     Variables,
     all_free,
     information,
     linearize,
 )
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray, whitener
 from legcal.machine import main_cylinders
 from legcal.perception.detection import NOT_PLACED, measure_outlines
 from legcal.perception.outline import OUTSIDE
@@ -209,13 +209,13 @@ def _problem(group: Group, lines: "_Lines", start: _State, middle: Array) -> Pro
     prior = GaussianPrior(np.arange(6, dtype=np.intp), np.zeros(6), prior_sigma)
     pose = Variables("pose", all_free(1, 6), Frames.moved, coordinates=pose_from_start, prior=prior)
 
-    def offset_rows(state: _State) -> Rows:
+    def offset_rows(state: _State) -> Residuals:
         J_element = np.broadcast_to(np.eye(3), (lines.n_items, 3, 3))
-        return Rows.of(state.offset, np.zeros((lines.n_items, 3, 0)), J_element)
+        return Residuals.of(state.offset, np.zeros((lines.n_items, 3, 0)), J_element)
 
-    def shift_rows(state: _State) -> Rows:
+    def shift_rows(state: _State) -> Residuals:
         J = np.broadcast_to(np.eye(6), (n_legs, 6, 6))
-        return Rows.of(state.shift.reshape(n_legs, 6), J)
+        return Residuals.of(state.shift.reshape(n_legs, 6), J)
 
     every = slice(None)
     n = len(lines.leg)
@@ -239,7 +239,7 @@ def _problem(group: Group, lines: "_Lines", start: _State, middle: Array) -> Pro
     )
 
 
-def _outline_rows(group: Group, lines: "_Lines", state: _State, middle: Array) -> Rows:
+def _outline_rows(group: Group, lines: "_Lines", state: _State, middle: Array) -> Residuals:
     """Return offsets (n, 2) of outlines [px], with derivatives by pose and shift, and by offset."""
     R, centre = state.pose.R[0], state.pose.t[0]
     A = (lines.A + state.shift[lines.leg, 0] - middle) @ R.T + centre
@@ -253,7 +253,7 @@ def _outline_rows(group: Group, lines: "_Lines", state: _State, middle: Array) -
         px[here], at_camera = _offsets_of(X, *args)
         D[here] = at_camera @ R_view
     J = _derivatives_by(D, np.stack([A, B], axis=1) - centre, R)
-    return Rows.of(px, J[..., :12], J[..., 12:])
+    return Residuals.of(px, J[..., :12], J[..., 12:])
 
 
 def _normal_equations(
@@ -279,7 +279,7 @@ def _normal_equations(
 
 
 def _squared_distances(
-    lines: "_Lines", rows: Rows, offset: Array, sigma: float
+    lines: "_Lines", rows: Residuals, offset: Array, sigma: float
 ) -> tuple[Array, Array]:
     """Return squared distances of items from the fit, and squares of their offsets [m^2].
 
@@ -297,7 +297,7 @@ def _squared_distances(
     )
 
 
-def _evidence(lines: "_Lines", rows: Rows, state: _State, joint_sigma: float) -> float:
+def _evidence(lines: "_Lines", rows: Residuals, state: _State, joint_sigma: float) -> float:
     """Return how much outlines speak for a state, each leg of an image by itself."""
     square, _ = _squared_distances(lines, rows, state.offset, IMAGE_SIGMA)
     n_outlines = np.minimum(0.5 * lines.size, MAX_OUTLINES)
@@ -412,7 +412,7 @@ def _lines_of(search: Search, group: Group, outlines: Outlines) -> _Lines | None
         outlines.edge[used] - 1,
         ends,
         metric,
-        np.linalg.inv(np.linalg.cholesky(covariance)),
+        whitener(covariance),
         row[first],
         leg[first],
         first,

@@ -14,10 +14,10 @@ from legcal.calibration import (
     CALLED,
     OUTLINE,
     QUANTITIES,
+    DatasetNoise,
     LegNoise,
     MethodNoise,
-    Noise,
-    Spread,
+    PooledSpread,
 )
 from legcal.report.render import heading, report, table
 
@@ -38,7 +38,7 @@ _CONVENTIONS = (
 _PAPER = "The paper's Table 1 for its own machine: 0.05, 0.06 (as printed in rad), 0.05 mm, 0.1 mm."
 
 
-def noise_table(noise: Noise) -> RenderableType:
+def noise_table(noise: DatasetNoise) -> RenderableType:
     """Return the measurement noise as people read it, in mm, degrees and px."""
     counts = sorted({len(group.rows) for group in noise.repeats})
     repeats = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
@@ -61,7 +61,7 @@ def noise_table(noise: Noise) -> RenderableType:
     )
 
 
-def _bounding(noise: Noise) -> list[str]:
+def _bounding(noise: DatasetNoise) -> list[str]:
     """Return lines on which orientations set the upper bounds."""
     lines = []
     for method in noise.methods:
@@ -77,7 +77,7 @@ def _bounding(noise: Noise) -> list[str]:
     return lines
 
 
-def _difference(noise: Noise) -> str | None:
+def _difference(noise: DatasetNoise) -> str | None:
     """Return a sentence on how far both methods put the same outlines apart."""
     found = noise.difference()
     if found is None:
@@ -90,7 +90,7 @@ def _difference(noise: Noise) -> str | None:
     )
 
 
-def _rows(noise: Noise) -> list[tuple[str, MethodNoise, LegNoise]]:
+def _rows(noise: DatasetNoise) -> list[tuple[str, MethodNoise, LegNoise]]:
     """Return the rows: every leg by every method."""
     return [
         (leg.name if k == 0 else "", method, method.legs[j])
@@ -100,14 +100,14 @@ def _rows(noise: Noise) -> list[tuple[str, MethodNoise, LegNoise]]:
 
 
 def _by_leg_and_method(
-    noise: Noise, title: str, columns: list[str], rows: list[list[str | Text]]
+    noise: DatasetNoise, title: str, columns: list[str], rows: list[list[str | Text]]
 ) -> Table:
     longest = max(len(leg.name) for leg in noise.methods[0].legs)
     names = ("leg", "method", *(f">{column}" for column in columns))
     return table(*names, rows=rows, title=title, least={0: min(longest, _MIN_NAME), 1: 8})
 
 
-def _axis_table(noise: Noise, title: str, columns: dict[str, str]) -> Table:
+def _axis_table(noise: DatasetNoise, title: str, columns: dict[str, str]) -> Table:
     """Return pooled standard deviations of some quantities, and their upper bounds."""
     rows: list[list[str | Text]] = []
     for name, method, leg in _rows(noise):
@@ -117,7 +117,7 @@ def _axis_table(noise: Noise, title: str, columns: dict[str, str]) -> Table:
         if method.name == _CLAIMING:
             cells = [_value(leg.spread(q), q, lambda s: s.claimed) for q in columns]
             rows.append([Text(cell, style="dim") for cell in ("", " claims", *cells, "")])
-    of_all: dict[str, Callable[[Spread], float]] = {
+    of_all: dict[str, Callable[[PooledSpread], float]] = {
         "median": lambda s: s.median,
         "upper bound": lambda s: s.largest,
     }
@@ -128,7 +128,7 @@ def _axis_table(noise: Noise, title: str, columns: dict[str, str]) -> Table:
     return _by_leg_and_method(noise, title, [*columns.values(), "images"], rows)
 
 
-def _outline_table(noise: Noise) -> Table:
+def _outline_table(noise: DatasetNoise) -> Table:
     """Return the spread of outlines beside what is claimed of them."""
     rows: list[list[str | Text]] = []
     for name, method, leg in _rows(noise):
@@ -143,7 +143,7 @@ def _outline_table(noise: Noise) -> Table:
     return _by_leg_and_method(noise, "Outlines, offsets at both ends [px]", columns, rows)
 
 
-def _outline_cells(spread: Spread | None) -> list[str]:
+def _outline_cells(spread: PooledSpread | None) -> list[str]:
     """Return spread, claim, ratio with its range, the median and the largest."""
     if spread is None:
         return ["-"] * 6
@@ -158,7 +158,7 @@ def _outline_cells(spread: Spread | None) -> list[str]:
 
 
 def _value(
-    spread: Spread | None, quantity: str, of: Callable[[Spread], float], none: str = "-"
+    spread: PooledSpread | None, quantity: str, of: Callable[[PooledSpread], float], none: str = "-"
 ) -> str:
     """Return a standard deviation in degrees or millimetres with three digits."""
     if spread is None:

@@ -10,35 +10,17 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.estimation import (
-    Factor,
-    Frames,
-    GaussianPrior,
-    Huber,
-    Problem,
-    Rows,
-    Variables,
-    all_free,
-    minimise,
-    normal_equations,
-)
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception import plane_poses
+from legcal.perception import AdjustedBoard, BoardImages, adjust_board, plane_poses
 from legcal.vision import (
     DISTORTION_MODELS,
     Camera,
     DistortionModel,
     ImageSize,
-    distort_derivatives,
     intrinsic_names,
-    intrinsic_values,
     quiet_opencv,
-    with_intrinsics,
 )
 
-_MAX_ITERATIONS = 60
-_LOSS = Huber(3.0)  # standard deviations from which a corner counts less and less
-_PRIOR_PX = 10.0  # image widths: prior of focal lengths and principal point
 _FOCAL_LENGTHS = (0.25, 4.0, 13)  # least to greatest, how many: parts of the longer side
 _MAX_ANGLE = 1.45  # [rad] to the axis of a fisheye lens
 _ROUGH, _ROUGH_ITERATIONS = ("fx", "fy", "k1"), 12  # estimated first
@@ -51,135 +33,27 @@ _MIN_NOISE_PX = 0.015  # of a corner: what neighbours share does not show in res
 _MIN_INLIERS = 0.6  # of the corners of an image that is used
 
 
-@dataclass(frozen=True, eq=False)
-class BoardCorners:
-    """The corners of the board in some images, n of them."""
-
-    image: IntArray  # (n,) of each corner, rising, from 0 to n_images - 1
-    points: Array  # (n, 3) where it is on the board [m]
-    px: Array  # (n, 2) where it is seen [px]
-    sigma_px: Array  # (n,) standard deviation of either coordinate [px]
-
-
-@dataclass(frozen=True, eq=False)
-class Adjusted:
-    """A camera and the board in every image."""
-
-    camera: Camera
-    T_camera_board: tuple[RigidTransform, ...]  # of every image
-    residual: Array  # (n, 2) corners less where they should be seen [px]
-    cost: float  # half the sum of squares, in standard deviations, large ones by Huber's loss
-    covariance: Array  # (k, k) of intrinsic_names, by the standard deviations of corners
-
-
-@dataclass(frozen=True, eq=False)
-class _State:
-    """What the adjustment moves."""
-
-    camera: Camera
-    board_pose: Frames  # T_camera_board of every image
-
-
-def adjust(
-    camera: Camera,
-    poses: Sequence[RigidTransform],
-    seen: BoardCorners,
-    free: Sequence[str] = (),
-    *,
-    max_iterations: int = _MAX_ITERATIONS,
-) -> Adjusted | None:
-    """Return the camera and poses of least cost near a start.
-
-    The intrinsics *free*, all of them without it, are held by priors that tell next to nothing.
-    None if no place near the start has all corners before the camera.
-    """
-    names = tuple(free) or intrinsic_names(camera)
-    where = np.array([intrinsic_names(camera).index(name) for name in names])
-    pixel = np.array([name[0] in "fc" for name in names])
-    known = GaussianPrior(
-        np.arange(len(names), dtype=np.intp),
-        np.where(pixel, intrinsic_values(camera)[where], 0.0),
-        np.where(
-            pixel,
-            _PRIOR_PX * max(camera.width, camera.height),
-            DISTORTION_MODELS[camera.model].prior_sigma,
-        ),
-    )
-
-    def moved(camera: Camera, change: Array) -> Camera:
-        values = intrinsic_values(camera)[where] + change[0]
-        return with_intrinsics(camera, dict(zip(names, values.tolist(), strict=True)))
-
-    n = len(seen.image)
-    problem = Problem[_State](
-        variables=(
-            Variables(
-                "camera",
-                all_free(1, len(names)),
-                moved,
-                names,
-                ("",) * len(names),
-                lambda camera: intrinsic_values(camera)[where],
-                prior=known,
-            ),
-        ),
-        eliminated=Variables("board_pose", all_free(len(poses), 6), Frames.moved),
-        factors=(
-            Factor(
-                "corners",
-                lambda state: _corner_rows(state, seen, names),
-                (("camera", np.zeros(n, dtype=np.intp), slice(None)),),
-                n,
-                2,
-                seen.image,
-                1.0 / seen.sigma_px[:, None, None],
-                robust=True,
-            ),
-        ),
-        name="calibration of the camera",
-    )
-    state = _State(camera, Frames.of(poses))
-    if not np.all(np.isfinite(problem.factor("corners").rows(state).r)):
-        return None
-    found = minimise(problem, state, _LOSS, max_iterations=max_iterations, must_converge=False)
-    normal = normal_equations(problem, found.state, found.linear, _LOSS)
-    return Adjusted(
-        found.state.camera,
-        found.state.board_pose.motions,
-        -found.linear["corners"].r * seen.sigma_px[:, None],
-        found.cost,
-        normal.kept_covariance(),
-    )
-
-
-def _corner_rows(state: _State, seen: BoardCorners, names: Sequence[str]) -> Rows:
-    """Return predicted less measured corners [px]; not finite where one is behind the camera."""
-    camera, R = state.camera, state.board_pose.R[seen.image]
-    arm = (R @ seen.points[:, :, None])[:, :, 0]
-    P = arm + state.board_pose.t[seen.image]
-    if P[:, 2].min() <= 1e-9 or not (camera.K[0, 0] > 1.0 and camera.K[1, 1] > 1.0):
-        nothing = np.full(seen.px.shape, np.nan)
-        shape = *seen.px.shape, len(names)
-        return Rows.of(nothing, np.zeros(shape), np.zeros((*seen.px.shape, 6)))
-    xy = P[:, :2] / P[:, 2:]
-    predicted, by_point = camera.project_with_derivative(P)
-    by_turn = np.cross(arm[:, None, :], by_point)  # d(pixel) = by_point . (w x arm)
-    by_pose = np.concatenate([by_turn, by_point], axis=-1)
-    return Rows.of(predicted - seen.px, distort_derivatives(camera, xy, names), by_pose)
-
-
-def _from_scratch(seen: BoardCorners, size: ImageSize, model: DistortionModel) -> Adjusted | None:
+def _from_scratch(
+    seen: BoardImages, size: ImageSize, model: DistortionModel
+) -> AdjustedBoard | None:
     """Return the adjustment from where a camera is roughly right, None if none succeeds."""
     start = None if DISTORTION_MODELS[model].is_fisheye else _by_opencv(seen, size, model)
     start = start or _by_straight_lines(seen, size, model)
     if start is None:
         return None
-    rough = adjust(*start, seen, _ROUGH, max_iterations=_ROUGH_ITERATIONS)
-    return None if rough is None else adjust(rough.camera, rough.T_camera_board, seen)
+    rough = adjust_board(*start, seen, _ROUGH, max_iterations=_ROUGH_ITERATIONS)
+    return None if rough is None else _all_adjusted(rough.camera, rough.T_camera_board, seen)
+
+
+def _all_adjusted(
+    camera: Camera, poses: Sequence[RigidTransform], seen: BoardImages
+) -> AdjustedBoard | None:
+    """Return the adjustment of poses and all intrinsics from a start."""
+    return adjust_board(camera, poses, seen, intrinsic_names(camera))
 
 
 def _by_straight_lines(
-    seen: BoardCorners, size: ImageSize, model: DistortionModel
+    seen: BoardImages, size: ImageSize, model: DistortionModel
 ) -> tuple[Camera, list[RigidTransform]] | None:
     """Return the camera without distortion before which boards are flattest, of several."""
     centre = 0.5 * (size.width - 1.0), 0.5 * (size.height - 1.0)
@@ -199,7 +73,7 @@ def _by_straight_lines(
     return best, poses
 
 
-def _non_flatness(camera: Camera, seen: BoardCorners) -> float:
+def _non_flatness(camera: Camera, seen: BoardImages) -> float:
     """Return how far the corners of boards are from any plane before a camera (rms) [px]."""
     angle = np.linalg.norm(seen.px - camera.K[:2, 2], axis=1) / camera.K[0, 0]
     if DISTORTION_MODELS[camera.model].is_fisheye and angle.max() > _MAX_ANGLE:
@@ -216,13 +90,13 @@ def _non_flatness(camera: Camera, seen: BoardCorners) -> float:
     return float(np.sqrt(np.mean(np.concatenate(off) ** 2)))
 
 
-def _bounds(seen: BoardCorners) -> IntArray:
+def _bounds(seen: BoardImages) -> IntArray:
     """Return where the corners of each image begin, and where those of the last one end."""
     return np.searchsorted(seen.image, np.arange(seen.image[-1] + 2))
 
 
 def _by_opencv(
-    seen: BoardCorners, size: ImageSize, model: DistortionModel
+    seen: BoardImages, size: ImageSize, model: DistortionModel
 ) -> tuple[Camera, list[RigidTransform]] | None:
     """Return the camera that OpenCV calibrates, with two coefficients of distortion."""
     pieces = list(pairwise(_bounds(seen)))
@@ -255,8 +129,8 @@ def _by_opencv(
 class RobustFit:
     """A camera, and the corners that agree with it."""
 
-    adjusted: Adjusted  # by the corners that were kept
-    seen: BoardCorners  # those corners, their images numbered anew
+    adjusted: AdjustedBoard  # by the corners that were kept
+    seen: BoardImages  # those corners, their images numbered anew
     images: tuple[int, ...]  # the number that each of these images had
     left_out: dict[int, str]  # images that disagree, and how
     n_left_out: int  # single corners that were left out of the other images
@@ -264,7 +138,7 @@ class RobustFit:
     scale: float  # factor on the covariance, by the residuals
 
 
-def robust_fit(seen: BoardCorners, size: ImageSize, model: DistortionModel) -> RobustFit | None:
+def robust_fit(seen: BoardImages, size: ImageSize, model: DistortionModel) -> RobustFit | None:
     """Return the camera on which corners agree; None if no adjustment succeeds."""
     n_images = int(seen.image[-1]) + 1
     claimed = seen.sigma_px
@@ -278,7 +152,7 @@ def robust_fit(seen: BoardCorners, size: ImageSize, model: DistortionModel) -> R
     adjusted, extra = first, 0.0
     for _ in range(_MAX_ROUNDS):
         part, images = _part(seen, kept, n_images)
-        found = adjust(camera, [poses[k] for k in images], part)
+        found = _all_adjusted(camera, [poses[k] for k in images], part)
         if found is None:
             break
         adjusted, camera = found, found.camera
@@ -305,7 +179,7 @@ def robust_fit(seen: BoardCorners, size: ImageSize, model: DistortionModel) -> R
         if converged:
             break
     part, images = _part(seen, kept, n_images)
-    last = adjust(camera, [poses[k] for k in images], part)
+    last = _all_adjusted(camera, [poses[k] for k in images], part)
     adjusted = last if last is not None else adjusted
     others = ~np.isin(seen.image, list(left_out))
     return RobustFit(
@@ -319,16 +193,12 @@ def robust_fit(seen: BoardCorners, size: ImageSize, model: DistortionModel) -> R
     )
 
 
-def _part(
-    seen: BoardCorners, kept: BoolArray, n_images: int
-) -> tuple[BoardCorners, tuple[int, ...]]:
+def _part(seen: BoardImages, kept: BoolArray, n_images: int) -> tuple[BoardImages, tuple[int, ...]]:
     """Return some of the corners, and the numbers that their images had."""
     images = sorted(set(seen.image[kept].tolist()))
     new = np.full(n_images, -1, dtype=np.intp)
     new[images] = np.arange(len(images))
-    part = BoardCorners(
-        new[seen.image[kept]], seen.points[kept], seen.px[kept], seen.sigma_px[kept]
-    )
+    part = BoardImages(new[seen.image[kept]], seen.points[kept], seen.px[kept], seen.sigma_px[kept])
     return part, tuple(images)
 
 
@@ -338,7 +208,7 @@ def _extra(residual: Array, claimed: Array) -> float:
     return float(np.sqrt(max(seen**2 - float(np.median(claimed)) ** 2, 0.0)))
 
 
-def _outlier_images(residual: Array, seen: BoardCorners, images: Sequence[int]) -> dict[int, str]:
+def _outlier_images(residual: Array, seen: BoardImages, images: Sequence[int]) -> dict[int, str]:
     """Return the images whose corners scatter far more than those of the others."""
     scatter = [float(np.sqrt(np.mean(residual[seen.image == i] ** 2))) for i in range(len(images))]
     usual = float(np.median(scatter))
@@ -349,7 +219,7 @@ def _outlier_images(residual: Array, seen: BoardCorners, images: Sequence[int]) 
     }
 
 
-def _scale(adjusted: Adjusted, seen: BoardCorners, n_images: int) -> float:
+def _scale(adjusted: AdjustedBoard, seen: BoardImages, n_images: int) -> float:
     """Return chi^2 of the corners by its degrees of freedom, for no less than the least noise."""
     chi2 = float(np.sum((adjusted.residual / seen.sigma_px[:, None]) ** 2))
     unknowns = len(adjusted.covariance) + 6 * n_images

@@ -13,7 +13,7 @@ import numpy as np
 
 from legcal.calibration.camera_calibration.adjustment import (
     MIN_CORNERS,
-    BoardCorners,
+    BoardImages,
     RobustFit,
     robust_fit,
 )
@@ -161,10 +161,10 @@ def _search(
     return found
 
 
-def _table(board: Board, found: Sequence[_Corners]) -> BoardCorners:
+def _table(board: Board, found: Sequence[_Corners]) -> BoardImages:
     """Return the corners of some images in one table."""
     counts = [len(numbers) for numbers, _, _ in found]
-    return BoardCorners(
+    return BoardImages(
         np.repeat(np.arange(len(found)), counts),
         np.concatenate([board.points[numbers] for numbers, _, _ in found]),
         np.concatenate([px for _, px, _ in found]),

@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from legcal.calibration.camera_calibration.adjustment import RobustFit, adjust
+from legcal.calibration.camera_calibration.adjustment import RobustFit
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array
+from legcal.perception import adjust_board
 from legcal.vision import Camera, intrinsic_names
 
 MIN_IMAGES, _FEW_IMAGES = 3, 10
@@ -149,7 +150,7 @@ def _overfit(found: RobustFit) -> list[str]:
     zeroed = full.camera.distortion.copy()
     zeroed[5:] = 0.0
     start = Camera(full.camera.K, full.camera.width, full.camera.height, zeroed, full.camera.model)
-    plain = adjust(start, full.T_camera_board, found.seen, simple)
+    plain = adjust_board(start, full.T_camera_board, found.seen, simple)
     if plain is None:
         return []
     dof = 2 * len(found.seen.px) - len(full.covariance) - 6 * len(found.images)

@@ -7,6 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from legcal.calibration.identify.information import expected_intrinsics
+from legcal.calibration.identify.predicted_observations import (
+    THIN,
+    PredictedObservations,
+    cameras_of,
+    legs_in_words,
+    orientations_of,
+    planned_observations,
+    recorded_observations,
+)
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.remedies import (
     ENOUGH_IMAGES,
@@ -16,15 +25,6 @@ from legcal.calibration.identify.remedies import (
     recommend,
 )
 from legcal.calibration.identify.report import Identifiability, Ranks, Recommendation
-from legcal.calibration.identify.session import (
-    THIN,
-    Session,
-    cameras_of,
-    legs_in_words,
-    orientations_of,
-    planned_session,
-    recorded_session,
-)
 from legcal.calibration.joint_fit import NO_CHOICES, Choices
 from legcal.data import Dataset
 from legcal.errors import NotIdentifiable, UsageError
@@ -140,12 +140,12 @@ def identifiability(
         recommendation = recommend(mechanism, images, board=board)
         names = recommendation[0].views if recommendation else (mechanism.leg_names,)
         legs = read_views(names, mechanism.leg_names, images)
-    session = planned_session(mechanism, legs, images, board=board)
+    predicted = planned_observations(mechanism, legs, images, board=board)
     replanning = Replanning(
-        lambda more: planned_session(mechanism, legs, more, board=board),
+        lambda more: planned_observations(mechanism, legs, more, board=board),
         lambda: recommend(mechanism, max(images, ENOUGH_IMAGES), board=board),
     )
-    return _judge(mechanism, Analysis(session), recommendation, replanning)
+    return _judge(mechanism, Analysis(predicted), recommendation, replanning)
 
 
 def identifiability_of_dataset(
@@ -159,16 +159,16 @@ def identifiability_of_dataset(
     Raises DidNotConverge if the readings do not lead to closed poses.
     """
     twists = any(name.endswith(".twist") for name in (*choices.free, *choices.priors))
-    session = recorded_session(dataset, twists=twists)
-    analysis = Analysis(session, choices)
+    predicted = recorded_observations(dataset, twists=twists)
+    analysis = Analysis(predicted, choices)
     report = _judge(dataset.machine, analysis, None, None)
     if dataset.axes is None:
         found = expected_intrinsics(
-            session,
+            predicted,
             analysis.images,
             analysis.equations,
             analysis.prior,
-            orientations_of(dataset, session),
+            orientations_of(dataset, predicted),
             cameras_of(dataset),
         )
         report = replace(report, intrinsics=found)
@@ -219,8 +219,8 @@ def _judge_hand_held(
             "that the images show; give --board and --view."
         )
     each = tuple(view for view in legs for _ in range(images))
-    session = planned_session(machine, each, 1, board=True)
-    return _judge(machine, Analysis(session), None, None)
+    predicted = planned_observations(machine, each, 1, board=True)
+    return _judge(machine, Analysis(predicted), None, None)
 
 
 def _judge(
@@ -230,11 +230,11 @@ def _judge(
     replanning: Replanning | None,
 ) -> Identifiability:
     """Return the report on a session."""
-    session = analysis.session
-    conditions = conditions_of(machine, session)
+    predicted = analysis.predicted
+    conditions = conditions_of(machine, predicted)
     board = judge_board(
         analysis,
-        *(conditions_of(machine, session.with_board(board=b)) for b in (False, True)),
+        *(conditions_of(machine, predicted.with_board(board=b)) for b in (False, True)),
     )
     staged, full = analysis.staged, analysis.full
     enough = staged.complete and full.complete
@@ -254,14 +254,14 @@ def _judge(
         n=machine.n_legs,
         n_d=len(machine.frame_legs),
         r=sum(leg.base_joint is JointType.REVOLUTE for leg in machine.legs),
-        n_ac=int(session.with_length.sum()),
+        n_ac=int(predicted.with_length.sum()),
         conditions=conditions,
         staged=staged,
         full=full,
         identifiable=full.complete,
         steps=analysis.step_ranks,
-        views=tuple(tuple(session.leg_names[j] for j in view) for view in session.views),
-        images=tuple(int((session.view == v).sum()) for v in range(session.n_views)),
+        views=tuple(tuple(predicted.leg_names[j] for j in view) for view in predicted.views),
+        images=tuple(int((predicted.view == v).sum()) for v in range(predicted.n_views)),
         board=board,
         platform_sigma=analysis.motion.sigma(analysis.information) if full.complete else None,
         remedies=() if enough else find_remedies(analysis, replanning),
@@ -293,30 +293,30 @@ def _machine_notes(machine: Machine) -> list[str]:
     return notes if singular is None else [*notes, singular[0].upper() + singular[1:]]
 
 
-def conditions_of(machine: Machine, session: Session) -> tuple[Condition, ...]:
+def conditions_of(machine: Machine, predicted: PredictedObservations) -> tuple[Condition, ...]:
     """Return the paper's conditions for a session.
 
     Counts are those of the views, as printed. Directions of a leg may differ between views that
     show a board: they are known in one frame.
     """
-    image, leg = session.seen[session.view].nonzero()
+    image, leg = predicted.seen[predicted.view].nonzero()
     counts = count_conditions(
-        session.views,
-        session.n_legs,
-        spatial=session.spatial,
-        revolute=[j for j, x in enumerate(session.legs) if x.base_joint is JointType.REVOLUTE],
-        passive=[j for j, has in enumerate(session.with_length) if not has],
-        board=bool(session.board.all()),
+        predicted.views,
+        predicted.n_legs,
+        spatial=predicted.spatial,
+        revolute=[j for j, x in enumerate(predicted.legs) if x.base_joint is JointType.REVOLUTE],
+        passive=[j for j, has in enumerate(predicted.with_length) if not has],
+        board=bool(predicted.board.all()),
     )
     return (
         *counts,
         two_directions(
-            session.frame[session.view[image]],
+            predicted.frame[predicted.view[image]],
             leg,
-            session.u[session.pose[image], leg],
-            session.n_legs,
+            predicted.u[predicted.pose[image], leg],
+            predicted.n_legs,
         ),
-        three_legs_at_once(session.views, geometries(machine), spatial=session.spatial),
+        three_legs_at_once(predicted.views, geometries(machine), spatial=predicted.spatial),
     )
 
 

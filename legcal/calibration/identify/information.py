@@ -13,19 +13,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from legcal.calibration.identify.report import CameraIntrinsics
-from legcal.calibration.identify.session import (
+from legcal.calibration.identify.predicted_observations import (
     Across,
-    Session,
+    PredictedObservations,
     at_base_joints,
     at_platform_joints,
 )
+from legcal.calibration.identify.report import CameraIntrinsics
 from legcal.calibration.joint_fit import Choices
 from legcal.estimation import (
     Factor,
     GaussianPrior,
     Problem,
-    Rows,
+    Residuals,
     Variables,
     all_free,
     information_rows,
@@ -68,58 +68,58 @@ class WhitenedEquations:
         return replace(self, by_pose=self.by_pose[poses], by_parameters=self.by_parameters[poses])
 
 
-def leg_equations(session: Session) -> WhitenedEquations:
+def leg_equations(predicted: PredictedObservations) -> WhitenedEquations:
     """Return what readings and legs demand of the poses of a session."""
-    equations = pose_equations(session.legs, session.R, session.t)
-    sigma = np.where(equations.measured, session.sigma_q, SIGMA_EXACT)[:, None]
-    columns = list(freedoms(session.frame_legs))
+    equations = pose_equations(predicted.legs, predicted.R, predicted.t)
+    sigma = np.where(equations.measured, predicted.sigma_q, SIGMA_EXACT)[:, None]
+    columns = list(freedoms(predicted.frame_legs))
     return WhitenedEquations(
-        (equations.by_pose / sigma * pose_unit(session))[:, :, columns],
-        equations.by_parameters(session.parametrization) / sigma * session.unit,
+        (equations.by_pose / sigma * pose_unit(predicted))[:, :, columns],
+        equations.by_parameters(predicted.parametrization) / sigma * predicted.unit,
         equations.leg,
         equations.kinds,
     )
 
 
-def image_rows(session: Session) -> Array:
+def image_rows(predicted: PredictedObservations) -> Array:
     """Return the whitened derivatives (n_images, n_legs, 4, f + 6 + p) of what images show.
 
     By the platform's motion, the motion of the camera of that image, and the parameters.
     """
-    base, platform = at_base_joints(session), at_platform_joints(session)
-    turns = pose_unit(session)
+    base, platform = at_base_joints(predicted), at_platform_joints(predicted)
+    turns = pose_unit(predicted)
     by_camera = np.concatenate([base.by_camera(), platform.by_camera()], axis=2) * turns
-    turn = np.cross(session.arm[session.pose][:, :, None], platform.gradient)
+    turn = np.cross(predicted.arm[predicted.pose][:, :, None], platform.gradient)
     by_pose = np.zeros_like(by_camera)
     by_pose[:, :, 2:] = np.concatenate([turn, platform.gradient], axis=3) * turns
-    scatter = session.local_to_parameters
-    inside = platform.gradient @ session.R[session.pose][:, None]
+    scatter = predicted.local_to_parameters
+    inside = platform.gradient @ predicted.R[predicted.pose][:, None]
     by_parameters = np.concatenate(
         [base.gradient @ scatter[:, :3], inside @ scatter[:, 3:6]], axis=2
     )
-    columns = list(freedoms(session.frame_legs))
+    columns = list(freedoms(predicted.frame_legs))
     return np.concatenate([by_pose[..., columns], by_camera, by_parameters], axis=3)
 
 
-def pose_unit(session: Session) -> Array:
+def pose_unit(predicted: PredictedObservations) -> Array:
     """Return what a metre of the six components of a motion is: turns count at the leg's length."""
-    return np.repeat([1.0 / session.mean_length, 1.0], 3)
+    return np.repeat([1.0 / predicted.mean_length, 1.0], 3)
 
 
-def prior_of(session: Session, choices: Choices) -> GaussianPrior:
+def prior_of(predicted: PredictedObservations, choices: Choices) -> GaussianPrior:
     """Return what is known of the parameters of a session: fixed ones, and those with priors."""
     sigma: dict[int, float] = {}
-    for i, name in enumerate(session.parametrization.names):
+    for i, name in enumerate(predicted.parametrization.names):
         if name in choices.priors:
             sigma[i] = choices.priors[name].sigma
         elif choices.holds(name, by_default=name.endswith(".twist")):
-            sigma[i] = SIGMA_EXACT * session.unit[i]
+            sigma[i] = SIGMA_EXACT * predicted.unit[i]
     known, values = np.array(list(sigma), dtype=np.intp), np.array(list(sigma.values()))
     return GaussianPrior(known, np.zeros(len(sigma)), values)
 
 
 def problem_of(
-    session: Session,
+    predicted: PredictedObservations,
     images: Array,  # of image_rows
     equations: WhitenedEquations,
     prior: GaussianPrior,
@@ -131,25 +131,25 @@ def problem_of(
     depend on too: the element that each leg in each image depends on (n_images, n_legs), and the
     derivatives (n_images, n_legs, 4, d) of what it shows.
     """
-    n_f, n_p, n_poses = len(freedoms(session.frame_legs)), len(session.unit), len(session.t)
+    n_f, n_p, n_poses = len(freedoms(predicted.frame_legs)), len(predicted.unit), len(predicted.t)
     n_images, n_legs = images.shape[:2]
     n, m, whole = n_images * n_legs, len(equations.leg), slice(None)
     J = np.concatenate([images[..., n_f:], *(by for _, _, by in more)], axis=3).reshape(n, 4, -1)
-    shown = Rows.of(np.zeros((n, 4)), J, images[..., :n_f].reshape(n, 4, n_f))
-    demanded = Rows.of(np.zeros((n_poses, m)), equations.by_parameters, equations.by_pose)
+    shown = Residuals.of(np.zeros((n, 4)), J, images[..., :n_f].reshape(n, 4, n_f))
+    demanded = Residuals.of(np.zeros((n_poses, m)), equations.by_parameters, equations.by_pose)
     parameters = Variables(
         "parameters",
         all_free(1, n_p),
-        labels=session.parametrization.names,
-        units=session.parametrization.units,
-        coordinates=lambda x: x * session.unit,
-        jacobian=lambda x: np.diag(session.unit),
+        labels=predicted.parametrization.names,
+        units=predicted.parametrization.units,
+        coordinates=lambda x: x * predicted.unit,
+        jacobian=lambda x: np.diag(predicted.unit),
         prior=prior,
     )
     problem = Problem[_Nominal](
         variables=(
             parameters,
-            Variables("camera", all_free(session.n_frames, 6)),
+            Variables("camera", all_free(predicted.n_frames, 6)),
             *(variables for variables, _, _ in more),
         ),
         eliminated=Variables("pose", all_free(n_poses, n_f)),
@@ -158,13 +158,13 @@ def problem_of(
                 "images",
                 lambda _: shown,
                 (
-                    ("camera", np.repeat(session.frame[session.view], n_legs), whole),
+                    ("camera", np.repeat(predicted.frame[predicted.view], n_legs), whole),
                     ("parameters", np.zeros(n, dtype=np.intp), whole),
                     *((variables.name, element.ravel(), whole) for variables, element, _ in more),
                 ),
                 n,
                 4,
-                np.repeat(session.pose, n_legs),
+                np.repeat(predicted.pose, n_legs),
             ),
             Factor(
                 "legs",
@@ -181,7 +181,7 @@ def problem_of(
 
 
 def expected_intrinsics(
-    session: Session,
+    predicted: PredictedObservations,
     images: Array,  # of image_rows
     equations: WhitenedEquations,
     prior: GaussianPrior,
@@ -192,14 +192,14 @@ def expected_intrinsics(
     """Return what the legs determine of the intrinsics of cameras, estimated with all else."""
     cameras = tuple(dict.fromkeys(owners))
     of_view = np.array([cameras.index(owner) for owner in owners], dtype=np.intp)
-    n_legs, n_cameras = session.n_legs, len(cameras)
-    by_radius, by_intrinsics = _radii_and_intrinsics(session, orientation)
-    known = GaussianPrior(np.arange(n_legs), np.zeros(n_legs), _RADIUS_SIGMA * session.radius)
+    n_legs, n_cameras = predicted.n_legs, len(cameras)
+    by_radius, by_intrinsics = _radii_and_intrinsics(predicted, orientation)
+    known = GaussianPrior(np.arange(n_legs), np.zeros(n_legs), _RADIUS_SIGMA * predicted.radius)
     leg = np.broadcast_to(np.arange(n_legs), images.shape[:2])
-    camera = np.broadcast_to(of_view[session.view][:, None], images.shape[:2])
+    camera = np.broadcast_to(of_view[predicted.view][:, None], images.shape[:2])
     numbers = Variables("intrinsics", all_free(n_cameras, len(INTRINSICS)))
     problem, state = problem_of(
-        session,
+        predicted,
         images,
         equations,
         prior,
@@ -211,11 +211,11 @@ def expected_intrinsics(
     left = marginal_rows(information_rows(problem, state), problem.where("intrinsics"))
     _, singular, basis = np.linalg.svd(left)
     # An unknown of one metre is one of as many pixels as a leg's length is long from afar.
-    is_seen = singular > 1.0 / (_MAX_INTRINSICS_SIGMA * session.mean_length)
+    is_seen = singular > 1.0 / (_MAX_INTRINSICS_SIGMA * predicted.mean_length)
     spread = np.sqrt(np.sum((basis[is_seen].T / singular[is_seen]) ** 2, axis=1))
     is_open = np.sqrt(np.sum(basis[~is_seen] ** 2, axis=0)) > _OPEN
     first = np.unique(of_view, return_index=True)[1]
-    metre = session.focal[first] / session.mean_length  # of each camera [px]
+    metre = predicted.focal[first] / predicted.mean_length  # of each camera [px]
     sigma = spread.reshape(n_cameras, -1) * metre[:, None]
     return tuple(
         CameraIntrinsics(
@@ -229,35 +229,39 @@ def expected_intrinsics(
     )
 
 
-def _radii_and_intrinsics(session: Session, orientation: Array) -> tuple[Array, Array]:
+def _radii_and_intrinsics(
+    predicted: PredictedObservations, orientation: Array
+) -> tuple[Array, Array]:
     """Return derivatives of what images show by radii and intrinsics, (n_images, n_legs, 4, d)."""
-    shape = len(session.view), session.n_legs, 4
+    shape = len(predicted.view), predicted.n_legs, 4
     by_radius, by_intrinsics = np.zeros((*shape, 1)), np.zeros((*shape, len(INTRINSICS)))
-    unit = (session.focal / session.mean_length)[session.view][:, None, None, None]
-    for k, across in enumerate((at_base_joints(session), at_platform_joints(session))):
-        lateral, widening = intrinsics_changes(session, across, orientation)
-        sigma_lateral, towards = _scales(session, across)
+    unit = (predicted.focal / predicted.mean_length)[predicted.view][:, None, None, None]
+    for k, across in enumerate((at_base_joints(predicted), at_platform_joints(predicted))):
+        lateral, widening = intrinsics_changes(predicted, across, orientation)
+        sigma_lateral, towards = _scales(predicted, across)
         rows = [lateral / sigma_lateral[..., None], widening * towards[..., None]]
         by_intrinsics[:, :, 2 * k : 2 * k + 2] = np.stack(rows, 2) * unit
-        by_radius[:, :, 2 * k + 1, 0] = towards / session.radius
-    hidden = ~session.seen[session.view]
+        by_radius[:, :, 2 * k + 1, 0] = towards / predicted.radius
+    hidden = ~predicted.seen[predicted.view]
     by_radius[hidden] = by_intrinsics[hidden] = 0.0
     return by_radius, by_intrinsics
 
 
-def intrinsics_changes(session: Session, across: Across, orientation: Array) -> tuple[Array, Array]:
+def intrinsics_changes(
+    predicted: PredictedObservations, across: Across, orientation: Array
+) -> tuple[Array, Array]:
     """Return what a pixel more of each intrinsic does, both (n_images, n_legs, 4).
 
     How far it moves the axis across the leg [m/px], and how much wider it makes the leg [1/px].
     """
-    R = orientation[session.view]
-    at = (across.point - session.camera[session.view][:, None]) @ R  # in the camera frame
+    R = orientation[predicted.view]
+    at = (across.point - predicted.camera[predicted.view][:, None]) @ R  # in the camera frame
     lateral = across.gradient[:, :, 0] @ R
     lateral /= np.maximum(np.linalg.norm(lateral, axis=2), 1e-300)[..., None]
-    focal = session.focal[session.view][:, None, None]
+    focal = predicted.focal[predicted.view][:, None, None]
     depth = np.maximum(at[..., 2:], 1e-6)
     xy = at[..., :2] / depth
-    u = session.u[session.pose] @ R
+    u = predicted.u[predicted.pose] @ R
     along, imaged = (focal / depth * (d[..., :2] - d[..., 2:] * xy) for d in (u, lateral))  # px/m
     normal = np.stack([-along[..., 1], along[..., 0]], axis=2)
     normal /= np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-300)
@@ -266,14 +270,14 @@ def intrinsics_changes(session: Session, across: Across, orientation: Array) -> 
     return shift, np.concatenate([normal**2 / focal, np.zeros_like(normal)], axis=2)
 
 
-def _scales(session: Session, across: Across) -> tuple[Array, Array]:
+def _scales(predicted: PredictedObservations, across: Across) -> tuple[Array, Array]:
     """Return, both (n_images, n_legs), what weighs such changes.
 
     The standard deviation of the axis across the leg [m], and by how many standard deviations a leg
     as wide again looks nearer, as what is seen towards the camera counts it.
     """
     lateral, depth = across.gradient[:, :, 0], across.gradient[:, :, 1]
-    ray = across.point - session.camera[session.view][:, None]
+    ray = across.point - predicted.camera[predicted.view][:, None]
     sigma = 1.0 / np.maximum(np.linalg.norm(lateral, axis=2), 1e-300)
     away = np.sign(np.sum(depth * ray, axis=2))
     return sigma, -away * np.linalg.norm(ray, axis=2) * np.linalg.norm(depth, axis=2)

@@ -14,12 +14,12 @@ from legcal.calibration.identify.information import (
     prior_of,
     problem_of,
 )
-from legcal.calibration.identify.report import PlatformError, Ranks, StepRank, WeakDirection
-from legcal.calibration.identify.session import Session
+from legcal.calibration.identify.predicted_observations import PredictedObservations
+from legcal.calibration.identify.report import Ranks, RmsMotion, StepRank, WeakDirection
 from legcal.calibration.identify.steps import (
     MAX_SIGMA,
     Located,
-    Step,
+    StepInformation,
     consecutive_distances,
     distance_rows,
     identify_base,
@@ -49,80 +49,82 @@ _HARMLESS = 1e-3  # of that: the platform does not move
 class Analysis:
     """What a session determines, computed where it is needed."""
 
-    session: Session
+    predicted: PredictedObservations
     choices: Choices = NO_CHOICES  # parameters that are fixed or have priors
 
-    def elsewhere(self, session: Session, poses: IntArray) -> Analysis:
+    def elsewhere(self, predicted: PredictedObservations, poses: IntArray) -> Analysis:
         """Return the analysis of other images of the same machine, at some of the same poses."""
-        other = Analysis(session, self.choices)
+        other = Analysis(predicted, self.choices)
         other.__dict__.update(motion=self.motion, equations=self.equations.at(poses))
         return other
 
     def with_board(self, *, board: bool = True) -> Analysis:
         """Return the analysis of the same images with a calibration board in all or in none."""
-        session = self.session.with_board(board=board)
-        other = self.elsewhere(session, np.arange(len(session.t)))
+        predicted = self.predicted.with_board(board=board)
+        other = self.elsewhere(predicted, np.arange(len(predicted.t)))
         other.__dict__.update(images=self.images)
         return other
 
     @cached_property
     def images(self) -> Array:
         """Whitened derivatives of what images show."""
-        return image_rows(self.session)
+        return image_rows(self.predicted)
 
     @cached_property
     def equations(self) -> WhitenedEquations:
         """The equations of readings and legs."""
-        return leg_equations(self.session)
+        return leg_equations(self.predicted)
 
     @cached_property
     def prior(self) -> GaussianPrior:
         """What is known of the parameters without images."""
-        return prior_of(self.session, self.choices)
+        return prior_of(self.predicted, self.choices)
 
     @cached_property
     def located(self) -> Located:
         """Step 1."""
-        return locate_joints(self.session)
+        return locate_joints(self.predicted)
 
     @cached_property
     def distances(self) -> tuple[Array, Array, IntArray]:
         """The distances of steps 3 and 4."""
-        return distance_rows(self.session, self.located)
+        return distance_rows(self.predicted, self.located)
 
     @cached_property
-    def default_steps(self) -> tuple[Step, ...]:
+    def default_steps(self) -> tuple[StepInformation, ...]:
         """Steps 2, 3 and 4, default criteria."""
         return (
-            identify_base(self.session, self.located),
-            offsets_from_distances(self.session, *self.distances),
-            identify_platform(self.session, self.located, self.images, self.equations),
+            identify_base(self.predicted, self.located),
+            offsets_from_distances(self.predicted, *self.distances),
+            identify_platform(self.predicted, self.located, self.images, self.equations),
         )
 
     @cached_property
-    def literal_steps(self) -> tuple[Step, ...]:
+    def literal_steps(self) -> tuple[StepInformation, ...]:
         """Steps 2, 3 and 4 as printed."""
         rows, weight, key = self.distances
         return (
-            scalar_products(self.session, self.located),
+            scalar_products(self.predicted, self.located),
             consecutive_distances(rows, weight, key, self.default_steps[1].columns),
-            mean_distances(self.session, weight, key),
+            mean_distances(self.predicted, weight, key),
         )
 
     @cached_property
     def of_cameras(self) -> Array:
         """The joint fit: rows by parameters and cameras, (m, p + 6 n_frames)."""
-        return information_rows(*problem_of(self.session, self.images, self.equations, self.prior))
+        return information_rows(
+            *problem_of(self.predicted, self.images, self.equations, self.prior)
+        )
 
     @cached_property
     def information(self) -> Array:
         """The joint fit: rows by parameters, (p, p)."""
-        return marginal_rows(self.of_cameras, np.arange(len(self.session.unit)))
+        return marginal_rows(self.of_cameras, np.arange(len(self.predicted.unit)))
 
     @cached_property
     def motion(self) -> PlatformMotion:
         """How the platform follows the parameters."""
-        return PlatformMotion(self.session)
+        return PlatformMotion(self.predicted)
 
     @cached_property
     def staged(self) -> Ranks:
@@ -131,21 +133,21 @@ class Analysis:
             direction
             for step in self.default_steps
             for direction in weak_directions(
-                self.session,
+                self.predicted,
                 self.motion,
-                undetermined(self.session, step.information),
+                undetermined(self.predicted, step.information),
                 step.columns,
             )
         )
-        n_p = len(self.session.unit)
+        n_p = len(self.predicted.unit)
         return Ranks(n_p - len(weak), n_p, weak)
 
     @cached_property
     def full(self) -> Ranks:
         """The joint fit."""
-        basis = undetermined(self.session, self.information)
-        weak = weak_directions(self.session, self.motion, basis)
-        n_p = len(self.session.unit)
+        basis = undetermined(self.predicted, self.information)
+        weak = weak_directions(self.predicted, self.motion, basis)
+        n_p = len(self.predicted.unit)
         return Ranks(n_p - len(weak), n_p, weak)
 
     @cached_property
@@ -158,7 +160,7 @@ class Analysis:
         ]
         for default, printed in zip(self.default_steps, self.literal_steps, strict=True):
             for criteria, step in (("default", default), ("literal", printed)):
-                rank = determined(self.session, step.information)
+                rank = determined(self.predicted, step.information)
                 found.append(StepRank(step.name, criteria, rank, len(step.columns)))
         return tuple(found)
 
@@ -166,67 +168,67 @@ class Analysis:
 class PlatformMotion:
     """How the platform moves with the parameters, over the poses that a session reaches."""
 
-    def __init__(self, session: Session) -> None:
-        self.session = session
+    def __init__(self, predicted: PredictedObservations) -> None:
+        self.predicted = predicted
         self.by_metres: Array | None = None
         self.why_not = ""
         try:
             moved = pose_sensitivity(
-                session.legs,
-                session.parametrization,
-                session.frame_legs,
-                session.R_reached,
-                session.t_reached,
+                predicted.legs,
+                predicted.parametrization,
+                predicted.frame_legs,
+                predicted.R_reached,
+                predicted.t_reached,
             )
         except NotIdentifiable as error:
             self.why_not = str(error)
             return
-        self.by_metres = moved * session.unit
+        self.by_metres = moved * predicted.unit
 
-    def effect(self, direction: Array) -> PlatformError | None:
+    def effect(self, direction: Array) -> RmsMotion | None:
         """Return what a direction (p,) in metres does."""
         if self.by_metres is None:
             return None
         moved = self.by_metres @ direction
         turn, shift = (float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in np.split(moved, 2, 1))
-        return PlatformError(shift, turn)
+        return RmsMotion(shift, turn)
 
-    def sigma(self, information: Array) -> PlatformError | None:
+    def sigma(self, information: Array) -> RmsMotion | None:
         """Return the standard deviation of the platform that information leaves."""
         if self.by_metres is None:
             return None
         _, singular, basis = np.linalg.svd(information)
-        seen = singular > _limit(self.session)
+        seen = singular > _limit(self.predicted)
         spread = self.by_metres @ (basis[seen].T / singular[seen])
         turn, shift = (
             float(np.sqrt(np.mean(np.sum(x**2, (1, 2))))) for x in np.split(spread, 2, 1)
         )
-        return PlatformError(shift, turn)
+        return RmsMotion(shift, turn)
 
     def split(self, basis: Array) -> tuple[Array, Array]:
         """Return a space (w, p) as that which moves the platform and that which does not."""
-        return split_by_motion(self.by_metres, basis, self.session.mean_length, _HARMLESS)
+        return split_by_motion(self.by_metres, basis, self.predicted.mean_length, _HARMLESS)
 
 
-def determined(session: Session, information: Array) -> int:
+def determined(predicted: PredictedObservations, information: Array) -> int:
     """Return the rank of whitened rows: directions known to better than a leg's length."""
     singular = np.linalg.svd(compress(information), compute_uv=False)
-    return int(np.sum(singular > _limit(session)))
+    return int(np.sum(singular > _limit(predicted)))
 
 
-def undetermined(session: Session, information: Array) -> Array:
+def undetermined(predicted: PredictedObservations, information: Array) -> Array:
     """Return an orthonormal basis (w, c) of the directions that rows (m, c) do not determine."""
     _, singular, basis = np.linalg.svd(compress(information))
-    return np.asarray(basis[singular <= _limit(session)])
+    return np.asarray(basis[singular <= _limit(predicted)])
 
 
-def missing(session: Session, rows: Array, motion: PlatformMotion) -> int:
+def missing(predicted: PredictedObservations, rows: Array, motion: PlatformMotion) -> int:
     """Return how many directions that move the platform rows of all parameters leave open."""
-    return len(motion.split(undetermined(session, rows))[0])
+    return len(motion.split(undetermined(predicted, rows))[0])
 
 
 def weak_directions(
-    session: Session,  # where names and units come from
+    predicted: PredictedObservations,  # where names and units come from
     motion: PlatformMotion,
     basis: Array,  # (w, c): the space, in metres
     columns: IntArray | None = None,  # (c,): which parameters; all without it
@@ -234,35 +236,35 @@ def weak_directions(
     """Return the directions of a space in words, those that move the platform first."""
     wide = basis
     if columns is not None:
-        wide = np.zeros((len(basis), len(session.unit)))
+        wide = np.zeros((len(basis), len(predicted.unit)))
         wide[:, columns] = basis
     parts = motion.split(wide)
     return tuple(
-        _direction(session, motion, row, harmless)
+        _direction(predicted, motion, row, harmless)
         for part, harmless in zip(parts, (False, True), strict=True)
         for row in sparse_basis(part)
     )
 
 
 def _direction(
-    session: Session, motion: PlatformMotion, row: Array, harmless: bool
+    predicted: PredictedObservations, motion: PlatformMotion, row: Array, harmless: bool
 ) -> WeakDirection:
     """Return a direction with its largest component at 1 mm."""
     row = row * (_ERROR / row[np.argmax(np.abs(row))])
     shown = np.flatnonzero(np.abs(row) > SHOWN * _ERROR)
     shown = shown[np.argsort(-np.abs(row[shown] / _ERROR).round(3), kind="stable")]
-    names = tuple(session.parametrization.names[i] for i in shown)
+    names = tuple(predicted.parametrization.names[i] for i in shown)
     effect = motion.effect(row)
     return WeakDirection(
-        describe_direction(names, session.leg_names),
+        describe_direction(names, predicted.leg_names),
         names,
-        tuple(float((row * session.unit)[i]) for i in shown),
+        tuple(float((row * predicted.unit)[i]) for i in shown),
         None if effect is None else effect.dX_m,
         None if effect is None else effect.dE_rad,
         harmless,
     )
 
 
-def _limit(session: Session) -> float:
+def _limit(predicted: PredictedObservations) -> float:
     """Return the least singular value that counts [1/m]."""
-    return 1.0 / (MAX_SIGMA * session.mean_length)
+    return 1.0 / (MAX_SIGMA * predicted.mean_length)

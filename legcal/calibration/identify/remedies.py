@@ -13,6 +13,17 @@ from itertools import combinations
 
 import numpy as np
 
+from legcal.calibration.identify.predicted_observations import (
+    FOCAL_PX,
+    PredictedObservations,
+    cameras_for,
+    legs_around,
+    legs_in_words,
+    neighbours,
+    planned_observations,
+    steps_apart,
+    views_in_words,
+)
 from legcal.calibration.identify.ranks import Analysis, missing, undetermined, weak_directions
 from legcal.calibration.identify.report import (
     BoardRanks,
@@ -20,17 +31,6 @@ from legcal.calibration.identify.report import (
     Recommendation,
     Remedy,
     WeakDirection,
-)
-from legcal.calibration.identify.session import (
-    FOCAL_PX,
-    Session,
-    cameras_for,
-    legs_around,
-    legs_in_words,
-    neighbours,
-    planned_session,
-    steps_apart,
-    views_in_words,
 )
 from legcal.calibration.identify.steps import base_by_frames, offsets_from_distances, scattered
 from legcal.estimation import compress, eliminate, marginal_rows
@@ -82,10 +82,10 @@ class _Candidates:
 
     def __init__(self, machine: Machine, images: int, *, board: bool) -> None:
         self.machine, self.images = machine, images
-        self.session = planned_session(machine, [range(machine.n_legs)], images, board=board)
-        self.every = Analysis(self.session)
+        self.predicted = planned_observations(machine, [range(machine.n_legs)], images, board=board)
+        self.every = Analysis(self.predicted)
         self.motion = self.every.motion
-        self.ring = legs_around(self.session)
+        self.ring = legs_around(self.predicted)
         self.of_size: dict[int, list[Analysis]] = {}
 
     def best(self, n_views: int, size: int) -> Recommendation | None:
@@ -104,7 +104,7 @@ class _Candidates:
             worst = float(np.linalg.svd(information, compute_uv=False)[-1])
             rank = 1.0 / worst if sigma is None else sigma.dX_m
             if best is None or rank < best[0]:
-                names = tuple(tuple(self.session.leg_names[j] for j in legs) for legs in views)
+                names = tuple(tuple(self.predicted.leg_names[j] for j in legs) for legs in views)
                 best = (rank, Recommendation(names, size, sigma))
         return None if best is None else best[1]
 
@@ -117,7 +117,7 @@ class _Candidates:
 
     def counts_hold(self, views: Sequence[Sequence[int]]) -> bool:
         """Say whether the paper's counts hold."""
-        s = self.session
+        s = self.predicted
         counts = count_conditions(
             views,
             s.n_legs,
@@ -131,16 +131,16 @@ class _Candidates:
 
     def together(self, chosen: Sequence[Analysis]) -> Array:
         """Return what views say of the parameters at once; a board makes them one camera."""
-        if not self.session.board.all():
+        if not self.predicted.board.all():
             return compress(np.concatenate([a.information for a in chosen]))
         rows = np.concatenate([a.of_cameras for a in chosen])
-        return marginal_rows(rows, np.arange(len(self.session.unit)))
+        return marginal_rows(rows, np.arange(len(self.predicted.unit)))
 
     def base_together(self, chosen: Sequence[Analysis]) -> Array:
         """Return what views say in step 2."""
-        if not self.session.board.all():
+        if not self.predicted.board.all():
             return np.concatenate([a.default_steps[0].information for a in chosen])
-        by_view = [base_by_frames(a.session, a.located)[1] for a in chosen]
+        by_view = [base_by_frames(a.predicted, a.located)[1] for a in chosen]
         rows = np.concatenate([x.reshape(-1, x.shape[2]) for x in by_view])
         return eliminate(rows[None], _CAMERA)[:, chosen[0].default_steps[0].columns]
 
@@ -151,11 +151,11 @@ class _Candidates:
             seen = np.zeros((len(views), self.machine.n_legs), dtype=np.bool_)
             for row, legs in zip(seen, views, strict=True):
                 row[list(legs)] = True
-            camera = cameras_for(self.session, views)
-            poses = np.arange(len(self.session.t))
+            camera = cameras_for(self.predicted, views)
+            poses = np.arange(len(self.predicted.t))
             self.of_size[size] = [
                 self.every.elsewhere(
-                    replace(self.session, seen=seen[[k]], camera=camera[[k]]), poses
+                    replace(self.predicted, seen=seen[[k]], camera=camera[[k]]), poses
                 )
                 for k in range(len(views))
             ]
@@ -163,19 +163,19 @@ class _Candidates:
 
     def suffices(self, chosen: Sequence[Analysis], information: Array) -> bool:
         """Say whether views determine all that moves the platform, at once and step by step."""
-        session, n_p = self.session, len(self.session.unit)
-        if missing(session, information, self.motion):
+        predicted, n_p = self.predicted, len(self.predicted.unit)
+        if missing(predicted, information, self.motion):
             return False
         last = np.concatenate([a.default_steps[2].information for a in chosen])
         for k, rows in ((0, self.base_together(chosen)), (2, last)):
             step = replace(chosen[0].default_steps[k], information=rows)
-            if missing(session, scattered(step, n_p), self.motion):
+            if missing(predicted, scattered(step, n_p), self.motion):
                 return False
         together = (
             np.concatenate(parts) for parts in zip(*(a.distances for a in chosen), strict=True)
         )
-        offsets = offsets_from_distances(session, *together)
-        return not missing(session, scattered(offsets, n_p), self.motion)
+        offsets = offsets_from_distances(predicted, *together)
+        return not missing(predicted, scattered(offsets, n_p), self.motion)
 
 
 def judge_board(
@@ -185,7 +185,7 @@ def judge_board(
     with_board: Sequence[Condition],
 ) -> BoardReport:
     """Return what a board does for a session, whether it has one or not."""
-    shown = analysis.session.board
+    shown = analysis.predicted.board
     none = analysis.with_board(board=False) if shown.any() else analysis
     every = analysis if shown.all() else analysis.with_board()
     needed = [
@@ -209,16 +209,16 @@ def _ranks(analysis: Analysis) -> BoardRanks:
 
 def _mended(none: Analysis, every: Analysis) -> tuple[str, ...]:
     """Return the directions that move the platform and that only a board determines, in words."""
-    n_p = len(none.session.unit)
+    n_p = len(none.predicted.unit)
     pairs = [
         (scattered(a, n_p), scattered(b, n_p))
         for a, b in zip(none.default_steps, every.default_steps, strict=True)
     ]
     found: list[str] = []
     for before, after in [*pairs, (none.information, every.information)]:
-        open_before, open_after = (undetermined(none.session, rows) for rows in (before, after))
+        open_before, open_after = (undetermined(none.predicted, rows) for rows in (before, after))
         mended = _outside(open_before, open_after)
-        directions = weak_directions(none.session, none.motion, mended)
+        directions = weak_directions(none.predicted, none.motion, mended)
         found += [d.direction for d in directions if not d.harmless]
     return tuple(dict.fromkeys(found))
 
@@ -233,7 +233,7 @@ def _outside(space: Array, part: Array) -> Array:
 class Replanning:
     """Other sessions of the same machine."""
 
-    images: Callable[[int], Session]  # return the session with another number of images a view
+    images: Callable[[int], PredictedObservations]  # the same with other numbers of images a view
     # return the smallest sets of views that suffice
     views: Callable[[], tuple[Recommendation, ...]]
 
@@ -247,7 +247,7 @@ def find_remedies(
     Only what raises a rank: what determines everything, else what is enough for the platform, else
     what helps.
     """
-    n_parameters = len(analysis.session.unit)
+    n_parameters = len(analysis.predicted.unit)
     before = _score(analysis)
     kinds: list[Iterable[tuple[str, Callable[[], _Score]]]] = [
         _more_images(analysis, replanning),
@@ -274,19 +274,19 @@ class _Score:
 
 def _score(analysis: Analysis, known: Sequence[int] = ()) -> _Score:
     """Return what is open when some parameters are known."""
-    session, motion = analysis.session, analysis.motion
-    extra = np.zeros((len(known), len(session.unit)))
+    predicted, motion = analysis.predicted, analysis.motion
+    extra = np.zeros((len(known), len(predicted.unit)))
     extra[np.arange(len(known)), list(known)] = _KNOWN
     steps = [
-        np.concatenate([scattered(step, len(session.unit)), extra])
+        np.concatenate([scattered(step, len(predicted.unit)), extra])
         for step in analysis.default_steps
     ]
     full = np.concatenate([analysis.information, extra])
     return _Score(
-        sum(len(undetermined(session, rows)) for rows in steps),
-        len(undetermined(session, full)),
-        sum(missing(session, rows, motion) for rows in steps),
-        missing(session, full, motion),
+        sum(len(undetermined(predicted, rows)) for rows in steps),
+        len(undetermined(predicted, full)),
+        sum(missing(predicted, rows, motion) for rows in steps),
+        missing(predicted, full, motion),
     )
 
 
@@ -315,7 +315,7 @@ def _more_images(
     analysis: Analysis, replanning: Replanning | None
 ) -> Iterator[tuple[str, Callable[[], _Score]]]:
     """Yield a session with more images a view."""
-    images = int(np.bincount(analysis.session.view).min())
+    images = int(np.bincount(analysis.predicted.view).min())
     if replanning is not None and images < ENOUGH_IMAGES:
         yield (
             f"take {ENOUGH_IMAGES} images a view instead of {images}",
@@ -325,49 +325,49 @@ def _more_images(
 
 def _wider_views(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
     """Yield views with one leg more or two, so that weak legs are seen with others."""
-    session, weak = analysis.session, _weak_legs(analysis)
-    ring = legs_around(session)
+    predicted, weak = analysis.predicted, _weak_legs(analysis)
+    ring = legs_around(predicted)
     for more in (1, 2):
         choices = [
             (sum(steps_apart(ring, j, view) for j in added), v, added)
-            for v, view in enumerate(session.views)
+            for v, view in enumerate(predicted.views)
             for added in combinations([j for j in ring if j not in view], more)
             if set(weak) & {*view, *added}
         ]
         for _, v, added in sorted(choices)[: _MOST_TRIED // 2]:
-            legs = tuple(sorted((*session.views[v], *added)))
-            text = f"see {legs_in_words(legs, session.leg_names)} together in view {v + 1}"
-            wider = _widened(session, v, legs)
-            yield text, partial(_more, analysis, wider, np.arange(len(session.t)))
+            legs = tuple(sorted((*predicted.views[v], *added)))
+            text = f"see {legs_in_words(legs, predicted.leg_names)} together in view {v + 1}"
+            wider = _widened(predicted, v, legs)
+            yield text, partial(_more, analysis, wider, np.arange(len(predicted.t)))
 
 
 def _further_cameras(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
     """Yield camera positions that show neighbours, among them weak legs."""
-    session, weak = analysis.session, _weak_legs(analysis)
-    ring = legs_around(session)
-    largest = max(len(view) for view in session.views)
-    which = _ORDINAL[session.n_views] if session.n_views < len(_ORDINAL) else "further"
+    predicted, weak = analysis.predicted, _weak_legs(analysis)
+    ring = legs_around(predicted)
+    largest = max(len(view) for view in predicted.views)
+    which = _ORDINAL[predicted.n_views] if predicted.n_views < len(_ORDINAL) else "further"
     article = "an" if which == "eighth" else "a"
-    for size in sorted({min(k, session.n_legs) for k in (3, 4, largest)}):
+    for size in sorted({min(k, predicted.n_legs) for k in (3, 4, largest)}):
         groups = [legs for legs in neighbours(ring, size) if set(weak) & set(legs)]
         groups.sort(key=lambda legs: -len(set(weak) & set(legs)))
         for legs in groups:
-            named = legs_in_words(legs, session.leg_names)
+            named = legs_in_words(legs, predicted.leg_names)
             text = f"add {article} {which} camera position ({named})"
-            poses = np.append(np.arange(len(session.t)), session.pose[session.view == 0])
-            yield text, partial(_more, analysis, _extended(session, legs), poses)
+            poses = np.append(np.arange(len(predicted.t)), predicted.pose[predicted.view == 0])
+            yield text, partial(_more, analysis, _extended(predicted, legs), poses)
 
 
 def _board(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
     """Yield a calibration board that ties the cameras to each other."""
-    if analysis.session.n_frames > 1:
+    if analysis.predicted.n_frames > 1:
         text = "put a calibration board on the base that every camera sees"
         yield text, lambda: _score(analysis.with_board())
 
 
 def _known_parameters(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
     """Yield parameters to measure otherwise and to hold: one of each direction, or all of them."""
-    names = analysis.session.parametrization.names
+    names = analysis.predicted.parametrization.names
     first = list(dict.fromkeys(d.parameters[0] for d in _harmful(analysis)))
     choices: list[tuple[str, ...]] = [(name,) for name in first[:_MOST_FIXED]]
     if 1 < len(first) <= _MOST_FIXED:
@@ -382,15 +382,15 @@ def _other_views(analysis: Analysis, replanning: Replanning | None) -> tuple[Rem
     sets = () if replanning is None else replanning.views()
     if not sets:
         return ()
-    names = analysis.session.leg_names
+    names = analysis.predicted.leg_names
     views = [legs_in_words([names.index(n) for n in view], names) for view in sets[0].views]
-    n_p = len(analysis.session.unit)
+    n_p = len(analysis.predicted.unit)
     return (Remedy(f"choose these views instead: {views_in_words(views)}", n_p, n_p, True),)
 
 
-def _more(analysis: Analysis, session: Session, poses: IntArray) -> _Score:
+def _more(analysis: Analysis, predicted: PredictedObservations, poses: IntArray) -> _Score:
     """Return what is open in a session that shows more, at these of the poses of another."""
-    other = analysis.elsewhere(session, poses)
+    other = analysis.elsewhere(predicted, poses)
     if len(analysis.full.weak) == 0:  # nothing to gain: more images take nothing away
         other.__dict__.update(information=analysis.information)
     return _score(other)
@@ -399,7 +399,7 @@ def _more(analysis: Analysis, session: Session, poses: IntArray) -> _Score:
 def _weak_legs(analysis: Analysis) -> list[int]:
     """Return the legs whose parameters are not determined."""
     touched = {p for d in _harmful(analysis) for p in d.parameters}
-    names = analysis.session.leg_names
+    names = analysis.predicted.leg_names
     return [j for j, name in enumerate(names) if any(p.startswith(f"{name}.") for p in touched)]
 
 
@@ -408,28 +408,30 @@ def _harmful(analysis: Analysis) -> list[WeakDirection]:
     return [d for d in (*analysis.full.weak, *analysis.staged.weak) if not d.harmless]
 
 
-def _widened(session: Session, v: int, legs: Sequence[int]) -> Session:
+def _widened(
+    predicted: PredictedObservations, v: int, legs: Sequence[int]
+) -> PredictedObservations:
     """Return a session in which a view shows other legs."""
-    seen = session.seen.copy()
+    seen = predicted.seen.copy()
     seen[v] = False
     seen[v, list(legs)] = True
-    return replace(session, seen=seen)
+    return replace(predicted, seen=seen)
 
 
-def _extended(session: Session, legs: Sequence[int]) -> Session:
+def _extended(predicted: PredictedObservations, legs: Sequence[int]) -> PredictedObservations:
     """Return a session with one more camera, for as many images as the first."""
-    images = session.pose[session.view == 0]
-    new = len(session.t) + np.arange(len(images))
-    seen = np.zeros((1, session.n_legs), dtype=np.bool_)
+    images = predicted.pose[predicted.view == 0]
+    new = len(predicted.t) + np.arange(len(images))
+    seen = np.zeros((1, predicted.n_legs), dtype=np.bool_)
     seen[0, list(legs)] = True
     return replace(
-        session,
-        R=np.concatenate([session.R, session.R[images]]),
-        t=np.concatenate([session.t, session.t[images]]),
-        view=np.concatenate([session.view, np.full(len(images), session.n_views)]),
-        pose=np.concatenate([session.pose, new]),
-        seen=np.concatenate([session.seen, seen]),
-        camera=np.concatenate([session.camera, cameras_for(session, [legs])]),
-        focal=np.append(session.focal, FOCAL_PX),
-        board=np.append(session.board, session.board.all()),
+        predicted,
+        R=np.concatenate([predicted.R, predicted.R[images]]),
+        t=np.concatenate([predicted.t, predicted.t[images]]),
+        view=np.concatenate([predicted.view, np.full(len(images), predicted.n_views)]),
+        pose=np.concatenate([predicted.pose, new]),
+        seen=np.concatenate([predicted.seen, seen]),
+        camera=np.concatenate([predicted.camera, cameras_for(predicted, [legs])]),
+        focal=np.append(predicted.focal, FOCAL_PX),
+        board=np.append(predicted.board, predicted.board.all()),
     )

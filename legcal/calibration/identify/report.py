@@ -54,7 +54,7 @@ class WeakDirection:
 
 
 @dataclass(frozen=True)
-class PlatformError:
+class RmsMotion:
     """How far the platform moves, root mean square over poses."""
 
     dX_m: float  # displacement of the origin of R_e [m]
@@ -69,7 +69,7 @@ class Recommendation:
     views: tuple[tuple[str, ...], ...]
     legs_a_view: int  # how many these are
     # standard deviation of the platform to expect; None where the motors do not determine its pose
-    platform_sigma: PlatformError | None
+    platform_sigma: RmsMotion | None
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class Identifiability:
     # standard deviation of the platform that is to be expected from outlines good to 0.1 px, rms
     # over the poses. None where something that moves the platform is not determined, or the motors
     # do not determine its pose
-    platform_sigma: PlatformError | None
+    platform_sigma: RmsMotion | None
     remedies: tuple[Remedy, ...]  # what would mend what is missing; each was tried
     # the smallest sets of views, fewest first; None where views were given
     recommendation: tuple[Recommendation, ...] | None

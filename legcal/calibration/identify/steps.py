@@ -12,7 +12,12 @@ from itertools import combinations, combinations_with_replacement
 import numpy as np
 
 from legcal.calibration.identify.information import SIGMA_EXACT, WhitenedEquations, pose_unit
-from legcal.calibration.identify.session import Across, Session, at_base_joints, at_platform_joints
+from legcal.calibration.identify.predicted_observations import (
+    Across,
+    PredictedObservations,
+    at_base_joints,
+    at_platform_joints,
+)
 from legcal.estimation import compress, eliminate, grouped
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis
 from legcal.machine import EquationKind, JointType, freedoms
@@ -43,7 +48,7 @@ class Located:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class StepInformation:
     """One step's information on the parameters that it identifies."""
 
     name: str  # what it identifies
@@ -51,41 +56,41 @@ class Step:
     information: Array  # (m, c): whitened rows by these parameters in metres
 
 
-def locate_joints(session: Session) -> Located:
+def locate_joints(predicted: PredictedObservations) -> Located:
     """Return what step 1 says: all axes of a leg in a frame meet in A (6), and v . u = 0 (7)."""
-    A, B = at_base_joints(session), at_platform_joints(session)
-    revolute = revolute_axes(session)
-    found = np.zeros((session.n_frames, session.n_legs, 5, 5))
-    frame, wanted = session.frame[session.view], 0
-    for f, legs in enumerate(session.frames):
+    A, B = at_base_joints(predicted), at_platform_joints(predicted)
+    revolute = revolute_axes(predicted)
+    found = np.zeros((predicted.n_frames, predicted.n_legs, 5, 5))
+    frame, wanted = predicted.frame[predicted.view], 0
+    for f, legs in enumerate(predicted.frames):
         for j in legs:
-            here = np.flatnonzero((frame == f) & session.seen[session.view, j])
+            here = np.flatnonzero((frame == f) & predicted.seen[predicted.view, j])
             wanted += 3 + 2 * int(revolute[j])
             if revolute[j]:
-                found[f, j] = compress(_joint_and_axis(session, A, B, here, j))
+                found[f, j] = compress(_joint_and_axis(predicted, A, B, here, j))
             else:
                 found[f, j, :3, :3] = compress(A.gradient[here, j].reshape(-1, 3))
-    limit = 1.0 / (MAX_SIGMA * session.mean_length)
+    limit = 1.0 / (MAX_SIGMA * predicted.mean_length)
     singular = np.linalg.svd(found, compute_uv=False)
     joint = np.linalg.svd(found[..., :3], compute_uv=False)[..., -1] > limit
     axis = revolute & joint & (singular[..., -1] > limit)
     return Located(found, joint, axis, int(np.sum(singular > limit)), wanted)
 
 
-def identify_base(session: Session, located: Located) -> Step:
+def identify_base(predicted: PredictedObservations, located: Located) -> StepInformation:
     """Return what step 2 says of base joints and revolute axes, the frames being free."""
-    columns, by_frame = base_by_frames(session, located)
-    return Step("base_joints", columns, eliminate(by_frame, 6)[:, columns])
+    columns, by_frame = base_by_frames(predicted, located)
+    return StepInformation("base_joints", columns, eliminate(by_frame, 6)[:, columns])
 
 
-def base_by_frames(session: Session, located: Located) -> tuple[IntArray, Array]:
+def base_by_frames(predicted: PredictedObservations, located: Located) -> tuple[IntArray, Array]:
     """Return the parameters of step 2, and rows by each frame and all parameters, (k, r, 6 + p)."""
     columns = np.union1d(
-        session.columns(_BASE),
-        _of_legs(session, _BASE_AXIS, revolute_axes(session)),
+        predicted.columns(_BASE),
+        _of_legs(predicted, _BASE_AXIS, revolute_axes(predicted)),
     )
     pairs = np.argwhere(located.joint)
-    rows = np.zeros((len(pairs), 5, 6 + len(session.unit)))
+    rows = np.zeros((len(pairs), 5, 6 + len(predicted.unit)))
     for row, (f, j) in zip(rows, pairs, strict=True):
         F = located.information[f, j]
         if not located.axis[f, j]:  # what is known of A alone
@@ -93,13 +98,15 @@ def base_by_frames(session: Session, located: Located) -> tuple[IntArray, Array]
             F[:3, :3] = compress(
                 eliminate(located.information[f, j][None][:, :, [3, 4, 0, 1, 2]], 2)
             )[:3]
-        row[:, :6] = _by_camera(session, j, F)
-        scatter = session.local_to_parameters[j]
-        row[:, 6:] = F[:, :3] @ scatter[:3] + F[:, 3:] @ scatter[7:9] * session.mean_length
-    return columns, grouped(rows, pairs[:, 0], session.n_frames)
+        row[:, :6] = _by_camera(predicted, j, F)
+        scatter = predicted.local_to_parameters[j]
+        row[:, 6:] = F[:, :3] @ scatter[:3] + F[:, 3:] @ scatter[7:9] * predicted.mean_length
+    return columns, grouped(rows, pairs[:, 0], predicted.n_frames)
 
 
-def distance_rows(session: Session, located: Located) -> tuple[Array, Array, IntArray]:
+def distance_rows(
+    predicted: PredictedObservations, located: Located
+) -> tuple[Array, Array, IntArray]:
     """Return what distances between leg ends say of the offsets.
 
     Two legs on one platform joint have none: their distance is zero whatever the offsets are.
@@ -108,87 +115,89 @@ def distance_rows(session: Session, located: Located) -> tuple[Array, Array, Int
     One over the standard deviation of each distance [1/m]; (m, 4): Frame, pose, and both legs of
     each distance.
     """
-    columns = session.columns(_LENGTH)
-    place = np.full(session.n_legs, -1)
-    place[session.with_length] = np.arange(len(columns))
-    B = at_platform_joints(session)
-    ends = located.joint & session.with_length
-    centres = np.array([leg.B for leg in session.legs])
+    columns = predicted.columns(_LENGTH)
+    place = np.full(predicted.n_legs, -1)
+    place[predicted.with_length] = np.arange(len(columns))
+    B = at_platform_joints(predicted)
+    ends = located.joint & predicted.with_length
+    centres = np.array([leg.B for leg in predicted.legs])
     gaps = np.linalg.norm(centres[:, None] - centres, axis=2)
-    frame = session.frame[session.view]
-    shown = ends[frame] & session.seen[session.view]
+    frame = predicted.frame[predicted.view]
+    shown = ends[frame] & predicted.seen[predicted.view]
     keys = [
         (f, i, j, g)
-        for f in range(session.n_frames)
+        for f in range(predicted.n_frames)
         for i in np.flatnonzero(frame == f)
         for j, g in combinations(np.flatnonzero(shown[i]).tolist(), 2)
-        if gaps[j, g] > _MIN_DISTANCE * session.mean_length
+        if gaps[j, g] > _MIN_DISTANCE * predicted.mean_length
     ]
     if not keys:
         return np.zeros((0, len(columns))), np.zeros(0), np.zeros((0, 4), dtype=np.intp)
     f, i, j, g = np.array(keys, dtype=np.intp).T
     apart = B.point[i, j] - B.point[i, g]
     n = apart / np.linalg.norm(apart, axis=1, keepdims=True)
-    pose = session.pose[i]
-    variance = sum(_end_variance(session, B, i, leg, n) for leg in (j, g))
+    pose = predicted.pose[i]
+    variance = sum(_end_variance(predicted, B, i, leg, n) for leg in (j, g))
     weight = 1.0 / np.sqrt(variance)
     rows = np.zeros((len(keys), len(columns)))
     each = np.arange(len(keys))
-    rows[each, place[j]] = weight * np.einsum("ki,ki->k", n, session.u[pose, j])
-    rows[each, place[g]] = -weight * np.einsum("ki,ki->k", n, session.u[pose, g])
+    rows[each, place[j]] = weight * np.einsum("ki,ki->k", n, predicted.u[pose, j])
+    rows[each, place[g]] = -weight * np.einsum("ki,ki->k", n, predicted.u[pose, g])
     return rows, np.asarray(weight), np.stack([f, pose, j, g], axis=1)
 
 
-def offsets_from_distances(session: Session, rows: Array, weight: Array, key: IntArray) -> Step:
+def offsets_from_distances(
+    predicted: PredictedObservations, rows: Array, weight: Array, key: IntArray
+) -> StepInformation:
     """Return what step 3 says: the distance of each pair is constant and free, (14)."""
-    columns = session.columns(_LENGTH)
+    columns = predicted.columns(_LENGTH)
     _, pair = np.unique(key[:, 2:], axis=0, return_inverse=True)
     pair = pair.ravel()
     own = np.concatenate([weight[:, None], rows], axis=1)
     laid = grouped(own[:, None], pair, int(pair.max(initial=-1)) + 1)
-    return Step("offsets", columns, eliminate(laid, 1))
+    return StepInformation("offsets", columns, eliminate(laid, 1))
 
 
 def identify_platform(
-    session: Session, located: Located, images: Array, equations: WhitenedEquations
-) -> Step:
+    predicted: PredictedObservations, located: Located, images: Array, equations: WhitenedEquations
+) -> StepInformation:
     """Return what step 4 says of platform joints and axes, and of universal axes at the base.
 
     *images* and *equations* are those of the joint fit.
     """
     universal = np.array(
-        [leg.base_joint is JointType.UNIVERSAL for leg in session.legs], dtype=np.bool_
+        [leg.base_joint is JointType.UNIVERSAL for leg in predicted.legs], dtype=np.bool_
     )
     columns = np.unique(
         np.concatenate(
             [
-                session.columns((*_PLATFORM, *_PLATFORM_AXIS, *_TWIST)),
-                _of_legs(session, _BASE_AXIS, universal),
+                predicted.columns((*_PLATFORM, *_PLATFORM_AXIS, *_TWIST)),
+                _of_legs(predicted, _BASE_AXIS, universal),
             ]
         )
     )
-    n_f, n_p = len(freedoms(session.frame_legs)), len(session.unit)
+    n_f, n_p = len(freedoms(predicted.frame_legs)), len(predicted.unit)
     keep = np.concatenate([np.arange(n_f), n_f + columns])
-    groups = _groups(session, located)
+    groups = _groups(predicted, located)
     seen = np.delete(images[:, :, 2:], np.s_[n_f : n_f + 6], axis=3)  # at B
     seen = seen * groups.used[groups.of_image][:, :, None, None]
-    seen = seen * located.joint[session.frame[session.view]][:, :, None, None]
-    seen = seen.reshape(len(session.view), 2 * session.n_legs, n_f + n_p)
+    seen = seen * located.joint[predicted.frame[predicted.view]][:, :, None, None]
+    seen = seen.reshape(len(predicted.view), 2 * predicted.n_legs, n_f + n_p)
     rows = np.concatenate([equations.by_pose, equations.by_parameters], axis=2)[groups.pose]
     wanted = _step_4_equations(equations, groups)
     rows = np.concatenate(
         [rows * wanted[..., None], grouped(seen, groups.of_image, len(groups.pose))], axis=1
     )
-    return Step("platform_joints", columns, eliminate(rows[:, :, keep], n_f))
+    return StepInformation("platform_joints", columns, eliminate(rows[:, :, keep], n_f))
 
 
-def scalar_products(session: Session, located: Located) -> Step:
+def scalar_products(predicted: PredictedObservations, located: Located) -> StepInformation:
     """Return what (9) says: all products of vectors A_j A_g and revolute axes of each frame."""
-    columns = identify_base(session, located).columns
-    scatter = session.local_to_parameters
-    rows = [np.zeros((0, len(session.unit)))]
-    for f in range(session.n_frames):
-        vectors, slopes = _vectors_of(session, located, f)
+    columns = identify_base(predicted, located).columns
+    scatter = predicted.local_to_parameters
+    rows = [np.zeros((0, len(predicted.unit)))]
+    for f in range(predicted.n_frames):
+        vectors, slopes = _vectors_of(predicted, located, f)
         pairs = [
             (p, q)
             for p, q in combinations_with_replacement(range(len(vectors)), 2)
@@ -197,15 +206,17 @@ def scalar_products(session: Session, located: Located) -> Step:
         if not pairs:
             continue
         G = np.array([vectors[p] @ slopes[q] + vectors[q] @ slopes[p] for p, q in pairs])
-        variance = np.einsum("pi,ij,pj->p", G, _covariance(session, located, f), G)
-        by_local = np.concatenate([scatter[:, :3], session.mean_length * scatter[:, 7:9]], axis=1)
+        variance = np.einsum("pi,ij,pj->p", G, _covariance(predicted, located, f), G)
+        by_local = np.concatenate([scatter[:, :3], predicted.mean_length * scatter[:, 7:9]], axis=1)
         rows.append(
             G @ by_local.reshape(G.shape[1], -1) / np.sqrt(variance + _MIN_VARIANCE)[:, None]
         )
-    return Step("base_joints", columns, np.concatenate(rows)[:, columns])
+    return StepInformation("base_joints", columns, np.concatenate(rows)[:, columns])
 
 
-def consecutive_distances(rows: Array, weight: Array, key: IntArray, columns: IntArray) -> Step:
+def consecutive_distances(
+    rows: Array, weight: Array, key: IntArray, columns: IntArray
+) -> StepInformation:
     """Return what (14) says: distances equal those of the next position of the frame.
 
     The rows, weights and keys are those of :func:`distance_rows`.
@@ -218,24 +229,26 @@ def consecutive_distances(rows: Array, weight: Array, key: IntArray, columns: In
             change = rows[k] / weight[k] - rows[before] / weight[before]
             found.append((change / np.hypot(1.0 / weight[k], 1.0 / weight[before]))[None])
         last[f, j, g] = k
-    return Step("offsets", columns, np.concatenate(found))
+    return StepInformation("offsets", columns, np.concatenate(found))
 
 
-def mean_distances(session: Session, weight: Array, key: IntArray) -> Step:
+def mean_distances(
+    predicted: PredictedObservations, weight: Array, key: IntArray
+) -> StepInformation:
     """Return what (16) says: mean distances of leg ends in each frame are those of the joints."""
-    columns = session.columns((3, 4, 5))
-    B = np.array([leg.B for leg in session.legs])
+    columns = predicted.columns((3, 4, 5))
+    B = np.array([leg.B for leg in predicted.legs])
     distinct, which = np.unique(key[:, [0, 2, 3]], axis=0, return_inverse=True)
     number = np.bincount(which.ravel(), weights=weight**2)
-    rows = np.zeros((len(distinct), len(session.unit)))
-    scatter = session.local_to_parameters[:, 3:6]
+    rows = np.zeros((len(distinct), len(predicted.unit)))
+    scatter = predicted.local_to_parameters[:, 3:6]
     for row, (_, j, g), n in zip(rows, distinct, number, strict=True):
         apart = B[g] - B[j]
         row += np.sqrt(n) * (apart / np.linalg.norm(apart)) @ (scatter[g] - scatter[j])
-    return Step("platform_joints", columns, rows[:, columns])
+    return StepInformation("platform_joints", columns, rows[:, columns])
 
 
-def scattered(step: Step, n_parameters: int) -> Array:
+def scattered(step: StepInformation, n_parameters: int) -> Array:
     """Return a step's rows by all parameters; the others count as known."""
     rows = np.zeros((len(step.information) + n_parameters, n_parameters))
     rows[: len(step.information), step.columns] = step.information
@@ -244,53 +257,57 @@ def scattered(step: Step, n_parameters: int) -> Array:
     return rows
 
 
-def revolute_axes(session: Session) -> BoolArray:
+def revolute_axes(predicted: PredictedObservations) -> BoolArray:
     """Return which legs have a revolute axis at the base that is a parameter, (n_legs,)."""
     return np.array(
-        [EquationKind.BASE_AXIS in leg.equations for leg in session.legs],
+        [EquationKind.BASE_AXIS in leg.equations for leg in predicted.legs],
         dtype=np.bool_,
     )
 
 
-def _joint_and_axis(session: Session, A: Across, B: Across, here: IntArray, j: int) -> Array:
+def _joint_and_axis(
+    predicted: PredictedObservations, A: Across, B: Across, here: IntArray, j: int
+) -> Array:
     """Return rows by A and the turns of the revolute axis, the leg's direction being free."""
-    axis = np.asarray(session.legs[j].base_axis)
-    pose = session.pose[here]
-    u, length = session.u[pose, j], session.length[pose, j]
+    axis = np.asarray(predicted.legs[j].base_axis)
+    pose = predicted.pose[here]
+    u, length = predicted.u[pose, j], predicted.length[pose, j]
     E = normal_basis(u)
     rows = np.zeros((len(here), 5, 7))  # the end moves by e1, e2 of the direction; A; the axis
     rows[:, :2, 2:5] = A.gradient[here, j]
     rows[:, 2:4, :2] = B.gradient[here, j] @ np.swapaxes(E, 1, 2)
     rows[:, 2:4, 2:5] = B.gradient[here, j]
-    rows[:, 4, :2] = (E @ axis) * (session.mean_length / length)[:, None]
+    rows[:, 4, :2] = (E @ axis) * (predicted.mean_length / length)[:, None]
     rows[:, 4, 5:] = u @ np.cross(normal_basis(axis), axis).T
     rows[:, 4] /= SIGMA_EXACT
     return eliminate(rows, 2)
 
 
-def _by_camera(session: Session, j: int, F: Array) -> Array:
+def _by_camera(predicted: PredictedObservations, j: int, F: Array) -> Array:
     """Return rows F by A and axis of a leg as rows by the turn and displacement of the camera."""
     rows = np.zeros((len(F), 6))
-    rows[:, :3] = -np.cross(session.A[j], F[:, :3])
+    rows[:, :3] = -np.cross(predicted.A[j], F[:, :3])
     rows[:, 3:] = -F[:, :3]
-    axis = session.legs[j].base_axis
+    axis = predicted.legs[j].base_axis
     if axis is not None:
-        rows[:, :3] -= session.mean_length * F[:, 3:] @ normal_basis(axis)
-    return rows * pose_unit(session)
+        rows[:, :3] -= predicted.mean_length * F[:, 3:] @ normal_basis(axis)
+    return rows * pose_unit(predicted)
 
 
-def _of_legs(session: Session, kinds: tuple[int, ...], legs: BoolArray) -> IntArray:
+def _of_legs(predicted: PredictedObservations, kinds: tuple[int, ...], legs: BoolArray) -> IntArray:
     """Return the parameters of some legs that stand for given ones of their twelve numbers."""
-    place = session.parametrization.place[legs][:, list(kinds)]
+    place = predicted.parametrization.place[legs][:, list(kinds)]
     return np.unique(place[place >= 0])
 
 
-def _end_variance(session: Session, B: Across, image: IntArray, leg: IntArray, n: Array) -> Array:
+def _end_variance(
+    predicted: PredictedObservations, B: Across, image: IntArray, leg: IntArray, n: Array
+) -> Array:
     """Return the variance of leg ends along directions n, (k,) [m^2], base joints being known."""
     gradient = B.gradient[image, leg]
     size = np.maximum(np.sum(gradient**2, axis=2), 1e-30)
     across = np.sum((np.einsum("ki,kri->kr", n, gradient) / size) ** 2, axis=1)
-    along = np.einsum("ki,ki->k", n, session.u[session.pose[image], leg]) * session.sigma_q
+    along = np.einsum("ki,ki->k", n, predicted.u[predicted.pose[image], leg]) * predicted.sigma_q
     return np.asarray(across + along**2)
 
 
@@ -305,17 +322,17 @@ class _Groups:
     enough: BoolArray
 
 
-def _groups(session: Session, located: Located) -> _Groups:
+def _groups(predicted: PredictedObservations, located: Located) -> _Groups:
     """Return the groups of a session, with the legs that take part in step 4."""
-    n_d = len(session.frame_legs)
-    frame = session.frame[session.view]
+    n_d = len(predicted.frame_legs)
+    frame = predicted.frame[predicted.view]
     in_base = (located.joint.sum(axis=1) >= n_d)[frame]
-    key = np.stack([session.pose, np.where(in_base, -1, frame)], axis=1)
+    key = np.stack([predicted.pose, np.where(in_base, -1, frame)], axis=1)
     distinct, of_image = np.unique(key, axis=0, return_inverse=True)
     of_image = of_image.ravel()
-    legs = np.zeros((len(distinct), session.n_legs), dtype=np.bool_)
-    np.logical_or.at(legs, of_image, located.joint[frame] & session.seen[session.view])
-    ends = legs & session.with_length
+    legs = np.zeros((len(distinct), predicted.n_legs), dtype=np.bool_)
+    np.logical_or.at(legs, of_image, located.joint[frame] & predicted.seen[predicted.view])
+    ends = legs & predicted.with_length
     number = ends.sum(axis=1)
     enough = number >= n_d
     used = np.where(enough[:, None], legs, ends & (number >= 2)[:, None])
@@ -331,18 +348,20 @@ def _step_4_equations(equations: WhitenedEquations, groups: _Groups) -> BoolArra
     return np.asarray(wanted & groups.used[:, equations.leg])
 
 
-def _vectors_of(session: Session, located: Located, f: int) -> tuple[list[Array], list[Array]]:
+def _vectors_of(
+    predicted: PredictedObservations, located: Located, f: int
+) -> tuple[list[Array], list[Array]]:
     """Return the set V of (8) and the derivative of each by A and axes of all legs, (3, 5 n)."""
     vectors, slopes = [], []
-    eye = np.eye(3 * session.n_legs).reshape(session.n_legs, 3, -1)
-    n_axes = 2 * session.n_legs
+    eye = np.eye(3 * predicted.n_legs).reshape(predicted.n_legs, 3, -1)
+    n_axes = 2 * predicted.n_legs
     for j, g in combinations(np.flatnonzero(located.joint[f]).tolist(), 2):
-        vectors.append(session.A[g] - session.A[j])
+        vectors.append(predicted.A[g] - predicted.A[j])
         slopes.append(_by_leg(eye[g] - eye[j], np.zeros((3, n_axes))))
     for j in np.flatnonzero(located.axis[f]).tolist():
-        axis = np.asarray(session.legs[j].base_axis)
+        axis = np.asarray(predicted.legs[j].base_axis)
         turn = np.zeros((3, n_axes))
-        turn[:, 2 * j : 2 * j + 2] = np.cross(normal_basis(axis), axis).T / session.mean_length
+        turn[:, 2 * j : 2 * j + 2] = np.cross(normal_basis(axis), axis).T / predicted.mean_length
         vectors.append(axis)
         slopes.append(_by_leg(np.zeros_like(eye[0]), turn))
     return vectors, slopes
@@ -354,9 +373,9 @@ def _by_leg(by_joints: Array, by_axes: Array) -> Array:
     return both.reshape(3, -1)
 
 
-def _covariance(session: Session, located: Located, f: int) -> Array:
+def _covariance(predicted: PredictedObservations, located: Located, f: int) -> Array:
     """Return the covariance of A and axes of a frame as step 1 found them, (5 n, 5 n) [m^2]."""
-    n = session.n_legs
+    n = predicted.n_legs
     covariance = np.zeros((5 * n, 5 * n))
     for j in np.flatnonzero(located.joint[f]).tolist():
         F = located.information[f, j]

@@ -5,21 +5,21 @@ outlines or axes, a :class:`Start`, :class:`Choices`; out: a :class:`Solution`. 
 as the method: a first minimum with a wide loss, open directions held at nominal or refused, rounds
 that reject outlines and estimate their noise, checks of the result, its assembly.
 
-=================== ==================================================================
-``choices``         which parameters are estimated, fixed or have a prior
-``variables``       state, manifold of the legs, exact constraints of platform poses
-``factors``         outlines, readings, axes and corners as residuals with derivatives
-``outline_errors``  noise of outlines, common-mode edge biases, gammas of cameras
-``problem``         variables and factors of a fit
-``fit``             the order of all of it
-``determinacy``     open directions: refused, or held at nominal
-``rounds``          rejection of outliers and estimation of noise
-``contradictions``  stated priors and fixed values against the measurements
-``sensitivity``     errors of what counts as known; focal lengths tested
-``held_out``        what a fit predicts of images that were not fitted
-``platform``        what a fit means at the platform
-``solution``        the result
-=================== ==================================================================
+===================== ==================================================================
+``parameter_choices`` which parameters are estimated, fixed or have a prior
+``variables``         state, manifold of the legs, exact constraints of platform poses
+``factors``           outlines, readings, axes and corners as residuals with derivatives
+``outline_errors``    noise of outlines, common-mode edge biases, gammas of cameras
+``problem``           variables and factors of a fit
+``fit``               the order of all of it
+``determinacy``       open directions: refused, or held at nominal
+``rounds``            rejection of outliers and estimation of noise
+``contradictions``    stated priors and fixed values against the measurements
+``sensitivity``       errors of what counts as known; focal lengths tested
+``held_out``          what a fit predicts of images that were not fitted
+``platform``          what a fit means at the platform
+``solution``          the result
+===================== ==================================================================
 
 Another kind of measurement is a class with a ``factor`` in ``factors`` and a line in its registry
 ``Observed``; what it depends on besides is a field of ``State`` and a block in ``problem``.

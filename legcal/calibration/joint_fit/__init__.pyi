@@ -1,10 +1,3 @@
-from .choices import BOARD_SCALE as BOARD_SCALE
-from .choices import NO_CHOICES as NO_CHOICES
-from .choices import Choices as Choices
-from .choices import KnownParameters as KnownParameters
-from .choices import Prior as Prior
-from .choices import known_parameters as known_parameters
-from .choices import resolve as resolve
 from .factors import BoardCorners as BoardCorners
 from .factors import average_images as average_images
 from .factors import known_gammas as known_gammas
@@ -21,6 +14,13 @@ from .outline_errors import EstimatedGamma as EstimatedGamma
 from .outline_errors import NoiseModel as NoiseModel
 from .outline_errors import next_gammas as next_gammas
 from .outline_errors import possible_biases as possible_biases
+from .parameter_choices import BOARD_SCALE as BOARD_SCALE
+from .parameter_choices import NO_CHOICES as NO_CHOICES
+from .parameter_choices import Choices as Choices
+from .parameter_choices import KnownParameters as KnownParameters
+from .parameter_choices import Prior as Prior
+from .parameter_choices import known_parameters as known_parameters
+from .parameter_choices import resolve as resolve
 from .platform import PlatformAccuracy as PlatformAccuracy
 from .platform import PlatformError as PlatformError
 from .platform import platform_accuracy as platform_accuracy

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from legcal.calibration.joint_fit.choices import BOARD_SCALE, Prior
 from legcal.calibration.joint_fit.determinacy import Held, held_at_nominal, open_directions
+from legcal.calibration.joint_fit.parameter_choices import BOARD_SCALE, Prior
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.variables import RefinementSettings, Start, State, intrinsic_of
@@ -105,7 +105,7 @@ def refuse_other_board(
 
 
 @dataclass(frozen=True)
-class Estimate:
+class EstimateWithoutPrior:
     """A parameter by everything but its prior."""
 
     value: float
@@ -115,7 +115,7 @@ class Estimate:
 
 def estimate_without_prior(
     problem: FitProblem, state: State, normal: NormalEquations, i: int, mean: float, sigma: float
-) -> Estimate | None:
+) -> EstimateWithoutPrior | None:
     """Return a named unknown by the measurements alone; None if they say nothing of it.
 
     With the information I that they have of it, an estimate that its own prior leaves at a distance
@@ -129,7 +129,7 @@ def estimate_without_prior(
     away = (float(problem.coordinates(state)[i]) - mean) * (1.0 + 1.0 / (known * sigma**2))
     variance = 1.0 / known
     apart = abs(away) / float(np.sqrt(sigma**2 + variance))
-    return Estimate(mean + away, float(np.sqrt(variance)), apart)
+    return EstimateWithoutPrior(mean + away, float(np.sqrt(variance)), apart)
 
 
 @dataclass(frozen=True)

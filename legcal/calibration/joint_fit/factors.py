@@ -21,8 +21,8 @@ import numpy as np
 from legcal.calibration.joint_fit.variables import FittedLegs, State
 from legcal.data import Corners, LegAxes, Measurements, Outlines, join_axes
 from legcal.errors import DatasetError
-from legcal.estimation import Factor, Rows
-from legcal.geometry import Array, BoolArray, IntArray, cross
+from legcal.estimation import Factor, Residuals
+from legcal.geometry import Array, BoolArray, IntArray, cross, whitener
 from legcal.machine import LegKind
 from legcal.vision import (
     EPSILON,
@@ -155,19 +155,19 @@ class ObservedOutlines:
         local, *_ = self._local(keys, state)
         return self._corrected(outline_residual().values(local, self.constants), state)
 
-    def rows(self, keys: tuple[str, ...], state: State) -> Rows:
+    def rows(self, keys: tuple[str, ...], state: State) -> Residuals:
         """Return these offsets with their derivatives."""
         local, ends, by_intrinsics = self._local(keys, state)
         r, slope = outline_residual().evaluate(local, self.constants)
         if not self.bias_index.shape[1] and not keys:
-            return Rows(r, slope[..., :7], ends.with_others)
+            return Residuals(r, slope[..., :7], ends.with_others)
         along = slope[..., 7:].reshape(len(self), 2, 2, 2)  # by (end, coordinate)
         others = [
             -np.swapaxes(self.bias_shift, 1, 2),
             np.einsum("nqec,neck->nqk", along, by_intrinsics),
         ]
         slope = np.concatenate([slope[..., :7], *others], axis=-1)
-        return Rows(self._corrected(r, state), slope, ends.with_others)
+        return Residuals(self._corrected(r, state), slope, ends.with_others)
 
     def _corrected(self, r: Array, state: State) -> Array:
         """Return offsets (n, 2) without common-mode biases."""
@@ -189,9 +189,9 @@ class ObservedOutlines:
             ("biases", self.bias_index, _ONE),
             ("cameras", self.view, _ALL),
         )
-        whitening = np.linalg.inv(np.linalg.cholesky(self.covariance))
+        whitening = whitener(self.covariance)
 
-        def rows(state: State) -> Rows:
+        def rows(state: State) -> Residuals:
             return self.rows(keys, state)
 
         return Factor("outlines", rows, touches, len(self), 2, self.pose, whitening, robust=True)
@@ -347,7 +347,7 @@ class Readings:
     def __len__(self) -> int:
         return len(self.leg)
 
-    def rows(self, state: State) -> Rows:
+    def rows(self, state: State) -> Residuals:
         """Return the closures of legs (n, 1) [m] with their derivatives."""
         arm, R_pose = state.arms[self.pose, self.leg], state.platform_pose.R[self.pose]
         B = state.platform_pose.t[self.pose] + arm
@@ -359,7 +359,7 @@ class Readings:
             J = np.concatenate([slope[..., :3], b @ R_pose, slope[..., 6:]], axis=-1)
             return J, np.concatenate([cross(arm[:, None], b), b], axis=-1)
 
-        return Rows(r, slope, chain)
+        return Residuals(r, slope, chain)
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor of readings; no camera matters to them."""
@@ -398,12 +398,12 @@ class ObservedAxes:
     def __len__(self) -> int:
         return len(self.leg)
 
-    def rows(self, state: State) -> Rows:
+    def rows(self, state: State) -> Residuals:
         """Return alpha and beta (n, 4) with their derivatives."""
         data = np.concatenate([self.M, self.basis.reshape(-1, 6)], axis=1)
         ends = _ends_in_camera(state, self.leg, self.view, self.pose)
         r, slope = axis_residual().evaluate(np.concatenate([ends.A, ends.B], axis=1), data)
-        return Rows(r, slope, ends.by_unknowns)
+        return Residuals(r, slope, ends.by_unknowns)
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor of measured axes, which contain cameras already."""
@@ -441,7 +441,7 @@ def observed_axes(
     ]
     if problems:
         raise DatasetError(problems)
-    whitening = np.linalg.inv(np.linalg.cholesky(correlation)) / scale[:, None, :]
+    whitening = whitener(correlation) / scale[:, None, :]
     view, pose = measurements.view[axes.row], measurements.pose[axes.row]
     return ObservedAxes(axes.leg, view, pose, axes.M, axes.basis, whitening)
 
@@ -487,7 +487,7 @@ class ObservedCorners:
         chosen = ObservedCorners(*(getattr(self, f.name)[which] for f in fields(self)))
         return replace(chosen, sigma=scale * chosen.sigma)
 
-    def rows(self, keys: tuple[str, ...], state: State) -> Rows:
+    def rows(self, keys: tuple[str, ...], state: State) -> Residuals:
         """Return predicted minus measured corners (n, 2) [px] with their derivatives."""
         R_camera = state.camera_pose.R[self.view]
         arm = self.point @ state.board_pose.R[0].T
@@ -510,7 +510,7 @@ class ObservedCorners:
             ]
             return np.concatenate(J, axis=-1), np.zeros((*slope.shape[:2], 6))
 
-        return Rows(r, slope, chain)
+        return Residuals(r, slope, chain)
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor of corners; no platform pose moves them."""
@@ -523,7 +523,7 @@ class ObservedCorners:
         )
         whitening = 1.0 / self.sigma[:, None, None]
 
-        def rows(state: State) -> Rows:
+        def rows(state: State) -> Residuals:
             return self.rows(keys, state)
 
         return Factor("corners", rows, touches, len(self), 2, None, whitening, robust=True)

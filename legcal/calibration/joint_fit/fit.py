@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from legcal.calibration.joint_fit.choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.contradictions import (
     naming_stated_values,
     refuse_contradicted_priors,
@@ -24,6 +23,7 @@ from legcal.calibration.joint_fit.determinacy import (
 )
 from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.outline_errors import NoiseModel, noise_of_the_median
+from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.rounds import first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.solution import Solution, assemble_solution, comparable_cost

@@ -33,7 +33,7 @@ from scipy.optimize import brentq
 from legcal.calibration.joint_fit.factors import ObservedOutlines
 from legcal.data import few_views
 from legcal.estimation import Effects, estimate_variances
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray, whitener
 
 _SUM = np.array([1.0, 1.0])
 _DIFFERENCE = np.array([-1.0, 1.0])
@@ -101,7 +101,7 @@ class NoiseModel:
 
     def whitening(self, claimed: Array, used: BoolArray | None = None) -> Array:
         """Return lower triangular T (n, 2, 2) with T C T^T = 1 [1/px]; zero where not used."""
-        T = np.linalg.inv(np.linalg.cholesky(self.covariance(claimed)))
+        T = whitener(self.covariance(claimed))
         return np.asarray(T if used is None else np.where(used[:, None, None], T, 0.0))
 
     def squared_norms(self, offsets: Array, claimed: Array) -> Array:

@@ -15,7 +15,6 @@ from functools import partial
 
 import numpy as np
 
-from legcal.calibration.joint_fit.choices import BOARD_SCALE, NO_CHOICES, Choices
 from legcal.calibration.joint_fit.factors import (
     BoardCorners,
     Observed,
@@ -29,6 +28,7 @@ from legcal.calibration.joint_fit.factors import (
     observed_readings,
 )
 from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel
+from legcal.calibration.joint_fit.parameter_choices import BOARD_SCALE, NO_CHOICES, Choices
 from legcal.calibration.joint_fit.variables import (
     DEFAULT_SETTINGS,
     FittedLegs,

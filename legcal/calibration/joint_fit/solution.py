@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit.choices import known_parameters
 from legcal.calibration.joint_fit.contradictions import rejected_notes, scale_notes
 from legcal.calibration.joint_fit.determinacy import Held, held_spread, named_units
 from legcal.calibration.joint_fit.held_out import Posterior
@@ -18,6 +17,7 @@ from legcal.calibration.joint_fit.outline_errors import (
     EstimatedGamma,
     NoiseModel,
 )
+from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_reasons
 from legcal.calibration.joint_fit.sensitivity import (
@@ -30,7 +30,7 @@ from legcal.calibration.joint_fit.variables import RefinementSettings, State
 from legcal.data import Dataset, Order, Outlines, inverse, reorder_measurements
 from legcal.estimation import (
     PseudoHuber,
-    WeakDirection,
+    WorstDirection,
     information,
     linearize,
     named_covariance,
@@ -78,7 +78,7 @@ class Solution:
     held_covariance: Array
     value_covariance: Array  # (p, p) kinematic_covariance of the values
     held_basis: Array  # (w, p) how values change along each held direction, by a metre
-    weak: tuple[WeakDirection, ...]  # the estimated directions known worst, worst first
+    weak: tuple[WorstDirection, ...]  # the estimated directions known worst, worst first
     held: tuple[str, ...]  # the directions that are held at nominal
     cost: float  # over all observations, rejected ones too, with claimed covariances: comparable
     chi2: float  # of used outlines, axes, readings and priors

@@ -18,12 +18,12 @@ from legcal.calibration.location.document import (
 )
 from legcal.calibration.location.fit import (
     RANK_TOLERANCE,
-    Fit,
+    FrameFit,
     frame_design_at,
     hold_tool,
 )
 from legcal.calibration.location.frames import N_STEP, PosePairs, jacobian
-from legcal.calibration.location.observations import Observations
+from legcal.calibration.location.observations import ToolObservations
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray
 from legcal.machine import random_configurations
@@ -47,7 +47,7 @@ _BLOCKS: tuple[tuple[slice, Frame, Kind], ...] = (
 class Determinacy:
     """The most likely frames, and how well each part of them is known."""
 
-    fit: Fit  # at the frames, the open part held
+    fit: FrameFit  # at the frames, the open part held
     # (12, 12): of a step: displacement and rotation of the base about world axes, of the tool about
     # platform axes [m, rad]; zero along what is held
     covariance: Array
@@ -57,8 +57,8 @@ class Determinacy:
 
 
 def determine(
-    observations: Observations,
-    found: Fit,
+    observations: ToolObservations,
+    found: FrameFit,
     # (3,): where the tool is taken in the platform where the machine leaves that open [m]
     tool_position: Array,
     name: str,  # what the poses are called in messages
@@ -87,7 +87,7 @@ def determine(
     )
 
 
-def hold(observations: Observations, found: Fit, tool_position: Array) -> Fit:
+def hold(observations: ToolObservations, found: FrameFit, tool_position: Array) -> FrameFit:
     """Return a fit moved along what it leaves open until the tool is where it is held."""
     k = _open_directions(found.frame_design, oriented=observations.is_oriented).shape[1]
     if k == 0:
@@ -199,7 +199,7 @@ def _needed_words(found: _PoseSpread, possible: _PoseSpread, scatter: str) -> st
     )
 
 
-def _open_at(observations: Observations, found: Fit, k: int, frames: Array) -> Array:
+def _open_at(observations: ToolObservations, found: FrameFit, k: int, frames: Array) -> Array:
     """Return the k directions (12, k) that are known least at some frames."""
     n = 12 if observations.is_oriented else 9
     design = frame_design_at(observations.pairs, frames, found.noise, observations.by_model)
@@ -209,7 +209,7 @@ def _open_at(observations: Observations, found: Fit, k: int, frames: Array) -> A
     return basis
 
 
-def _workspace(observations: Observations) -> PosePairs:
+def _workspace(observations: ToolObservations) -> PosePairs:
     """Return poses all over the workspace, as if each had been measured."""
     sampled = random_configurations(observations.machine, _N_POSES, _SEED)
     matrices = np.array([T.as_matrix() for T in sampled.poses])
@@ -224,7 +224,7 @@ def _workspace(observations: Observations) -> PosePairs:
 
 
 def _check_machine(
-    observations: Observations, found: Fit, basis: Array, workspace: PosePairs, name: str
+    observations: ToolObservations, found: FrameFit, basis: Array, workspace: PosePairs, name: str
 ) -> None:
     """Refuse what other poses would tell, and what holding the tool does not close."""
     pairs = observations.pairs
@@ -247,7 +247,7 @@ def _check_machine(
         )
 
 
-def _scatter(observations: Observations, found: Fit) -> str:
+def _scatter(observations: ToolObservations, found: FrameFit) -> str:
     """Return the standard deviations of a measured component."""
     sigma = found.noise.rms
     turn = f" and {np.degrees(sigma[1]):.2g} deg" if observations.is_oriented else ""
@@ -280,7 +280,9 @@ def _held_words(parts: list[OpenPart], workspace: PosePairs, tool_position: Arra
     )
 
 
-def _weak(covariance: Array, found: Fit, pairs: PosePairs, *, oriented: bool) -> tuple[str, ...]:
+def _weak(
+    covariance: Array, found: FrameFit, pairs: PosePairs, *, oriented: bool
+) -> tuple[str, ...]:
     """Return which directions are known badly, one sentence for each part of the frames."""
     position, angle = found.noise.rms.tolist()
     one = max(position, angle * pairs.length if oriented else 0.0)

@@ -27,14 +27,14 @@ from legcal.calibration.location.frames import (
     residuals,
     tool_motions,
 )
-from legcal.calibration.location.observations import Noise, Observations
+from legcal.calibration.location.observations import PoseNoise, ToolObservations
 from legcal.calibration.location.search import kept_rows
 from legcal.estimation import (
     Factor,
     Frames,
     GaussianPrior,
     Problem,
-    Rows,
+    Residuals,
     Variables,
     all_free,
     minimise,
@@ -57,11 +57,11 @@ _MIN_DOF = 1.0  # for a scatter
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class FrameFit:
     """The most likely frames."""
 
     frames: Array  # (2, 3, 4)
-    noise: Noise  # with the factors that were stated or estimated
+    noise: PoseNoise  # with the factors that were stated or estimated
     whitened: Array  # (n, 6): residuals in standard deviations, errors of the model taken out
     # (n * 6 + k, 12 + k): whitened derivative by a step in units of ``pairs.scale``, and by the k
     # errors of the model, whose priors are the last rows
@@ -83,7 +83,7 @@ class Fit:
         return np.asarray(F.T @ F)
 
 
-def fit_observations(observations: Observations, start: Array) -> Fit:
+def fit_observations(observations: ToolObservations, start: Array) -> FrameFit:
     """Return the most likely frames of observations, from a start.
 
     Errors of the readings move the tool through the frames that are estimated: their covariance
@@ -100,9 +100,9 @@ def fit(
     pairs: PosePairs,
     # within the basin of the answer; where the rows leave a direction open it stays there
     start: Array,
-    noise: Noise,  # standard deviations; factors of kinds that are not stated are estimated
+    noise: PoseNoise,  # standard deviations; factors of kinds that are not stated are estimated
     motions: Array | None = None,  # (n, 6, k): platform motions by errors of the model
-) -> Fit:
+) -> FrameFit:
     """Return the most likely frames near a start.
 
     Raises DidNotConverge if the steps do not end.
@@ -120,7 +120,9 @@ def fit(
     return fit_at(pairs, frames, noise, motions)
 
 
-def fit_at(pairs: PosePairs, frames: Array, noise: Noise, motions: Array | None = None) -> Fit:
+def fit_at(
+    pairs: PosePairs, frames: Array, noise: PoseNoise, motions: Array | None = None
+) -> FrameFit:
     """Return the fit at frames and noise that are most likely already."""
     y, A = _whitened(
         *_unweighted(pairs, frames, motions), noise.whitening(pairs.oriented)
@@ -129,7 +131,7 @@ def fit_at(pairs: PosePairs, frames: Array, noise: Noise, motions: Array | None 
     _, dof = _variances(pairs, frames, replace(noise, stated=(True, True)), motions)
     s = np.linalg.svd(A, compute_uv=False)
     rank = int(np.sum(s > RANK_TOLERANCE * s[0])) - (A.shape[1] - N_STEP)
-    return Fit(
+    return FrameFit(
         frames=frames,
         noise=noise,
         whitened=left[: 6 * len(pairs)].reshape(-1, 6),
@@ -152,7 +154,7 @@ class _State:
 def _most_likely(
     pairs: PosePairs,
     frames: Array,
-    noise: Noise,
+    noise: PoseNoise,
     motions: Array | None,
     fixed: Array | None = None,  # (12, k): directions in units of ``pairs.scale`` that do not move
 ) -> Array:
@@ -163,13 +165,13 @@ def _most_likely(
     def frames_in(state: _State) -> Array:
         return frames_from(state.base.R[0], state.base.t[0], state.tool.R[0], state.tool.t[0])
 
-    def rows_of(state: _State) -> Rows:
+    def rows_of(state: _State) -> Residuals:
         there = frames_in(state)
         J = jacobian(there, pairs)
         by_model = np.zeros((n, 6, 0)) if motions is None else tool_motions(motions, there, pairs)
         blocks = J[..., :6][..., _TURN_FIRST], J[..., 6:][..., _TURN_FIRST], by_model
         r = by_model @ state.errors - residuals(there, pairs)
-        return Rows.of(r, np.concatenate(blocks, axis=-1))
+        return Residuals.of(r, np.concatenate(blocks, axis=-1))
 
     one, whole = np.zeros(n, dtype=np.intp), slice(None)
     errors = np.arange(k, dtype=np.intp)
@@ -208,7 +210,7 @@ def _most_likely(
 
 
 def _variances(
-    pairs: PosePairs, frames: Array, noise: Noise, motions: Array | None
+    pairs: PosePairs, frames: Array, noise: PoseNoise, motions: Array | None
 ) -> tuple[Array, Array]:
     """Return the factors of restricted likelihood (2,), and their degrees of freedom (2,).
 
@@ -243,7 +245,9 @@ def _variances(
     return factor, dof
 
 
-def frame_design_at(pairs: PosePairs, frames: Array, noise: Noise, motions: Array | None) -> Array:
+def frame_design_at(
+    pairs: PosePairs, frames: Array, noise: PoseNoise, motions: Array | None
+) -> Array:
     """Return the whitened columns (m, 12) of the frames, errors of the model eliminated."""
     raw = _unweighted(pairs, frames, motions)
     return frame_design(_whitened(*raw, noise.whitening(pairs.oriented))[1])
@@ -277,11 +281,11 @@ def _whitened(r: Array, design: Array, W: Array) -> tuple[Array, Array]:
 
 
 def hold_tool(
-    observations: Observations,
-    found: Fit,
+    observations: ToolObservations,
+    found: FrameFit,
     open_at: Callable[[Array], Array],  # returns the open directions (12, k) at frames
     tool_position: Array,  # (3,): in the platform [m]
-) -> Fit:
+) -> FrameFit:
     """Return the most likely frames whose open part is that of a tool at a given position.
 
     Along open directions the tool is brought as near to the given position, and to the axes of the
@@ -311,10 +315,10 @@ class Inliers:
     distance: Array
     angle: Array
     frames: Array  # by the inliers
-    factor: Array  # (2,): the scatter of the inliers, as a factor of :class:`Noise`
+    factor: Array  # (2,): the scatter of the inliers, as a factor of :class:`PoseNoise`
 
 
-def find_inliers(observations: Observations, start: Array) -> Inliers:
+def find_inliers(observations: ToolObservations, start: Array) -> Inliers:
     """Return which rows agree with each other, from frames that most rows agree with.
 
     A row is never left out for what stated standard deviations allow.
@@ -347,14 +351,16 @@ def find_inliers(observations: Observations, start: Array) -> Inliers:
     )
 
 
-def _fit_to(pairs: PosePairs, start: Array, noise: Noise) -> Fit:
+def _fit_to(pairs: PosePairs, start: Array, noise: PoseNoise) -> FrameFit:
     """Return the fit of some rows at the scatter that they show, at least at the stated one."""
     found = fit(pairs, start, replace(noise, stated=(False, False), readings=None))
     least = np.where(noise.stated, noise.factor, 0.0)
     return replace(found, noise=found.noise.scaled(np.maximum(found.noise.factor, least)))
 
 
-def _probability(pairs: PosePairs, noise: Noise, found: Fit, stated: tuple[bool, bool]) -> Array:
+def _probability(
+    pairs: PosePairs, noise: PoseNoise, found: FrameFit, stated: tuple[bool, bool]
+) -> Array:
     """Return how probable rows as far off as these are, given those of a fit, (n,)."""
     sigma = noise.scaled(found.noise.factor).standard_deviations()
     H = found.information

@@ -12,17 +12,17 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.location.determinacy import Determinacy, determine, hold
 from legcal.calibration.location.document import Location, MeasurementNoise, RowResidual, Status
-from legcal.calibration.location.fit import Fit, Inliers, find_inliers, fit, fit_observations
+from legcal.calibration.location.fit import FrameFit, Inliers, find_inliers, fit, fit_observations
 from legcal.calibration.location.frames import jacobian, residuals, transforms
 from legcal.calibration.location.observations import (
     MAX_ANGLE_SIGMA,
     MIN_SIGMA,
-    Observations,
+    ToolObservations,
     ToolPoses,
     observations_of,
     read_tool_poses,
 )
-from legcal.calibration.location.search import Candidates, likely_mistake, search
+from legcal.calibration.location.search import FrameCandidates, likely_mistake, search
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.files import describe
 from legcal.geometry import Array
@@ -135,7 +135,9 @@ def _check_numbers(
         )
 
 
-def _check_plausible(observations: Observations, candidates: Candidates, name: str) -> None:
+def _check_plausible(
+    observations: ToolObservations, candidates: FrameCandidates, name: str
+) -> None:
     """Refuse poses that no frames explain, with the mistake that would explain them.
 
     The rows that agree best are looked at: most are right, or all are wrong in one way.
@@ -157,7 +159,9 @@ def _check_plausible(observations: Observations, candidates: Candidates, name: s
         )
 
 
-def _refuse_mistakes(observations: Observations, candidates: Candidates, name: str) -> None:
+def _refuse_mistakes(
+    observations: ToolObservations, candidates: FrameCandidates, name: str
+) -> None:
     """Refuse poses that a common mistake explains."""
     mistake = likely_mistake(observations.pairs, float(candidates.cost[0]), observations.fewest)
     if mistake is not None:
@@ -169,7 +173,7 @@ def _refuse_mistakes(observations: Observations, candidates: Candidates, name: s
 
 
 def _check_outliers(
-    observations: Observations, candidates: Candidates, inliers: Inliers, name: str
+    observations: ToolObservations, candidates: FrameCandidates, inliers: Inliers, name: str
 ) -> None:
     """Refuse poses of which too many disagree."""
     n, n_out = len(observations.pairs), int(np.sum(~inliers.is_inlier))
@@ -185,7 +189,7 @@ def _check_outliers(
     )
 
 
-def _check_scatter(observations: Observations, found: Fit, name: str) -> None:
+def _check_scatter(observations: ToolObservations, found: FrameFit, name: str) -> None:
     """Refuse to estimate a scatter from rows that leave nothing over."""
     for kind, (what, option) in enumerate(
         (("positions", "--position-sigma"), ("orientations", "--angle-sigma"))
@@ -200,9 +204,9 @@ def _check_scatter(observations: Observations, found: Fit, name: str) -> None:
 
 
 def _check_unique(
-    observations: Observations,
+    observations: ToolObservations,
     determined: Determinacy,
-    candidates: Candidates,
+    candidates: FrameCandidates,
     at: Array,
     name: str,
 ) -> None:
@@ -247,7 +251,7 @@ def _apart(one: Array, other: Array) -> tuple[float, float]:
 
 
 def _judge(
-    observations: Observations,
+    observations: ToolObservations,
     name: str,  # what the poses are called
     inliers: Inliers,  # the rows that the frames rest on
     determined: Determinacy,
@@ -289,7 +293,7 @@ def _judge(
     )
 
 
-def _tested(found: Fit) -> tuple[float | None, str, str]:
+def _tested(found: FrameFit) -> tuple[float | None, str, str]:
     """Return the probability of larger residuals, and what is too large or too small in words."""
     noise = found.noise
     kinds = [k for k in range(2) if noise.stated[k] and found.kind_dof[k] > 0.5]
@@ -310,7 +314,7 @@ def _tested(found: Fit) -> tuple[float | None, str, str]:
     return p_value, " and ".join(large) if p_value < _MIN_P else "", too_small
 
 
-def _noise(observations: Observations, found: Fit) -> MeasurementNoise:
+def _noise(observations: ToolObservations, found: FrameFit) -> MeasurementNoise:
     """Return what was stated or found of the measurement."""
     rms = found.noise.rms
     oriented = observations.is_oriented
@@ -324,7 +328,7 @@ def _noise(observations: Observations, found: Fit) -> MeasurementNoise:
     )
 
 
-def _rows(observations: Observations, inliers: Inliers, found: Fit) -> list[RowResidual]:
+def _rows(observations: ToolObservations, inliers: Inliers, found: FrameFit) -> list[RowResidual]:
     """Return the residuals of all rows; errors of the model are not taken out of them."""
     pairs = observations.pairs
     r = residuals(found.frames, pairs)
@@ -342,7 +346,7 @@ def _rows(observations: Observations, inliers: Inliers, found: Fit) -> list[RowR
     return rows
 
 
-def _off(observations: Observations, inliers: Inliers, i: int) -> str:
+def _off(observations: ToolObservations, inliers: Inliers, i: int) -> str:
     """Return how far a row is from where the others predict it."""
     sigma = inliers.factor * observations.noise.sigma[i]
     found = f"{1e3 * inliers.distance[i]:.3g} mm"
@@ -353,7 +357,9 @@ def _off(observations: Observations, inliers: Inliers, i: int) -> str:
     return f"{found} from where the other rows predict it, which scatter {scatter}"
 
 
-def _at_the_tool(observations: Observations, determined: Determinacy) -> tuple[float, float | None]:
+def _at_the_tool(
+    observations: ToolObservations, determined: Determinacy
+) -> tuple[float, float | None]:
     """Return how well the frames put the tool in the world, rms over the poses [m], [rad]."""
     J = jacobian(determined.fit.frames, observations.pairs)
     variance = np.einsum("nij,jk,nik->ni", J, determined.covariance, J)
@@ -365,7 +371,7 @@ def _at_the_tool(observations: Observations, determined: Determinacy) -> tuple[f
 
 
 def _sentence(
-    observations: Observations, determined: Determinacy, left_out: Sequence[int], too_large: str
+    observations: ToolObservations, determined: Determinacy, left_out: Sequence[int], too_large: str
 ) -> str:
     """Return the verdict."""
     used = len(observations.poses) - len(left_out)
@@ -403,7 +409,7 @@ def _sentence(
 
 
 def _notes(
-    observations: Observations,
+    observations: ToolObservations,
     determined: Determinacy,
     inliers: Inliers,
     too_small: str,

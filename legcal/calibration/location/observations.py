@@ -27,7 +27,7 @@ from legcal.calibration.result_folder import MODEL_NAME, RESULT_NAME, read_resul
 from legcal.data import reading_columns, readings_in
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.files import QUATERNION_TOLERANCE, Column, Table, read_table
-from legcal.geometry import Array, BoolArray, IntArray, cross_matrices
+from legcal.geometry import Array, BoolArray, IntArray, cross_matrices, whitener
 from legcal.machine import (
     Machine,
     forward_kinematics_many,
@@ -192,7 +192,7 @@ def _orientations(table: Table) -> tuple[Array, BoolArray, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class Noise:
+class PoseNoise:
     """Standard deviations of the rows."""
 
     sigma: Array  # (n, 2): of position [m] and orientation [rad] of each row, up to ``factor``
@@ -203,12 +203,12 @@ class Noise:
     # (n, 6, 6): covariance of the tool pose by errors of the readings [m, rad]; None without any
     readings: Array | None = None
 
-    def of(self, rows: BoolArray | IntArray) -> Noise:
+    def of(self, rows: BoolArray | IntArray) -> PoseNoise:
         """Return that of some rows."""
         readings = None if self.readings is None else self.readings[rows]
         return replace(self, sigma=self.sigma[rows], readings=readings)
 
-    def scaled(self, factor: Array) -> Noise:
+    def scaled(self, factor: Array) -> PoseNoise:
         """Return the same with other factors."""
         return replace(self, factor=factor)
 
@@ -236,19 +236,19 @@ class Noise:
             S = self.readings.copy()
             S[~oriented, 3:, :3] = S[~oriented, :3, 3:] = 0.0
             S[:, range(6), range(6)] += sigma**2
-            W = np.linalg.inv(np.linalg.cholesky(S))
+            W = whitener(S)
         W[~oriented, 3:] = 0.0
         return np.asarray(W)
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
+class ToolObservations:
     """Measured poses with all that is known of their errors."""
 
     machine: Machine
     poses: ToolPoses  # as measured
     pairs: PosePairs  # beside the platform poses at the readings
-    noise: Noise  # of the measurement
+    noise: PoseNoise  # of the measurement
     encoder_sigma: float  # of a reading [m]; zero if none was stated
     # by_readings, by_model: (n, 6, k): platform motions (see tool_motions) by independent errors of
     # one standard deviation; None if nothing is known of them
@@ -256,7 +256,7 @@ class Observations:
     by_model: Array | None
     fewest: int  # poses that can determine the frames
 
-    def of(self, rows: BoolArray) -> Observations:
+    def of(self, rows: BoolArray) -> ToolObservations:
         """Return some rows, with the measured poses as they were."""
         return replace(
             self,
@@ -266,7 +266,7 @@ class Observations:
             by_model=None if self.by_model is None else self.by_model[rows],
         )
 
-    def noise_at(self, frames: Array) -> Noise:
+    def noise_at(self, frames: Array) -> PoseNoise:
         """Return the noise with what errors of the readings do to the tool at some frames."""
         if self.by_readings is None:
             return self.noise
@@ -289,7 +289,7 @@ def observations_of(
     position_sigma: float | None,
     angle_sigma: float | None,
     encoder_sigma: float,
-) -> Observations:
+) -> ToolObservations:
     """Return measured poses beside those of the platform, with what is known of their errors.
 
     Raises NotIdentifiable if there are too few poses, or the motors do not determine the pose;
@@ -312,7 +312,7 @@ def observations_of(
         length=_RADIAN * leg_scale(machine, machine.home),
     )
     by_model = _motions_by_model(machine, T)
-    return Observations(
+    return ToolObservations(
         machine=machine,
         poses=poses,
         pairs=pairs,
@@ -348,7 +348,7 @@ def _noise(
     angle_sigma: float | None,
     length: float,
     name: str,
-) -> Noise:
+) -> PoseNoise:
     """Return the standard deviations that were stated, and a start for the others."""
     sigma = np.ones((len(poses), 2))
     factor, stated = np.array([_FIRST_FACTOR * length, _FIRST_FACTOR]), [False, False]
@@ -369,7 +369,7 @@ def _noise(
     if not poses.oriented.any():
         sigma[:, 1] = factor[1] = 1.0
         stated[1] = True
-    return Noise(sigma, factor, (stated[0], stated[1]))
+    return PoseNoise(sigma, factor, (stated[0], stated[1]))
 
 
 def motions_by_readings(

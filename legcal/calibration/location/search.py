@@ -52,7 +52,7 @@ _MIRRORS = (
 )
 
 
-class Candidates(NamedTuple):
+class FrameCandidates(NamedTuple):
     """Where the search has ended, the best first."""
 
     frames: Array  # (k, 2, 3, 4)
@@ -65,7 +65,7 @@ def search(
     fewest: int,  # rows that determine the frames
     *,
     subsets: int = _SUBSETS,  # how many starts come from a few rows each
-) -> Candidates:
+) -> FrameCandidates:
     """Return the frames that agree best with most rows, from starts all over the rotations."""
     if len(pairs) > _MAX_ROWS:
         pairs = pairs.of(np.linspace(0, len(pairs) - 1, _MAX_ROWS).astype(np.intp))
@@ -76,7 +76,7 @@ def search(
     frames = _descended(pairs, frames[order], n_kept, _MAX_ITERATIONS)
     cost = _trimmed_cost(frames, pairs, n_kept)
     order = np.argsort(cost, kind="stable")
-    return Candidates(frames[order], cost[order] / n_kept)
+    return FrameCandidates(frames[order], cost[order] / n_kept)
 
 
 def kept_rows(n: int, fewest: int) -> int:

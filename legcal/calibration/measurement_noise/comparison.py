@@ -10,7 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from legcal.calibration.measurement_noise.canny import canny_parts
-from legcal.calibration.measurement_noise.document import CALLED, LegNoise, MethodNoise, Noise
+from legcal.calibration.measurement_noise.document import (
+    CALLED,
+    DatasetNoise,
+    LegNoise,
+    MethodNoise,
+)
 from legcal.calibration.measurement_noise.repeatability import (
     OUTLINE,
     LegOrientation,
@@ -58,7 +63,7 @@ _MAX_NAMED = 4  # places in a note
 
 def measure_noise(
     source: str | Path | Dataset, *, progress: Report = no_progress, workers: int = 1
-) -> Noise:
+) -> DatasetNoise:
     """Estimate the noise of outlines and leg axes from repeated images of the same poses.
 
     Parameters
@@ -112,7 +117,7 @@ def measure_noise(
         placement.T_base_camera,
         BEFORE_FIT,
     )
-    return Noise(
+    return DatasetNoise(
         dataset=dataset,
         view_names=tuple(view.name for view in views),
         pose_labels=measurements.pose_labels,

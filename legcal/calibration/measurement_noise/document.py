@@ -12,9 +12,9 @@ from legcal.calibration.measurement_noise.repeatability import (
     OUTLINE,
     QUANTITIES,
     LegOrientation,
+    PooledSpread,
     Repeats,
     Sample,
-    Spread,
     pool,
 )
 from legcal.data import Dataset
@@ -53,7 +53,7 @@ class LegNoise:
         """Return the samples of one of the ``QUANTITIES`` or of the outlines."""
         return [sample for o in self.orientations for sample in o.samples(quantity)]
 
-    def spread(self, quantity: str) -> Spread | None:
+    def spread(self, quantity: str) -> PooledSpread | None:
         """Return the spread over all orientations, None where nothing was found twice."""
         return pool(self.samples(quantity))
 
@@ -65,7 +65,7 @@ class MethodNoise:
     name: str  # one of METHODS
     legs: tuple[LegNoise, ...]
 
-    def spread(self, quantity: str) -> Spread | None:
+    def spread(self, quantity: str) -> PooledSpread | None:
         """Return the spread over all legs and orientations; its largest is that of Table 1."""
         return pool([sample for leg in self.legs for sample in leg.samples(quantity)])
 
@@ -76,7 +76,7 @@ class MethodNoise:
 
 
 @dataclass(frozen=True, eq=False)
-class Noise:
+class DatasetNoise:
     """The measurement noise of a dataset.
 
     Attributes
@@ -160,7 +160,7 @@ class Noise:
                 )
                 for leg in method.legs
             ],
-            all=ByQuantity[Spread](**spreads),
+            all=ByQuantity[PooledSpread](**spreads),
             upper_bound=ByQuantity[float](**largest),
             upper_bound_at=ByQuantity[Place](**at),
         )
@@ -227,15 +227,15 @@ class LegBlock(Document):
     outlines: int
     outlines_found: int
     without_M_LS: int
-    psi: Spread | None
-    theta: Spread | None
-    x: Spread | None
-    z: Spread | None
-    angle: Spread | None
-    across: Spread | None
-    tilt: Spread | None
-    depth: Spread | None
-    outline: Spread | None
+    psi: PooledSpread | None
+    theta: PooledSpread | None
+    x: PooledSpread | None
+    z: PooledSpread | None
+    angle: PooledSpread | None
+    across: PooledSpread | None
+    tilt: PooledSpread | None
+    depth: PooledSpread | None
+    outline: PooledSpread | None
     orientations: list[OrientationBlock]
 
 
@@ -243,7 +243,7 @@ class MethodBlock(Document):
     """What one method finds."""
 
     legs: list[LegBlock]
-    all: ByQuantity[Spread]
+    all: ByQuantity[PooledSpread]
     upper_bound: ByQuantity[float]
     upper_bound_at: ByQuantity[Place]
 

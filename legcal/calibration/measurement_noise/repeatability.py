@@ -71,7 +71,7 @@ class Sample:
         return float(np.sqrt(np.trace(self.covariance) / np.trace(self.claimed)))
 
 
-class Spread(Document):
+class PooledSpread(Document):
     """A standard deviation pooled over orientations."""
 
     sd: float
@@ -92,7 +92,7 @@ def sample_of(deviations: Array, claimed: Array) -> Sample:
     return Sample(np.asarray(centred.T @ centred / dof), np.asarray(claimed.mean(axis=0)), dof)
 
 
-def pool(samples: Sequence[Sample]) -> Spread | None:
+def pool(samples: Sequence[Sample]) -> PooledSpread | None:
     """Return the pooled standard deviation of samples of one dimension; None without any."""
     if not samples:
         return None
@@ -111,7 +111,7 @@ def pool(samples: Sequence[Sample]) -> Spread | None:
         for p in (1.0 - tail, tail)
     )
     each = [s.sd for s in samples]
-    return Spread(
+    return PooledSpread(
         sd=found,
         claimed=claimed,
         ratio=found / claimed,

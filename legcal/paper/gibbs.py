@@ -74,8 +74,3 @@ def turns_of(axis: Array, nominal: Array) -> Array:
     axis = axis if axis @ nominal > 0.0 else -axis
     gibbs = np.cross(nominal, axis) / (1.0 + float(nominal @ axis))
     return np.asarray(2.0 * normal_basis(nominal) @ gibbs)
-
-
-def whitener(covariance: Array) -> Array:
-    """Return W with W covariance W' = 1, for symmetric positive covariances (..., n, n)."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))

@@ -1,7 +1,7 @@
 """Predicted observations: which legs each camera position shows, at which poses.
 
-A :class:`Session` is planned (cameras in default places, random poses) or that of a dataset; what
-it shows across each leg is given with the standard deviation of an outline.
+They are planned (cameras in default places, random poses) or those of a dataset; what they show
+across each leg is given with the standard deviation of an outline.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg lengt
 
 
 @dataclass(frozen=True, eq=False)
-class Session:
+class PredictedObservations:
     """Observations as they will be made, of a machine that is nearly the nominal one."""
 
     leg_names: tuple[str, ...]
@@ -153,7 +153,7 @@ class Session:
         """Which legs have a length that is measured or constant, (n_legs,)."""
         return np.array([leg.kind is not LegKind.PASSIVE for leg in self.legs], dtype=np.bool_)
 
-    def with_board(self, *, board: bool = True) -> Session:
+    def with_board(self, *, board: bool = True) -> PredictedObservations:
         """Return the same with a calibration board in all images, or in none."""
         return replace(self, board=np.full(self.n_views, board, dtype=np.bool_))
 
@@ -178,41 +178,41 @@ class Across:
         return np.concatenate([turn, -self.gradient], axis=3)
 
 
-def at_base_joints(session: Session) -> Across:
+def at_base_joints(predicted: PredictedObservations) -> Across:
     """Return what is seen at the base joint centres."""
-    images = len(session.view)
-    return _across(session, np.broadcast_to(session.A, (images, *session.A.shape)))
+    images = len(predicted.view)
+    return _across(predicted, np.broadcast_to(predicted.A, (images, *predicted.A.shape)))
 
 
-def at_platform_joints(session: Session) -> Across:
+def at_platform_joints(predicted: PredictedObservations) -> Across:
     """Return what is seen at the platform joint centres."""
-    return _across(session, (session.arm + session.t[:, None])[session.pose])
+    return _across(predicted, (predicted.arm + predicted.t[:, None])[predicted.pose])
 
 
-def _across(session: Session, point: Array) -> Across:
+def _across(predicted: PredictedObservations, point: Array) -> Across:
     """Return the directions across legs at points (n_images, n_legs, 3)."""
-    u = session.u[session.pose]
-    ray = point - session.camera[session.view][:, None]
+    u = predicted.u[predicted.pose]
+    ray = point - predicted.camera[predicted.view][:, None]
     distance = np.linalg.norm(ray, axis=2)
     lateral = np.cross(u, ray / distance[..., None])
     lateral /= np.maximum(np.linalg.norm(lateral, axis=2), _ALONG)[..., None]
     depth = np.cross(u, lateral)
-    sigma_lateral = SIGMA_PX * distance / session.focal[session.view][:, None]
-    sigma_depth = sigma_lateral * distance / session.radius
+    sigma_lateral = SIGMA_PX * distance / predicted.focal[predicted.view][:, None]
+    sigma_depth = sigma_lateral * distance / predicted.radius
     gradient = np.stack(
         [lateral / sigma_lateral[..., None], depth / sigma_depth[..., None]], axis=2
     )
-    gradient[~session.seen[session.view]] = 0.0
+    gradient[~predicted.seen[predicted.view]] = 0.0
     return Across(gradient, point)
 
 
-def planned_session(
+def planned_observations(
     machine: Machine,
     views: Sequence[Sequence[int]],  # the legs that each view shows
     images: int = 15,  # and poses, a view
     *,
     board: bool = False,  # every image shows a calibration board on the base
-) -> Session:
+) -> PredictedObservations:
     """Return a session with cameras in default places and random poses inside the travel.
 
     It is that of a machine whose every parameter is a micrometre or less from the nominal one, so
@@ -228,7 +228,7 @@ def planned_session(
     seen = np.zeros((len(views), len(legs)), dtype=np.bool_)
     for v, view in enumerate(views):
         seen[v, list(view)] = True
-    return Session(
+    return PredictedObservations(
         leg_names=machine.leg_names,
         legs=legs,
         frame_legs=machine.frame_legs,
@@ -248,13 +248,13 @@ def planned_session(
     )
 
 
-def recorded_session(
+def recorded_observations(
     # A view is taken to show the legs that have axes in it; without a table of axes those that it
     # names, or all
     dataset: Dataset,
     *,
     twists: bool = False,  # count the twists of legs among the parameters
-) -> Session:
+) -> PredictedObservations:
     """Return the session of a dataset.
 
     Where readings do not give its poses, random ones inside the travel take their place.
@@ -292,7 +292,7 @@ def recorded_session(
     for v, view in enumerate(views):
         if view.T_base_camera is not None:
             camera[v] = (to_Rb * view.T_base_camera).translation
-    return Session(
+    return PredictedObservations(
         leg_names=machine.leg_names,
         legs=legs,
         frame_legs=machine.frame_legs,
@@ -312,13 +312,13 @@ def recorded_session(
     )
 
 
-def orientations_of(dataset: Dataset, session: Session) -> Array:
+def orientations_of(dataset: Dataset, predicted: PredictedObservations) -> Array:
     """Return R of the camera of every used view in R_b, (n_views, 3, 3).
 
     Cameras whose place the dataset does not give look at the legs.
     """
     to_Rb, views = dataset.machine.T_base_Rb.inv(), dataset.measurements.views
-    found = looking_at(session)
+    found = looking_at(predicted)
     for v, view in enumerate(views[i] for i in np.unique(dataset.measurements.view).tolist()):
         if view.T_base_camera is not None:
             found[v] = (to_Rb * view.T_base_camera).rotation.as_matrix()
@@ -332,11 +332,11 @@ def cameras_of(dataset: Dataset) -> tuple[str, ...]:
     return tuple(owners[v] for v in np.unique(m.view).tolist())
 
 
-def looking_at(session: Session) -> Array:
+def looking_at(predicted: PredictedObservations) -> Array:
     """Return orientations (n_views, 3, 3) of cameras that look at the legs of their views."""
-    middle = 0.5 * (session.A + (session.arm + session.t[:, None]).mean(axis=0))
+    middle = 0.5 * (predicted.A + (predicted.arm + predicted.t[:, None]).mean(axis=0))
     orientations = []
-    for place, shown in zip(session.camera, session.seen, strict=True):
+    for place, shown in zip(predicted.camera, predicted.seen, strict=True):
         z = (middle[shown] if shown.any() else middle).mean(axis=0) - place
         z /= np.linalg.norm(z)
         x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
@@ -381,11 +381,11 @@ def default_cameras(
     return np.array(places).reshape(-1, 3)
 
 
-def cameras_for(session: Session, views: Sequence[Sequence[int]]) -> Array:
+def cameras_for(predicted: PredictedObservations, views: Sequence[Sequence[int]]) -> Array:
     """Return where further cameras stand by default, (n_views, 3) in R_b [m]."""
-    B = (session.arm + session.t[:, None]).mean(axis=0)
+    B = (predicted.arm + predicted.t[:, None]).mean(axis=0)
     rng = np.random.default_rng(_SEED + 1)
-    return default_cameras(session.A, B, views, session.spatial, rng)
+    return default_cameras(predicted.A, B, views, predicted.spatial, rng)
 
 
 def _axis(A: Array, B: Array) -> Array:
@@ -461,11 +461,11 @@ def _focal(K: Array) -> float:
     return float(np.sqrt(K[0, 0] * K[1, 1]))
 
 
-def legs_around(session: Session) -> list[int]:
+def legs_around(predicted: PredictedObservations) -> list[int]:
     """Return the legs in their order around the base."""
-    points = session.A + (session.arm + session.t[:, None]).mean(axis=0)
+    points = predicted.A + (predicted.arm + predicted.t[:, None]).mean(axis=0)
     centred = points - points.mean(axis=0)
-    _, _, basis = np.linalg.svd(session.A - session.A.mean(axis=0))
+    _, _, basis = np.linalg.svd(predicted.A - predicted.A.mean(axis=0))
     angle = np.arctan2(centred @ basis[1], centred @ basis[0])
     return [int(j) for j in np.argsort(angle, kind="stable")]
 
