@@ -7,8 +7,8 @@ import numpy as np
 from boards import before
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.camera_calibration.adjustment import BoardImages
 from legcal.geometry.types import Array
+from legcal.perception import BoardImages
 from legcal.simulation import Appearance, PlacedBoard, render
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera

@@ -14,7 +14,7 @@ from camera_sessions import CAMERAS, NOISE_PX, PINHOLE, SIZE, drawings, photogra
 
 from legcal import calibrate_camera, cli
 from legcal.calibration import CameraCalibration
-from legcal.calibration.camera_calibration.adjustment import BoardImages, RobustFit, robust_fit
+from legcal.calibration.camera_calibration.adjustment import RobustFit, robust_fit
 from legcal.calibration.camera_calibration.diagnostics import refuse_undetermined, warnings
 from legcal.calibration.joint_fit.parameter_choices import Prior, known_parameters, resolve
 from legcal.data.measurements import View
@@ -22,6 +22,7 @@ from legcal.data.overrides import overrides_of_call
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry import Array
 from legcal.machine import load_mechanism
+from legcal.perception import BoardImages
 from legcal.vision import Board, DistortionModel, board_of, intrinsic_values
 from legcal.vision.camera_file import read_camera
 

@@ -7,12 +7,24 @@ where all agree, the camera was moved.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit import DISAGREES, Solution
 from legcal.data import Measurements
+from legcal.errors import DidNotConverge
+from legcal.estimation import (
+    Factor,
+    Frames,
+    Problem,
+    PseudoHuber,
+    Residuals,
+    Variables,
+    all_free,
+    minimise,
+    normal_equations,
+)
 from legcal.geometry import Array, IntArray
 from legcal.machine import Machine
 
@@ -22,10 +34,16 @@ MIN_REJECTED_UNEXPLAINED = 0.67  # the share, if the readings agree with the ima
 CAMERA_MOVED = "its readings suit it, so check that nobody moved the camera"
 MIN_OUTLINES, MIN_LEGS = 6, 3  # that determine a pose
 MIN_NOISE = 5e-5  # of an outline at its leg [m]
+LOSS = PseudoHuber(4.0)  # of outlines, in least noises
 SIGNIFICANT_SIGMAS = 5.0
 MIN_READING_ERROR = 3e-4  # [m]
 SAME_READING = 1e-3  # tolerance for the reading of another image [m]
 MAX_NAMED_LEGS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    pose: Frames  # T_Rb_Re
 
 
 def outlier_images(
@@ -70,38 +88,44 @@ def _readings(
     o = solution.outlines
     chosen = chosen[np.isfinite(o.h[chosen]).all(axis=1)]
     legs = o.leg[chosen]
-    if len(chosen) < MIN_OUTLINES or len(np.unique(legs)) < MIN_LEGS:
+    n = len(chosen)
+    if n < MIN_OUTLINES or len(np.unique(legs)) < MIN_LEGS:
         return None
     T_camera_Rb = solution.T_camera_Rb[int(measurements.view[row])]
-    begin = solution.T_Rb_Re[int(measurements.pose[row])]
     A = np.array([leg.A for leg in solution.legs])
     B = np.array([leg.B for leg in solution.legs])
     radius = np.array([solution.radii[int(o.leg[i]), o.part[i]] for i in chosen.tolist()])
     signed = np.where(o.edge[chosen] == 1, radius, -radius)
+    normal_Rb = o.h[chosen] @ T_camera_Rb.rotation.as_matrix()  # of the planes of outlines
 
-    def moved(x: Array) -> Array:
-        turn = Rotation.from_rotvec(x[:3]) * begin.rotation
-        return RigidTransform.from_components(begin.translation + x[3:], turn).apply(B)
+    def distances(state: _State) -> Residuals:
+        arm = B @ state.pose.R[0].T
+        ends = T_camera_Rb.apply(arm + state.pose.t)[legs]
+        J = np.concatenate([np.cross(arm[legs], normal_Rb), normal_Rb], axis=1)
+        return Residuals.of((np.sum(o.h[chosen] * ends, axis=1) - signed)[:, None], J[:, None])
 
-    def residuals(x: Array) -> Array:
-        ends = T_camera_Rb.apply(moved(x))[legs]
-        return np.asarray(np.sum(o.h[chosen] * ends, axis=1) - signed)
-
-    def lengths(x: Array) -> Array:
-        return np.asarray(np.linalg.norm(moved(x) - A, axis=1))
-
-    solved = least_squares(residuals, np.zeros(6), loss="soft_l1", f_scale=4.0 * MIN_NOISE)
-    J_outlines = np.asarray(solved.jac, dtype=np.float64)
-    normal = J_outlines.T @ J_outlines
-    if not solved.success or np.linalg.cond(normal) > 1e12:
+    touches = (("pose", np.zeros(n, dtype=np.intp), slice(None)),)
+    outlines = Factor("outlines", distances, touches, n, 1, whitening=1.0 / MIN_NOISE, robust=True)
+    pose = Variables("pose", all_free(1, 6), Frames.moved)
+    problem, loss = Problem[_State]((pose,), None, (outlines,)), LOSS
+    begin = _State(Frames.of([solution.T_Rb_Re[int(measurements.pose[row])]]))
+    try:
+        found = minimise(problem, begin, loss)
+    except DidNotConverge:
         return None
-    noise = max(MIN_NOISE, 1.48 * float(np.median(np.abs(residuals(solved.x)))))
-    step = 1e-6 * np.eye(6)
-    J = np.stack([(lengths(solved.x + d) - lengths(solved.x - d)) / 2e-6 for d in step], axis=1)
-    variance = np.einsum("ja,ab,jb->j", J, noise**2 * np.linalg.inv(normal), J)
+    normal = normal_equations(problem, found.state, found.linear, loss).U
+    if np.linalg.cond(normal) > 1e12:
+        return None
+    scale = max(1.0, 1.48 * float(np.median(np.abs(found.linear["outlines"].r))))
+    arm = B @ found.state.pose.R[0].T
+    AB = arm + found.state.pose.t - A
+    length = np.linalg.norm(AB, axis=1)
+    u = AB / length[:, None]
+    J = np.concatenate([np.cross(arm, u), u], axis=1)
+    variance = scale**2 * np.einsum("ja,ab,jb->j", J, np.linalg.inv(normal), J)
     q0 = np.array([leg.q0 for leg in solution.legs])
     sign = np.array([leg.sign for leg in machine.legs])
-    return sign * (lengths(solved.x) - q0), np.sqrt(variance)
+    return sign * (length - q0), np.sqrt(variance)
 
 
 def _explanation(

@@ -13,7 +13,6 @@ import numpy as np
 
 from legcal.calibration.camera_calibration.adjustment import (
     MIN_CORNERS,
-    BoardImages,
     RobustFit,
     robust_fit,
 )
@@ -34,7 +33,7 @@ from legcal.calibration.camera_calibration.document import (
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
 from legcal.files import describe
 from legcal.geometry import Array, IntArray
-from legcal.perception import describe_image, find_corners
+from legcal.perception import BoardImages, describe_image, find_corners
 from legcal.progress import Report, no_progress
 from legcal.vision import (
     Board,

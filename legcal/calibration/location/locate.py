@@ -25,7 +25,7 @@ from legcal.calibration.location.observations import (
 from legcal.calibration.location.search import FrameCandidates, likely_mistake, search
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.files import describe
-from legcal.geometry import Array
+from legcal.geometry import Array, pose_distance
 from legcal.machine import Machine, load_mechanism
 
 _MAX_OUTLIERS = 4  # a row of so many may disagree, and one of few
@@ -243,11 +243,9 @@ def _are_one(one: Array, other: Array, length: float) -> bool:
 
 def _apart(one: Array, other: Array) -> tuple[float, float]:
     """Return how far the frames of two answers are apart, the worse of base and tool [m, rad]."""
-    apart = one - other
-    # The matrices of two orientations are sqrt(8) sin(turn / 2) apart.
-    chord = float(np.linalg.norm(apart[:, :, :3], axis=(1, 2)).max())
-    shift = float(np.linalg.norm(apart[:, :, 3], axis=1).max())
-    return shift, 2.0 * float(np.arcsin(min(1.0, chord / np.sqrt(8.0))))
+    both = zip(transforms(one), transforms(other), strict=True)
+    shifts, turns = zip(*(pose_distance(a, b) for a, b in both), strict=True)
+    return max(shifts), max(turns)
 
 
 def _judge(
