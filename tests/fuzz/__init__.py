@@ -1,0 +1,1 @@
+"""Mutated inputs of every reader, run in child processes with limits."""

@@ -1,0 +1,213 @@
+"""Commands on damaged files, in child processes that may take so much time and memory.
+
+The rule: a command ends by itself with 0, 1 or 2, in 5 s of work and 1 GB of memory beyond what
+it starts with; a refusal leaves nothing behind, and what it prints is clean text of bounded length.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import resource
+import shutil
+import signal
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+from characterisation.inputs import made_input
+from characterisation.running import run, words_of
+
+from fuzz.mutations import mutate
+from fuzz.subjects import SUBJECTS, Subject
+
+MAX_SECONDS = 5.0  # of work of the processor
+MAX_WAIT = 60.0  # [s] on the wall, with other work beside it
+MAX_BYTES = 1 << 30
+MAX_TEXT = 20_000  # characters that a command prints about a damaged file
+DEEP_SHARE = 0.03
+CONTROL = re.compile(
+    r"[^\x20-\x7e\xa0-\u2027\u2030-\ud7ff\ue000-\U0010ffff\n]|[\x80-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]"
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A damaged file: which, and how it is drawn."""
+
+    subject: int
+    seed: int
+
+    def content(self) -> bytes:
+        """Return the damaged file."""
+        subject = SUBJECTS[self.subject]
+        valid = (made_input(subject.input) / subject.file).read_bytes()
+        return mutate(valid, subject.kind, np.random.default_rng([self.subject, self.seed]))
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended; *fault* says what breaks the rule, if anything does."""
+
+    case: Case
+    code: int | None
+    seconds: float
+    megabytes: float
+    fault: str = ""
+
+
+@dataclass
+class Count:
+    """What many cases did."""
+
+    codes: Counter[str] = field(default_factory=Counter)
+    faults: list[Ended] = field(default_factory=list)
+    slowest: Ended | None = None
+    largest: Ended | None = None
+
+    def add(self, ended: Ended) -> None:
+        """Count one more."""
+        self.codes[str(ended.code)] += 1
+        if ended.fault:
+            self.faults.append(ended)
+        if self.slowest is None or ended.seconds > self.slowest.seconds:
+            self.slowest = ended
+        if self.largest is None or ended.megabytes > self.largest.megabytes:
+            self.largest = ended
+
+
+def drawn_cases(count: int, seed: int, deep_share: float = DEEP_SHARE) -> list[Case]:
+    """Return that many cases, in turn of all subjects; few of those that take long."""
+    chance = np.random.default_rng(seed)
+    deep = [k for k, subject in enumerate(SUBJECTS) if subject.deep]
+    shallow = [k for k, subject in enumerate(SUBJECTS) if not subject.deep]
+    cases = []
+    for number in range(count):
+        group = deep if chance.random() < deep_share else shallow
+        cases.append(Case(group[int(chance.integers(len(group)))], 1_000_000 * seed + number))
+    return cases
+
+
+def run_cases(cases: Sequence[Case], *, lone: bool = False) -> Iterator[Ended]:
+    """Run cases in a child process, and in another one after each that did not survive.
+
+    What broke a limit is run again alone: the memory of those before it is not its own.
+    """
+    for case in cases:
+        made_input(SUBJECTS[case.subject].input)
+    context = get_context("fork")
+    left = list(cases)
+    while left:
+        ours, theirs = context.Pipe(duplex=False)
+        child = context.Process(target=_work, args=(left, theirs))
+        child.start()
+        theirs.close()
+        done = 0
+        for ended in _received(ours):
+            done += 1
+            yield ended
+        child.join(1.0)
+        if done < len(left):  # the child died, or hangs
+            child.kill()
+            child.join()
+            case = left[done]
+            how = child.exitcode
+            if lone or done == 0:
+                yield Ended(case, None, MAX_SECONDS, 0.0, _death(how))
+            else:
+                yield from run_cases([case], lone=True)
+            done += 1
+        left = left[done:]
+
+
+def _death(exit_code: int | None) -> str:
+    if exit_code == -signal.SIGPROF:
+        return f"more than {MAX_SECONDS:g} s"
+    if exit_code == -signal.SIGKILL:
+        return f"hangs for {MAX_WAIT:g} s"
+    return f"the process died with {exit_code}"
+
+
+def _received(pipe: Connection) -> Iterator[Ended]:
+    while True:
+        try:
+            if not pipe.poll(MAX_WAIT):
+                return
+            yield pipe.recv()
+        except EOFError:
+            return
+
+
+def _work(cases: Sequence[Case], pipe: Connection) -> None:
+    """Run cases in this process, under its limits."""
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + MAX_BYTES, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    with tempfile.TemporaryDirectory(prefix="legcal-fuzz-") as top, open(os.devnull, "w") as null:
+        os.dup2(null.fileno(), 1)  # what libraries print past Python
+        os.dup2(null.fileno(), 2)
+        for number, case in enumerate(cases):
+            folder = Path(top) / str(number)
+            pipe.send(_run_one(case, folder))
+            shutil.rmtree(folder, ignore_errors=True)
+    pipe.close()
+    os._exit(0)
+
+
+def _run_one(case: Case, folder: Path) -> Ended:
+    subject = SUBJECTS[case.subject]
+    _copy(made_input(subject.input), folder / "in", subject.file, case.content())
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    begin = time.process_time()
+    signal.setitimer(signal.ITIMER_PROF, MAX_SECONDS)
+    words = words_of(subject.command, {"in": folder / "in", "out": folder / "out"})
+    outcome = run([*words, "--json"], inside=folder)
+    signal.setitimer(signal.ITIMER_PROF, 0.0)
+    seconds = time.process_time() - begin
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024.0
+    return Ended(
+        case, outcome.code, seconds, grown, _fault(outcome.code, outcome.out, outcome.err, folder)
+    )
+
+
+def _fault(code: int, out: str, err: str, folder: Path) -> str:
+    if code not in (0, 1, 2):
+        lines = [line for line in err.splitlines() if line.strip()]
+        return f"exit {code}: {lines[-1] if lines else ''}"
+    try:
+        document = json.loads(out)
+    except ValueError:
+        return "no JSON document on stdout"
+    if "error" not in document:
+        return ""
+    if (folder / "out").exists():
+        return "refused, and the output is there"
+    message = document["error"]["message"]
+    if len(message) > MAX_TEXT:
+        return f"a message of {len(message)} characters"
+    control = CONTROL.search(message)
+    if control is not None:
+        return f"the character {control[0]!r} in a message: ...{message[max(0, control.start() - 60) : control.start()]}"
+    return ""
+
+
+def _copy(source: Path, target: Path, changed: str, content: bytes) -> None:
+    """Copy an input by links, but for the file that is damaged."""
+    shutil.copytree(source, target, copy_function=os.link)
+    (target / changed).unlink()
+    (target / changed).write_bytes(content)
+
+
+def count_cases(cases: Iterable[Case]) -> Count:
+    """Run cases and count what they did."""
+    count = Count()
+    for ended in run_cases(list(cases)):
+        count.add(ended)
+    return count

@@ -1,0 +1,100 @@
+"""What is damaged: a valid file of each kind, and the command that reads it."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from characterisation.inputs import MAKERS, copy_of, made_input
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A file of an input of the characterisation, and a command that reads it.
+
+    ``command`` holds the words after ``legcal``; ``{in}`` is the folder with the damaged file,
+    ``{out}`` a place where nothing is.
+    """
+
+    input: str
+    file: str
+    command: str
+    deep: bool = False  # the command works for long where the file is still valid
+
+    @property
+    def name(self) -> str:
+        """Its input and file, in one word."""
+        return f"{self.input}:{self.file}"
+
+    @property
+    def kind(self) -> str:
+        """How the file is damaged: its suffix."""
+        suffix = Path(self.file).suffix.removeprefix(".")
+        return {"yml": "yaml", "tif": "tiff", "jpeg": "jpg", "jsonl": "json"}.get(suffix, suffix)
+
+
+SUBJECTS = (
+    Subject("model", "models/hexapod.yaml", "inspect {in}/models/hexapod.yaml"),
+    Subject("model", "urdf/hexapod.urdf", "inspect {in}/models/hexapod.yaml"),
+    Subject("formats", "gepetto/robot.yaml", "inspect {in}/gepetto"),
+    Subject("formats", "gepetto/robot.urdf", "inspect {in}/gepetto"),
+    Subject("formats", "loops.urdf", "inspect {in}/loops.urdf"),
+    Subject("formats", "planar.xml", "inspect {in}/planar.xml"),
+    Subject("tables", "tripod.csv", "new {in}/tripod.csv --unit mm -o {out}"),
+    Subject("tables", "3-rpr.yaml", "new {in}/3-rpr.yaml -o {out}"),
+    Subject("plain", "dataset.yaml", "detect {in} -o {out}"),
+    Subject("plain", "measurements.csv", "detect {in} -o {out}"),
+    Subject("plain", "camera_info.yaml", "detect {in} -o {out}"),
+    Subject("plain", "images/c1_1.png", "detect {in} -o {out}"),
+    Subject("pictures", "images/c1_1.tiff", "detect {in} -o {out}"),
+    Subject("pictures", "images/c1_2.jpg", "detect {in} -o {out}"),
+    Subject("tool-poses", "3-rpr.csv", "locate {in}/3-rpr/models/3-rpr.yaml {in}/3-rpr.csv -o {out}"),
+    Subject("3-rpr-axes", "dataset.yaml", "calibrate {in} -o {out}", deep=True),
+    Subject("3-rpr-axes", "measurements.csv", "calibrate {in} -o {out}", deep=True),
+    Subject("3-rpr-axes", "axes.csv", "calibrate {in} -o {out}", deep=True),
+    Subject("3-rpr-outlines", "observations.csv", "calibrate {in} -o {out}", deep=True),
+    Subject("3-rpr-outlines", "camera_info.yaml", "calibrate {in} -o {out}", deep=True),
+    Subject("result", "result/result.json", "calibrate {in}/set --check {in}/result", deep=True),
+    Subject("result", "result/calibrated.yaml", "evaluate {in}/result/calibrated.yaml 3-rpr"),
+    Subject("settings", "cameras.yaml", "simulate 3-rpr --level axes --poses 4 --cameras "
+            "{in}/cameras.yaml -o {out}", deep=True),
+    Subject("settings", "poses.csv", "simulate 3-rpr --level axes --poses {in}/poses.csv -o {out}",
+            deep=True),
+    Subject("settings", "camera.yaml", "simulate 3-rpr --level axes --poses 4 --camera "
+            "{in}/camera.yaml -o {out}", deep=True),
+    Subject("settings", "appearance.yaml", "simulate 3-rpr --poses 1 --views 1 --camera "
+            "{in}/camera.yaml --appearance {in}/appearance.yaml -o {out}", deep=True),
+    Subject("settings", "board.png", "camera {in}/board.png --board chessboard:5x4:20mm -o {out}"),
+)  # fmt: skip
+
+
+def _pictures(folder: Path) -> None:
+    """Save two pictures of a small dataset in other formats."""
+    shutil.copytree(copy_of("plain", folder / "plain"), folder, dirs_exist_ok=True)
+    shutil.rmtree(folder / "plain")
+    text = (folder / "measurements.csv").read_text()
+    for name, suffix in (("c1_1", "tiff"), ("c1_2", "jpg")):
+        picture = cv2.imread(str(folder / f"images/{name}.png"), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(folder / f"images/{name}.{suffix}"), picture)
+        text = text.replace(f"{name}.png", f"{name}.{suffix}")
+    (folder / "measurements.csv").write_text(text)
+
+
+def _settings(folder: Path) -> None:
+    """Write what simulate reads beside a model, and the picture of a board."""
+    shutil.copy(made_input("plain") / "camera_info.yaml", folder / "camera.yaml")
+    places = made_input("3-rpr-axes").parent / "3-rpr-places.yaml"
+    shutil.copy(places, folder / "cameras.yaml")
+    header = "leg1_prismatic,leg2_prismatic,leg3_prismatic"
+    (folder / "poses.csv").write_text(f"{header}\n0.05,0.06,0.07\n0.08,0.06,0.05\n0.07,0.09,0.06\n")
+    (folder / "appearance.yaml").write_text(
+        "lamps:\n- {direction: [0.3, 0.2, 1.0], power: 1.5}\nclutter: 2\n"
+    )
+    squares = np.kron(np.indices((7, 8)).sum(axis=0) % 2, np.ones((24, 24)))
+    cv2.imwrite(str(folder / "board.png"), (40 + 170 * squares).astype(np.uint8))
+
+
+MAKERS |= {"pictures": _pictures, "settings": _settings}
