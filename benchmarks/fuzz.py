@@ -17,8 +17,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from fuzz.running import DEEP_SHARE, Count, count_cases, drawn_cases
-from fuzz.subjects import SUBJECTS
+from fuzzing.running import DEEP_SHARE, Count, count_cases, drawn_cases
+from fuzzing.subjects import SUBJECTS
 
 
 def main() -> None:

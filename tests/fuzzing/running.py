@@ -25,8 +25,8 @@ import numpy as np
 from characterisation.inputs import made_input
 from characterisation.running import run, words_of
 
-from fuzz.mutations import mutate
-from fuzz.subjects import SUBJECTS, Subject
+from fuzzing.mutations import mutate
+from fuzzing.subjects import SUBJECTS, Subject
 
 MAX_SECONDS = 5.0  # of work of the processor
 MAX_WAIT = 60.0  # [s] on the wall, with other work beside it
