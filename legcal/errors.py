@@ -8,6 +8,12 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 
+MAX_WORD = 200  # characters without a space: longer ones are cut in the middle
+MAX_SENTENCE = 4000  # characters of one problem
+_CONTROL = re.compile(  # not printable, or turning the direction of what is
+    r"[^\x20-\x7e\xa0-\u200d\u2010-\u2027\u2030-\u2065\u206a-\ud7ff\ue000-\ufefe\uff00-\U0010ffff]"
+)
+_LONG_WORD = re.compile(rf"\S{{{MAX_WORD + 1},}}")
 _MANY_ALIKE = 10  # problems of one kind: a message that has more spells out the first few
 _SPELT_OUT = 5
 _PARTICULAR = re.compile(r"'[^']*'|\S*\d\S*")  # what differs between problems of one kind
@@ -29,23 +35,46 @@ class LegcalError(Exception):
     exit_code = 1
 
     def __init__(self, problems: str | Sequence[str]) -> None:
-        self.problems = (problems,) if isinstance(problems, str) else tuple(problems)
+        found = (problems,) if isinstance(problems, str) else problems
+        self.problems = tuple(printable(problem) for problem in found)
         super().__init__("\n".join(_shortened(self.problems)))
 
     def __reduce__(self) -> tuple[type, tuple[tuple[str, ...]]]:
         return type(self), (self.problems,)
 
 
+def printable(text: str) -> str:
+    """Return text, also of foreign files, as it may be shown: one line, no control characters.
+
+    Control characters (escape sequences of terminals, changes of direction, ends of lines) are
+    written as escapes; words and texts that are too long are cut in the middle.
+    """
+    text = _LONG_WORD.sub(lambda word: _cut(word[0], MAX_WORD), text)
+    text = _CONTROL.sub(_escaped, text)
+    return _cut(text, MAX_SENTENCE)
+
+
+def _escaped(match: re.Match[str]) -> str:
+    character = match[0]
+    return " " if character in "\n\r\t" else character.encode("unicode_escape").decode()
+
+
+def _cut(text: str, most: int) -> str:
+    if len(text) <= most:
+        return text
+    return f"{text[: 2 * most // 3]} ... {text[-most // 4 :]}"
+
+
 def _shortened(problems: Sequence[str]) -> list[str]:
     """Return sentences; of more than ten of a kind five, and how many there are besides."""
     kinds = [_PARTICULAR.sub("", problem) for problem in problems]
-    total, told = Counter(kinds), Counter[str]()
+    total, shown = Counter(kinds), Counter[str]()
     lines = []
     for kind, problem in zip(kinds, problems, strict=True):
-        told[kind] += 1
-        if total[kind] <= _MANY_ALIKE or told[kind] <= _SPELT_OUT:
+        shown[kind] += 1
+        if total[kind] <= _MANY_ALIKE or shown[kind] <= _SPELT_OUT:
             lines.append(problem)
-        elif told[kind] == _SPELT_OUT + 1:
+        elif shown[kind] == _SPELT_OUT + 1:
             lines.append(f"... and {total[kind] - _SPELT_OUT} more like these.")
     return lines
 
