@@ -23,12 +23,12 @@ from fuzzing.subjects import SUBJECTS
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--inputs", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--keep", type=Path)
-    parser.add_argument("--deep", type=float, default=DEEP_SHARE)
+    parser.add_argument("--keep", type=Path, help="folder for the damaged files of the faults")
+    parser.add_argument("--deep", type=float, default=DEEP_SHARE, help="share of slow commands")
     parser.add_argument("--only", default="", help="subjects whose name holds this")
     asked = parser.parse_args()
     begin = time.perf_counter()
@@ -38,33 +38,21 @@ def main() -> None:
     total = Count()
     with ProcessPoolExecutor(asked.workers) as pool:
         for count in pool.map(count_cases, parts):
-            total.codes += count.codes
-            for ended in (*count.faults, count.slowest, count.largest):
-                if ended is not None and (ended.fault or not total.faults):
-                    pass
-            total.faults += count.faults
-            for name in ("slowest", "largest"):
-                one, other = getattr(total, name), getattr(count, name)
-                value = "seconds" if name == "slowest" else "megabytes"
-                if one is None or (other and getattr(other, value) > getattr(one, value)):
-                    setattr(total, name, other)
-    print(
-        f"{len(cases)} inputs in {time.perf_counter() - begin:.0f} s: exit codes {dict(total.codes)}"
-    )
+            total.include(count)
+    seconds = time.perf_counter() - begin
+    print(f"{total.n_cases} inputs in {seconds:.0f} s: exit codes {dict(total.codes)}")
     for word, ended in (("slowest", total.slowest), ("largest", total.largest)):
         if ended is not None:
-            name = SUBJECTS[ended.case.subject].name
-            print(
-                f"{word}: {name} seed {ended.case.seed}: {ended.seconds:.2f} s, {ended.megabytes:.0f} MB"
-            )
+            what = f"{ended.seconds:.2f} s, {ended.megabytes:.0f} MB"
+            print(f"{word}: {ended.case.name}: {what}")
     print(f"{len(total.faults)} faults")
     for ended in total.faults:
-        subject = SUBJECTS[ended.case.subject]
-        print(f"  {subject.name} seed {ended.case.seed}: {ended.fault[:300]}")
+        print(f"  {ended.case.name}: {ended.fault[:300]}")
         if asked.keep:
             asked.keep.mkdir(parents=True, exist_ok=True)
-            name = f"{ended.case.seed}-{subject.name}".replace("/", "_").replace(":", "_")
+            name = ended.case.name.replace("/", "_").replace(":", "_").replace(" ", "_")
             (asked.keep / name).write_bytes(ended.case.content())
+    sys.exit(bool(total.faults))
 
 
 if __name__ == "__main__":

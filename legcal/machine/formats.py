@@ -85,6 +85,9 @@ def read_source(model: str | Path) -> Source:
     source = _read_xml(path) if is_xml else read_yaml_source(path)
     if source.file.legcal is not None:
         return source
+    known = {*source.urdf.links, *source.urdf.joints}
+    if not all(name in known for pair in source.file.closed_loop for name in pair):
+        return source  # refused later, with the place of the name
     check_one_mechanism(source.urdf, source.file.closed_loop, source.path)
     return completed(source)
 
@@ -394,9 +397,6 @@ def _motors(robot: etree._Element, urdf: Urdf, problems: Problems) -> tuple[list
 
 def completed(source: Source) -> Source:
     """Return a mechanism without a block with the poses where it is closed, and all travels."""
-    known = {*source.urdf.links, *source.urdf.joints}
-    if not all(name in known for pair in source.file.closed_loop for name in pair):
-        return source  # refused later, with the place of the name
     closures = [
         Closure("3d" if kind == "3d" else "6d", one, two)
         for (one, two), kind in zip(source.file.closed_loop, source.file.type, strict=True)

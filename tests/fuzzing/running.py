@@ -17,21 +17,28 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 from characterisation.inputs import made_input
 from characterisation.running import run, words_of
 
 from fuzzing.mutations import mutate
-from fuzzing.subjects import SUBJECTS, Subject
+from fuzzing.subjects import SUBJECTS
+from legcal.machine import Machine, loader
+from legcal.machine.files import find_model
+from legcal.machine.formats import read_source
+from legcal.machine.spanning_tree import Source
 
 MAX_SECONDS = 5.0  # of work of the processor
 MAX_WAIT = 60.0  # [s] on the wall, with other work beside it
 MAX_BYTES = 1 << 30
 MAX_TEXT = 20_000  # characters that a command prints about a damaged file
+MOST_OF_CHILD = 400  # cases, before another process starts anew
 DEEP_SHARE = 0.03
 CONTROL = re.compile(
     r"[^\x20-\x7e\xa0-\u2027\u2030-\ud7ff\ue000-\U0010ffff\n]|[\x80-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]"
@@ -44,6 +51,11 @@ class Case:
 
     subject: int
     seed: int
+
+    @property
+    def name(self) -> str:
+        """Which file, and its seed."""
+        return f"{SUBJECTS[self.subject].name} seed {self.seed}"
 
     def content(self) -> bytes:
         """Return the damaged file."""
@@ -67,6 +79,7 @@ class Ended:
 class Count:
     """What many cases did."""
 
+    n_cases: int = 0
     codes: Counter[str] = field(default_factory=Counter)
     faults: list[Ended] = field(default_factory=list)
     slowest: Ended | None = None
@@ -74,25 +87,29 @@ class Count:
 
     def add(self, ended: Ended) -> None:
         """Count one more."""
-        self.codes[str(ended.code)] += 1
-        if ended.fault:
-            self.faults.append(ended)
-        if self.slowest is None or ended.seconds > self.slowest.seconds:
-            self.slowest = ended
-        if self.largest is None or ended.megabytes > self.largest.megabytes:
-            self.largest = ended
+        faults = [ended] if ended.fault else []
+        self.include(Count(1, Counter([str(ended.code)]), faults, ended, ended))
+
+    def include(self, other: Count) -> None:
+        """Count those of another count too."""
+        self.n_cases += other.n_cases
+        self.codes += other.codes
+        self.faults += other.faults
+        both = [ended for ended in (self.slowest, other.slowest) if ended is not None]
+        self.slowest = max(both, key=lambda ended: ended.seconds, default=None)
+        both = [ended for ended in (self.largest, other.largest) if ended is not None]
+        self.largest = max(both, key=lambda ended: ended.megabytes, default=None)
 
 
 def drawn_cases(count: int, seed: int, deep_share: float = DEEP_SHARE) -> list[Case]:
     """Return that many cases, in turn of all subjects; few of those that take long."""
     chance = np.random.default_rng(seed)
-    deep = [k for k, subject in enumerate(SUBJECTS) if subject.deep]
-    shallow = [k for k, subject in enumerate(SUBJECTS) if not subject.deep]
-    cases = []
-    for number in range(count):
-        group = deep if chance.random() < deep_share else shallow
-        cases.append(Case(group[int(chance.integers(len(group)))], 1_000_000 * seed + number))
-    return cases
+    shares = np.array([subject.share for subject in SUBJECTS])
+    is_deep = np.array([subject.deep for subject in SUBJECTS])
+    for part, chosen in ((deep_share, is_deep), (1.0 - deep_share, ~is_deep)):
+        shares[chosen] *= part / shares[chosen].sum()
+    drawn = chance.choice(len(SUBJECTS), count, p=shares)
+    return [Case(int(k), 1_000_000 * seed + number) for number, k in enumerate(drawn)]
 
 
 def run_cases(cases: Sequence[Case], *, lone: bool = False) -> Iterator[Ended]:
@@ -102,11 +119,13 @@ def run_cases(cases: Sequence[Case], *, lone: bool = False) -> Iterator[Ended]:
     """
     for case in cases:
         made_input(SUBJECTS[case.subject].input)
+    _read_shipped_models_once()
     context = get_context("fork")
     left = list(cases)
     while left:
+        batch, left = left[:MOST_OF_CHILD], left[MOST_OF_CHILD:]
         ours, theirs = context.Pipe(duplex=False)
-        child = context.Process(target=_work, args=(left, theirs))
+        child = context.Process(target=_work, args=(batch, theirs))
         child.start()
         theirs.close()
         done = 0
@@ -114,17 +133,35 @@ def run_cases(cases: Sequence[Case], *, lone: bool = False) -> Iterator[Ended]:
             done += 1
             yield ended
         child.join(1.0)
-        if done < len(left):  # the child died, or hangs
+        if done < len(batch):  # the child died, or hangs
             child.kill()
             child.join()
-            case = left[done]
+            case = batch[done]
             how = child.exitcode
             if lone or done == 0:
                 yield Ended(case, None, MAX_SECONDS, 0.0, _death(how))
             else:
                 yield from run_cases([case], lone=True)
-            done += 1
-        left = left[done:]
+            left = batch[done + 1 :] + left
+
+
+@cache
+def _read_shipped_models_once() -> None:
+    """Let all cases share the models that none of them damages: reading them takes longest."""
+    load = loader._load
+    load_once = cache(load)
+    shipped = {path: read_source(path) for path in map(find_model, ("hexapod", "3-rpr"))}
+
+    def read(model: str | Path) -> Source:
+        return shipped.get(Path(model)) or read_source(model)
+
+    def loaded(source: Source) -> Machine:
+        return (load_once if source in shipped.values() else load)(source)
+
+    patch.object(loader, "read_source", read).start()
+    patch.object(loader, "_load", loaded).start()
+    for source in shipped.values():
+        load_once(source)
 
 
 def _death(exit_code: int | None) -> str:
@@ -194,7 +231,8 @@ def _fault(code: int, out: str, err: str, folder: Path) -> str:
         return f"a message of {len(message)} characters"
     control = CONTROL.search(message)
     if control is not None:
-        return f"the character {control[0]!r} in a message: ...{message[max(0, control.start() - 60) : control.start()]}"
+        before = message[: control.start()][-60:]
+        return f"the character {control[0]!r} in a message: ...{before}"
     return ""
 
 

@@ -23,6 +23,7 @@ class Subject:
     file: str
     command: str
     deep: bool = False  # the command works for long where the file is still valid
+    share: float = 1.0  # how often it is drawn, in comparison with others
 
     @property
     def name(self) -> str:
@@ -44,21 +45,23 @@ SUBJECTS = (
     Subject("formats", "loops.urdf", "inspect {in}/loops.urdf"),
     Subject("formats", "planar.xml", "inspect {in}/planar.xml"),
     Subject("tables", "tripod.csv", "new {in}/tripod.csv --unit mm -o {out}"),
-    Subject("tables", "3-rpr.yaml", "new {in}/3-rpr.yaml -o {out}"),
+    Subject("tables", "3-rpr.yaml", "new {in}/3-rpr.yaml -o {out}", share=0.5),
     Subject("plain", "dataset.yaml", "detect {in} -o {out}"),
     Subject("plain", "measurements.csv", "detect {in} -o {out}"),
     Subject("plain", "camera_info.yaml", "detect {in} -o {out}"),
     Subject("plain", "images/c1_1.png", "detect {in} -o {out}"),
     Subject("pictures", "images/c1_1.tiff", "detect {in} -o {out}"),
-    Subject("pictures", "images/c1_2.jpg", "detect {in} -o {out}"),
-    Subject("tool-poses", "3-rpr.csv", "locate {in}/3-rpr/models/3-rpr.yaml {in}/3-rpr.csv -o {out}"),
+    Subject("pictures", "images/c1_2.jpg", "detect {in} -o {out}", share=0.3),
+    Subject("tool-poses", "3-rpr.csv",
+            "locate {in}/3-rpr/models/3-rpr.yaml {in}/3-rpr.csv -o {out}", deep=True),
     Subject("3-rpr-axes", "dataset.yaml", "calibrate {in} -o {out}", deep=True),
     Subject("3-rpr-axes", "measurements.csv", "calibrate {in} -o {out}", deep=True),
     Subject("3-rpr-axes", "axes.csv", "calibrate {in} -o {out}", deep=True),
     Subject("3-rpr-outlines", "observations.csv", "calibrate {in} -o {out}", deep=True),
     Subject("3-rpr-outlines", "camera_info.yaml", "calibrate {in} -o {out}", deep=True),
     Subject("result", "result/result.json", "calibrate {in}/set --check {in}/result", deep=True),
-    Subject("result", "result/calibrated.yaml", "evaluate {in}/result/calibrated.yaml 3-rpr"),
+    Subject("result", "result/calibrated.yaml",
+            "evaluate {in}/result/calibrated.yaml 3-rpr", deep=True),
     Subject("settings", "cameras.yaml", "simulate 3-rpr --level axes --poses 4 --cameras "
             "{in}/cameras.yaml -o {out}", deep=True),
     Subject("settings", "poses.csv", "simulate 3-rpr --level axes --poses {in}/poses.csv -o {out}",
@@ -78,6 +81,7 @@ def _pictures(folder: Path) -> None:
     text = (folder / "measurements.csv").read_text()
     for name, suffix in (("c1_1", "tiff"), ("c1_2", "jpg")):
         picture = cv2.imread(str(folder / f"images/{name}.png"), cv2.IMREAD_UNCHANGED)
+        assert picture is not None
         cv2.imwrite(str(folder / f"images/{name}.{suffix}"), picture)
         text = text.replace(f"{name}.png", f"{name}.{suffix}")
     (folder / "measurements.csv").write_text(text)
