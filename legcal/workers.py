@@ -1,22 +1,37 @@
-"""Work on images one after the other, or in several processes.
+"""Work on images one after the other or in several processes: the results are the same, bit by bit.
 
 Threads do not pay: the work is many short steps, and they would wait for each other.
 """
 
+import copyreg
 import os
 import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from threading import Thread
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
+
+from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import OutOfResources
 
 T = TypeVar("T")
+
+
+def _reduced(motion: RigidTransform) -> tuple[Any, ...]:
+    """Return how a motion is pickled: SciPy would make its matrix orthogonal once more.
+
+    That changes last digits, and measurements by a pickled motion would be others.
+    """
+    return partial(RigidTransform, normalize=False), (motion.as_matrix(),)
+
+
+copyreg.pickle(RigidTransform, _reduced)
 
 _CHUNKS = 4  # tasks for each process: few enough to spare messages, enough to share the work
 

@@ -12,8 +12,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 from dataset_folder import HEXAPOD, Folder, folder
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import cli, load_dataset, load_mechanism
 from legcal.errors import DatasetError, ModelError, OutOfResources, UsageError
@@ -100,6 +102,16 @@ def _runs(pid: int) -> bool:
 def test_a_process_that_is_ended_from_outside_is_said_in_one_sentence() -> None:
     with pytest.raises(OutOfResources, match="ended from outside"), worker_pool(2) as run:
         list(run(os._exit, [1, 1]))
+
+
+def test_what_goes_to_another_process_and_back_is_the_same_bit_by_bit() -> None:
+    rng = np.random.default_rng(0)
+    rotations = Rotation.random(64, rng=rng)
+    motions = tuple(RigidTransform.from_components(rng.normal(size=(64, 3)), rotations))
+    with worker_pool(2) as run:
+        found = list(run(motions.__getitem__, range(64)))
+    for one, other in zip(motions, found, strict=True):
+        assert one.as_matrix().tobytes() == other.as_matrix().tobytes()
 
 
 def test_processes_do_not_finish_work_that_is_not_wanted_any_more() -> None:
