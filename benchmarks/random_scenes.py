@@ -44,7 +44,7 @@ Shown = tuple[tuple[LegView, ...], ...]
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """What the method is told.
+    """What the method is given.
 
     Attributes
     ----------

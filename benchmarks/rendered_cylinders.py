@@ -42,7 +42,7 @@ class Looks:
     blur : float
         Of the lens [px]; that of the pixels comes on top.
     gamma : float
-        Of the camera; negative if legcal is not told.
+        Of the camera; negative if legcal is not given it.
     electrons : float
         Of a pixel at full scale.
     bits : int

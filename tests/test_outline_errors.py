@@ -429,7 +429,7 @@ def test_gamma_of_a_camera_is_found_by_its_outlines(session: Session) -> None:
     of_fit, unseen = gamma.fitted_sigma / RECOVERED_SHARE, np.log(gamma.gamma)  # as much again
     assert gamma.sigma == pytest.approx(np.sqrt(of_fit**2 + unseen**2 + LIMB_SIGMA**2))
     assert np.log(gamma.gamma) == pytest.approx(LOG_GAMMA, abs=0.06)  # the fit's own three sigmas
-    assert any("The gamma of the camera of views c1, c2, c3 is not told" in n for n in found.notes)
+    assert any("The gamma of the camera of views c1, c2, c3 is not given" in n for n in found.notes)
     assert not any("gamma" in name for name in found.biases)
     as_linear = refine(session.legs, session.measurements, outlines, start)
     right, wrong = (np.sqrt(np.mean(joint_errors(s.parameters) ** 2)) for s in (found, as_linear))
@@ -521,9 +521,11 @@ def test_search_of_a_gamma_converges(true: float, share: float) -> None:
 
 def test_note_on_a_gamma_says_how_well_it_is_known_and_names_few_views() -> None:
     clear = str(EstimatedGamma(("c1",), 2.1, 0.05, 2.0))
-    assert clear.startswith("The gamma of the camera of view c1 is not told: found 2.10 +- 0.43 by")
+    assert clear.startswith(
+        "The gamma of the camera of view c1 is not given: found 2.10 +- 0.43 by"
+    )
     vague = str(EstimatedGamma(tuple(f"c{k}" for k in range(8)), 1.2, 0.4, 1.0))
-    assert "of views c0, c1, c2, c3, c4 and 3 more is not told, and its outlines hardly" in vague
+    assert "of views c0, c1, c2, c3, c4 and 3 more is not given, and its outlines hardly" in vague
 
 
 @pytest.mark.parametrize(
@@ -548,7 +550,7 @@ def test_photographs_without_a_gamma_are_read_with_the_one_they_show(tmp_path: P
     session = settings(level="photographs", poses=5, views=3, seed=1, tell_gamma=False)
     data = simulate_folder("hexapod", tmp_path / "data", session).folder
     assert "gamma" not in (data / "dataset.yaml").read_text()
-    assert any("c1, c2, c3 is not told and was taken as 1" in n for n in detect(data).notes)
+    assert any("c1, c2, c3 is not given and was taken as 1" in n for n in detect(data).notes)
     found = legcal.calibrate(data)
     (gamma,) = found.solution.gammas
     assert abs(np.log(gamma.gamma / 2.2)) < 3.0 * gamma.sigma

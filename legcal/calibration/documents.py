@@ -22,8 +22,8 @@ from pydantic import (
 from legcal.errors import DatasetError
 from legcal.files import Document, Number, Version, describe, read_text, validate
 
-Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
-Axes = dict[str, Vector]  # unit vectors by leg
+Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
+AxesByLeg = dict[str, Triple]  # unit vectors
 Matrix = list[list[Number]]
 Positive = Annotated[Number, Field(gt=0.0)]
 NotNegative = Annotated[Number, Field(ge=0.0)]
@@ -32,18 +32,18 @@ NotNegative = Annotated[Number, Field(ge=0.0)]
 class Pose(Document):
     """A rigid motion."""
 
-    xyz: Vector
+    xyz: Triple
     quat_xyzw: Annotated[list[Number], Field(min_length=4, max_length=4)]
 
 
 class Legs(Document):
     """The legs in R_b and R_e [m, rad]."""
 
-    base_joints: list[Vector]
-    platform_joints: list[Vector]
+    base_joints: list[Triple]
+    platform_joints: list[Triple]
     offsets: list[Number | None]  # the length of a constant leg, null for a passive one
-    base_axes: Axes  # of axes that are parameters
-    platform_axes: Axes
+    base_axes: AxesByLeg  # of axes that are parameters
+    platform_axes: AxesByLeg
     twists: dict[str, Number]
 
 
@@ -107,7 +107,7 @@ class Stages(Document):
     staged: Staged | NoSteps
 
 
-class Noise(Document):
+class NoiseBlock(Document):
     """The noise of the outlines."""
 
     scale: Positive
@@ -115,14 +115,19 @@ class Noise(Document):
     tilt_px: NotNegative
 
 
-class Residuals(Document):
-    """What was left of the observations."""
+class FitQuality(Document):
+    """How large the residuals of a fit are."""
 
     chi2: Number
     dof: int
     rms_px: Number | None
+
+
+class ResidualsBlock(FitQuality):
+    """The same of a calibration, with the noise that they show."""
+
     rms_axes: Number | None
-    noise: Noise
+    noise: NoiseBlock
     shared_px: dict[str, NotNegative]
 
 
@@ -204,21 +209,20 @@ class Holdout(Document):
     platform: HoldoutPlatform | None
 
 
-class Result(Document):
-    """``result.json``."""
+class Heading(Document):
+    """What a result is worth, and the order of its legs."""
 
     legcal_result: Version
     status: Literal["converged"]
     verdict: str
     trustworthy: bool
     legs: list[str]  # the order of what follows
-    base_joints: list[Vector]
-    platform_joints: list[Vector]
-    offsets: list[Number | None]
-    base_axes: Axes
-    platform_axes: Axes
-    twists: dict[str, Number]
-    nominal_axes: dict[str, Axes]  # that turns count from, by side
+
+
+class Result(Legs, Heading):
+    """``result.json``: the heading, the calibrated legs, and how well they are known."""
+
+    nominal_axes: dict[str, AxesByLeg]  # that turns count from, by side
     parameters: Annotated[list[ParameterRow], Field(min_length=1)]
     covariance: Matrix  # of the estimated parameters, in their order
     kinematic: Kinematic
@@ -228,7 +232,7 @@ class Result(Document):
     cameras: dict[str, dict[str, StrictInt | StrictFloat | StrictStr]]  # as they came
     gammas: list[Gamma]
     stages: Stages
-    residuals: Residuals
+    residuals: ResidualsBlock
     board: BoardPose | None = None  # left out without a board
     start: str
     platform: PlatformBlock | None
@@ -290,14 +294,6 @@ class MovedPlatform(Document):
     sigma_dE_rad: float
 
 
-class CheckResiduals(Document):
-    """What was left of the new observations."""
-
-    chi2: float
-    dof: int
-    rms_px: float | None
-
-
 class CheckDocument(Document):
     """What ``legcal calibrate --check --json`` prints."""
 
@@ -314,7 +310,7 @@ class CheckDocument(Document):
     explanations: list[ExplanationBlock]
     platform: MovedPlatform
     images: int
-    residuals: CheckResiduals
+    residuals: FitQuality  # of the new images
     notes: list[str]
 
 

@@ -153,7 +153,7 @@ def _notes(data: OrderedDataset, placement: Placement) -> list[str]:
     notes = hint_notes([view.name for view in views], hints, placement.T_base_camera, BEFORE_FIT)
     without_gamma = [view.name for view in views if not view.camera.gamma_is_given]
     gamma = (
-        f"The gamma of {few_views(without_gamma)} is not told and was taken as 1: outlines of a "
+        f"The gamma of {few_views(without_gamma)} is not given and was taken as 1: outlines of a "
         "camera that encodes light lie off by up to half of the blur; write gamma of the views in "
         "dataset.yaml, or let legcal calibrate estimate it."
     )

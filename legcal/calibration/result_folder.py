@@ -28,7 +28,7 @@ from legcal.calibration.documents import (
     PlatformBlock,
     Pose,
     PoseAccuracy,
-    Residuals,
+    ResidualsBlock,
     Result,
     SensitivityRow,
     Staged,
@@ -169,7 +169,7 @@ def result_of(calibration: Calibration) -> Result:
             if steps.legs is None
             else Staged(**_legs(names, steps.legs), diagnostics=list(steps.diagnostics))
         ),
-        residuals=Residuals.model_validate(solution),
+        residuals=ResidualsBlock.model_validate(solution),
         board=_board(calibration),
         start=solution.start,
         platform=_platform(calibration),

@@ -1,4 +1,4 @@
-"""What a calibration gives: parameters with their uncertainty, and whether to believe them."""
+"""What a calibration gives: parameters with their uncertainty, and whether to trust them."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def _verdict_on_parameters(dataset: Dataset, solution: Solution) -> Verdict:
     found = (
         f"joints and lengths change by {1e3 * change:.3f} mm against the nominal model, known to "
         f"{1e3 * sigma:.3f} mm (1 sigma, both rms); the motors do not determine the pose of the "
-        "platform, so that no error of it is told"
+        "platform, so that no error of it is stated"
     )
     return _verdict(change, sigma, found)
 

@@ -18,8 +18,8 @@ from legcal.calibration.change_detection import (
 )
 from legcal.calibration.documents import (
     CheckDocument,
-    CheckResiduals,
     ExplanationBlock,
+    FitQuality,
     MovedPlatform,
 )
 from legcal.calibration.joint_fit import (
@@ -136,7 +136,7 @@ class Check:
                 sigma_dE_rad=pair.expected_rotation,
             ),
             images=self.dataset.measurements.n_rows,
-            residuals=CheckResiduals.model_validate(self.solution),
+            residuals=FitQuality.model_validate(self.solution),
             notes=list(self.notes),
         ).document()
 

@@ -64,7 +64,7 @@ def calibrate(
         float | None,
         typer.Option(
             metavar="PART",
-            help="Keep this part of the images aside (0.2: a fifth) and tell how well the fit of "
+            help="Keep this part of the images aside (0.2: a fifth) and report how well the fit of "
             "the others predicts them.",
             rich_help_panel=_TESTS,
         ),

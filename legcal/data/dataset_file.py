@@ -149,7 +149,7 @@ def hand_held_problems(path: Path, views: Mapping[str, ViewEntry], *, has_board:
     ]
     problems += [
         f"{path}: views.{name}.T_base_camera could not be used: found one pose of a camera that is "
-        "held in the hand, needed none, the board tells the pose of every image; remove it."
+        "held in the hand, needed none, the board gives the pose of every image; remove it."
         for name, view in held.items()
         if view.T_base_camera is not None
     ]

@@ -76,7 +76,7 @@ def _unknown() -> Array:
 class Outlines(ImageTable):
     """Outlines of cylinders in images, one row an outline (eqs 2, 3, 5).
 
-    What tells how well an outline was seen and how it depends on the gamma may be left out; it is
+    How well an outline was seen and how it depends on the gamma may be left out; it is
     NaN where nothing was found and for outlines that were given or edited.
     """
 
@@ -212,7 +212,7 @@ def read_observations(
     """Return the table ``observations.csv`` in the order of the file.
 
     (a, b, c) is normalised; the ends are put in order, nearer to the base joint first, as the
-    sign of eq (3) tells it. With ``skip_stale``, detected outlines of images, legs or parts that
+    sign of eq (3) says which. With ``skip_stale``, detected outlines of images, legs or parts that
     are no longer there are left out, as in a table that legcal wrote for an earlier state of the
     dataset. Raises DatasetError with one sentence for each thing that is wrong.
     """

@@ -182,7 +182,7 @@ def _board(board: BoardReport, of: int) -> str:
 
 
 def _intrinsics(found: CameraIntrinsics) -> str:
-    """Return what the legs tell of a camera."""
+    """Return what the legs determine of a camera."""
     camera = f"Camera of {found.camera}: the legs"
     known = {name: sigma for name, sigma in found.sigma.items() if sigma is not None}
     if not found.determined:

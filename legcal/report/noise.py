@@ -86,7 +86,7 @@ def _difference(noise: DatasetNoise) -> str | None:
     side = "outside" if mean >= 0.0 else "inside"
     return (
         f"Averaged over repeats, Canny's outlines lie {abs(mean):.3f} px {side} the detector's "
-        f"({rms:.3f} px rms): bias of at least one of them, of which the spread tells nothing."
+        f"({rms:.3f} px rms): bias of at least one of them, which the spread does not show."
     )
 
 
