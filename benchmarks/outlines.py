@@ -28,11 +28,11 @@ from rendered_cylinders import (
     Looks,
     Photographed,
     draw_looks,
+    grey_levels,
     photograph,
 )
 
 from legcal.geometry.types import Array
-from legcal.perception.light import to_grey
 from legcal.vision.cylinder import EPSILON
 
 START = 0.4  # how far the start is off at each end [px]
@@ -68,7 +68,7 @@ def outcomes(scene: Photographed, method: str, rng: np.random.Generator) -> list
     found: list[list[tuple[Array, Array]]] = [[], []]
     for image in scene.images:
         start = scene.v + START * rng.standard_normal((2, 2))
-        ends = MEASURED[method](scene, to_grey(image), start)
+        ends = MEASURED[method](scene, grey_levels(image), start)
         for edge, (line, epsilon) in enumerate(zip(ends, EPSILON, strict=True)):
             if line is not None:
                 found[edge].append((epsilon * line[0], line[1]))

@@ -11,11 +11,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array, Image
-from legcal.perception.light import Grey, to_grey
 from legcal.simulation import Appearance, Light, prepare_view
 from legcal.simulation.rendering.rays import in_view
 from legcal.simulation.rendering.scene import Canvas, develop
 from legcal.simulation.solids import Cylinder, Material, PlacedSolid, Solid
+from legcal.vision import Grey
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 from legcal.vision.visibility import Band, band_of_leg
@@ -160,7 +160,9 @@ def photograph(looks: Looks, rng: np.random.Generator, times: int = PHOTOGRAPHS)
     light *= np.float32(rng.uniform(0.5, 0.95) / np.quantile(light, 0.98))
     images = [develop(light.copy(), appearance, rng) for _ in range(times)]
     plain = replace(appearance, electrons=np.inf, bits=16)
-    contrast = _contrasts(to_grey(develop(light.copy(), plain, rng)), camera, band, v, looks.blur)
+    contrast = _contrasts(
+        grey_levels(develop(light.copy(), plain, rng)), camera, band, v, looks.blur
+    )
     told = replace(camera, gamma=1.0) if looks.gamma < 0.0 else camera
     return Photographed(looks, images, told, band, v, contrast)
 
@@ -213,6 +215,16 @@ def _contrasts(grey: Grey, camera: Camera, band: Band, v: Array, blur: float) ->
         )
         contrasts.append(float(inside - outside))
     return np.array(contrasts)
+
+
+def grey_levels(image: Image) -> Grey:
+    """Return an image of 8 or 16 bits, grey or in colour (BGR), as grey levels 0 to 255."""
+    values = image.astype(np.float32)
+    if image.dtype == np.uint16:
+        values /= np.float32(257.0)
+    if values.ndim == 3:
+        values = np.asarray(cv2.cvtColor(values, cv2.COLOR_BGR2GRAY), dtype=np.float32)
+    return values
 
 
 def interpolated(grey: Grey, camera: Camera, xy: Array) -> Grey:

@@ -14,16 +14,18 @@ from typing import Any
 
 import cv2
 import numpy as np
+from rendered_cylinders import grey_levels
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
-from legcal.geometry.types import Array, Image
+from legcal.geometry.types import Array
 from legcal.machine import Machine, forward_kinematics
 from legcal.perception.detection import measure_outlines
 from legcal.perception.placement import Placement, Search
 from legcal.perception.recognition import recognise
+from legcal.vision import Grey
 from legcal.vision.cylinder import EPSILON
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -121,11 +123,11 @@ def main() -> None:
     wanted = np.ones((len(measurements.views), len(cylinders)), dtype=np.bool_)
     names = machine.leg_names
 
-    def load(row: int) -> Image:
+    def load(row: int) -> Grey:
         image = cv2.imread(str(DATASET / measurements.image[row]), cv2.IMREAD_UNCHANGED)
         if image is None:
             raise FileNotFoundError(measurements.image[row])
-        return np.asarray(image)
+        return grey_levels(image)
 
     A, B = joint_centres(machine, measurements)
     rough = [view.T_base_camera for view in measurements.views]

@@ -30,6 +30,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from random_scenes import Given, Scene, Truth, draw
+from rendered_cylinders import grey_levels
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data.outlines import Outlines
@@ -37,7 +38,6 @@ from legcal.geometry.types import Array, Image
 from legcal.perception.camera_search import NOMINAL_JOINT_ERROR, place_camera, refined, scores
 from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
 from legcal.perception.detection import measure_outlines
-from legcal.perception.light import to_grey
 from legcal.perception.pair_matching import CameraPoses, Picture, leg_segments
 from legcal.perception.placement import Placement, Search, group_views
 from legcal.perception.recognition import recognise
@@ -67,8 +67,8 @@ def find(given: Given) -> Found:
     n_legs, m = len(given.leg_names), given.measurements
     wanted = np.ones((1, n_legs), dtype=np.bool_)
     search = Search(
-        lambda row: given.images[row], m, given.A_base, given.B_base, given.cylinders, wanted,
-        given.leg_names,
+        lambda row: grey_levels(given.images[row]), m, given.A_base, given.B_base,
+        given.cylinders, wanted, given.leg_names,
     )  # fmt: skip
     begin = time.process_time()
     rows = np.arange(len(given.images))
@@ -259,7 +259,7 @@ def look(seed: int, folder: Path) -> dict[str, Any]:
     given, truth = scene.given, scene.truth
     for row, image in enumerate(given.images):
         picture = _eight_bits(image)
-        pairs = find_candidate_pairs(find_segments(to_grey(image), given.camera))
+        pairs = find_candidate_pairs(find_segments(grey_levels(image), given.camera))
         for middle, along, half in zip(pairs.middle, pairs.along, pairs.half_length, strict=True):
             ends = np.stack([middle - half * along, middle + half * along])
             _line(picture, given.camera.distort(ends), (150, 150, 150), 1)

@@ -25,12 +25,10 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import load_dataset
 from legcal.data.outlines import no_outlines
-from legcal.geometry.types import Image
 from legcal.machine import forward_kinematics
 from legcal.perception import Photographs, Placement, measure_photographs, place
 from legcal.perception.detection import measure_outlines
-from legcal.perception.image_quality import expose
-from legcal.perception.light import to_grey
+from legcal.perception.image_quality import measure_exposure
 from legcal.perception.placement import group_views
 from legcal.perception.view_fit import refine_views
 from legcal.progress import no_progress
@@ -85,14 +83,14 @@ def measure_speed() -> None:
     """Print the time of every stage, and images a second."""
     photographs, scene = sample()
     rows = photographs.detect.tolist()
-    decoded: list[Image] = [np.asarray(photographs.load(row)) for row in rows]
+    decoded = [photographs.load(row) for row in rows]
     photographs = replace(photographs, load=decoded.__getitem__)
     watch = Stopwatch(len(rows))
     begin = np.array(rows[:3])
     measure_photographs(
         replace(photographs, detect=begin), scene, no_progress
     )  # what is computed only once
-    watch("exposure and blur", lambda: [expose(to_grey(image)) for image in decoded])
+    watch("exposure and blur", lambda: [measure_exposure(image) for image in decoded])
     near = watch("recognition near poses", lambda: place(photographs, scene, no_progress))
     watch("recognition without", lambda: place(photographs, without_poses(scene), no_progress))
     search = photographs.search(scene)
@@ -145,7 +143,7 @@ def peak_memory(n: int) -> float:
     )
     scene = replace(scene, A_base=scene.A_base[rows], B_base=scene.B_base[rows])
     for row in range(n):
-        expose(to_grey(photographs.load(row)))
+        measure_exposure(photographs.load(row))
     measure_photographs(photographs, place(photographs, scene, no_progress), no_progress)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 

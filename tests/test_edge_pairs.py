@@ -14,7 +14,7 @@ from legcal.perception.candidate_pairs import (
     find_candidate_pairs,
     find_segments,
 )
-from legcal.perception.light import Grey, to_grey
+from legcal.vision import Grey
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 
@@ -43,7 +43,7 @@ def _picture(camera: Camera, bars: list[Bar], background: float = 40.0, noise: f
         noise=noise,
         supersample=3 if camera.width == 320 else 1,
     )
-    return to_grey(np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    return np.clip(np.rint(image), 0, 255).astype(np.float32)
 
 
 def _lines(bar: Bar) -> Array:

@@ -269,7 +269,7 @@ def canny_errors(
     cylinders = [(Cylinder("rod", 0.011, "base", 0.0, float(length)),) for length in lengths]
     A, B = (X + 2e-3 * rng.choice([-1.0, 1.0], X.shape) for X in (A, B))
     shown = np.ones((1, n), dtype=np.bool_)
-    image = np.clip(pixels, 0, 255).astype(np.uint8)
+    image = np.clip(pixels, 0, 255).astype(np.float32)
     names = [f"leg{i + 1}" for i in range(n)]
     search = Search(lambda row: image, m, A, B, cylinders, shown, names)
     placement = Placement(A, B, (RigidTransform.identity(),))

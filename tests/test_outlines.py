@@ -67,7 +67,7 @@ def detect_with_blur(
     names = [f"leg{i + 1}" for i in range(len(bars))]
     wanted, one_view = np.ones((1, len(bars)), dtype=np.bool_), measurements(cam, len(bars))
     cylinders = [cylinder(b, radius) for b in bars]
-    search = Search(lambda row: image, one_view, A, B, cylinders, wanted, names)
+    search = Search(lambda row: image.astype(np.float32), one_view, A, B, cylinders, wanted, names)
     found, blur = measure_outlines(search, Placement(A, B, (IDENTITY,), blur=known), [0])
     return found, float(blur[0])
 
@@ -187,14 +187,11 @@ def test_outlines_are_straight_in_space_and_not_in_the_picture() -> None:
     cam = camera(np.array([-0.3, 0.1, 0.001, -0.002, 0.0]))
     bars = [bar(-0.15, 0.02, 150.0), bar(0.15, -0.02, 150.0, 0.025)]
     image = render(cam, bars, 30.0, blur=0.6, noise=0.3, supersample=4)
-    deep: Image = np.rint(257.0 * image).astype(np.uint16)
-    colour = np.repeat(np.rint(image).astype(np.uint8)[..., None], 3, axis=2)
-    for stored in (deep, colour):
-        found = detect(cam, bars, stored)
-        assert np.all(found.used), found.reason
-        assert np.abs(errors(cam, bars, found)).max() < 0.15
-        sigma = np.sqrt([np.diag(C) for C in found.covariance])
-        assert sigma.min() > 0.02  # what the model leaves out, however little noise there is
+    found = detect(cam, bars, np.rint(image).astype(np.uint8))
+    assert np.all(found.used), found.reason
+    assert np.abs(errors(cam, bars, found)).max() < 0.15
+    sigma = np.sqrt([np.diag(C) for C in found.covariance])
+    assert sigma.min() > 0.02  # what the model leaves out, however little noise there is
 
 
 def test_edges_near_the_leg_are_not_taken_for_it() -> None:
@@ -294,7 +291,9 @@ def test_tube_and_rod_are_two_parts() -> None:
         Cylinder("rod", 0.009, "platform", -0.8 * length, 0.0),
     )
     A, B, wanted = whole.A[None, None], whole.B[None, None], np.ones((1, 1), dtype=np.bool_)
-    search = Search(lambda row: image, measurements(cam, 1), A, B, [parts], wanted, ["leg1"])
+    search = Search(
+        lambda row: image.astype(np.float32), measurements(cam, 1), A, B, [parts], wanted, ["leg1"]
+    )
     found, _ = measure_outlines(search, Placement(A, B, (IDENTITY,)), [0])
     assert found.part == ("rod", "rod", "tube", "tube")
     assert np.all(found.used), found.reason

@@ -33,8 +33,7 @@ from legcal.perception.diagnostics import (
     image_verdict,
     reject_images,
 )
-from legcal.perception.image_quality import Exposure, expose, image_defects
-from legcal.perception.light import to_grey
+from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
 from legcal.perception.photographs import ImageObservations, observe
 from legcal.progress import no_progress
 from legcal.workers import in_turn
@@ -301,8 +300,8 @@ def test_blur_is_measured_whatever_the_light() -> None:
     for blur in (1.0, 2.0, 4.0):
         smooth = np.asarray(cv2.GaussianBlur(picture, (0, 0), blur))
         for light in (0.3, 1.0):
-            noisy = to_grey(light * smooth + rng.standard_normal(picture.shape))
-            assert expose(noisy).blur == pytest.approx(blur, rel=0.35, abs=0.3)
+            noisy = (light * smooth + rng.standard_normal(picture.shape)).astype(np.float32)
+            assert measure_exposure(noisy).blur == pytest.approx(blur, rel=0.35, abs=0.3)
 
 
 def test_blurred_images_are_compared_with_their_camera_where_their_view_has_few() -> None:

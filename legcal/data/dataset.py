@@ -23,9 +23,8 @@ from legcal.data.outlines import Outlines, read_observations
 from legcal.data.overrides import Override
 from legcal.errors import DatasetError
 from legcal.files import closest, describe, path_problem
-from legcal.geometry import Image
 from legcal.machine import Machine, load_mechanism, shipped_folders, shipped_names
-from legcal.vision import Board, Camera, image_problem, parse_board, read_camera, read_image
+from legcal.vision import Board, Camera, Grey, image_problem, parse_board, read_camera, read_image
 
 AXES_NAME = "axes.csv"
 CORNERS_NAME = "corners.csv"
@@ -57,7 +56,7 @@ class Dataset:
         image = self.measurements.image[row]
         return self.folder / image if image else None
 
-    def read_image(self, row: int) -> Image:
+    def read_image(self, row: int) -> Grey:
         """Return the image of a row as (height, width) grey levels 0 to 255, float32."""
         return self.image_reader([row])(0)
 
@@ -91,7 +90,7 @@ class ImageReader:
     cameras: tuple[Camera, ...]  # the camera of each image
     places: tuple[str, ...]  # where each image is named, for messages
 
-    def __call__(self, k: int) -> Image:
+    def __call__(self, k: int) -> Grey:
         """Return image k as (height, width) grey levels 0 to 255, float32."""
         path = self.paths[k]
         if path is None:

@@ -10,7 +10,6 @@ from .board_poses import plane_poses as plane_poses
 from .diagnostics import BEFORE_FIT as BEFORE_FIT
 from .diagnostics import FAR_OFF as FAR_OFF
 from .diagnostics import hint_notes as hint_notes
-from .light import Grey as Grey
 from .outline import HIDDEN as HIDDEN
 from .outline import MIN_LENGTH as MIN_LENGTH
 from .outline import MIN_LONE_KEPT as MIN_LONE_KEPT

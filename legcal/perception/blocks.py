@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception.light import Grey, Samples, evened_weights, to_light
+from legcal.perception.light import Samples, evened_weights, to_light
 from legcal.perception.limb import N_BASIS, basis
 from legcal.perception.profiles import Edge, read_profiles
-from legcal.vision import Camera
+from legcal.vision import Camera, Grey
 
 DEPTH = (2.0, 2.5)  # used distance from an outline: [px] and in blurs
 MAX_DEPTH = 0.8  # largest used depth, in half-widths

@@ -18,7 +18,6 @@ from scipy.special import erf
 from legcal.data import MIN_CORNERS, Corners, Measurements, found_corners, join_corners
 from legcal.errors import NotVisible
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception.light import to_grey
 from legcal.perception.placement import Load
 from legcal.progress import Report
 from legcal.vision import (
@@ -474,11 +473,7 @@ def require_board(
         if view.name not in views or v in shown or not rows:
             continue
         found = next(
-            (
-                what
-                for row in rows[:MAX_ASKED]
-                if (what := describe_image(board, to_grey(load(row))))
-            ),
+            (what for row in rows[:MAX_ASKED] if (what := describe_image(board, load(row)))),
             None,
         )
         problems.append(
@@ -500,7 +495,7 @@ def _in_words(board: Board) -> str:
 
 def _search(board: Board, load: Load, row: int) -> tuple[IntArray, Array, Array]:
     """Return the corners, their pixels and sigmas in the image of a row."""
-    return find_corners(board, to_grey(load(row)))
+    return find_corners(board, load(row))
 
 
 _MIN_SIDE = 3  # along a side of a chessboard, for OpenCV

@@ -15,8 +15,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception.light import Grey, reduce
-from legcal.vision import Camera
+from legcal.perception.light import reduce
+from legcal.vision import Camera, Grey
 
 LONG_SIDE = 480  # of the reduced picture at least [px]
 MAX_REDUCTION = 4  # by which a picture is reduced: legs are 12 px wide and more

@@ -8,7 +8,6 @@ import numpy as np
 
 from legcal.data import Outlines, join_outlines
 from legcal.geometry import Array
-from legcal.perception.light import to_grey
 from legcal.perception.outline import OUTSIDE, ImageSearch, Method, measure, part_outlines
 from legcal.perception.placement import Placement, Search
 from legcal.vision import PredictedLeg, predict_legs
@@ -68,7 +67,7 @@ def _of_image(
     known = placement.blur[view] if placement.blur else np.nan
     one = ImageSearch(
         row,
-        np.zeros((0, 0), dtype=np.float32) if T is None else to_grey(search.load(row)),
+        np.zeros((0, 0), dtype=np.float32) if T is None else search.load(row),
         camera,
         predicted,
         search.leg_names,

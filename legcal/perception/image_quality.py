@@ -5,13 +5,14 @@ slope proportional to (sigma^2 + s^2)^(-1/2); slopes after two such s give sigma
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from legcal.perception.light import Grey, reduce
+from legcal.perception.light import reduce
+from legcal.vision import Grey
 
 BLACK, WHITE = 8.0, 247.0  # what nearly all of an image is below or above [grey levels]
 TAIL_PERCENT = 0.5  # percent of an image that may be otherwise
@@ -34,11 +35,11 @@ MIN_IMAGES = 3  # images of a view or camera, to be compared
 
 @dataclass(frozen=True)
 class Exposure:
-    """How an image was exposed [grey levels]."""
+    """Range of grey levels and blur of an image."""
 
-    dark: float  # what nearly all of the image is brighter than
-    bright: float  # what nearly all of it is darker than
-    range: float  # between the darkest and the brightest places
+    dark: float  # nearly all of the image is brighter [grey levels]
+    bright: float  # nearly all of it is darker [grey levels]
+    range: float  # between the darkest and the brightest places [grey levels]
     blur: float  # standard deviation of the blur of its sharp edges [px]
 
     @property
@@ -53,8 +54,8 @@ class Exposure:
         return ""
 
 
-def expose(grey: Grey) -> Exposure:
-    """Return how an image was exposed."""
+def measure_exposure(grey: Grey) -> Exposure:
+    """Return the range of grey levels and the blur of an image."""
     small = reduce(grey, max(1, min(REDUCTION, min(grey.shape) // 16)))
     low, high = np.percentile(small, [TAIL_PERCENT, 100.0 - TAIL_PERCENT])
     dark, bright = np.percentile(grey[::STRIDE, ::STRIDE], [TAIL_PERCENT, 100.0 - TAIL_PERCENT])
@@ -107,7 +108,7 @@ def _slopes(grey: Grey) -> tuple[Grey, Grey]:
 
 
 def image_defects(
-    exposures: Mapping[int, Exposure], view: Mapping[int, int], camera: Mapping[int, int]
+    exposures: Mapping[int, Exposure], view: Mapping[int, int], camera: Mapping[int, Hashable]
 ) -> dict[int, str]:
     """Return why images cannot be used: by themselves, or beside others, by row.
 

@@ -1,4 +1,4 @@
-"""Grey levels as light, and what each pixel counts by its noise.
+"""Grey levels as light, and weights of pixels by their noise.
 
 Grey levels are light to the power 1 / gamma. Noise grows with light, and a surface has texture: a
 dark background is several times quieter than a lit leg in front of it, so that the foot of the
@@ -12,30 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from legcal.geometry import Array, BoolArray, Image, IntArray
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.vision import Grey
 
-Grey = NDArray[np.float32]  # (height, width), 0 to 255
 Samples = NDArray[np.float32]
 
 DARK = 12.0  # grey level below which noise is taken to be that of this level
-BEYOND = (1.0, 2.5)  # distance from an outline from which on the step is over: [px] and in blurs
-N_SMOOTH = 3  # functions by which a side of a block is smooth: constant, linear, quadratic
+STEP_END = (1.0, 2.5)  # distance from an outline at which the step is over: [px] and in blurs
+N_SMOOTH = 3  # of the polynomial that describes a side of a block: constant to quadratic
 MIN_PIXELS = 8  # pixels on a side of a block
 MIN_NOISE = 0.3  # of rounded grey levels: their standard deviation
 MAX_NOISE_RATIO = 8.0  # of the noise on both sides
 MIN_BLOCKS = 3  # blocks of an outline that give its noise
-
-
-def to_grey(image: Image) -> Grey:
-    """Return an 8 or 16 bit image, grey or colour (BGR), as grey levels 0 to 255."""
-    values = image.astype(np.float32, copy=False)
-    if image.dtype == np.uint16:
-        values = values / np.float32(257.0)
-    if values.ndim == 3 and values.shape[2] == 1:
-        values = values[..., 0]
-    elif values.ndim == 3:
-        values = np.asarray(cv2.cvtColor(values[..., :3], cv2.COLOR_BGR2GRAY), dtype=np.float32)
-    return np.ascontiguousarray(values)
 
 
 def reduce(grey: Grey, factor: int) -> Grey:
@@ -74,7 +62,7 @@ def evened_weights(
     outlines, ``kept`` the blocks that lie on them. Either side of an outline keeps the noise that
     its median block shows there; across the blurred step the variance changes as light does.
     """
-    beyond = max(BEYOND[0], BEYOND[1] * blur)
+    beyond = max(STEP_END[0], STEP_END[1] * blur)
     outer, inner = (
         _of_edges(_variance(side, light, weight * (side > beyond)), kept, bounds)
         for side in (-d, d)

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
 
-from legcal.geometry import Array, IntArray
+from legcal.geometry import Array
 from legcal.perception.light import Samples
 
 N_BASIS = 5
@@ -73,8 +73,8 @@ def basis(d: Samples, half_width: Samples, blur: Samples | float) -> tuple[Sampl
     return values, slopes
 
 
-# Columns: 1, z, the Gaussian g(z), z g(z), and blurred powers; the last letter is the power.
-ONE, Z, GAUSS, Z_GAUSS, STEP, LESS_HALF, Z_LESS_HALF, HALF, RAMP, THREE_HALVES, SQUARE = range(11)
+# Columns: 1, z, the Gaussian g(z), z g(z), and blurred powers of max(z, 0) or their products by z.
+ONE, Z, GAUSS, Z_GAUSS, STEP, MINUS_HALF, Z_MINUS_HALF, HALF, RAMP, THREE_HALVES, SQUARE = range(11)
 N_POWERS = 11
 
 _REACH, _PER_BLUR = 24.0, 256  # range of the table on both sides, and entries per unit
@@ -88,36 +88,29 @@ def _tabulate_powers() -> Array:
     kernel *= 2.0 * (root[1] - root[0])
     kernel[:, 0] *= 0.5
     z = np.arange(-_REACH, _REACH + 1e-9, 1.0 / _PER_BLUR)
-    less_half = CubicSpline(coarse, kernel.sum(axis=1))(z)
+    minus_half = CubicSpline(coarse, kernel.sum(axis=1))(z)
     half = CubicSpline(coarse, kernel @ root**2)(z)
     gauss, step = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi), ndtr(z)
     ramp = z * step + gauss
-    three_halves, square = z * half + 0.5 * less_half, z * ramp + step
+    three_halves, square = z * half + 0.5 * minus_half, z * ramp + step
     columns = [
-        np.ones_like(z), z, gauss, z * gauss, step, less_half, z * less_half, half, ramp,
+        np.ones_like(z), z, gauss, z * gauss, step, minus_half, z * minus_half, half, ramp,
         three_halves, square,
     ]  # fmt: skip
     return np.stack([*columns, np.zeros_like(z)], axis=1)
 
 
-_POWERS_WITH_ROOM = _tabulate_powers()
-_POWERS = np.ascontiguousarray(_POWERS_WITH_ROOM[:, :N_POWERS])
+_POWERS = _tabulate_powers()
 
 
 def powers(z: Array) -> Array:
-    """Return the functions at distances z (...) in units of the blur, (..., N_POWERS)."""
-    return np.asarray(_POWERS.take(_entries(z), axis=0))
+    """Return the functions at distances z (...) in units of the blur, and a column of zeros.
 
-
-def powers_with_room(z: Array) -> Array:
-    """Return the functions, and a column of zeros beside them, (..., N_POWERS + 1)."""
-    return np.asarray(_POWERS_WITH_ROOM.take(_entries(z), axis=0))
-
-
-def _entries(z: Array) -> IntArray:
-    """Return the nearest entries of the tables."""
-    place = np.clip((z + _REACH) * _PER_BLUR + 0.5, 0.0, len(_POWERS) - 1.0)
-    return place.astype(np.intp)
+    (..., N_POWERS + 1); the zeros are room for grey levels, so that one product of matrices gives
+    all sums over pixels.
+    """
+    entry = np.clip((z + _REACH) * _PER_BLUR + 0.5, 0.0, len(_POWERS) - 1.0)
+    return np.asarray(_POWERS.take(entry.astype(np.intp), axis=0))  # the nearest ones
 
 
 BACKGROUND, SLOPE, SURFACE = 0, 1, 2
@@ -155,11 +148,11 @@ def profile_functions(half_width: Array, blur: Array, depth: float) -> tuple[Arr
     scale = blur / half_width
     root = np.sqrt(scale)
     value[:, 0, STEP], slope[:, 0, GAUSS], widening[:, 0, Z_GAUSS] = 1.0, 1.0 / blur, -1.0
-    value[:, 1, HALF], slope[:, 1, LESS_HALF] = root, 0.5 * root / blur
-    widening[:, 1, HALF], widening[:, 1, Z_LESS_HALF] = 0.5 * root, -0.5 * root
+    value[:, 1, HALF], slope[:, 1, MINUS_HALF] = root, 0.5 * root / blur
+    widening[:, 1, HALF], widening[:, 1, Z_MINUS_HALF] = 0.5 * root, -0.5 * root
     value[:, 2, RAMP], slope[:, 2, STEP], widening[:, 2, GAUSS] = scale, scale / blur, scale
     value[:, 3, THREE_HALVES], slope[:, 3, HALF] = scale * root, 1.5 * scale * root / blur
-    widening[:, 3, LESS_HALF] = 0.75 * scale * root
+    widening[:, 3, MINUS_HALF] = 0.75 * scale * root
     value[:, 4, SQUARE], slope[:, 4, RAMP] = scale**2, 2.0 * scale**2 / blur
     widening[:, 4, STEP] = 2.0 * scale**2
     for of_surface, all_of_it in ((value, values), (slope, slopes), (widening, widenings)):

@@ -14,11 +14,10 @@ import numpy as np
 
 from legcal.data import Outlines, join_outlines
 from legcal.geometry import Array, IntArray
-from legcal.perception.light import Grey
 from legcal.perception.part_edges import EdgePair, LegPart, block_positions, find_pairs
 from legcal.perception.profiles import Edge
 from legcal.perception.subpixel_edges import MeasuredEdge, measure_edges
-from legcal.vision import EPSILON, Camera, PredictedLeg, band_of_leg, hidden_by
+from legcal.vision import EPSILON, Camera, Grey, PredictedLeg, band_of_leg, hidden_by
 
 OUTSIDE = "outside the image"  # a reason
 HIDDEN = "hidden by"  # the beginning of one

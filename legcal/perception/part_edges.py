@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception.light import Grey, Samples
-from legcal.vision import Band, Camera, PredictedLeg, Segment
+from legcal.perception.light import Samples
+from legcal.vision import Band, Camera, Grey, PredictedLeg, Segment
 
 BLOCK_LENGTH = 8.0  # [px]
 ROWS = 4  # rows of a block

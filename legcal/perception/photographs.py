@@ -33,8 +33,7 @@ from legcal.perception.diagnostics import (
     is_visible,
     reject_images,
 )
-from legcal.perception.image_quality import Exposure, expose, image_defects
-from legcal.perception.light import to_grey
+from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
 from legcal.perception.outline import WRONG_WIDTH, Method
 from legcal.perception.placement import (
     NEAR_FIT_PX,
@@ -48,7 +47,7 @@ from legcal.perception.radii import LegRadius, radius_notes
 from legcal.perception.recognition import recognise
 from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
-from legcal.vision import camera_numbers
+from legcal.vision import shared_cameras
 from legcal.workers import Run
 
 DETECTOR_VERSION = 1  # raise it whenever outlines or notes that are kept come out differently
@@ -90,7 +89,7 @@ class Photographs:
     def search(
         self, nominal: Placement, pairs: Mapping[int, CandidatePairs] | None = None
     ) -> Search:
-        """Return what is searched for by a model, in images some of whose edge pairs are known."""
+        """Return what is searched for by a model; candidate pairs of some images may be known."""
         return Search(
             self.load,
             self.measurements,
@@ -279,7 +278,7 @@ def _measured(
 def _inspect_images(
     photographs: Photographs, nominal: Placement, report: Report, joined: Joined
 ) -> tuple[dict[int, str], dict[int, CandidatePairs]]:
-    """Return why images show nothing, and edge pairs of those recognised first, by row."""
+    """Return why images show nothing, and candidate pairs of those recognised first, by row."""
     rows, measurements = photographs.detect.tolist(), photographs.measurements
     hints = nominal.T_base_camera
     groups = group_views(measurements, photographs.detect, hints, joined)
@@ -292,8 +291,8 @@ def _inspect_images(
         if own is not None:
             pairs[row] = own
         count(row)
-    numbers = [camera_numbers(view.camera) for view in measurements.views]
-    camera = [numbers.index(own) for own in numbers]  # the first view of the same camera
+    views = measurements.views
+    camera = shared_cameras([view.name for view in views], [view.camera for view in views])
     view = {row: int(measurements.view[row]) for row in rows}
     return image_defects(exposures, view, {row: camera[v] for row, v in view.items()}), pairs
 
@@ -301,11 +300,11 @@ def _inspect_images(
 def _inspect(
     search: Search, rows: Collection[int], row: int
 ) -> tuple[Exposure, CandidatePairs | None]:
-    """Return how an image was exposed, and the edge pairs of those that are to be recognised."""
+    """Return how an image was exposed, and its candidate pairs if it is one of rows."""
     image = search.load(row)
     view = int(search.measurements.view[row])
     pairs = replace(search, load=lambda _: image).pairs(row, view) if row in rows else None
-    return expose(to_grey(image)), pairs
+    return measure_exposure(image), pairs
 
 
 def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[LegRadius]:

@@ -14,22 +14,20 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data import Measurements
 from legcal.errors import NotVisible
-from legcal.geometry import Array, BoolArray, Image, IntArray
+from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Cylinder
 from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
-from legcal.perception.light import to_grey
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
 from legcal.perception.radii import NO_RADIUS_FACTORS, RadiusFactors
-from legcal.vision import Camera
+from legcal.vision import Camera, Grey
 
-Load = Callable[[int], Image]  # of a row, 8 or 16 bit, grey or colour (BGR)
+Load = Callable[[int], Grey]  # the image of a row
 Joined = Sequence[RigidTransform | None] | None  # T_board_camera of views that show a board
 
-PREDICTED_JOINT_ERROR = (
-    4e-3  # of predicted joint centres: the nominal model's joints and platform pose [m]
-)
+# Of predicted joint centres: the nominal model's joints and platform pose [m].
+PREDICTED_JOINT_ERROR = 4e-3
 PIXEL_ERROR = 3.0  # added to every window [px]
-NEAR_FIT_PX = 3.0  # how far outlines may be from a joint fit
+NEAR_FIT_PX = 3.0  # how far outlines may be from a joint fit [px]
 NEAR_IMAGES = 6  # of a group that are searched where a rough pose is given, at first
 
 
@@ -37,7 +35,7 @@ NEAR_IMAGES = 6  # of a group that are searched where a rough pose is given, at 
 class Search:
     """What is searched for; it travels to worker processes."""
 
-    load: Load
+    load: Load  # the image of a row
     measurements: Measurements
     A_base: Array  # (n_rows, n_legs, 3) joint centres by the nominal model, in the base link [m]
     B_base: Array
@@ -62,7 +60,7 @@ class Search:
         if view == int(self.measurements.view[row]) and row in self.edge_pairs:
             return self.edge_pairs[row]
         camera = self.measurements.views[view].camera
-        return find_candidate_pairs(find_segments(to_grey(self.load(row)), camera))
+        return find_candidate_pairs(find_segments(self.load(row), camera))
 
     def targets(self, row: int, view: int) -> LegSegments:
         """Return the legs at the reading of a row that a view is stated to show."""
@@ -145,7 +143,7 @@ class Group:
     views: list[int]
     T_group_camera: dict[int, RigidTransform]  # by view
     rows: list[int]  # all images to use
-    some: list[int]  # a few of them
+    some: list[int]  # a few of them, at even distances
     view_of_row: dict[int, int]
     hint: RigidTransform | None  # T_base_group, roughly
 

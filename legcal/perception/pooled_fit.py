@@ -13,7 +13,7 @@ import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.blocks import Blocks
-from legcal.perception.limb import N_AMPLITUDES, N_POWERS, powers_with_room, profile_functions
+from legcal.perception.limb import N_AMPLITUDES, N_POWERS, powers, profile_functions
 
 # Standard deviations of amplitudes, in contrasts of the outline, as limb.py orders them: of
 # what an outline has in common, of its changes along the outline, and of single blocks.
@@ -52,7 +52,7 @@ class PooledLines(NamedTuple):
     by_gamma: Array  # (n_edges,) how far each moves inside with ln gamma [px]; NaN: nothing seen
 
 
-class _Round(NamedTuple):
+class _Iterate(NamedTuple):
     """Where the unknowns of all edges are."""
 
     amplitude: Array  # (n_edges, N_ALONG, N_AMPLITUDES)
@@ -72,7 +72,7 @@ def fit_pooled(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> Po
     if n == 0 or not np.any(pool.seen):
         nothing = np.full(n, np.nan)
         return PooledLines(np.zeros((n, 2)), np.tile(np.eye(2), (n, 1, 1)), blur, nothing)
-    start = _Round(
+    start = _Iterate(
         np.zeros((n, N_ALONG, N_AMPLITUDES)),
         np.zeros((n, 2)),
         np.full(n, np.log(blur)),
@@ -80,7 +80,7 @@ def fit_pooled(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> Po
         np.zeros((n, N_ALONG * N_UNKNOWNS, N_ALONG * N_UNKNOWNS)),
     )
     found = pool.rounds(pool.first_amplitudes(start), np.log(blur), PRIOR_BLUR, FIRST_ROUNDS)
-    even, sigma = _even_blur(found, pool.seen)
+    even, sigma = _common_blur(found, pool.seen)
     found = found._replace(log_blur=np.full(n, even))
     sigma = float(np.hypot(sigma, EVEN_BLUR))
     found = pool.rounds(found, even, sigma, LAST_ROUNDS)
@@ -91,7 +91,7 @@ def fit_pooled(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> Po
     return PooledLines(found.line @ at_ends.T, covariance, float(np.exp(even)), by_gamma)
 
 
-def _even_blur(found: _Round, seen: BoolArray) -> tuple[float, float]:
+def _common_blur(found: _Iterate, seen: BoolArray) -> tuple[float, float]:
     """Return the logarithm of the blur that most outlines of an image agree on, and its sigma."""
     log_blur = found.log_blur[seen]
     weight = 1.0 / (found.inverse[seen, BLUR, BLUR] + BLUR_SCATTER**2)
@@ -124,7 +124,7 @@ class _Pixels:
         edge = self.edge[some]
         moved = self.gain[some] * np.sum(line[edge] * self.along[some, :2], axis=1)
         z = (self.d[some] - moved[:, None]) / np.exp(log_blur)[edge][:, None]
-        U = powers_with_room(z)  # in double precision: sums nearly cancel
+        U = powers(z)  # in double precision: sums nearly cancel
         U *= self.weight[some][..., None]
         U[..., -1] = self.light[some]
         first = np.flatnonzero(np.diff(self.joined[some], prepend=-1))
@@ -208,9 +208,9 @@ class _Pool:
             np.full(n_edges, np.nan),
         )
 
-    def first_amplitudes(self, at: _Round) -> _Round:
+    def first_amplitudes(self, at: _Iterate) -> _Iterate:
         """Return the amplitudes that an outline has in common, with its line where it is."""
-        self._know(at, np.ones(len(self.half_width), dtype=np.bool_))
+        self._update_products(at, np.ones(len(self.half_width), dtype=np.bool_))
         values, _, _ = profile_functions(self.half_width, np.exp(at.log_blur), self.depth)
         products = self._of_edges(self.products, np.ones((len(self.edge), 1)))[:, 0]
         of_edge = values @ products[:, :-1, :-1] @ values.swapaxes(1, 2)
@@ -220,17 +220,17 @@ class _Pool:
         at.amplitude[:, 0] = np.linalg.solve(of_edge, target)[..., 0]
         return at
 
-    def rounds(self, at: _Round, log_blur: float, sigma: float, n: int) -> _Round:
+    def rounds(self, at: _Iterate, log_blur: float, sigma: float, n: int) -> _Iterate:
         """Take Gauss-Newton steps, ``n`` at most, the blur known to ``sigma`` beforehand."""
         moving = np.ones(len(self.half_width), dtype=np.bool_)
         for _ in range(n):
             before = at
-            self._know(at, moving)
+            self._update_products(at, moving)
             if np.all(moving):
                 at = self._step(at, log_blur, sigma)
             else:
-                at = _Round(*(values.copy() for values in before))
-                some = _Round(*(values[moving] for values in before))
+                at = _Iterate(*(values.copy() for values in before))
+                some = _Iterate(*(values[moving] for values in before))
                 step = self._part(moving)._step(some, log_blur, sigma)
                 for values, new in zip(at, step, strict=True):
                     values[moving] = new
@@ -240,7 +240,7 @@ class _Pool:
                 break
         return at
 
-    def _know(self, at: _Round, edges: BoolArray) -> None:
+    def _update_products(self, at: _Iterate, edges: BoolArray) -> None:
         """Sum the products of some edges again, those that have moved from where they are."""
         blur = np.exp(self.at_log_blur)
         moved = np.abs(at.line - self.at_line).sum(axis=1) / blur
@@ -273,9 +273,9 @@ class _Pool:
             self.at_log_blur[edges],
         )
 
-    def _step(self, at: _Round, log_blur: float, sigma: float) -> _Round:
+    def _step(self, at: _Iterate, log_blur: float, sigma: float) -> _Iterate:
         """Take one step of all edges."""
-        normal, right, expected = self._blocks(at)
+        normal, right, expected = self._block_equations(at)
         normal /= at.noise[self.edge][:, None, None]
         right /= at.noise[self.edge][:, None]
         # A block's own amplitudes and place are eliminated, its blur is that of the edge:
@@ -285,8 +285,8 @@ class _Pool:
         fitted = (free @ (right[:, :BLUR] + own * expected)[..., None])[..., 0]
         noise, weight = self._noise(at, normal[:, :BLUR, :BLUR], right[:, :BLUR], fitted)
         known = _eliminated(normal, right, free, own)
-        system, target = self._in_common(known, weight)
-        precision, pull = self._known_before(at, log_blur, sigma)
+        system, target = self._edge_equations(known, weight)
+        precision, pull = self._prior(at, log_blur, sigma)
         n = len(self.half_width)
         shape = n, N_ALONG * N_UNKNOWNS
         whole = system + _diagonal(precision.reshape(shape))
@@ -297,7 +297,7 @@ class _Pool:
         widen = np.clip(step[:, 0, BLUR], -MAX_STEP[1], MAX_STEP[1])
         least, most = np.log(BLURS).tolist()
         widened = np.clip(at.log_blur + widen, least, most)
-        return _Round(
+        return _Iterate(
             step[..., :N_AMPLITUDES],
             at.line + move,
             np.asarray(widened),
@@ -305,29 +305,29 @@ class _Pool:
             np.asarray(inverse),
         )
 
-    def response_to_gamma(self, at: _Round) -> tuple[Array, Array]:
+    def response_to_gamma(self, at: _Iterate) -> tuple[Array, Array]:
         """Return the equations of what a change of ln gamma does to all edges, where they are.
 
         Normal matrices (n_edges, k, k), with what is known beforehand of all unknowns but the blur,
         and right sides (n_edges, k), for the unknowns of N_ALONG polynomials one after the other.
         """
         every = np.ones(len(self.half_width), dtype=np.bool_)
-        self._know(at, every)
-        normal, right, expected = self._blocks(at)
+        self._update_products(at, every)
+        normal, right, expected = self._block_equations(at)
         products = self.pixels.changed_by_gamma().products(self.at_line, self.at_log_blur, every)
-        _, change, _ = replace(self, products=products)._blocks(at)
+        _, change, _ = replace(self, products=products)._block_equations(at)
         noise = at.noise[self.edge]
         normal, own = normal / noise[:, None, None], self._own_precision()
         right, change = right / noise[:, None], change / noise[:, None]
         free = np.asarray(np.linalg.inv(normal[:, :BLUR, :BLUR] + _diagonal(own)), np.float64)
         fitted = (free @ (right[:, :BLUR] + own * expected)[..., None])[..., 0]
         _, weight = self._noise(at, normal[:, :BLUR, :BLUR], right[:, :BLUR], fitted)
-        system, target = self._in_common(_eliminated(normal, change, free, own), weight)
-        precision, _ = self._known_before(at, 0.0, UNKNOWN_SIGMA)
+        system, target = self._edge_equations(_eliminated(normal, change, free, own), weight)
+        precision, _ = self._prior(at, 0.0, UNKNOWN_SIGMA)
         shape = len(every), N_ALONG * N_UNKNOWNS
         return system + _diagonal(precision.reshape(shape)), target.reshape(shape)
 
-    def _in_common(self, known: Array, weight: Array) -> tuple[Array, Array]:
+    def _edge_equations(self, known: Array, weight: Array) -> tuple[Array, Array]:
         """Return what blocks (n, N_UNKNOWNS, N_UNKNOWNS + 1) that count by a weight say of edges.
 
         Normal matrices (n_edges, k, k) and right sides (n_edges, N_ALONG, N_UNKNOWNS).
@@ -340,7 +340,7 @@ class _Pool:
         side = N_ALONG * N_UNKNOWNS
         return system.reshape(n, side, side), sums[:, :N_ALONG, :, -1]
 
-    def _blocks(self, at: _Round) -> tuple[Array, Array, Array]:
+    def _block_equations(self, at: _Iterate) -> tuple[Array, Array, Array]:
         """Return the normal equations of all blocks, and the unknowns that are expected."""
         values, slopes, widenings = profile_functions(
             self.half_width, np.exp(self.at_log_blur), self.depth
@@ -361,7 +361,9 @@ class _Pool:
         expected[:, :N_AMPLITUDES] = amplitude
         return normal, with_light[..., -1], expected
 
-    def _noise(self, at: _Round, normal: Array, right: Array, fitted: Array) -> tuple[Array, Array]:
+    def _noise(
+        self, at: _Iterate, normal: Array, right: Array, fitted: Array
+    ) -> tuple[Array, Array]:
         """Return the noise of each edge, and how much each block counts by its own."""
         explained = 2.0 * right - (normal @ fitted[..., None])[..., 0]
         explained = np.sum(fitted * explained, axis=1) * at.noise[self.edge]
@@ -380,7 +382,7 @@ class _Pool:
         precision[:, SHIFT] = ROUGHNESS**-2
         return precision
 
-    def _known_before(self, at: _Round, log_blur: float, sigma: float) -> tuple[Array, Array]:
+    def _prior(self, at: _Iterate, log_blur: float, sigma: float) -> tuple[Array, Array]:
         """Return what is known of the unknowns of edges beforehand: precision, and its pull."""
         precision = np.full((len(self.half_width), N_ALONG, N_UNKNOWNS), 1e10)
         pull = np.zeros_like(precision)
@@ -441,20 +443,22 @@ def _diagonal(values: Array) -> Array:
     return np.asarray(values[..., None] * np.eye(values.shape[-1]))
 
 
-def _shifts_by_gamma(pool: _Pool, at: _Round, even_blur: float) -> Array:
+def _shifts_by_gamma(pool: _Pool, at: _Iterate, even_blur: float) -> Array:
     """Return how far the middles (n_edges,) of outlines move inside with ln gamma [px], or NaN.
 
     ``even_blur`` is by how much the logarithms of blurs differ in the image.
     """
     normal, right = pool.response_to_gamma(at)
-    moved, inverse = _solved(normal, right, 0.0, PRIOR_BLUR)
+    moved, inverse = _solve_with_blur(normal, right, 0.0, PRIOR_BLUR)
     counts = pool.seen / (inverse[:, BLUR, BLUR] + BLUR_SCATTER**2)
     widened = float(counts @ moved[:, BLUR] / counts.sum())
-    moved, _ = _solved(normal, right, widened, even_blur)
+    moved, _ = _solve_with_blur(normal, right, widened, even_blur)
     return np.where(pool.seen, moved[:, SHIFT], np.nan)
 
 
-def _solved(normal: Array, right: Array, widened: float, sigma: float) -> tuple[Array, Array]:
+def _solve_with_blur(
+    normal: Array, right: Array, widened: float, sigma: float
+) -> tuple[Array, Array]:
     """Return the unknowns of edges (n, k) and their covariance, the blur known to sigma."""
     whole, target = normal.copy(), right.copy()
     whole[:, BLUR, BLUR] += sigma**-2

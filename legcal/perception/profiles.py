@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception.light import Grey, Samples
-from legcal.vision import Band, Camera
+from legcal.perception.light import Samples
+from legcal.vision import Band, Camera, Grey
 
 SATURATED = 250.0  # grey level from which a pixel is saturated
 MAX_NOISY = 4  # such pixels of a block that may be noise

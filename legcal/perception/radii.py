@@ -21,7 +21,7 @@ from legcal.perception.pair_matching import (
     gauss_newton_step,
     match_pairs,
 )
-from legcal.vision import EQUAL_RADII
+from legcal.vision import look_alike
 
 FACTORS = (1.0, 0.93, 1.075, 0.86, 1.16, 0.8, 1.25, 0.72, 1.38)  # of radii that are tried
 TOLERANCES = (0.018, 0.018, 0.012, 0.012)  # of an axis from its pair, on the sensor plane
@@ -57,7 +57,7 @@ class RadiusFactors:
     def of(self, leg: int, radius: float) -> float:
         """Return the factor of a part."""
         for (other, r), factor in self.factor.items():
-            if other == leg and _alike(r, radius):
+            if other == leg and look_alike(r, radius):
                 return factor
         return self.common or 1.0
 
@@ -66,7 +66,7 @@ class RadiusFactors:
         mine = {
             part: factor
             for part, factor in self.factor.items()
-            if any(part[0] == leg and _alike(part[1], radius) for leg, radius in suspects)
+            if any(part[0] == leg and look_alike(part[1], radius) for leg, radius in suspects)
         }
         if self.common and len(mine) >= MIN_SHARE_ALIKE * len(self.factor):
             return self
@@ -87,11 +87,6 @@ class RadiusFactors:
             (leg, r): f * step.of(leg, r * self.of(leg, r)) for (leg, r), f in self.factor.items()
         }
         return RadiusFactors(factor, self.common * (step.common or 1.0))
-
-
-def _alike(one: float, other: float) -> bool:
-    """Say whether cylinders of two radii are seen as one."""
-    return abs(one - other) <= EQUAL_RADII * other
 
 
 NO_RADIUS_FACTORS = RadiusFactors({})

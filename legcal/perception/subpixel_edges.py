@@ -14,10 +14,9 @@ import numpy as np
 
 from legcal.geometry import Array
 from legcal.perception.blocks import Blocks, Line, depth_for_blur, estimate_blur
-from legcal.perception.light import Grey
 from legcal.perception.pooled_fit import PooledLines, fit_pooled
 from legcal.perception.profiles import Edge
-from legcal.vision import Camera
+from legcal.vision import Camera, Grey
 
 FIRST_BLUR = 1.0  # [px]
 MIN_GAIN = 30  # in chi^2, by which a block shows an edge at all

@@ -29,6 +29,7 @@ from .cylinder import direction_derivative as direction_derivative
 from .cylinder import direction_of_angles as direction_of_angles
 from .cylinder import outlines_of_axis as outlines_of_axis
 from .cylinder import point_with_zero_y as point_with_zero_y
+from .image_file import Grey as Grey
 from .image_file import ImageSize as ImageSize
 from .image_file import enlarged as enlarged
 from .image_file import image_problem as image_problem
@@ -36,11 +37,11 @@ from .image_file import image_size as image_size
 from .image_file import quiet_opencv as quiet_opencv
 from .image_file import read_image as read_image
 from .image_file import reduced as reduced
-from .visibility import EQUAL_RADII as EQUAL_RADII
 from .visibility import Band as Band
 from .visibility import PredictedLeg as PredictedLeg
 from .visibility import Segment as Segment
 from .visibility import band_of_leg as band_of_leg
 from .visibility import hidden_by as hidden_by
+from .visibility import look_alike as look_alike
 from .visibility import predict_legs as predict_legs
 from .visibility import visible_segments as visible_segments

@@ -19,13 +19,13 @@ class Board:
     """A flat calibration board."""
 
     kind: BoardKind  # what is printed on it
-    columns: int  # squares along x and along y, black and white ones (chessboard, ChArUco)
-    rows: int  # squares along x and along y, black and white ones (chessboard, ChArUco)
+    columns: int  # along x: squares, black and white ones (chessboard, ChArUco), or tags
+    rows: int  # along y, the same
     side: float  # side of a square, or of the black frame of a tag (AprilGrid) [m]
     marker: float = 0.0  # side of a marker of a ChArUco board [m]; zero for other kinds
     spacing: float = 0.0  # gap between the tags of an AprilGrid as a part of their side
     dictionary: str = ""  # what markers and tags are taken from, as OpenCV names it
-    legacy: bool = False
+    legacy: bool = False  # ChArUco as OpenCV printed it before version 4.6
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -93,7 +93,7 @@ def dictionary_size(name: str) -> int:
 
 
 def charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
-    """Return a ChArUco board as OpenCV has it, its squares of the size of the board's [m]."""
+    """Return a ChArUco board as an object of OpenCV, lengths in metres."""
     found = cv2.aruco.CharucoBoard(
         (board.columns, board.rows), board.side, board.marker, dictionary(board.dictionary)
     )

@@ -98,13 +98,13 @@ class Camera:
     """Intrinsics of a camera."""
 
     K: Array  # (3, 3) camera matrix [px]
-    width: int  # image size [px]
-    height: int  # image size [px]
+    width: int  # of the image [px]
+    height: int  # of the image [px]
     distortion: Array = field(default_factory=lambda: np.zeros(0))  # (n,)
     model: DistortionModel = "plumb_bob"  # meaning of the coefficients
     gamma: float = 1.0  # grey levels are light to the power 1 / gamma
     gamma_is_given: bool = True  # false where it is assumed
-    sigma: Mapping[str, float] = field(default_factory=dict)  # standard deviations of its numbers
+    sigma: Mapping[str, float] = field(default_factory=dict)  # of its intrinsics, by name
 
     @property
     def has_distortion(self) -> bool:
@@ -235,7 +235,7 @@ def undistort_derivatives(
 
 def shared_cameras(names: Sequence[str], cameras: Sequence[Camera]) -> tuple[str, ...]:
     """Return for each view the name of the view whose intrinsics it has."""
-    keys = [_identity(camera) for camera in cameras]
+    keys = [tuple(camera_numbers(camera).items()) for camera in cameras]
     owner: dict[object, str] = {}
     for name, key in sorted(zip(names, keys, strict=True), key=lambda pair: pair[0]):
         owner.setdefault(key, name)
@@ -248,12 +248,6 @@ def camera_numbers(camera: Camera) -> dict[str, float | str]:
     skew = float(camera.K[0, 1])
     size = {"width": camera.width, "height": camera.height, "model": camera.model}
     return size | {"skew": skew} | dict(numbers)
-
-
-def _identity(camera: Camera) -> tuple[object, ...]:
-    """Return what two equal cameras have in common."""
-    numbers = (*camera.K.ravel().tolist(), *_padded(camera).tolist())
-    return (camera.width, camera.height, camera.model, *numbers)
 
 
 def _padded(camera: Camera) -> Array:

@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legcal.errors import DatasetError
-from legcal.geometry import Array, Image
+from legcal.geometry import Array
 from legcal.vision.camera import Camera
+
+Grey = NDArray[np.float32]  # (height, width) grey levels, 0 to 255
 
 _lock = threading.Lock()
 _state = {"depth": 0, "level": 0}
@@ -43,7 +45,7 @@ _FLAGS = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATI
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
-_DEEP, _FULL = 12, 16  # bits of the data in files of 16
+_DEEP, _FULL = 12, 16  # bits that the data in files of 16 bits may have
 _TIFF_INTEGERS = {1: "B", 3: "H", 4: "I"}  # struct's letters by the type numbers of TIFF
 _TIFF_FORMATS = {2: "signed", 3: "floating-point"}  # of samples, others than unsigned
 _TIFF_BYTES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}  # others have one
@@ -69,8 +71,8 @@ class ImageSize:
     height: int
 
 
-def read_image(path: Path, camera: Camera, where: str = "") -> Image:
-    """Read an image as grey levels, (height, width)."""
+def read_image(path: Path, camera: Camera, where: str = "") -> Grey:
+    """Read an image of 8 or 16 bits, grey or in colour, as grey levels."""
     content, problem = _complete_content(path, camera, where)
     if problem:
         raise DatasetError(problem)
@@ -85,10 +87,12 @@ def read_image(path: Path, camera: Camera, where: str = "") -> Image:
     levels = pixels.astype(np.float32)
     if pixels.dtype == np.uint16:
         levels *= np.float32(255.0 / (2 ** _depth(pixels) - 1))
-    return levels if levels.ndim == 2 else np.asarray(cv2.cvtColor(levels, cv2.COLOR_BGR2GRAY))
+    if levels.ndim == 3:
+        levels = np.asarray(cv2.cvtColor(levels, cv2.COLOR_BGR2GRAY), dtype=np.float32)
+    return levels
 
 
-def _depth(pixels: Image) -> int:
+def _depth(pixels: NDArray[np.generic]) -> int:
     """Return how many bits the data of a file of 16 bits have.
 
     Data that are moved to the upper bits leave the lower ones empty and have all 16. An image of 16
@@ -216,12 +220,12 @@ def _tiff_size(content: bytes) -> ImageSize:
     return ImageSize(tags[256][0], tags[257][0])
 
 
-MOST_PIXELS = 6_000_000  # of an image that is made larger
+MAX_PIXELS = 6_000_000  # of an image that is made larger
 
 
 def enlarged(grey: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
     """Return an image made larger by a whole factor; a large one as it is."""
-    if scale == 1 or grey.size > MOST_PIXELS:
+    if scale == 1 or grey.size > MAX_PIXELS:
         return grey
     size = (scale * grey.shape[1], scale * grey.shape[0])
     larger = cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC)

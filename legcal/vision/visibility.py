@@ -13,7 +13,9 @@ from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 
 EQUAL_RADII = 0.01  # relative difference below which two cylinders look like one
-END_COVER = 2.0  # length that may be hidden at a joint and beside a thicker cylinder, in radii
+END_COVER = 2.0  # length that may be hidden at a joint and beside a thicker cylinder [radii]
+N_SAMPLES = 64  # points along a leg that are tested for visibility
+MIN_DEPTH_SHARE = 0.05  # of the leg length: points nearer to the image plane are cut off
 
 
 @dataclass(frozen=True)
@@ -21,9 +23,9 @@ class Segment:
     """A visible stretch of one cylinder of a leg."""
 
     link: str  # the URDF link that names the part
-    radius: float  # radius [m]
-    start: float  # distances from A along the leg between which its outline is looked for [m]
-    end: float  # distances from A along the leg between which its outline is looked for [m]
+    radius: float  # [m]
+    start: float  # distance from A along the leg from which on its outline is looked for [m]
+    end: float  # distance from A up to which it is [m]
 
 
 def visible_segments(
@@ -46,7 +48,7 @@ def visible_segments(
                     for stretch in ((low, min(high, first - gap)), (max(low, last + gap), high))
                 ]
         low, high = max(stretches, key=lambda stretch: stretch[1] - stretch[0])
-        if high > low and _look_alike(radius, main[link].radius):
+        if high > low and look_alike(radius, main[link].radius):
             segments.append(Segment(link, radius, low, high))
     return tuple(sorted(segments, key=lambda segment: (segment.start, segment.link)))
 
@@ -59,7 +61,7 @@ def _merge_equal(
     merged: list[tuple[tuple[float, str], float, float, float]] = []
     for name, radius, start, end in sorted(spans, key=lambda span: (span[2], span[3], span[0])):
         for i, (other_name, other, low, high) in enumerate(merged):
-            if _look_alike(radius, other) and start <= high + radius:
+            if look_alike(radius, other) and start <= high + radius:
                 longest = max(name, other_name)  # of equal lengths the later name, in any pose
                 merged[i] = (longest, max(radius, other), low, max(high, end))
                 break
@@ -68,22 +70,18 @@ def _merge_equal(
     return [(link, radius, start, end) for (_, link), radius, start, end in merged]
 
 
-def _look_alike(one: float, two: float) -> bool:
-    """Say whether two radii are too near to show a step."""
+def look_alike(one: float, two: float) -> bool:
+    """Say whether cylinders of two radii are seen as one: too near to show a step."""
     return abs(one - two) <= EQUAL_RADII * max(one, two)
-
-
-N_SAMPLES = 64  # points along a leg that are tested for visibility
-NEAREST = 0.05  # points nearer to the image plane than this fraction of the leg length are cut off
 
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """A frame on the sensor plane."""
+    """A frame on the sensor plane along a leg: coordinates t along it and v across it [px]."""
 
-    origin: Array  # (2,) point with t = v = 0, and unit directions of t and v, on the sensor plane
-    along: Array  # (2,) point with t = v = 0, and unit directions of t and v, on the sensor plane
-    normal: Array  # (2,) point with t = v = 0, and unit directions of t and v, on the sensor plane
+    origin: Array  # (2,) the point with t = v = 0
+    along: Array  # (2,) unit direction of t
+    normal: Array  # (2,) unit direction of v
     scale: float  # pixels per unit of the sensor plane
     length: float  # the predicted leg is visible for 0 <= t <= length [px]
 
@@ -141,7 +139,7 @@ def bands_of_legs(
     u = (B_camera - A_camera) / length[:, None]
     s = start[:, None] + (end - start)[:, None] * np.linspace(0.0, 1.0, N_SAMPLES)
     axis = A_camera[:, None] + s[..., None] * u[:, None]
-    inside = in_picture(camera, axis, NEAREST * length[:, None])
+    inside = in_picture(camera, axis, MIN_DEPTH_SHARE * length[:, None])
     m = moment(u, A_camera)
     runs = [longest_run(one) if np.count_nonzero(one) > 1 else (0, 0) for one in inside]
     first, last = np.array(runs, dtype=np.intp).reshape(-1, 2).T
@@ -199,10 +197,10 @@ def longest_run(flags: BoolArray) -> tuple[int, int]:
 class PredictedLeg:
     """One leg as it should appear in one image."""
 
-    row: int  # the image and the leg
-    leg: int  # the image and the leg
-    A_camera: Array  # (3,) joint centres in the camera frame [m]
-    B_camera: Array  # (3,) joint centres in the camera frame [m]
+    row: int  # of the image
+    leg: int  # index of the leg
+    A_camera: Array  # (3,) its base joint in the camera frame [m]
+    B_camera: Array  # (3,) its platform joint [m]
     segments: tuple[Segment, ...]  # the parts that can be seen, from base to platform
     outlines: Array  # (n_segments, 2, 3) their outlines h1, h2, eq (3)
     band: Band  # the frame along the visible stretch of the whole leg

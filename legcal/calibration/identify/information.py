@@ -21,6 +21,7 @@ from legcal.calibration.identify.predicted_observations import (
 )
 from legcal.calibration.identify.report import CameraIntrinsics
 from legcal.calibration.joint_fit import Choices
+from legcal.calibration.joint_fit.variables import RefinementSettings
 from legcal.estimation import (
     Factor,
     GaussianPrior,
@@ -37,7 +38,6 @@ from legcal.machine import EquationKind, freedoms, pose_equations
 SIGMA_EXACT = 1e-7  # [m]: of what the mechanism itself demands
 INTRINSICS = ("fx", "fy", "cx", "cy")
 _MAX_INTRINSICS_SIGMA = 0.1  # of a focal length: what is known to no better is not determined
-_RADIUS_SIGMA = 0.02  # relative, as a fit has it
 _OPEN = 0.05  # component of an open direction from which on an intrinsic is part of it
 
 
@@ -194,7 +194,9 @@ def expected_intrinsics(
     of_view = np.array([cameras.index(owner) for owner in owners], dtype=np.intp)
     n_legs, n_cameras = predicted.n_legs, len(cameras)
     by_radius, by_intrinsics = _radii_and_intrinsics(predicted, orientation)
-    known = GaussianPrior(np.arange(n_legs), np.zeros(n_legs), _RADIUS_SIGMA * predicted.radius)
+    known = GaussianPrior(
+        np.arange(n_legs), np.zeros(n_legs), RefinementSettings.radius_sigma * predicted.radius
+    )
     leg = np.broadcast_to(np.arange(n_legs), images.shape[:2])
     camera = np.broadcast_to(of_view[predicted.view][:, None], images.shape[:2])
     numbers = Variables("intrinsics", all_free(n_cameras, len(INTRINSICS)))

@@ -18,12 +18,12 @@ from legcal.geometry import Array
 from legcal.perception import (
     MIN_LENGTH,
     MIN_LONE_KEPT,
-    Grey,
     ImageSearch,
     LegPart,
     find_parts,
     part_outlines,
 )
+from legcal.vision import Grey
 
 SMOOTHING = 1.0  # of the picture before its gradient is taken [px]
 NO_EDGE = 0.9  # share of the pixels whose gradient is below the upper threshold
