@@ -35,6 +35,7 @@ CAMERA_MOVED = "its readings suit it, so check that nobody moved the camera"
 MIN_OUTLINES, MIN_LEGS = 6, 3  # that determine a pose
 MIN_NOISE = 5e-5  # of an outline at its leg [m]
 LOSS = PseudoHuber(4.0)  # of outlines, in least noises
+MAX_STEP = (0.3, 0.3, 0.3, np.inf, np.inf, np.inf)  # of the pose: [rad], and any displacement
 SIGNIFICANT_SIGMAS = 5.0
 MIN_READING_ERROR = 3e-4  # [m]
 SAME_READING = 1e-3  # tolerance for the reading of another image [m]
@@ -106,7 +107,7 @@ def _readings(
 
     touches = (("pose", np.zeros(n, dtype=np.intp), slice(None)),)
     outlines = Factor("outlines", distances, touches, n, 1, whitening=1.0 / MIN_NOISE, robust=True)
-    pose = Variables("pose", all_free(1, 6), Frames.moved)
+    pose = Variables("pose", all_free(1, 6), Frames.moved, max_step=MAX_STEP)
     problem, loss = Problem[_State]((pose,), None, (outlines,)), LOSS
     begin = _State(Frames.of([solution.T_Rb_Re[int(measurements.pose[row])]]))
     try:

@@ -7,8 +7,8 @@ images nor robots (:mod:`legcal.calibration.joint_fit` is its largest client):
 
 **Variables** A block: elements of one manifold. ``unknown`` (n, d) says which unknown moves each of
 the d numbers of each element: -1 is fixed (gauge, or by choice), equal numbers move
-together (views that share a lens). ``retract`` applies changes: :func:`add`, ``Frames.moved``, or
-the client's own. ``labels`` and ``units`` name unknowns that are reported, ``coordinates`` and
+together (views that share a lens). ``retract`` applies changes (a sum, ``Frames.moved``, or
+the client's own). ``labels`` and ``units`` name unknowns that are reported, ``coordinates`` and
 ``jacobian`` map x to reported values where these differ, ``prior`` is a Gaussian on them.
 
 **Factor** Measurements of one kind: ``rows(state)`` returns residuals of all of them at once with

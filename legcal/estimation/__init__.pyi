@@ -1,4 +1,3 @@
-from .loss import LEAST_SQUARES as LEAST_SQUARES
 from .loss import Huber as Huber
 from .loss import PseudoHuber as PseudoHuber
 from .problem import Factor as Factor
@@ -9,7 +8,6 @@ from .problem import Problem as Problem
 from .problem import Residuals as Residuals
 from .problem import Tangent as Tangent
 from .problem import Variables as Variables
-from .problem import add as add
 from .problem import all_free as all_free
 from .problem import fixed_at_start as fixed_at_start
 from .problem import linearize as linearize
@@ -30,7 +28,6 @@ from .uncertainty import explained_share as explained_share
 from .uncertainty import marginal as marginal
 from .uncertainty import named_covariance as named_covariance
 from .uncertainty import named_information as named_information
-from .uncertainty import reduced_jacobian as reduced_jacobian
 from .uncertainty import residual_changes as residual_changes
 from .uncertainty import response as response
 from .uncertainty import score_test as score_test

@@ -24,7 +24,7 @@ from legcal.geometry import Array, IntArray, components, motions_of, turned
 S = TypeVar("S")  # the state: a dataclass with one field for each block of variables
 
 
-def add(value: Array, change: Array) -> Array:
+def _added(value: Array, change: Array) -> Array:
     """Return numbers after a change, whatever shape their elements have."""
     return np.asarray(value + change.reshape(value.shape))
 
@@ -85,7 +85,7 @@ class Variables:
 
     name: str
     unknown: IntArray  # (n, d) the unknown that moves each number; -1 fixed, equal ones move as one
-    retract: Callable[[Any, Array], Any] = add  # (value, change (n, d)) -> value
+    retract: Callable[[Any, Array], Any] = _added  # (value, change (n, d)) -> value
     labels: tuple[str, ...] = ()  # of the unknowns; blocks with labels come first
     units: tuple[str, ...] = ()
     coordinates: Callable[[Any], Array] | None = None  # value -> (n_unknowns,)

@@ -68,7 +68,7 @@ def marginal(information: Array, which: IntArray) -> Array:
     return np.asarray(information[np.ix_(which, which)] - mixed.T @ inverse @ mixed)
 
 
-def reduced_jacobian(
+def _reduced_jacobian(
     problem: Problem[S], linear: Linearization, normal: NormalEquations, name: str
 ) -> Array:
     """Return a factor's derivatives (n, q, n_kept) by kept unknowns, elements following them."""
@@ -100,7 +100,7 @@ def explained_share(
     *covariance* is that of the kept unknowns, if not that of these equations.
     """
     where, rows = problem.places[name], linear[name]
-    G = reduced_jacobian(problem, linear, normal, name)
+    G = _reduced_jacobian(problem, linear, normal, name)
     share = (G @ (normal.kept_covariance() if covariance is None else covariance)) @ np.swapaxes(
         G, -1, -2
     )
@@ -179,7 +179,7 @@ def score_test(
     by_element = np.zeros((*normal.V.shape[:2], c))
     for name, v in columns.items():
         where, rows = problem.places[name], linear[name]
-        G = reduced_jacobian(problem, linear, normal, name)
+        G = _reduced_jacobian(problem, linear, normal, name)
         kept += np.einsum("nqk,nqc->kc", G, v, optimize=True)
         score += np.einsum("nqc,nq->c", v, rows.r)
         left += np.einsum("nqc,nqd->cd", v, v)
