@@ -29,6 +29,34 @@ def test_the_two_commands_of_the_readme_are_the_ones_that_are_checked() -> None:
     assert checked == commands
 
 
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("document", [pytest.param(path, id=path.name) for path in DOCUMENTS])
+def test_documents_name_files_and_functions_that_exist(document: Path) -> None:
+    text = document.read_text()
+    headings = {path: _headings(path) for path in DOCUMENTS}
+    lost = []
+    for link in re.findall(r"\]\((?!http)([^)\s]+)\)", text):
+        name, _, part = link.partition("#")
+        target = (document.parent / name).resolve() if name else document
+        if not target.exists() or (part and part not in headings[target]):
+            lost.append(link)
+    words = " ".join(re.findall(r"`([^`\n]+)`", text))
+    lost += [name for name in re.findall(r"\b\w+\.py\b", words) if not [*ROOT.rglob(name)]]
+    paths = re.findall(r"(?<![\w/.])(?:legcal|benchmarks|tests|docs|examples)/[\w./-]+", words)
+    lost += [path for path in paths if not (ROOT / path).exists()]
+    for name in re.findall(r"\blegcal\.([A-Za-z_]+)\(", text):
+        lost += [] if hasattr(legcal, name) else [f"legcal.{name}"]
+    assert lost == []
+
+
+def _headings(path: Path) -> set[str]:
+    """Return the anchors of the headings of a page."""
+    names = re.findall(r"^#+ (.*)$", path.read_text(), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", name.strip().lower()).replace(" ", "-") for name in names}
+
+
 def test_every_direct_dependency_is_pinned_to_the_version_that_was_tested() -> None:
     pinned = {
         re.split(r"==", line)[0].lower().replace("_", "-")

@@ -212,7 +212,7 @@ def read_observations(
     """Return the table ``observations.csv`` in the order of the file.
 
     (a, b, c) is normalised; the ends are put in order, nearer to the base joint first, as the
-    sign of eq (3) says which. With ``skip_stale``, detected outlines of images, legs or parts that
+    sign of eq (3) has it. With ``skip_stale``, detected outlines of images, legs or parts that
     are no longer there are left out, as in a table that legcal wrote for an earlier state of the
     dataset. Raises DatasetError with one sentence for each thing that is wrong.
     """
