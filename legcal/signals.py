@@ -1,33 +1,123 @@
-"""Stopping by a signal: clean up once, whoever asks and however often."""
+"""Stopping by a signal: what the command line does about Ctrl-C, SIGTERM and SIGHUP.
+
+Only the command line installs handlers (:func:`stopped_by_signals`); in a program that imports
+legcal those of Python and of the program stay. The first signal raises KeyboardInterrupt in the
+main thread. Libraries may swallow it on its way (in imports, destructors, callbacks of solvers): it
+is raised again until it gets through, and nothing is recorded any more (:func:`raise_if_stopped`).
+The second signal ends the process, whatever it does.
+"""
 
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # the last is not on every system
+_NUMBERS = [signal.Signals[name] for name in _NAMES if hasattr(signal, name)]
+_AGAIN = 1.0  # [s] until an interrupt that was swallowed is raised again
+_HAS_TIMER = hasattr(signal, "setitimer")
+_HAS_MASK = hasattr(signal, "pthread_sigmask")
+
+
+class _State:
+    """What the handlers know; one process has one main thread."""
+
+    handling = False  # inside stopped_by_signals
+    stopped = False  # a signal was heard
+    holding = 0  # depth of held_back_signals
 
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """Raise KeyboardInterrupt for any signal that asks the block to end, once.
+    """Raise KeyboardInterrupt for any signal that asks the block to end; a second ends the process.
 
-    Further signals are ignored until the block is left, so that its clean-up runs to the end.
-    A signal that was ignored before, as by ``nohup``, stays so.
+    A block that heard a signal ends with KeyboardInterrupt, whatever became of the first one. A
+    signal that was ignored before, as by ``nohup``, stays so. Blocks in the block do nothing.
     """
-    numbers = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
-    before = {number: signal.getsignal(number) for number in numbers}
-    heard = [number for number in numbers if before[number] is not signal.SIG_IGN]
+    if _State.handling:
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in _NUMBERS}
+    heard = [number for number in _NUMBERS if before[number] is not signal.SIG_IGN]
 
     def stop(_number: int, _frame: FrameType | None) -> None:
-        for number in heard:
-            signal.signal(number, signal.SIG_IGN)
-        raise KeyboardInterrupt
+        for number in heard:  # by the system, as Python may be kept from answering
+            signal.signal(number, signal.SIG_DFL)
+        _State.stopped = True
+        if _HAS_TIMER:
+            signal.signal(signal.SIGALRM, _raise_again)
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN, _AGAIN)
+        if not _State.holding:
+            raise KeyboardInterrupt
 
+    alarm = signal.getsignal(signal.SIGALRM) if _HAS_TIMER else None
     try:
+        _State.handling = True
         for number in heard:
             signal.signal(number, stop)
         yield
+        raise_if_stopped()
+    except BaseException as error:
+        if not isinstance(error, KeyboardInterrupt):
+            raise_if_stopped()
+        raise
     finally:
+        if _State.stopped and _HAS_TIMER:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, alarm)
         for number in heard:
             signal.signal(number, before[number])
+        _State.handling = _State.stopped = False
+
+
+def _raise_again(_number: int, _frame: FrameType | None) -> None:
+    """Raise the interrupt, unless it is on its way and cleans up."""
+    error = sys.exception()
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt | GeneratorExit):
+            return
+        error = error.__context__
+    if not _State.holding:
+        raise KeyboardInterrupt
+
+
+def raise_if_stopped() -> None:
+    """Raise KeyboardInterrupt if a signal was heard: before anything is recorded."""
+    if _State.stopped:
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def held_back_signals() -> Iterator[None]:
+    """Let signals wait for the end of a short block; a longer one looks at :func:`is_waiting`.
+
+    Threads and processes that are started in the block hear none either: they inherit that.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _NUMBERS) if _HAS_MASK else ()
+    _State.holding += 1
+    try:
+        yield
+    finally:
+        _State.holding -= 1
+        if _HAS_MASK:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    raise_if_stopped()  # another thread may have taken it
+
+
+def is_waiting() -> bool:
+    """Say whether a signal waits for the end of a block."""
+    return _State.stopped or (_HAS_MASK and not signal.sigpending().isdisjoint(_NUMBERS))
+
+
+def leave_interrupts_to_parent() -> None:
+    """Let a process of a pool ignore Ctrl-C, which its parent answers, and be ended by the others.
+
+    It was started with :func:`held_back_signals`, so that none came before.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in _NUMBERS:
+        if number is not signal.SIGINT:
+            signal.signal(number, signal.SIG_DFL)
+    if _HAS_MASK:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _NUMBERS)

@@ -5,7 +5,6 @@ Threads do not pay: the work is many short steps, and they would wait for each o
 
 import copyreg
 import os
-import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -19,6 +18,7 @@ from typing import Any, Protocol, TypeVar
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import OutOfResources
+from legcal.signals import held_back_signals, leave_interrupts_to_parent, raise_if_stopped
 
 T = TypeVar("T")
 
@@ -75,11 +75,13 @@ def worker_pool(workers: int) -> Iterator[Run]:
 
     def run(task: Callable[[int], T], rows: Sequence[int], /) -> Iterable[T]:
         chunk = max(1, len(rows) // (_CHUNKS * workers))
-        return pool.map(task, rows, chunksize=chunk)
+        with held_back_signals():  # processes are started in it
+            return pool.map(task, rows, chunksize=chunk)
 
     try:
         yield run
     except BrokenProcessPool as error:
+        raise_if_stopped()  # the signal may have reached them first
         raise OutOfResources(
             f"The images could not be worked on: found that one of {workers} processes was ended "
             "from outside, needed all of them to the end; see that there is enough memory and try "
@@ -89,9 +91,11 @@ def worker_pool(workers: int) -> Iterator[Run]:
         lifeline.close()  # nobody waits for work that is not wanted any more
         raise
     finally:
-        pool.shutdown(cancel_futures=True)
-        lifeline.close()
-        held.close()
+        try:
+            pool.shutdown(cancel_futures=True)
+        finally:
+            lifeline.close()
+            held.close()
 
 
 def _end_with(lifeline: Connection) -> None:
@@ -100,7 +104,7 @@ def _end_with(lifeline: Connection) -> None:
     The other end of the lifeline closes when the pool is stopped, or its process killed: a pool's
     processes would then wait for work for ever.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    leave_interrupts_to_parent()
     Thread(target=_wait_for_end, args=(lifeline,), daemon=True).start()
 
 

@@ -1,8 +1,11 @@
 """Stored outlines: which images are searched again, which rows are kept, what makes them stale."""
 
 import json
+import os
 from collections.abc import Callable, Collection
+from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -238,6 +241,45 @@ def test_a_file_that_cannot_be_read_matches_nothing(folder: Folder, content: byt
     _store(folder)
     (folder.path / CACHE_NAME).write_bytes(content)
     assert _plan(folder).detect.tolist() == list(ALL)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("disk")])
+@pytest.mark.parametrize("n_written", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("before", "searched"), [("nothing", ALL), ("stale", ALL), ("given", (1, 2, 3))]
+)
+def test_writing_that_stops_anywhere_leaves_what_is_searched_again(
+    before: str,
+    searched: tuple[int, ...],
+    n_written: int,
+    error: BaseException,
+    folder: Folder,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if before == "given":
+        _give(folder, (0,))
+    elif before == "stale":
+        _store(folder)
+        _change_image(folder)
+    dataset, replacing, written = load_dataset(folder.path), os.replace, []
+    plan, current = _plan(folder), fingerprint(dataset, SETTINGS)
+    assert tuple(plan.detect) == searched
+
+    def replace_some(source: Path, target: Path) -> None:
+        if len(written) == n_written:
+            raise error
+        written.append(target.name)
+        replacing(source, target)
+
+    with monkeypatch.context() as during, suppress(KeyboardInterrupt):
+        during.setattr(os, "replace", replace_some)
+        note = store_outlines(dataset, _hexapod_outlines(), current, plan.given)
+        assert note is not None
+    assert len(written) == n_written
+    assert tuple(_plan(folder).detect) == searched
+    assert np.array_equal(_plan(folder).given, plan.given)
+    store_outlines(dataset, _hexapod_outlines(), current, plan.given)
+    assert len(_plan(folder).detect) == 0
 
 
 def test_the_file_is_as_documented(folder: Folder) -> None:

@@ -8,9 +8,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 
 import numpy as np
 import pytest
@@ -19,13 +20,14 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import cli, load_dataset, load_mechanism
 from legcal.errors import DatasetError, ModelError, OutOfResources, UsageError
-from legcal.files import check_destination, closest, parse_yaml, result_folder
-from legcal.signals import stopped_by_signals
+from legcal.files import check_destination, closest, parse_yaml, result_folder, write_atomically
+from legcal.signals import raise_if_stopped, stopped_by_signals
 from legcal.workers import worker_pool
 
 __all__ = ["folder"]
 
 LONG = "a" * 400
+Handler = Callable[[int, FrameType | None], object]
 
 POOL = """
 import multiprocessing, os, time
@@ -40,7 +42,7 @@ if __name__ == "__main__":
 
 
 @contextmanager
-def handled(number: signal.Signals, by: signal.Handlers) -> Iterator[None]:
+def handled(number: signal.Signals, by: signal.Handlers | Handler) -> Iterator[None]:
     """Handle a signal in one way for a while, whatever the tests were started under."""
     before = signal.signal(number, by)
     try:
@@ -50,7 +52,7 @@ def handled(number: signal.Signals, by: signal.Handlers) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
-def test_any_signal_stops_once_and_lets_the_clean_up_end(name: str) -> None:
+def test_the_first_signal_interrupts_and_the_second_ends_the_process(name: str) -> None:
     number, ended = signal.Signals[name], []
 
     @stopped_by_signals()
@@ -58,14 +60,71 @@ def test_any_signal_stops_once_and_lets_the_clean_up_end(name: str) -> None:
         try:
             signal.raise_signal(number)
         finally:
-            signal.raise_signal(number)
+            assert signal.getsignal(number) is signal.SIG_DFL
+            with pytest.raises(KeyboardInterrupt):
+                raise_if_stopped()
             ended.append(True)
 
-    with handled(number, signal.SIG_DFL):
+    with handled(number, signal.default_int_handler):
         with pytest.raises(KeyboardInterrupt):
             work()
         assert ended
-        assert signal.getsignal(number) is signal.SIG_DFL
+        assert signal.getsignal(number) is signal.default_int_handler
+    raise_if_stopped()
+
+
+def test_an_interrupt_that_is_swallowed_is_raised_again_but_not_in_its_clean_up() -> None:
+    cleaned = []
+
+    @stopped_by_signals()
+    def work() -> None:
+        try:
+            with suppress(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+            time.sleep(20.0)
+        finally:
+            time.sleep(1.5)
+            cleaned.append(True)
+
+    with handled(signal.SIGINT, signal.default_int_handler), pytest.raises(KeyboardInterrupt):
+        work()
+    assert cleaned
+
+
+@pytest.mark.parametrize("error", [ImportError("numpy"), SystemExit(0), None])
+def test_a_block_that_heard_a_signal_is_interrupted_whatever_came_of_it(
+    error: BaseException | None,
+) -> None:
+    @stopped_by_signals()
+    def work() -> None:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        if error is not None:
+            raise error
+
+    with handled(signal.SIGINT, signal.default_int_handler), pytest.raises(KeyboardInterrupt):
+        work()
+
+
+def test_nothing_is_written_once_a_signal_was_heard(tmp_path: Path) -> None:
+    def write_file() -> None:
+        write_atomically(tmp_path / "file", b"new")
+
+    def write_folder() -> None:
+        with result_folder(tmp_path / "out") as new:
+            (new / "result.json").write_text("{}")
+
+    @stopped_by_signals()
+    def work() -> None:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        for write in (write_file, write_folder):
+            with pytest.raises(KeyboardInterrupt):
+                write()
+
+    with handled(signal.SIGINT, signal.default_int_handler), pytest.raises(KeyboardInterrupt):
+        work()
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGHUP"])

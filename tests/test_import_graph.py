@@ -140,6 +140,7 @@ def test_estimation_knows_no_images_and_no_robot() -> None:
         "files",
         "geometry",
         "estimation",
+        "signals",
     }
 
 
@@ -148,6 +149,7 @@ def test_geometry_knows_no_robot_and_no_camera() -> None:
         "errors",
         "files",
         "geometry",
+        "signals",
     }
 
 

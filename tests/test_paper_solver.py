@@ -1,6 +1,9 @@
 """What the steps are built of: least squares by IPOPT, unknown motions and axes, registration."""
 
+import os
+import signal
 from dataclasses import replace
+from threading import Timer
 
 import casadi as ca
 import numpy as np
@@ -83,6 +86,28 @@ def test_a_problem_that_ipopt_gives_up_is_refused_with_its_status() -> None:
     problem = _problem("A root", x, ca.sqrt(x) - 1.0, [-1.0])
     with pytest.raises(DidNotConverge, match=r"A root could not be .*Invalid_Number.*, needed "):
         solve_least_squares(problem)
+
+
+def test_an_interrupt_inside_ipopt_reaches_the_caller() -> None:
+    x = ca.SX.sym("x", 2)
+    problem = _problem("A valley", x, ca.vertcat(1.0 - x[0], 10.0 * (x[1] - x[0] ** 2)), [-1.2, 1])
+    solve_least_squares(problem)  # compiled
+
+    def solve_until_killed(killer: Timer) -> None:
+        killer.start()
+        while True:
+            solve_least_squares(problem)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        for delay in np.linspace(0.001, 0.03, 12).tolist():
+            killer = Timer(delay, os.kill, (os.getpid(), signal.SIGINT))
+            with pytest.raises(KeyboardInterrupt):
+                solve_until_killed(killer)
+            killer.join()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert solve_least_squares(problem).status == "Solve_Succeeded"
 
 
 def _poses_of_a_plane(n_poses: int, seen: int) -> LeastSquares:

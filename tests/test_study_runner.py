@@ -70,6 +70,19 @@ def test_failed_runs_are_recorded_and_counted(tmp_path: Path) -> None:
     assert again.document() == document
 
 
+def test_runs_that_an_interrupt_ended_inside_ipopt_are_done_again(tmp_path: Path) -> None:
+    whole = run_study(Draws(), 10, output=tmp_path).document()
+    checkpoint = tmp_path / CHECKPOINT_NAME
+    message = "IPOPT stopped after 3 iterations with NonIpopt_Exception_Thrown, needed ..."
+    failure = {"run": 4, "failure": {"kind": "DidNotConverge", "message": message}}
+    lines = _lines(tmp_path)
+    lines[5] = json.dumps(failure).encode() + b"\n"
+    checkpoint.write_bytes(b"".join(lines))
+    for _ in range(2):
+        assert run_study(Draws(), 10, output=tmp_path).document() == whole
+    assert len(_lines(tmp_path)) == len(lines) + 1
+
+
 def test_a_study_of_failures_only_says_why() -> None:
     with pytest.raises(DidNotConverge, match=r"all of its 5 runs failed.*The draw is"):
         run_study(Draws(fails_above=-np.inf), 5)

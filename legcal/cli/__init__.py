@@ -1,5 +1,23 @@
 """The command line: parses, calls a job, prints its document or its report, returns a code."""
 
-from legcal.cli.app import main
+import sys
 
-__all__ = ["main"]
+from legcal.signals import stopped_by_signals
+
+_INTERRUPTED = 130
+
+
+def main() -> None:
+    """Run the command line and exit with 0, 1 (data), 2 (use), 3 (internal) or 130 (stopped)."""
+    as_json = "--json" in sys.argv
+    try:
+        with stopped_by_signals():  # before all imports that take time
+            from legcal.cli.app import run
+
+            code = run(as_json=as_json)
+    except KeyboardInterrupt:
+        from legcal.cli.options import print_failure
+
+        print_failure("Interrupted", "Stopped before the end.", as_json=as_json)
+        code = _INTERRUPTED
+    sys.exit(code)

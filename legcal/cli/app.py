@@ -20,11 +20,11 @@ from legcal.cli.options import print_failure
 from legcal.cli.simulate import simulate
 from legcal.cli.study import study
 from legcal.errors import LegcalError, UsageError
-from legcal.signals import stopped_by_signals
+from legcal.signals import raise_if_stopped
 from legcal.version import __version__
 
 ISSUES = "the issue tracker of legcal"
-INTERRUPTED = 130
+INTERRUPTED = 130  # exit code
 NO_COMMAND = "Nothing was done: found no command, needed one of those above."
 
 app = typer.Typer(
@@ -80,26 +80,25 @@ def _refuse_empty(words: Sequence[str]) -> None:
             )
 
 
-def main() -> None:
-    """Run the command line and exit with 0, 1 (data), 2 (use), 3 (internal) or 130 (stopped)."""
+def run(*, as_json: bool) -> int:
+    """Run the command line and return 0, 1 (data), 2 (use) or 3 (internal)."""
     # Thousands of small matrices: threads inside a product only get in each other's way.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     usage_error: type[Exception] = typer.BadParameter.__bases__[0]
-    as_json = "--json" in sys.argv
     try:
-        with stopped_by_signals():
-            _refuse_empty(sys.argv[1:])
-            code = app(standalone_mode=False)
-    except LegcalError as error:
-        print_failure(type(error).__name__, str(error), as_json=as_json)
-        code = error.exit_code
-    except usage_error as error:
-        message = getattr(error, "format_message", error.__str__)()
-        print_failure("UsageError", message or NO_COMMAND, as_json=as_json)
-        code = 2
-    except (KeyboardInterrupt, typer.Abort):
-        code = INTERRUPTED
+        _refuse_empty(sys.argv[1:])
+        code = app(standalone_mode=False)
+    except typer.Abort as error:
+        raise KeyboardInterrupt from error
     except Exception as error:  # the one place that may: the boundary to the shell
+        raise_if_stopped()  # libraries turn interrupts into errors of their own
+        if isinstance(error, LegcalError):
+            print_failure(type(error).__name__, str(error), as_json=as_json)
+            return error.exit_code
+        if isinstance(error, usage_error):
+            message = getattr(error, "format_message", error.__str__)()
+            print_failure("UsageError", message or NO_COMMAND, as_json=as_json)
+            return 2
         traceback.print_exc()
         print_failure(
             "InternalError",
@@ -108,7 +107,7 @@ def main() -> None:
             f"lines above to {ISSUES}.",
             as_json=as_json,
         )
-        code = 3
+        return 3
     if code == INTERRUPTED:  # typer turns the interrupt of a command into this code
-        print_failure("Interrupted", "Stopped before the end.", as_json=as_json)
-    sys.exit(code if isinstance(code, int) else 0)
+        raise KeyboardInterrupt
+    return code if isinstance(code, int) else 0

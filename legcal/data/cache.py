@@ -30,6 +30,7 @@ from legcal.version import __version__
 from legcal.vision import board_document
 
 FORMAT = 1
+_INCOMPLETE = "incomplete"  # the fingerprint while the table is being written: it matches nothing
 
 
 class CacheEntry(FileSchema):
@@ -159,24 +160,33 @@ def store_outlines(
     given: BoolArray,  # (n_rows,) ``DetectionPlan.given``
     notes: Sequence[str] = (),
 ) -> str | None:
-    """Write outlines and the fingerprint of what they came from beside the dataset."""
+    """Write outlines and the fingerprint of what they came from beside the dataset.
+
+    A fingerprint that matches nothing stands until the table does: whatever stops the writing, the
+    outlines that were detected are never taken for outlines that the user gave, nor for others'.
+    """
     names = zip(places(dataset.measurements), given, strict=True)
     entry = {
         "format": FORMAT,
-        "fingerprint": current,
+        "fingerprint": _INCOMPLETE,
         "given": sorted(list(name) for name, is_given in names if is_given),
         "notes": list(notes),
     }
     path = dataset.folder / OBSERVATIONS_NAME
     try:
+        _write_entry(dataset.folder, entry)
         write_observations(path, outlines, dataset.measurements, dataset.machine.leg_names)
-        write_atomically(dataset.folder / CACHE_NAME, (json.dumps(entry) + "\n").encode())
+        _write_entry(dataset.folder, entry | {"fingerprint": current})
     except OSError as error:
         return (
             f"{path}: the outlines could not be kept: found '{error.strerror}', needed a folder "
             "that can be written to; the images will be searched again next time."
         )
     return None
+
+
+def _write_entry(folder: Path, entry: Mapping[str, object]) -> None:
+    write_atomically(folder / CACHE_NAME, (json.dumps(entry) + "\n").encode())
 
 
 def _read_entry(path: Path) -> CacheEntry | None:

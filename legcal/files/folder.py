@@ -19,6 +19,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from legcal.errors import DatasetError, LegcalError, OutOfResources, UsageError
 from legcal.files.schema import parse_yaml, read_text
+from legcal.signals import held_back_signals, raise_if_stopped
 
 TEMPORARY_SUFFIX = ".legcal-part"
 _MOST_OF_NAME = 40  # letters: a name of the greatest length leaves none for what is added to it
@@ -28,6 +29,7 @@ def write_atomically(path: Path, content: bytes) -> None:
     """Write a file so that any other program sees its old or its new content, never a part."""
     with temporary_folder(path.parent, path.name) as folder:
         (folder / path.name).write_bytes(content)
+        raise_if_stopped()
         os.replace(folder / path.name, path)
 
 
@@ -225,10 +227,12 @@ def result_folder(
                 yield new
             _check_places(new, destination, kind, replaceable)
             destination.parent.mkdir(parents=True, exist_ok=True)
-            if destination.exists():
-                _replace_files(new, destination, temporary / "old", stale)
-            else:
-                os.rename(new, destination)
+            raise_if_stopped()
+            with held_back_signals():
+                if destination.exists():
+                    _replace_files(new, destination, temporary / "old", stale)
+                else:
+                    os.rename(new, destination)
     except OSError as error:
         raise OutOfResources(
             f"{destination}: the {kind.noun} could not be written: found '{error.strerror}', "

@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from legcal.errors import DidNotConverge
 from legcal.geometry import Array, BoolArray, IntArray
+from legcal.signals import held_back_signals, is_waiting
 
 _RANK = 1e-7  # singular values of the scaled Jacobian below this are undetermined directions
 _REWEIGHTINGS = 4
@@ -26,6 +27,7 @@ _OUTLIER = 4.0  # an observation this many times the median has half its weight
 _CONVERGED = 0.01  # change of a weight that no longer matters
 _MIN_THRESHOLD = 1e-3  # standard deviations: smaller residuals are rounding
 _CACHE_SIZE = 8  # compiled structures: those of one run of the steps, with either criteria
+_INTERRUPTED = ("NonIpopt_Exception_Thrown", "User_Requested_Stop")  # return statuses
 _OPTIONS: dict[str, bool | int | float | str] = {
     "print_time": False,
     "calc_lam_p": False,
@@ -174,6 +176,12 @@ def solve_least_squares(problem: LeastSquares) -> IpoptSolution:
     not depend on units of length or on the noise. With robust terms the problem is solved again
     with Cauchy weights until these have converged. Raises DidNotConverge.
     """
+    with held_back_signals():  # CasADi swallows what is raised in its conversions
+        return _solved(problem)
+
+
+def _solved(problem: LeastSquares) -> Solution:
+    """Return :func:`solve_least_squares`; it ends early if a signal waits."""
     compiled, observed = _compiled(problem._structure()), problem._observed()
     scale = _column_scale(_sparse(compiled.jacobian(problem.start, observed)))
     if problem.exact_hessian:  # coordinates of one kind; some columns of J may vanish
@@ -188,8 +196,7 @@ def solve_least_squares(problem: LeastSquares) -> IpoptSolution:
                 break
             root_weight = new
         parameters = ca.vertcat(ca.DM(root_weight), ca.DM(problem.start), ca.DM(scale), observed)
-        found = compiled.solver(x0=z, p=parameters)
-        stats = compiled.solver.stats()
+        z, stats = _minimum(compiled, z, parameters)
         if not stats["success"]:
             raise DidNotConverge(
                 f"{problem.name} could not be computed: IPOPT stopped after "
@@ -197,7 +204,7 @@ def solve_least_squares(problem: LeastSquares) -> IpoptSolution:
                 "Solve_Succeeded or Solved_To_Acceptable_Level; check the nominal model and the "
                 "observations, or reject the ones with large residuals."
             )
-        z, status = _dense(found["x"]), str(stats["return_status"])
+        status = str(stats["return_status"])
         n_iterations += int(stats["iter_count"])
     x = problem.start + scale * z
     return IpoptSolution(
@@ -208,6 +215,20 @@ def solve_least_squares(problem: LeastSquares) -> IpoptSolution:
         n_iterations=n_iterations,
         status=status,
     )
+
+
+def _minimum(compiled: _Compiled, z: Array, parameters: ca.DM) -> tuple[Array, dict[str, Any]]:
+    """Return where IPOPT ends and its statistics; raise KeyboardInterrupt if a signal stopped it.
+
+    No exception passes through IPOPT. One that a signal handler raises while CasADi looks for
+    signals ends it with a status that nothing else causes here: failed evaluations have others.
+    """
+    compiled.watch.is_stopped = False
+    found = compiled.solver(x0=z, p=parameters)
+    stats = compiled.solver.stats()
+    if compiled.watch.is_stopped or stats["return_status"] in _INTERRUPTED:
+        raise KeyboardInterrupt
+    return _dense(found["x"]), stats
 
 
 def _cauchy_root_weights(residuals: Array, block: IntArray) -> Array:
@@ -236,6 +257,35 @@ class _Compiled(NamedTuple):
     solver: ca.Function  # parameters: square roots of weights, start, scale, observed
     residuals: ca.Function  # (x, observed) -> (m,)
     jacobian: ca.Function  # (x, observed) -> sparse (m, n)
+    watch: _Watch  # of the solver
+
+
+class _Watch(ca.Callback):
+    """Called by IPOPT in every iteration: stops it when a signal waits."""
+
+    def __init__(self, n_unknowns: int) -> None:
+        super().__init__()
+        self.is_stopped = False
+        self._sizes = {"x": n_unknowns, "lam_x": n_unknowns, "f": 1}
+        self.construct("watch")
+
+    def get_n_in(self) -> int:
+        return int(ca.nlpsol_n_out())
+
+    def get_n_out(self) -> int:
+        return 1
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        size = self._sizes.get(ca.nlpsol_out(i))
+        return ca.Sparsity(0, 0) if size is None else ca.Sparsity.dense(size)
+
+    def eval(self, _found: Sequence[ca.DM]) -> list[int]:
+        """Return 1 to stop."""
+        try:
+            self.is_stopped = self.is_stopped or is_waiting()
+        except KeyboardInterrupt:  # out of the handler of Python, which runs here
+            self.is_stopped = True
+        return [int(self.is_stopped)]
 
 
 @lru_cache(maxsize=_CACHE_SIZE)
@@ -267,8 +317,10 @@ def _compiled(structure: _Structure) -> _Compiled:
         )
     if robust:  # more iterations only look for a descent below rounding
         options["ipopt.acceptable_iter"] = 2
+    watch = _Watch(n)
+    options["iteration_callback"] = watch
     nlp: dict[str, Any] = {"x": z, "p": p, "f": cost}
-    return _Compiled(ca.nlpsol("solver", "ipopt", nlp, options), residuals, jacobian)
+    return _Compiled(ca.nlpsol("solver", "ipopt", nlp, options), residuals, jacobian, watch)
 
 
 def _residuals_and_jacobian(

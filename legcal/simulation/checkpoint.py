@@ -16,11 +16,13 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from legcal.errors import OutOfResources, UsageError
+from legcal.signals import raise_if_stopped
 from legcal.version import __version__
 
 CHECKPOINT_NAME = "runs.jsonl"
 _KEY = "legcal_study"
 _VERSION = 1
+_INTERRUPTED = b"NonIpopt_Exception_Thrown"  # an interrupt that earlier versions took for a failure
 _NEXT = "free some space and start the same command again; the runs before are kept"
 _NEXT_WITHOUT = "free some space, or give an output folder elsewhere, which keeps what is done"
 
@@ -90,7 +92,8 @@ class Checkpoint:
             yield json.loads(self._reader.readline())
 
     def _write(self, content: bytes) -> None:
-        """Append bytes and wait until the disk has them."""
+        """Append bytes and wait until the disk has them; nothing once a signal was heard."""
+        raise_if_stopped()
         try:
             rest = memoryview(content)
             while rest:
@@ -160,7 +163,8 @@ def _read(
             continue
         if not _is_run(found, is_record):
             raise _damaged(path, number)
-        offsets.setdefault(found["run"], end)
+        if _INTERRUPTED not in line:  # such a run is done again
+            offsets.setdefault(found["run"], end)
         end += len(line)
     return offsets, end
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import sys
 import tempfile
 import time
@@ -30,6 +29,7 @@ from legcal.errors import DidNotConverge, LegcalError, OutOfResources, UsageErro
 from legcal.files import TEMPORARY_SUFFIX, write_atomically
 from legcal.processors import processors
 from legcal.progress import Report, no_progress
+from legcal.signals import held_back_signals, leave_interrupts_to_parent, raise_if_stopped
 from legcal.simulation.checkpoint import (
     CHECKPOINT_NAME,
     Checkpoint,
@@ -291,8 +291,11 @@ def lines_of_runs(
         )
         tasks = (delayed(run_chunk)(study, seed, chunk) for chunk in chunks)
         try:
-            yield from parallel(tasks)
+            with held_back_signals():  # processes are started in it
+                chunks_of_lines = parallel(tasks)
+            yield from chunks_of_lines
         except BrokenProcessPool as error:
+            raise_if_stopped()  # the signal may have reached them first
             raise OutOfResources(
                 f"The study could not be finished: found that one of {workers} processes was "
                 "ended from outside, needed all of them to the end; see that there is enough "
@@ -336,7 +339,7 @@ def _without_advice() -> Iterator[None]:
 
 def _follow(parent: int) -> None:
     """Leave the answer to Ctrl-C to the process that started this one, and end when it does."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    leave_interrupts_to_parent()
     Thread(target=_end_with, args=(parent,), daemon=True).start()
 
 
