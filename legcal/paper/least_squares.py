@@ -180,7 +180,7 @@ def solve_least_squares(problem: LeastSquares) -> IpoptSolution:
         return _solved(problem)
 
 
-def _solved(problem: LeastSquares) -> Solution:
+def _solved(problem: LeastSquares) -> IpoptSolution:
     """Return :func:`solve_least_squares`; it ends early if a signal waits."""
     compiled, observed = _compiled(problem._structure()), problem._observed()
     scale = _column_scale(_sparse(compiled.jacobian(problem.start, observed)))
