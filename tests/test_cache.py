@@ -261,7 +261,7 @@ def test_writing_that_stops_anywhere_leaves_what_is_searched_again(
     elif before == "stale":
         _store(folder)
         _change_image(folder)
-    dataset, replacing, written = load_dataset(folder.path), os.replace, []
+    dataset, replacing, written = load_dataset(folder.path), os.replace, list[str]()
     plan, current = _plan(folder), fingerprint(dataset, SETTINGS)
     assert tuple(plan.detect) == searched
 
