@@ -1,28 +1,29 @@
-"""The fit written out densely, by differences and without elimination, to check the solver by."""
+"""A problem written out densely, by differences and without elimination, to check the solver by."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy.linalg import null_space
 
 from legcal.calibration.joint_fit import FitProblem, State
-from legcal.estimation import Linearization, linearize
+from legcal.estimation import Linearization, Problem, linearize
 from legcal.geometry import Array
 from legcal.machine import pose_equations
 
 STEP = 1e-6
 
 
-def residuals(problem: FitProblem, state: State) -> Array:
+def residuals(problem: Problem[Any], state: Any) -> Array:
     """Return all whitened residuals one below the other, those of priors last."""
     linear = linearize(problem, state)
     of_factors = [linear[factor.name].r.ravel() for factor in problem.factors]
     return np.concatenate([*of_factors, linear.prior_r])
 
 
-def jacobians(problem: FitProblem, linear: Linearization) -> dict[str, Array]:
+def jacobians(problem: Problem[Any], linear: Linearization) -> dict[str, Array]:
     """Return the derivatives (n, size) of each factor's residuals by all unknowns, and priors'."""
     found = {}
     for factor in problem.factors:
@@ -33,16 +34,17 @@ def jacobians(problem: FitProblem, linear: Linearization) -> dict[str, Array]:
         at = np.arange(n)[:, None, None], np.arange(q)[None, :, None]
         np.add.at(wide, (*at, kept[:, None]), rows.J)
         if factor.element is not None:
-            poses = problem.n_kept + 6 * factor.element[:, None] + np.arange(6)
-            np.add.at(wide, (*at, poses[:, None]), rows.J_element)
+            d = problem.d_element
+            elements = problem.n_kept + d * factor.element[:, None] + np.arange(d)
+            np.add.at(wide, (*at, elements[:, None]), rows.J_element)
         found[factor.name] = wide[..., :-1].reshape(n * q, problem.size)
     priors = np.zeros((len(linear.prior_r), problem.size))
     priors[:, : problem.n_kept] = linear.prior_J
     return found | {"priors": priors}
 
 
-def jacobian(problem: FitProblem, linear: Linearization) -> Array:
-    """Return the derivatives of all residuals by all unknowns, (n, size), as the fit has them."""
+def jacobian(problem: Problem[Any], linear: Linearization) -> Array:
+    """Return the derivatives of all residuals by all unknowns as the solver has them, (n, size)."""
     return np.concatenate(list(jacobians(problem, linear).values()))
 
 
@@ -52,11 +54,11 @@ def projected_move(problem: FitProblem, state: State, x: Array) -> State:
 
 
 def by_differences(
-    problem: FitProblem,
-    state: State,
-    values: Callable[[State], Array],
+    problem: Problem[Any],
+    state: Any,
+    values: Callable[[Any], Array],
     directions: Array,
-    move: Callable[[FitProblem, State, Array], State] = FitProblem.moved,
+    move: Callable[[Any, Any, Array], Any] = Problem.moved,
 ) -> Array:
     """Return the derivatives of values of a state along rows of directions."""
     columns = [

@@ -1,11 +1,16 @@
-"""Residuals of the joint fit by a second route, all derivatives by differences, steps densely."""
+"""Residuals by a second route, derivatives of all clients by differences, steps densely."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 from axes_session import axes_session
 from board_session import SIGMA_PX, corners_of, with_board
+from camera_sessions import CAMERAS, seen_corners
 from dense_fit import (
     allowed,
     by_differences,
@@ -15,15 +20,33 @@ from dense_fit import (
     residuals,
     violations,
 )
+from hexapod_session import disturbed_start, simulate
+from located import BASE, TOOL, frames_of, pairs_at
 from machine_session import LENS, PINHOLE, MachineSession, machine_session, shifted
+from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
-from legcal.calibration.joint_fit import Choices, FitProblem, Prior, State, build_fit
+from legcal import load_mechanism
+from legcal.calibration import outlier_images as outlier_images_module
+from legcal.calibration.joint_fit import (
+    DISAGREES,
+    Choices,
+    FitProblem,
+    Prior,
+    State,
+    build_fit,
+    refine,
+)
 from legcal.calibration.joint_fit.outline_errors import N_KINDS, EdgeBiases
+from legcal.calibration.location import fit as location_fit
+from legcal.calibration.location.fit import fit
+from legcal.calibration.location.observations import PoseNoise
+from legcal.calibration.outlier_images import outlier_images
 from legcal.data import axes_from_outlines, no_outlines
-from legcal.estimation import Frames, PseudoHuber, linearize, normal_equations, solver
+from legcal.estimation import Frames, Problem, PseudoHuber, linearize, normal_equations, solver
 from legcal.geometry import Array
-from legcal.vision import Camera, outlines_of_axis
+from legcal.perception import adjust_board, board_adjustment
+from legcal.vision import Camera, intrinsic_names, outlines_of_axis
 
 K = 0.1
 LOSS = PseudoHuber(K**-0.5)
@@ -181,6 +204,64 @@ def test_all_factors_have_the_derivatives_of_finite_differences(name: str) -> No
     assert all("axis" in n or n.endswith((".twist", ".length")) for n in idle)
     # Differences of an angle with a prior are rounded by 1e-16 rad over its sigma and the step.
     assert np.abs((J - expected) / np.maximum(size, 0.1)).max() < 1e-6
+
+
+def _board(free: tuple[str, ...] = (), model: str = "plumb_bob") -> None:
+    camera = CAMERAS[model]
+    seen = seen_corners(camera, 3, 1)
+    start = RigidTransform.from_translation([-0.12, -0.08, 0.4])
+    adjust_board(camera, [start] * 3, seen, free or (), max_iterations=3)
+
+
+def _tool_poses() -> None:
+    pairs, noise = pairs_at(BASE, TOOL), PoseNoise(np.ones((8, 2)), np.ones(2), (True, True))
+    by_model = np.random.default_rng(0).normal(size=(8, 6, 4))
+    fit(pairs, frames_of(BASE, TOOL), noise, by_model)
+
+
+def _outlier_image() -> None:
+    session = simulate(6)
+    found = refine(session.legs, session.measurements, session.outlines, disturbed_start(session))
+    o = found.outlines
+    wrong = o.row == 1
+    reason = tuple(DISAGREES if out else "" for out in wrong.tolist())
+    rejected = replace(found, outlines=replace(o, used=o.used & ~wrong, reason=reason))
+    assert outlier_images(session.measurements, load_mechanism("hexapod"), rejected)
+
+
+CLIENTS: dict[str, tuple[ModuleType, Callable[[], None]]] = {
+    "board before a known camera": (board_adjustment, _board),
+    **{
+        f"board before an unknown camera, {model}": (
+            board_adjustment,
+            partial(_board, intrinsic_names(camera), model),
+        )
+        for model, camera in CAMERAS.items()
+    },
+    "tool poses with errors of the model": (location_fit, _tool_poses),
+    "outlines of one image": (outlier_images_module, _outlier_image),
+}
+
+
+@pytest.mark.parametrize("client", CLIENTS)
+def test_problems_of_other_clients_have_them_too(
+    client: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module, run = CLIENTS[client]
+    seen: list[tuple[Problem[Any], Any]] = []
+
+    def watched(problem: Problem[Any], state: Any, *more: Any, **options: Any) -> Any:
+        seen.append((problem, state))
+        return solver.minimise(problem, state, *more, **options)
+
+    monkeypatch.setattr(module, "minimise", watched)
+    run()
+    problem, state = seen[0]
+    J = jacobian(problem, linearize(problem, state))
+    expected = by_differences(problem, state, lambda s: residuals(problem, s), np.eye(problem.size))
+    size = np.abs(expected).max(axis=0)
+    assert np.all(size > 0.0)
+    assert np.abs((J - expected) / size).max() < 1e-5
 
 
 @pytest.mark.parametrize(
