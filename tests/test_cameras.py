@@ -22,9 +22,15 @@ from legcal.vision import (
     DistortionModel,
     axis_of_outlines,
     camera_info,
+    intrinsic_names,
+    intrinsic_unit,
+    intrinsic_values,
     outlines_of_axis,
     point_with_zero_y,
     read_camera,
+    shared_cameras,
+    undistort_derivatives,
+    with_intrinsics,
 )
 
 FAST = settings(deadline=None, max_examples=40)
@@ -119,6 +125,61 @@ def test_line_offset_is_the_distance_to_the_line_as_the_lens_bends_it(
     nearest = np.linalg.norm(curve - camera.distort(xy), axis=-1).min()
     assert camera.line_offset(h, xy) == pytest.approx(np.sign(offset) * nearest, abs=2e-3)
     assert camera.line_offset(5.0 * h, xy) == pytest.approx(camera.line_offset(h, xy), rel=1e-12)
+
+
+# Intrinsics by their names.
+
+PIXELS = np.array([[[12.0, 30.0], [700.5, 101.25]], [[511.5, 380.5], [1000.0, 760.0]]])
+STRAIGHT = np.array([[1290.0, 0.0, 511.0], [0.0, 1285.0, 380.0], [0.0, 0.0, 1.0]])
+PLAIN, FIVE = Camera(STRAIGHT, *SIZE), Camera(STRAIGHT, *SIZE, np.array(PLUMB_BOB))
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [PLAIN, PINHOLE, *(Camera(STRAIGHT, *SIZE, np.array(D), model) for model, D in LENSES[1:5])],
+    ids=lambda c: f"{c.model}-{len(c.distortion)}",
+)
+def test_points_move_with_each_intrinsic_as_the_differences_say(camera: Camera) -> None:
+    names, values = intrinsic_names(camera), intrinsic_values(camera)
+    found = undistort_derivatives(camera, PIXELS, names)
+    assert found.shape == (2, 2, 2, len(names))
+    for k, (name, value) in enumerate(zip(names, values, strict=True)):
+        step = 1e-2 if intrinsic_unit(name) == "px" else 1e-5
+        plus, minus = (
+            with_intrinsics(camera, {name: value + sign * step}).undistort(PIXELS)
+            for sign in (1, -1)
+        )
+        slope = (plus - minus) / (2.0 * step)
+        np.testing.assert_allclose(found[..., k], slope, rtol=2e-5, atol=2e-8, err_msg=name)
+    same = with_intrinsics(camera, dict(zip(names, values, strict=True)))
+    np.testing.assert_array_equal(same.undistort(PIXELS), camera.undistort(PIXELS))
+    both = undistort_derivatives(camera, PIXELS, ("cy", "fx"))
+    alone = undistort_derivatives(camera, PIXELS, ("fx",))
+    np.testing.assert_allclose(both[..., 1:], alone, rtol=1e-12)
+    assert undistort_derivatives(camera, PIXELS, ()).shape == (2, 2, 2, 0)
+
+
+def test_intrinsics_are_those_of_the_model() -> None:
+    plumb_bob = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    for camera, names in (
+        (PLAIN, plumb_bob),
+        (FIVE, plumb_bob),
+        (CAMERAS[2], plumb_bob),
+        (CAMERAS[3], (*plumb_bob, "k4", "k5", "k6")),
+        (CAMERAS[4], ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
+        (PINHOLE, ("fx", "fy", "cx", "cy")),  # it has skew, which OpenCV's distortion lacks
+    ):
+        assert intrinsic_names(camera) == names
+    assert [intrinsic_unit(name) for name in ("fx", "cy", "k1", "p2")] == ["px", "px", "", ""]
+
+
+def test_views_of_one_camera_share_its_intrinsics_in_any_order() -> None:
+    again = Camera(STRAIGHT.copy(), *SIZE, np.zeros(5))  # the same camera, written at length
+    for names, cameras in (
+        (["c3", "c2", "c1"], [PLAIN, FIVE, again]),
+        (["c1", "c2", "c3"], [again, FIVE, PLAIN]),
+    ):
+        assert shared_cameras(names, cameras) == ("c1", "c2", "c1")
 
 
 # Files.

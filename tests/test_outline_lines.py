@@ -18,15 +18,13 @@ from legcal.perception.blocks import (
     fit_blocks,
     fit_lines,
 )
-from legcal.perception.light import MAX_NOISE_RATIO, Samples, evened_weights, to_light
+from legcal.perception.light import Samples, evened_weights, to_light
 from legcal.perception.limb import (
     HALF,
-    MINUS_HALF,
     N_AMPLITUDES,
     N_POWERS,
     RAMP,
     SQUARE,
-    STEP,
     THREE_HALVES,
     basis,
     powers,
@@ -69,35 +67,38 @@ def read(
     return read_profiles(numbered(axis), LENS, edges, [e.v for e in edges], depths, 8, most)
 
 
-@pytest.mark.parametrize("angle", [0.1, 1.5, 2.4, 5.0])
-@pytest.mark.parametrize("epsilon", [1.0, -1.0])
-def test_distances_are_those_of_the_pixels_that_are_read(angle: float, epsilon: float) -> None:
+@pytest.mark.parametrize(
+    ("angle", "epsilon", "place"),
+    [(0.1, 1.0, None), (1.5, -1.0, None), (2.4, -1.0, None), (5.0, 1.0, None),
+     (np.pi / 2, 1.0, (399.0, 150.0)), (0.0, 1.0, (200.0, 299.0))],
+)  # fmt: skip
+def test_distances_are_those_of_the_pixels_that_are_read(
+    angle: float, epsilon: float, place: tuple[float, float] | None
+) -> None:
+    """Those inside the image, up to a depth, also where an outline is on its border."""
     one = edge_at(angle, epsilon)
+    if place is not None:
+        there = LENS.undistort(np.array(place))
+        one = replace(one, band=replace(one.band, origin=one.band.origin + there))
     columns, rows = read([one], 0), read([one], 1)
     xy = LENS.undistort(np.stack([columns.grey, rows.grey], axis=-1).astype(np.float64))
     h = one.band.line(*V)
     distance = epsilon * LENS.line_offset(np.broadcast_to(h, (*xy.shape[:-1], 3)), xy)
     seen = columns.inside
+    np.testing.assert_allclose(
+        columns.d[seen], distance[seen], atol=0.02 if place is None else 0.05
+    )
+    if place is not None:
+        assert np.count_nonzero(seen) > 50
+        return
     assert np.count_nonzero(seen) > 500
-    np.testing.assert_allclose(columns.d[seen], distance[seen], atol=0.02)
     assert distance[seen].min() < -DEEP + 0.3
     assert distance[seen].max() > DEEP - 0.3
     t, _ = one.band.coordinates(xy)
     np.testing.assert_allclose(columns.position, t.mean(axis=1) / one.band.length, atol=0.02)
-
-
-@pytest.mark.parametrize(("angle", "place"), [(np.pi / 2, (399.0, 150.0)), (0.0, (200.0, 299.0))])
-def test_pixels_beyond_the_border_are_not_read(angle: float, place: tuple[float, float]) -> None:
-    one = edge_at(angle)
-    there = LENS.undistort(np.array(place))
-    one = replace(one, band=replace(one.band, origin=one.band.origin + there))
-    columns, rows = read([one], 0), read([one], 1)
-    xy = LENS.undistort(np.stack([columns.grey, rows.grey], axis=-1).astype(np.float64))
-    h = one.band.line(*V)
-    distance = LENS.line_offset(np.broadcast_to(h, (*xy.shape[:-1], 3)), xy)
-    seen = columns.inside
-    assert np.count_nonzero(seen) > 50
-    np.testing.assert_allclose(columns.d[seen], distance[seen], atol=0.05)
+    shallow = read([one], inner=1.0)
+    assert shallow.d[shallow.inside].max() <= 1.0
+    assert shallow.d[shallow.inside].min() < -3.0
 
 
 def test_gain_is_how_far_an_outline_moves_in_the_image() -> None:
@@ -131,12 +132,6 @@ def test_hidden_stretches_and_other_blocks_are_left_out() -> None:
     )
     n = len(every.position) // 2
     np.testing.assert_array_equal(read([edge_at(1.3)], most=n).position, every.position[::2])
-
-
-def test_no_pixels_are_read_deeper_inside_than_asked() -> None:
-    found = read([edge_at(0.4)], inner=1.0)
-    assert found.d[found.inside].max() <= 1.0
-    assert found.d[found.inside].min() < -3.0
 
 
 # Pixels by their noise.
@@ -182,16 +177,6 @@ def test_both_sides_are_equally_noisy_when_weighted() -> None:
     assert np.max(weight[BOUNDS[1] :]) > 1.2
 
 
-def test_equal_noise_and_smooth_shading_leave_pixels_equal() -> None:
-    d, light = noisy_blocks(np.full((2, 2), 4.0), np.random.default_rng(2))
-    assert evened(d, light, np.ones_like(d)) == pytest.approx(np.ones_like(d), rel=0.1)
-    shaded = light + np.where(d > 0.0, 4.0 * d - 0.5 * d**2, 0.0).astype(np.float32)
-    assert evened(d, shaded, np.ones_like(d)) == pytest.approx(np.ones_like(d), rel=0.15)
-    d, light = noisy_blocks(np.array([[0.0, 200.0], [0.0, 200.0]]), np.random.default_rng(6))
-    weight = evened(d, light, np.ones_like(d))  # a side without noise
-    assert np.max(weight) / np.min(weight) <= MAX_NOISE_RATIO * 1.001
-
-
 # Blocks one by one, and lines through them.
 
 HALF_WIDTH_PX = 14.0
@@ -212,7 +197,7 @@ def limb_blocks(
     return d, grey.astype(np.float32)
 
 
-@pytest.mark.parametrize("x", [-1.5, -0.2, 0.0, 0.7, 3.0])
+@pytest.mark.parametrize("x", [-1.5, 0.0, 3.0])
 def test_limb_is_a_blurred_square_root(x: float) -> None:
     blur, half_width = 0.7, 1e6  # so wide that sqrt(rho (2 - rho)) is sqrt(2 rho)
     values, _ = basis(np.array([[x]], dtype=np.float32), column(half_width, 1), blur)
@@ -287,40 +272,25 @@ def fitted(line: Line | None) -> Line:
     return line
 
 
-def test_line_through_exact_blocks_is_exact() -> None:
-    position = np.linspace(0.1, 0.9, 30)
-    line = fitted(fit_straight(position, 0.5 - 0.8 * position, np.full(30, 1e-4)))
-    np.testing.assert_allclose(line.ends, [0.5, -0.3], atol=1e-9)
-    assert line.first == pytest.approx(0.1)
-    assert line.last == pytest.approx(0.9)
-    assert line.inlier_share == 1.0
-
-
 def test_an_occlusion_does_not_move_the_line_and_is_left_out() -> None:
     rng = np.random.default_rng(0)
     position = np.linspace(0.0, 1.0, 50)
     shift = 0.2 + 0.02 * rng.standard_normal(50)
     shift[20:35] += 0.7
+    shift[47:] += 0.8  # and an end that bends away
     line = fitted(fit_straight(position, shift, np.full(50, 4e-4)))
     np.testing.assert_allclose(line.ends, 0.2, atol=0.03)
     assert not np.any(line.kept[20:35])
-    assert line.inlier_share == pytest.approx(0.7, abs=0.03)
+    assert line.inlier_share == pytest.approx(0.64, abs=0.03)
+    assert line.last == pytest.approx(46 / 49)
 
 
-def test_ends_that_bend_away_are_not_part_of_the_piece() -> None:
-    position = np.linspace(0.0, 1.0, 41)
-    shift = np.where(position > 0.9, 0.8, 0.0)
-    line = fitted(fit_straight(position, shift, np.full(41, 1e-4)))
-    assert line.last == pytest.approx(0.9)
-
-
-@pytest.mark.parametrize("position_range", [(0.0, 1.0), (0.3, 0.6)])
-def test_covariance_agrees_with_monte_carlo(position_range: tuple[float, float]) -> None:
-    rng = np.random.default_rng(2)
+def test_covariance_agrees_with_monte_carlo() -> None:
+    rng, position_range = np.random.default_rng(2), (0.3, 0.6)
     position = np.linspace(*position_range, 40)
     lines = [
         fitted(fit_straight(position, 0.1 * rng.standard_normal(40), np.full(40, 0.01)))
-        for _ in range(400)
+        for _ in range(200)
     ]
     ends = np.array([[(1 - p) * f.ends[0] + p * f.ends[1] for p in position_range] for f in lines])
     claimed = np.mean([f.covariance for f in lines], axis=0)
@@ -344,13 +314,6 @@ def test_blocks_that_share_their_errors_count_for_fewer() -> None:
     independent = fitted(fit_straight(position, white, np.full(64, 0.01))).covariance
     shared = fitted(fit_straight(position, smooth, np.full(64, 0.01))).covariance
     assert np.trace(shared) > 1.5 * np.trace(independent)
-
-
-def test_too_few_blocks_give_no_line() -> None:
-    position = np.linspace(0.0, 1.0, 10)
-    variance = np.where(np.arange(10) < 3, 1e-3, np.inf)
-    assert fit_straight(position, np.zeros(10), variance) is None
-    assert fit_straight(np.full(10, 0.5), np.zeros(10), np.full(10, 1e-3)) is None
 
 
 def test_lines_of_several_outlines_are_those_of_each() -> None:
@@ -419,7 +382,7 @@ def outline(
 @pytest.mark.parametrize(
     ("column", "power"), [(HALF, 0.5), (RAMP, 1.0), (THREE_HALVES, 1.5), (SQUARE, 2.0)]
 )
-@pytest.mark.parametrize("z", [-1.5, -0.2, 0.0, 0.7, 3.0])
+@pytest.mark.parametrize("z", [-1.5, 0.0, 3.0])
 def test_powers_are_means_over_a_gaussian(z: float, column: int, power: float) -> None:
     def integrand(x: float) -> float:
         return float(x**power * np.exp(-0.5 * (x - z) ** 2) / np.sqrt(2.0 * np.pi))
@@ -428,15 +391,7 @@ def test_powers_are_means_over_a_gaussian(z: float, column: int, power: float) -
     assert powers(np.array(z))[column] == pytest.approx(expected, rel=2e-3, abs=1e-5)
 
 
-def test_powers_are_each_others_derivatives() -> None:
-    z, step = np.linspace(-6.0, 20.0, 500), 1.0 / 16.0
-    slope = (powers(z + step)[..., :N_POWERS] - powers(z - step)[..., :N_POWERS]) / (2.0 * step)
-    values = powers(z)[..., :N_POWERS]
-    for column, factor, of in ((RAMP, 1.0, STEP), (SQUARE, 2.0, RAMP), (HALF, 0.5, MINUS_HALF)):
-        np.testing.assert_allclose(slope[:, column], factor * values[:, of], atol=1e-2)
-
-
-@pytest.mark.parametrize("blur", [0.35, 1.1])
+@pytest.mark.parametrize("blur", [0.35])
 def test_slopes_and_widenings_are_derivatives_of_profiles(blur: float) -> None:
     d, half_width = np.linspace(-4.0, 4.0, 81), single(HALF_WIDTH, 1)
 
@@ -455,8 +410,7 @@ def test_slopes_and_widenings_are_derivatives_of_profiles(blur: float) -> None:
 
 
 @pytest.mark.parametrize("amplitude", [BRIGHT, DARK, GLINT], ids=["bright", "dark", "glint"])
-@pytest.mark.parametrize("blur", [0.4, 0.9])
-@pytest.mark.parametrize("change", [0.0, 0.6])
+@pytest.mark.parametrize(("blur", "change"), [(0.4, 0.6), (0.9, 0.0)])
 def test_exact_profiles_give_line_and_blur(amplitude: Array, blur: float, change: float) -> None:
     blocks = outline(amplitude, (0.12, -0.06), blur, noise=0.3, change=change)
     found = fit_pooled(blocks, np.ones(40, dtype=np.bool_), 1.15 * blur, DEPTH)
@@ -504,11 +458,8 @@ def test_outlines_without_blocks_stay_where_they_are() -> None:
     assert np.isnan(found.by_gamma).all()
 
 
-@pytest.mark.parametrize("amplitude", [BRIGHT, DARK, GLINT], ids=["bright", "dark", "glint"])
-def test_sums_over_pixels_serve_places_and_blurs_nearby(
-    amplitude: Array, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    blocks, every = outline(amplitude, (0.1, -0.05), 0.5, noise=0.2), np.ones(40, dtype=np.bool_)
+def test_sums_over_pixels_serve_places_and_blurs_nearby(monkeypatch: pytest.MonkeyPatch) -> None:
+    blocks, every = outline(GLINT, (0.1, -0.05), 0.5, noise=0.2), np.ones(40, dtype=np.bool_)
     found = fit_pooled(blocks, every, 0.54, DEPTH)
     monkeypatch.setattr(pool, "MAX_MOVE_OF_PRODUCTS", (0.0, 0.0))  # sums anew in every round
     anew = fit_pooled(blocks, every, 0.54, DEPTH)

@@ -5,8 +5,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from outlines import CLEAR, outcomes
-from rendered_cylinders import BACKGROUNDS, LIGHTS, Looks, photograph
 from rendering import Bar, Light, render
 from scipy.spatial.transform import RigidTransform
 
@@ -14,9 +12,12 @@ from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
 from legcal.machine import Cylinder
+from legcal.perception.blocks import Line
 from legcal.perception.detection import measure_outlines
-from legcal.perception.part_edges import MIN_LONE_SCORE, _alone
+from legcal.perception.outline import NARROW_BIAS, WRONG_WIDTH, PartVerdict, verdict
+from legcal.perception.part_edges import MIN_LONE_SCORE, EdgePair, _alone
 from legcal.perception.placement import Placement, Search
+from legcal.perception.subpixel_edges import MeasuredEdge
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 from legcal.vision.visibility import END_COVER, visible_segments
@@ -110,7 +111,7 @@ def test_outlines_are_found_where_they_are(name: str) -> None:
     background, albedo, light, blur = SCENES[name]
     cam = camera()
     bars = [bar(-0.09, 0.03, albedo), bar(0.08, -0.05, albedo)]
-    image = render(cam, bars, background, light, blur=blur, noise=2.0, supersample=4)
+    image = render(cam, bars, background, light, blur=blur, noise=2.0, supersample=3)
     found = detect(cam, bars, np.rint(image).astype(np.uint8))
     assert np.all(found.used), found.reason
     error = errors(cam, bars, found)
@@ -121,18 +122,27 @@ def test_outlines_are_found_where_they_are(name: str) -> None:
     )  # signed: half a pixel somewhere would show
     sigma = np.sqrt([np.diag(c) for c in found.covariance])
     assert np.sqrt(np.mean((error / sigma) ** 2)) < 2.0
+    if name == "bright on dark":  # near a fit, with the blur of other images
+        found, seen = detect_with_blur(
+            cam, bars, np.rint(image).astype(np.uint8), off=2e-4, known=(0.45,)
+        )
+        assert np.all(found.used), found.reason
+        error = errors(cam, bars, found)
+        assert np.abs(error).max() < 0.2
+        assert np.median(np.abs(error)) < 0.08
+        assert seen == pytest.approx(np.hypot(blur, 0.29), rel=0.25)  # with that of the pixels
 
 
 @pytest.mark.parametrize(
     ("level", "blur"),
-    [(252.0, 0.5), (300.0, 0.5), (300.0, 1.0)],
+    [(252.0, 0.5), (300.0, 1.0)],
 )
 def test_a_saturated_background_moves_no_outline(level: float, blur: float) -> None:
     cam = camera()
     bars = [bar(-0.05, 0.02, 60.0), bar(0.06, 0.02, 60.0)]
     behind = np.full((270, 360), 120.0)
     behind[:, 181:] = level  # behind the second leg
-    image = render(cam, bars, behind, blur=blur, noise=1.0, supersample=4)
+    image = render(cam, bars, behind, blur=blur, noise=1.0, supersample=3)
     clipped = np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8)
     found, seen = detect_with_blur(cam, bars, clipped, off=1e-3)
     assert np.all(found.used), found.reason
@@ -146,37 +156,18 @@ def test_a_saturated_background_moves_no_outline(level: float, blur: float) -> N
 def test_outlines_are_rejected_where_saturation_leaves_nothing_of_the_step() -> None:
     cam = camera()
     bars = [bar(-0.05, 0.02, 60.0), bar(0.06, 0.02, 60.0)]
-    image = render(cam, bars, 1000.0, blur=0.5, noise=1.0, supersample=4)
+    image = render(cam, bars, 1000.0, blur=0.5, noise=1.0, supersample=3)
     clipped = np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8)
     found = detect(cam, bars, clipped, off=1e-3)
     assert not np.any(found.used), errors(cam, bars, found)
     assert any("the background is overexposed" in reason for reason in found.reason), found.reason
 
 
-def test_outlines_near_a_fit_are_found_with_the_blur_of_other_images() -> None:
-    background, albedo, light, blur = SCENES["bright on dark"]
-    cam = camera()
-    bars = [bar(-0.09, 0.03, albedo), bar(0.08, -0.05, albedo)]
-    image = render(cam, bars, background, light, blur=blur, noise=2.0, supersample=4)
-    found, seen = detect_with_blur(
-        cam,
-        bars,
-        np.rint(image).astype(np.uint8),
-        off=2e-4,  # as after a fit: some tenths of a pixel
-        known=(0.45,),
-    )
-    assert np.all(found.used), found.reason
-    error = errors(cam, bars, found)
-    assert np.abs(error).max() < 0.2
-    assert np.median(np.abs(error)) < 0.08
-    assert seen == pytest.approx(np.hypot(blur, 0.29), rel=0.25)  # with that of the pixels
-
-
 def test_an_edge_stands_alone_where_the_other_side_is_as_dark_as_the_background() -> None:
     cam = camera()
     light = Light(direction=(1.0, 0.0, -0.3), ambient=0.1, diffuse=0.9)
     bars = [bar(-0.09, 0.03, 170.0, 0.015), bar(0.08, -0.05, 170.0, 0.015)]
-    image = render(cam, bars, 17.0, light, blur=0.6, noise=2.0, supersample=4)
+    image = render(cam, bars, 17.0, light, blur=0.6, noise=2.0, supersample=3)
     found = detect(cam, bars, np.rint(image).astype(np.uint8))
     np.testing.assert_array_equal(found.used, [True, False, True, False])
     assert np.abs(errors(cam, bars, found)).max() < 0.2
@@ -186,7 +177,7 @@ def test_an_edge_stands_alone_where_the_other_side_is_as_dark_as_the_background(
 def test_outlines_are_straight_in_space_and_not_in_the_picture() -> None:
     cam = camera(np.array([-0.3, 0.1, 0.001, -0.002, 0.0]))
     bars = [bar(-0.15, 0.02, 150.0), bar(0.15, -0.02, 150.0, 0.025)]
-    image = render(cam, bars, 30.0, blur=0.6, noise=0.3, supersample=4)
+    image = render(cam, bars, 30.0, blur=0.6, noise=0.3, supersample=3)
     found = detect(cam, bars, np.rint(image).astype(np.uint8))
     assert np.all(found.used), found.reason
     assert np.abs(errors(cam, bars, found)).max() < 0.15
@@ -197,7 +188,7 @@ def test_outlines_are_straight_in_space_and_not_in_the_picture() -> None:
 def test_edges_near_the_leg_are_not_taken_for_it() -> None:
     cam = camera()
     bars = [bar(0.0, 0.03, 150.0)]
-    image = render(cam, bars, 40.0, blur=0.5, supersample=4)
+    image = render(cam, bars, 40.0, blur=0.5, supersample=3)
     for offset, level in ((-45, 230.0), (-25, 10.0), (18, 90.0), (33, 220.0)):
         slope = round(2 * 0.03 * F / 0.82)
         start, end = (181 + offset - slope // 2, 269), (181 + offset + slope // 2, 0)
@@ -211,7 +202,7 @@ def test_edges_near_the_leg_are_not_taken_for_it() -> None:
 def test_legs_behind_others_end_where_they_are_hidden() -> None:
     cam = camera()
     front, behind = bar(0.0, 0.08, 60.0, depth=0.7), bar(0.0, -0.08, 170.0, depth=0.9)
-    image = render(cam, [front, behind], 30.0, blur=0.5, supersample=4)
+    image = render(cam, [front, behind], 30.0, blur=0.5, supersample=3)
     found = detect(cam, [front, behind], image.astype(np.uint8))
     assert np.all(found.used), found.reason
     assert np.abs(errors(cam, [front, behind], found)).max() < 0.2
@@ -224,7 +215,7 @@ def test_outlines_say_how_well_they_were_seen() -> None:
     cam = camera()
     bars = [bar(-0.09, 0.03, 150.0), bar(0.08, 0.03, 90.0), bar(0.9, 0.0, 150.0)]
     flat = Light(ambient=1.0, diffuse=0.0)
-    image = render(cam, bars[:2], 30.0, flat, blur=0.5, noise=2.0, supersample=4)
+    image = render(cam, bars[:2], 30.0, flat, blur=0.5, noise=2.0, supersample=3)
     found = detect(cam, bars, np.rint(image).astype(np.uint8))
     np.testing.assert_allclose(found.contrast[:4], [120.0, 120.0, 60.0, 60.0], rtol=0.05)
     seen = np.linalg.norm(found.ends[:4, 1] - found.ends[:4, 0], axis=1)
@@ -284,7 +275,7 @@ def test_tube_and_rod_are_two_parts() -> None:
     whole = bar(0.0, 0.03, 150.0)
     middle = 0.5 * (whole.A + whole.B)
     tube, rod = Bar(whole.A, middle, 0.014, 150.0), Bar(middle, whole.B, 0.009, 150.0)
-    image = render(cam, [tube, rod], 30.0, blur=0.5, supersample=4).astype(np.uint8)
+    image = render(cam, [tube, rod], 30.0, blur=0.5, supersample=3).astype(np.uint8)
     length = float(np.linalg.norm(whole.B - whole.A))
     parts = (
         Cylinder("tube", 0.014, "base", 0.0, 0.5 * length),
@@ -302,25 +293,6 @@ def test_tube_and_rod_are_two_parts() -> None:
         h = outlines_of_axis(u, one.A, one.radius)
         offset = cam.line_offset(h[:, None], cam.undistort(found.ends[i]))
         assert np.abs(offset).max() < 0.15
-
-
-def test_outlines_are_good_to_the_figures_that_are_stated() -> None:
-    """A sixth of what ``benchmarks/outlines.py`` draws: legs of 40 px, a lens of 0.8 px."""
-    found, lost = [], 0
-    for i, light in enumerate(LIGHTS):
-        for j, background in enumerate(BACKGROUNDS):
-            rng = np.random.default_rng([0, i, j])
-            scene = photograph(Looks(40.0, 0.8, 1.0, 8000.0, 8, light, background), rng, 1)
-            clear = [o for o in outcomes(scene, "legcal", rng) if abs(o.contrast) > CLEAR]
-            lost += sum(len(o.errors) == 0 for o in clear)
-            found += [o for o in clear if len(o.errors)]
-    middle = np.array([o.errors.mean() for o in found])
-    pull = np.concatenate([(o.errors / o.sigma).ravel() for o in found])
-    assert len(found) > 10
-    assert lost <= 1
-    assert abs(middle.mean()) < 0.02 + 2.0 * middle.std() / np.sqrt(len(middle))
-    assert np.sqrt(np.mean(middle**2)) < 0.08
-    assert 0.3 < np.sqrt(np.mean(pull**2)) < 1.5
 
 
 def test_an_edge_stands_alone_only_without_a_rival() -> None:
@@ -382,3 +354,109 @@ def test_equally_long_cylinders_have_one_name_at_every_length() -> None:
     halves = [Cylinder("a", 0.01, "platform", -0.3, 0.0), Cylinder("b", 0.01, "base", 0.0, 0.3)]
     lengths = np.linspace(0.35, 0.608, 100)
     assert {s.link for x in lengths for s in visible_segments(halves, float(x))} == {"b"}
+
+
+# Which of two measured edges of a part are its outlines.
+
+WIDTH = np.array([20.0, 18.0])  # by the radius [px]
+LENGTH = 200.0
+N = 20
+
+
+def _edge(v: Array, *, sigma: float = 0.1, kept: float = 1.0, is_step: bool = True) -> MeasuredEdge:
+    on_line = np.arange(N) < kept * N
+    position = (np.flatnonzero(on_line) + 0.5) / N
+    n = len(position)
+    line = Line(np.zeros(2), on_line, 1.0, position, np.zeros(n), np.full(n, 0.01))
+    return MeasuredEdge(v, line, 50.0, is_step, 1.0, sigma**2 * np.eye(2))
+
+
+def _judged(
+    off: float,
+    one: MeasuredEdge | None,
+    two: MeasuredEdge | None,
+    *,
+    alone: bool = False,
+    window: float | None = None,
+) -> PartVerdict:
+    """Judge edges whose pair was found at a distance that is off [px]."""
+    v = np.stack([np.zeros(2), WIDTH + off])
+    pair = EdgePair(v, np.ones(2, dtype=np.bool_), np.full(2, alone))
+    return verdict(pair, np.stack([np.zeros(2), WIDTH]), LENGTH, (one, two), window)
+
+
+def test_an_outline_before_a_saturated_background_needs_some_of_its_step() -> None:
+    whole, most = _edge(np.zeros(2)), replace(_edge(WIDTH), clipped=0.2)
+    assert _judged(0.0, whole, most).reasons == ("", "")
+    found = _judged(0.0, whole, replace(most, clipped=0.5))
+    assert found.reasons[1] == "the background is overexposed, 1.0 px of the step are left"
+
+
+def test_two_edges_at_the_distance_of_the_radius_are_used() -> None:
+    found = _judged(0.0, _edge(np.zeros(2)), _edge(WIDTH + 0.5))
+    assert found.reasons == ("", "")
+    assert found.bias == 0.0
+
+
+@pytest.mark.parametrize(
+    ("off", "used"),
+    [((1.0, 0.0), (False, True)), ((0.0, -1.0), (True, False)), ((0.6, -0.6), (False, False))],
+)
+def test_after_a_fit_an_edge_away_from_its_prediction_is_not_the_outline(
+    off: tuple[float, float], used: tuple[bool, bool]
+) -> None:
+    """A pixel of width passes while the radius is hardly known, and not near a fit."""
+    predicted = np.stack([np.zeros(2), WIDTH])
+    edges = _edge(predicted[0] + off[0]), _edge(predicted[1] + off[1])
+    pair = EdgePair(predicted, np.ones(2, dtype=np.bool_), np.zeros(2, dtype=np.bool_))
+    assert verdict(pair, predicted, LENGTH, edges).reasons == ("", "")
+    found = verdict(pair, predicted, LENGTH, edges, near_fit=True)
+    for reason, is_used in zip(found.reasons, used, strict=True):
+        assert reason == "" if is_used else reason.startswith(WRONG_WIDTH)
+
+
+@pytest.mark.parametrize("surer", [0, 1])
+def test_of_two_edges_too_near_to_each_other_the_surer_is_the_outline(surer: int) -> None:
+    sigma = [0.3, 0.3]
+    sigma[surer] = 0.1
+    one, two = _edge(np.zeros(2), sigma=sigma[0]), _edge(WIDTH - 3.0, sigma=sigma[1])
+    found = _judged(-3.0, one, two)
+    assert found.reasons[surer] == ""
+    assert found.reasons[1 - surer].startswith(WRONG_WIDTH)
+    assert found.bias == pytest.approx(3.0 * NARROW_BIAS)
+
+
+@pytest.mark.parametrize(
+    ("off", "sigma", "is_step"),
+    [(3.0, 0.1, True), (-3.0, 0.28, True), (-3.0, 0.1, False)],
+    ids=["too far from each other", "about as sure", "no step"],
+)
+def test_otherwise_edges_at_another_distance_are_not_used(
+    off: float, sigma: float, is_step: bool
+) -> None:
+    one = _edge(np.zeros(2), sigma=sigma, is_step=is_step)
+    found = _judged(off, one, _edge(WIDTH + off, sigma=0.3))
+    assert all(reason.startswith(WRONG_WIDTH) for reason in found.reasons)
+
+
+@pytest.mark.parametrize(
+    ("off", "alone", "kept", "used"),
+    [(0.5, False, 1.0, True), (4.0, False, 1.0, False), (4.0, True, 1.0, True),
+     (0.5, False, 0.4, False)],
+    ids=["found at its distance", "found elsewhere", "convincing alone", "half of it seen"],
+)  # fmt: skip
+def test_an_edge_whose_partner_was_found_but_not_measured(
+    off: float, alone: bool, kept: float, used: bool
+) -> None:
+    found = _judged(off, _edge(np.zeros(2), kept=kept), None, alone=alone)
+    expected = "" if used else "its other outline: edge hardly visible"
+    assert found.reasons == (expected, "edge hardly visible")
+
+
+@pytest.mark.parametrize(("beside", "used"), [(0.5, True), (3.0, False)])
+def test_an_edge_where_other_legs_predict_it_needs_no_partner(beside: float, used: bool) -> None:
+    found = _judged(6.0, _edge(np.full(2, beside)), _edge(WIDTH + 6.0), window=5.0)
+    assert (found.reasons[0] == "") is used
+    assert found.reasons[1].startswith(WRONG_WIDTH)
+    lone = _judged(6.0, _edge(np.full(2, beside)), None, alone=True, window=5.0)
+    assert (lone.reasons[0] == "") is used

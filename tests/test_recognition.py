@@ -28,8 +28,8 @@ from legcal.perception.pair_matching import (
     Picture,
     _equations,
     _moved,
+    depth_reversed,
     distances,
-    exchanged,
     gauss_newton_step,
     leg_segments,
     match_pairs,
@@ -430,12 +430,12 @@ def test_a_flat_machine_is_seen_alike_with_near_and_far_exchanged() -> None:
     R = Rotation.random(5, rng=rng).as_matrix()
     far = np.array([0.3, -0.2, 200.0])
     poses = CameraPoses.rigid(R, far - R @ X.mean(axis=0), 4)
-    other = exchanged(poses, X)
+    other = depth_reversed(poses, X)
     assert np.allclose(np.linalg.det(other.R), 1.0)
     here, there = (X @ p.R.swapaxes(1, 2) + p.t[:, None] for p in (poses, other))
     assert np.abs(here[..., :2] / here[..., 2:] - there[..., :2] / there[..., 2:]).max() < 1e-5
     assert np.abs(here[..., 2] + there[..., 2] - 2.0 * far[2]).max() < 1e-3
-    again = exchanged(other, X)
+    again = depth_reversed(other, X)
     np.testing.assert_allclose(again.R, poses.R, atol=1e-9)
     np.testing.assert_allclose(again.t, poses.t, atol=1e-6)
 

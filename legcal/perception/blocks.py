@@ -28,19 +28,18 @@ MAX_BLOCK_SIGMA = (1.3, 0.6)  # of a block that counts: in blurs, and [px]
 CONVERGED = 0.1  # movement of every line below which the rounds end [px]
 
 BLURS = (0.3, 2.7, 6)  # trials, least to greatest [px]
-BLUR_BLOCKS = 16
-BLUR_ROUNDS = 2
+BLUR_BLOCKS, BLUR_ROUNDS = 16, 2  # blocks of an image that give its blur, steps of each trial
 # Prior precision of the amplitudes, in units of the contrast of a block.
 RIDGE = np.array([1e-6, 1.0, 1e-2, 0.05, 0.05])
 BEND = (0, 1, 4)  # functions of the limb model without an edge
 MAX_STEP = 0.8  # largest step of a block [px]
 
-TUKEY = 4.0  # sigmas at which a block counts no longer
+TUKEY = 4.0  # width of the biweight: blocks beyond have no weight [standard deviations]
 N_ROUNDS = 10
 N_SCALES = 3  # rounds in which the scale of the scatter is estimated
-MIN_SCATTER = 0.01  # [px]
+MIN_SCATTER = 0.01  # added to the standard deviation of a block [px]
 COMMON_BIAS, TILT_BIAS = 0.03, 0.02  # of the outline model: of both ends, of each end [px]
-MIN_BLOCKS = 4
+MIN_BLOCKS = 4  # of a line
 
 
 def depth_for_blur(blur: float) -> float:
@@ -249,6 +248,7 @@ def _sum(functions: Samples, amplitude: Array) -> Samples:
 
 
 def _applied(matrices: Array, vectors: Array) -> Array:
+    """Return the products (n, 5) of matrices with vectors."""
     return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 

@@ -19,8 +19,8 @@ from legcal.perception.pair_matching import (
     CameraPoses,
     PairMatches,
     Picture,
+    depth_reversed,
     distances,
-    exchanged,
     gauss_newton_step,
     match_pairs,
 )
@@ -191,7 +191,7 @@ def _polished(pictures: Sequence[Picture], poses: CameraPoses) -> CameraPoses:
 def _reversed(pictures: Sequence[Picture], poses: CameraPoses) -> CameraPoses:
     """Return the poses that show a flat machine alike from far: near and far exchanged."""
     ends = np.concatenate([picture.targets.ends.reshape(-1, 3) for picture in pictures])
-    return exchanged(poses, ends) if len(ends) else poses
+    return depth_reversed(poses, ends) if len(ends) else poses
 
 
 def _around(pictures: Sequence[Picture], R: Array, t: Array, n_legs: int) -> CameraPoses:

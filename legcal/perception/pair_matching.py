@@ -395,7 +395,7 @@ def _moved(poses: CameraPoses, xi: Array, shift: Array, centre: Array) -> Camera
     return CameraPoses(turn @ poses.R, t, shift)
 
 
-def exchanged(poses: CameraPoses, X: Array) -> CameraPoses:
+def depth_reversed(poses: CameraPoses, X: Array) -> CameraPoses:
     """Return the poses that show points X (m, 3) of a flat machine alike as seen from far.
 
     The machine is reflected in its own plane, which leaves a flat one as it is, and in the plane

@@ -47,12 +47,12 @@ MIRRORED_STARTS = 1, 1  # as START_PICTURES, for mirrored pictures
 UNOBSERVED_ERROR = 6e-3  # of the joint centres of a leg that a view did not show [m]
 MIN_ERROR, ERROR_SIGMAS = 1.5e-3, 2.5  # of those of a leg that it did: [m], standard deviations
 
-N_POSES, N_AGAIN = 4, 3  # that are looked at, and at the best of which missing legs are sought
-# How many times the evidence for any other pose one needs, and how much more than the least.
-TIMES, MORE = 1.6, 3.0
-TIMES_AGREED, MORE_AGREED = 1.5, 0.0  # the same where edge pairs are convincing by themselves
-WITHOUT_RIVAL = 4.0  # times the evidence for others, from which on no more is needed either
-TIMES_ALONE, MORE_ALONE = 2.5, 6.0  # and of a single image
+N_POSES, N_REFINED = 4, 3  # at which outlines are measured, and at the best missing legs sought
+# Evidence for a pose: its ratio to that for any other one, and what it exceeds the least by.
+RATIO, MARGIN = 1.6, 3.0
+RATIO_AGREED, MARGIN_AGREED = 1.5, 0.0  # the same where edge pairs are convincing by themselves
+RATIO_WITHOUT_RIVAL = 4.0  # ratio from which on no margin is needed either
+RATIO_ALONE, MARGIN_ALONE = 2.5, 6.0  # the same of a single image
 POSE_JOINT_ERROR = 3e-3  # of the legs as a pose has them [m]
 SAME_PX, SAME_PART = 3.0, 0.7  # of outlines that two poses share: how near, how many of them
 
@@ -254,7 +254,7 @@ def _decided_by_outlines(
         trials += [_measure_at(search, few, candidates, i) for i in range(1, min(N_POSES, n))]
         if not (candidates.is_convincing and _is_decided(trials, candidates, few)):
             by_both = candidates.score[: len(trials)] + [trial.evidence for trial in trials]
-            for i in np.argsort(-by_both, kind="stable")[:N_AGAIN].tolist():
+            for i in np.argsort(-by_both, kind="stable")[:N_REFINED].tolist():
                 one = trials[i]
                 if one.fit is not None:
                     again = refine_views(search, [few], one.placement, one.outlines)
@@ -295,15 +295,15 @@ def _is_decided(trials: Sequence[_Trial], candidates: PoseCandidates, group: Gro
         for i, trial in enumerate(trials)
         if i != best and not _same(trial.outlines, trials[best].outlines)
     ]
-    more, times = (MORE, TIMES) if len(group.rows) > 1 else (MORE_ALONE, TIMES_ALONE)
+    margin, ratio = (MARGIN, RATIO) if len(group.rows) > 1 else (MARGIN_ALONE, RATIO_ALONE)
     fit, other = trials[best].fit, max(others, default=0.0)
     if fit is None or not fit.is_determined:
         return False
     if best == 0 and candidates.is_convincing:
-        more, times = MORE_AGREED, TIMES_AGREED
-    elif len(group.rows) > 1 and fit.evidence >= WITHOUT_RIVAL * other:
-        more = MORE_AGREED
-    return fit.evidence >= max(min_evidence(group) + more, times * other)
+        margin, ratio = MARGIN_AGREED, RATIO_AGREED
+    elif len(group.rows) > 1 and fit.evidence >= RATIO_WITHOUT_RIVAL * other:
+        margin = MARGIN_AGREED
+    return fit.evidence >= max(min_evidence(group) + margin, ratio * other)
 
 
 def _same(one: Outlines, other: Outlines) -> bool:

@@ -19,13 +19,13 @@ from legcal.perception.profiles import Edge
 from legcal.vision import Camera, Grey
 
 FIRST_BLUR = 1.0  # [px]
-MIN_GAIN = 30  # in chi^2, by which a block shows an edge at all
+MIN_CHI2_GAIN = 30  # by an edge, from which on a block shows one
 FIRST_BLOCKS = 12  # of an outline
 FIRST_ROUNDS, LAST_ROUNDS = 2, 2  # the last ones at most
 MAX_BLUR_TRIALS, BLUR_CONVERGED = 3, 0.25  # until its logarithm changes by less
 SHADING = 0.5  # that the model leaves out [grey levels]
 WIDENING = 1.3  # of the standard deviations of a fit of all blocks, which share what is left out
-COMMON_BIAS, TILT_BIAS = 0.012, 0.02  # of both ends, of each end [px]
+POOLED_COMMON_BIAS, POOLED_TILT_BIAS = 0.012, 0.02  # of such a fit: of both ends, of each [px]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +38,7 @@ class MeasuredEdge:
     is_step: bool  # whether most blocks show a step or a limb, not only a bend of the shading
     blur: float  # standard deviation of the blur of the image [px]
     covariance: Array  # (2, 2) of the offsets at both ends of the used piece [px^2]
-    clipped: float = (
-        -math.inf
-    )  # depth up to which the background saturates the median block [blurs]
+    clipped: float = -math.inf  # depth to which the background saturates most blocks [blurs]
     by_gamma: float = math.nan  # how far it moves inside with ln gamma [px]; NaN where not known
 
     @property
@@ -111,7 +109,7 @@ def _measured(
             found.append(None)
             continue
         contrast = float(np.median(contrasts[line.kept]))
-        is_step = float(np.median(sharp[line.kept])) > MIN_GAIN
+        is_step = float(np.median(sharp[line.kept])) > MIN_CHI2_GAIN
         # How far shading moves an outline: its grey levels over the slope of the step.
         bias = float(SHADING * np.sqrt(2.0 * np.pi) * blur / max(contrast, 1e-3))
         moved = _moved(edge, at, line)
@@ -122,7 +120,7 @@ def _measured(
         to_piece = np.array([[1.0 - place, place] for place in (line.first, line.last)])
         covariance = WIDENING**2 * to_piece @ joint.covariance[i] @ to_piece.T
         covariance = 0.5 * (covariance + covariance.T)
-        covariance += COMMON_BIAS**2 + TILT_BIAS**2 * np.eye(2) + bias**2
+        covariance += POOLED_COMMON_BIAS**2 + POOLED_TILT_BIAS**2 * np.eye(2) + bias**2
         ends = joint.ends[i]
         depth = (float(np.median(clipped[line.kept])) - float(ends.mean())) / blur
         found.append(

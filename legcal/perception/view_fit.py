@@ -39,7 +39,7 @@ from legcal.geometry import Array, BoolArray, IntArray, whitener
 from legcal.machine import main_cylinders
 from legcal.perception.detection import NOT_PLACED, measure_outlines
 from legcal.perception.outline import OUTSIDE
-from legcal.perception.pair_matching import MIN_DEPTH, CameraPoses, exchanged
+from legcal.perception.pair_matching import MIN_DEPTH, CameraPoses, depth_reversed
 from legcal.perception.placement import Group, Placement, Search
 from legcal.vision import Camera, outlines_of_axis
 from legcal.workers import Run, in_turn
@@ -351,7 +351,7 @@ def reversed_pose(search: Search, group: Group, T_base_group: RigidTransform) ->
     """Return the pose at which a flat machine looks alike from far: near and far exchanged."""
     X = np.concatenate([search.A_base[group.rows], search.B_base[group.rows]]).reshape(-1, 3)
     pose = CameraPoses.one(T_base_group, np.zeros((search.n_legs, 2, 3)))
-    return exchanged(pose, X).T_base_camera()
+    return depth_reversed(pose, X).T_base_camera()
 
 
 @dataclass(frozen=True, eq=False)
