@@ -13,7 +13,7 @@ from staged_machines import Observed, made_up_base, seen_from, shipped
 
 from legcal.data import LegAxes, Measurements, View
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, BoolArray, IntArray, normal_basis
+from legcal.geometry import Array, BoolArray, IntArray, normal_basis, turned_axis
 from legcal.machine import JointType, Leg, LegKind
 from legcal.paper import Criteria, NominalMachine, joints_in_camera, run_base_steps
 from legcal.paper.camera_poses import camera_poses
@@ -23,7 +23,6 @@ from legcal.paper.joints_in_camera import (
     locate_joints_in_cameras,
     oriented,
     residual_jacobian,
-    turned,
 )
 from legcal.paper.leg_directions import directions_through_joints, observed_directions
 from legcal.simulation import OutlineNoise, nominal_of
@@ -203,7 +202,8 @@ def test_the_jacobian_of_axes_about_a_joint_is_that_of_differences() -> None:
     for k, e in enumerate(h * np.eye(5)):
         turns = np.tile(e[3:], (len(axes), 1))
         ahead, behind = (
-            joint_residuals(axes, here, A + s * e[:3], turned(v, s * turns))[0] for s in (1.0, -1.0)
+            joint_residuals(axes, here, A + s * e[:3], turned_axis(v, s * turns))[0]
+            for s in (1.0, -1.0)
         )
         assert np.allclose((ahead - behind) / (2.0 * h), found[:, :, k], atol=1e-8)
 

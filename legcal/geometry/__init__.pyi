@@ -1,3 +1,6 @@
+from .axes import axis_angles as axis_angles
+from .axes import axis_angles_slope as axis_angles_slope
+from .axes import turned_axis as turned_axis
 from .covariances import whitener as whitener
 from .lines import distance_to_line as distance_to_line
 from .lines import moment as moment

@@ -21,7 +21,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
-from legcal.machine.leg import N_LOCAL, EquationKind, JointType, Leg, LegKind
+from legcal.machine.leg import EquationKind, JointType, Leg, LegColumns, LegKind
 from legcal.machine.model import Machine
 from legcal.machine.parameters import Parametrization
 
@@ -32,8 +32,8 @@ class PoseEquations:
 
     values: Array  # (k, m) residuals [m]; |AB| - q0 for a length, to equal s q
     by_pose: Array  # (k, m, 6) derivative by rotation [rad] and displacement [m]
-    by_local: Array  # (k, m, 12) by the numbers of the row's leg, exact where residuals are zero:
-    # A, B, q0 [m], turns of both axes about their normal_basis, twist [rad]; or (k, m, 0)
+    by_local: Array  # (k, m, 12) by the numbers of the row's leg (LegColumns), axes by turns about
+    # their normal_basis, exact where residuals are zero; or (k, m, 0)
     leg: IntArray  # (m,) the leg of each row, -1 for the plane
     kinds: tuple[EquationKind, ...]  # (m,) what each row is about
     measured: BoolArray  # (m,) rows of readings; the others are constraints
@@ -96,7 +96,7 @@ def leg_equations(leg: Leg, R: Array, t: Array, *, by_local: bool = True) -> Pos
     at = _Placed(leg, R, length, vector / length[:, None])
     kinds = leg.equations
     values, by_pose = np.empty((len(t), len(kinds))), np.empty((len(t), len(kinds), 6))
-    local = np.zeros((len(t), len(kinds), N_LOCAL if by_local else 0))
+    local = np.zeros((len(t), len(kinds), LegColumns.COUNT if by_local else 0))
     for i, kind in enumerate(kinds):
         row = _RESIDUALS[kind](at)
         values[:, i] = row.value
@@ -104,14 +104,17 @@ def leg_equations(leg: Leg, R: Array, t: Array, *, by_local: bool = True) -> Pos
         if row.by_tied is not None:
             by_pose[:, i, :3] += cross(at.in_base(row.tied), row.by_tied)
         if by_local:
-            local[:, i, :3], local[:, i, 3:6] = -row.by_leg, _in_platform(R, row.by_leg)
-            local[:, i, 6], local[:, i, 11] = row.by_q0, row.by_twist
+            local[:, i, LegColumns.A] = -row.by_leg
+            local[:, i, LegColumns.B] = _in_platform(R, row.by_leg)
+            local[:, i, LegColumns.LENGTH] = row.by_q0
+            local[:, i, LegColumns.TWIST] = row.by_twist
             if row.by_base_axis is not None:
                 e1, e2 = _basis(_given(leg.base_axis))
-                local[:, i, 7], local[:, i, 8] = -row.by_base_axis @ e2, row.by_base_axis @ e1
+                turns = np.stack([-row.by_base_axis @ e2, row.by_base_axis @ e1], axis=1)
+                local[:, i, LegColumns.BASE_AXIS] = turns
             if row.by_tied is not None:
                 turns = cross(_basis(_given(leg.platform_axis)), row.tied)
-                local[:, i, 9:11] = _in_platform(R, row.by_tied) @ turns.T
+                local[:, i, LegColumns.PLATFORM_AXIS] = _in_platform(R, row.by_tied) @ turns.T
     measured = [kind is EquationKind.LENGTH and leg.kind is LegKind.ACTUATED for kind in kinds]
     return PoseEquations(
         values, by_pose, local, np.zeros(len(kinds), dtype=np.intp), kinds, np.array(measured)
@@ -229,9 +232,10 @@ def _lengths(legs: Sequence[Leg], R: Array, t: Array, by_local: bool) -> PoseEqu
     vectors = arms + t[:, None] - A
     lengths = np.sqrt(np.einsum("knx,knx->kn", vectors, vectors))
     u = vectors / lengths[..., None]
-    local = np.zeros((*lengths.shape, N_LOCAL if by_local else 0))
+    local = np.zeros((*lengths.shape, LegColumns.COUNT if by_local else 0))
     if by_local:
-        local[..., :3], local[..., 3:6], local[..., 6] = -u, u @ R, -1.0
+        local[..., LegColumns.A], local[..., LegColumns.B] = -u, u @ R
+        local[..., LegColumns.LENGTH] = -1.0
     return PoseEquations(
         lengths - np.array([leg.q0 for leg in legs]),
         np.concatenate([cross(arms, u), u], axis=2),

@@ -23,7 +23,14 @@ from legcal.machine.bodies import Connection
 MIN_LENGTH, MAX_LENGTH = 1e-3, 20.0  # [m]; legs beyond are most likely written in another unit
 MIN_RADIUS, MAX_RADIUS = 2e-4, 0.5  # of the leg length; beyond, its unit is the mistake
 MAX_LEGS = 32  # the work of all that is done with them grows with the cube of their number
-N_LOCAL = 12  # numbers of a leg: A, B, length, base axis 1 and 2, platform axis 1 and 2, twist
+
+
+class LegColumns:
+    """Where the numbers of a leg stand: joint centres [m], length [m], angles of axes, twist."""
+
+    A, B, LENGTH = slice(0, 3), slice(3, 6), 6
+    BASE_AXIS, PLATFORM_AXIS, TWIST = slice(7, 9), slice(9, 11), 11
+    COUNT = 12
 
 
 class LegKind(StrEnum):
@@ -288,6 +295,13 @@ class Leg:
         if self.twist is not None:
             found.append(EquationKind.TWIST)
         return tuple(found)
+
+    @property
+    def urdf_chain(self) -> LegChain:
+        """Its joints in the URDF; ValueError if no file describes the leg."""
+        if self.chain is None:
+            raise ValueError("a leg that no file describes has no joints in a URDF")
+        return self.chain
 
     @property
     def idle_spins(self) -> int:

@@ -6,18 +6,26 @@ frames (their gauge), lengths, two turns of each axis that is a parameter, and t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
-from legcal.machine.leg import N_LOCAL, KinematicParameters, Leg, LegKind
+from legcal.geometry import (
+    Array,
+    BoolArray,
+    IntArray,
+    axis_angles,
+    normal_basis,
+    rotation_between,
+    turned_axis,
+)
+from legcal.machine.leg import KinematicParameters, Leg, LegColumns, LegKind
 from legcal.machine.model import Machine
 
-_LENGTH, _TWIST = 6, 11
-_COLUMNS = (range(3), range(3, 6), (_LENGTH,), (7, 8), (9, 10), (_TWIST,))  # in this order
+_STEP = 1e-6  # [m or rad], of numerical derivatives
+_BLOCKS = (range(3), range(3, 6), (6,), (7, 8), (9, 10), (11,))  # of LegColumns, in this order
 _LOCAL_NAMES = (
     *(f"{side}.{axis}" for side in ("base", "platform") for axis in "xyz"),
     "offset",
@@ -32,7 +40,7 @@ class Parametrization:
 
     names: tuple[str, ...]  # leg2.base.x, leg1.offset, leg1.length, leg1.base_axis.1, leg1.twist
     units: tuple[str, ...]  # m or rad
-    place: IntArray  # (n_legs, 12) of A, B, length, turns of both axes, twist; -1 for no parameter
+    place: IntArray  # (n_legs, 12) of each leg's numbers (LegColumns); -1 for no parameter
 
     def __len__(self) -> int:
         return len(self.names)
@@ -49,26 +57,27 @@ def parametrize(
     names: Sequence[str], legs: Sequence[Leg], frame_legs: Sequence[int], *, twists: bool = False
 ) -> Parametrization:
     """Return the parameters of legs in R_b and R_e; without *twists* these are fixed."""
-    free = np.zeros((len(legs), N_LOCAL), dtype=np.bool_)
-    free[:, :3] = free[:, 3:6] = free_coordinates(len(legs), frame_legs)
+    columns = LegColumns
+    free = np.zeros((len(legs), columns.COUNT), dtype=np.bool_)
+    free[:, columns.A] = free[:, columns.B] = free_coordinates(len(legs), frame_legs)
     for j, leg in enumerate(legs):
-        free[j, _LENGTH] = leg.kind is not LegKind.PASSIVE
-        free[j, 7:9] = leg.base_axis is not None
-        free[j, 9:11] = leg.platform_axis is not None
-        free[j, _TWIST] = twists and leg.twist is not None
+        free[j, columns.LENGTH] = leg.kind is not LegKind.PASSIVE
+        free[j, columns.BASE_AXIS] = leg.base_axis is not None
+        free[j, columns.PLATFORM_AXIS] = leg.platform_axis is not None
+        free[j, columns.TWIST] = twists and leg.twist is not None
         if leg.is_fixed_to_platform and leg.platform_axis is not None:  # B anywhere on the line
-            free[j, 3 + int(np.argmax(np.abs(leg.platform_axis)))] = False
+            free[j, columns.B.start + int(np.argmax(np.abs(leg.platform_axis)))] = False
     found: list[tuple[str, str]] = []
     place = np.full(free.shape, -1, dtype=np.intp)
-    for columns in _COLUMNS:
+    for block in _BLOCKS:
         for j, leg in enumerate(legs):
-            for column in columns:
+            for column in block:
                 if free[j, column]:
                     place[j, column] = len(found)
                     name = _LOCAL_NAMES[column]
-                    if column == _LENGTH and leg.kind is LegKind.CONSTANT:
+                    if column == columns.LENGTH and leg.kind is LegKind.CONSTANT:
                         name = "length"
-                    found.append((f"{names[j]}.{name}", "m" if column <= _LENGTH else "rad"))
+                    found.append((f"{names[j]}.{name}", "m" if column <= columns.LENGTH else "rad"))
     return Parametrization(tuple(n for n, _ in found), tuple(u for _, u in found), place)
 
 
@@ -150,36 +159,85 @@ def from_vector(vector: Array, n_legs: int, frame_legs: Sequence[int]) -> Kinema
 def vector_of(
     parametrization: Parametrization, legs: Sequence[Leg], nominal: Sequence[Leg]
 ) -> Array:
-    """Return the parameters of legs as a vector [m, rad].
-
-    Axes are rotations of the nominal ones: v = exp([w]_x) v_nominal with w = w_1 e_1 + w_2 e_2 and
-    e_1, e_2 the :func:`legcal.geometry.normal_basis` of v_nominal.
-    """
+    """Return the parameters of legs as a vector [m, rad], axes by angles from the nominal ones."""
+    numbers, is_parameter = numbers_of(legs, nominal), parametrization.place >= 0
     vector = np.zeros(len(parametrization))
-    for leg, start, place in zip(legs, nominal, parametrization.place, strict=True):
-        turns = _turn(leg.base_axis, start.base_axis), _turn(leg.platform_axis, start.platform_axis)
-        local = np.concatenate([leg.A, leg.B, [leg.q0], *turns, [_twist(leg, start)]])
-        vector[place[place >= 0]] = local[place >= 0]
+    vector[parametrization.place[is_parameter]] = numbers[is_parameter]
     return vector
+
+
+def numbers_of(legs: Sequence[Leg], nominal: Sequence[Leg]) -> Array:
+    """Return the numbers of legs, (n_legs, 12), in the order of :class:`LegColumns` [m, rad].
+
+    Axes are :func:`~legcal.geometry.axis_angles` from the nominal ones, zero for legs without one.
+    """
+    numbers = np.zeros((len(legs), LegColumns.COUNT))
+    for row, leg, start in zip(numbers, legs, nominal, strict=True):
+        row[LegColumns.A], row[LegColumns.B], row[LegColumns.LENGTH] = leg.A, leg.B, leg.q0
+        if leg.base_axis is not None and start.base_axis is not None:
+            row[LegColumns.BASE_AXIS] = axis_angles(leg.base_axis, start.base_axis)
+        if leg.platform_axis is not None and start.platform_axis is not None:
+            row[LegColumns.PLATFORM_AXIS] = axis_angles(leg.platform_axis, start.platform_axis)
+        row[LegColumns.TWIST] = _twist(leg, start)
+    return numbers
+
+
+def with_numbers(
+    legs: Sequence[Leg], nominal: Sequence[Leg], numbers: Array, given: BoolArray
+) -> tuple[Leg, ...]:
+    """Return legs of which some numbers, *given* (n_legs, 12), are those of :func:`numbers_of`.
+
+    Where an axis at the platform or a twist is given the leg has its twist as given.
+    """
+    found = []
+    for leg, start, row, own in zip(legs, nominal, numbers, given, strict=True):
+        if not own.any():
+            found.append(leg)
+            continue
+        axes = []
+        for columns, axis, origin in (
+            (LegColumns.BASE_AXIS, leg.base_axis, start.base_axis),
+            (LegColumns.PLATFORM_AXIS, leg.platform_axis, start.platform_axis),
+        ):
+            if axis is not None and origin is not None and own[columns].any():
+                turned = turned_axis(origin, row[columns])
+                axis = turned if turned @ axis > 0.0 else -turned
+            axes.append(axis)
+        moved = replace(
+            leg,
+            A=np.where(own[LegColumns.A], row[LegColumns.A], leg.A),
+            B=np.where(own[LegColumns.B], row[LegColumns.B], leg.B),
+            q0=float(row[LegColumns.LENGTH]) if own[LegColumns.LENGTH] else leg.q0,
+            base_axis=axes[0],
+            platform_axis=axes[1],
+        )
+        if leg.twist is not None and own[LegColumns.PLATFORM_AXIS.start :].any():
+            moved = replace(moved, twist=tied_twist(moved, start, float(row[LegColumns.TWIST])))
+        found.append(moved)
+    return tuple(found)
 
 
 def moved_legs(legs: Sequence[Leg], place: IntArray, step: Array) -> tuple[Leg, ...]:
     """Return legs after a small step of the parameters, which stand at *place* of it."""
-    padded = np.append(step, 0.0)
+    columns, padded = LegColumns, np.append(step, 0.0)
     moved = []
     for leg, local in zip(legs, padded[place], strict=True):
-        twist = leg.twist
-        if twist is not None:
-            twist = twist_after(leg, turn_of(leg.platform_axis, local[9:11]))
+        base_axis, platform_axis, twist = leg.base_axis, leg.platform_axis, leg.twist
+        if base_axis is not None:
+            base_axis = turned_axis(base_axis, local[columns.BASE_AXIS])
+        if platform_axis is not None:
+            angles = local[columns.PLATFORM_AXIS]
+            twist = twist_after(leg, Rotation.from_rotvec(angles @ normal_basis(platform_axis)))
+            platform_axis = turned_axis(platform_axis, angles)
         moved.append(
             replace(
                 leg,
-                A=leg.A + local[:3],
-                B=leg.B + local[3:6],
-                q0=leg.q0 + float(local[6]),
-                base_axis=turned(leg.base_axis, local[7:9]),
-                platform_axis=turned(leg.platform_axis, local[9:11]),
-                twist=None if twist is None else twist + float(local[11]),
+                A=leg.A + local[columns.A],
+                B=leg.B + local[columns.B],
+                q0=leg.q0 + float(local[columns.LENGTH]),
+                base_axis=base_axis,
+                platform_axis=platform_axis,
+                twist=None if twist is None else twist + float(local[columns.TWIST]),
             )
         )
     return tuple(moved)
@@ -200,16 +258,6 @@ def with_platform_foot(legs: Sequence[Leg], origin: Array) -> tuple[Leg, ...]:
     return tuple(found)
 
 
-def turned(axis: Array | None, turn: Array) -> Array | None:
-    """Return an axis turned by two angles about its :func:`normal_basis`."""
-    return None if axis is None else np.asarray(turn_of(axis, turn).apply(axis))
-
-
-def turn_of(axis: Array | None, turn: Array) -> Rotation:
-    """Return the rotation by two angles about the :func:`normal_basis` of an axis."""
-    return Rotation.from_rotvec(np.zeros(3) if axis is None else turn @ normal_basis(axis))
-
-
 def twist_after(leg: Leg, turn: Rotation) -> float | None:
     """Return the twist of a leg after its platform axis has been turned, and what is tied to it.
 
@@ -224,44 +272,13 @@ def twist_after(leg: Leg, turn: Rotation) -> float | None:
     return float(twist - np.pi * np.ceil(twist / np.pi - 0.5))
 
 
-def _turn(axis: Array | None, nominal: Array | None) -> Array:
-    """Return the two angles by which an axis, a line, is turned from the nominal one [rad]."""
-    if axis is None or nominal is None:
-        return np.zeros(2)
-    if axis @ nominal < 0.0:
-        axis = -axis
-    turn = cross(nominal, axis)
-    sine = float(np.sqrt(turn @ turn))
-    scale = 1.0 if sine == 0.0 else float(np.arctan2(sine, axis @ nominal)) / sine
-    return np.asarray(normal_basis(nominal) @ (scale * turn))
-
-
-def turn_slope(axis: Array | None, nominal: Array | None) -> Array:
-    """Return the derivative (2, 2) of the angles of an axis from the nominal one by its turns.
-
-    Turns are about the :func:`normal_basis` of the axis where it is now.
-    """
-    if axis is None or nominal is None:
-        return np.eye(2)
-    seen = -axis if axis @ nominal < 0.0 else axis
-    by_turn = cross(normal_basis(axis), seen)
-    turn, d_turn = cross(nominal, seen), cross(nominal, by_turn)
-    sine, cosine = float(np.sqrt(turn @ turn)), float(nominal @ seen)
-    if sine == 0.0:
-        return np.asarray(normal_basis(nominal) @ d_turn.T)
-    scale = float(np.arctan2(sine, cosine)) / sine
-    d_sine = d_turn @ turn / sine
-    d_scale = (cosine * d_sine - sine * (by_turn @ nominal) - scale * d_sine) / sine
-    return np.asarray(normal_basis(nominal) @ (scale * d_turn + np.outer(d_scale, turn)).T)
-
-
 def tied_twist(leg: Leg, nominal: Leg, twist: float) -> float | None:
     """Return the twist of a leg that had another one where its platform axis was nominal [rad].
 
     The axis went from there by the smallest rotation: what is tied to it has turned about it on any
     other way.
     """
-    turn = turn_between(nominal.platform_axis, leg.platform_axis)
+    turn = _turn_between(nominal.platform_axis, leg.platform_axis)
     return twist_after(replace(nominal, twist=twist), turn)
 
 
@@ -284,13 +301,57 @@ def _twist(leg: Leg, nominal: Leg) -> float:
 
     Twists are angles between lines.
     """
-    twist = twist_after(leg, turn_between(nominal.platform_axis, leg.platform_axis).inv())
+    twist = twist_after(leg, _turn_between(nominal.platform_axis, leg.platform_axis).inv())
     if twist is None or nominal.twist is None:
         return 0.0
     return float(twist - np.pi * np.round((twist - nominal.twist) / np.pi))
 
 
-def turn_between(nominal: Array | None, axis: Array | None) -> Rotation:
+def _turn_between(nominal: Array | None, axis: Array | None) -> Rotation:
     """Return the smallest rotation that takes a nominal axis to an axis, both as lines."""
-    angles = _turn(axis, nominal)
-    return Rotation.from_rotvec(np.zeros(3) if nominal is None else angles @ normal_basis(nominal))
+    if nominal is None or axis is None:
+        return Rotation.identity()
+    return rotation_between(nominal, axis if axis @ nominal >= 0.0 else -axis)
+
+
+def nominal_axes(
+    leg_names: Sequence[str], nominal: Sequence[Leg]
+) -> dict[str, dict[str, list[float]]]:
+    """Return the axes that turns count from, at the base in R_b and at the platform in R_e."""
+    named = list(zip(leg_names, nominal, strict=True))
+    return {
+        "base": {name: leg.base_axis.tolist() for name, leg in named if leg.base_axis is not None},
+        "platform": {
+            name: leg.platform_axis.tolist() for name, leg in named if leg.platform_axis is not None
+        },
+    }
+
+
+def turns_between(
+    parametrization: Parametrization,
+    calibrated: Sequence[Leg],
+    nominal: Sequence[Leg],
+) -> Array:
+    """Return the derivative (p, p) of parameters with calibrated axes by those with nominal ones.
+
+    Twists, which are tied to axes, depend on these and on the turns of the axes.
+    """
+    by_step = []
+    for start in (calibrated, nominal):
+        columns = []
+        for step in _STEP * np.eye(len(parametrization)):
+            ahead, behind = (
+                vector_of(parametrization, moved_legs(calibrated, parametrization.place, by), start)
+                for by in (step, -step)
+            )
+            columns.append((ahead - behind) / (2.0 * _STEP))
+        by_step.append(np.column_stack(columns))
+    return np.asarray(np.linalg.solve(by_step[1].T, by_step[0].T).T)
+
+
+def calibrated_axis(
+    nominal: Sequence[float], leg: str, side: str, values: Mapping[str, float]
+) -> Array:
+    """Return the axis (3,) that a result has, from the nominal one and its turns."""
+    w = np.array([values.get(f"{leg}.{side}_axis.{k}", 0.0) for k in (1, 2)])
+    return np.asarray(turned_axis(np.array(nominal), w))

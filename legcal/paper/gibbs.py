@@ -2,7 +2,8 @@
 
 Unknown rotations are Gibbs vectors w = tan(angle / 2) along the axis, counted from a start: they
 have no branches and no square root. An unknown axis is turned about its normal basis e1, e2 by
-two turns [rad], w = (turn_1 e1 + turn_2 e2) / 2.
+two turns, w = (turn_1 e1 + turn_2 e2) / 2: its :func:`~legcal.geometry.axis_angles` but for a
+factor near one (:func:`gibbs_of`).
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array, normal_basis
+from legcal.geometry import Array, normal_basis, turned_axis
 
 # Unknown motions
 
@@ -49,28 +50,25 @@ def turned_frame(turns: ca.SX, frame: ca.SX) -> ca.SX:
     return turned_points(0.5 * frame[:, 1:] @ turns, frame)
 
 
-def turned_axis(nominal: Array, turns: Array) -> Array:
-    """Return the first column of :func:`turned_frame` for numbers."""
-    if not turns.any():
-        return nominal
-    square = 0.25 * float(turns @ turns)
-    coordinates = np.array([1.0 - square, turns[1], -turns[0]]) / (1.0 + square)
-    axis = coordinates @ np.vstack([nominal, normal_basis(nominal)])
-    return np.asarray(axis / np.linalg.norm(axis))
+def gibbs_of(angles: Array) -> Array:
+    """Return the turns (..., 2) of an axis that is turned by angles (..., 2) [rad]."""
+    half = 0.5 * np.linalg.norm(angles, axis=-1, keepdims=True)
+    return np.asarray(angles * np.where(half > 0.0, np.tan(half) / np.where(half, half, 1.0), 1.0))
 
 
-def turned_axis_slope(nominal: Array, turns: Array) -> Array:
-    """Return the derivative (3, 2) of :func:`turned_axis` by the turns."""
+def angles_of(turns: Array) -> Array:
+    """Return the angles (..., 2) [rad] of turns, the inverse of :func:`gibbs_of`."""
+    half = 0.5 * np.linalg.norm(turns, axis=-1, keepdims=True)
+    return np.asarray(
+        turns * np.where(half > 0.0, np.arctan(half) / np.where(half, half, 1.0), 1.0)
+    )
+
+
+def axis_slope(nominal: Array, turns: Array) -> Array:
+    """Return the derivative (3, 2) of the first column of :func:`turned_frame` by the turns."""
     by_turns = np.array([-0.5 * turns, [0.0, 1.0], [-1.0, 0.0]])
-    axis = turned_axis(nominal, turns)
+    axis = turned_axis(nominal, angles_of(turns))
     frame = np.vstack([nominal, normal_basis(nominal)])
     return np.asarray(
         (frame.T @ by_turns - 0.5 * np.outer(axis, turns)) / (1.0 + 0.25 * float(turns @ turns))
     )
-
-
-def turns_of(axis: Array, nominal: Array) -> Array:
-    """Return the turns (2,) that take a nominal axis to an axis, both as lines."""
-    axis = axis if axis @ nominal > 0.0 else -axis
-    gibbs = np.cross(nominal, axis) / (1.0 + float(nominal @ axis))
-    return np.asarray(2.0 * normal_basis(nominal) @ gibbs)

@@ -26,20 +26,21 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, components, whitener
+from legcal.machine import LegColumns
 from legcal.paper.camera_poses import camera_poses, signs_seen
 from legcal.paper.criteria import Criteria
 from legcal.paper.gibbs import (
     axis_frames,
+    axis_slope,
     moved,
     moved_points,
-    turned_axis_slope,
     turned_frame,
     turned_points,
 )
 from legcal.paper.joints_in_camera import JointsInCamera, with_signs
 from legcal.paper.least_squares import IpoptSolution, LeastSquares, Term, solve_least_squares
 from legcal.paper.nominal import NominalMachine
-from legcal.paper.unknowns import BASE_TURNS, OF_A, Unknowns
+from legcal.paper.unknowns import Unknowns
 
 _MAX_SIGMA_TURN = 1.0  # [rad] of an axis; beyond, nothing is known of it
 _APART = (
@@ -93,9 +94,9 @@ def locate_joints_in_base(
     else:
         solution, cameras = _registered(machine, joints)
         _check_identifiable(machine, joints, solution)
-        of_turns, place = solution.covariance(), unknowns.place[:, BASE_TURNS]
+        of_turns, place = solution.covariance(), unknowns.place[:, LegColumns.BASE_AXIS]
         for j in np.flatnonzero(machine.revolute):
-            slope = turned_axis_slope(machine.base_axes[j], solution.x[place[j]])
+            slope = axis_slope(machine.base_axes[j], solution.x[place[j]])
             axis_covariance[j] = slope @ of_turns[np.ix_(place[j], place[j])] @ slope.T
     located = replace(machine, legs=unknowns.legs(solution.x, machine.legs))
     if criteria == "literal":
@@ -118,7 +119,8 @@ def build_scalar_products(machine: NominalMachine, joints: JointsInCamera) -> Le
         for product in _products(*view)
     ]
     places = tuple(
-        tuple(unknowns.place[:, columns].ravel().tolist()) for columns in (OF_A, BASE_TURNS)
+        tuple(unknowns.place[:, columns].ravel().tolist())
+        for columns in (LegColumns.A, LegColumns.BASE_AXIS)
     )
     n_legs = machine.n_legs
     observed = (
@@ -276,13 +278,13 @@ def build_rigid(
     for chosen, kind in ((seen & ~with_axis, "point"), (with_axis, "axis")):
         view, leg = np.nonzero(chosen)
         C, v = joints.covariance[view, leg], joints.v_camera[view, leg]
-        index = np.hstack([unknowns.place[leg, OF_A], steps(view)])
+        index = np.hstack([unknowns.place[leg, LegColumns.A], steps(view)])
         A_camera = joints.A_camera[view, leg]
         observed = (unknowns.known_A[leg], R[number[view]], t[number[view]], A_camera)
         if kind == "point":
             terms.append(Term(_centre(), index, (*observed, whitener(C[:, :3, :3]))))
         elif machine.spatial:
-            index = np.hstack([index, unknowns.place[leg, BASE_TURNS]])
+            index = np.hstack([index, unknowns.place[leg, LegColumns.BASE_AXIS]])
             more = (unknowns.base_frames[leg], axis_frames(v), whitener(C))
             terms.append(Term(_centre_and_axis(), index, (*observed, *more)))
         else:  # the centre follows turns of the normal by G
@@ -321,7 +323,7 @@ def _distances(
     C = (joints.covariance[view, j] + joints.covariance[view, g])[:, :3, :3]
     sigma = np.sqrt(np.einsum("ni,nij,nj->n", apart, C, apart)) / distance
     known = np.stack([unknowns.known_A[j], unknowns.known_A[g]], axis=2)
-    index = np.hstack([unknowns.place[j, OF_A], unknowns.place[g, OF_A]])
+    index = np.hstack([unknowns.place[j, LegColumns.A], unknowns.place[g, LegColumns.A]])
     return Term(distance_of_joints(), index, (known, distance, sigma))
 
 
@@ -432,8 +434,8 @@ def _check_identifiable(
     sigma = np.sqrt(np.diag(solution.covariance())[:n])
     loose = np.append(solution.undetermined(n) | (sigma > limit), False)
     names = np.array(machine.leg_names)
-    moving = names[loose[unknowns.place[:, OF_A]].any(axis=1)]
-    turning = names[loose[unknowns.place[:, BASE_TURNS]].any(axis=1)]
+    moving = names[loose[unknowns.place[:, LegColumns.A]].any(axis=1)]
+    turning = names[loose[unknowns.place[:, LegColumns.BASE_AXIS]].any(axis=1)]
     if not len(moving) and not len(turning):
         return
     what = "base joints" if len(moving) else "revolute axes at the base"

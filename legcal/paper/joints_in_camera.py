@@ -19,7 +19,7 @@ import numpy as np
 
 from legcal.data import LegAxes, Measurements
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, BoolArray, IntArray, normal_basis
+from legcal.geometry import Array, BoolArray, IntArray, normal_basis, turned_axis
 from legcal.paper.camera_poses import camera_poses, side_of_plane, signs_seen
 from legcal.paper.criteria import Criteria
 from legcal.paper.nominal import NominalMachine
@@ -344,7 +344,7 @@ def _weighted_joints(
         size = np.maximum(of_A / np.linalg.norm(A[active], axis=1), of_v)
         step /= np.maximum(size / _MAX_STEP, 1.0)[:, None]
         A[active] -= step[:, :3]
-        v[active] = turned(before, -step[:, 3:])
+        v[active] = turned_axis(before, -step[:, 3:])
         return step
 
     _until_converged(update, A, C, pool)
@@ -409,13 +409,6 @@ def residual_jacobian(axes: LegAxes, here: IntArray, v: Array, alpha: Array) -> 
     J[:, 2, 3] = np.sum(N[:, 1] * better, axis=1)
     J[:, 2, 4] = -np.sum(N[:, 0] * better, axis=1)
     return J
-
-
-def turned(v: Array, turn: Array) -> Array:
-    """Return unit vectors (n, 3) turned about their normal bases by small angles (n, 2)."""
-    w = np.einsum("ni,nia->na", turn, normal_basis(v))
-    moved = v + np.cross(w, v)
-    return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
 
 
 def _pooled(F: Array, b: Array, pool: IntArray) -> tuple[Array, Array]:

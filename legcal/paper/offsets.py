@@ -21,11 +21,12 @@ import numpy as np
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, IntArray
+from legcal.machine import LegColumns
 from legcal.paper.criteria import Criteria
 from legcal.paper.least_squares import IpoptSolution, LeastSquares, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
 from legcal.paper.nominal import NominalMachine
-from legcal.paper.unknowns import LENGTH, Unknowns
+from legcal.paper.unknowns import Unknowns
 
 _REWEIGHTINGS = 2
 _APART = 1e-3  # mean leg lengths: nearer platform joints count as one
@@ -70,7 +71,7 @@ def build_consecutive(machine: NominalMachine, directions: LegDirections) -> Lea
     before, after = np.array(found, dtype=np.intp).T
     term = Term(
         _change_of_distance(),
-        unknowns.place[directions.leg[pairs[after]], LENGTH],
+        unknowns.place[directions.leg[pairs[after]], LegColumns.LENGTH],
         (observed_legs(directions, pairs[before]), observed_legs(directions, pairs[after])),
     )
     return LeastSquares("The offsets (eq 14)", (term,), unknowns.vector(machine.legs))
@@ -92,7 +93,7 @@ def build_constant_distances(
     start = unknowns.vector(machine.legs)
     term = Term(
         _constant_distance(),
-        np.column_stack([unknowns.place[legs, LENGTH], len(start) + which]),
+        np.column_stack([unknowns.place[legs, LegColumns.LENGTH], len(start) + which]),
         (observed_legs(directions, pairs), distance_sigma(ends, covariance, pairs)),
         robust=True,
     )

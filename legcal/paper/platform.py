@@ -27,7 +27,7 @@ import numpy as np
 
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, whitener
-from legcal.machine import EquationKind, JointType, leg_equations
+from legcal.machine import EquationKind, JointType, LegColumns, leg_equations
 from legcal.paper.criteria import Criteria, Transformation
 from legcal.paper.joints_in_base import JointsInBase
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
@@ -43,7 +43,7 @@ from legcal.paper.offsets import (
 )
 from legcal.paper.platform_pose import PlatformPoses, locate_platform
 from legcal.paper.platform_printed import platform_as_printed
-from legcal.paper.unknowns import LENGTH, OF_B, Unknowns
+from legcal.paper.unknowns import Unknowns
 from legcal.paper.weak_directions import fix_weak_directions, nominal_prior
 
 _APART = 1e-3  # mean leg lengths: nearer joints count as one, whose distance has no direction
@@ -85,7 +85,8 @@ def locate_platform_joints(
     # should. Axes that the poses show too poorly to converge without it stay near the nominal ones.
     problem = build_rigid(rigid)
     n, terms = len(unknowns), problem.terms
-    turns = unknowns.place[[leg.twist is not None for leg in machine.legs], LENGTH + 1 :]
+    twisting = [leg.twist is not None for leg in machine.legs]
+    turns = unknowns.place[twisting, LegColumns.BASE_AXIS.start :]
     prior = nominal_prior(np.unique(turns[turns >= 0]))
     solution = solve_least_squares(replace(problem, terms=(*terms, *prior)))
     legs = unknowns.legs(solution.x, machine.legs)
@@ -155,7 +156,7 @@ class RigidProblem:
         free = np.arange(6) if self.machine.spatial else _IN_PLANE
         first = len(self.unknowns) + (free.max() + 1) * self.poses.pose[rows, None]
         steps = np.where(free >= 0, first + free, -1)
-        of_leg = self.unknowns.place[self.directions.leg[rows], OF_B.start :]
+        of_leg = self.unknowns.place[self.directions.leg[rows], LegColumns.B.start :]
         return np.hstack([of_leg, steps])
 
     def known(self, rows: IntArray) -> tuple[Array, Array, Array, Array]:
@@ -237,7 +238,9 @@ def build_rigid(rigid: RigidProblem) -> LeastSquares:
         )
     covariance = leg_end_covariance(directions, q0, rigid.sigma_q)
     of_pairs = rigid.unknowns.place[directions.leg][pairs]
-    index = np.hstack([of_pairs[:, :, LENGTH], of_pairs[:, :, OF_B].reshape(-1, 6)])
+    index = np.hstack(
+        [of_pairs[:, :, LegColumns.LENGTH], of_pairs[:, :, LegColumns.B].reshape(-1, 6)]
+    )
     sigma = distance_sigma(leg_ends(directions, q0), covariance, pairs)
     with_length = posed[np.isfinite(q0[directions.leg[posed]])]
     sigma_length = float(np.hypot(rigid.sigma_q, _MIN_SIGMA_LENGTH * mean_offset))

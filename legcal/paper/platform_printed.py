@@ -16,10 +16,18 @@ from dataclasses import replace
 import numpy as np
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, BoolArray, IntArray, frame_on_points
-from legcal.machine import EquationKind, JointType, Leg, LegKind, tied_twist, twist_after
+from legcal.geometry import Array, BoolArray, IntArray, frame_on_points, turned_axis
+from legcal.machine import (
+    EquationKind,
+    JointType,
+    Leg,
+    LegColumns,
+    LegKind,
+    tied_twist,
+    twist_after,
+)
 from legcal.paper.criteria import Transformation
-from legcal.paper.gibbs import axis_frames
+from legcal.paper.gibbs import angles_of, axis_frames
 from legcal.paper.joints_in_base import JointsInBase, distance_of_joints
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
@@ -27,15 +35,7 @@ from legcal.paper.leg_equations import closure_of_leg
 from legcal.paper.nominal import NominalMachine
 from legcal.paper.offsets import leg_ends, pairs_of_legs
 from legcal.paper.platform_pose import PlatformPoses, locate_platform, register_by_rays
-from legcal.paper.unknowns import (
-    BASE_TURNS,
-    LENGTH,
-    OF_B,
-    PLATFORM_TURNS,
-    TWIST,
-    Unknowns,
-    turned,
-)
+from legcal.paper.unknowns import Unknowns
 from legcal.paper.weak_directions import fix_weak_directions, nominal_prior
 
 _APART = 1e-3  # mean leg lengths: nearer joints count as one, whose distance has no direction
@@ -110,7 +110,7 @@ def build_mean_distances(
     which = which.ravel()
     mean = np.bincount(which, weights=distance) / np.bincount(which)
     legs = distinct[:, 1:]
-    place = unknowns.place[:, OF_B]
+    place = unknowns.place[:, LegColumns.B]
     observed = (np.swapaxes(unknowns.known_B[legs], 1, 2), mean, np.ones(len(mean)))
     return LeastSquares(
         "The platform joints (eq 16)",
@@ -168,7 +168,7 @@ def _with_axis_and_end(
         twist = None if leg.twist is None else tied_twist(fixed, leg, leg.twist)
         leg = replace(fixed, twist=twist)
     if leg.kind is LegKind.PASSIVE:
-        free = np.flatnonzero(unknowns.place[j, OF_B] >= 0)
+        free = np.flatnonzero(unknowns.place[j, LegColumns.B] >= 0)
         if j in machine.frame_legs and not leg.is_fixed_to_platform:
             free = np.arange(3 if machine.spatial else 2)
         B = locate_passive_end(name, u, directions.A[here], (R, t), leg.B, free)
@@ -259,8 +259,8 @@ def _close_legs(
     """
     twisting = np.array([leg.twist is not None for leg in unknowns.start])
     known_axis = np.array([leg.platform_joint is not JointType.UNIVERSAL for leg in unknowns.start])
-    turns = unknowns.place[twisting, LENGTH + 1 :]
-    wanted = np.setdiff1d(turns[turns >= 0], unknowns.place[known_axis, PLATFORM_TURNS])
+    turns = unknowns.place[twisting, LegColumns.BASE_AXIS.start :]
+    wanted = np.setdiff1d(turns[turns >= 0], unknowns.place[known_axis, LegColumns.PLATFORM_AXIS])
     if not len(wanted):
         return legs, ()
     numbers = np.unique(poses.pose[in_base & (poses.pose >= 0)])
@@ -311,7 +311,9 @@ def _build_closure(
             np.array([float(legs[j].twist or 0.0) for j in leg]),
             np.full(len(rows), _SIGMA_CLOSURE / np.sqrt(n_rows)),
         )
-        terms.append(Term(closure_of_leg(*joints), place[leg, LENGTH + 1 :], observed))
+        terms.append(
+            Term(closure_of_leg(*joints), place[leg, LegColumns.BASE_AXIS.start :], observed)
+        )
     return LeastSquares("The universal axes (step 4)", tuple(terms), np.zeros(len(wanted)))
 
 
@@ -321,17 +323,20 @@ def _closed(
     """Return legs with universal axes turned from the nominal ones, and twists changed."""
     values = np.zeros(len(unknowns) + 1)
     values[wanted] = x
-    return tuple(
-        leg
-        if leg.twist is None
-        else replace(
-            leg,
-            base_axis=turned(leg.base_axis, values[place[BASE_TURNS]]),
-            platform_axis=turned(leg.platform_axis, values[place[PLATFORM_TURNS]]),
-            twist=leg.twist + float(values[place[TWIST]]),
-        )
-        for leg, place in zip(legs, unknowns.place, strict=True)
-    )
+    found = []
+    for leg, own in zip(legs, values[unknowns.place], strict=True):
+        if leg.twist is not None and leg.base_axis is not None and leg.platform_axis is not None:
+            base, platform = (
+                turned_axis(axis, angles_of(own[columns]))
+                for axis, columns in (
+                    (leg.base_axis, LegColumns.BASE_AXIS),
+                    (leg.platform_axis, LegColumns.PLATFORM_AXIS),
+                )
+            )
+            twist = leg.twist + float(own[LegColumns.TWIST])
+            leg = replace(leg, base_axis=base, platform_axis=platform, twist=twist)
+        found.append(leg)
+    return tuple(found)
 
 
 def _in_own_frame(machine: NominalMachine, legs: tuple[Leg, ...]) -> tuple[Leg, ...]:

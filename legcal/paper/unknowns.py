@@ -1,25 +1,28 @@
 """The unknowns of a step: some of the kinematic parameters of the legs, counted from a start.
 
 Joint centres and lengths are unknown as they are [m], axes by two turns from where the step starts
-(:func:`~legcal.paper.gibbs.turned_axis`), twists by their change [rad].
+(:func:`~legcal.paper.gibbs.gibbs_of` the angles), twists by their change [rad].
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import N_LOCAL, Leg, LegKind, Parametrization, parametrize, tied_twist
-from legcal.paper.gibbs import axis_frames, turned_axis, turns_of
+from legcal.machine import (
+    Leg,
+    LegColumns,
+    Parametrization,
+    numbers_of,
+    parametrize,
+    with_numbers,
+)
+from legcal.paper.gibbs import angles_of, axis_frames, gibbs_of
 from legcal.paper.nominal import NominalMachine
-
-# Columns among the twelve numbers of a leg
-OF_A, OF_B, LENGTH = slice(0, 3), slice(3, 6), 6
-BASE_TURNS, PLATFORM_TURNS, TWIST = slice(7, 9), slice(9, 11), 11
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,24 +36,24 @@ class Unknowns:
     @classmethod
     def of_base(cls, machine: NominalMachine) -> Unknowns:
         """Return those of step 2: base joints, and revolute axes at the base."""
-        columns = np.zeros((machine.n_legs, N_LOCAL), dtype=np.bool_)
-        columns[:, OF_A] = True
-        columns[:, BASE_TURNS] = machine.revolute[:, None]
+        columns = np.zeros((machine.n_legs, LegColumns.COUNT), dtype=np.bool_)
+        columns[:, LegColumns.A] = True
+        columns[:, LegColumns.BASE_AXIS] = machine.revolute[:, None]
         return cls._among(machine, columns)
 
     @classmethod
     def of_lengths(cls, machine: NominalMachine) -> Unknowns:
         """Return those of step 3: offsets and constant lengths."""
-        columns = np.zeros((machine.n_legs, N_LOCAL), dtype=np.bool_)
-        columns[:, LENGTH] = True
+        columns = np.zeros((machine.n_legs, LegColumns.COUNT), dtype=np.bool_)
+        columns[:, LegColumns.LENGTH] = True
         return cls._among(machine, columns)
 
     @classmethod
     def of_platform(cls, machine: NominalMachine, *, free_twists: bool = False) -> Unknowns:
         """Return those of step 4: all that step 2 does not estimate; twists only if freed."""
-        columns = np.ones((machine.n_legs, N_LOCAL), dtype=np.bool_)
-        columns[:, OF_A] = False
-        columns[:, BASE_TURNS] = ~machine.revolute[:, None]
+        columns = np.ones((machine.n_legs, LegColumns.COUNT), dtype=np.bool_)
+        columns[:, LegColumns.A] = False
+        columns[:, LegColumns.BASE_AXIS] = ~machine.revolute[:, None]
         return cls._among(machine, columns, free_twists=free_twists)
 
     @classmethod
@@ -66,7 +69,7 @@ class Unknowns:
 
     @cached_property
     def place(self) -> IntArray:
-        """Place of each leg's twelve numbers among the unknowns, (n_legs, 12); -1 if known."""
+        """Where each leg's numbers (LegColumns) are among the unknowns, (n_legs, 12), or -1."""
         place = np.full(len(self.parametrization) + 1, -1, dtype=np.intp)
         place[self.parameters] = np.arange(len(self))
         return np.asarray(place[self.parametrization.place])
@@ -84,12 +87,12 @@ class Unknowns:
     @property
     def known_A(self) -> Array:
         """Coordinates of A that are no unknowns, zero for the others, (n_legs, 3) [m]."""
-        return np.where(self.place[:, OF_A] < 0, [leg.A for leg in self.start], 0.0)
+        return np.where(self.place[:, LegColumns.A] < 0, [leg.A for leg in self.start], 0.0)
 
     @property
     def known_B(self) -> Array:
         """The same of B."""
-        return np.where(self.place[:, OF_B] < 0, [leg.B for leg in self.start], 0.0)
+        return np.where(self.place[:, LegColumns.B] < 0, [leg.B for leg in self.start], 0.0)
 
     @cached_property
     def base_frames(self) -> Array:
@@ -106,46 +109,21 @@ class Unknowns:
 
     def vector(self, legs: Sequence[Leg]) -> Array:
         """Return the unknowns of legs, (n,)."""
-        local = np.zeros(self.place.shape)
-        for row, leg, start in zip(local, legs, self.start, strict=True):
-            row[OF_A], row[OF_B] = leg.A, leg.B
-            row[LENGTH] = 0.0 if leg.kind is LegKind.PASSIVE else leg.q0
-            if leg.base_axis is not None and start.base_axis is not None:
-                row[BASE_TURNS] = turns_of(leg.base_axis, start.base_axis)
-            if leg.platform_axis is not None and start.platform_axis is not None:
-                row[PLATFORM_TURNS] = turns_of(leg.platform_axis, start.platform_axis)
+        local = numbers_of(legs, self.start)
+        for columns in (LegColumns.BASE_AXIS, LegColumns.PLATFORM_AXIS):
+            local[:, columns] = gibbs_of(local[:, columns])
+        local[:, LegColumns.TWIST] -= [leg.twist or 0.0 for leg in self.start]
         x = np.zeros(len(self))
         x[self.place[self.place >= 0]] = local[self.place >= 0]
         return x
 
     def legs(self, x: Array, legs: Sequence[Leg]) -> tuple[Leg, ...]:
         """Return legs with the unknowns at values of which these are the first."""
-        padded = np.append(x[: len(self)], 0.0)
-        moved_legs = []
-        for leg, start, place in zip(legs, self.start, self.place, strict=True):
-            local = padded[place]
-            moved = replace(
-                leg,
-                A=np.where(place[OF_A] >= 0, local[OF_A], leg.A),
-                B=np.where(place[OF_B] >= 0, local[OF_B], leg.B),
-                q0=float(local[LENGTH]) if place[LENGTH] >= 0 else leg.q0,
-                base_axis=leg.base_axis
-                if place[BASE_TURNS.start] < 0
-                else turned(start.base_axis, local[BASE_TURNS]),
-                platform_axis=leg.platform_axis
-                if place[PLATFORM_TURNS.start] < 0
-                else turned(start.platform_axis, local[PLATFORM_TURNS]),
-            )
-            if start.twist is not None:
-                twist = start.twist + float(local[TWIST])
-                moved = replace(moved, twist=tied_twist(moved, start, twist))
-            moved_legs.append(moved)
-        return tuple(moved_legs)
-
-
-def turned(axis: Array | None, turns: Array) -> Array | None:
-    """Return the axis to which two turns take another one, if there is one."""
-    return None if axis is None else turned_axis(axis, turns)
+        local = np.append(x[: len(self)], 0.0)[self.place]
+        for columns in (LegColumns.BASE_AXIS, LegColumns.PLATFORM_AXIS):
+            local[:, columns] = angles_of(local[:, columns])
+        local[:, LegColumns.TWIST] += [leg.twist or 0.0 for leg in self.start]
+        return with_numbers(legs, self.start, local, self.place >= 0)
 
 
 def _frames(axes: Sequence[Array | None]) -> Array:

@@ -14,19 +14,20 @@ import casadi as ca
 import numpy as np
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, IntArray, normal_basis
+from legcal.geometry import Array, IntArray, axis_angles, normal_basis
 from legcal.machine import (
     SHOWN,
     Leg,
+    LegColumns,
     describe_direction,
     pose_sensitivity,
     sparse_basis,
     split_by_motion,
 )
-from legcal.paper.gibbs import turned_axis_slope, turns_of
+from legcal.paper.gibbs import axis_slope, gibbs_of
 from legcal.paper.least_squares import Term
 from legcal.paper.nominal import NominalMachine
-from legcal.paper.unknowns import BASE_TURNS, PLATFORM_TURNS, Unknowns
+from legcal.paper.unknowns import Unknowns
 
 _MAX_SIGMA = 10.0  # mean leg lengths, or [rad]: what is known worse is not determined at all
 _POOR_SIGMA = 0.1  # the same: nominal models know it better, unless the platform moves with it
@@ -122,12 +123,12 @@ def _platform_motion(
         return None
     for place, leg, start in zip(every.place, legs, unknowns.start, strict=True):
         for columns, axis, nominal in (
-            (BASE_TURNS, leg.base_axis, start.base_axis),
-            (PLATFORM_TURNS, leg.platform_axis, start.platform_axis),
+            (LegColumns.BASE_AXIS, leg.base_axis, start.base_axis),
+            (LegColumns.PLATFORM_AXIS, leg.platform_axis, start.platform_axis),
         ):
             if axis is not None and nominal is not None and place[columns].min() >= 0:
                 # Turns about the basis of the axis, by turns from the nominal one.
-                slope = turned_axis_slope(nominal, turns_of(axis, nominal))
+                slope = axis_slope(nominal, gibbs_of(axis_angles(axis, nominal)))
                 e1, e2 = normal_basis(axis)
                 motion[:, :, place[columns]] @= np.stack([-e2 @ slope, e1 @ slope])
     return np.asarray(motion[:, :, unknowns.parameters])

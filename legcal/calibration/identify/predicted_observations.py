@@ -18,8 +18,8 @@ from legcal.data import Dataset
 from legcal.estimation import Frames
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
-    N_LOCAL,
     Leg,
+    LegColumns,
     LegKind,
     Machine,
     Parametrization,
@@ -144,9 +144,9 @@ class PredictedObservations:
     @cached_property
     def local_to_parameters(self) -> Array:
         """Derivative of each leg's twelve numbers by the parameters in metres, (n_legs, 12, p)."""
-        eye = np.eye(N_LOCAL)
-        scattered = [self.parametrization.scatter(eye, j) for j in range(self.n_legs)]
-        return np.array(scattered).reshape(self.n_legs, N_LOCAL, len(self.unit)) * self.unit
+        n = LegColumns.COUNT
+        scattered = [self.parametrization.scatter(np.eye(n), j) for j in range(self.n_legs)]
+        return np.array(scattered).reshape(self.n_legs, n, len(self.unit)) * self.unit
 
     @cached_property
     def with_length(self) -> BoolArray:
@@ -157,10 +157,12 @@ class PredictedObservations:
         """Return the same with a calibration board in all images, or in none."""
         return replace(self, board=np.full(self.n_views, board, dtype=np.bool_))
 
-    def columns(self, kinds: Sequence[int]) -> IntArray:
-        """Return the parameters that stand for given ones of the legs' twelve numbers."""
-        place = self.parametrization.place[:, list(kinds)]
-        return np.unique(place[place >= 0])
+    def columns(self, *kinds: int | slice, legs: BoolArray | None = None) -> IntArray:
+        """Return the parameters that stand for numbers (:class:`LegColumns`) of some legs."""
+        place = self.parametrization.place
+        place = place if legs is None else place[legs]
+        found = np.concatenate([place[:, kind].ravel() for kind in kinds])
+        return np.unique(found[found >= 0])
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,14 +20,8 @@ from legcal.calibration.identify.predicted_observations import (
 )
 from legcal.estimation import compress, eliminate, grouped
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis
-from legcal.machine import EquationKind, JointType, freedoms
+from legcal.machine import EquationKind, JointType, LegColumns, freedoms
 
-_BASE = (0, 1, 2)  # places among the twelve numbers of a leg
-_PLATFORM = (3, 4, 5)
-_LENGTH = (6,)
-_BASE_AXIS = (7, 8)
-_PLATFORM_AXIS = (9, 10)
-_TWIST = (11,)
 MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
 _MIN_DISTANCE = 1e-3  # mean leg lengths: nearer joints count as one
 _MIN_VARIANCE = 1e-12  # of a variance [m^2]
@@ -86,8 +80,8 @@ def identify_base(predicted: PredictedObservations, located: Located) -> StepInf
 def base_by_frames(predicted: PredictedObservations, located: Located) -> tuple[IntArray, Array]:
     """Return the parameters of step 2, and rows by each frame and all parameters, (k, r, 6 + p)."""
     columns = np.union1d(
-        predicted.columns(_BASE),
-        _of_legs(predicted, _BASE_AXIS, revolute_axes(predicted)),
+        predicted.columns(LegColumns.A),
+        predicted.columns(LegColumns.BASE_AXIS, legs=revolute_axes(predicted)),
     )
     pairs = np.argwhere(located.joint)
     rows = np.zeros((len(pairs), 5, 6 + len(predicted.unit)))
@@ -100,7 +94,8 @@ def base_by_frames(predicted: PredictedObservations, located: Located) -> tuple[
             )[:3]
         row[:, :6] = _by_camera(predicted, j, F)
         scatter = predicted.local_to_parameters[j]
-        row[:, 6:] = F[:, :3] @ scatter[:3] + F[:, 3:] @ scatter[7:9] * predicted.mean_length
+        row[:, 6:] = F[:, :3] @ scatter[LegColumns.A]
+        row[:, 6:] += F[:, 3:] @ scatter[LegColumns.BASE_AXIS] * predicted.mean_length
     return columns, grouped(rows, pairs[:, 0], predicted.n_frames)
 
 
@@ -115,7 +110,7 @@ def distance_rows(
     One over the standard deviation of each distance [1/m]; (m, 4): Frame, pose, and both legs of
     each distance.
     """
-    columns = predicted.columns(_LENGTH)
+    columns = predicted.columns(LegColumns.LENGTH)
     place = np.full(predicted.n_legs, -1)
     place[predicted.with_length] = np.arange(len(columns))
     B = at_platform_joints(predicted)
@@ -150,7 +145,7 @@ def offsets_from_distances(
     predicted: PredictedObservations, rows: Array, weight: Array, key: IntArray
 ) -> StepInformation:
     """Return what step 3 says: the distance of each pair is constant and free, (14)."""
-    columns = predicted.columns(_LENGTH)
+    columns = predicted.columns(LegColumns.LENGTH)
     _, pair = np.unique(key[:, 2:], axis=0, return_inverse=True)
     pair = pair.ravel()
     own = np.concatenate([weight[:, None], rows], axis=1)
@@ -171,8 +166,8 @@ def identify_platform(
     columns = np.unique(
         np.concatenate(
             [
-                predicted.columns((*_PLATFORM, *_PLATFORM_AXIS, *_TWIST)),
-                _of_legs(predicted, _BASE_AXIS, universal),
+                predicted.columns(LegColumns.B, LegColumns.PLATFORM_AXIS, LegColumns.TWIST),
+                predicted.columns(LegColumns.BASE_AXIS, legs=universal),
             ]
         )
     )
@@ -207,7 +202,8 @@ def scalar_products(predicted: PredictedObservations, located: Located) -> StepI
             continue
         G = np.array([vectors[p] @ slopes[q] + vectors[q] @ slopes[p] for p, q in pairs])
         variance = np.einsum("pi,ij,pj->p", G, _covariance(predicted, located, f), G)
-        by_local = np.concatenate([scatter[:, :3], predicted.mean_length * scatter[:, 7:9]], axis=1)
+        turns = predicted.mean_length * scatter[:, LegColumns.BASE_AXIS]
+        by_local = np.concatenate([scatter[:, LegColumns.A], turns], axis=1)
         rows.append(
             G @ by_local.reshape(G.shape[1], -1) / np.sqrt(variance + _MIN_VARIANCE)[:, None]
         )
@@ -236,12 +232,12 @@ def mean_distances(
     predicted: PredictedObservations, weight: Array, key: IntArray
 ) -> StepInformation:
     """Return what (16) says: mean distances of leg ends in each frame are those of the joints."""
-    columns = predicted.columns((3, 4, 5))
+    columns = predicted.columns(LegColumns.B)
     B = np.array([leg.B for leg in predicted.legs])
     distinct, which = np.unique(key[:, [0, 2, 3]], axis=0, return_inverse=True)
     number = np.bincount(which.ravel(), weights=weight**2)
     rows = np.zeros((len(distinct), len(predicted.unit)))
-    scatter = predicted.local_to_parameters[:, 3:6]
+    scatter = predicted.local_to_parameters[:, LegColumns.B]
     for row, (_, j, g), n in zip(rows, distinct, number, strict=True):
         apart = B[g] - B[j]
         row += np.sqrt(n) * (apart / np.linalg.norm(apart)) @ (scatter[g] - scatter[j])
@@ -292,12 +288,6 @@ def _by_camera(predicted: PredictedObservations, j: int, F: Array) -> Array:
     if axis is not None:
         rows[:, :3] -= predicted.mean_length * F[:, 3:] @ normal_basis(axis)
     return rows * pose_unit(predicted)
-
-
-def _of_legs(predicted: PredictedObservations, kinds: tuple[int, ...], legs: BoolArray) -> IntArray:
-    """Return the parameters of some legs that stand for given ones of their twelve numbers."""
-    place = predicted.parametrization.place[legs][:, list(kinds)]
-    return np.unique(place[place >= 0])
 
 
 def _end_variance(

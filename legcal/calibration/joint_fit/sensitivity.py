@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.variables import TWIST, LegConstraints, State, intrinsic_of
+from legcal.calibration.joint_fit.variables import LegConstraints, State, intrinsic_of
 from legcal.estimation import (
     Linearization,
     NormalEquations,
@@ -25,6 +25,7 @@ from legcal.estimation import (
     score_test,
 )
 from legcal.geometry import Array
+from legcal.machine import LegColumns
 from legcal.vision import shared_cameras
 
 FOCAL_PART = 0.01  # of the focal length: the error whose effect is reported
@@ -104,7 +105,7 @@ def sensitivities(
         found = [
             Sensitivity(what, _of_kinematic(wide, steps[:, [i]])) for i, what in enumerate(names)
         ]
-    place = wide.legs.parametrization.place[:, TWIST]
+    place = wide.legs.parametrization.place[:, LegColumns.TWIST]
     twisted = [j for j, x in enumerate(place) if x >= 0 and not wide.free[x]]
     if twisted:
         columns = [_of_twist(wide, state, linear, normal, loss, j) for j in twisted]
@@ -148,7 +149,7 @@ def _of_twist(
     leg: int,
 ) -> Array:
     """Return the steps (p,) of kinematic parameters if a fixed twist is off, poses following."""
-    motion = _TWIST_ERROR * LegConstraints(problem.legs).following(state, leg, TWIST)
+    motion = _TWIST_ERROR * LegConstraints(problem.legs).following(state, leg, LegColumns.TWIST)
     changes = {
         factor.name: _efficiency(problem, loss, factor.name)
         * linear[factor.name].J_element
@@ -157,7 +158,7 @@ def _of_twist(
         if factor.element is not None  # corners do not depend on poses
     }
     steps = _of_kinematic(problem, response(problem, linear, normal, changes))[:, 0]
-    steps[problem.legs.parametrization.place[leg, TWIST]] = _TWIST_ERROR
+    steps[problem.legs.parametrization.place[leg, LegColumns.TWIST]] = _TWIST_ERROR
     return steps
 
 

@@ -17,9 +17,10 @@ from scipy.spatial.transform import RigidTransform
 from legcal.data import Measurements
 from legcal.errors import DatasetError, DidNotConverge
 from legcal.estimation import Frames, Problem, Tangent
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray, axis_angles_slope
 from legcal.machine import (
     Leg,
+    LegColumns,
     Machine,
     Parametrization,
     PoseEquations,
@@ -31,14 +32,11 @@ from legcal.machine import (
     solve_poses,
     tied_twist,
     tied_twist_slope,
-    turn_of,
-    turn_slope,
     vector_of,
+    with_numbers,
 )
 from legcal.vision import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 
-A, B, LENGTH = slice(0, 3), slice(3, 6), 6  # among the twelve numbers of a leg
-BASE_AXIS, PLATFORM_AXIS, TWIST = slice(7, 9), slice(9, 11), 11
 _RANK = 1e-7  # of the largest singular value
 _STEP_TOLERANCE = 1e-6  # [m, rad], last step where constraints cannot all be met to rounding
 
@@ -183,14 +181,14 @@ class LegParameters:
     @cached_property
     def turns(self) -> bool:
         """Whether an axis is free, whose angles from nominal are not just added up."""
-        return bool(np.any(self.unknown[:, BASE_AXIS.start : TWIST] >= 0))
+        return bool(np.any(self.unknown[:, LegColumns.BASE_AXIS.start : LegColumns.TWIST] >= 0))
 
     @cached_property
     def _half_fixed(self) -> dict[int, float]:
         """The fixed angles of axes whose other angle is free."""
         place, found = self.legs.parametrization.place, dict[int, float]()
         for own, unknown in zip(place, self.unknown, strict=True):
-            for axis in (BASE_AXIS, PLATFORM_AXIS):
+            for axis in (LegColumns.BASE_AXIS, LegColumns.PLATFORM_AXIS):
                 is_fixed = (own[axis] >= 0) & (unknown[axis] < 0)
                 if is_fixed.sum() == 1:
                     number = int(own[axis][is_fixed][0])
@@ -219,7 +217,9 @@ class LegParameters:
                 leg,
                 twist=tied_twist(leg, nominal, self.values.get(f"{name}.twist", nominal.twist)),
             )
-            if nominal.twist is not None and leg.is_fixed_to_platform and unknown[TWIST] < 0
+            if nominal.twist is not None
+            and leg.is_fixed_to_platform
+            and unknown[LegColumns.TWIST] < 0
             else leg
             for leg, nominal, name, unknown in zip(
                 moved, self.legs.nominal, names, self.unknown, strict=True
@@ -236,14 +236,16 @@ class LegParameters:
         for leg, nominal, unknown, number in zip(
             geometry, self.legs.nominal, self.unknown, self.legs.parametrization.place, strict=True
         ):
-            both = (leg.base_axis, nominal.base_axis), (leg.platform_axis, nominal.platform_axis)
-            for columns, axes in zip((BASE_AXIS, PLATFORM_AXIS), both, strict=True):
-                if np.all(unknown[columns] < 0):
+            for columns, axis, start in (
+                (LegColumns.BASE_AXIS, leg.base_axis, nominal.base_axis),
+                (LegColumns.PLATFORM_AXIS, leg.platform_axis, nominal.platform_axis),
+            ):
+                if axis is None or start is None or np.all(unknown[columns] < 0):
                     continue
                 by = np.zeros((len(self.free), 2))
-                by[number[columns]] = turn_slope(*axes)
-                if columns is PLATFORM_AXIS and number[TWIST] >= 0:
-                    by[number[TWIST]] = -tied_twist_slope(leg, nominal)
+                by[number[columns]] = axis_angles_slope(axis, start)
+                if columns is LegColumns.PLATFORM_AXIS and number[LegColumns.TWIST] >= 0:
+                    by[number[LegColumns.TWIST]] = -tied_twist_slope(leg, nominal)
                 for x, column in zip(unknown[columns], by.T, strict=True):
                     if x >= 0:
                         J[:, x] = column[self.free]
@@ -254,46 +256,9 @@ def with_values(
     geometry: tuple[Leg, ...], legs: FittedLegs, values: Mapping[int, float]
 ) -> tuple[Leg, ...]:
     """Return legs some of whose parameters, by their number, have given values [m, rad]."""
-    wanted = np.append(legs.vector(tuple(geometry)), 0.0)
+    wanted, place = np.append(legs.vector(geometry), 0.0), legs.parametrization.place
     wanted[list(values)] = list(values.values())
-    given = np.isin(legs.parametrization.place, list(values))
-    found = []
-    for leg, nominal, place, own in zip(
-        geometry, legs.nominal, legs.parametrization.place, given, strict=True
-    ):
-        if not own.any():
-            found.append(leg)
-            continue
-        numbers = wanted[place]
-        moved = replace(
-            leg,
-            A=np.where(own[A], numbers[A], leg.A),
-            B=np.where(own[B], numbers[B], leg.B),
-            q0=float(numbers[LENGTH]) if own[LENGTH] else leg.q0,
-            base_axis=_axis_at(
-                leg.base_axis, nominal.base_axis, numbers[BASE_AXIS], own[BASE_AXIS]
-            ),
-            platform_axis=_axis_at(
-                leg.platform_axis,
-                nominal.platform_axis,
-                numbers[PLATFORM_AXIS],
-                own[PLATFORM_AXIS],
-            ),
-        )
-        if leg.twist is not None and own[PLATFORM_AXIS.start :].any():
-            moved = replace(moved, twist=tied_twist(moved, nominal, float(numbers[TWIST])))
-        found.append(moved)
-    return tuple(found)
-
-
-def _axis_at(
-    axis: Array | None, nominal: Array | None, angles: Array, given: BoolArray
-) -> Array | None:
-    """Return an axis at angles from the nominal one, as it was if none is given for."""
-    if axis is None or nominal is None or not given.any():
-        return axis
-    there = np.asarray(turn_of(nominal, angles).apply(nominal))
-    return there if there @ axis > 0.0 else -there
+    return with_numbers(geometry, legs.nominal, wanted[place], np.isin(place, list(values)))
 
 
 def intrinsic_of(camera: Camera, key: str) -> float:
@@ -370,9 +335,9 @@ class LegConstraints:
         for i, leg in enumerate(rows.leg):
             place = problem.place["legs"][leg]
             by_local = rows.by_local[:, i]
-            if place[TWIST] == n_kept:
+            if place[LegColumns.TWIST] == n_kept:
                 slope = tied_twist_slope(state.legs[leg], self.legs.nominal[leg])
-                by_local[:, PLATFORM_AXIS] += by_local[:, [TWIST]] * slope
+                by_local[:, LegColumns.PLATFORM_AXIS] += by_local[:, [LegColumns.TWIST]] * slope
             Q[place] -= by_local.T[..., None] * inverse[None, :, :, i]
         return Tangent(Z, Q[:-1])
 

@@ -1,0 +1,114 @@
+"""What deserves attention in a machine that was loaded, one sentence each."""
+
+from legcal.machine.home import legs_outside
+from legcal.machine.kinematics import readings_at
+from legcal.machine.mobility import singularity
+from legcal.machine.model import Machine
+from legcal.machine.schema import LegcalBlock
+
+REGULAR = 1e-4  # singularity measure: less than that is the rounding of a file
+
+
+def diagnose(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]:
+    """Return what deserves attention in a mechanism, one sentence each."""
+    notes = []
+    if not home_is_given:
+        xyz = ", ".join(f"{x:.6g}" for x in machine.home.translation)
+        quat = ", ".join(f"{x:.6g}" for x in machine.home.rotation.as_quat(canonical=True))
+        notes.append(
+            "legcal.home is not given: a pose with all legs at mid-travel was taken, xyz "
+            f"[{xyz}], quat_xyzw [{quat}]; write it down if the machine is assembled this way."
+        )
+    q = readings_at(machine, machine.home)
+    outside = legs_outside(machine)
+    for j, leg in enumerate(machine.legs):
+        lower, upper = leg.travel
+        if j in outside:
+            notes.append(
+                f"leg '{leg.name}' is at {1e3 * q[j]:.2f} mm at home, outside its travel of "
+                f"{1e3 * lower:.2f} to {1e3 * upper:.2f} mm; check legcal.home or the limits."
+            )
+    return (*notes, *_unseen_notes(machine), *_motor_notes(machine), *_spin_notes(machine))
+
+
+def proposal_notes(written: LegcalBlock | None, machine: Machine) -> tuple[str, ...]:
+    """Return what of the block ``legcal`` was proposed because the file does not have it."""
+    frame = ", ".join(machine.leg_names[j] for j in machine.frame_legs)
+    if written is None:
+        return (
+            f"the file has no block legcal: base '{machine.base}', platform "
+            f"'{machine.platform}', legs {', '.join(machine.leg_names)} and base_frame "
+            f"[{frame}] were taken from its bodies; write them down to choose others.",
+        )
+    if written.base_frame is None:
+        return (
+            f"legcal.base_frame is not given: [{frame}] was taken, whose joints span most; write "
+            "it down to choose others.",
+        )
+    return ()
+
+
+def singularity_note(machine: Machine) -> str | None:
+    """Return that the motors do not hold the platform at home, None where they do."""
+    if not 0 < machine.mobility <= len(machine.motors):
+        return None
+    measure = singularity(machine, machine.home)
+    if measure > REGULAR:
+        return None
+    return (
+        "the mechanism is singular at home: the platform moves there although all motors stand "
+        f"(singularity measure {measure:.1g}, needed above {REGULAR:g}); correct legcal.home, or "
+        "the joints if they make similar figures on base and platform."
+    )
+
+
+def _unseen_notes(machine: Machine) -> list[str]:
+    """Return which legs show no cylinder."""
+    unseen = [leg.name for leg in machine.legs if not leg.cylinders]
+    if not unseen:
+        return []
+    if len(unseen) == 1:
+        who, add = f"leg '{unseen[0]}' has no <visual> cylinder along its axis: it", "add one"
+    else:
+        who = f"legs {', '.join(unseen)} have no <visual> cylinder along their axes: they"
+        add = "add one to each"
+    return [f"{who} cannot be seen in images; {add} with its radius."]
+
+
+def _motor_notes(machine: Machine) -> list[str]:
+    """Return where forward kinematics has too few motors, or too many, or a singular start."""
+    notes = []
+    if machine.mobility == 0:
+        return ["the platform cannot move: mobility 0; check the joints and axes of the legs."]
+    if not machine.is_determined:
+        n_motors = len(machine.motors)
+        found = "the motors do not determine the pose"
+        if n_motors > machine.mobility:
+            found = "there are more motors than the pose needs"
+        notes.append(
+            f"{found}: mobility {machine.mobility}, motors {n_motors}; forward kinematics is "
+            "refused."
+        )
+    singular = singularity_note(machine)
+    return notes if singular is None else [*notes, singular]
+
+
+def _spin_notes(machine: Machine) -> list[str]:
+    """Return what spins idly: legs with an S joint at both ends, and revolutes too many."""
+    notes = []
+    both = sum(
+        leg.base_joint.twists_freely and leg.platform_joint.twists_freely for leg in machine.legs
+    )
+    if both:
+        legs, spin = "1 leg has", "spins about itself"
+        if both > 1:
+            legs, spin = f"{both} legs have", "spin about themselves"
+        notes.append(f"{legs} an S joint at both ends and {spin}; this is not counted as mobility.")
+    others = sum(leg.idle_spins for leg in machine.legs) - both
+    if others:
+        joints = "1 revolute repeats" if others == 1 else f"{others} revolutes repeat"
+        notes.append(
+            f"{joints} what an S joint of the leg does, or another revolute; this is not counted "
+            "as mobility."
+        )
+    return notes

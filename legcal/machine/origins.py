@@ -1,0 +1,253 @@
+"""Which origins of a URDF carry the numbers of legs, and where they go with other numbers.
+
+A number of a leg is carried by the origin of a joint: that of its first joint by A, of its last by
+B, of its slider or of a joint of its rod by the length. Where an origin moves that leg alone it is
+a :class:`Handle`; legs whose origins carry other things too are refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.errors import OutOfClass
+from legcal.geometry import Array, rotation_between
+from legcal.machine.bodies import Bodies, frame_link, rigid_bodies
+from legcal.machine.leg import Leg, LegChain, Step
+from legcal.machine.model import Machine
+from legcal.machine.parameters import in_links, twist_after
+from legcal.machine.urdf import UrdfJoint
+
+_ROUNDING = 1e-14  # [rad]: what turns less does not turn
+
+
+def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[RigidTransform, bool]]:
+    """Return the new origin of every joint that carries a number of a leg, and if it is turned."""
+    handles = Handles(machine)
+    found: dict[str, tuple[RigidTransform, bool]] = {}
+
+    def move(handle: Handle, motion: Motion, body: str) -> None:
+        """Move a joint by a motion that is given in a link of its body."""
+        joint, T_body_link = handle.joint, handles.bodies.T_body_link
+        T_parent_origin, is_turned = found.get(joint.name, (joint.T_parent_origin, False))
+        there = T_body_link[joint.parent].inv() * T_body_link[body]
+        seen = motion.seen_from(there) if body != joint.parent else motion
+        seen = seen.inv() if handle.is_inverse else seen
+        found[joint.name] = seen.of(T_parent_origin), is_turned or seen.turn is not None
+
+    for leg, wanted in zip(machine.legs, in_links(machine, legs), strict=True):
+        chain = leg.urdf_chain
+        at_base, at_platform = _ends(leg, wanted)
+        grown = wanted.q0 - leg.q0, _twisted(leg, wanted, at_platform)
+        if chain.slider is not None:
+            move(*_at_slider(handles, leg, chain, grown))
+        elif any(grown):
+            move(*_in_rod(handles, leg, chain, grown))
+        first, last = chain.steps[0], chain.steps[-1]
+        base, platform = machine.base, machine.platform
+        move(handles.of(first, first.near, base, leg.name), at_base, base)
+        move(handles.of(last, last.far, platform, leg.name), at_platform, platform)
+    return found
+
+
+class Handle(NamedTuple):
+    """The joint of the URDF whose origin is moved."""
+
+    joint: UrdfJoint
+    is_inverse: bool  # whether its origin moves the body against the leg's joint
+
+
+class Handles:
+    """Which origins of the URDF move the joints of legs in the bodies of a machine."""
+
+    def __init__(self, machine: Machine) -> None:
+        self._machine = machine
+        self._urdf = machine.urdf
+        self._closures = machine.chain.closures
+        self._fixed = rigid_bodies(self._urdf, (), machine.platform_joint)
+        self.bodies: Bodies = rigid_bodies(self._urdf, self._closures, machine.platform_joint)
+        self._above = {joint.child: joint for joint in self._urdf.joints.values()}
+
+    def of(self, step: Step, side: int, body: str, leg: str) -> Handle:
+        """Return what moves a joint in a body."""
+        connection = step.connection
+        if connection.closure is not None:
+            closure = self._closures[connection.closure]
+            return Handle(self._carrier((closure.frame_1, closure.frame_2)[side], leg), False)
+        joint = self._urdf.joints[str(connection.joint)]
+        if side == 0:
+            return Handle(joint, False)
+        if self._fixed.body_of[joint.child] == self._fixed.body_of[body]:
+            return Handle(self._onward(joint, body, leg), True)
+        return self._weld(joint, body, leg)
+
+    def link(self, step: Step, side: int) -> str:
+        """Return the link that carries one side of a joint."""
+        connection = step.connection
+        if connection.closure is not None:
+            closure = self._closures[connection.closure]
+            return frame_link(self._urdf, (closure.frame_1, closure.frame_2)[side])
+        joint = self._urdf.joints[str(connection.joint)]
+        return (joint.parent, joint.child)[side]
+
+    def _onward(self, joint: UrdfJoint, body: str, leg: str) -> UrdfJoint:
+        """Return the fixed joint that leads from the child of a joint to the rest of its body."""
+        link, onward = body, None
+        while link != joint.child and link in self._above:
+            onward = self._above[link]
+            link = onward.parent
+        if link == joint.child and onward is not None and self._carries_only(link, onward):
+            return onward
+        raise OutOfClass(
+            f"{self._machine.urdf_path}: leg '{leg}' could not be written: found that joint "
+            f"'{joint.name}' carries the link '{body}' itself, needed legs that hang from base or "
+            "platform, or are closed on them; let a virtual floating joint carry the platform, or "
+            "put a link on a fixed joint between them."
+        )
+
+    def _weld(self, joint: UrdfJoint, body: str, leg: str) -> Handle:
+        """Return the fixed joint under a frame of the closure that welds a leg to a body."""
+        ours, theirs = self._fixed.body_of[body], self._fixed.body_of[joint.child]
+        problem: OutOfClass | None = None
+        for closure in self._closures:
+            frames = closure.frame_1, closure.frame_2
+            on = [self._fixed.body_of[frame_link(self._urdf, frame)] for frame in frames]
+            if closure.kind == "6d" and set(on) == {ours, theirs}:
+                for wanted in (ours, theirs):
+                    try:
+                        carrier = self._carrier(frames[on.index(wanted)], leg)
+                    except OutOfClass as error:
+                        problem = problem or error
+                        continue
+                    return Handle(carrier, wanted == theirs)
+        if problem is not None:
+            raise problem
+        raise OutOfClass(
+            f"{self._machine.urdf_path}: leg '{leg}' could not be written: found several welds "
+            f"between joint '{joint.name}' and the link '{body}', needed one; close the leg once."
+        )
+
+    def _carrier(self, frame: str, leg: str) -> UrdfJoint:
+        """Return the fixed joint under a closure's frame, which must carry nothing else."""
+        link = frame_link(self._urdf, frame)
+        above = self._above.get(link)
+        if above is not None and not above.moves and self._carries_only(link, None, closures=1):
+            return above
+        raise OutOfClass(
+            f"{self._machine.urdf_path}: leg '{leg}' could not be written: found the closure "
+            f"frame '{frame}' on a link that carries other things too, needed a link of its own on "
+            "a fixed joint; add one at the joint centre."
+        )
+
+    def _carries_only(self, link: str, below: UrdfJoint | None, closures: int = 0) -> bool:
+        """Say whether a link carries one joint or none, and so many frames of closures."""
+        found = [joint for joint in self._urdf.joints.values() if joint.parent == link]
+        frames = [f for c in self._closures for f in (c.frame_1, c.frame_2)]
+        uses = sum(frame_link(self._urdf, frame) == link for frame in frames)
+        return found == ([] if below is None else [below]) and uses == closures
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A rigid motion in a frame: p -> about + R (p - about) + shift."""
+
+    shift: Array  # (3,) displacement of the point *about* [m]
+    about: Array  # (3,) [m]
+    turn: Rotation | None = None  # R; None where nothing turns, so that nothing is rounded
+
+    def inv(self) -> Motion:
+        """Return the motion back."""
+        turn = None if self.turn is None else self.turn.inv()
+        return Motion(-self.shift, self.about + self.shift, turn)
+
+    def seen_from(self, T_to_from: RigidTransform) -> Motion:
+        """Return the same motion in another frame."""
+        R = T_to_from.rotation
+        turn = None if self.turn is None else R * self.turn * R.inv()
+        return Motion(
+            np.asarray(R.apply(self.shift)), np.asarray(T_to_from.apply(self.about)), turn
+        )
+
+    def of(self, T: RigidTransform) -> RigidTransform:
+        """Return a pose after the motion."""
+        if self.turn is None:
+            return RigidTransform.from_components(T.translation + self.shift, T.rotation)
+        arm = self.turn.apply(T.translation - self.about)
+        return RigidTransform.from_components(self.about + arm + self.shift, self.turn * T.rotation)
+
+
+def _ends(leg: Leg, wanted: Leg) -> tuple[Motion, Motion]:
+    """Return how the ends of a leg move in the links of base and platform."""
+    is_fixed = leg.is_fixed_to_platform
+    return (
+        Motion(wanted.A - leg.A, leg.A, _turn(leg.base_axis, wanted.base_axis)),
+        Motion(
+            wanted.B - leg.B,
+            leg.B,
+            _turn(leg.platform_axis, wanted.platform_axis, directed=is_fixed),
+        ),
+    )
+
+
+def _turn(axis: Array | None, wanted: Array | None, *, directed: bool = False) -> Rotation | None:
+    """Return the smallest rotation of an axis, a line unless it is directed, onto another."""
+    if axis is None or wanted is None:
+        return None
+    if not directed and axis @ wanted < 0.0:
+        wanted = -wanted
+    turn = rotation_between(axis, wanted)
+    return None if turn.magnitude() < _ROUNDING else turn
+
+
+def _twisted(leg: Leg, wanted: Leg, at_platform: Motion) -> float:
+    """Return how far the upper half of a leg turns about it, beside what its end does [rad]."""
+    if leg.twist is None or wanted.twist is None:
+        return 0.0
+    carried = leg.twist
+    if at_platform.turn is not None:
+        carried = float(twist_after(leg, at_platform.turn) or 0.0)
+    twist = wanted.twist - carried
+    twist -= np.pi * np.round(twist / np.pi)
+    return float(twist) if abs(twist) > _ROUNDING else 0.0
+
+
+def _screw(along: Array, point: Array, grown: tuple[float, float]) -> Motion:
+    """Return the motion of the upper half of a leg: growth along its line, and turn about it."""
+    growth, twist = grown
+    turn = None if twist == 0.0 else Rotation.from_rotvec(twist * along)
+    return Motion(growth * along, point, turn)
+
+
+def _at_slider(
+    handles: Handles, leg: Leg, chain: LegChain, grown: tuple[float, float]
+) -> tuple[Handle, Motion, str]:
+    """Return what moves the upper half of a leg at its slider, how, and the body that says so."""
+    slider = chain.slider
+    if slider is None:
+        raise ValueError("a rod has no slider")
+    body = slider.connection.bodies[0]  # that of the joint's parent
+    if slider.near == 0:
+        point, along = chain.line_in(chain.n_lower, chain.A)
+    else:
+        point, along = chain.line_in(chain.n_upper, chain.B)
+    handle = handles.of(slider, 0, body, leg.name)._replace(is_inverse=slider.near != 0)
+    return handle, _screw(leg.sign * along, point, grown), body
+
+
+def _in_rod(
+    handles: Handles, leg: Leg, chain: LegChain, grown: tuple[float, float]
+) -> tuple[Handle, Motion, str]:
+    """Return what moves the upper end of a rod against its lower one, how, and the body."""
+    below, above = chain.steps[chain.n_lower - 1], chain.steps[chain.n_lower]
+    body = chain.bodies[chain.n_lower - 1]
+    try:
+        handle = handles.of(above, above.near, handles.link(below, below.far), leg.name)
+    except OutOfClass:
+        handle = handles.of(below, below.far, handles.link(above, above.near), leg.name)
+        handle = handle._replace(is_inverse=not handle.is_inverse)
+    point, along = chain.line_in(chain.n_lower, chain.A)
+    return handle, _screw(along, point, grown), body
