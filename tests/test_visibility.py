@@ -93,6 +93,7 @@ def test_a_leg_counts_as_seen_from_40_percent_on() -> None:
 
     assert MIN_SHARE == 0.4
     assert view(0.41).is_seen
+    assert view(0.4).is_seen
     assert not view(0.39).is_seen
 
 
