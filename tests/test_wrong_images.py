@@ -269,11 +269,12 @@ def test_a_rough_pose_may_be_off_by_what_rough_poses_are() -> None:
             3,
             r"All legs are seen 1[2-9] % thinner than their radii in the model; the radii",
         ),
-        (
+        pytest.param(  # test_recognition.py shows that single legs are found
             "leg3",
             0.8,
             5,
             r"leg3 is seen 2\d % thicker than its radius in the model: found a radius",
+            marks=pytest.mark.slow,
         ),
     ],
 )

@@ -98,7 +98,7 @@ class Places(Case):
 
 
 QUICK_MACHINES = {
-    "outlines": set(MACHINES) - {"nategh-agheli"},
+    "outlines": set(MACHINES) - {"nategh-agheli", "6-sps", "3-spr", "3-upu-tilted"},
     "axes": {"3-rpr", "3-rps", "3-upu", "hexapod", "tricept"},
     "photographs": {"3-rpr"},
 }
@@ -398,7 +398,9 @@ def _studies() -> Iterable[Case]:
     ):
         runs = "1" if name == "paper" else "2"
         command = f"study {name} --runs {runs} --seed 5 --workers 1 {words} --output {{out}} --json"
-        yield Case(f"study-{name}", (Step(command, folder=folder),), slow=name == "bound")
+        yield Case(
+            f"study-{name}", (Step(command, folder=folder),), slow=name in {"bound", "convergence"}
+        )
     resumed = f"study convergence --runs {{}} --seed 5 --workers 2 {machine} -o {{{{out}}}} --json"
     yield Case(
         "study-resumed",

@@ -174,7 +174,9 @@ def _calibrated(folder: Path, *words: str, many: bool = False) -> Any:
     return facts(run(command, many=many).document)
 
 
-@pytest.mark.parametrize("name", ["3-rpr-axes", "3-rpr-outlines"])
+@pytest.mark.parametrize(
+    "name", ["3-rpr-outlines", pytest.param("3-rpr-axes", marks=pytest.mark.slow)]
+)
 def test_order_does_not_matter(name: str, tmp_path: Path) -> None:
     found = []
     for change in (lambda folder: None, _reversed_session):
