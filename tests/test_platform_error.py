@@ -9,6 +9,7 @@ from parameter_steps import random_covariance, written_with
 from thinned import thinned
 
 from legcal import evaluate
+from legcal.calibration.joint_fit import platform
 from legcal.calibration.joint_fit.platform import (
     PlatformAccuracy,
     expected_error,
@@ -23,6 +24,7 @@ from legcal.geometry import Array
 from legcal.machine import (
     LegKind,
     Machine,
+    configurations,
     forward_kinematics_many,
     geometries,
     load_mechanism,
@@ -160,7 +162,8 @@ def test_wrong_assumptions_count_over_the_workspace_or_at_the_readings(
     longer[-6:] = 1e-3  # all offsets: the platform is lifted
     q = random_configurations(nominal, 2, 0).readings
     if not workspace:
-        monkeypatch.setattr("legcal.machine.configurations.SHARES", np.zeros(0))
+        monkeypatch.setattr(platform, "workspace", configurations.workspace)  # drawn anew
+        monkeypatch.setattr(configurations, "SHARES", np.zeros(0))
     accuracy = _accuracy(
         nominal, nominal, q, np.zeros((30, 1)), Sensitivity("legs 1 mm longer", longer[:, None])
     )
