@@ -125,7 +125,11 @@ def test_a_freed_radius_has_no_prior(session: MachineSession) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "wrong", "true"), [("fx", 1303.0, 1290.0), ("cx", 520.0, 518.0), ("k1", -0.10, -0.12)]
+    ("key", "wrong", "true"),
+    thinned(
+        [("fx", 1303.0, 1290.0), ("cx", 520.0, 518.0), ("k1", -0.10, -0.12)],
+        lambda key, *_: key != "cx",
+    ),
 )
 def test_a_freed_intrinsic_is_found(
     session: MachineSession, key: str, wrong: float, true: float
@@ -184,7 +188,7 @@ def test_what_is_held_stays_at_nominal() -> None:
 
 
 def test_two_priors_that_contradict_each_other_are_refused() -> None:
-    session = machine_session("3-upu", n_poses=5)
+    session = machine_session("3-upu", n_poses=4)
     found = [true_values(session)[n] for n in ("leg2.base.x", "leg3.base.y")]
     choices = Choices(
         priors={
@@ -233,7 +237,7 @@ def test_other_stated_values_that_contradict_measurements_are_refused(
 
 
 @pytest.mark.parametrize("scale", thinned([1.0, 4.0], [4.0]))
-@pytest.mark.parametrize("part", ["offset", "platform", "radius"])
+@pytest.mark.parametrize("part", thinned(["offset", "platform", "radius"], ["platform", "radius"]))
 def test_right_fixed_values_are_accepted_whatever_outlines_claim(part: str, scale: float) -> None:
     exact = machine_session("hexapod", n_poses=10)
     measurements, outlines = exact.noisy(5)
@@ -272,6 +276,7 @@ def test_a_leg_most_of_whose_outlines_disagree_is_named(noisy: MachineSession) -
     assert "leg3" not in note
 
 
+@pytest.mark.slow
 def test_a_fit_that_priors_keep_from_converging_names_them() -> None:
     session = machine_session("3-upu")
     choices = Choices(
@@ -286,6 +291,7 @@ def test_a_fit_that_priors_keep_from_converging_names_them() -> None:
     assert "leg2.base.x" in found.value.problems[0]
 
 
+@pytest.mark.slow
 def test_a_prior_far_off_is_named_with_that_of_the_measurements() -> None:
     session = machine_session("tricept")
     true = true_values(session)["centre.twist"]
@@ -294,7 +300,10 @@ def test_a_prior_far_off_is_named_with_that_of_the_measurements() -> None:
         fitted(session, choices)
 
 
-@pytest.mark.parametrize(("factor", "way"), [(0.9, "10 % smaller"), (1.1, "10 % larger")])
+@pytest.mark.parametrize(
+    ("factor", "way"),
+    thinned([(0.9, "10 % smaller"), (1.1, "10 % larger")], [(1.1, "10 % larger")]),
+)
 def test_a_wrong_encoder_scale_shows_in_the_radii(factor: float, way: str) -> None:
     session = machine_session("hexapod", n_poses=10)
     measurements, outlines = session.noisy(6)
@@ -309,7 +318,7 @@ def test_one_wrong_radius_is_no_wrong_scale(noisy: MachineSession) -> None:
     assert found.notes == ()
 
 
-@pytest.mark.parametrize("factor", [0.5, 1.02])
+@pytest.mark.parametrize("factor", thinned([0.5, 1.02], [1.02]))
 def test_a_board_of_other_dimensions_is_refused(factor: float) -> None:
     session = machine_session("hexapod")
     measurements, outlines = session.noisy(7)
