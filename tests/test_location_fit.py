@@ -25,7 +25,6 @@ from legcal.calibration.location.frames import (
     PosePairs,
     jacobian,
     moved,
-    predicted,
     residuals,
     tool_motions,
 )
@@ -55,16 +54,6 @@ def of(noise: tuple[Array, tuple[bool, bool]], n: int) -> PoseNoise:
 
 def fitted(pairs: PosePairs, noise: tuple[Array, tuple[bool, bool]] = STATED) -> FrameFit:
     return fit(pairs, search(pairs, 3).frames[0], of(noise, len(pairs)))
-
-
-def test_derivatives_of_predictions_are_those_of_differences() -> None:
-    pairs, frames = pairs_at(BASE, TOOL), frames_of(BASE, TOOL)
-    J = jacobian(frames, pairs)
-    for i, step in enumerate(1e-6 * np.eye(12)):
-        (M, p), (M_back, p_back) = (predicted(moved(frames, s * step), pairs) for s in (1.0, -1.0))
-        turn = Rotation.from_matrix(M @ np.swapaxes(M_back, 1, 2)).as_rotvec()
-        np.testing.assert_allclose(J[:, :3, i], (p - p_back) / 2e-6, atol=1e-9)
-        np.testing.assert_allclose(J[:, 3:, i], turn / 2e-6, atol=1e-9)
 
 
 def test_residuals_are_the_step_that_was_made_and_zero_where_nothing_was_measured() -> None:
