@@ -217,19 +217,8 @@ def test_tables_fit_80_columns_and_say_the_verdict(
 @pytest.mark.parametrize(
     ("words", "kind", "named"),
     [
-        (("hexapod", "--view", "leg1,lge2"), "UsageError", ("View 1", "'lge2'", "'leg2'")),
-        (("hexapod", "--view", ""), "UsageError", ("--view",)),
-        (("hexapod", "--view", ","), "UsageError", ("no leg",)),
-        (("hexapod", "--view", "leg1,,leg2"), "UsageError", ("''", "a leg")),
-        (("hexapod", "--view", "leg1, leg1"), "UsageError", ("'leg1' 2 times",)),
-        (("hexapod", "--images", "0"), "UsageError", ("0 images",)),
-        (("hexapod", "--images", "2001"), "UsageError", ("2001", "2000")),
-        (("hexapod", *options([["leg1"]] * 51)), "UsageError", ("51", "50")),
-        (("hexapod", "--images", "many"), "UsageError", ("--images",)),
         ((HEXAPOD, "--board"), "UsageError", ("--board",)),
         ((HEXAPOD, "--hand-held"), "UsageError", ("--hand-held",)),
-        (("hexapod", "--hand-held", "--view", "leg1"), "UsageError", ("no board", "--board")),
-        (("hexapod", "--hand-held", "--board"), "UsageError", ("no views", "--view")),
     ],
 )
 def test_refusals_are_one_sentence_in_one_document(
