@@ -178,7 +178,7 @@ def test_outlines_are_straight_in_space_and_not_in_the_picture() -> None:
     cam = camera(np.array([-0.3, 0.1, 0.001, -0.002, 0.0]))
     bars = [bar(-0.15, 0.02, 150.0), bar(0.15, -0.02, 150.0, 0.025)]
     image = render(cam, bars, 30.0, blur=0.6, noise=0.3, supersample=3)
-    found = detect(cam, bars, np.rint(image).astype(np.uint8))
+    found = detect(cam, bars, image)
     assert np.all(found.used), found.reason
     assert np.abs(errors(cam, bars, found)).max() < 0.15
     sigma = np.sqrt([np.diag(C) for C in found.covariance])

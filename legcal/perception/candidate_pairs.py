@@ -24,19 +24,19 @@ MIN_PIECE_LENGTH = 7.0  # of a piece [reduced px]
 MIN_LENGTH = 14.0  # of a joined edge [reduced px]
 MAX_OFFSET = 1.6  # of the ends of a piece from the line that it continues [reduced px]
 MAX_TURN = np.deg2rad(4.0)  # between pieces of one edge
-MAX_GAP = 3.0  # between them, in lengths of the shorter one
-DARK = 1.0 / 30.0  # part of the brightest light
+MAX_GAP = 3.0  # between such pieces [lengths of the shorter one]
+DARK = 1.0 / 30.0  # part of the brightest light below which light is mostly noise
 MAX_PIECES = 400  # pieces of a picture, longest first
 N_GRADIENT_BINS = 64  # of the order in which pixels are visited: each one takes time
 
 MAX_CONVERGENCE = np.deg2rad(9.0)  # of two outlines: a leg that points at the camera
 MIN_WIDTH, MAX_WIDTH = 2.5, 130.0  # [reduced px]
-MIN_SLENDERNESS = 1.5  # length in widths
-MIN_OVERLAP = 0.35  # of the longer edge
+MIN_SLENDERNESS = 1.5  # length of a pair [widths]
+MIN_OVERLAP = 0.35  # of the edges of a pair, as a part of the longer one
 SAME_POLARITY = 0.5  # weight of a pair at both of whose edges the picture changes the same way
 MAX_PAIRS = 48  # pairs of a picture
 MAX_PAIRS_OF_EDGE = 4  # pairs to which one edge belongs
-DUPLICATE = 0.35, 0.2  # of a pair that says the same as another: distance, widths in widths
+DUPLICATE = 0.35, 0.2  # of a pair that repeats another: distance, difference of widths [widths]
 
 
 @dataclass(frozen=True, eq=False)

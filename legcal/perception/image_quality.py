@@ -17,7 +17,7 @@ from legcal.vision import Grey
 BLACK, WHITE = 8.0, 247.0  # what nearly all of an image is below or above [grey levels]
 TAIL_PERCENT = 0.5  # percent of an image that may be otherwise
 MIN_RANGE = 10.0  # of an image in which something can be seen [grey levels]
-REDUCTION = 8  # before the range is taken, so that noise does not count
+REDUCTION = 8  # factor by which an image is reduced before its range is taken, against noise
 SCALES = (0.95, 2.5)  # at which slopes are compared, standard deviations [px]
 # The first is that of the filter of slopes alone. The second is taken from means of four pixels,
 # where that filter is twice as wide.

@@ -16,6 +16,8 @@ part in a hundred up to rho = 0.8 (:func:`profile_functions` of :func:`powers`):
     r, ..., r^4     inside
 """
 
+from functools import cache
+
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
@@ -31,6 +33,7 @@ def _gauss(x: Array) -> Array:
     return np.asarray(np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi))
 
 
+@cache
 def _tabulate() -> Samples:
     """Tabulate step, Gaussian, blurred sqrt(max(x, 0)) and its derivative at x, (4, n)."""
     coarse = np.arange(-_BEFORE, _AFTER + 1e-9, 1.0 / 32.0)
@@ -42,9 +45,6 @@ def _tabulate() -> Samples:
     return np.stack([ndtr(x), _gauss(x), value, slope]).astype(np.float32)
 
 
-_TABLE = _tabulate()
-
-
 def basis(d: Samples, half_width: Samples, blur: Samples | float) -> tuple[Samples, Samples]:
     """Return five functions (n, 5, m) of the distances d (n, m) inside an outline, and slopes by d.
 
@@ -53,9 +53,10 @@ def basis(d: Samples, half_width: Samples, blur: Samples | float) -> tuple[Sampl
     """
     blur = np.asarray(blur, dtype=np.float32)
     z = d / blur
-    place = np.clip((z + _BEFORE) * _PER_UNIT + 0.5, 0.0, _TABLE.shape[1] - 1.0)
+    table = _tabulate()
+    place = np.clip((z + _BEFORE) * _PER_UNIT + 0.5, 0.0, table.shape[1] - 1.0)
     index = place.astype(np.intp)  # the type that needs no conversion: take is slower with others
-    step, peak, root, root_slope = (function.take(index, mode="clip") for function in _TABLE)
+    step, peak, root, root_slope = (function.take(index, mode="clip") for function in table)
     depth = blur * (z * step + peak)  # the blurred ramp max(d, 0)
     rho = depth / half_width
     bend = np.sqrt(2.0 - np.clip(rho, 0.0, 1.0))
@@ -80,6 +81,7 @@ N_POWERS = 11
 _REACH, _PER_BLUR = 24.0, 256  # range of the table on both sides, and entries per unit
 
 
+@cache  # where no image is measured nothing is tabulated
 def _tabulate_powers() -> Array:
     """Tabulate the functions and a column of zeros over the range, (n, N_POWERS + 1)."""
     coarse = np.arange(-_REACH, _REACH + 1e-9, 1.0 / 32.0)
@@ -100,17 +102,15 @@ def _tabulate_powers() -> Array:
     return np.stack([*columns, np.zeros_like(z)], axis=1)
 
 
-_POWERS = _tabulate_powers()
-
-
 def powers(z: Array) -> Array:
     """Return the functions at distances z (...) in units of the blur, and a column of zeros.
 
     (..., N_POWERS + 1); the zeros are room for grey levels, so that one product of matrices gives
     all sums over pixels.
     """
-    entry = np.clip((z + _REACH) * _PER_BLUR + 0.5, 0.0, len(_POWERS) - 1.0)
-    return np.asarray(_POWERS.take(entry.astype(np.intp), axis=0))  # the nearest ones
+    table = _tabulate_powers()
+    entry = np.clip((z + _REACH) * _PER_BLUR + 0.5, 0.0, len(table) - 1.0)
+    return np.asarray(table.take(entry.astype(np.intp), axis=0))  # the nearest ones
 
 
 BACKGROUND, SLOPE, SURFACE = 0, 1, 2

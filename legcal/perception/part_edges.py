@@ -19,13 +19,13 @@ from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.light import Samples
 from legcal.vision import Band, Camera, Grey, PredictedLeg, Segment
 
-BLOCK_LENGTH = 8.0  # [px]
-ROWS = 4  # rows of a block
-MAX_BLOCKS = 80
-MARGIN = 6  # columns beyond the search window, to judge what an edge is
-MAX_LINES = 8
+BLOCK_LENGTH = 8.0  # along the part [px]
+ROWS = 4  # of samples in a block
+MAX_BLOCKS = 80  # of a part
+MARGIN = 6  # columns beyond the search window, to judge what an edge is [px]
+MAX_LINES = 8  # near an edge
 WIDTH_TOLERANCE = (1.0, 0.02)  # [px] and share of the width: one standard deviation
-MIN_SCORE = 0.15
+MIN_SCORE = 0.15  # of an edge of a pair: mean sharpness of its blocks
 MIN_LONE_SCORE = 0.5  # of an edge that may stand alone
 MIN_LONE_SCORE_GUIDED = 0.35  # the same near a fit to other legs
 MAX_RIVAL = 0.6  # of its score, which no other line may reach

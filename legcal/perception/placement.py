@@ -28,7 +28,7 @@ Joined = Sequence[RigidTransform | None] | None  # T_board_camera of views that 
 PREDICTED_JOINT_ERROR = 4e-3
 PIXEL_ERROR = 3.0  # added to every window [px]
 NEAR_FIT_PX = 3.0  # how far outlines may be from a joint fit [px]
-NEAR_IMAGES = 6  # of a group that are searched where a rough pose is given, at first
+NEAR_IMAGES = 6  # images of a group that are searched first where a rough pose is given
 
 
 @dataclass(frozen=True, eq=False)

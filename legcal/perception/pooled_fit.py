@@ -25,18 +25,18 @@ PRIOR_BLUR = 0.7  # of the logarithm of the blur, a priori
 BLUR_SCATTER = 0.05  # that outlines of one image seem to have, in its logarithm
 ROUGHNESS = 0.02  # displacement of single blocks [px]
 START_SIGMA = (0.02, 0.35)  # standard deviation of the lines that it starts from: [px] and in blurs
-BLURS = (0.2, 4.0)  # [px]
-MIN_SAMPLES = 30  # of a block
+BLURS = (0.2, 4.0)  # least and greatest [px]
+MIN_SAMPLES = 30  # pixels of a block
 ENOUGH_BLOCKS, MAX_JOINED = 16, 3  # of an outline, to join some blocks, so many at most
 MAX_STEP = (0.7, 0.4)  # of one round: of the line [blurs], of the logarithm of the blur
 MAX_MOVE_OF_PRODUCTS = (0.08, 0.05)  # the same up to which products of powers are not summed again
 CONVERGED = 0.01  # step of a line below which its rounds end [px]
 ODD_NOISE = (1.5, 4.0)  # of a typical block, from where on one counts less, and not at all
-MIN_NOISE = 0.05  # [grey levels^2]
+MIN_NOISE = 0.05  # variance of grey levels [grey levels^2]
 MIN_LIGHT = 1e-3  # of the mean light of a block
 UNKNOWN_SIGMA = 1e3  # standard deviation of what is not known
 
-EVEN_BLUR = 0.03  # of the logarithm of the blur, from edge to edge
+COMMON_BLUR_SIGMA = 0.03  # of the logarithm of the blur of an outline, about that of the image
 FIRST_ROUNDS, LAST_ROUNDS = 2, 8  # at most
 
 ONE, OTHER = (0, 1, 2, 1, 2, 2), (0, 0, 0, 1, 1, 2)  # pairs of polynomials
@@ -82,7 +82,7 @@ def fit_pooled(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> Po
     found = pool.rounds(pool.first_amplitudes(start), np.log(blur), PRIOR_BLUR, FIRST_ROUNDS)
     even, sigma = _common_blur(found, pool.seen)
     found = found._replace(log_blur=np.full(n, even))
-    sigma = float(np.hypot(sigma, EVEN_BLUR))
+    sigma = float(np.hypot(sigma, COMMON_BLUR_SIGMA))
     found = pool.rounds(found, even, sigma, LAST_ROUNDS)
     at_ends = np.array([[1.0, -1.0], [1.0, 1.0]])
     line = [SHIFT, N_UNKNOWNS + SHIFT]
@@ -155,7 +155,7 @@ class _Pool:
     along: Array  # (n, N_ALONG) polynomials at the blocks
     half_width: Array  # (n_edges,) [px]
     contrast: Array  # (n_edges,)
-    depth: float
+    depth: float  # distance from the outlines at which blocks end [px]
     seen: BoolArray  # (n_edges,) edges with usable blocks
     # Products of powers and light of each block, and where the lines were and how wide the blur.
     products: Array  # (n, N_POWERS + 1, N_POWERS + 1)

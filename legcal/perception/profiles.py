@@ -15,9 +15,9 @@ from legcal.perception.light import Samples
 from legcal.vision import Band, Camera, Grey
 
 SATURATED = 250.0  # grey level from which a pixel is saturated
-MAX_NOISY = 4  # such pixels of a block that may be noise
-MAX_OFFSET = 1.0  # how far an outline may be off [px]
-MIN_SHARE_CLIPPED = 0.5  # share of them from some distance on with which a background is clipped
+MAX_NOISY = 4  # saturated pixels of a block that may be noise
+MAX_OFFSET = 1.0  # how far an outline may be from where it was found [px]
+MIN_SHARE_CLIPPED = 0.5  # share of saturated pixels with which a background is clipped
 MAX_ROWS = 512  # along one outline
 NODE_SPACING = 16.0  # between points at which the lens distortion is computed [px]
 

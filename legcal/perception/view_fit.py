@@ -61,9 +61,11 @@ MAX_DISTANCE = 3.5  # standard deviations from the fit, of a leg in an image
 MAX_SHIFT = 4.0  # of a leg, in standard deviations
 MAX_LONE_SHIFT = 2.5  # the same of a leg of which only single outlines were found
 MAX_TURN_SIGMA = np.deg2rad(10.0)  # of a pose; before any outline it is TURN_SIGMA
-GOOD_FIT = 0.85  # of the most evidence that outlines can give
-SHIFT_COST = 0.25  # of shifts, less than half a square: some are the pose's
-MIN_EVIDENCE, MIN_EVIDENCE_OF_IMAGE = 8.0, 1.2  # and besides for each image
+GOOD_FIT = 0.85  # share of the evidence that outlines can give at most
+SHIFT_COST = (
+    0.25  # evidence that a squared shift costs [standard deviations^-2]: some are the pose's
+)
+MIN_EVIDENCE, MIN_EVIDENCE_OF_IMAGE = 8.0, 1.2  # of a group, and for each of its images
 EDGE_SIGMA = 0.3  # of an outline: what its covariance leaves out, as a wrong gamma [px]
 STEP = 1e-6  # of finite differences [m]
 
@@ -307,7 +309,7 @@ def _evidence(lines: "_Lines", rows: Residuals, state: _State, joint_sigma: floa
 
 
 def min_evidence(group: Group) -> float:
-    """Return how much evidence outlines must give: more images show more that is_good by chance."""
+    """Return how much evidence outlines must give: more images agree more by chance."""
     return MIN_EVIDENCE + MIN_EVIDENCE_OF_IMAGE * len(group.rows)
 
 
