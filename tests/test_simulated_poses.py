@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
 from legcal.geometry import Array, segment_distance
 from legcal.machine import (
-    REGULAR,
+    MIN_SINGULARITY,
     Configurations,
     LegKind,
     Machine,
@@ -53,7 +53,7 @@ def test_extreme_poses_of_shipped_machines_are_poses_of_theirs(name: str) -> Non
     poses = _drawn(machine, 4)
     assert len(poses.poses) == 4
     lower, upper = np.array([leg.travel for leg in machine.legs]).T
-    least = REGULAR * singularity(machine, machine.home)
+    least = MIN_SINGULARITY * singularity(machine, machine.home)
     for configuration, readings, T in zip(
         poses.configurations, poses.readings, poses.poses, strict=True
     ):

@@ -27,7 +27,6 @@ from .quantity import read_prior as read_prior
 from .quantity import read_value as read_value
 from .schema import Document as Document
 from .schema import FileSchema as FileSchema
-from .schema import Metres as Metres
 from .schema import Name as Name
 from .schema import Number as Number
 from .schema import PlainName as PlainName
@@ -42,6 +41,5 @@ from .schema import validate as validate
 from .table import Column as Column
 from .table import Table as Table
 from .table import format_table as format_table
-from .table import number_in as number_in
 from .table import place_in as place_in
 from .table import read_table as read_table

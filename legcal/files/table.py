@@ -51,7 +51,7 @@ class Column:
             return ""
         if self.kind == "text":
             return " or ".join(self.choices) if self.choices and text not in self.choices else ""
-        value = number_in(text)
+        value = _number_in(text)
         if self.kind == "whole" and not _WHOLE.fullmatch(text):
             value = math.nan
         if self.least <= value <= self.most and math.isfinite(value):
@@ -93,7 +93,7 @@ class Table:
 
     def number(self, name: str) -> Array:
         """Return the numbers of a column, (n_rows,); NaN where there is none."""
-        return np.array([number_in(text) for text in self.text(name)], dtype=np.float64)
+        return np.array([_number_in(text) for text in self.text(name)], dtype=np.float64)
 
     def numbers(self, names: Iterable[str]) -> Array:
         """Return the numbers of some columns, (n_rows, n_names); NaN where there is none."""
@@ -255,7 +255,7 @@ def format_table(header: Sequence[str], rows: Iterable[Iterable[object]]) -> str
     return text.getvalue()
 
 
-def number_in(text: str) -> float:
+def _number_in(text: str) -> float:
     """Return the number in a cell, NaN if it holds no finite one."""
     value = float(text) if _NUMBER.fullmatch(text) else math.nan
     return value if math.isfinite(value) else math.nan

@@ -17,11 +17,9 @@ from .motions import product as product
 from .motions import register_groups as register_groups
 from .motions import register_in_plane as register_in_plane
 from .motions import register_points as register_points
-from .rotations import cayley as cayley
 from .rotations import cross as cross
 from .rotations import cross_matrices as cross_matrices
 from .rotations import nearest_rotation as nearest_rotation
-from .rotations import orthogonal as orthogonal
 from .rotations import roll_pitch_yaw as roll_pitch_yaw
 from .rotations import rotation_between as rotation_between
 from .rotations import rotation_matrices as rotation_matrices

@@ -1,5 +1,5 @@
-from .configurations import INSIDE as INSIDE
-from .configurations import REGULAR as REGULAR
+from .configurations import MIN_SINGULARITY as MIN_SINGULARITY
+from .configurations import TRAVEL_TOLERANCE as TRAVEL_TOLERANCE
 from .configurations import WORKSPACE_POSES as WORKSPACE_POSES
 from .configurations import WORKSPACE_SEED as WORKSPACE_SEED
 from .configurations import Configurations as Configurations
@@ -28,11 +28,10 @@ from .family import described as described
 from .files import DATASET_YAML as DATASET_YAML
 from .files import shipped_folders as shipped_folders
 from .files import shipped_names as shipped_names
-from .home import NEAR as NEAR
+from .home import TRAVEL_MARGIN as TRAVEL_MARGIN
 from .home import home_of_legs as home_of_legs
 from .home import legs_outside as legs_outside
 from .kinematics import Follower as Follower
-from .kinematics import SolvedPoses as SolvedPoses
 from .kinematics import follow as follow
 from .kinematics import followed_poses as followed_poses
 from .kinematics import forward_kinematics as forward_kinematics
@@ -42,7 +41,6 @@ from .kinematics import joint_values as joint_values
 from .kinematics import platform_in_base as platform_in_base
 from .kinematics import platform_pose as platform_pose
 from .kinematics import pose_differences as pose_differences
-from .kinematics import project_pose as project_pose
 from .kinematics import readings_at as readings_at
 from .kinematics import slider_columns as slider_columns
 from .kinematics import solve_poses as solve_poses

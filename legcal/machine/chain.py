@@ -52,7 +52,7 @@ class ClosedChain:
         self.text = text
         self.closures = tuple(closures)
         self.normals = tuple(normals) or (None,) * len(self.closures)
-        self._held = [None if n is None else _in_plane(n) for n in self.normals]
+        self._in_plane = [None if n is None else _projector(n) for n in self.normals]
         try:
             self._model: Any = pin.buildModelFromXML(text)
         except (ValueError, RuntimeError) as error:
@@ -109,8 +109,8 @@ class ClosedChain:
         pin.computeJointJacobians(model, data, configuration)
         residual, jacobian = np.empty(self.n_rows), np.empty((self.n_rows, self.nv))
         row = 0
-        for closure, anchor, anchor_data, held in zip(
-            self.closures, self._anchors, self._anchor_data, self._held, strict=True
+        for closure, anchor, anchor_data, in_plane in zip(
+            self.closures, self._anchors, self._anchor_data, self._in_plane, strict=True
         ):
             anchor.calc(model, data, anchor_data)
             rows = slice(row, row + closure.rows)
@@ -119,8 +119,8 @@ class ClosedChain:
             if closure.kind == "6d":
                 M = anchor_data.c1Mc2
                 block = pin.Jlog6(M) @ M.inverse().action @ block
-            if held is not None:
-                residual[rows], block = held @ residual[rows], held @ block
+            if in_plane is not None:
+                residual[rows], block = in_plane @ residual[rows], in_plane @ block
             jacobian[rows] = block
             row = rows.stop
         residual.flags.writeable = jacobian.flags.writeable = False
@@ -264,9 +264,9 @@ class ClosedChain:
         return make(self._model, one.parentJoint, one.placement, two.parentJoint, two.placement)
 
 
-def _in_plane(normal: Array) -> Array:
+def _projector(normal: Array) -> Array:
     """Return what keeps displacements in a plane and turns about its normal, (6, 6)."""
-    held = np.zeros((6, 6))
-    held[3:, 3:] = np.outer(normal, normal)
-    held[:3, :3] = np.eye(3) - held[3:, 3:]
-    return held
+    projector = np.zeros((6, 6))
+    projector[3:, 3:] = np.outer(normal, normal)
+    projector[:3, :3] = np.eye(3) - projector[3:, 3:]
+    return projector

@@ -30,13 +30,13 @@ from legcal.machine.solver import RANK, moved
 
 MAX_DRAWS = 40  # draws for each configuration
 SHARES = 1.3 * 0.8 ** np.arange(MAX_DRAWS)  # how far from home draws go, at most all of the way
-REGULAR = 0.1  # of the singularity measure at home: nobody works nearer to a singularity
+MIN_SINGULARITY = 0.1  # of the singularity measure at home: nobody works nearer to a singularity
 MIN_STEP = 1.0 / 16.0  # of the way from home; what is harder to reach is drawn again
 WALK = 6  # steps of a random walk between two configurations
 ON_THE_CHAIN = 7  # draws of eight, where following is quick
 MAX_FAILED = 20  # configurations in vain, if they are the first
 STRIDE = 0.15  # [rad], and of a leg length
-INSIDE = 1e-12  # [m]
+TRAVEL_TOLERANCE = 1e-12  # [m]
 WORKSPACE_POSES = 100  # that stand for the workspace wherever errors over it are reported
 WORKSPACE_SEED = 20020721
 
@@ -139,7 +139,7 @@ def _drawn(machine: Machine, count: int, chance: np.random.Generator) -> Iterato
     motors = [machine.legs[j] for j in machine.motors]
     lower, upper = np.array([leg.travel for leg in motors]).T
     home = machine.home_configuration[slider_columns(machine, machine.motors)[0]]
-    least = REGULAR * singularity(machine, machine.home)
+    least = MIN_SINGULARITY * singularity(machine, machine.home)
     drawn = 0
     for turn in range(count):
         if turn == MAX_FAILED and not drawn:
@@ -194,8 +194,8 @@ def beyond_travel(machine: Machine, configuration: Array) -> BoolArray:
     """Return which legs are outside their travel, or flipped, (n_legs,)."""
     values = joint_values(machine, configuration)
     lower, upper = np.array([leg.travel for leg in machine.legs]).T
-    outside = (values < lower - INSIDE) | (values > upper + INSIDE)
-    return np.asarray(outside | (machine.sign * values + machine.q0 <= 0.0))
+    outside = (values < lower - TRAVEL_TOLERANCE) | (values > upper + TRAVEL_TOLERANCE)
+    return np.asarray(outside | (machine.lengths_at(values) <= 0.0))
 
 
 def random_poses(

@@ -60,14 +60,14 @@ class LegEntry:
     name: str  # its name
     type: LegType  # its joints
     kind: LegKind  # whether its slider has a motor, moves freely, or is not there
-    A_base: Array  # (3,) joint centres in the base and the platform link [m]
-    B_platform: Array  # (3,) joint centres in the base and the platform link [m]
+    A_base: Array  # (3,) joint centre in the base link [m]
+    B_platform: Array  # (3,) joint centre in the platform link [m]
     offset: float | None  # length at reading zero [m] of an actuated leg, length of a constant one
     travel: tuple[float, float] | None  # lowest and highest reading [m]
-    tube: float | None  # radii of the base and of the platform half [m]
-    rod: float | None  # radii of the base and of the platform half [m]
-    base_axis: Array | None  # (3,)
-    platform_axis: Array | None  # (3,)
+    tube: float | None  # radius of the half at the base [m]
+    rod: float | None  # radius of the half at the platform [m]
+    base_axis: Array | None  # (3,) in the base link; None for the default
+    platform_axis: Array | None  # (3,) in the platform link; None for the default
 
 
 @dataclass(frozen=True, eq=False)

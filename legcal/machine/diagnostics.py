@@ -6,7 +6,7 @@ from legcal.machine.mobility import singularity
 from legcal.machine.model import Machine
 from legcal.machine.schema import LegcalBlock
 
-REGULAR = 1e-4  # singularity measure: less than that is the rounding of a file
+_MIN_SINGULARITY = 1e-4  # singularity measure: less than that is the rounding of a file
 
 
 def diagnose(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]:
@@ -53,12 +53,12 @@ def singularity_note(machine: Machine) -> str | None:
     if not 0 < machine.mobility <= len(machine.motors):
         return None
     measure = singularity(machine, machine.home)
-    if measure > REGULAR:
+    if measure > _MIN_SINGULARITY:
         return None
     return (
         "the mechanism is singular at home: the platform moves there although all motors stand "
-        f"(singularity measure {measure:.1g}, needed above {REGULAR:g}); correct legcal.home, or "
-        "the joints if they make similar figures on base and platform."
+        f"(singularity measure {measure:.1g}, needed above {_MIN_SINGULARITY:g}); correct "
+        "legcal.home, or the joints if they make similar figures on base and platform."
     )
 
 

@@ -29,16 +29,16 @@ class Family:
 
     family: str  # number and type of the legs, ``6-UPS``
     unit: str | None = None  # unit of the lengths; required
-    base_radius: float | None = None  # radii of the circles on which the joint centres lie
-    platform_radius: float | None = None  # radii of the circles on which the joint centres lie
+    base_radius: float | None = None  # of the circle on which the base joints lie; required
+    platform_radius: float | None = None  # of the circle on which the platform joints lie; required
     height: float | None = None  # height of the platform over the base at home
-    base_spread: float | None = None  # angle between the two joints of a pair, for 6 legs
-    platform_spread: float | None = None  # angle between the two joints of a pair, for 6 legs
+    base_spread: float | None = None  # angle between the two joints of a pair on the base, 6 legs
+    platform_spread: float | None = None  # the same on the platform
     turn: float | None = None  # turn of the platform about z at home
     offset: float | None = None  # leg length at reading zero; by default 0.8 of the length at home
     travel: tuple[float, float] | None = None  # lowest and highest reading
     leg_radius: float | None = None  # radius of tube and rod; by default 0.02 of the length at home
-    tilt: float = 0.0
+    tilt: float = 0.0  # of axes out of the horizontal; those at the platform the other way
     name: str | None = None  # name of the model; the family in small letters by default
 
 

@@ -24,7 +24,7 @@ TRIALS = 200
 MIN_TRIALS = 20  # trials, where one of them found a pose above the base
 BATCH = 21  # trials solved at once
 MAX_STALLED = 5  # steps that change little
-NEAR = 0.05  # of the travel: as good as inside
+TRAVEL_MARGIN = 0.05  # of the travel: as good as inside
 MAX_OUTSIDE = 1.0  # of the travel: refused beyond, if it is also beyond
 _MAX_OUTSIDE_OF_LEG = 0.01  # of the leg length at home, for sliders that hardly move
 
@@ -38,10 +38,10 @@ def closed_home(machine: Machine, home: RigidTransform | None) -> tuple[RigidTra
         As :func:`project_home`, :func:`find_home` and :func:`legcal.machine.kinematics.close_at`.
     """
     start = find_home(machine) if home is None else home
-    settled = project_home(machine, start)
-    configuration = close_at(machine, settled, hold=False)
+    projected = project_home(machine, start)
+    configuration = close_at(machine, projected, exact=False)
     constrained = is_constrained(machine)
-    return platform_pose(machine, configuration) if constrained else settled, configuration
+    return platform_pose(machine, configuration) if constrained else projected, configuration
 
 
 def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
@@ -55,13 +55,13 @@ def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
     ModelError
         If home is more than 1 % of a leg length away from any such pose.
     """
-    settled, problem = project_pose(machine, home)
+    projected, problem = project_pose(machine, home)
     if problem is not None:
         raise ModelError(
             f"{machine.yaml_path}: legcal.home could not be used: found {problem} there, needed "
             "a closed pose; correct legcal.home."
         )
-    return settled
+    return projected
 
 
 def find_home(machine: Machine) -> RigidTransform:
@@ -78,7 +78,7 @@ def find_home(machine: Machine) -> RigidTransform:
     """
     middle = np.array([0.5 * sum(leg.travel) for leg in machine.legs])
     wanted = machine.sign * middle
-    held = np.array([leg.kind is LegKind.ACTUATED for leg in machine.legs])
+    actuated = np.array([leg.kind is LegKind.ACTUATED for leg in machine.legs])
     rng = np.random.default_rng(1965)
     centre = machine.A_base.mean(axis=0)
     reach = float(np.abs(wanted + machine.q0).mean())
@@ -89,7 +89,7 @@ def find_home(machine: Machine) -> RigidTransform:
             (centre + rng.normal(0.0, reach, 3), rng.normal(0.0, 0.1 + trial / TRIALS, 3))
             for trial in trials
         ]
-        found = _with_lengths(machine, starts, wanted[held], reach)
+        found = _with_lengths(machine, starts, wanted[actuated], reach)
         for trial, T in zip(trials, found, strict=True):
             if T is None:
                 continue
@@ -187,8 +187,8 @@ def check_home_travel(machine: Machine) -> None:
     q = readings_at(machine, machine.home)
     for j, excess in legs_outside(machine, MAX_OUTSIDE).items():
         leg = machine.legs[j]
-        length = leg.sign * float(q[j]) + leg.q0
-        if leg.kind is LegKind.ACTUATED and excess > _MAX_OUTSIDE_OF_LEG * length:
+        allowed = _MAX_OUTSIDE_OF_LEG * leg.length_at(float(q[j]))
+        if leg.kind is LegKind.ACTUATED and excess > allowed:
             far[j] = excess
     if not far:
         return

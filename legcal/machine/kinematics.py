@@ -35,16 +35,14 @@ from legcal.machine.mobility import (
 from legcal.machine.model import Machine, leg_vectors
 from legcal.machine.solver import Equations, Retraction, moved, newton, solve, walk_in_steps
 
-POSE_TOLERANCE = 1e-11  # [m, rad]: where a held platform is
-NEAR = 2e-3  # [m, rad]: no other posture of a leg is as near as what axes may be off
+POSE_TOLERANCE = 1e-11  # [m, rad]: of a pose at which the chain is closed
+AXIS_TOLERANCE = 2e-3  # [m, rad]: what axes may be off; no other posture of a leg is as near
 RESTARTS = 60
 CONTRACTION = 0.5  # of the step before; of 1 rad or a leg length for the first
 TOLERANCE = 1e-13  # of a leg length
 MIN_STEP = 1.0 / 4096.0  # of the way from known readings to the wanted ones
-RANDOM_ANGLES, FEW_RESTARTS = (
-    6,
-    2,
-)  # other angles of all legs, and of those that do not close from there
+RANDOM_ANGLES = 6  # other angles of all legs that are tried
+FEW_RESTARTS = 2  # of legs that do not close from there
 DEPENDENT = 1e-7  # of the largest singular value: equations that say the same
 MAX_POSE_ERROR = 0.01  # of a leg length: how far a given pose may be from a closed one
 
@@ -110,13 +108,13 @@ class Follower:
         self._machine = mechanism
         self.configuration = mechanism.home_configuration
         if start is not None:
-            settled, problem = project_pose(mechanism, start)
+            projected, problem = project_pose(mechanism, start)
             if problem is not None:
                 raise UsageError(
                     f"The pose could not be followed from its start: found {problem} there, needed "
                     "a pose that the legs allow; correct the start."
                 )
-            self.configuration = close_at(mechanism, settled, self.configuration, hold=False)
+            self.configuration = close_at(mechanism, projected, self.configuration, exact=False)
 
     @property
     def pose(self) -> RigidTransform:
@@ -228,14 +226,13 @@ def _readings(machine: Machine, q: Array) -> Array:
         )
     _check_determined(machine)
     readings = q[:, list(machine.motors)]
-    legs = list(machine.motors)
-    lengths = machine.sign[legs] * readings + machine.q0[legs]
+    lengths = machine.lengths_at(readings, machine.motors)
     wrong = np.argwhere(~((lengths > 0.0) & np.isfinite(lengths)))
     if len(wrong):
         row, column = wrong[0]
         raise UsageError(
             f"The pose of row {row + 1} could not be computed: found the reading "
-            f"{readings[row, column]:g} of leg '{machine.legs[legs[column]].name}', needed a "
+            f"{readings[row, column]:g} of leg '{machine.legs[machine.motors[column]].name}', needed a "
             "finite number above a leg length of zero; correct the reading."
         )
     return readings
@@ -365,15 +362,15 @@ def project_pose(
 
     def equations(poses: Array) -> tuple[Array, Array]:
         found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
-        held = ~found.measured
-        return found.values[:, held], found.by_pose[:, held]
+        constraints = ~found.measured
+        return found.values[:, constraints], found.by_pose[:, constraints]
 
     unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
     found = solve(equations, moved, T.as_matrix()[None, :3], tolerance=TOLERANCE * scale, unit=unit)
-    settled = motion_of(found.points[0, :, :3], found.points[0, :, 3])
+    projected = motion_of(found.points[0, :, :3], found.points[0, :, 3])
     if found.worst[0] <= 1e-9 * scale:
-        return settled, None
-    return settled, describe_worst(machine, constraints_at(machine, settled))
+        return projected, None
+    return projected, describe_worst(machine, constraints_at(machine, projected))
 
 
 def close_at(
@@ -382,48 +379,48 @@ def close_at(
     start: Array | None = None,
     restarts: int = RESTARTS,
     *,
-    hold: bool = True,
+    exact: bool = True,
 ) -> Array:
     """Return the configuration (nq,) that closes every loop to 1e-12 m with the platform at a pose.
 
     Sliders are set from the distance of their joints, so that no leg is ever flipped; joint angles
     are solved from ``start``, and from seeded random ones for legs that do not close from there.
-    The pose must meet the constraints. Without *hold* it need meet them but for rounding: the
-    platform is let go at the end and moves by what the axes of the model are off.
+    The pose must meet the constraints. Where it is not *exact* it need meet them but for rounding:
+    in the end the platform is free too, and moves by what the axes of the model are off.
 
     Raises
     ------
     DidNotConverge
         If a leg does not close, naming its closure and the distance left.
     """
-    chain, tolerance = machine.chain, POSE_TOLERANCE if hold else NEAR
+    chain, tolerance = machine.chain, POSE_TOLERANCE if exact else AXIS_TOLERANCE
     angles = np.zeros(chain.nv, dtype=np.bool_)
     for joint in machine.urdf.joints.values():
         if joint.type in ("revolute", "continuous"):
             angles[chain.v_index(joint.name)] = True
     # Gaps of legs shorter than a metre count in leg lengths: beside angles in radians they would
-    # weigh too little to be closed, and NEAR would be a large part of a leg.
+    # weigh too little to be closed, and AXIS_TOLERANCE would be a large part of a leg.
     metre = min(1.0, leg_scale(machine, T_base_platform))
     configuration = _placed(machine, T_base_platform, start, tolerance)
     rng = np.random.default_rng(20020701)
     for _ in range(restarts):
-        equations, retract = _held(machine, T_base_platform, metre, angles)
+        equations, retract = _closure_equations(machine, T_base_platform, metre, angles)
         found = solve(equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True)
         configuration = found.points[0]
-        stuck = np.abs(found.values[0]) > NEAR
+        stuck = np.abs(found.values[0]) > AXIS_TOLERANCE
         if not stuck.any():
             break
         columns = np.zeros(chain.nv, dtype=np.bool_)
         columns[angles] = np.abs(found.jacobian[0, stuck]).max(axis=0) > 1e-9
         step = np.where(columns, rng.uniform(-np.pi, np.pi, chain.nv), 0.0)
         configuration = chain.integrate(configuration, step)
-    everything = _held(machine, T_base_platform, 1.0, angles)
+    everything = _closure_equations(machine, T_base_platform, 1.0, angles)
     left = everything[0](configuration[None])[0][0]
     if np.abs(left).max(initial=0.0) >= CLOSED:
         angles[slider_columns(machine, range(machine.n_legs))[1]] = True  # and sliders
-        pose = T_base_platform if hold else None
-        every = angles if hold else np.ones(chain.nv, dtype=np.bool_)
-        equations, retract = _held(machine, pose, 1.0, every)
+        pose = T_base_platform if exact else None
+        every = angles if exact else np.ones(chain.nv, dtype=np.bool_)
+        equations, retract = _closure_equations(machine, pose, 1.0, every)
         found = solve(equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True)
         configuration, left = found.points[0], found.values[0]
     off = _off(machine, T_base_platform, configuration)
@@ -475,10 +472,10 @@ def _placed(
     return configuration
 
 
-def _held(
+def _closure_equations(
     machine: Machine, T: RigidTransform | None, metre: float, free: BoolArray | IntArray
 ) -> tuple[Equations, Retraction]:
-    """Return the closures by free tangent coordinates; the platform held at T where legs carry it.
+    """Return the closures by free tangent coordinates; the platform fixed at T where legs carry it.
 
     Lengths are divided by ``metre``.
     """
@@ -493,9 +490,9 @@ def _held(
     def equations(points: Array) -> tuple[Array, Array]:
         residual, jacobian = chain.linearize(points[0])
         if weld is not None:
-            held, held_jacobian = chain.welded(machine.base, machine.platform, weld)
-            residual = np.concatenate([residual, held])
-            jacobian = np.concatenate([jacobian, held_jacobian])
+            of_weld, by_joints = chain.welded(machine.base, machine.platform, weld)
+            residual = np.concatenate([residual, of_weld])
+            jacobian = np.concatenate([jacobian, by_joints])
         return (residual * weights)[None], (jacobian[:, free] * weights[:, None])[None]
 
     def retract(points: Array, step: Array) -> Array:
@@ -649,8 +646,8 @@ def follow_pose(
 def _closed_from(
     machine: Machine, configuration: Array, free: IntArray
 ) -> tuple[Array | None, Array]:
-    """Return the configuration closed with the motors held, None if not near, and its Jacobian."""
-    equations, retract = _held(machine, None, 1.0, free)
+    """Return the configuration closed with the motors fixed, None if not near, and its Jacobian."""
+    equations, retract = _closure_equations(machine, None, 1.0, free)
     found = newton(
         equations, retract, configuration, tolerance=0.01 * CLOSED, contraction=CONTRACTION
     )
@@ -662,17 +659,17 @@ def _closed_at(
 ) -> Array | None:
     """Return the closed configuration at readings whose pose is known, None if joints forbid it.
 
-    The platform is let go only where axes that are a little off leave no other way.
+    The platform is free only where axes that are a little off leave no other way.
     """
     rng = np.random.default_rng(1965)
     angles = machine.chain.rotation_columns()
     turns = np.zeros((1 + RANDOM_ANGLES, machine.chain.nv))
     turns[1:, angles] = rng.uniform(-np.pi, np.pi, (RANDOM_ANGLES, machine.chain.nv))[:, angles]
     tries = [(turn, True) for turn in turns] + [(turns[0], False)] * is_constrained(machine)
-    for turn, hold in tries:
+    for turn, exact in tries:
         there = machine.chain.integrate(start, turn)
         try:
-            trial = close_at(machine, T, there, FEW_RESTARTS, hold=hold)
+            trial = close_at(machine, T, there, FEW_RESTARTS, exact=exact)
         except DidNotConverge:
             continue
         trial[slider_columns(machine, machine.motors)[0]] = readings
@@ -688,7 +685,7 @@ def _is_flipped(machine: Machine, configuration: Array) -> bool:
     if not rows:
         return False
     q = configuration[slider_columns(machine, rows)[0]]
-    return bool(np.any(machine.sign[rows] * q + machine.q0[rows] <= 0.0))
+    return bool(np.any(machine.lengths_at(q, rows) <= 0.0))
 
 
 def _is_reversed(machine: Machine, T: RigidTransform) -> bool:

@@ -284,6 +284,10 @@ class Leg:
         """Whether the leg does not turn against the platform."""
         return self.platform_joint is JointType.FIXED
 
+    def length_at(self, reading: float) -> float:
+        """Return the length |AB| at a reading, L = sign q + q0 [m]."""
+        return self.sign * reading + self.q0
+
     @property
     def equations(self) -> tuple[EquationKind, ...]:
         """The equations of this leg, in the order of their rows."""

@@ -85,6 +85,11 @@ class Machine:
         """Whether each leg grows (+1) or shrinks (-1) with its reading, (n_legs,)."""
         return _fixed(np.array([float(leg.sign) for leg in self.legs]))
 
+    def lengths_at(self, q: Array, legs: Sequence[int] | None = None) -> Array:
+        """Return the lengths of some legs, or all, at readings (..., n): :meth:`Leg.length_at`."""
+        chosen = slice(None) if legs is None else list(legs)
+        return np.asarray(self.sign[chosen] * q + self.q0[chosen])
+
     @cached_property
     def T_base_Rb(self) -> RigidTransform:
         """The frame on the base joint centres of the frame legs, in the base link."""

@@ -20,8 +20,8 @@ from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
 from legcal.files import read_table
 from legcal.geometry import Array, BoolArray, IntArray, segment_distance
 from legcal.machine import (
-    INSIDE,
-    REGULAR,
+    MIN_SINGULARITY,
+    TRAVEL_TOLERANCE,
     Configurations,
     Machine,
     beyond_travel,
@@ -200,7 +200,7 @@ class Feasibility:
         self._revolutes = [joint.name for joint, _ in limited]
         self._columns = [machine.chain.q_index(name) for name in self._revolutes]
         self._limits = np.array([limits for _, limits in limited]).reshape(-1, 2)
-        self._min_singularity = REGULAR * singularity(machine, machine.home)
+        self._min_singularity = MIN_SINGULARITY * singularity(machine, machine.home)
         cylinders = [(j, c) for j, leg in enumerate(machine.legs) for c in leg.cylinders]
         self._leg = np.array([j for j, _ in cylinders], dtype=np.intp)
         self._ends = np.array([(c.start, c.end) for _, c in cylinders]).reshape(-1, 2)
@@ -355,7 +355,7 @@ def _outside_travel(machine: Machine, row: Array) -> str | None:
     for j, q in zip(machine.motors, row, strict=True):
         leg = machine.legs[j]
         lower, upper = leg.travel
-        if not lower - INSIDE <= q <= upper + INSIDE:
+        if not lower - TRAVEL_TOLERANCE <= q <= upper + TRAVEL_TOLERANCE:
             travel = f"{lower:.9g} to {upper:.9g} m"
             return f"{leg.prismatic} at {q:.9g} m, outside its travel of {travel},"
     return None

@@ -31,7 +31,7 @@ from legcal.errors import NotIdentifiable, UsageError
 from legcal.files import closest
 from legcal.machine import (
     DATASET_YAML,
-    NEAR,
+    TRAVEL_MARGIN,
     JointType,
     Machine,
     geometries,
@@ -280,13 +280,13 @@ def _machine_notes(machine: Machine) -> list[str]:
             f"The model has no <visual> cylinder along {which}: they were taken as visible, with "
             f"{100 * THIN:g} % of the mean leg length as radius; add one to each."
         )
-    outside = list(legs_outside(machine, NEAR))
+    outside = list(legs_outside(machine, TRAVEL_MARGIN))
     if outside:
         which = legs_in_words(outside, machine.leg_names)
         stand = "stand outside their" if len(outside) > 1 else "stands outside its"
         notes.append(
-            f"At home {which} {stand} travel by more than {100 * NEAR:g} % of it: poses between "
-            "home and travel were judged too, which the machine may not reach; correct "
+            f"At home {which} {stand} travel by more than {100 * TRAVEL_MARGIN:g} % of it: "
+            "poses between home and travel were judged too, which the machine may not reach; correct "
             "legcal.home or the limits."
         )
     singular = singularity_note(machine)

@@ -442,7 +442,7 @@ def travel_of(machine: Machine) -> Array:
     """Return shortest and longest length of each leg, (n_legs, 2) [m]."""
     lengths = []
     for leg in machine.legs:
-        ends = [leg.sign * q + leg.q0 for q in leg.travel]
+        ends = [leg.length_at(q) for q in leg.travel]
         lengths.append([leg.q0, leg.q0] if leg.kind is LegKind.CONSTANT else sorted(ends))
     return np.array(lengths)
 

@@ -196,8 +196,8 @@ def _workspace_poses(machine: Machine, legs: Sequence[Leg]) -> Sequence[RigidTra
 def _is_reached(machine: Machine, legs: Sequence[Leg], q: Array, T_Rb_Re: RigidTransform) -> bool:
     """Say whether legs have the lengths of readings (n_legs,) at a pose: some have them nowhere."""
     return all(
-        abs(np.linalg.norm(T_Rb_Re.apply(leg.B) - leg.A) - sign * reading - leg.q0) < _REACHED
-        for leg, sign, reading in zip(legs, machine.sign, q, strict=True)
+        abs(np.linalg.norm(T_Rb_Re.apply(leg.B) - leg.A) - leg.length_at(reading)) < _REACHED
+        for leg, reading in zip(legs, q, strict=True)
         if leg.kind is LegKind.ACTUATED
     )
 
