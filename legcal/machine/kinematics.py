@@ -232,8 +232,8 @@ def _readings(machine: Machine, q: Array) -> Array:
         row, column = wrong[0]
         raise UsageError(
             f"The pose of row {row + 1} could not be computed: found the reading "
-            f"{readings[row, column]:g} of leg '{machine.legs[machine.motors[column]].name}', needed a "
-            "finite number above a leg length of zero; correct the reading."
+            f"{readings[row, column]:g} of leg '{machine.leg_names[machine.motors[column]]}', needed "
+            "a finite number above a leg length of zero; correct the reading."
         )
     return readings
 

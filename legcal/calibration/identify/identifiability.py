@@ -286,8 +286,8 @@ def _machine_notes(machine: Machine) -> list[str]:
         stand = "stand outside their" if len(outside) > 1 else "stands outside its"
         notes.append(
             f"At home {which} {stand} travel by more than {100 * TRAVEL_MARGIN:g} % of it: "
-            "poses between home and travel were judged too, which the machine may not reach; correct "
-            "legcal.home or the limits."
+            "poses between home and travel were judged too, which the machine may not reach; "
+            "correct legcal.home or the limits."
         )
     singular = singularity_note(machine)
     return notes if singular is None else [*notes, singular[0].upper() + singular[1:]]
