@@ -230,10 +230,11 @@ def _readings(machine: Machine, q: Array) -> Array:
     wrong = np.argwhere(~((lengths > 0.0) & np.isfinite(lengths)))
     if len(wrong):
         row, column = wrong[0]
+        name = machine.leg_names[machine.motors[column]]
         raise UsageError(
             f"The pose of row {row + 1} could not be computed: found the reading "
-            f"{readings[row, column]:g} of leg '{machine.leg_names[machine.motors[column]]}', needed "
-            "a finite number above a leg length of zero; correct the reading."
+            f"{readings[row, column]:g} of leg '{name}', needed a finite number above a leg length "
+            "of zero; correct the reading."
         )
     return readings
 
