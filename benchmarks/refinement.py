@@ -23,7 +23,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from hexapod_session import disturbed_start, noisy_outlines, noisy_readings, simulate
+from fit_sessions import disturbed_start, irregular_hexapod, noisy_outlines, noisy_readings
 from plain_fit import PlainFit
 
 from legcal.calibration.joint_fit.fit import refine
@@ -48,7 +48,7 @@ def shortest_ms(call: Callable[[], object], repeats: int = REPEATS) -> float:
 
 def measure(n_images: int, with_scipy: bool) -> None:
     """Print one row: sizes and times of a session; then what SciPy needs."""
-    session = simulate(n_images // 3)
+    session = irregular_hexapod(n_images // 3)
     rng = np.random.default_rng(0)
     measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
     start = disturbed_start(session)

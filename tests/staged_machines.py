@@ -5,7 +5,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from machine_session import PINHOLE, MachineSession, machine_session
+from fit_sessions import PINHOLE, MachineSession, machine_session
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.identify.predicted_observations import (

@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from axes_session import axes_session
-from board_session import SIGMA_PX, corners_of, with_board
 from camera_sessions import CAMERAS, seen_corners
 from dense_fit import (
     allowed,
@@ -20,9 +18,20 @@ from dense_fit import (
     residuals,
     violations,
 )
-from hexapod_session import disturbed_start, simulate
+from fit_sessions import (
+    LENS,
+    PINHOLE,
+    SIGMA_PX,
+    MachineSession,
+    axes_session,
+    corners_of,
+    disturbed_start,
+    irregular_hexapod,
+    machine_session,
+    shifted,
+    with_board,
+)
 from located import BASE, TOOL, frames_of, pairs_at
-from machine_session import LENS, PINHOLE, MachineSession, machine_session, shifted
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
@@ -220,7 +229,7 @@ def _tool_poses() -> None:
 
 
 def _outlier_image() -> None:
-    session = simulate(6)
+    session = irregular_hexapod(6)
     found = refine(session.legs, session.measurements, session.outlines, disturbed_start(session))
     o = found.outlines
     wrong = o.row == 1

@@ -5,17 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from axes_session import axes_session
-from hexapod_session import (
+from fit_sessions import (
     FRAME_LEGS,
     PINHOLE,
     TRUTH,
-    Session,
+    HexapodSession,
+    axes_session,
     disturbed_start,
-    geometry_of,
+    irregular_hexapod,
     moved_outlines,
     noisy_outlines,
-    simulate,
+    point_like_legs,
 )
 
 from legcal.calibration.joint_fit import (
@@ -34,20 +34,20 @@ from legcal.machine import load_mechanism
 
 
 @pytest.fixture(scope="module")
-def session() -> Session:
-    return simulate(6, legs_seen=5)
+def session() -> HexapodSession:
+    return irregular_hexapod(6, legs_seen=5)
 
 
-def at_truth(session: Session) -> Start:
+def at_truth(session: HexapodSession) -> Start:
     """Return a start at the truth, poses by the readings."""
-    legs, poses = geometry_of(TRUTH), session.T_Rb_Re
+    legs, poses = point_like_legs(TRUTH), session.T_Rb_Re
     m, cameras = session.measurements, session.T_camera_Rb
     return start_from(legs, m, session.legs, cameras, poses, "nominal")
 
 
-def one_pose_many_times(n_times: int) -> Session:
+def one_pose_many_times(n_times: int) -> HexapodSession:
     """Return a session in which three views see the same pose again and again."""
-    once = simulate(1, shared_poses=True)
+    once = irregular_hexapod(1, shared_poses=True)
     m, n = once.measurements, 3 * n_times
     measurements = replace(
         m,
@@ -107,7 +107,7 @@ def measured_with_two_gammas(o: Outlines) -> Outlines:
     ids=["none", "swapped edges", "scattered", "covariance", "part", "gammas"],
 )
 def test_outlines_that_cannot_be_fitted_are_refused(
-    session: Session, change: Change, error: type[LegcalError], found: str
+    session: HexapodSession, change: Change, error: type[LegcalError], found: str
 ) -> None:
     m = session.measurements
     camera = replace(PINHOLE, gamma_is_given=False)
@@ -119,13 +119,18 @@ def test_outlines_that_cannot_be_fitted_are_refused(
 @pytest.mark.parametrize(
     ("few", "found"),
     [
-        (simulate(1, n_views=2), r"2 images with 16 outlines and 12 readings give \d+ equations"),
+        (
+            irregular_hexapod(1, n_views=2),
+            r"2 images with 16 outlines and 12 readings give \d+ equations",
+        ),
         (one_pose_many_times(6), r"found \d+ of \d+ directions .* leave open .*leg"),
-        (simulate(10), r"found \d+ of \d+ directions .* and that matter"),
+        (irregular_hexapod(10), r"found \d+ of \d+ directions .* and that matter"),
     ],
     ids=["two images", "one pose", "one leg"],
 )
-def test_images_that_do_not_determine_the_parameters_are_refused(few: Session, found: str) -> None:
+def test_images_that_do_not_determine_the_parameters_are_refused(
+    few: HexapodSession, found: str
+) -> None:
     shown = few.outlines
     if "matter" in found:
         shown = noisy_outlines(few, np.random.default_rng(0))
@@ -165,7 +170,7 @@ def test_axes_that_cannot_be_fitted_are_refused(
         refine(session.legs, measurements, no_outlines(), session.start(), axes=change(axes))
 
 
-def test_a_start_far_away_is_refused(session: Session) -> None:
+def test_a_start_far_away_is_refused(session: HexapodSession) -> None:
     far = disturbed_start(session, joints=0.1, camera=0.5, angle=2.0)
     with pytest.raises(DidNotConverge, match=r"still falls by|outlines disagree with it"):
         refine(session.legs, session.measurements, session.outlines, far)
@@ -176,7 +181,7 @@ def test_a_start_far_away_is_refused(session: Session) -> None:
         refine_from_best(session.legs, session.measurements, session.outlines, [])
 
 
-def test_views_without_a_rough_pose_are_named(session: Session) -> None:
+def test_views_without_a_rough_pose_are_named(session: HexapodSession) -> None:
     T = motion_from_xyz_quat([0.1, 0.2, 0.3], [0.0, 0.0, 0.6, 0.8])
     with pytest.raises(DatasetError, match="c1, c2, c3 have no T_base_camera"):
         cameras_from_hints(session.measurements, T)
@@ -186,10 +191,10 @@ def test_views_without_a_rough_pose_are_named(session: Session) -> None:
         np.testing.assert_allclose(T_camera_Rb.as_matrix(), np.eye(4), atol=1e-15)
 
 
-def test_platform_poses_have_the_lengths_of_the_readings(session: Session) -> None:
+def test_platform_poses_have_the_lengths_of_the_readings(session: HexapodSession) -> None:
     m = session.measurements
     start = start_from(
-        geometry_of(TRUTH),
+        point_like_legs(TRUTH),
         m,
         session.legs,
         session.T_camera_Rb,
@@ -200,10 +205,10 @@ def test_platform_poses_have_the_lengths_of_the_readings(session: Session) -> No
         assert np.linalg.norm((found.inv() * true).translation) < 1e-11
 
 
-def test_lengths_that_no_pose_has_give_the_nearest_pose(session: Session) -> None:
+def test_lengths_that_no_pose_has_give_the_nearest_pose(session: HexapodSession) -> None:
     lengths = session.measurements.q + TRUTH.offsets
     lengths[0, 2] += 0.4
-    poses = platform_poses(geometry_of(TRUTH), lengths, session.T_Rb_Re, FRAME_LEGS)
+    poses = platform_poses(point_like_legs(TRUTH), lengths, session.T_Rb_Re, FRAME_LEGS)
     assert np.all(np.isfinite(poses[0].as_matrix()))
     np.testing.assert_allclose(poses[1].as_matrix(), session.T_Rb_Re[1].as_matrix(), atol=1e-9)
 

@@ -6,14 +6,14 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hexapod_session import (
+from fit_sessions import (
     PINHOLE,
-    Session,
+    HexapodSession,
     disturbed_start,
+    irregular_hexapod,
     moved_outlines,
     noisy_outlines,
     noisy_readings,
-    simulate,
 )
 from outline_sessions import Noise, StartErrors, design_of, draw_session
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -159,11 +159,11 @@ def test_few_outlines_give_nothing_at_the_platform_and_none_no_residuals() -> No
 
 
 @pytest.fixture(scope="module")
-def session() -> Session:
-    return simulate(12, legs_seen=5, sigma_px=0.05)
+def session() -> HexapodSession:
+    return irregular_hexapod(12, legs_seen=5, sigma_px=0.05)
 
 
-def _held_out(session: Session, level: float, seed: int) -> HeldOut:
+def _held_out(session: HexapodSession, level: float, seed: int) -> HeldOut:
     """Return what a fourth of the images say of a fit of the others.
 
     Each edge of each leg errs alike in all images of a view, by *level* [px].
@@ -187,7 +187,7 @@ def _held_out(session: Session, level: float, seed: int) -> HeldOut:
 
 
 def _of_rows(
-    session: Session, measurements: Measurements, outlines: Outlines, rows: IntArray
+    session: HexapodSession, measurements: Measurements, outlines: Outlines, rows: IntArray
 ) -> tuple[Measurements, Outlines, tuple[RigidTransform, ...]]:
     """Return some of the images, each of a pose of its own, with the start of their poses."""
     m = measurements
@@ -197,7 +197,7 @@ def _of_rows(
     return some, outlines.at(rows), tuple(poses[k] for k in m.pose[rows].tolist())
 
 
-def _ratios(session: Session, level: float) -> Array:
+def _ratios(session: HexapodSession, level: float) -> Array:
     """Return found over expected: in pixels, then displacement and rotation of the platform."""
     ratios = []
     for seed in range(N_SEEDS):
@@ -217,7 +217,7 @@ def _ratios(session: Session, level: float) -> Array:
 
 
 @pytest.mark.parametrize("level", thinned([0.0, 0.05, 0.15], [0.0, 0.15]))
-def test_images_are_as_far_off_as_is_expected(session: Session, level: float) -> None:
+def test_images_are_as_far_off_as_is_expected(session: HexapodSession, level: float) -> None:
     pixels, displacement, rotation = _ratios(session, level)
     assert pixels == pytest.approx(1.0, abs=0.1)
     assert displacement == pytest.approx(1.0, abs=0.25)

@@ -8,20 +8,25 @@ from functools import cache
 
 import numpy as np
 import pytest
-from axes_session import AxesSession, axes_session
-from board_session import corners_of, place_of_board, with_board
 from dense_fit import allowed, by_differences, projected_move, residuals
-from hexapod_session import (
+from fit_sessions import (
     LENS,
-    Session,
+    SHIPPED,
+    AxesSession,
+    HexapodSession,
+    MachineSession,
+    axes_session,
+    corners_of,
     disturbed_start,
     gauge_is_kept,
+    irregular_hexapod,
     joint_errors,
+    machine_session,
     noisy_outlines,
     noisy_readings,
-    simulate,
+    place_of_board,
+    with_board,
 )
-from machine_session import SHIPPED, MachineSession, machine_session
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
@@ -285,16 +290,20 @@ def test_values_are_set_whatever_basis_an_axis_has() -> None:
 
 
 @pytest.fixture(scope="module")
-def small() -> Session:
-    return simulate(6, legs_seen=5)
+def small() -> HexapodSession:
+    return irregular_hexapod(6, legs_seen=5)
 
 
 @pytest.mark.parametrize(
     "session",
-    [simulate(12), simulate(6, camera=LENS, legs_seen=5), simulate(8, shared_poses=True)],
+    [
+        irregular_hexapod(12),
+        irregular_hexapod(6, camera=LENS, legs_seen=5),
+        irregular_hexapod(8, shared_poses=True),
+    ],
     ids=["pinhole", "lens", "shared poses"],
 )
-def test_a_hexapod_is_found_from_5_mm_and_3_degrees_away(session: Session) -> None:
+def test_a_hexapod_is_found_from_5_mm_and_3_degrees_away(session: HexapodSession) -> None:
     start = disturbed_start(session, joints=0.005, camera=0.02, angle=np.deg2rad(3.0))
     assert np.abs(joint_errors(parameters_of_legs(start.legs))).min() > 0.0045
     found = refine(session.legs, session.measurements, session.outlines, start)
@@ -307,7 +316,7 @@ def test_a_hexapod_is_found_from_5_mm_and_3_degrees_away(session: Session) -> No
 
 
 def test_a_leg_that_no_image_shows_is_found_from_its_encoder_whatever_its_sign() -> None:
-    session, sign = simulate(12), np.array([1, -1, 1, 1, -1, 1])
+    session, sign = irregular_hexapod(12), np.array([1, -1, 1, 1, -1, 1])
     shown = replace(session.outlines, used=session.outlines.leg != 2)
     measurements = replace(session.measurements, q=sign * session.measurements.q)
     legs = replace(session.legs, sign=sign)
@@ -318,7 +327,7 @@ def test_a_leg_that_no_image_shows_is_found_from_its_encoder_whatever_its_sign()
 
 @pytest.mark.parametrize("n_left", [0, 1])
 def test_a_view_with_hardly_an_outline_neither_helps_nor_harms(n_left: int) -> None:
-    session = simulate(10, legs_seen=5)
+    session = irregular_hexapod(10, legs_seen=5)
     used = session.outlines.used.copy()
     used[np.flatnonzero(session.measurements.view[session.outlines.row] == 2)[n_left:]] = False
     outlines = replace(session.outlines, used=used)
@@ -327,7 +336,7 @@ def test_a_view_with_hardly_an_outline_neither_helps_nor_harms(n_left: int) -> N
 
 
 def test_a_passive_leg_needs_no_reading() -> None:
-    session = simulate(10, legs_seen=6)
+    session = irregular_hexapod(10, legs_seen=6)
     q = session.measurements.q.copy()
     q[:, 3] = np.nan
     start = disturbed_start(session)
@@ -343,7 +352,7 @@ def test_a_passive_leg_needs_no_reading() -> None:
 
 
 def test_encoders_carry_the_scale_so_that_a_wrong_radius_is_found() -> None:
-    session = simulate(15, radius=1.01 * 0.010, sigma_px=0.01)
+    session = irregular_hexapod(15, radius=1.01 * 0.010, sigma_px=0.01)
     start = disturbed_start(session)
     solution = refine(session.legs, session.measurements, session.outlines, start)
     # The prior, 2 % of the radius, pulls a little; what it costs is within sigma.
@@ -357,7 +366,7 @@ def test_encoders_carry_the_scale_so_that_a_wrong_radius_is_found() -> None:
 
 @pytest.mark.parametrize("n", thinned([12, 30], [12]))
 def test_errors_agree_with_the_covariance(n: int) -> None:
-    session = simulate(6, legs_seen=5)
+    session = irregular_hexapod(6, legs_seen=5)
     start = disturbed_start(session)
     normalised, z, scales, chi2 = [], [], [], []
     for seed in range(n):
@@ -378,7 +387,7 @@ def test_errors_agree_with_the_covariance(n: int) -> None:
 
 
 def test_the_result_is_reproduced_and_outlines_in_another_order_change_nothing(
-    small: Session,
+    small: HexapodSession,
 ) -> None:
     rng = np.random.default_rng(5)
     measurements, outlines = noisy_readings(small, rng), noisy_outlines(small, rng)
@@ -400,7 +409,7 @@ def vector(found: Solution) -> Array:
 
 
 def test_the_better_start_wins_and_is_named_and_between_equal_ones_the_first(
-    small: Session,
+    small: HexapodSession,
 ) -> None:
     rng = np.random.default_rng(5)
     noisy = noisy_readings(small, rng), noisy_outlines(small, rng)
@@ -535,7 +544,7 @@ def test_exact_axes_give_the_truth(coplanar: bool) -> None:
 
 
 def test_axes_beside_outlines_add_to_what_is_known() -> None:
-    session = simulate(6, legs_seen=5)
+    session = irregular_hexapod(6, legs_seen=5)
     radii = {part: r for (_, part), r in session.legs.radii.items()}
     axes = axes_from_outlines(session.outlines, session.measurements, radii)
     arguments = (session.legs, session.measurements, session.outlines, disturbed_start(session))

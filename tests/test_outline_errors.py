@@ -8,20 +8,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from axes_session import axes_session
-from board_session import BOARD, corners_of, with_board
 from dense_fit import jacobian, residuals
-from hexapod_session import (
+from fit_sessions import (
+    BOARD,
     PINHOLE,
-    Session,
+    HexapodSession,
+    MachineSession,
+    axes_session,
+    corners_of,
     disturbed_start,
+    irregular_hexapod,
     joint_errors,
+    machine_session,
     moved_outlines,
     noisy_outlines,
     noisy_readings,
-    simulate,
+    shifted,
+    with_board,
 )
-from machine_session import MachineSession, machine_session, shifted
 from simulated import settings
 from thinned import thinned
 
@@ -72,8 +76,8 @@ LOG_GAMMA = 0.6
 
 
 @pytest.fixture(scope="module")
-def session() -> Session:
-    return simulate(8, legs_seen=5, sigma_px=0.05)
+def session() -> HexapodSession:
+    return irregular_hexapod(8, legs_seen=5, sigma_px=0.05)
 
 
 @cache
@@ -175,7 +179,7 @@ def find(outlines: Outlines, row: int, leg: int, edge: int) -> int:
 
 
 def test_a_rejected_outline_carries_how_far_it_is_and_the_edge_that_it_lies_on() -> None:
-    session = simulate(8)
+    session = irregular_hexapod(8)
     o, names = session.outlines, session.legs.names
     one, two = np.unique(o.leg[o.row == 2])[:2].tolist()
     other = int(o.leg[o.row == 5][0])
@@ -246,14 +250,14 @@ def test_rejected_corners_and_a_board_in_no_image_are_left_out() -> None:
     assert BOARD_SCALE not in solution.values
 
 
-def biases_of(session: Session) -> EdgeBiases:
+def biases_of(session: HexapodSession) -> EdgeBiases:
     """Return all biases that the outlines of a session may share."""
     observed = observed_outlines(session.outlines, session.measurements, session.legs)
     return possible_biases(observed, session.legs.names)
 
 
 def shared_errors(
-    session: Session, rng: np.random.Generator, level: float, slope: float
+    session: HexapodSession, rng: np.random.Generator, level: float, slope: float
 ) -> Outlines:
     """Return outlines whose edges err alike in all images of a view, and change with place."""
     possible = biases_of(session)
@@ -269,7 +273,7 @@ def scores_of(problem: FitProblem, state: State, possible: EdgeBiases) -> tuple[
     return scores_of_block(possible_problem, there, "biases")
 
 
-def test_scores_are_those_of_the_residuals_of_a_fit(session: Session) -> None:
+def test_scores_are_those_of_the_residuals_of_a_fit(session: HexapodSession) -> None:
     rng = np.random.default_rng(4)
     measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
     problem = build_fit(session.legs, measurements, outlines)
@@ -293,7 +297,7 @@ def test_scores_are_those_of_the_residuals_of_a_fit(session: Session) -> None:
     np.testing.assert_allclose(z, left.T @ r_all, atol=1e-6 * np.abs(z).max())
 
 
-def test_scores_do_not_depend_on_the_biases_that_are_fitted(session: Session) -> None:
+def test_scores_do_not_depend_on_the_biases_that_are_fitted(session: HexapodSession) -> None:
     rng = np.random.default_rng(5)
     measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
     problem = build_fit(session.legs, measurements, outlines)
@@ -311,7 +315,7 @@ def test_scores_do_not_depend_on_the_biases_that_are_fitted(session: Session) ->
         np.testing.assert_allclose(other, one, atol=1e-7 * np.abs(one).max())
 
 
-def test_biases_have_different_names(session: Session) -> None:
+def test_biases_have_different_names(session: HexapodSession) -> None:
     possible = biases_of(session)
     assert len(set(possible.names)) == len(possible.names) == len(possible.kind)
     assert {"all.bias", "c1.tilt", "leg1.rod.bias"} <= set(possible.names)
@@ -319,7 +323,7 @@ def test_biases_have_different_names(session: Session) -> None:
     assert len(possible.of_sizes(np.zeros(N_KINDS))) == 0
 
 
-def test_shared_errors_are_found_and_weighed(session: Session) -> None:
+def test_shared_errors_are_found_and_weighed(session: HexapodSession) -> None:
     start = disturbed_start(session)
     normalised, sizes = [], []
     for seed in range(3):
@@ -335,7 +339,7 @@ def test_shared_errors_are_found_and_weighed(session: Session) -> None:
     assert 0.7 < np.mean(normalised) < 1.5
 
 
-def test_independent_errors_are_not_taken_for_shared_ones(session: Session) -> None:
+def test_independent_errors_are_not_taken_for_shared_ones(session: HexapodSession) -> None:
     start = disturbed_start(session)
     for seed in range(3):
         rng = np.random.default_rng(100 + seed)
@@ -345,7 +349,7 @@ def test_independent_errors_are_not_taken_for_shared_ones(session: Session) -> N
         assert found.noise.bias_px == found.noise.tilt_px == 0.0
 
 
-def test_residuals_of_known_biases_give_their_sizes(session: Session) -> None:
+def test_residuals_of_known_biases_give_their_sizes(session: HexapodSession) -> None:
     possible = biases_of(session)
     sigma, found = np.array([0.0, 0.0, 0.06, 0.04, 0.03, 0.0]), []
     problem = build_fit(session.legs, session.measurements, session.outlines)
@@ -361,7 +365,7 @@ def test_residuals_of_known_biases_give_their_sizes(session: Session) -> None:
     assert found_sigma == pytest.approx(sigma, rel=0.15, abs=0.03)
 
 
-def _fit_in_rounds(session: Session, level: float, n_rounds: int) -> Solution:
+def _fit_in_rounds(session: HexapodSession, level: float, n_rounds: int) -> Solution:
     """Return a fit to outlines whose errors are shared by parts in views, in some rounds."""
     rng = np.random.default_rng(3)
     outlines = shared_errors(session, rng, level, 0.5 * level)
@@ -370,19 +374,19 @@ def _fit_in_rounds(session: Session, level: float, n_rounds: int) -> Solution:
     return refine(session.legs, measurements, outlines, start, settings)
 
 
-def test_a_fit_that_still_changes_a_lot_is_refused(session: Session) -> None:
+def test_a_fit_that_still_changes_a_lot_is_refused(session: HexapodSession) -> None:
     with pytest.raises(DidNotConverge, match=r"could not settle.*needed hardly any change"):
         _fit_in_rounds(session, 0.2, 1)
 
 
-def test_a_fit_that_still_changes_a_little_says_so(session: Session) -> None:
+def test_a_fit_that_still_changes_a_little_says_so(session: HexapodSession) -> None:
     (note,) = _fit_in_rounds(session, 0.2, 4).notes or ("",)
     assert "not quite settled" in note
     assert " px to 0." in note
 
 
 @pytest.mark.parametrize("level", thinned([0.0, 0.03, 0.2], [0.03]))
-def test_a_fit_with_the_usual_rounds_converges(session: Session, level: float) -> None:
+def test_a_fit_with_the_usual_rounds_converges(session: HexapodSession, level: float) -> None:
     assert _fit_in_rounds(session, level, DEFAULT_SETTINGS.noise_rounds).notes == ()
 
 
@@ -403,7 +407,7 @@ def without_gamma(measurements: Measurements) -> Measurements:
     return replace(measurements, views=views)
 
 
-def encoded(session: Session, log_gamma: float = LOG_GAMMA, seed: int = 3) -> Outlines:
+def encoded(session: HexapodSession, log_gamma: float = LOG_GAMMA, seed: int = 3) -> Outlines:
     """Return noisy outlines that were measured with a gamma of one, of a camera with another."""
     rng = np.random.default_rng(seed)
     outlines = noisy_outlines(session, rng)
@@ -417,7 +421,7 @@ def encoded(session: Session, log_gamma: float = LOG_GAMMA, seed: int = 3) -> Ou
     return replace(moved, gamma=np.ones(len(moved)), by_gamma=by_gamma)
 
 
-def test_gamma_of_a_camera_is_found_by_its_outlines(session: Session) -> None:
+def test_gamma_of_a_camera_is_found_by_its_outlines(session: HexapodSession) -> None:
     measurements = without_gamma(session.measurements)
     outlines = encoded(session)
     start = disturbed_start(session)
@@ -439,7 +443,7 @@ def test_gamma_of_a_camera_is_found_by_its_outlines(session: Session) -> None:
     assert found.rms_px < 0.7 * as_linear.rms_px
 
 
-def test_view_whose_gamma_is_given_keeps_it(session: Session) -> None:
+def test_view_whose_gamma_is_given_keeps_it(session: HexapodSession) -> None:
     views = without_gamma(session.measurements).views
     told = replace(views[0], camera=PINHOLE)
     measurements = replace(session.measurements, views=(told, *views[1:]))
@@ -448,7 +452,7 @@ def test_view_whose_gamma_is_given_keeps_it(session: Session) -> None:
     assert gamma.views == ("c2", "c3")
 
 
-def test_used_outlines_say_with_which_gamma_they_were_measured(session: Session) -> None:
+def test_used_outlines_say_with_which_gamma_they_were_measured(session: HexapodSession) -> None:
     outlines = encoded(session)
     outlines = replace(outlines, gamma=np.full(len(outlines), 1.8))
     found = known_gammas(outlines, without_gamma(session.measurements))
@@ -458,7 +462,7 @@ def test_used_outlines_say_with_which_gamma_they_were_measured(session: Session)
     assert known_gammas(rejected, without_gamma(session.measurements)) == {}
 
 
-def test_pull_of_a_gamma_is_that_of_its_sigma(session: Session) -> None:
+def test_pull_of_a_gamma_is_that_of_its_sigma(session: HexapodSession) -> None:
     measurements = without_gamma(session.measurements)
     start, pulls = disturbed_start(session, joints=0.0, camera=0.0, angle=0.0), []
     for seed in range(4):
@@ -468,7 +472,7 @@ def test_pull_of_a_gamma_is_that_of_its_sigma(session: Session) -> None:
 
 
 def test_gammas_that_are_given_or_of_which_nothing_is_known_are_not_estimated(
-    session: Session,
+    session: HexapodSession,
 ) -> None:
     outlines, start = encoded(session, log_gamma=0.0), disturbed_start(session)
     bare = replace(outlines, gamma=np.zeros(0), by_gamma=np.zeros(0))
@@ -480,7 +484,7 @@ def test_gammas_that_are_given_or_of_which_nothing_is_known_are_not_estimated(
         np.testing.assert_array_equal(found.covariance, given.covariance)
 
 
-def test_each_camera_has_its_own_gamma(session: Session) -> None:
+def test_each_camera_has_its_own_gamma(session: HexapodSession) -> None:
     cameras = [
         replace(PINHOLE, K=PINHOLE.K + 1e-9 * np.diag([k, k, 0.0]), gamma_is_given=k < 2)
         for k in range(3)

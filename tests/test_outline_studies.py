@@ -16,9 +16,9 @@ import pytest
 from bound import BoundStudy, errors_of
 from classes_study import FIT, ClassesStudy, as_stated, errors_of_fit, standing_where_held
 from convergence import ConvergenceStudy
+from fit_sessions import machine_session, shown_outlines
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from machine_session import machine_session, shown_outlines
 from outline_bound import Bound, Determined, at_best, band_of_ratio, bound_of
 from outline_sessions import (
     MACHINES,

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from machine_session import PINHOLE
+from fit_sessions import PINHOLE
 from scipy.spatial.transform import RigidTransform, Rotation
 from staged_hexapods import exact_session, noisy_session
 from staged_machines import Observed, made_up_base, seen_from, shipped

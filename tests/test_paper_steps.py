@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from machine_session import SHIPPED
+from fit_sessions import SHIPPED
 from scipy.spatial.transform import Rotation
 from staged_hexapods import errors, exact_session, five_millimetres_away, noisy_session, staged
 from staged_machines import Observed, planned, shipped

@@ -4,8 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from board_session import BOARD, corners_of, with_board
-from machine_session import LENS, MachineSession, machine_session, shifted
+from fit_sessions import (
+    BOARD,
+    LENS,
+    MachineSession,
+    corners_of,
+    machine_session,
+    shifted,
+    with_board,
+)
 from thinned import thinned
 
 from legcal.calibration.joint_fit import (

@@ -21,6 +21,7 @@ from .hexapod import perturb as perturb
 from .observe import OutlineNoise as OutlineNoise
 from .observe import Scene as Scene
 from .observe import TableNoise as TableNoise
+from .observe import moved_outlines as moved_outlines
 from .observe import noisy_outlines as noisy_outlines
 from .observe import outlines_of as outlines_of
 from .observe import plain_scene as plain_scene

@@ -1,0 +1,513 @@
+"""Simulated sessions in memory for the tests of the fit: exact, noisy, and started from far away.
+
+Outlines of any shipped machine, of a hexapod whose joints lie in no plane, corners of a board
+beside them, and axes of the hexapod of section 4.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from outline_sessions import closed_poses, moved_poses
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal import simulation
+from legcal.calibration.joint_fit.factors import BoardCorners
+from legcal.calibration.joint_fit.variables import FittedLegs, Start, fitted_legs, start_from
+from legcal.data import LegAxes, Measurements, Outlines, View
+from legcal.data.axes import axes_of_table, table_of_axes
+from legcal.data.corners import Corners, found_corners
+from legcal.geometry import Array, components, motions_of
+from legcal.machine import (
+    KinematicParameters,
+    Leg,
+    LegKind,
+    Machine,
+    free_coordinates,
+    from_vector,
+    geometries,
+    load_mechanism,
+    moved_legs,
+    parameters_of_legs,
+    platform_in_base,
+    point_like_legs,
+    to_vector,
+)
+from legcal.simulation import (
+    PAPER_VIEWS,
+    OutlineNoise,
+    TableNoise,
+    Viewpoint,
+    hexapod_cameras,
+    look_at,
+    moved_outlines,
+    outlines_of,
+    paper_hexapod,
+    perturb,
+    plain_scene,
+)
+from legcal.vision import Board, Camera
+
+K = np.array([[1290.0, 0.0, 518.0], [0.0, 1280.0, 380.0], [0.0, 0.0, 1.0]])
+PINHOLE = Camera(K, 1024, 768)
+LENS = Camera(K, 1024, 768, np.array([-0.12, 0.05, 1e-3, -5e-4, 0.0]))
+SHIPPED = (
+    "hexapod",
+    "hexapod-rod",
+    "hexapod-strut",
+    "nategh-agheli",
+    "6-sps",
+    "3-rpr",
+    "3-rps",
+    "3-spr",
+    "3-upu",
+    "3-upu-tilted",
+    "tricept",
+)
+SIGMA_Q = 2e-6  # [m]
+_TURN, _SHIFT = 0.12, 0.06  # of poses: [rad], of the length of a leg
+
+
+@dataclass(frozen=True, eq=False)
+class MachineSession:
+    """What a true machine shows, and where a fit of it begins.
+
+    Attributes
+    ----------
+    legs : FittedLegs
+        The nominal legs, wrong, with the true radii.
+    measurements : Measurements
+        Exact readings; every image is a pose of its own.
+    outlines : Outlines
+        Exact outlines of all legs, with the covariance that noise would have.
+    truth : Start
+        The true legs, cameras and poses.
+    start : Start
+        The wrong legs, cameras that are wrong as well, poses that follow from these legs.
+    """
+
+    legs: FittedLegs
+    measurements: Measurements
+    outlines: Outlines
+    truth: Start
+    start: Start
+
+    def noisy(self, seed: int) -> tuple[Measurements, Outlines]:
+        """Return readings and outlines with the errors that they claim."""
+        rng, m = np.random.default_rng(seed), self.measurements
+        q = m.q + m.sigma_q * rng.standard_normal(m.q.shape)
+        return replace(m, q=q), simulation.noisy_outlines(self.outlines, m.views[0].camera, rng)
+
+
+def shifted(session: MachineSession, outlines: Outlines, offsets: Array) -> Outlines:
+    """Return outlines moved across themselves by (n, 2) pixels at their ends."""
+    return moved_outlines(outlines, session.measurements.views[0].camera, offsets)
+
+
+@cache
+def machine_session(
+    name: str,
+    *,
+    length: float = 0.003,
+    angle: float = float(np.deg2rad(1.0)),
+    camera_shift: float = 0.003,
+    camera_turn: float = float(np.deg2rad(1.0)),
+    n_views: int = 3,
+    n_poses: int = 6,
+    camera: Camera = LENS,
+    seed: int = 0,
+) -> MachineSession:
+    """Return a session of a shipped model, which is the truth.
+
+    Parameters
+    ----------
+    name : str
+        The model.
+    length, angle : float
+        How wrong every coordinate, offset and constant length [m] and every axis [rad] of the
+        nominal legs is.
+    camera_shift, camera_turn : float
+        How far each camera is from where it is said to be [m], [rad].
+    n_views, n_poses : int
+        Number of cameras, and of poses that each of them sees alone.
+    camera : Camera
+        Intrinsics of all cameras.
+    seed : int
+        Of poses and errors.
+    """
+    rng = np.random.default_rng(seed)
+    machine = load_mechanism(name)
+    legs, fitted = geometries(machine), fitted_legs(machine)
+    R, t = _poses(machine, legs, n_views * n_poses, rng)
+    view = np.repeat(np.arange(n_views), n_poses)
+    T_camera_Rb = _cameras(machine, legs, n_views, camera)
+    measurements = Measurements(
+        tuple(View(f"c{v + 1}", camera) for v in range(n_views)),
+        tuple(f"c{v + 1}_{i:03d}.png" for i, v in enumerate(view)),
+        view,
+        np.arange(len(view)),
+        _readings(machine, legs, R, t),
+        SIGMA_Q,
+    )
+    truth = Start(legs, T_camera_Rb, motions_of(R, t), "truth")
+    away = _wrong(fitted, legs, length, angle, rng)
+    home = (platform_in_base(machine, machine.home),) * len(t)
+    rough = tuple(_shaken(T, camera_shift, camera_turn, rng) for T in T_camera_Rb)
+    wrong = replace(fitted, nominal=away)
+    return MachineSession(
+        wrong,
+        measurements,
+        shown_outlines(fitted.radii, measurements, truth),
+        truth,
+        start_from(away, measurements, wrong, rough, home, "nominal"),
+    )
+
+
+def _poses(
+    machine: Machine, legs: tuple[Leg, ...], n: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return poses around home at which the legs close."""
+    R, t = components((platform_in_base(machine, machine.home),) * n)
+    size = np.mean([np.linalg.norm(R[0] @ leg.B + t[0] - leg.A) for leg in legs])
+    step = rng.uniform(-1.0, 1.0, (n, 6)) * np.repeat([_TURN, _SHIFT * size], 3)
+    return closed_poses(legs, machine.frame_legs, *moved_poses(R, t, step))
+
+
+def _readings(machine: Machine, legs: tuple[Leg, ...], R: Array, t: Array) -> Array:
+    q = np.full((len(t), len(legs)), np.nan)
+    for j, leg in enumerate(legs):
+        if leg.kind is LegKind.ACTUATED:
+            length = np.linalg.norm(R @ leg.B + t - leg.A, axis=1)
+            q[:, j] = machine.sign[j] * (length - leg.q0)
+    return q
+
+
+def _cameras(
+    machine: Machine, legs: tuple[Leg, ...], n_views: int, camera: Camera
+) -> tuple[RigidTransform, ...]:
+    """Return T_camera_Rb of cameras around the middle of the machine."""
+    home = platform_in_base(machine, machine.home)
+    joints = np.array([leg.A for leg in legs] + [home.apply(leg.B) for leg in legs])
+    middle = joints.mean(axis=0)
+    size = np.linalg.norm(joints - middle, axis=1).max()
+    found = []
+    for v in range(n_views):
+        turn = 0.4 + 2.1 * v
+        outward = np.array([np.cos(turn), np.sin(turn), 0.35 + 0.1 * v])
+        centre = middle + 4.0 * size * outward / np.linalg.norm(outward)
+        found.append(look_at(centre, middle).inv())
+    return tuple(found)
+
+
+def shown_outlines(
+    radii: Mapping[tuple[int, str], float], m: Measurements, truth: Start
+) -> Outlines:
+    """Return both outlines of every part of every leg in every image."""
+    R, t = components(truth.T_Rb_Re)
+    A, B = (np.array([getattr(leg, joint) for leg in truth.legs]) for joint in "AB")
+    ends = np.einsum("kij,lj->kli", R, B) + t[:, None]
+    views = [
+        Viewpoint(view.name, view.camera, T.inv())
+        for view, T in zip(m.views, truth.T_camera_Rb, strict=True)
+    ]
+    scene = plain_scene(np.broadcast_to(A, ends.shape), ends, views, m.view, m.pose, radii)
+    return outlines_of(scene, OutlineNoise(0.2, 150))
+
+
+def _wrong(
+    fitted: FittedLegs,
+    legs: tuple[Leg, ...],
+    length: float,
+    angle: float,
+    rng: np.random.Generator,
+) -> tuple[Leg, ...]:
+    """Return legs every number of which is wrong by as much, up or down; twists are right."""
+    parametrization = fitted.parametrization
+    size = np.where(np.array(parametrization.units) == "m", length, angle / np.sqrt(2.0))
+    size[[name.endswith(".twist") for name in parametrization.names]] = 0.0
+    step = size * rng.choice([-1.0, 1.0], len(size))
+    return moved_legs(legs, parametrization.place, step)
+
+
+def _shaken(
+    T: RigidTransform, distance: float, angle: float, rng: np.random.Generator
+) -> RigidTransform:
+    """Return a camera that is wrong by a distance and an angle in any direction."""
+    turn, shift = rng.standard_normal((2, 3))
+    rotation = Rotation.from_rotvec(angle * turn / np.linalg.norm(turn))
+    return RigidTransform.from_components(
+        T.translation + distance * shift / np.linalg.norm(shift), rotation * T.rotation
+    )
+
+
+# A hexapod with point-like joints
+
+FRAME_LEGS = (0, 2, 4)
+RADIUS = 0.010
+TRUTH = KinematicParameters(
+    np.array(
+        [
+            [0.0, 0.0, 0.0],
+            [0.392, -0.083, -0.004],
+            [0.467, 0.0, 0.0],
+            [0.343, 0.380, 0.010],
+            [0.233, 0.404, 0.0],
+            [-0.037, 0.105, 0.004],
+        ]
+    ),
+    np.array(
+        [
+            [0.0, 0.0, 0.0],
+            [0.057, -0.061, -0.019],
+            [0.339, 0.0, 0.0],
+            [0.362, 0.077, 0.003],
+            [0.170, 0.293, 0.0],
+            [0.089, 0.276, -0.006],
+        ]
+    ),
+    np.array([0.3457, 0.3438, 0.3466, 0.3439, 0.3431, 0.3438]),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class HexapodSession:
+    """Exact measurements and the truth behind them."""
+
+    legs: FittedLegs
+    measurements: Measurements
+    outlines: Outlines
+    truth: KinematicParameters
+    T_camera_Rb: tuple[RigidTransform, ...]
+    T_Rb_Re: tuple[RigidTransform, ...]
+
+
+def irregular_hexapod(
+    n_poses_per_view: int = 15,
+    *,
+    camera: Camera = PINHOLE,
+    legs_seen: int = 4,
+    radius: float = RADIUS,
+    sigma_px: float = 0.1,
+    seed: int = 0,
+    shared_poses: bool = False,
+    n_views: int = 3,
+) -> HexapodSession:
+    """Return a session of a non-coplanar hexapod: views around it, every image its own pose."""
+    rng = np.random.default_rng(seed)
+    T_cameras = tuple(_camera_around(angle) for angle in 0.4 + 2.1 * np.arange(n_views))
+    n_rows = n_views * n_poses_per_view
+    view = np.repeat(np.arange(n_views), n_poses_per_view)
+    pose = np.tile(np.arange(n_poses_per_view), n_views) if shared_poses else np.arange(n_rows)
+    poses = [_pose(rng) for _ in range(int(pose.max()) + 1)]
+    A, B = TRUTH.base_joints, TRUTH.platform_joints
+    lengths = np.array([np.linalg.norm(T.apply(B) - A, axis=1) for T in poses])
+    names = tuple(f"leg{i + 1}" for i in range(6))
+    measurements = Measurements(
+        tuple(View(f"c{v + 1}", camera) for v in range(n_views)),
+        tuple(f"c{v + 1}_{i:03d}.png" for i, v in enumerate(view)),
+        view,
+        pose,
+        (lengths - TRUTH.offsets)[pose],
+        2e-6,
+    )
+    # Images show the legs whose base joints are nearest to the camera.
+    depth = np.array([T.apply(A)[:, 2] for T in T_cameras])
+    nearest = [np.sort(np.argsort(depth[v])[:legs_seen]).tolist() for v in view]
+    scene = plain_scene(
+        np.broadcast_to(A, (*lengths.shape, 3)),
+        np.array([T.apply(B) for T in poses]),
+        [Viewpoint(f"c{v + 1}", camera, T.inv()) for v, T in enumerate(T_cameras)],
+        view,
+        pose,
+        {(j, "rod"): radius for j in range(6)},
+        nearest,
+        span=(0.08, 0.92),
+    )
+    white = np.tile(sigma_px**2 * np.eye(2), (2 * legs_seen * n_rows, 1, 1))
+    outlines = replace(outlines_of(scene), covariance=white)
+    radii = {(i, "rod"): RADIUS for i in range(6)}
+    sign = np.ones(6, dtype=np.intp)
+    legs = FittedLegs(names, point_like_legs(TRUTH), sign, FRAME_LEGS, radii)
+    return HexapodSession(legs, measurements, outlines, TRUTH, T_cameras, tuple(poses))
+
+
+def noisy_outlines(session: HexapodSession, rng: np.random.Generator) -> Outlines:
+    """Return outlines with Gaussian errors of their claimed covariances."""
+    return simulation.noisy_outlines(session.outlines, session.measurements.views[0].camera, rng)
+
+
+def noisy_readings(session: HexapodSession, rng: np.random.Generator) -> Measurements:
+    """Return measurements with Gaussian errors in the readings, equal within a pose."""
+    m = session.measurements
+    error = m.sigma_q * rng.standard_normal((m.n_poses, m.q.shape[1]))
+    return replace(m, q=m.q + error[m.pose])
+
+
+def disturbed_start(
+    session: HexapodSession,
+    *,
+    joints: float = 0.002,
+    camera: float = 0.005,
+    angle: float = 0.01,
+    seed: int = 1,
+) -> Start:
+    """Return a start whose every coordinate, camera and pose is wrong by that much [m, rad]."""
+    rng = np.random.default_rng(seed)
+    xi = to_vector(session.truth, FRAME_LEGS)
+    xi = xi + joints * rng.choice([-1.0, 1.0], len(xi))
+    return Start(
+        point_like_legs(from_vector(xi, 6, FRAME_LEGS)),
+        tuple(_shaken(T, camera, angle, rng) for T in session.T_camera_Rb),
+        tuple(_shaken(T, camera, angle, rng) for T in session.T_Rb_Re),
+        "nominal",
+    )
+
+
+def joint_errors(parameters: KinematicParameters) -> Array:
+    """Return the errors of the free parameters [m]."""
+    return to_vector(parameters, FRAME_LEGS) - to_vector(TRUTH, FRAME_LEGS)
+
+
+def gauge_is_kept(parameters: KinematicParameters) -> bool:
+    """Return whether the coordinates that define the frames are still exactly zero."""
+    fixed = ~free_coordinates(6, FRAME_LEGS)
+    return not (parameters.base_joints[fixed].any() or parameters.platform_joints[fixed].any())
+
+
+def _camera_around(angle: float) -> RigidTransform:
+    """Return T_camera_Rb of a camera 0.9 m away that looks at the middle of the machine."""
+    middle = np.array([0.23, 0.15, 0.17])
+    centre = middle + np.array([0.9 * np.cos(angle), 0.9 * np.sin(angle), 0.1])
+    return look_at(centre, middle).inv()
+
+
+def _pose(rng: np.random.Generator) -> RigidTransform:
+    home = Rotation.from_rotvec([0.0, 0.0, 0.6])
+    tilt = Rotation.from_rotvec(rng.uniform(-0.18, 0.18, 3))
+    translation = np.array([0.14, -0.05, 0.34]) + rng.uniform(-0.03, 0.03, 3)
+    return RigidTransform.from_components(translation, tilt * home)
+
+
+# A calibration board on the base of a machine
+
+BOARD = Board("chessboard", 7, 6, 0.025)
+SIGMA_PX = 0.05
+
+
+def place_of_board(session: MachineSession) -> RigidTransform:
+    """Return T_Rb_board: it lies flat under the middle of the legs, its z down into the base."""
+    ends = [leg.A for leg in session.truth.legs]
+    ends += [T.apply(leg.B) for T in session.truth.T_Rb_Re[:1] for leg in session.truth.legs]
+    middle = np.mean(ends, axis=0) - BOARD.points.mean(axis=0)
+    turn = Rotation.from_euler("xz", [np.pi, 0.4])
+    return RigidTransform.from_components(middle, turn)
+
+
+def corners_of(
+    session: MachineSession, board: Board = BOARD, *, seed: int | None = None
+) -> Corners:
+    """Return the corners in every image, exact or with the errors that they claim."""
+    T_Rb_board = place_of_board(session)
+    seen, views = [], session.measurements.view
+    for row, v in enumerate(views.tolist()):
+        camera = session.measurements.views[v].camera
+        in_camera = (session.truth.T_camera_Rb[v] * T_Rb_board).apply(board.points)
+        seen.append((np.full(len(in_camera), row), camera.project(in_camera)))
+    of_row = np.concatenate([r for r, _ in seen])
+    px: Array = np.concatenate([p for _, p in seen])
+    if seed is not None:
+        px = px + SIGMA_PX * np.random.default_rng(seed).standard_normal(px.shape)
+    corner = np.tile(np.arange(board.n_corners), len(views))
+    return found_corners(of_row, corner, px, np.full(len(px), SIGMA_PX))
+
+
+def with_board(session: MachineSession, corners: Corners) -> tuple[BoardCorners, Start]:
+    """Return what is seen of the board, and the wrong start with a board that is wrong as well."""
+    wrong = RigidTransform.from_components([0.004, -0.003, 0.005], Rotation.from_rotvec([0.02] * 3))
+    start = replace(session.start, T_Rb_board=place_of_board(session) * wrong)
+    return BoardCorners(BOARD, corners), start
+
+
+# Axes of the hexapod of section 4.3
+
+
+@dataclass(frozen=True, eq=False)
+class AxesSession:
+    """Exact axes, the readings and the truth behind them."""
+
+    legs: FittedLegs
+    measurements: Measurements
+    axes: LegAxes
+    truth: Start
+
+    @property
+    def parameters(self) -> KinematicParameters:
+        """The true parameters [m]."""
+        return parameters_of_legs(self.truth.legs)
+
+    def noisy(self, seed: int) -> tuple[Measurements, LegAxes]:
+        """Return readings and axes with the errors that they claim."""
+        rng, m = np.random.default_rng(seed), self.measurements
+        error = rng.normal(scale=m.sigma_q, size=(m.n_poses, len(self.legs.names)))
+        values, sigmas = table_of_axes(self.axes)
+        values += sigmas * rng.normal(size=values.shape)
+        axes = axes_of_table(self.axes.row, self.axes.leg, values, sigmas)
+        return replace(m, q=m.q + error[m.pose]), axes
+
+    def start(self, seed: int = 7, joints: float = 0.002) -> Start:
+        """Return a start that is wrong by so much in every parameter [m]; cameras by 1 degree."""
+        rng = np.random.default_rng(seed)
+        xi = to_vector(self.parameters, self.legs.frame_legs)
+        xi = xi + joints * rng.choice([-1.0, 1.0], len(xi))
+        cameras = [
+            view.T_base_camera.inv()
+            for view in self.measurements.views
+            if view.T_base_camera is not None
+        ]
+        return start_from(
+            point_like_legs(from_vector(xi, self.legs.n_legs, self.legs.frame_legs)),
+            self.measurements,
+            self.legs,
+            cameras,
+            self.truth.T_Rb_Re,
+            "nominal",
+        )
+
+    def errors(self, parameters: KinematicParameters) -> Array:
+        """Return the errors of the free parameters [m]."""
+        frame_legs = self.legs.frame_legs
+        return to_vector(parameters, frame_legs) - to_vector(self.parameters, frame_legs)
+
+
+@cache
+def axes_session(
+    n_poses: int = 8,
+    n_images: int = 1,
+    *,
+    coplanar: bool = False,
+    legs: tuple[tuple[int, ...], ...] = PAPER_VIEWS,
+) -> AxesSession:
+    """Return a session of a hexapod 2 mm off its drawing, seen with the noise of Table 1."""
+    rng = np.random.default_rng(3)
+    machine = perturb(paper_hexapod(), rng, 0.002, coplanar=coplanar)
+    cameras = hexapod_cameras(machine, rng, legs=legs)
+    session = simulation.hexapod_session(
+        machine, cameras, rng, noise=TableNoise(), noisy=False, n_poses=n_poses, n_images=n_images
+    )
+    # Rough camera poses, about 1 degree and 1 cm wrong.
+    near = simulation.hexapod_session(machine, cameras, rng, noise=TableNoise(), n_poses=1)
+    legs_true = point_like_legs(machine.parameters)
+    return AxesSession(
+        FittedLegs(machine.leg_names, legs_true, machine.sign, machine.frame_legs, {}),
+        replace(session.measurements, views=near.measurements.views),
+        session.axes,
+        Start(
+            legs_true,
+            tuple(camera.T_Rb_camera.inv() for camera in cameras),
+            tuple(session.T_Rb_Re),
+            "truth",
+        ),
+    )
