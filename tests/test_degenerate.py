@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from authoring import made
+from machines import made
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from outline_tables import assert_same
-from repeated_images import SIZE, RepeatedImages, repeated_images
+from rendering import SIZE, RepeatedImages, repeated_images
 from scipy.spatial.transform import RigidTransform
 
 from legcal import cli, detect, load_dataset

@@ -13,9 +13,7 @@ from fit_sessions import (
     axes_session,
     disturbed_start,
     irregular_hexapod,
-    moved_outlines,
     noisy_outlines,
-    point_like_legs,
 )
 
 from legcal.calibration.joint_fit import (
@@ -30,7 +28,8 @@ from legcal.calibration.joint_fit import (
 from legcal.data import LegAxes, Outlines, View, no_outlines
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, NotIdentifiable
 from legcal.files import motion_from_xyz_quat
-from legcal.machine import load_mechanism
+from legcal.machine import load_mechanism, point_like_legs
+from legcal.simulation import moved_outlines
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ from fit_sessions import (
     HexapodSession,
     disturbed_start,
     irregular_hexapod,
-    moved_outlines,
     noisy_outlines,
     noisy_readings,
 )
@@ -35,6 +34,7 @@ from legcal.calibration.joint_fit.outline_errors import N_KINDS
 from legcal.data import Measurements, Outlines
 from legcal.geometry import Array, IntArray, motions_of
 from legcal.machine import Leg
+from legcal.simulation import moved_outlines
 
 MACHINES = ("6-spu-coplanar", "3-upu-tilted", "3-rpr")
 N_SEEDS = 3

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from authoring import made
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from machines import made
 from random_legs import closed_leg
-from staged_hexapods import exact_session
+from staged_sessions import exact_session
 from thinned import thinned
 
 import legcal

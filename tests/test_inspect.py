@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from authoring import read_family
-from machines import ROOT
+from machines import ROOT, read_family
 from rich.console import Console
 
 from legcal import evaluate, load_mechanism

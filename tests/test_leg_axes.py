@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from staged_hexapods import exact_session
+from staged_sessions import exact_session
 
 from legcal.data import LegAxes, Outlines, axes_from_outlines, join_axes
 from legcal.data.axes import outline_derivative

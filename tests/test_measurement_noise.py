@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from rendering import Bar, Light, render
-from repeated_images import RepeatedImages, repeated_images
+from rendering import Bar, Light, RepeatedImages, render, repeated_images
 from rich.console import Console
 from scipy.spatial.transform import RigidTransform
 

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from authoring import TRIPOD, made, read_family, read_table, write_table
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from machines import ROOT, SHIPPED
+from machines import ROOT, SHIPPED, TRIPOD, made, read_family, read_table, write_table
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, UsageError

@@ -20,7 +20,6 @@ from fit_sessions import (
     irregular_hexapod,
     joint_errors,
     machine_session,
-    moved_outlines,
     noisy_outlines,
     noisy_readings,
     shifted,
@@ -67,6 +66,7 @@ from legcal.data import Measurements, Outlines, no_outlines
 from legcal.errors import DidNotConverge
 from legcal.estimation import linearize, scores_of_block
 from legcal.geometry import Array, BoolArray
+from legcal.simulation import moved_outlines
 from legcal.simulation import simulate as simulate_folder
 from legcal.vision import EPSILON
 

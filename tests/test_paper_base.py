@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from fit_sessions import PINHOLE
 from scipy.spatial.transform import RigidTransform, Rotation
-from staged_hexapods import exact_session, noisy_session
-from staged_machines import Observed, made_up_base, seen_from, shipped
+from staged_sessions import Observed, exact_session, made_up_base, noisy_session, seen_from, shipped
 
 from legcal.data import LegAxes, Measurements, View
 from legcal.errors import NotIdentifiable

@@ -10,8 +10,14 @@ from hypothesis import strategies as st
 from random_legs import closed_leg
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
-from staged_hexapods import exact_session, five_millimetres_away, noisy_session, staged
-from staged_machines import planned, shipped
+from staged_sessions import (
+    exact_session,
+    five_millimetres_away,
+    noisy_session,
+    planned,
+    shipped,
+    staged,
+)
 
 from legcal.calibration.identify.predicted_observations import planned_observations
 from legcal.errors import DidNotConverge, NotIdentifiable

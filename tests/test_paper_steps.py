@@ -9,8 +9,16 @@ import numpy as np
 import pytest
 from fit_sessions import SHIPPED
 from scipy.spatial.transform import Rotation
-from staged_hexapods import errors, exact_session, five_millimetres_away, noisy_session, staged
-from staged_machines import Observed, planned, shipped
+from staged_sessions import (
+    Observed,
+    errors,
+    exact_session,
+    five_millimetres_away,
+    noisy_session,
+    planned,
+    shipped,
+    staged,
+)
 from thinned import thinned
 
 from legcal.calibration.identify.predicted_observations import planned_observations

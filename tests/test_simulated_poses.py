@@ -287,20 +287,12 @@ def test_given_poses_with_legs_through_each_other_are_refused(tmp_path: Path) ->
     assert rows == {i for i, overlap in enumerate(overlaps) if overlap > 0.0}
 
 
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ("0,0,0\n0,0\n", r"row 2 \(line 3\)"),
-        ("0,nan,0\n", r"row 1 \(line 2\), column leg2_prismatic: .*'nan'"),
-        ("0,0,1.0\n", "column leg3_prismatic: readings are outside the travel: found 1 m"),
-        ("", "no row"),
-    ],
-)
-def test_malformed_files_of_poses_are_refused(text: str, named: str, tmp_path: Path) -> None:
+def test_malformed_files_of_poses_are_refused(tmp_path: Path) -> None:
+    """Others are among the refusals of tests/characterisation."""
     path = tmp_path / "poses.csv"
-    path.write_text(f"leg1_prismatic,leg2_prismatic,leg3_prismatic\n{text}")
+    path.write_text("leg1_prismatic,leg2_prismatic,leg3_prismatic\n0,0,0\n0,0\n")
     machine = load_mechanism("3-rps")
-    with pytest.raises(DatasetError, match=f"^{path}.*{named}"):
+    with pytest.raises(DatasetError, match=rf"^{path}.*row 2 \(line 3\)"):
         given_poses(machine, path)
     passive = replace(machine.legs[1], kind=LegKind.PASSIVE)
     free = replace(machine, legs=(machine.legs[0], passive, machine.legs[2]))

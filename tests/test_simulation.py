@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
-from staged_hexapods import exact_session
+from staged_sessions import exact_session
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.lines import moment

@@ -9,10 +9,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from hexapod_example import Picture, Spoiled, spoiled
 from outline_tables import outlines_of
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings
-from spoiled import Picture, Spoiled, spoiled
 
 from legcal import calibrate, detect, load_dataset, simulate
 from legcal.calibration import Calibration, Detection

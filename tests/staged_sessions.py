@@ -1,4 +1,4 @@
-"""What the four steps take of any shipped machine, and bases that are made up."""
+"""What the four steps take of shipped machines, hexapods of section 4.3 and made-up bases."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -17,17 +17,32 @@ from legcal.data import LegAxes, Measurements, View, axes_from_outlines
 from legcal.geometry import Array, BoolArray, normal_basis
 from legcal.machine import (
     JointType,
+    KinematicParameters,
     Leg,
     LegKind,
     Parametrization,
+    from_vector,
     moved_legs,
     parametrize,
+    to_vector,
     vector_of,
 )
 from legcal.paper import Criteria, NominalMachine, run_base_steps, run_steps
 from legcal.paper.four_steps import StagedResult
 from legcal.paper.joints_in_base import JointsInBase
 from legcal.paper.joints_in_camera import JointsInCamera
+from legcal.simulation import (
+    PAPER_VIEWS,
+    HexapodSession,
+    OutlineNoise,
+    PaperHexapod,
+    TableNoise,
+    hexapod_cameras,
+    hexapod_session,
+    nominal_of,
+    paper_hexapod,
+    perturb,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,3 +201,72 @@ def seen_from(
         np.zeros(len(seen), dtype=np.bool_),
     )
     return joints, cameras
+
+
+# Hexapods of section 4.3
+
+
+@cache
+def exact_session(
+    seed: int = 0,
+    *,
+    coplanar: bool = False,
+    noise: OutlineNoise | TableNoise | None = None,
+    legs: tuple[tuple[int, ...], ...] = PAPER_VIEWS,
+    n_poses: int = 6,
+    share_poses: bool = False,
+) -> HexapodSession:
+    """Return a session without noise of a hexapod 2 mm off its drawing."""
+    rng = np.random.default_rng(seed)
+    machine = perturb(paper_hexapod(), rng, 0.002, coplanar=coplanar)
+    return hexapod_session(
+        machine,
+        hexapod_cameras(machine, rng, legs=legs),
+        rng,
+        noise=noise or OutlineNoise(),
+        noisy=False,
+        n_poses=n_poses,
+        share_poses=share_poses,
+    )
+
+
+@cache
+def noisy_session(
+    seed: int, noise: OutlineNoise | TableNoise, *, coplanar: bool = False, n_poses: int = 15
+) -> tuple[HexapodSession, PaperHexapod]:
+    """Return a session with noise, and a nominal machine up to 2 mm wrong in every parameter."""
+    rng = np.random.default_rng(seed)
+    machine = perturb(paper_hexapod(), rng, 0.002, coplanar=coplanar)
+    nominal = perturb(machine, rng, 0.002)
+    session = hexapod_session(
+        machine,
+        hexapod_cameras(machine, rng),
+        rng,
+        noise=noise,
+        n_poses=n_poses,
+        n_images=3 if isinstance(noise, TableNoise) else 1,
+    )
+    return session, nominal
+
+
+def five_millimetres_away(machine: PaperHexapod, seed: int = 0) -> PaperHexapod:
+    """Return the machine with every parameter exactly 5 mm wrong, z and offsets included."""
+    vector = to_vector(machine.parameters, machine.frame_legs)
+    signs = np.random.default_rng(seed).choice([-1.0, 1.0], len(vector))
+    parameters = from_vector(vector + 0.005 * signs, machine.n_legs, machine.frame_legs)
+    return replace(machine, parameters=parameters)
+
+
+def errors(parameters: KinematicParameters, machine: PaperHexapod) -> Array:
+    """Return the absolute error of every parameter [m]."""
+    difference = to_vector(parameters, machine.frame_legs) - to_vector(
+        machine.parameters, machine.frame_legs
+    )
+    return np.asarray(np.abs(difference))
+
+
+def staged(
+    session: HexapodSession, nominal: PaperHexapod, criteria: Criteria = "default"
+) -> StagedResult:
+    """Run the four steps on a session."""
+    return run_steps(nominal_of(nominal), session.axes, session.measurements, criteria=criteria)
