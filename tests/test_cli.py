@@ -10,7 +10,6 @@ from hexapod_example import Run, copy_of_the_example
 
 from legcal import cli
 from legcal.errors import ModelError, NotVisible
-from legcal.version import __version__
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
@@ -42,13 +41,6 @@ def test_commands_load_only_what_they_need(words: list[str], heavy: set[str], pr
     )
     assert done.returncode == 0, done.stderr
     assert printed in done.stdout
-
-
-def test_version_is_printed(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(monkeypatch, "--version") == 0
-    assert capsys.readouterr().out == f"legcal {__version__}\n"
 
 
 def test_inspect_prints_a_table_of_80_columns(
