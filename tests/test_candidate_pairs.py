@@ -123,29 +123,29 @@ def _edges(width: float, length: float, *, turn: float = 0.0, same_way: bool = F
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_the_outlines_of_legs_are_bars_with_their_axes_and_widths(seed: int) -> None:
+def test_the_outlines_of_legs_are_pairs_with_their_axes_and_widths(seed: int) -> None:
     rng = np.random.default_rng(seed)
     made, T = lp.machine(6, rng), lp.camera(rng)
     targets = lp.pieces(made.A, made.posed(lp.platform(rng)))
     for k in range(len(targets)):
         lines = lp.edges(targets, T)[k]
-        bars = find_candidate_pairs(lp.segments(lines))
-        assert len(bars) == 1
+        pairs = find_candidate_pairs(lp.segments(lines))
+        assert len(pairs) == 1
         X = T.inv().apply(targets.ends[k])
         ends = X[:, :2] / X[:, 2:]
-        aside = (ends - bars.middle[0]) @ bars.normal[0]
+        aside = (ends - pairs.middle[0]) @ pairs.normal[0]
         assert np.abs(aside).max() < 0.2 * lp.PIXEL  # the axis is not quite in the middle
         middle = X.mean(axis=0)
         normal = np.cross(X[0], X[1])
         flat = np.linalg.norm(normal[:2]) / np.linalg.norm(normal)
         width = 2.0 * targets.radius[k] / (middle[2] * flat)
-        assert bars.width[0].mean() == pytest.approx(width, rel=0.02)
-        assert 2.0 * bars.half_length[0] == pytest.approx(
+        assert pairs.width[0].mean() == pytest.approx(width, rel=0.02)
+        assert 2.0 * pairs.half_length[0] == pytest.approx(
             np.linalg.norm(ends[1] - ends[0]), rel=0.05
         )
 
 
-def test_edges_that_are_too_near_or_too_far_apart_or_too_short_are_no_bars() -> None:
+def test_edges_that_are_too_near_or_too_far_apart_or_too_short_are_no_pairs() -> None:
     for width, length, n in (
         (MIN_WIDTH - 0.5, 60.0, 0),
         (MIN_WIDTH + 0.5, 60.0, 1),
@@ -180,10 +180,10 @@ def test_a_pair_at_which_light_changes_the_same_way_twice_counts_less() -> None:
     assert len(nothing) == len(find_candidate_pairs(nothing)) == 0
 
 
-def test_the_best_bars_come_first_and_copies_of_a_bar_are_left_out() -> None:
+def test_the_best_pairs_come_first_and_copies_of_a_pair_are_left_out() -> None:
     short, long = _edges(12.0, 40.0) + 60.0 * lp.PIXEL, _edges(10.0, 90.0, turn=1.2)
     copy = long + 0.5 * lp.PIXEL
-    bars = find_candidate_pairs(lp.segments(np.concatenate([short, long, copy])))
-    assert np.all(np.diff(bars.merit) <= 0.0)
-    assert len(bars) == 2
-    assert len(bars.take(np.array([1]))) == 1
+    pairs = find_candidate_pairs(lp.segments(np.concatenate([short, long, copy])))
+    assert np.all(np.diff(pairs.merit) <= 0.0)
+    assert len(pairs) == 2
+    assert len(pairs.take(np.array([1]))) == 1
