@@ -37,12 +37,8 @@ from .kinematics import followed_poses as followed_poses
 from .kinematics import forward_kinematics as forward_kinematics
 from .kinematics import forward_kinematics_many as forward_kinematics_many
 from .kinematics import inverse_kinematics as inverse_kinematics
-from .kinematics import joint_values as joint_values
 from .kinematics import platform_in_base as platform_in_base
-from .kinematics import platform_pose as platform_pose
 from .kinematics import pose_differences as pose_differences
-from .kinematics import readings_at as readings_at
-from .kinematics import slider_columns as slider_columns
 from .kinematics import solve_poses as solve_poses
 from .leg import Cylinder as Cylinder
 from .leg import EquationKind as EquationKind
@@ -60,7 +56,11 @@ from .mobility import leg_scale as leg_scale
 from .mobility import singularity as singularity
 from .model import Machine as Machine
 from .model import describe as describe
+from .model import joint_values as joint_values
 from .model import leg_vectors as leg_vectors
+from .model import platform_pose as platform_pose
+from .model import readings_at as readings_at
+from .model import slider_columns as slider_columns
 from .model_builder import create_model as create_model
 from .model_writer import check_closes as check_closes
 from .model_writer import mechanism_text as mechanism_text

@@ -16,16 +16,10 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge
 from legcal.geometry import Array, BoolArray
 from legcal.machine.equations import PoseEquations, freedoms, pose_equations
-from legcal.machine.kinematics import (
-    follow,
-    joint_values,
-    platform_pose,
-    slider_columns,
-    solve_poses,
-)
+from legcal.machine.kinematics import follow, solve_poses
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.mobility import free_motions, project, singularity
-from legcal.machine.model import Machine
+from legcal.machine.model import Machine, joint_values, platform_pose, slider_columns
 from legcal.machine.solver import RANK, moved
 
 MAX_DRAWS = 40  # draws for each configuration

@@ -1,9 +1,8 @@
 """What deserves attention in a machine that was loaded, one sentence each."""
 
 from legcal.machine.home import legs_outside
-from legcal.machine.kinematics import readings_at
 from legcal.machine.mobility import singularity
-from legcal.machine.model import Machine
+from legcal.machine.model import Machine, readings_at
 from legcal.machine.schema import LegcalBlock
 
 _MIN_SINGULARITY = 1e-4  # singularity measure: less than that is the rounding of a file

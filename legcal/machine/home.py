@@ -13,10 +13,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry import Array, motion_of
+from legcal.machine.closing import close_at
 from legcal.machine.equations import is_constrained, machine_equations
-from legcal.machine.kinematics import close_at, platform_pose, project_pose, readings_at
+from legcal.machine.kinematics import project_pose
 from legcal.machine.leg import Leg, LegKind
-from legcal.machine.model import Machine
+from legcal.machine.model import Machine, platform_pose, readings_at
 from legcal.machine.parameters import in_links
 from legcal.machine.solver import moved, solve
 
@@ -35,7 +36,7 @@ def closed_home(machine: Machine, home: RigidTransform | None) -> tuple[RigidTra
     Raises
     ------
     ModelError, DidNotConverge
-        As :func:`project_home`, :func:`find_home` and :func:`legcal.machine.kinematics.close_at`.
+        As :func:`project_home`, :func:`find_home` and :func:`legcal.machine.closing.close_at`.
     """
     start = find_home(machine) if home is None else home
     projected = project_home(machine, start)

@@ -14,7 +14,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.geometry import Array, BoolArray, IntArray, motion_of, product
+from legcal.geometry import Array, IntArray, motion_of, product
+from legcal.machine.closing import close_at, closure_equations
 from legcal.machine.equations import (
     constraints_at,
     describe_worst,
@@ -32,12 +33,15 @@ from legcal.machine.mobility import (
     excludes_singularity,
     leg_scale,
 )
-from legcal.machine.model import Machine, leg_vectors
-from legcal.machine.solver import Equations, Retraction, moved, newton, solve, walk_in_steps
+from legcal.machine.model import (
+    Machine,
+    leg_vectors,
+    platform_pose,
+    readings_at,
+    slider_columns,
+)
+from legcal.machine.solver import moved, newton, solve, walk_in_steps
 
-POSE_TOLERANCE = 1e-11  # [m, rad]: of a pose at which the chain is closed
-AXIS_TOLERANCE = 2e-3  # [m, rad]: what axes may be off; no other posture of a leg is as near
-RESTARTS = 60
 CONTRACTION = 0.5  # of the step before; of 1 rad or a leg length for the first
 TOLERANCE = 1e-13  # of a leg length
 MIN_STEP = 1.0 / 4096.0  # of the way from known readings to the wanted ones
@@ -273,33 +277,6 @@ def pose_differences(
     return displacement, np.asarray(Rotation.from_matrix(between).magnitude())
 
 
-def readings_at(machine: Machine, T_base_platform: RigidTransform) -> Array:
-    """Return the joint value of every leg at a pose, q = sign (|AB| - q0), (n_legs,) [m]."""
-    lengths = np.linalg.norm(leg_vectors(machine, T_base_platform), axis=1)
-    return np.asarray(machine.sign * (lengths - machine.q0))
-
-
-def platform_pose(machine: Machine, configuration: Array) -> RigidTransform:
-    """Return T_base_platform at a configuration."""
-    return machine.chain.pose(configuration, machine.base, machine.platform)
-
-
-def slider_columns(machine: Machine, legs: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Return where the sliders of some legs stand in configurations and in tangent vectors."""
-    names = [machine.legs[j].prismatic for j in legs]
-    joints = [name for name in names if name is not None]
-    chain = machine.chain
-    return [chain.q_index(j) for j in joints], [chain.v_index(j) for j in joints]
-
-
-def joint_values(machine: Machine, configuration: Array) -> Array:
-    """Return the joint value of every leg at a configuration, zero for rods, (n_legs,) [m]."""
-    values = np.zeros(machine.n_legs)
-    sliding = [j for j, leg in enumerate(machine.legs) if leg.kind is not LegKind.CONSTANT]
-    values[sliding] = configuration[slider_columns(machine, sliding)[0]]
-    return values
-
-
 class SolvedPoses(NamedTuple):
     """Platform poses of R_e in R_b at which legs miss least."""
 
@@ -372,162 +349,6 @@ def project_pose(
     if found.worst[0] <= 1e-9 * scale:
         return projected, None
     return projected, describe_worst(machine, constraints_at(machine, projected))
-
-
-def close_at(
-    machine: Machine,
-    T_base_platform: RigidTransform,
-    start: Array | None = None,
-    restarts: int = RESTARTS,
-    *,
-    exact: bool = True,
-) -> Array:
-    """Return the configuration (nq,) that closes every loop to 1e-12 m with the platform at a pose.
-
-    Sliders are set from the distance of their joints, so that no leg is ever flipped; joint angles
-    are solved from ``start``, and from seeded random ones for legs that do not close from there.
-    The pose must meet the constraints. Where it is not *exact* it need meet them but for rounding:
-    in the end the platform is free too, and moves by what the axes of the model are off.
-
-    Raises
-    ------
-    DidNotConverge
-        If a leg does not close, naming its closure and the distance left.
-    """
-    chain, tolerance = machine.chain, POSE_TOLERANCE if exact else AXIS_TOLERANCE
-    angles = np.zeros(chain.nv, dtype=np.bool_)
-    for joint in machine.urdf.joints.values():
-        if joint.type in ("revolute", "continuous"):
-            angles[chain.v_index(joint.name)] = True
-    # Gaps of legs shorter than a metre count in leg lengths: beside angles in radians they would
-    # weigh too little to be closed, and AXIS_TOLERANCE would be a large part of a leg.
-    metre = min(1.0, leg_scale(machine, T_base_platform))
-    configuration = _placed(machine, T_base_platform, start, tolerance)
-    rng = np.random.default_rng(20020701)
-    for _ in range(restarts):
-        equations, retract = _closure_equations(machine, T_base_platform, metre, angles)
-        found = solve(equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True)
-        configuration = found.points[0]
-        stuck = np.abs(found.values[0]) > AXIS_TOLERANCE
-        if not stuck.any():
-            break
-        columns = np.zeros(chain.nv, dtype=np.bool_)
-        columns[angles] = np.abs(found.jacobian[0, stuck]).max(axis=0) > 1e-9
-        step = np.where(columns, rng.uniform(-np.pi, np.pi, chain.nv), 0.0)
-        configuration = chain.integrate(configuration, step)
-    everything = _closure_equations(machine, T_base_platform, 1.0, angles)
-    left = everything[0](configuration[None])[0][0]
-    if np.abs(left).max(initial=0.0) >= CLOSED:
-        angles[slider_columns(machine, range(machine.n_legs))[1]] = True  # and sliders
-        pose = T_base_platform if exact else None
-        every = angles if exact else np.ones(chain.nv, dtype=np.bool_)
-        equations, retract = _closure_equations(machine, pose, 1.0, every)
-        found = solve(equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True)
-        configuration, left = found.points[0], found.values[0]
-    off = _off(machine, T_base_platform, configuration)
-    if np.abs(left).max(initial=0.0) >= CLOSED:
-        problem = f"{worst_closure(machine, left)}, needed less than 1e-12 m"
-    elif max(off) > tolerance:
-        problem = f"the platform went {_away(off)} away, needed a pose that the legs allow"
-    else:
-        return configuration
-    raise _not_closed(machine, T_base_platform, problem)
-
-
-def worst_closure(machine: Machine, residual: Array) -> str:
-    """Return which closure is most open, in words."""
-    row = 0
-    worst = (0.0, "the platform pose")
-    for closure in machine.chain.closures:
-        gap = float(np.abs(residual[row : row + closure.rows]).max())
-        worst = max(worst, (gap, f"'{closure.frame_1}' and '{closure.frame_2}'"))
-        row += closure.rows
-    return f"{worst[1]} stay {worst[0]:.3g} m apart"
-
-
-def _placed(
-    machine: Machine, T_base_platform: RigidTransform, start: Array | None, tolerance: float
-) -> Array:
-    """Return a configuration with the platform and the sliders set."""
-    chain = machine.chain
-    configuration = chain.neutral() if start is None else start.copy()
-    if machine.platform_joint is not None:
-        configuration = chain.with_platform(
-            configuration,
-            machine.platform_joint,
-            machine.base,
-            machine.platform,
-            T_base_platform,
-        )
-        off = _off(machine, T_base_platform, configuration)
-        if max(off) > tolerance:
-            raise _not_closed(
-                machine,
-                T_base_platform,
-                f"the virtual joint '{machine.platform_joint}' leaves it {_away(off)} away, "
-                "needed a joint that reaches it",
-            )
-    q = readings_at(machine, T_base_platform)
-    sliding = [j for j, leg in enumerate(machine.legs) if leg.prismatic is not None]
-    configuration[slider_columns(machine, sliding)[0]] = q[sliding]
-    return configuration
-
-
-def _closure_equations(
-    machine: Machine, T: RigidTransform | None, metre: float, free: BoolArray | IntArray
-) -> tuple[Equations, Retraction]:
-    """Return the closures by free tangent coordinates; the platform fixed at T where legs carry it.
-
-    Lengths are divided by ``metre``.
-    """
-    chain = machine.chain
-    weld = T if machine.platform_joint is None else None
-    weights = np.ones(chain.n_rows + 6 * (weld is not None))
-    row = 0
-    for rows in [closure.rows for closure in chain.closures] + [6]:
-        weights[row : row + 3] = 1.0 / metre
-        row += rows
-
-    def equations(points: Array) -> tuple[Array, Array]:
-        residual, jacobian = chain.linearize(points[0])
-        if weld is not None:
-            of_weld, by_joints = chain.welded(machine.base, machine.platform, weld)
-            residual = np.concatenate([residual, of_weld])
-            jacobian = np.concatenate([jacobian, by_joints])
-        return (residual * weights)[None], (jacobian[:, free] * weights[:, None])[None]
-
-    def retract(points: Array, step: Array) -> Array:
-        full = np.zeros(chain.nv)
-        full[free] = step[0]
-        return chain.integrate(points[0], full)[None]
-
-    return equations, retract
-
-
-def _off(
-    machine: Machine, T_base_platform: RigidTransform, configuration: Array
-) -> tuple[float, float]:
-    """Return how far the platform is from where it should be [m], and how far turned [rad]."""
-    R, t = machine.chain.placement(configuration, machine.base, machine.platform)
-    matrix = T_base_platform.as_matrix()
-    chord = float(np.linalg.norm(R - matrix[:3, :3]))  # of small turns as good as of large ones
-    turn = 2.0 * float(np.arcsin(min(1.0, chord / np.sqrt(8.0))))
-    return float(np.linalg.norm(t - matrix[:3, 3])), turn
-
-
-def _away(off: tuple[float, float]) -> str:
-    """Return a distance and a turn in words, without the one that is rounding beside the other."""
-    said = f"{1e3 * off[0]:.3g} mm", f"{np.degrees(off[1]):.3g} deg"
-    return " and ".join(text for text, x in zip(said, off, strict=True) if x > 1e-6 * max(off))
-
-
-def _not_closed(machine: Machine, T_base_platform: RigidTransform, problem: str) -> DidNotConverge:
-    """Return the error of a pose at which the chain does not close."""
-    place = "(" + ", ".join(f"{1e3 * x:.1f}" for x in T_base_platform.translation) + ")"
-    return DidNotConverge(
-        f"{machine.yaml_path}: the legs could not be closed with the platform at {place} mm: "
-        f"{problem}; check that the legs reach this pose (legcal.home)."
-    )
 
 
 def follow(
@@ -648,7 +469,7 @@ def _closed_from(
     machine: Machine, configuration: Array, free: IntArray
 ) -> tuple[Array | None, Array]:
     """Return the configuration closed with the motors fixed, None if not near, and its Jacobian."""
-    equations, retract = _closure_equations(machine, None, 1.0, free)
+    equations, retract = closure_equations(machine, None, 1.0, free)
     found = newton(
         equations, retract, configuration, tolerance=0.01 * CLOSED, contraction=CONTRACTION
     )

@@ -18,7 +18,6 @@ from legcal.machine.diagnostics import diagnose, proposal_notes
 from legcal.machine.equations import leg_equations
 from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home
-from legcal.machine.kinematics import platform_pose, slider_columns
 from legcal.machine.leg import (
     MAX_LEGS,
     MAX_LENGTH,
@@ -31,7 +30,7 @@ from legcal.machine.leg import (
     LegKind,
 )
 from legcal.machine.mobility import CONFIGURATIONS, generic_configurations, mobility
-from legcal.machine.model import Machine, leg_vectors
+from legcal.machine.model import Machine, leg_vectors, platform_pose, slider_columns
 from legcal.machine.parameters import n_frame_legs
 from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.spanning_tree import Source

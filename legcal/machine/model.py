@@ -153,6 +153,33 @@ def leg_vectors(machine: Machine, T_base_platform: RigidTransform) -> Array:
     return np.asarray(machine.B_platform @ matrix[:3, :3].T + matrix[:3, 3] - machine.A_base)
 
 
+def readings_at(machine: Machine, T_base_platform: RigidTransform) -> Array:
+    """Return the joint value of every leg at a pose, q = sign (|AB| - q0), (n_legs,) [m]."""
+    lengths = np.linalg.norm(leg_vectors(machine, T_base_platform), axis=1)
+    return np.asarray(machine.sign * (lengths - machine.q0))
+
+
+def platform_pose(machine: Machine, configuration: Array) -> RigidTransform:
+    """Return T_base_platform at a configuration."""
+    return machine.chain.pose(configuration, machine.base, machine.platform)
+
+
+def slider_columns(machine: Machine, legs: Sequence[int]) -> tuple[list[int], list[int]]:
+    """Return where the sliders of some legs stand in configurations and in tangent vectors."""
+    names = [machine.legs[j].prismatic for j in legs]
+    joints = [name for name in names if name is not None]
+    chain = machine.chain
+    return [chain.q_index(j) for j in joints], [chain.v_index(j) for j in joints]
+
+
+def joint_values(machine: Machine, configuration: Array) -> Array:
+    """Return the joint value of every leg at a configuration, zero for rods, (n_legs,) [m]."""
+    values = np.zeros(machine.n_legs)
+    sliding = [j for j, leg in enumerate(machine.legs) if leg.kind is not LegKind.CONSTANT]
+    values[sliding] = configuration[slider_columns(machine, sliding)[0]]
+    return values
+
+
 def describe(machine: Machine) -> dict[str, Any]:
     """Return the document of ``legcal inspect --json``: legs with types, frames, mobility.
 

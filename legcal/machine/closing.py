@@ -1,0 +1,173 @@
+"""The joints of all legs where the platform is known: the chain closed at a pose.
+
+Sliders are set, joint angles solved from the closures of the URDF's tree in Pinocchio.
+"""
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import DidNotConverge
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.machine.mobility import CLOSED, leg_scale
+from legcal.machine.model import Machine, readings_at, slider_columns
+from legcal.machine.solver import Equations, Retraction, solve
+
+POSE_TOLERANCE = 1e-11  # [m, rad]: of a pose at which the chain is closed
+AXIS_TOLERANCE = 2e-3  # [m, rad]: what axes may be off; no other posture of a leg is as near
+RESTARTS = 60
+
+
+def close_at(
+    machine: Machine,
+    T_base_platform: RigidTransform,
+    start: Array | None = None,
+    restarts: int = RESTARTS,
+    *,
+    exact: bool = True,
+) -> Array:
+    """Return the configuration (nq,) that closes every loop to 1e-12 m with the platform at a pose.
+
+    Sliders are set from the distance of their joints, so that no leg is ever flipped; joint angles
+    are solved from ``start``, and from seeded random ones for legs that do not close from there.
+    The pose must meet the constraints. Where it is not *exact* it need meet them but for rounding:
+    in the end the platform is free too, and moves by what the axes of the model are off.
+
+    Raises
+    ------
+    DidNotConverge
+        If a leg does not close, naming its closure and the distance left.
+    """
+    chain, tolerance = machine.chain, POSE_TOLERANCE if exact else AXIS_TOLERANCE
+    angles = np.zeros(chain.nv, dtype=np.bool_)
+    for joint in machine.urdf.joints.values():
+        if joint.type in ("revolute", "continuous"):
+            angles[chain.v_index(joint.name)] = True
+    # Gaps of legs shorter than a metre count in leg lengths: beside angles in radians they would
+    # weigh too little to be closed, and AXIS_TOLERANCE would be a large part of a leg.
+    metre = min(1.0, leg_scale(machine, T_base_platform))
+    configuration = _placed(machine, T_base_platform, start, tolerance)
+    rng = np.random.default_rng(20020701)
+    for _ in range(restarts):
+        equations, retract = closure_equations(machine, T_base_platform, metre, angles)
+        found = solve(equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True)
+        configuration = found.points[0]
+        stuck = np.abs(found.values[0]) > AXIS_TOLERANCE
+        if not stuck.any():
+            break
+        columns = np.zeros(chain.nv, dtype=np.bool_)
+        columns[angles] = np.abs(found.jacobian[0, stuck]).max(axis=0) > 1e-9
+        step = np.where(columns, rng.uniform(-np.pi, np.pi, chain.nv), 0.0)
+        configuration = chain.integrate(configuration, step)
+    everything = closure_equations(machine, T_base_platform, 1.0, angles)
+    left = everything[0](configuration[None])[0][0]
+    if np.abs(left).max(initial=0.0) >= CLOSED:
+        angles[slider_columns(machine, range(machine.n_legs))[1]] = True  # and sliders
+        pose = T_base_platform if exact else None
+        every = angles if exact else np.ones(chain.nv, dtype=np.bool_)
+        equations, retract = closure_equations(machine, pose, 1.0, every)
+        found = solve(equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True)
+        configuration, left = found.points[0], found.values[0]
+    off = _off(machine, T_base_platform, configuration)
+    if np.abs(left).max(initial=0.0) >= CLOSED:
+        problem = f"{worst_closure(machine, left)}, needed less than 1e-12 m"
+    elif max(off) > tolerance:
+        problem = f"the platform went {_away(off)} away, needed a pose that the legs allow"
+    else:
+        return configuration
+    raise _not_closed(machine, T_base_platform, problem)
+
+
+def worst_closure(machine: Machine, residual: Array) -> str:
+    """Return which closure is most open, in words."""
+    row = 0
+    worst = (0.0, "the platform pose")
+    for closure in machine.chain.closures:
+        gap = float(np.abs(residual[row : row + closure.rows]).max())
+        worst = max(worst, (gap, f"'{closure.frame_1}' and '{closure.frame_2}'"))
+        row += closure.rows
+    return f"{worst[1]} stay {worst[0]:.3g} m apart"
+
+
+def _placed(
+    machine: Machine, T_base_platform: RigidTransform, start: Array | None, tolerance: float
+) -> Array:
+    """Return a configuration with the platform and the sliders set."""
+    chain = machine.chain
+    configuration = chain.neutral() if start is None else start.copy()
+    if machine.platform_joint is not None:
+        configuration = chain.with_platform(
+            configuration,
+            machine.platform_joint,
+            machine.base,
+            machine.platform,
+            T_base_platform,
+        )
+        off = _off(machine, T_base_platform, configuration)
+        if max(off) > tolerance:
+            raise _not_closed(
+                machine,
+                T_base_platform,
+                f"the virtual joint '{machine.platform_joint}' leaves it {_away(off)} away, "
+                "needed a joint that reaches it",
+            )
+    q = readings_at(machine, T_base_platform)
+    sliding = [j for j, leg in enumerate(machine.legs) if leg.prismatic is not None]
+    configuration[slider_columns(machine, sliding)[0]] = q[sliding]
+    return configuration
+
+
+def closure_equations(
+    machine: Machine, T: RigidTransform | None, metre: float, free: BoolArray | IntArray
+) -> tuple[Equations, Retraction]:
+    """Return the closures by free tangent coordinates; the platform fixed at T where legs carry it.
+
+    Lengths are divided by ``metre``.
+    """
+    chain = machine.chain
+    weld = T if machine.platform_joint is None else None
+    weights = np.ones(chain.n_rows + 6 * (weld is not None))
+    row = 0
+    for rows in [closure.rows for closure in chain.closures] + [6]:
+        weights[row : row + 3] = 1.0 / metre
+        row += rows
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        residual, jacobian = chain.linearize(points[0])
+        if weld is not None:
+            of_weld, by_joints = chain.welded(machine.base, machine.platform, weld)
+            residual = np.concatenate([residual, of_weld])
+            jacobian = np.concatenate([jacobian, by_joints])
+        return (residual * weights)[None], (jacobian[:, free] * weights[:, None])[None]
+
+    def retract(points: Array, step: Array) -> Array:
+        full = np.zeros(chain.nv)
+        full[free] = step[0]
+        return chain.integrate(points[0], full)[None]
+
+    return equations, retract
+
+
+def _off(
+    machine: Machine, T_base_platform: RigidTransform, configuration: Array
+) -> tuple[float, float]:
+    """Return how far the platform is from where it should be [m], and how far turned [rad]."""
+    R, t = machine.chain.placement(configuration, machine.base, machine.platform)
+    matrix = T_base_platform.as_matrix()
+    chord = float(np.linalg.norm(R - matrix[:3, :3]))  # of small turns as good as of large ones
+    turn = 2.0 * float(np.arcsin(min(1.0, chord / np.sqrt(8.0))))
+    return float(np.linalg.norm(t - matrix[:3, 3])), turn
+
+
+def _away(off: tuple[float, float]) -> str:
+    """Return a distance and a turn in words, without the one that is rounding beside the other."""
+    said = f"{1e3 * off[0]:.3g} mm", f"{np.degrees(off[1]):.3g} deg"
+    return " and ".join(text for text, x in zip(said, off, strict=True) if x > 1e-6 * max(off))
+
+
+def _not_closed(machine: Machine, T_base_platform: RigidTransform, problem: str) -> DidNotConverge:
+    """Return the error of a pose at which the chain does not close."""
+    place = "(" + ", ".join(f"{1e3 * x:.1f}" for x in T_base_platform.translation) + ")"
+    return DidNotConverge(
+        f"{machine.yaml_path}: the legs could not be closed with the platform at {place} mm: "
+        f"{problem}; check that the legs reach this pose (legcal.home)."
+    )
