@@ -22,7 +22,6 @@ from .joint_fit.factors import average_images as average_images
 from .joint_fit.fit import bound as bound
 from .joint_fit.fit import refine as refine
 from .joint_fit.parameter_choices import Choices as Choices
-from .joint_fit.platform import PlatformError as PlatformError
 from .joint_fit.platform import poses_at_readings as poses_at_readings
 from .joint_fit.problem import build_fit as build_fit
 from .joint_fit.solution import Solution as Solution
