@@ -89,7 +89,7 @@ def test_sigmas_are_those_of_opencv() -> None:
     assert np.abs((ours - theirs) / sigmas(found)).max() < 0.5  # other weights, the same data
 
 
-def test_claims_of_corners_are_believed_relative_to_each_other() -> None:
+def test_claims_of_corners_count_relative_to_each_other() -> None:
     """Half of the corners three times as noisy, and said so: the answer is as good as its sigma."""
     seen = seen_corners(CAMERAS["plumb_bob"], 12, 11)
     rng = np.random.default_rng(2)

@@ -445,8 +445,8 @@ def test_gamma_of_a_camera_is_found_by_its_outlines(session: HexapodSession) -> 
 
 def test_view_whose_gamma_is_given_keeps_it(session: HexapodSession) -> None:
     views = without_gamma(session.measurements).views
-    told = replace(views[0], camera=PINHOLE)
-    measurements = replace(session.measurements, views=(told, *views[1:]))
+    given = replace(views[0], camera=PINHOLE)
+    measurements = replace(session.measurements, views=(given, *views[1:]))
     found = refine(session.legs, measurements, encoded(session), disturbed_start(session))
     (gamma,) = found.gammas
     assert gamma.views == ("c2", "c3")

@@ -216,12 +216,12 @@ class NormalEquations:
         return inverse_on_range(self.V)
 
     @property
-    def follow(self) -> Array:
-        """How elements follow the kept unknowns inside the constraints, (n_elements, f, n_kept)."""
+    def elements_by_kept(self) -> Array:
+        """Derivative of elements at their minimum by kept unknowns, (n_elements, f, n_kept)."""
         return np.asarray(-self.V_inverse @ np.moveaxis(self.W, 0, 2))
 
-    def inside(self, J_element: Array, element: IntArray) -> Array:
-        """Return derivatives (n, q, f) inside the constraints from those by elements (n, q, d)."""
+    def along_constraints(self, J_element: Array, element: IntArray) -> Array:
+        """Return derivatives (n, q, f) along what constraints leave, from (n, q, d) by elements."""
         return J_element if self.tangent is None else J_element @ self.tangent.Z[element]
 
     def reduced(self) -> Array:

@@ -83,7 +83,9 @@ def _reduced_jacobian(
     if normal.tangent is not None:
         G = G + rows.J_element @ np.moveaxis(normal.tangent.Q, 0, 2)[where.element]
     return np.asarray(
-        G + normal.inside(rows.J_element, where.element) @ normal.follow[where.element]
+        G
+        + normal.along_constraints(rows.J_element, where.element)
+        @ normal.elements_by_kept[where.element]
     )
 
 
@@ -106,7 +108,7 @@ def explained_share(
     )
     if where.element is None:
         return np.asarray(share)
-    J_element = normal.inside(rows.J_element, where.element)
+    J_element = normal.along_constraints(rows.J_element, where.element)
     return np.asarray(
         share + J_element @ normal.V_inverse[where.element] @ np.swapaxes(J_element, -1, -2)
     )
@@ -184,7 +186,7 @@ def score_test(
         score += np.einsum("nqc,nq->c", v, rows.r)
         left += np.einsum("nqc,nqd->cd", v, v)
         if where.element is not None:
-            J_element = normal.inside(rows.J_element, where.element)
+            J_element = normal.along_constraints(rows.J_element, where.element)
             np.add.at(by_element, where.element, np.swapaxes(J_element, 1, 2) @ v)
     following, covariance = normal.V_inverse @ by_element, normal.kept_covariance()
     elements = (normal.V_inverse @ normal.g_elements[..., None])[..., 0]

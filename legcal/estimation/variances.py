@@ -20,7 +20,7 @@ from scipy.linalg import solve_triangular
 
 from legcal.geometry import Array, BoolArray, IntArray
 
-_SETTLED = 1e-6  # change of the log-likelihood
+_CONVERGED = 1e-6  # change of the log-likelihood
 _MAX_STEPS = 50
 _HALVINGS = 30
 
@@ -104,7 +104,7 @@ def estimate_variances(effects: Effects, least_gain: float) -> tuple[Array, floa
                 break
         # Even steps like this to the end would not gain enough.
         hopeless = best < 0.25 * least_gain and best - before < least_gain / (8.0 * _MAX_STEPS)
-        if best - before < _SETTLED or hopeless:
+        if best - before < _CONVERGED or hopeless:
             break
     gain = 2.0 * best
     return (variances if gain > least_gain else np.zeros_like(variances)), gain

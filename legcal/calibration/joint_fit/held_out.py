@@ -206,7 +206,7 @@ def _covariance(outlines: NormalEquations, readings: NormalEquations, of_fit: Ar
 
     Each has its own noise, and both follow the errors of the fit.
     """
-    apart = outlines.follow - readings.follow
+    apart = outlines.elements_by_kept - readings.elements_by_kept
     inside = outlines.V_inverse + readings.V_inverse + apart @ of_fit @ np.swapaxes(apart, 1, 2)
     Z = _motions(outlines)
     return np.asarray(Z @ inside @ np.swapaxes(Z, 1, 2))
