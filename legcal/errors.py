@@ -16,7 +16,7 @@ _CONTROL = re.compile(  # not printable, or turning the direction of what is
 _LONG_WORD = re.compile(rf"\S{{{MAX_WORD + 1},}}")
 _MANY_ALIKE = 10  # problems of one kind: a message that has more spells out the first few
 _SPELT_OUT = 5
-_PARTICULAR = re.compile(r"'[^']*'|\S*\d\S*")  # what differs between problems of one kind
+_PARTICULAR = re.compile(r"'[^']*'|[^\s\d]*+\d\S*")  # what differs between problems of one kind
 
 
 class LegcalError(Exception):

@@ -321,7 +321,7 @@ BOMB = "a: &a [1,1,1,1,1,1,1,1,1]\n" + "".join(
         (kalibr(intrinsics=[1290, 1290, 2000, 300]), ("cx = 2000", "1024 x 768")),
         ({**kalibr(), "cam1": kalibr()["cam0"]}, ("2 cameras", "cam0, cam1", "needed one")),
         ({"fx": 1, "fy": 2}, ("the keys fx, fy", "ROS camera_info")),
-        ([1, 2], ("[1, 2]", "'key: value'")),
+        ([1, 2], ("a list", "'key: value'")),
         ("", ("nothing", "'key: value'")),
         ("a: [1, 2", ("line 1, column 9",)),
         ("a: 1\nb: 2\na: 3", ("line 3, column 1", "'a' twice")),

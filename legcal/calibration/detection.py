@@ -33,7 +33,16 @@ from legcal.data import (
     write_observations,
 )
 from legcal.errors import OutOfResources, UsageError
-from legcal.files import Document, OutputKind, check_destination, path_problem, result_folder
+from legcal.files import (
+    MAX_IMAGE,
+    Document,
+    OutputKind,
+    check_destination,
+    path_problem,
+    read_bytes,
+    read_json,
+    result_folder,
+)
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Cylinder
 from legcal.perception import HIDDEN, OUTSIDE, PartMarks, draw, marks_of_image, short_reason
@@ -343,12 +352,12 @@ def check_detection_destination(destination: Path, dataset: Path | None) -> None
     table = destination / OBSERVATIONS_NAME
     written = _earlier(destination).get("table")
     with suppress(OSError):
-        content = table.read_bytes()
+        content = read_bytes(table, MAX_IMAGE)
         if written == hashlib.sha256(content).hexdigest():
             return
         if dataset is not None:
             with suppress(OSError):
-                if (dataset / OBSERVATIONS_NAME).read_bytes() == content:
+                if read_bytes(dataset / OBSERVATIONS_NAME, MAX_IMAGE) == content:
                     return
         raise UsageError(
             f"{table}: the detection could not be written: found a table that was changed since "
@@ -375,7 +384,7 @@ def write_detection(detection: Detection, destination: Path, run: Run, progress:
         files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
         record = {
             **detection.document,
-            "table": hashlib.sha256(table.read_bytes()).hexdigest(),
+            "table": hashlib.sha256(read_bytes(table, MAX_IMAGE)).hexdigest(),
             "files": [*files, DETECTION.marker],
         }
         (folder / DETECTION.marker).write_text(json.dumps(record, indent=1) + "\n", "utf-8")
@@ -449,7 +458,7 @@ def _earlier(destination: Path) -> dict[str, Any]:
     """Return the document of an earlier detection in a folder; empty if there is none."""
     if not DETECTION.is_in(destination):
         return {}
-    found: dict[str, Any] = json.loads((destination / DETECTION.marker).read_bytes())
+    found: dict[str, Any] = read_json(destination / DETECTION.marker)
     return found
 
 

@@ -24,7 +24,7 @@ from legcal.data.outlines import (
     no_outlines,
     write_observations,
 )
-from legcal.files import FileSchema, write_atomically
+from legcal.files import MAX_DOCUMENT, MAX_IMAGE, FileSchema, read_bytes, write_atomically
 from legcal.geometry import BoolArray, IntArray
 from legcal.version import __version__
 from legcal.vision import board_document
@@ -146,10 +146,10 @@ def _files(dataset: Dataset) -> list[bytes]:
 
 
 def _digest(path: Path) -> bytes:
-    """Return the SHA-256 of a file; that of a file which is not there is empty."""
+    """Return the SHA-256 of a file; that of a file which cannot be read is empty."""
     try:
-        return hashlib.sha256(path.read_bytes()).digest()
-    except FileNotFoundError:
+        return hashlib.sha256(read_bytes(path, MAX_IMAGE)).digest()
+    except OSError:
         return b""
 
 
@@ -192,7 +192,7 @@ def _write_entry(folder: Path, entry: Mapping[str, object]) -> None:
 def _read_entry(path: Path) -> CacheEntry | None:
     """Return the fingerprint file; one that cannot be read matches nothing."""
     try:
-        content = path.read_bytes()
+        content = read_bytes(path, MAX_DOCUMENT)
         entry = CacheEntry.model_validate_json(content)
     except FileNotFoundError:
         return None

@@ -249,15 +249,19 @@ def read_measurements(
 def _refuse_images(table: Table, images: Sequence[str], folder: Path) -> None:
     """Refuse images that are named twice or lie outside the dataset folder."""
     first: dict[Path, int] = {}
+    targets: dict[str, Path | str] = {}  # of each image, or what is wrong with it
     for row, image in enumerate(images):
         if not image:
             continue
-        problem = path_problem(folder, image)
-        if problem:
+        if image not in targets:
+            problem = path_problem(folder, image)
+            targets[image] = problem or (folder / image).resolve()
+        target = targets[image]
+        if isinstance(target, str):
             needed = "a relative path inside it; move the image there"
-            table.refuse(row, problem, needed, "image", what=f"image {image}")
+            table.refuse(row, target, needed, "image", what=f"image {image}")
             continue
-        earlier = first.setdefault((folder / image).resolve(), row)
+        earlier = first.setdefault(target, row)
         if earlier != row:
             found = f"it also in {place_in(table.where[earlier])}"
             needed = "one row an image; remove one of them"

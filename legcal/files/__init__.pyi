@@ -25,6 +25,14 @@ from .quantity import Quantity as Quantity
 from .quantity import parse_quantity as parse_quantity
 from .quantity import read_prior as read_prior
 from .quantity import read_value as read_value
+from .reading import MAX_DOCUMENT as MAX_DOCUMENT
+from .reading import MAX_IMAGE as MAX_IMAGE
+from .reading import MAX_MESH as MAX_MESH
+from .reading import MAX_TEXT as MAX_TEXT
+from .reading import open_regular as open_regular
+from .reading import read_bytes as read_bytes
+from .reading import read_json as read_json
+from .schema import NAME_NEEDED as NAME_NEEDED
 from .schema import Document as Document
 from .schema import FileSchema as FileSchema
 from .schema import Name as Name
@@ -33,6 +41,7 @@ from .schema import PlainName as PlainName
 from .schema import Version as Version
 from .schema import closest as closest
 from .schema import describe as describe
+from .schema import is_name as is_name
 from .schema import is_plain_name as is_plain_name
 from .schema import parse_yaml as parse_yaml
 from .schema import plain_name as plain_name

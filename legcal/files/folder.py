@@ -8,7 +8,6 @@ looked at again.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import tempfile
@@ -18,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from legcal.errors import DatasetError, LegcalError, OutOfResources, UsageError
+from legcal.files.reading import read_json
 from legcal.files.schema import parse_yaml, read_text
 from legcal.signals import held_back_signals, raise_if_stopped
 
@@ -120,8 +120,8 @@ class OutputKind:
     def is_in(self, folder: Path) -> bool:
         """Say whether a folder holds an output of this kind that legcal wrote."""
         try:
-            found = json.loads((folder / self.marker).read_bytes())
-        except (OSError, ValueError, RecursionError):
+            found = read_json(folder / self.marker)
+        except (OSError, ValueError):
             return False
         return isinstance(found, dict) and self.key in found
 

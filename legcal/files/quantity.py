@@ -15,7 +15,7 @@ LENGTH: Mapping[str, float] = {"mm": 1e-3, "um": 1e-6, "nm": 1e-9, "cm": 1e-2, "
 ANGLE: Mapping[str, float] = {"deg": math.pi / 180.0, "mrad": 1e-3, "rad": 1.0}
 PIXELS: Mapping[str, float] = {"px": 1.0}
 
-_NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z]*)\s*"
+_NUMBER = r"\s*([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z]*)\s*"
 _VALUE = re.compile(_NUMBER, re.ASCII)
 _PRIOR = re.compile(rf"{_NUMBER}(?:±|\+/?-){_NUMBER}", re.ASCII)
 

@@ -22,10 +22,13 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from legcal.errors import DatasetError
+from legcal.files.reading import MAX_TEXT, MAX_YAML, read_bytes
 
-MAX_BYTES = 4_000_000
 MAX_NODES = 100_000  # aliases let a small file stand for a tree without bound
+MAX_DEPTH = 100
+MAX_PROBLEMS = 1000  # of one file that are looked into
 _MOST_NAMES = 10  # that a hint lists
+_LONGEST_WORD = 100  # for which one that is like it is looked for
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 
 _NEEDED = {
@@ -45,13 +48,26 @@ _NEEDED = {
 }
 
 
+NAME_NEEDED = "printable characters without spaces at the ends, the first none of = + - @"
+
+
+def is_name(name: str) -> bool:
+    """Say whether tables and messages can show a name as it is.
+
+    What begins like a formula is run as one by programs that open tables.
+    """
+    return (
+        bool(name)
+        and name.isprintable()
+        and name == name.strip()
+        and not name.startswith(("=", "+", "-", "@"))
+    )
+
+
 def _one_plain_line(name: str) -> str:
-    """Refuse a name that a table or a message could not show as it is."""
-    if not name or name != name.strip() or not name.isprintable():
-        raise ValueError(
-            f"found the name {name!r}, needed printable characters without spaces at the ends; "
-            "rename it."
-        )
+    """Refuse a name that tables and messages cannot show as it is."""
+    if not is_name(name):
+        raise ValueError(f"found the name {describe(name)}, needed {NAME_NEEDED}; rename it.")
     return name
 
 
@@ -105,7 +121,34 @@ class Document(BaseModel):
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML: keys are text, repeated keys are refused, 2e-6 is a number and 6:25 is none."""
+    """Safe YAML: keys are text, repeated keys are refused, 2e-6 is a number and 6:25 is none.
+
+    Values are counted while they are read: merge keys and lists can name more than memory holds.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        super().__init__(stream)
+        self._n_nodes = self._n_merged = self._depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        self._n_nodes += 1
+        self._depth += 1
+        if self._n_nodes > MAX_NODES:
+            raise _TooMuch(f"more than {MAX_NODES} values", "far fewer; split the file")
+        if self._depth > MAX_DEPTH:
+            raise _TooMuch(f"more than {MAX_DEPTH} levels", "far fewer; write it without nesting")
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        super().flatten_mapping(node)
+        self._n_merged += len(node.value)
+        if self._n_merged > MAX_NODES:
+            raise _TooMuch(
+                f"more than {MAX_NODES} values, some repeated through merge keys",
+                "far fewer; write it without them",
+            )
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
         node = super().compose_mapping_node(anchor)
@@ -136,12 +179,20 @@ _Loader.add_implicit_resolver(
 )
 
 
+class _TooMuch(yaml.YAMLError):
+    """What is too much in a file: found and needed, as parts of a sentence."""
+
+    def __init__(self, found: str, needed: str) -> None:
+        super().__init__(found)
+        self.needed = needed
+
+
 def _at(node: yaml.Node, found: str) -> yaml.MarkedYAMLError:
     """Return a YAML error at the place of a node."""
     return yaml.MarkedYAMLError(problem=found, problem_mark=node.start_mark)
 
 
-def read_text(path: Path, what: str) -> bytes:
+def read_text(path: Path, what: str, most: int = MAX_TEXT) -> bytes:
     """Return the bytes of a small text file."""
     remedy = f"check the path of the {what}"
     if not os.path.exists(path):  # unlike that of a Path, False where a name is too long
@@ -154,23 +205,33 @@ def read_text(path: Path, what: str) -> bytes:
             f"{remedy}."
         )
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise DatasetError(
-                f"{path}: the {what} could not be read: found {path.stat().st_size} bytes, needed "
-                f"at most {MAX_BYTES}; {remedy}."
-            )
-        return path.read_bytes()
+        size = path.stat().st_size
+        if size <= most:
+            return read_bytes(path, most)
     except OSError as error:
         raise DatasetError(
             f"{path}: the {what} could not be read: found '{error.strerror}', needed a readable "
             "file; check its permissions."
         ) from error
+    raise DatasetError(
+        f"{path}: the {what} could not be read: found {size} bytes, needed at most {most}; "
+        f"{remedy}."
+    )
 
 
 def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:
     """Return the mapping that a YAML file holds, with its keys as text."""
+    if len(content) > MAX_YAML:
+        raise DatasetError(
+            f"{path}: the {what} could not be read: found {len(content)} bytes of YAML, needed at "
+            f"most {MAX_YAML}; check the path of the {what}."
+        )
     try:
         found = yaml.load(content, Loader=_Loader)
+    except _TooMuch as error:
+        raise DatasetError(
+            f"{path}: the {what} could not be read: found {error}, needed {error.needed}."
+        ) from error
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
@@ -185,7 +246,7 @@ def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:
         ) from error
     if not isinstance(found, dict):
         raise DatasetError(
-            f"{path}: the {what} could not be read: found {describe(found)}, needed 'key: value' "
+            f"{path}: the {what} could not be read: found {_kind_of(found)}, needed 'key: value' "
             "lines; write the file again."
         )
     if _exceeds(found, MAX_NODES):
@@ -200,6 +261,14 @@ def _first_line(error: Exception) -> str:
     """Return what an exception says, on one line."""
     text = str(error).strip().splitlines()
     return f"'{text[0]}'" if text else "text nested too deeply"
+
+
+def _kind_of(value: object) -> str:
+    """Return what a foreign file holds, without showing any of it."""
+    if value is None:
+        return "nothing"
+    kinds = {str: "text", list: "a list", bool: "true or false", int: "a number", float: "a number"}
+    return kinds.get(type(value), "one value")
 
 
 def _exceeds(value: object, limit: int) -> bool:
@@ -226,7 +295,13 @@ def validate(
     try:
         return schema.model_validate(dict(found))
     except ValidationError as error:
-        raise DatasetError([_sentence(schema, e, path, prefix) for e in error.errors()]) from error
+        found_wrong = error.errors(include_url=False)
+        sentences = [_sentence(schema, e, path, prefix) for e in found_wrong[:MAX_PROBLEMS]]
+        if len(found_wrong) > MAX_PROBLEMS:
+            sentences.append(
+                f"{path}: {len(found_wrong) - MAX_PROBLEMS} more values could not be used."
+            )
+        raise DatasetError(sentences) from error
 
 
 class _Short(reprlib.Repr):
@@ -251,7 +326,7 @@ def describe(value: object) -> str:
 def closest(word: str, known: Iterable[str]) -> str:
     """Return a hint at the known word most like a given one, or the known words, ten at most."""
     names = list(known)
-    near = difflib.get_close_matches(word, names, n=1)
+    near = difflib.get_close_matches(word, names, n=1) if len(word) <= _LONGEST_WORD else []
     if near:
         return f"did you mean '{near[0]}'?"
     more = len(names) - _MOST_NAMES

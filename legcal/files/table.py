@@ -21,10 +21,12 @@ from typing import Literal
 import numpy as np
 
 from legcal.errors import DatasetError
-from legcal.files.schema import closest, describe, read_text
+from legcal.files.schema import MAX_PROBLEMS, NAME_NEEDED, closest, describe, is_name, read_text
 from legcal.geometry import Array, BoolArray
 
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+MAX_ROWS = 50_000
+MAX_COLUMNS = 300
 _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
 
 
@@ -50,7 +52,9 @@ class Column:
         if not text and self.blank:
             return ""
         if self.kind == "text":
-            return " or ".join(self.choices) if self.choices and text not in self.choices else ""
+            if self.choices:
+                return " or ".join(self.choices) if text not in self.choices else ""
+            return NAME_NEEDED if text and not is_name(text) else ""
         value = _number_in(text)
         if self.kind == "whole" and not _WHOLE.fullmatch(text):
             value = math.nan
@@ -76,7 +80,7 @@ class Table:
         self.where: list[str] = []
         self._lines: list[int] = []
         self._cells: list[list[str]] = []
-        self._problems: list[tuple[int, str]] = []
+        self._problems: list[tuple[int, str | tuple[str, ...]]] = []  # by line
 
     def __len__(self) -> int:
         return len(self.where)
@@ -88,8 +92,11 @@ class Table:
         """Return the cells of a column; empty ones of a column that is not there."""
         if name not in self.columns:
             return ("",) * len(self)
-        place = list(self.columns).index(name)
+        place = self._place(name)
         return tuple(cells[place] for cells in self._cells)
+
+    def _place(self, name: str) -> int:
+        return list(self.columns).index(name)
 
     def number(self, name: str) -> Array:
         """Return the numbers of a column, (n_rows,); NaN where there is none."""
@@ -105,17 +112,11 @@ class Table:
         where = self.where[row]
         if columns:
             where += f", column{'s' * (len(columns) > 1)} {', '.join(columns)}"
-        self._problems.append(
-            (
-                self._lines[row],
-                f"{where}: the {what or self.thing} could not be used: found {found}, needed "
-                f"{needed}.",
-            )
-        )
+        self._problems.append((self._lines[row], (where, what or self.thing, found, needed)))
 
     def refuse_cell(self, row: int, name: str, needed: str) -> None:
         """Add a sentence about one cell that is not what its column needs."""
-        text, column = self.text(name)[row], self.columns[name]
+        text, column = self._cells[row][self._place(name)], self.columns[name]
         found = describe(text) if text else "an empty cell"
         self.refuse(row, found, f"{needed}; {column.remedy}", name, what=column.what)
 
@@ -153,7 +154,11 @@ class Table:
         """Raise DatasetError with everything that is wrong, by line."""
         if self._problems:
             self._problems.sort(key=lambda problem: problem[0])
-            raise DatasetError([sentence for _, sentence in self._problems])
+            sentences = [_sentence(problem) for _, problem in self._problems[:MAX_PROBLEMS]]
+            more = len(self._problems) - MAX_PROBLEMS
+            if more > 0:
+                sentences.append(f"{self.path}: {more} more cells or rows could not be used.")
+            raise DatasetError(sentences)
 
     def _add(self, lines: Iterable[tuple[int, list[str]]], header: Sequence[str]) -> None:
         """Take the lines below the header; those that are not complete are refused."""
@@ -255,6 +260,14 @@ def format_table(header: Sequence[str], rows: Iterable[Iterable[object]]) -> str
     return text.getvalue()
 
 
+def _sentence(problem: str | tuple[str, ...]) -> str:
+    """Return what is wrong with a row, or with the file."""
+    if isinstance(problem, str):
+        return problem
+    where, what, found, needed = problem
+    return f"{where}: the {what} could not be used: found {found}, needed {needed}."
+
+
 def _number_in(text: str) -> float:
     """Return the number in a cell, NaN if it holds no finite one."""
     value = float(text) if _NUMBER.fullmatch(text) else math.nan
@@ -266,6 +279,14 @@ def place_in(where: str) -> str:
     return where.rsplit(", ", 1)[-1]
 
 
+def _too_large(path: Path, what: str) -> DatasetError:
+    """Return the refusal of a table that takes too long to check."""
+    return DatasetError(
+        f"{path}: the {what} could not be read: found more than {MAX_ROWS} rows or {MAX_COLUMNS} "
+        "columns, needed fewer; check the path, or split the file."
+    )
+
+
 def _read_lines(path: Path, what: str) -> list[tuple[int, list[str]]]:
     """Return the lines that are not blank, numbered from 1, their cells stripped.
 
@@ -274,7 +295,11 @@ def _read_lines(path: Path, what: str) -> list[tuple[int, list[str]]]:
     try:
         text = read_text(path, what).decode("utf-8-sig")
         reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+        lines: list[tuple[int, list[str]]] = []
+        for cells in reader:
+            if len(lines) > MAX_ROWS or len(cells) > MAX_COLUMNS:
+                raise _too_large(path, what)
+            lines.append((reader.line_num, [cell.strip() for cell in cells]))
     except (UnicodeDecodeError, csv.Error) as error:
         found = (
             f"the byte 0x{error.object[error.start]:02x} at place {error.start}, which is no text"

@@ -20,7 +20,7 @@ from legcal.geometry import Array
 from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.files import find_model, find_urdf, read_file, yaml_of_urdf
 from legcal.machine.mjcf import read_mjcf_source
-from legcal.machine.schema import MechanismFile, read_mechanism_file
+from legcal.machine.schema import MAX_LOOPS, MechanismFile, read_mechanism_file
 from legcal.machine.solver import solve
 from legcal.machine.spanning_tree import (
     DRAWING,
@@ -238,6 +238,11 @@ def read_loop_source(path: Path, content: bytes) -> Source:
     robot = parse_robot(path, content)
     problems = Problems(path)
     elements = [element for element in robot if element.tag in LOOP_TAGS]
+    if len(elements) > MAX_LOOPS:
+        raise ModelError(
+            f"{path}: the loops could not be closed: found {len(elements)} of them, needed at most "
+            f"{MAX_LOOPS}; give one mechanism."
+        )
     bare = checked_tree(robot, path, content, problems, travel_needed=False)
     loops = _loops(elements, bare, problems)
     motors, notes = _motors(robot, bare, problems)

@@ -19,7 +19,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import ModelError, OutOfClass
 from legcal.files import closest
 from legcal.geometry import Array, rotation_between
-from legcal.machine.schema import MechanismFile
+from legcal.machine.schema import MAX_LOOPS, MechanismFile
 from legcal.machine.spanning_tree import (
     DRAWING,
     EYE,
@@ -73,6 +73,11 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
     loops = list(reader.loops())
     motors = reader.motors()
     reader.problems.raise_if_any()
+    if len(loops) > MAX_LOOPS:
+        raise ModelError(
+            f"{path}: the loops could not be closed: found {len(loops)} of them, needed at most "
+            f"{MAX_LOOPS}; give one mechanism."
+        )
     if not loops:
         raise OutOfClass(
             f"{path}: this is not a parallel mechanism: found an MJCF file without <connect> or "

@@ -19,7 +19,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge, OutOfResources, UsageError
 from legcal.files import motion_to_xyz_quat, write_atomically
 from legcal.geometry import roll_pitch_yaw
-from legcal.machine.files import FOLDER_YAML
+from legcal.machine.files import FOLDER_YAML, read_file
 from legcal.machine.formats import XML_SUFFIXES
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import Leg, LegKind
@@ -125,7 +125,7 @@ def write_calibrated_yaml(
         there = machine if home is None else replace(machine, home=home)
         destination.write_bytes(mechanism_text(there, urdf_name).encode("utf-8"))
         return
-    text = machine.yaml_path.read_bytes().decode("utf-8")
+    text = read_file(machine.yaml_path, "mechanism file").decode("utf-8")
     if home is not None:
         text = _with_home(text, home)
     value = urdf_name if _PLAIN.fullmatch(urdf_name) else json.dumps(urdf_name)
@@ -157,7 +157,7 @@ def _is_written_down(machine: Machine) -> bool:
     """Say whether the YAML of a mechanism is one of ours, and holds of the URDF as it is."""
     if machine.yaml_path.suffix.lower() in XML_SUFFIXES:
         return False
-    content = machine.yaml_path.read_bytes().decode("utf-8")
+    content = read_file(machine.yaml_path, "mechanism file").decode("utf-8")
     document = yaml.compose(content, Loader=yaml.SafeLoader)
     stand_ins = _entry(document, "joint_name")
     has_stand_ins = isinstance(stand_ins, yaml.SequenceNode) and bool(stand_ins.value)

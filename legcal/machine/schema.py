@@ -12,6 +12,7 @@ from legcal.files import FileSchema, MotionEntry, PlainName, Version, closest, p
 from legcal.machine.files import DATASET_YAML, read_file, what_a_dataset_is_for
 
 WHAT = "mechanism file"
+MAX_LOOPS = 100
 
 
 class LegcalBlock(FileSchema):
@@ -109,6 +110,11 @@ def _contradictions(file: MechanismFile, path: Path) -> list[str]:
         for i, kind in enumerate(file.type)
         if kind not in ("3d", "6d")
     ]
+    if len(file.closed_loop) > MAX_LOOPS:
+        problems.append(
+            f"{path}: the loops could not be closed: found {len(file.closed_loop)} pairs in "
+            f"closed_loop, needed at most {MAX_LOOPS}; give one mechanism."
+        )
     if not file.closed_loop:
         problems.append(
             f"{path}: the mechanism could not be closed: found no pair in closed_loop, needed the "

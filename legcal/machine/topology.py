@@ -39,6 +39,9 @@ VIRTUAL = ("floating", "planar")
 TIE = 1e-6  # of the largest triangle
 
 
+MAX_JOINTS_OF_LEG = 12  # a sphere written as three revolutes at each end, and a slider, are seven
+
+
 def find_chains(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[LegChain]:
     """Return the legs between two links, each understood as joint, slider, joint.
 
@@ -76,6 +79,12 @@ def _paths(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[list[St
             body = connection.bodies[1 - near]
             if body == platform:
                 break
+            if len(steps) > MAX_JOINTS_OF_LEG:
+                raise OutOfClass(
+                    f"{urdf.path}: this is not a platform on legs: found a leg of more than "
+                    f"{MAX_JOINTS_OF_LEG} joints from {_name(steps[0].connection)}, needed joint, "
+                    "slider, joint; give the mechanism alone."
+                )
             onward = [c for c in at[body] if c is not connection]
             if body == base or len(onward) != 1 or id(onward[0]) in used:
                 raise OutOfClass(_not_a_chain(urdf, steps, body, base, len(onward)))

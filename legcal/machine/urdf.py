@@ -12,8 +12,13 @@ from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError
+from legcal.files import NAME_NEEDED, describe, is_name
 from legcal.geometry import Array, motion_of, roll_pitch_yaw
 from legcal.machine.files import read_file
+
+MAX_ELEMENTS = 50_000
+MAX_LINKS = 1000
+MAX_MOVING = 100
 
 
 def parse_robot(path: Path, content: bytes) -> etree._Element:
@@ -23,6 +28,11 @@ def parse_robot(path: Path, content: bytes) -> etree._Element:
         raise ModelError(
             f"{path}, line {robot.sourceline}: the URDF could not be read: found <{robot.tag}> "
             "as its outermost element, needed <robot>; give the URDF of the mechanism."
+        )
+    if not robot.get("name", "").isprintable():
+        raise ModelError(
+            f"{path}, line {robot.sourceline}: the URDF could not be read: found <robot> with the "
+            f"name {describe(robot.get('name'))}, needed printable characters; rename it."
         )
     if not robot.get("name", "").strip():
         raise ModelError(
@@ -46,6 +56,11 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
             f"{path}, line {line}: the {what} could not be read: found {error.msg}, needed "
             "well-formed XML; mend that line, or copy the file again if it was cut off."
         ) from error
+    if sum(1 for _ in root.iter()) > MAX_ELEMENTS:
+        raise ModelError(
+            f"{path}: the {what} could not be read: found more than {MAX_ELEMENTS} elements, "
+            "needed fewer; give the file of one mechanism."
+        )
     document: Any = root.getroottree().docinfo
     if document.doctype or document.internalDTD is not None:
         raise ModelError(
@@ -62,7 +77,7 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
     return root
 
 
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z", re.ASCII)
+_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\Z", re.ASCII)
 
 MAX_NUMBER = (
     1e12  # squares of larger numbers overflow; none of them is a length, an angle or a limit
@@ -189,6 +204,8 @@ def _check_names(elements: list[etree._Element], problems: Problems) -> None:
         name = element.get("name", "")
         if not name.strip():
             problems.add(element, "has no name", "name it")
+        elif not is_name(name) and (element.tag == "joint" or not name.isprintable()):
+            problems.add(element, f"has a name that is none, needed {NAME_NEEDED}", "rename it")
         elif name in seen:
             problems.add(
                 element, f"has a name that {counts[name]} of them share", "give each its own name"
@@ -311,17 +328,28 @@ def checked_tree(
     """Return the tree of a ``<robot>``, whatever else it holds; see :func:`parse_urdf`."""
     links = [e for e in robot if e.tag == "link"]
     joints = [e for e in robot if e.tag == "joint"]
+    n_moving = sum(e.get("type") != "fixed" for e in joints)
+    for found, most, what in (
+        (len(links), MAX_LINKS, "links"),
+        (len(joints), MAX_LINKS, "joints"),
+        (n_moving, MAX_MOVING, "joints that move"),
+    ):
+        if found > most:
+            raise ModelError(
+                f"{path}: the mechanism could not be read: found {found} {what}, needed at most "
+                f"{most}; give one mechanism, with fixed joints where nothing moves."
+            )
     for element in (*links, *joints):
         check_numbers(element, problems)
     root = check_tree(links, joints, problems)
-    found = {j.name: j for e in joints if (j := _joint(e, problems, travel_needed)) is not None}
+    tree = {j.name: j for e in joints if (j := _joint(e, problems, travel_needed)) is not None}
     problems.raise_if_any()
     return Urdf(
         path=path,
         content=content,
         name=robot.get("name", path.stem),
         links=tuple(str(e.get("name")) for e in links),
-        joints=found,
+        joints=tree,
         root=root,
         has_cylinders=any(e.find("visual/geometry/cylinder") is not None for e in links),
     )
@@ -382,7 +410,10 @@ def _vector(
 
 def _axis(element: etree._Element, kind: str, problems: Problems) -> Array:
     """Return the unit axis; the URDF default is x."""
-    axis = _vector(element.find("axis"), "xyz", (1.0, 0.0, 0.0))
+    part = element.find("axis")
+    if part is not None and part.get("xyz") is None and kind not in ("fixed", "floating"):
+        problems.add(element, "has an <axis> without xyz", "write its direction")
+    axis = _vector(part, "xyz", (1.0, 0.0, 0.0))
     norm = float(np.linalg.norm(axis))
     if kind in ("revolute", "continuous", "prismatic", "planar") and norm < 1e-9:
         problems.add(element, "has a zero axis, needed a direction", "correct <axis xyz>")

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from legcal.errors import OutOfResources, UsageError
+from legcal.files import open_regular
 from legcal.signals import raise_if_stopped
 from legcal.version import __version__
 
@@ -23,6 +24,7 @@ CHECKPOINT_NAME = "runs.jsonl"
 _KEY = "legcal_study"
 _VERSION = 1
 _INTERRUPTED = b"NonIpopt_Exception_Thrown"  # an interrupt that earlier versions took for a failure
+_MOST_OF_LINE = 4_000_000  # bytes
 _NEXT = "free some space and start the same command again; the runs before are kept"
 _NEXT_WITHOUT = "free some space, or give an output folder elsewhere, which keeps what is done"
 
@@ -37,6 +39,8 @@ def open_checkpoint(
     """Open the checkpoint of a study, or begin it."""
     with ExitStack() as files:
         try:
+            if os.path.lexists(path):
+                open_regular(path).close()
             writer = files.enter_context(open(path, "ab", buffering=0))
             reader = files.enter_context(open(path, "rb"))
         except OSError as error:
@@ -110,8 +114,8 @@ def is_begun(path: Path) -> bool:
     """Return whether a file holds the first line of a checkpoint, or of something else."""
     if not path.is_file():
         return False
-    with open(path, "rb") as file:
-        return file.readline().endswith(b"\n")
+    with open_regular(path) as file:
+        return file.readline(_MOST_OF_LINE).endswith(b"\n")
 
 
 def header(name: str, settings: dict[str, Any], seed: int) -> dict[str, Any]:
@@ -147,13 +151,13 @@ def _read(
     path: Path, file: BinaryIO, expected: dict[str, Any], is_record: IsRecord
 ) -> tuple[dict[int, int], int]:
     """Return where the line of each run begins, and where the last complete line ends."""
-    first = file.readline()
+    first = file.readline(_MOST_OF_LINE)
     if not first.endswith(b"\n") and _encoded(expected).startswith(first):
         return {}, 0  # empty, or killed while it was begun
     _check_header(path, first, expected)
     offsets: dict[int, int] = {}
     end, broken, number = len(first), 0, 1
-    for line in file:
+    for line in iter(lambda: file.readline(_MOST_OF_LINE), b""):
         number += 1
         if broken:
             raise _damaged(path, broken)

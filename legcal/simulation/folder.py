@@ -35,6 +35,7 @@ from legcal.files import (
     in_the_way,
     motion_to_xyz_quat,
     path_problem,
+    read_json,
     read_table,
     result_folder,
 )
@@ -195,7 +196,7 @@ def _earlier(destination: Path) -> list[Path]:
     """Return the files of the simulated dataset in a folder, and what calibration left there."""
     if not SIMULATED.is_in(destination):
         return []
-    named = json.loads((destination / TRUTH_NAME).read_bytes()).get("files", [])
+    named = read_json(destination / TRUTH_NAME).get("files", [])
     names = [name for name in named if isinstance(name, str)] if isinstance(named, list) else []
     if _is_detected(destination):
         names += [OBSERVATIONS_NAME, CACHE_NAME]
@@ -206,7 +207,7 @@ def _earlier(destination: Path) -> list[Path]:
 def _is_detected(folder: Path) -> bool:
     """Say whether a calibration left the table of outlines, and nobody gave or corrected a row."""
     try:
-        if json.loads((folder / CACHE_NAME).read_bytes()).get("given"):
+        if read_json(folder / CACHE_NAME).get("given"):
             return False
         if not os.path.exists(folder / OBSERVATIONS_NAME):
             return True

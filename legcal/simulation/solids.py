@@ -14,6 +14,7 @@ from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError
+from legcal.files import MAX_MESH, open_regular
 from legcal.geometry import Array, BoolArray, IntArray, distance_to_line, product
 from legcal.machine import (
     COAXIAL,
@@ -126,6 +127,8 @@ def _mesh(urdf_path: Path, visual: etree._Element) -> Mesh:
 
     name = visual.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
     try:
+        if (path := _found(urdf_path, name)) is not None:
+            open_regular(path, MAX_MESH).close()
         scene: Any = URDF.load(
             io.BytesIO(_alone(visual)),
             filename_handler=lambda fname: str(_found(urdf_path, fname)),

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, ModelError, OutOfClass, UsageError
+from legcal.files import MAX_TEXT, read_bytes
 from legcal.machine import (
     Leg,
     Machine,
@@ -181,7 +182,7 @@ def write_model_with(
     for path in (yaml_path, urdf_path):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_urdf(nominal, legs, urdf_path)
-    patch = UrdfPatch(urdf_path.read_bytes())
+    patch = UrdfPatch(read_bytes(urdf_path, MAX_TEXT))
     for (link, number), radius in radii.items():
         patch.set_radius(link, number, radius)
     urdf_path.write_bytes(patch.content())

@@ -15,7 +15,7 @@ from legcal.errors import DatasetError
 from legcal.files import FileSchema, parse_yaml, read_text, validate
 from legcal.geometry import Array
 from legcal.vision.camera import DISTORTION_MODELS, Camera, DistortionModel, intrinsic_names
-from legcal.vision.image_file import quiet_opencv
+from legcal.vision.image_file import quiet_opencv, size_problem
 
 Pixels = Annotated[int, Field(gt=0)]
 Sigma = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -256,6 +256,11 @@ def _checked(
     if len(distortion) not in counts:
         needed = " or ".join(str(n) for n in counts)
         problems.append(_wrong_count(path, model, len(distortion), needed))
+    if problem := size_problem(*size):
+        problems.append(
+            f"{path}: the image size could not be used: found {problem[0]}, needed {problem[1]}; "
+            "calibrate at the size of the images."
+        )
     problems += _matrix_problems(path, K, size)
     if not np.all(np.isfinite(distortion)):
         problems.append(

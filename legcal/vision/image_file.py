@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legcal.errors import DatasetError
+from legcal.files import MAX_IMAGE, read_bytes
 from legcal.geometry import Array
 from legcal.vision.camera import Camera
 
@@ -43,13 +44,21 @@ def quiet_opencv() -> Iterator[None]:
 
 _FLAGS = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
+_JPEG_SIGNATURE = b"\xff\xd8\xff"
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
 _DEEP, _FULL = 12, 16  # bits that the data in files of 16 bits may have
 _TIFF_INTEGERS = {1: "B", 3: "H", 4: "I"}  # struct's letters by the type numbers of TIFF
+_TIFF_TAGS = (256, 257, 258, 273, 279, 322, 323, 324, 325, 339)  # that are looked at
 _TIFF_FORMATS = {2: "signed", 3: "floating-point"}  # of samples, others than unsigned
 _TIFF_BYTES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}  # others have one
 
+
+MAX_SIDE = 30_000  # [px]
+MAX_PIXELS = 100_000_000  # of an image or a camera; the largest sensors have as many
+_MOST_SCANS = 200  # of a JPEG: each is another pass over all pixels
+_MOST_TAGS, _MOST_STRIPS = 200, 100_000  # of a TIFF
+_STRIP = 256  # rows of an image that become grey levels at once
 
 _COMPLETE = "a complete PNG, JPEG or TIFF file"
 _LEVELS = "8 or 16 bit grey levels or colours"
@@ -84,12 +93,16 @@ def read_image(path: Path, camera: Camera, where: str = "") -> Grey:
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         found = "data that cannot be decoded" if pixels is None else f"{pixels.dtype} pixels"
         raise DatasetError(_problem(path, where, found, _LEVELS))
-    levels = pixels.astype(np.float32)
-    if pixels.dtype == np.uint16:
-        levels *= np.float32(255.0 / (2 ** _depth(pixels) - 1))
-    if levels.ndim == 3:
-        levels = np.asarray(cv2.cvtColor(levels, cv2.COLOR_BGR2GRAY), dtype=np.float32)
-    return levels
+    scale = 255.0 / (2 ** _depth(pixels) - 1) if pixels.dtype == np.uint16 else 1.0
+    grey = np.empty(pixels.shape[:2], dtype=np.float32)
+    for top in range(0, len(grey), _STRIP):  # colours in 32 bits take more than there may be
+        levels = pixels[top : top + _STRIP].astype(np.float32)
+        if pixels.dtype == np.uint16:
+            levels *= np.float32(scale)
+        if levels.ndim == 3:
+            levels = np.asarray(cv2.cvtColor(levels, cv2.COLOR_BGR2GRAY))
+        grey[top : top + _STRIP] = levels
+    return grey
 
 
 def _depth(pixels: NDArray[np.generic]) -> int:
@@ -112,16 +125,26 @@ def image_size(content: bytes) -> ImageSize:
     """Return the size of an image from the bytes of its file."""
     if not content:
         raise _BadImage("an empty file")
+    readers = {_JPEG_SIGNATURE: _jpeg_size, _PNG_SIGNATURE: _png_size}
+    readers |= dict.fromkeys(_TIFF_SIGNATURES, _tiff_size)
     try:
-        if content.startswith(b"\xff\xd8\xff"):
-            return _jpeg_size(content)
-        if content.startswith(_PNG_SIGNATURE):
-            return _png_size(content)
-        if content.startswith(_TIFF_SIGNATURES):
-            return _tiff_size(content)
+        for signature, read in readers.items():
+            if content.startswith(signature):
+                size = read(content)
+                if problem := size_problem(size.width, size.height):
+                    raise _BadImage(*problem)
+                return size
     except (struct.error, IndexError) as error:
         raise _BadImage(f"a file cut off after {len(content)} bytes") from error
     raise _BadImage("a file that is none of these")
+
+
+def size_problem(width: int, height: int) -> tuple[str, str] | None:
+    """Return found and needed of a size that no image and no camera can have, else None."""
+    if min(width, height) > 0 and max(width, height) <= MAX_SIDE and width * height <= MAX_PIXELS:
+        return None
+    needed = f"at most {MAX_SIDE} px a side and {MAX_PIXELS} px in all"
+    return f"{width} x {height} px", needed
 
 
 def _complete_content(path: Path, camera: Camera, where: str) -> tuple[bytes, str | None]:
@@ -130,7 +153,7 @@ def _complete_content(path: Path, camera: Camera, where: str) -> tuple[bytes, st
         found = "something that is not a file" if os.path.exists(path) else "no such file"
         return b"", _problem(path, where, found, _COMPLETE, "correct the path or remove the row")
     try:
-        content = path.read_bytes()
+        content = read_bytes(path, MAX_IMAGE)
         size = image_size(content)
     except OSError as error:
         return b"", _problem(path, where, f"'{error.strerror}'", "a readable file")
@@ -158,7 +181,7 @@ def _problem(
 
 def _jpeg_size(content: bytes) -> ImageSize:
     """Walk the segments of a JPEG to its end-of-image marker."""
-    size, at = None, 2
+    size, at, n_scans = None, 2, 0
     while True:
         match = _JPEG_MARKER.search(content, at)
         if match is None:
@@ -168,6 +191,9 @@ def _jpeg_size(content: bytes) -> ImageSize:
             break
         if marker in (0x01, 0xD8):
             continue
+        n_scans += marker == 0xDA
+        if n_scans > _MOST_SCANS:
+            raise _BadImage(f"a JPEG of more than {_MOST_SCANS} scans", "fewer")
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             height, width = struct.unpack_from(">HH", content, at + 3)
             size = ImageSize(width, height)
@@ -197,16 +223,26 @@ def _tiff_size(content: bytes) -> ImageSize:
     order = "<" if content.startswith(b"II") else ">"
     (at,) = struct.unpack_from(order + "I", content, 4)
     (n_tags,) = struct.unpack_from(order + "H", content, at)
+    if n_tags > _MOST_TAGS:
+        raise _BadImage(f"a TIFF of {n_tags} tags", f"at most {_MOST_TAGS}")
     ends = [at + 2 + 12 * n_tags + 4]  # the directory, and the pointer to the next one
     tags: dict[int, tuple[int, ...]] = {}
+    n_all = 0
     for entry in range(at + 2, at + 2 + 12 * n_tags, 12):
         tag, kind, count = struct.unpack_from(order + "HHI", content, entry)
         n_bytes = count * _TIFF_BYTES.get(kind, 1)
         (pointer,) = struct.unpack_from(order + "I", content, entry + 8)
         start = pointer if n_bytes > 4 else entry + 8
         ends.append(start + n_bytes)
-        if kind in _TIFF_INTEGERS and ends[-1] <= len(content):
+        n_all += n_bytes
+        if n_all > len(content):  # tags may point to the same bytes, which are read many times
+            raise _BadImage(f"a TIFF cut off after {len(content)} bytes")
+        if count > _MOST_STRIPS and tag in _TIFF_TAGS:
+            raise _BadImage(f"a TIFF of {count} strips", f"at most {_MOST_STRIPS}")
+        if count and tag in _TIFF_TAGS and kind in _TIFF_INTEGERS and ends[-1] <= len(content):
             tags[tag] = struct.unpack_from(f"{order}{count}{_TIFF_INTEGERS[kind]}", content, start)
+    if max(tags.get(322, (0,))) * max(tags.get(323, (0,))) > MAX_PIXELS:
+        raise _BadImage("a TIFF of tiles that are larger than any image")
     starts, lengths = tags.get(273, tags.get(324, ())), tags.get(279, tags.get(325, ()))
     ends += [start + length for start, length in zip(starts, lengths, strict=False)]
     if max(ends) > len(content):

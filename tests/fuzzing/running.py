@@ -25,10 +25,10 @@ from unittest.mock import patch
 
 import numpy as np
 from characterisation.inputs import made_input
-from characterisation.running import run, words_of
+from characterisation.running import Outcome, run, words_of
 
 from fuzzing.mutations import mutate
-from fuzzing.subjects import SUBJECTS
+from fuzzing.subjects import SUBJECTS, Subject
 from legcal.machine import Machine, loader
 from legcal.machine.files import find_model
 from legcal.machine.formats import read_source
@@ -47,21 +47,38 @@ CONTROL = re.compile(
 
 @dataclass(frozen=True)
 class Case:
-    """A damaged file: which, and how it is drawn."""
+    """A damaged file: which, and how it is drawn or made."""
 
-    subject: int
-    seed: int
+    subject: Subject
+    seed: int = 0
+    made: bytes | None = None  # the content, if it is not drawn
+    special: str = ""  # "pipe", "folder" or the target of a link, if it is no file
 
     @property
     def name(self) -> str:
         """Which file, and its seed."""
-        return f"{SUBJECTS[self.subject].name} seed {self.seed}"
+        return f"{self.subject.name} seed {self.seed}"
 
     def content(self) -> bytes:
         """Return the damaged file."""
-        subject = SUBJECTS[self.subject]
-        valid = (made_input(subject.input) / subject.file).read_bytes()
-        return mutate(valid, subject.kind, np.random.default_rng([self.subject, self.seed]))
+        if self.made is not None:
+            return self.made
+        valid = (made_input(self.subject.input) / self.subject.file).read_bytes()
+        seeds = [SUBJECTS.index(self.subject), self.seed]
+        return mutate(valid, self.subject.kind, np.random.default_rng(seeds))
+
+    def put(self, path: Path) -> None:
+        """Put the damaged file, or what is none, at a place."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        if self.special == "pipe":
+            os.mkfifo(path)
+        elif self.special == "folder":
+            path.mkdir()
+        elif self.special:
+            path.symlink_to(self.special)
+        else:
+            path.write_bytes(self.content())
 
 
 @dataclass(frozen=True)
@@ -73,6 +90,7 @@ class Ended:
     seconds: float
     megabytes: float
     fault: str = ""
+    message: str = ""  # of a refusal
 
 
 @dataclass
@@ -109,7 +127,7 @@ def drawn_cases(count: int, seed: int, deep_share: float = DEEP_SHARE) -> list[C
     for part, chosen in ((deep_share, is_deep), (1.0 - deep_share, ~is_deep)):
         shares[chosen] *= part / shares[chosen].sum()
     drawn = chance.choice(len(SUBJECTS), count, p=shares)
-    return [Case(int(k), 1_000_000 * seed + number) for number, k in enumerate(drawn)]
+    return [Case(SUBJECTS[k], 1_000_000 * seed + n) for n, k in enumerate(drawn.tolist())]
 
 
 def run_cases(cases: Sequence[Case], *, lone: bool = False) -> Iterator[Ended]:
@@ -118,7 +136,7 @@ def run_cases(cases: Sequence[Case], *, lone: bool = False) -> Iterator[Ended]:
     What broke a limit is run again alone: the memory of those before it is not its own.
     """
     for case in cases:
-        made_input(SUBJECTS[case.subject].input)
+        made_input(case.subject.input)
     _read_shipped_models_once()
     context = get_context("fork")
     left = list(cases)
@@ -199,8 +217,9 @@ def _work(cases: Sequence[Case], pipe: Connection) -> None:
 
 
 def _run_one(case: Case, folder: Path) -> Ended:
-    subject = SUBJECTS[case.subject]
-    _copy(made_input(subject.input), folder / "in", subject.file, case.content())
+    subject = case.subject
+    shutil.copytree(made_input(subject.input), folder / "in", copy_function=os.link)
+    case.put(folder / "in" / subject.file)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     begin = time.process_time()
     signal.setitimer(signal.ITIMER_PROF, MAX_SECONDS)
@@ -209,38 +228,32 @@ def _run_one(case: Case, folder: Path) -> Ended:
     signal.setitimer(signal.ITIMER_PROF, 0.0)
     seconds = time.process_time() - begin
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024.0
-    return Ended(
-        case, outcome.code, seconds, grown, _fault(outcome.code, outcome.out, outcome.err, folder)
-    )
+    fault, message = _judged(outcome, folder)
+    return Ended(case, outcome.code, seconds, grown, fault, message)
 
 
-def _fault(code: int, out: str, err: str, folder: Path) -> str:
-    if code not in (0, 1, 2):
-        lines = [line for line in err.splitlines() if line.strip()]
-        return f"exit {code}: {lines[-1] if lines else ''}"
+def _judged(outcome: Outcome, folder: Path) -> tuple[str, str]:
+    """Return what breaks the rule, and the message of a refusal."""
+    if outcome.code not in (0, 1, 2):
+        lines = [line for line in outcome.err.splitlines() if line.strip()]
+        return f"exit {outcome.code}: {lines[-1] if lines else ''}", ""
     try:
-        document = json.loads(out)
+        document = json.loads(outcome.out)
     except ValueError:
-        return "no JSON document on stdout"
+        return "no JSON document on stdout", ""
     if "error" not in document:
-        return ""
-    if (folder / "out").exists():
-        return "refused, and the output is there"
+        return "", ""
     message = document["error"]["message"]
-    if len(message) > MAX_TEXT:
-        return f"a message of {len(message)} characters"
     control = CONTROL.search(message)
-    if control is not None:
+    fault = ""
+    if (folder / "out").exists():
+        fault = "refused, and the output is there"
+    elif len(message) > MAX_TEXT:
+        fault = f"a message of {len(message)} characters"
+    elif control is not None:
         before = message[: control.start()][-60:]
-        return f"the character {control[0]!r} in a message: ...{before}"
-    return ""
-
-
-def _copy(source: Path, target: Path, changed: str, content: bytes) -> None:
-    """Copy an input by links, but for the file that is damaged."""
-    shutil.copytree(source, target, copy_function=os.link)
-    (target / changed).unlink()
-    (target / changed).write_bytes(content)
+        fault = f"the character {control[0]!r} in a message: ...{before}"
+    return fault, message
 
 
 def count_cases(cases: Iterable[Case]) -> Count:

@@ -31,7 +31,7 @@ from legcal.calibration.camera_calibration.document import (
     write_camera,
 )
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
-from legcal.files import describe
+from legcal.files import MAX_IMAGE, describe, read_bytes
 from legcal.geometry import Array, IntArray
 from legcal.perception import BoardImages, describe_image, find_corners
 from legcal.progress import Report, no_progress
@@ -271,7 +271,7 @@ def _common_size(paths: Sequence[Path]) -> ImageSize:
     for path in paths:
         found = ""
         try:
-            sizes.setdefault(image_size(path.read_bytes()), []).append(path)
+            sizes.setdefault(image_size(read_bytes(path, MAX_IMAGE)), []).append(path)
         except OSError as error:
             found = f"'{error.strerror}'"
         except ValueError as error:

@@ -1,0 +1,171 @@
+"""Files that were made to do harm: to take memory or time, to hang, or to write to a terminal."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from characterisation.inputs import ROOT, made_input
+
+from fuzzing.running import Case
+from fuzzing.subjects import SUBJECTS, Subject
+
+_NAMED = {subject.name: subject for subject in SUBJECTS}
+DETECT = "detect {in} -o {out}"
+CALIBRATE = "calibrate {in} -o {out}"
+
+
+def harmful_files() -> Iterator[tuple[str, Case, str]]:
+    """Yield a name, the file, and a word of the refusal."""
+    for name, text, word in _yaml():
+        for file in ("plain:dataset.yaml", "plain:camera_info.yaml")[: 1 + (len(text) < 10_000)]:
+            yield f"{name} as {file}", Case(_NAMED[file], made=text), word
+    for name, file, made, word in (*_tables(), *_models(), *_images()):
+        yield f"{name} as {file}", Case(_NAMED[file], made=made), word
+
+
+def special_files() -> Iterator[tuple[str, Case]]:
+    """Yield pipes, devices and folders in the place of everything that is read."""
+    study = "study paper --runs 1 --workers 1 --seed 1 -o {in}/study"
+    result = "calibrate {in}/set --check {in}/result"
+    places = (
+        *((subject.input, subject.file, subject.command) for subject in SUBJECTS),
+        ("plain", "observations.csv", DETECT),
+        ("plain", ".legcal-cache.json", "detect {in} -o {in}/found"),
+        ("plain", "axes.csv", CALIBRATE),
+        ("plain", "corners.csv", CALIBRATE),
+        ("plain", "found/detection.json", "detect {in} -o {in}/found"),
+        ("plain", "found/result.json", "calibrate {in} -o {in}/found"),
+        ("plain", "found/camera.yaml", "camera {in}/images/c1_1.png --board chessboard:5x4:20mm "
+         "-o {in}/found/camera.yaml"),
+        ("settings", "found/truth/truth.json", "simulate 3-rpr --level axes --poses 4 -o "
+         "{in}/found"),
+        ("plain", "study/runs.jsonl", study),
+        ("result", "set/observations.csv", result),
+    )  # fmt: skip
+    for source, file, command in places:
+        for special in ("pipe", "folder", "/dev/zero"):
+            case = Case(Subject(source, file, command), special=special)
+            yield f"{special} as {case.subject.name}", case
+
+
+def _yaml() -> Iterator[tuple[str, bytes, str]]:
+    merged = ["a0: &a0 {x: 1, y: 2}"]
+    lists = ["a0: &a0 [1, 2]"]
+    for k in range(1, 12):
+        merged.append(f"a{k}: &a{k} {{<<: [{', '.join([f'*a{k - 1}'] * 9)}]}}")
+        lists.append(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]")
+    yield "merge keys", "\n".join(merged).encode(), "merge keys"
+    yield "aliases", "\n".join(lists).encode(), "values"
+    yield "deep nesting", b"a: " + b"[" * 100_000, "levels"
+    yield "deep mappings", b"a: " + b"{a: " * 30_000, "levels"
+    yield "many numbers", b"a: [" + b"1," * 900_000 + b"]", "values"
+    yield "more numbers", b"a: [" + b"1," * 1_900_000 + b"]", "bytes"
+    yield "many keys", b"".join(b"k%d: 1\n" % k for k in range(150_000)), "values"
+    yield "more keys", b"".join(b"k%d: 1\n" % k for k in range(350_000)), "bytes"
+    yield "unknown keys", b"".join(b"k%d: 1\n" % k for k in range(40_000)), "k"
+    yield "a long number", b"a: " + b"1" * 1_900_000, "a"
+    yield "a long word", b"a" * 1_900_000, "text"
+    yield "a long key", b"k" * 900 + b": 1", "k"
+    yield "escapes", b'"\\e[31m\\u202e": 1\n"\\x9b": &a [*a]', ""
+    yield "an unknown tag", b"a: !\xe2\x80\xae\xc2\x9b x", ""
+
+
+def _tables() -> Iterator[tuple[str, str, bytes, str]]:
+    table = "plain:measurements.csv"
+    lines = (made_input("plain") / "measurements.csv").read_bytes().splitlines()
+    for digits in (b"1" * 130_000 + b"x", b"1" * 130_000, b"." + b"1" * 130_000 + b"e"):
+        row = lines[1].rsplit(b",", 1)[0] + b"," + digits
+        yield "long digits", table, b"\n".join([lines[0], *[row] * 25]), "number"
+    yield "long cells", table, lines[0] + b"\n" + b"1" * 140_000, "limit"
+    yield "short rows", table, lines[0] + b"\nc" * 950_000, "rows"
+    yield "some short rows", table, lines[0] + b"\nc" * 49_000, "row"
+    yield "columns", table, b",".join(b"c%d" % k for k in range(350_000)), "columns"
+    yield "unknown columns", table, b",".join([*(b"c%d" % k for k in range(299)), b"x\n1"]), "c1"
+    yield "one column many times", table, b",".join([b"view"] * 300) + b"\n1", "times"
+    yield "bad cells", table, lines[0] + b"\n" + b"\n".join([b"x" + lines[1]] * 40_000), "view"
+    long_name = lines[1].replace(b"images/c1_1.png", b"=HYPERLINK(%s)" % (b"x" * 90_000))
+    yield "a formula", table, b"\n".join([lines[0], *[long_name] * 40]), "= + - @"
+    escape = lines[1].replace(b"images/c1_1.png", b"\x1b[31mred.png")
+    yield "an escape sequence", table, b"\n".join([lines[0], escape]), "\\x1b"
+    yield "a header of escapes", table, b"\x1b]0;x\x07," + lines[0] + b"\n1\n", "\\x1b"
+
+
+def _models() -> Iterator[tuple[str, str, bytes, str]]:
+    for n, word in ((9000, "needed"), (900, "move")):
+        yield f"{n} revolutes", "formats:loops.urdf", _chain(n, "revolute"), word
+    yield "900 fixed joints", "formats:loops.urdf", _chain(900, "fixed"), ""
+    yield "99 revolutes", "formats:loops.urdf", _chain(99, "revolute"), ""
+    many = _chain(20, "revolute").replace(b"</robot>", b"<loop_joint/>" * 40_000 + b"</robot>")
+    yield "many loops", "formats:loops.urdf", many, "loops"
+    yield "elements", "formats:loops.urdf", b"<robot>" + b"<a/>" * 900_000 + b"</robot>", "elements"
+    urdf = (ROOT / "urdf/hexapod.urdf").read_bytes()
+    model = "model:urdf/hexapod.urdf"
+    yield "a name of 3 MB", model, urdf.replace(b'"base"', b'"%s"' % (b"b" * 3_000_000), 1), "b"
+    for name, word in ((b"&#9;", "joint"), ("\u202e".encode(), "\\u202e"), (b"\xc2\x9b", "\\x9b")):
+        made = urdf.replace(b"leg1_prismatic", b"leg1_" + name + b"prismatic")
+        yield f"{name!r} in a joint", model, made, word
+    yield "a formula", model, urdf.replace(b"leg1_prismatic", b"=leg1_prismatic"), "= + - @"
+    yield "no axis", model, urdf.replace(b'<axis xyz="0.0 0.0 1.0"/>', b"<axis/>", 1), "<axis>"
+    yield "a broken line", model, urdf.replace(b"<link", b"<li\nnk\n<", 1), "line"
+
+
+def _chain(n: int, kind: str) -> bytes:
+    """Return a URDF of joints in a row, closed to a loop."""
+    limit = b'<axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/>'
+    parts = [b'<robot name="r"><link name="l0"/>']
+    for k in range(n):
+        parts.append(
+            b'<link name="l%d"/><joint name="j%d" type="%s"><parent link="l%d"/>'
+            b'<child link="l%d"/><origin xyz="0.1 0 0"/>%s</joint>'
+            % (k + 1, k, kind.encode(), k, k + 1, limit)
+        )
+    parts.append(
+        b'<loop_joint name="c" type="spherical"><link1 link="l0"/><link2 link="l%d"/></loop_joint>'
+        b"</robot>" % n
+    )
+    return b"".join(parts)
+
+
+def _images() -> Iterator[tuple[str, str, bytes, str]]:
+    for size in (30_000, 2**31 - 1):
+        yield f"{size} px", "settings:board.png", _png(size), "px"
+        yield f"{size} px", "plain:images/c1_1.png", _png(size), "px"
+    named = _png(64, b"\x1b[3m")
+    yield "a chunk of escapes", "plain:images/c1_1.png", named[:-20] + b"\0" + named[-19:], ""
+    for camera in (2**31 - 1, 10**30, 20_000):
+        text = (made_input("plain") / "camera_info.yaml").read_bytes()
+        text = text.replace(b"width: 64", b"width: %d" % camera)
+        text = text.replace(b"height: 48", b"height: %d" % camera)
+        yield f"{camera} px", "plain:camera_info.yaml", text, "image"
+    tiff = "pictures:images/c1_1.tiff"
+    n = 60_000
+    tags = struct.pack("<HHI", 273, 4, 270_000) + struct.pack("<I", 8)
+    body = b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", n) + tags * n + bytes(400_000)
+    yield "60,000 tags", tiff, body, "tags"
+    body = b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", 150) + tags * 150 + bytes(1_100_000)
+    yield "tags of the same bytes", tiff, body, "TIFF"
+    empty = struct.pack("<HHI", 258, 3, 0) + bytes(4)
+    body = b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", 9) + empty * 9 + bytes(100)
+    yield "empty tags", tiff, body, "TIFF"
+    encoded = cv2.imencode(".jpg", np.zeros((48, 64), dtype=np.uint8))[1].tobytes()
+    at = encoded.index(b"\xff\xda")
+    scan = encoded[at:-2]
+    yield "scans", "pictures:images/c1_2.jpg", encoded[:at] + scan * 3000 + b"\xff\xd9", "scans"
+
+
+def _png(size: int, kind: bytes = b"tEXt") -> bytes:
+    header = struct.pack(">IIBBBBB", size, size, 8, 0, 0, 0, 0)
+    chunks = (
+        (b"IHDR", header),
+        (b"IDAT", zlib.compress(bytes(1000))),
+        (kind, b"x"),
+        (b"IEND", b""),
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        for name, data in chunks
+    )
