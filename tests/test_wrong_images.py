@@ -349,8 +349,11 @@ def _with_rejected(outlines: Outlines, rejected: BoolArray) -> Outlines:
 @pytest.mark.parametrize(
     ("off", "words"),
     [
-        ({2: 3e-3}, r"it shows a reading of leg3 of [\d.]+ \+- 0\.\d+ mm, given"),
-        ({0: 5e-3, 2: -4e-3, 4: 6e-3}, r"another pose than its reading says, .* leg1, leg3, leg5 "),
+        ({2: 3e-3}, r"it shows a reading of leg3_prismatic of [\d.]+ \+- 0\.\d+ mm, given"),
+        (
+            {0: 5e-3, 2: -4e-3, 4: 6e-3},
+            r"another pose than .*leg1_prismatic, leg3_prismatic, leg5_prismatic ",
+        ),
         ({}, r"its readings suit it, so check that nobody moved the camera"),
         ("other", r"it shows the reading given for image image4\.png; check which image"),
     ],
@@ -372,6 +375,41 @@ def test_a_reading_that_the_outlines_contradict_is_named(
     assert list(notes) == [row]
     assert notes[row].startswith("view c1, image image1.png: ")
     assert re.search(words, notes[row]), notes
+
+
+def test_a_wrong_digit_is_named_where_outlines_of_few_legs_leave_the_pose_open(
+    fitted: Calibration,
+) -> None:
+    solution, m, row = fitted.solution, fitted.dataset.measurements, 1
+    o = solution.outlines
+    few = o.choose((o.row != row) | (o.leg < 4))
+    few = _with_rejected(few, few.row == row)
+    for leg, change in ((0, 0.02), (3, -0.05), (5, 0.004)):
+        q = m.q.copy()
+        q[row, leg] += change
+        notes = outlier_images(
+            replace(m, q=q), fitted.dataset.machine, replace(solution, outlines=few)
+        )
+        found = re.search(r"reading of leg(\d)_prismatic of ([\d.-]+) \+-", notes[row])
+        assert found is not None, notes
+        assert int(found[1]) == leg + 1
+        assert float(found[2]) == pytest.approx(1e3 * m.q[row, leg], abs=1.0)
+
+
+def test_no_reading_is_said_that_the_travel_does_not_have(fitted: Calibration) -> None:
+    solution, m, row = fitted.solution, fitted.dataset.measurements, 1
+    machine, q = fitted.dataset.machine, m.q.copy()
+    q[row, [0, 2, 4]] += 0.05
+    limits = [(float(x) - 1e-3, float(x) + 1e-3) for x in q[row]]
+    legs = tuple(
+        replace(leg, travel=travel) for leg, travel in zip(machine.legs, limits, strict=True)
+    )
+    fit = replace(
+        solution, outlines=_with_rejected(solution.outlines, solution.outlines.row == row)
+    )
+    notes = outlier_images(replace(m, q=q), replace(machine, legs=legs), fit)
+    assert "its outlines suit no pose within the travel of the legs" in notes[row]
+    assert "mm" not in notes[row]
 
 
 def test_some_wrong_outlines_do_not_make_an_image_an_outlier(fitted: Calibration) -> None:

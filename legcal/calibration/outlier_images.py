@@ -1,12 +1,14 @@
 """Outlier images: most of their outlines are rejected by the joint fit; the probable cause of each.
 
-The outlines of such an image alone give the platform's pose, and with it predicted readings. Where
-these are the readings of another image, two images were exchanged; where one differs, it is wrong;
-where all agree, the camera was moved.
+Where the outlines and all readings but one agree on a pose of the platform, that reading is wrong.
+Else the outlines of such an image alone give the pose, and with it predicted readings. Where these
+are the readings of another image, two images were exchanged; where one differs, it is wrong; where
+all agree, the camera was moved. No reading is predicted that the travel does not have.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,15 +38,27 @@ MIN_OUTLINES, MIN_LEGS = 6, 3  # that determine a pose
 MIN_NOISE = 5e-5  # of an outline at its leg [m]
 LOSS = PseudoHuber(4.0)  # of outlines, in least noises
 MAX_STEP = (0.3, 0.3, 0.3, np.inf, np.inf, np.inf)  # of the pose: [rad], and any displacement
+READING_NOISE = 6e-5  # of readings beside the legs of a fit [m]
 SIGNIFICANT_SIGMAS = 5.0
 MIN_READING_ERROR = 3e-4  # [m]
 SAME_READING = 1e-3  # tolerance for the reading of another image [m]
 MAX_NAMED_LEGS = 4
+BEYOND_TRAVEL = 0.05  # of the travel: what joint limits of a model leave out
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
     pose: Frames  # T_Rb_Re
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """The pose of an image as readings, (n_legs,) [m]."""
+
+    readings: Array
+    sigma: Array
+    noise: float  # of the outlines at their legs [m]
+    cost: float  # half the robust sum of squares, in units of that noise
 
 
 def outlier_images(
@@ -64,8 +78,10 @@ def outlier_images(
             continue
         view = measurements.views[int(measurements.view[row])]
         name = f"view {view.name}, image {measurements.image[row] or f'of row {row + 1}'}"
-        readings = _readings(measurements, machine, solution, row, judged)
-        explanation = _explanation(measurements, machine, row, readings)
+        explanation = _wrong_reading(measurements, machine, solution, row, judged)
+        if not explanation:
+            alone = _shown(measurements, machine, solution, row, judged)
+            explanation = _explanation(measurements, machine, row, alone)
         if not explanation and len(wrong) < MIN_REJECTED_UNEXPLAINED * len(judged):
             continue  # the outlines are wrong, not the image
         notes[row] = (
@@ -75,28 +91,31 @@ def outlier_images(
     return notes
 
 
-def _readings(
+def _shown(
     measurements: Measurements,
     machine: Machine,
     solution: Solution,
     row: int,
     chosen: IntArray,
-) -> tuple[Array, Array] | None:
-    """Return the readings by the outlines of an image alone, and their sigmas (n_legs,) [m].
+    held: Sequence[int] = (),
+) -> _Shown | None:
+    """Return what outlines of an image show, with the readings of some legs or by themselves.
 
-    None if the outlines do not determine the pose.
+    None if they do not determine the pose.
     """
     o = solution.outlines
     chosen = chosen[np.isfinite(o.h[chosen]).all(axis=1)]
     legs = o.leg[chosen]
     n = len(chosen)
-    if n < MIN_OUTLINES or len(np.unique(legs)) < MIN_LEGS:
+    if n + len(held) < MIN_OUTLINES or (not held and len(np.unique(legs)) < MIN_LEGS):
         return None
     T_camera_Rb = solution.T_camera_Rb[int(measurements.view[row])]
     A = np.array([leg.A for leg in solution.legs])
     B = np.array([leg.B for leg in solution.legs])
     radius = np.array([solution.radii[int(o.leg[i]), o.part[i]] for i in chosen.tolist()])
     signed = np.where(o.edge[chosen] == 1, radius, -radius)
+    q0 = np.array([leg.q0 for leg in solution.legs])
+    sign = np.array([leg.sign for leg in machine.legs], dtype=np.float64)
     normal_Rb = o.h[chosen] @ T_camera_Rb.rotation.as_matrix()  # of the planes of outlines
 
     def distances(state: _State) -> Residuals:
@@ -105,10 +124,27 @@ def _readings(
         J = np.concatenate([np.cross(arm[legs], normal_Rb), normal_Rb], axis=1)
         return Residuals.of((np.sum(o.h[chosen] * ends, axis=1) - signed)[:, None], J[:, None])
 
-    touches = (("pose", np.zeros(n, dtype=np.intp), slice(None)),)
-    outlines = Factor("outlines", distances, touches, n, 1, whitening=1.0 / MIN_NOISE, robust=True)
+    def readings(state: _State) -> tuple[Array, Array]:
+        arm = B @ state.pose.R[0].T
+        AB = arm + state.pose.t - A
+        length = np.linalg.norm(AB, axis=1)
+        u = sign[:, None] * AB / length[:, None]
+        return sign * (length - q0), np.concatenate([np.cross(arm, u), u], axis=1)
+
+    def differences(state: _State) -> Residuals:
+        q, J = readings(state)
+        r = q[list(held)] - measurements.q[row, list(held)]
+        return Residuals.of(r[:, None], J[list(held), None])
+
+    zero, m = np.zeros(max(n, len(held)), dtype=np.intp), len(held)
+    of_outlines, of_readings = (("pose", zero[:k], slice(None)) for k in (n, m))
+    white = 1.0 / MIN_NOISE
+    factors = [Factor("outlines", distances, (of_outlines,), n, 1, whitening=white, robust=True)]
+    if held:
+        white = 1.0 / READING_NOISE
+        factors.append(Factor("readings", differences, (of_readings,), m, 1, whitening=white))
     pose = Variables("pose", all_free(1, 6), Frames.moved, max_step=MAX_STEP)
-    problem, loss = Problem[_State]((pose,), None, (outlines,)), LOSS
+    problem, loss = Problem[_State]((pose,), None, tuple(factors)), LOSS
     begin = _State(Frames.of([solution.T_Rb_Re[int(measurements.pose[row])]]))
     try:
         found = minimise(problem, begin, loss)
@@ -118,29 +154,62 @@ def _readings(
     if np.linalg.cond(normal) > 1e12:
         return None
     scale = max(1.0, 1.48 * float(np.median(np.abs(found.linear["outlines"].r))))
-    arm = B @ found.state.pose.R[0].T
-    AB = arm + found.state.pose.t - A
-    length = np.linalg.norm(AB, axis=1)
-    u = AB / length[:, None]
-    J = np.concatenate([np.cross(arm, u), u], axis=1)
+    q, J = readings(found.state)
     variance = scale**2 * np.einsum("ja,ab,jb->j", J, np.linalg.inv(normal), J)
-    q0 = np.array([leg.q0 for leg in solution.legs])
-    sign = np.array([leg.sign for leg in machine.legs])
-    return sign * (length - q0), np.sqrt(variance)
+    return _Shown(q, np.sqrt(variance), scale * MIN_NOISE, found.cost / scale**2)
+
+
+def _wrong_reading(
+    measurements: Measurements, machine: Machine, solution: Solution, row: int, chosen: IntArray
+) -> str:
+    """Return which reading is wrong if the outlines suit all others, and no others but these."""
+    motors = list(machine.motors)
+    shown: dict[int, _Shown] = {}
+    for leg in motors:
+        held = [other for other in motors if other != leg]
+        found = _shown(measurements, machine, solution, row, chosen, held)
+        if found is None:
+            return ""
+        shown[leg] = found
+    noise = min((each.noise for each in shown.values()), default=0.0)
+    cost = {leg: each.cost * (each.noise / noise) ** 2 for leg, each in shown.items()}
+    best, *others = sorted(motors, key=cost.__getitem__)
+    if others and cost[others[0]] - cost[best] < 0.5 * SIGNIFICANT_SIGMAS**2:
+        return ""
+    found, given = shown[best], float(measurements.q[row, best])
+    value, sigma = float(found.readings[best]), float(found.sigma[best])
+    least = max(SIGNIFICANT_SIGMAS * max(sigma, found.noise), MIN_READING_ERROR)
+    if abs(value - given) < least or not _is_in_travel(machine, best, value, sigma):
+        return ""
+    return _one_wrong(machine, best, value, sigma, given)
+
+
+def _one_wrong(machine: Machine, leg: int, shown: float, sigma: float, given: float) -> str:
+    return (
+        f"it shows a reading of {machine.legs[leg].prismatic} of {1e3 * shown:.2f} +- "
+        f"{1e3 * sigma:.2f} mm, given {1e3 * given:.2f} mm; check that reading"
+    )
+
+
+def _is_in_travel(machine: Machine, leg: int, reading: float, sigma: float) -> bool:
+    """Say whether a leg has a reading, as far as it is known."""
+    low, high = machine.legs[leg].travel
+    margin = BEYOND_TRAVEL * (high - low) + SIGNIFICANT_SIGMAS * sigma
+    return low - margin <= reading <= high + margin
 
 
 def _explanation(
     measurements: Measurements,
     machine: Machine,
     row: int,
-    readings: tuple[Array, Array] | None,
+    alone: _Shown | None,  # by its outlines alone
 ) -> str:
     """Return the probable cause and what to check; "" where the readings agree with the image."""
     motors = list(machine.motors)
-    if readings is None or not motors:
+    if alone is None or not motors:
         return "check its reading and that nobody moved camera or machine"
     given = measurements.q[row, motors]
-    shown, sigma = readings[0][motors], readings[1][motors]
+    shown, sigma = alone.readings[motors], alone.sigma[motors]
     off = shown - given
     wrong = np.flatnonzero(np.abs(off) > np.maximum(SIGNIFICANT_SIGMAS * sigma, MIN_READING_ERROR))
     if len(wrong) == 0:
@@ -159,14 +228,18 @@ def _explanation(
             f"it shows the reading given for image {measurements.image[nearest]}; check which "
             "image belongs to which row"
         )
-    names = [machine.leg_names[motors[k]] for k in wrong]
+    if not all(_is_in_travel(machine, motors[k], shown[k], sigma[k]) for k in wrong):
+        return (
+            "its outlines suit no pose within the travel of the legs; check that it was taken with "
+            "this reading and that nobody moved camera or machine"
+        )
     if len(wrong) == 1:
         k = int(wrong[0])
-        return (
-            f"it shows a reading of {names[0]} of {1e3 * shown[k]:.2f} +- {1e3 * sigma[k]:.2f} mm, "
-            f"given {1e3 * given[k]:.2f} mm; check that reading"
-        )
-    worst = 1e3 * float(np.abs(off[wrong]).max())
+        return _one_wrong(machine, motors[k], shown[k], sigma[k], given[k])
+    names = [str(machine.legs[motors[k]].prismatic) for k in wrong]
+    travel = [machine.legs[motors[k]].travel for k in wrong]
+    possible = np.clip(shown[wrong], *np.transpose(travel)) - given[wrong]
+    worst = 1e3 * float(np.abs(possible).max())
     more = f" and {len(names) - MAX_NAMED_LEGS} more" if len(names) > MAX_NAMED_LEGS else ""
     return (
         "it shows another pose than its reading says, with readings of "

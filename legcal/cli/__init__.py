@@ -20,4 +20,5 @@ def main() -> None:
 
         print_failure("Interrupted", "Stopped before the end.", as_json=as_json)
         code = _INTERRUPTED
+        exec("")  # else Python, if interrupted in code from a text, ends as if nobody caught it
     sys.exit(code)

@@ -46,6 +46,7 @@ class Command:
     input: str = ""
     kept: tuple[str, ...] = ()  # files of checkpoints and caches, which may be there in part
     again: str = ""  # more words where a result stands already
+    guarded: tuple[str, ...] = ()  # files that are not written over if somebody changed them
 
 
 COMMANDS = (
@@ -56,14 +57,24 @@ COMMANDS = (
         again="--force",
     ),
     Command("study", "study paper --runs 2 --workers 1 -o out", kept=("out/runs.jsonl",)),
-    Command("detect", "detect in -o out --workers 1", "3-rpr-photographs"),
+    Command(
+        "detect",
+        "detect in -o out --workers 1",
+        "3-rpr-photographs",
+        guarded=("out/observations.csv",),
+    ),
     Command(
         "calibrate photographs, two processes",
         "calibrate in -o out",
         "3-rpr-photographs",
         kept=("in/observations.csv", "in/.legcal-cache.json"),
     ),
-    Command("detect, two processes", "detect in -o out --workers 2", "3-rpr-photographs"),
+    Command(
+        "detect, two processes",
+        "detect in -o out --workers 2",
+        "3-rpr-photographs",
+        guarded=("out/observations.csv",),
+    ),
     Command(
         "simulate photographs, two processes",
         "simulate 3-rpr -o out --poses 2 --views 1",
@@ -213,10 +224,11 @@ def _prepare(command: Command, folder: Path) -> None:
 
 
 def _lay_older_result(command: Command, finished: Path, folder: Path) -> None:
-    """Put a result where the command writes, other in every file but checkpoints."""
+    """Put a result where the command writes, with every file changed that may be."""
     shutil.copytree(finished / "out", folder / "out")
+    same = {folder / name for name in (*command.kept, *command.guarded)}
     for path in (folder / "out").rglob("*"):
-        if path.is_file() and str(path.relative_to(folder)) not in command.kept:
+        if path.is_file() and path not in same:
             with path.open("ab") as file:
                 file.write(b"\n")
 
