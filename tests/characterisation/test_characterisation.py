@@ -184,7 +184,7 @@ def _calibrated(folder: Path, *words: str, many: bool = False) -> Any:
 
 
 @pytest.mark.parametrize(
-    "name", ["3-rpr-outlines", pytest.param("3-rpr-axes", marks=pytest.mark.slow)]
+    "name", ["3-rpr-axes", pytest.param("3-rpr-outlines", marks=pytest.mark.slow)]
 )
 def test_order_does_not_matter(name: str, tmp_path: Path) -> None:
     found = []
