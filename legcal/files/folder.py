@@ -228,11 +228,10 @@ def result_folder(
             _check_places(new, destination, kind, replaceable)
             destination.parent.mkdir(parents=True, exist_ok=True)
             raise_if_stopped()
-            with held_back_signals():
-                if destination.exists():
-                    _replace_files(new, destination, temporary / "old", stale)
-                else:
-                    os.rename(new, destination)
+            if destination.exists():
+                _replace_files(new, destination, temporary / "old", stale)
+            else:
+                os.rename(new, destination)
     except OSError as error:
         raise OutOfResources(
             f"{destination}: the {kind.noun} could not be written: found '{error.strerror}', "
@@ -295,17 +294,18 @@ def _replace_files(new: Path, destination: Path, old: Path, stale: Iterable[Path
     for name in kept:
         (old / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(destination / name, old / name, follow_symlinks=False)
-    try:
-        for name in names:
-            (destination / name).parent.mkdir(parents=True, exist_ok=True)
-            os.replace(new / name, destination / name)
-        for name in gone:
-            os.unlink(destination / name)
-    except BaseException:
-        for name in [*names, *gone]:
-            with suppress(FileNotFoundError):
-                if name in kept:
-                    os.replace(old / name, destination / name)
-                elif not (new / name).exists():
-                    os.unlink(destination / name)
-        raise
+    with held_back_signals():
+        try:
+            for name in names:
+                (destination / name).parent.mkdir(parents=True, exist_ok=True)
+                os.replace(new / name, destination / name)
+            for name in gone:
+                os.unlink(destination / name)
+        except BaseException:
+            for name in [*names, *gone]:
+                with suppress(FileNotFoundError):
+                    if name in kept:
+                        os.replace(old / name, destination / name)
+                    elif not (new / name).exists():
+                        os.unlink(destination / name)
+            raise

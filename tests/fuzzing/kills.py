@@ -33,6 +33,12 @@ STOPPED = "legcal: Stopped before the end."
 FALSE_WORDS = ("Traceback", "ended from outside", "mistake in legcal")
 MARK = "LEGCAL_KILL"  # in the environment of the command and of all that it starts
 
+# Tests may run with Ctrl-C ignored, which programs that they start inherit.
+WITH_SIGNALS = (
+    "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); "
+    "os.execv(sys.executable, [sys.executable, '-m', 'legcal', *sys.argv[1:]])"
+)
+
 Contents = dict[str, str]
 """The digest of every file of a folder, by its path."""
 
@@ -133,7 +139,7 @@ def faults_of(kill: Kill) -> Iterator[str]:
         before = _contents(folder)
         process = _start(command, folder, mark)
         time.sleep(kill.part * duration)
-        answers = _answers(process.pid, kill.number)
+        answered = answers(process.pid)
         with suppress(ProcessLookupError):
             (os.killpg if kill.to_all else os.kill)(process.pid, kill.number)
         try:
@@ -148,12 +154,12 @@ def faults_of(kill: Kill) -> Iterator[str]:
         now = _contents(folder)
         yield from _faults_of_output(command, before, results, now, code)
         complete = code == 0 or _is_one_of(now, results, command)
-        allowed = {0, 130, -kill.number} if complete or not answers else {130}
+        allowed = {0, 130, -kill.number} if complete or not answered else {130}
         if code not in ({0, -9} if kill.number is signal.SIGKILL else allowed):
             yield f"exit code {code}: {_said(folder)}"
         elif code == 130 and not _said(folder).endswith(STOPPED):
             yield f"said {_said(folder)}"
-        if kill.number is not signal.SIGKILL:
+        if kill.number is not signal.SIGKILL and answered:
             yield from (f"said {word}" for word in FALSE_WORDS if word in _said(folder))
         if now == before or code == 0:
             return  # nothing to go on from
@@ -240,7 +246,7 @@ def _start(command: Command, folder: Path, mark: str) -> subprocess.Popen[bytes]
     environment = dict(os.environ, OMP_NUM_THREADS="1", PYTHONPATH=str(ROOT), **{MARK: mark})
     with (folder / "said.txt").open("wb") as said:
         return subprocess.Popen(
-            [sys.executable, "-c", _PROGRAM, *words],
+            [sys.executable, "-c", WITH_SIGNALS, *words],
             cwd=folder,
             env=environment,
             stdin=subprocess.DEVNULL,
@@ -250,21 +256,14 @@ def _start(command: Command, folder: Path, mark: str) -> subprocess.Popen[bytes]
         )
 
 
-# Tests may run with Ctrl-C ignored, which programs that they start inherit.
-_PROGRAM = (
-    "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); "
-    "os.execv(sys.executable, [sys.executable, '-m', 'legcal', *sys.argv[1:]])"
-)
-
-
-def _answers(process: int, number: signal.Signals) -> bool:
-    """Say whether a process has a handler for a signal."""
+def answers(process: int) -> bool:
+    """Say whether a command has its handlers: Python has one for SIGINT alone before."""
     try:
         status = Path(f"/proc/{process}/status").read_text()
     except OSError:
         return False
     caught = next((line for line in status.splitlines() if line.startswith("SigCgt:")), "0 0")
-    return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
+    return bool(int(caught.split()[1], 16) >> (signal.SIGTERM - 1) & 1)
 
 
 def _said(folder: Path) -> str:
