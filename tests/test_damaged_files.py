@@ -1,8 +1,13 @@
 """Damaged files of every kind that is read: refused in a sentence, or used; never anything else."""
 
+from pathlib import Path
+
 import pytest
+from characterisation.inputs import ROOT
 from fuzzing.crafted import harmful_files, special_files
 from fuzzing.running import count_cases, drawn_cases, run_cases
+
+from legcal import LegcalError, load_mechanism
 
 PARTS = 4
 
@@ -34,3 +39,23 @@ def test_pipes_devices_and_folders_are_never_read() -> None:
         if ended.fault
     ]
     assert not found
+
+
+def test_text_from_files_is_shown_on_one_short_line_without_control_characters() -> None:
+    bad = "\x1b]0;x\x07 \x9b31m \u202e \u2066 \u200f \u2028 \x85 \ufeff \r\n\t \x00 \ud800"
+    (shown,) = LegcalError(f"{bad} {'x' * 3_000_000} {'many words ' * 10_000} ¼±°ä€🤖").problems
+    assert shown.isprintable()
+    assert len(shown) < 5000
+    assert "\\x1b" in shown
+    assert shown.endswith("¼±°ä€🤖")
+    plain = "leg 'leg1-a': found 0.42 mm, needed ±1 µm; correct it."
+    assert str(LegcalError(plain)) == plain
+
+
+def test_a_hyphen_inside_a_name_is_part_of_it(tmp_path: Path) -> None:
+    for name in ("models/hexapod.yaml", "urdf/hexapod.urdf"):
+        text = (ROOT / name).read_text().replace("leg1_prismatic", "leg1-prismatic=a@b+c")
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text(text)
+    machine = load_mechanism(tmp_path / "models/hexapod.yaml")
+    assert "leg1-prismatic=a@b+c" in machine.urdf.joints

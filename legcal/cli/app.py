@@ -19,7 +19,7 @@ from legcal.cli.commands import camera, detect, evaluate, identify, inspect, loc
 from legcal.cli.options import print_failure
 from legcal.cli.simulate import simulate
 from legcal.cli.study import study
-from legcal.errors import LegcalError, UsageError
+from legcal.errors import LegcalError, UsageError, printable
 from legcal.signals import raise_if_stopped
 from legcal.version import __version__
 
@@ -99,7 +99,7 @@ def run(*, as_json: bool) -> int:
             message = getattr(error, "format_message", error.__str__)()
             print_failure("UsageError", message or NO_COMMAND, as_json=as_json)
             return 2
-        traceback.print_exc()
+        print(*map(printable, traceback.format_exc().split("\n")), sep="\n", file=sys.stderr)
         print_failure(
             "InternalError",
             f"This is a mistake in legcal {__version__}, not in your data: "

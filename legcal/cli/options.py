@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from legcal.errors import OutOfResources, UsageError
+from legcal.errors import OutOfResources, UsageError, printable
 from legcal.processors import processors
 
 MAX_IMAGE_WORKERS = 4  # processes that search images; each takes about 150 MB
@@ -113,6 +113,7 @@ def _leave_stdout() -> None:
 
 def print_failure(kind: str, message: str, *, as_json: bool) -> None:
     """Say on stderr, or in JSON on stdout, why a command failed."""
+    message = "\n".join(map(printable, message.split("\n")))
     if as_json:
         with suppress(OutOfResources):
             print_json({"error": {"kind": kind, "message": message}})
