@@ -156,6 +156,18 @@ def _images() -> Iterator[tuple[str, str, bytes, str]]:
         yield f"{size} px", "plain:images/c1_1.png", _png(size), "px"
     named = _png(64, b"\x1b[3m")
     yield "a chunk of escapes", "plain:images/c1_1.png", named[:-20] + b"\0" + named[-19:], ""
+    heads = (
+        b"%YAML:1.0\n---\na: ",
+        b'{"opencv-matrix": ',
+        b"<?xml version='1.0'?><opencv_storage>",
+    )
+    for head, opening in zip(heads, (b"- ", b"[", b"<a>"), strict=True):
+        yield (
+            f"{opening!r} in a storage",
+            "plain:camera_info.yaml",
+            head + opening * 60_000,
+            "lists",
+        )
     for camera in (2**31 - 1, 10**30, 20_000):
         text = (made_input("plain") / "camera_info.yaml").read_bytes()
         text = text.replace(b"width: 64", b"width: %d" % camera)
