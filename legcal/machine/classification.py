@@ -467,6 +467,9 @@ def _telescope(
     return base, platform, A, B, u, idle_spins
 
 
+_COPLANAR = 1e-12  # volume that three unit directions span
+
+
 def _on_slider(base: Pivot, platform: Pivot, u: Array, origin: Array) -> tuple[Array, Array, float]:
     """Return A and B where a line along the slider meets both joints, and by how much it misses."""
     A, B = base.centre, platform.centre
@@ -476,7 +479,11 @@ def _on_slider(base: Pivot, platform: Pivot, u: Array, origin: Array) -> tuple[A
         if parallel(v.along, w.along):
             across = np.cross(v.along, u)
             return v.foot(origin), w.foot(origin), abs(float((w.point - v.point) @ across))
-        s, _, t = np.linalg.solve(np.stack([v.along, u, -w.along], axis=1), w.point - v.point)
+        directions = np.stack([v.along, u, -w.along], axis=1)
+        if abs(np.linalg.det(directions)) < _COPLANAR:  # one axis is not square to the slider
+            s, _, t = np.linalg.lstsq(directions, w.point - v.point)[0]
+        else:
+            s, _, t = np.linalg.solve(directions, w.point - v.point)
         return v.point + s * v.along, w.point + t * w.along, 0.0
     if A is None and v is not None:
         A = _crossing(v, u, origin if B is None else B)

@@ -5,6 +5,7 @@ loops itself, or MJCF (:mod:`legcal.machine.mjcf`): all become a :class:`Source`
 of frames that coincide. Without a block ``legcal`` the tree is closed near where it is drawn.
 """
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -54,6 +55,7 @@ _AXES = dict(zip("XYZ", np.eye(3), strict=True))
 TRIALS = 24
 STEPS = 200
 CLOSED = 1e-10  # [m] and [rad]
+_RIGID = 1e-3  # determinants of rotations but for rounding
 _SPREAD = 0.1  # [rad] and [m], of the start of a trial, times its number
 _MAX_STEP = 0.3  # step [rad, m]
 
@@ -450,6 +452,8 @@ def closed_near(chain: ClosedChain, start: Array, links: Sequence[str]) -> Array
 def _turned(before: Array, after: Array) -> float:
     """Return by how much rotations (n, 3, 3) differ, all together [rad]."""
     apart = np.swapaxes(before, 1, 2) @ after
+    if not np.all(np.abs(np.linalg.det(apart) - 1.0) < _RIGID):  # rounded away, or not finite
+        return math.inf
     return float(Rotation.from_matrix(apart).magnitude().sum())
 
 

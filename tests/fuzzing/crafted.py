@@ -119,6 +119,9 @@ def _models() -> Iterator[tuple[str, str, bytes, str]]:
         yield f"{n} revolutes", "formats:loops.urdf", _chain(n, "revolute"), word
     yield "900 fixed joints", "formats:loops.urdf", _chain(900, "fixed"), ""
     yield "99 revolutes", "formats:loops.urdf", _chain(99, "revolute"), ""
+    planar = (made_input("formats") / "planar.xml").read_bytes()
+    made = planar.replace(b'"b1" axis="0 0 1"', b'"b1" axis="0.1 0 1"')
+    yield "an axis in the plane of slider and leg", "formats:planar.xml", made, "b1"
     many = _chain(20, "revolute").replace(b"</robot>", b"<loop_joint/>" * 40_000 + b"</robot>")
     yield "many loops", "formats:loops.urdf", many, "loops"
     yield "elements", "formats:loops.urdf", b"<robot>" + b"<a/>" * 900_000 + b"</robot>", "elements"
