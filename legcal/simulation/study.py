@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from pathlib import Path
 from threading import Thread
 from typing import Any, Protocol
@@ -291,6 +292,8 @@ def lines_of_runs(
         )
         tasks = (delayed(run_chunk)(study, seed, chunk) for chunk in chunks)
         try:
+            if os.name == "posix":  # it lets signals through again when it starts
+                resource_tracker.ensure_running()
             with held_back_signals():  # processes are started in it
                 chunks_of_lines = parallel(tasks)
             yield from chunks_of_lines
