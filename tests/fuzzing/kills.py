@@ -153,9 +153,13 @@ def faults_of(kill: Kill) -> Iterator[str]:
             yield f"{left} processes are left"
         now = _contents(folder)
         yield from _faults_of_output(command, before, results, now, code)
-        complete = code == 0 or _is_one_of(now, results, command)
-        allowed = {0, 130, -kill.number} if complete or not answered else {130}
-        if code not in ({0, -9} if kill.number is signal.SIGKILL else allowed):
+        if kill.number is signal.SIGKILL:
+            allowed = {0, -9}
+        elif _is_one_of(now, results, command):  # Python was about to end
+            allowed = {0, 130, -kill.number}
+        else:  # before the handlers stood, Python ended itself, in its own words
+            allowed = {130} if answered else {code}
+        if code not in allowed:
             yield f"exit code {code}: {_said(folder)}"
         elif code == 130 and not _said(folder).endswith(STOPPED):
             yield f"said {_said(folder)}"
