@@ -272,6 +272,6 @@ def test_the_table_has_80_columns_units_and_the_printed_figures(
     for words in ("dX [mm]", "dE [deg]", "of bound", "Table 1", "within +-2 mm"):
         assert words in text
     assert any(re.fullmatch(r" after +0.08 +0.018 +0.040 to 1.000 +100", line) for line in lines)
-    fits = [line for line in lines if line.startswith(" one fit")]
+    fits = [line for line in lines if line.startswith(" joint fit")]
     assert len(fits) == 2
     assert all(len(re.findall(r"\d \+- 0\.\d", line)) == 2 for line in fits)

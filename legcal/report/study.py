@@ -13,8 +13,8 @@ from legcal.report.render import report, table
 _LABELS = {
     "initial": "before",
     "literal": "steps as printed",
-    "default": "legcal's steps",
-    "fit": "one fit",
+    "default": "weighted steps",
+    "fit": "joint fit",
     "bound": "Cramer-Rao bound",
 }
 _COLUMNS = ("joints", ">dX [mm]", ">dE [deg]", ">parameters [mm]", ">of bound", ">runs")

@@ -55,7 +55,7 @@ READINGS = (
     "angles of the rotation between both orientations.",
     "The machine: the shipped hexapod, whose joints are coplanar, and the same with joints 2, 4 "
     "and 6 moved 30 mm out of the planes of 1, 3 and 5; cameras stand 0.9 m from its middle.",
-    "one fit: started from the initial model and from cameras up to 15 mm and 1.5 deg off, not "
+    "joint fit: started from the initial model and from cameras up to 15 mm and 1.5 deg off, not "
     "from what the steps find.",
     "bound: the Cramer-Rao bound of the same data, all used at once; the table has the errors to "
     "be expected of an estimator that reaches it. Errors of readings count as Gaussian there, "
@@ -65,7 +65,7 @@ READINGS = (
     "deviation of the mean over runs.",
 )
 
-_DRAWN = {"literal": "steps as printed", "default": "legcal's steps", "fit": "one fit"}
+_DRAWN = {"literal": "steps as printed", "default": "weighted steps", "fit": "joint fit"}
 _BAR, _LIMIT, _LINE = "#4c78a8", "#e45756", "#8a8a8a"
 _LETTERS = {"base": "A", "platform": "B", "offset": "q0"}
 _ERROR_AXIS, _TRUTH_AXIS = "mean error [mm]", "true value [mm]"
