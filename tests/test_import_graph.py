@@ -35,16 +35,17 @@ def _modules() -> dict[str, Path]:
 
 @cache
 def _handed_out(facade: str) -> dict[str, str]:
-    """Return which module each name of a façade comes from."""
+    """Return which module each name of a façade comes from, seen through façades within it."""
     path = _modules()[facade].with_suffix(".pyi")
     if not path.exists():
         return {}
-    return {
-        alias.name: f"{facade}.{node.module}"
-        for node in ast.parse(path.read_text()).body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
+    found: dict[str, str] = {}
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.ImportFrom):
+            module = f"{facade}.{node.module}"
+            inner = _handed_out(module) if module in _modules() else {}
+            found |= {alias.name: inner.get(alias.name, module) for alias in node.names}
+    return found
 
 
 @cache
@@ -104,14 +105,19 @@ def test_rooms_are_used_through_their_facades() -> None:
     past = set()
     for module in _of(*rooms, *OUTSIDE):
         for node in ast.walk(ast.parse(_modules()[module].read_text())):
-            if not isinstance(node, ast.ImportFrom):
-                continue
-            name = node.module or ""
-            if name.startswith("legcal.") and _room(name) in rooms - {_room(module)}:
-                inside = name.count(".") > 1 or any(
-                    f"{name}.{alias.name}" in _modules() for alias in node.names
-                )
-                past |= {(module, name)} if inside else set()
+            names: list[str] = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                whole = [f"{node.module}.{alias.name}" for alias in node.names]
+                names = [node.module or "", *(name for name in whole if name in _modules())]
+            past |= {
+                (module, name)
+                for name in names
+                if name.startswith("legcal.")
+                and name.count(".") > 1
+                and _room(name) in rooms - {_room(module)}
+            }
     assert past == set()
 
 

@@ -375,13 +375,13 @@ def _fit_in_rounds(session: HexapodSession, level: float, n_rounds: int) -> Solu
 
 
 def test_a_fit_that_still_changes_a_lot_is_refused(session: HexapodSession) -> None:
-    with pytest.raises(DidNotConverge, match=r"could not settle.*needed hardly any change"):
+    with pytest.raises(DidNotConverge, match=r"did not converge.*needed hardly any change"):
         _fit_in_rounds(session, 0.2, 1)
 
 
 def test_a_fit_that_still_changes_a_little_says_so(session: HexapodSession) -> None:
     (note,) = _fit_in_rounds(session, 0.2, 4).notes or ("",)
-    assert "not quite settled" in note
+    assert "not quite converged" in note
     assert " px to 0." in note
 
 

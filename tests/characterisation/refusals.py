@@ -766,7 +766,7 @@ def _tables() -> Iterable[Refusal]:
     )
 
 
-def _wishes() -> Iterable[Refusal]:
+def _overrides() -> Iterable[Refusal]:
     """Choices of parameters by options."""
     priors: list[tuple[str, str, tuple[str, ...]]] = [
         ("no-value", "leg1.offset", ("leg1.offset",)),
@@ -1140,7 +1140,7 @@ REFUSALS: tuple[Refusal, ...] = (
     *_measurements(),
     *_cameras(),
     *_tables(),
-    *_wishes(),
+    *_overrides(),
     *_models(),
     *_new(),
     *_poses(),

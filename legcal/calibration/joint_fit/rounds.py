@@ -320,13 +320,13 @@ def check_convergence(
     most_changed = _MAX_CHANGED * changes.n_accepted
     if abs(after[i] - before[i]) > _MAX_ERROR_CHANGE * largest or changes.n_changed > most_changed:
         raise DidNotConverge(
-            "The joint fit could not settle which outlines are right and how large their "
+            "The joint fit did not converge on which outlines are right and how large their "
             f"errors are: found that {found}, needed hardly any change; add images, or correct "
             "outlines that are wrong."
         )
     return (
-        "The errors of the outlines are not quite settled, and the uncertainty of the result is "
-        f"that unsure: {found}.",
+        "The errors of the outlines have not quite converged, which leaves the uncertainty of the "
+        f"result that uncertain: {found}.",
     )
 
 

@@ -29,7 +29,7 @@ from legcal.geometry import Array, pose_distance
 from legcal.machine import Machine, load_mechanism
 
 _MAX_OUTLIERS = 4  # a row of so many may disagree, and one of few
-_SUSPICIOUS = 0.05  # residuals in parts of the spread of positions, and [rad]
+_LARGE_RESIDUAL = 0.05  # residuals in parts of the spread of positions, and [rad]
 _MAX_RESIDUAL = 0.2  # the same
 _MIN_DOF = 1.0  # for a scatter
 _MAX_SIGMA = 1.0  # [m]
@@ -146,7 +146,7 @@ def _check_plausible(
     spread = float(np.sqrt(pairs.p.var(axis=0).sum()))
     left = float(np.sqrt(candidates.cost[0]))  # in lengths of the machine, and [rad]
     part = left / min(1.0, spread / pairs.length + 1e-12)
-    if part <= _SUSPICIOUS:
+    if part <= _LARGE_RESIDUAL:
         return
     _refuse_mistakes(observations, candidates, name)
     if part > _MAX_RESIDUAL:
