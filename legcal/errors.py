@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 MAX_WORD = 200  # characters without a space: longer ones are cut in the middle
 MAX_SENTENCE = 4000  # characters of one problem
+MAX_MESSAGE = 16_000  # characters of all that are shown
 _CONTROL = re.compile(  # not printable, or turning the direction of what is
     r"[^\x20-\x7e\xa0-\u200d\u2010-\u2027\u2030-\u2065\u206a-\ud7ff\ue000-\ufefe\uff00-\U0010ffff]"
 )
@@ -26,7 +27,8 @@ class LegcalError(Exception):
     ----------
     problems : tuple of str
         One sentence for each problem found, in the order in which they were found. The message
-        has them all, but of more than ten of a kind only five and how many there are besides.
+        has them all, but of more than ten of a kind only five and how many there are besides,
+        and as many as a screen or two can hold.
     exit_code : int
         The process exit code of the command line: 1 for a reason in the data, 2 for
         malformed input or wrong use.
@@ -76,6 +78,11 @@ def _shortened(problems: Sequence[str]) -> list[str]:
             lines.append(problem)
         elif shown[kind] == _SPELT_OUT + 1:
             lines.append(f"... and {total[kind] - _SPELT_OUT} more like these.")
+    length = 0
+    for k, line in enumerate(lines):
+        length += len(line)
+        if k and length > MAX_MESSAGE:
+            return [*lines[:k], f"... and {len(lines) - k} more."]
     return lines
 
 

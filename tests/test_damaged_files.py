@@ -48,6 +48,10 @@ def test_text_from_files_is_shown_on_one_short_line_without_control_characters()
     assert len(shown) < 5000
     assert "\\x1b" in shown
     assert shown.endswith("¼±°ä€🤖")
+    many = LegcalError([f"problem {'a' * k}: it is {'b ' * 1000}" for k in range(100)])
+    assert len(str(many)) < 20_000
+    assert str(many).endswith("... and 93 more.")
+    assert len(many.problems) == 100
     plain = "leg 'leg1-a': found 0.42 mm, needed ±1 µm; correct it."
     assert str(LegcalError(plain)) == plain
 

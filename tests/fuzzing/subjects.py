@@ -51,7 +51,7 @@ SUBJECTS = (
     Subject("plain", "camera_info.yaml", "detect {in} -o {out}"),
     Subject("plain", "images/c1_1.png", "detect {in} -o {out}"),
     Subject("pictures", "images/c1_1.tiff", "detect {in} -o {out}"),
-    Subject("pictures", "images/c1_2.jpg", "detect {in} -o {out}", share=0.3),
+    Subject("pictures", "images/c1_2.jpg", "detect {in} -o {out}", share=0.15),
     Subject("tool-poses", "3-rpr.csv",
             "locate {in}/3-rpr/models/3-rpr.yaml {in}/3-rpr.csv -o {out}", deep=True),
     Subject("3-rpr-axes", "dataset.yaml", "calibrate {in} -o {out}", deep=True),
