@@ -295,9 +295,7 @@ def test_the_rigid_criterion_has_the_rank_that_is_predicted(name: str) -> None:
     rigid = rigid_problem(observed)
     problem = build_rigid(rigid)
     J, residuals = problem.jacobian(problem.start), problem.residuals(problem.start)
-    information = IpoptSolution(
-        problem.start, residuals, J, len(rigid.unknowns), 0, ""
-    ).information()
+    information = IpoptSolution(problem.start, residuals, J, len(rigid.unknowns), "").information()
     kept = [i for i, name in enumerate(rigid.unknowns.names) if "offset" not in name]
     metre = np.where(rigid.unknowns.is_angle, 1.0 / session.mean_length, 1.0)
     assert len(kept) == rank.of

@@ -75,7 +75,7 @@ def leg_of(
 ) -> Leg:
     """Return a leg in the links of base and platform, which stand at T_body_link in their bodies.
 
-    In a plane axes and twist say nothing. *home* is T_base_platform of a pose that tells the sign
+    In a plane axes and twist say nothing. *home* is T_base_platform of a pose that shows the sign
     of the length law.
     """
     T_base, T_platform = T_body_link
@@ -113,7 +113,7 @@ def leg_of(
 def _sign(reach: float, travel: tuple[float, float], length: float | None) -> int:
     """Return whether a leg grows (+1) or shrinks (-1) with its joint value.
 
-    B stands at reach + q along the slider. Its length at home tells on which side of A, where
+    B stands at reach + q along the slider. Its length at home shows on which side of A, where
     only one of the two is within the travel; else the middle of the travel does.
     """
     if length is not None:
@@ -268,7 +268,7 @@ def _names(axes: Sequence[Axis]) -> str:
     return " and ".join(f"'{axis.name}'" for axis in axes)
 
 
-def _with_spins(base: Pivot, platform: Pivot, u: Array, leg: str) -> tuple[Pivot, Pivot, int]:
+def _with_spins(base: Pivot, platform: Pivot, leg: str) -> tuple[Pivot, Pivot, int]:
     """Return both joints with the revolutes along the leg made part of them, and the idle ones.
 
     A universal joint and a revolute along the leg are an S, on whichever end it stands: the leg
@@ -374,7 +374,7 @@ def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str) -> Ends:
         )
     u = (B - A) / length
     base, platform = _pivot(lower, u, leg), _pivot(upper, u, leg)
-    base, platform, idle_spins = _with_spins(base, platform, u, leg)
+    base, platform, idle_spins = _with_spins(base, platform, leg)
     if platform.type is JointType.FIXED:
         raise OutOfClass(
             f"the leg of joint '{leg}' is outside the method: found a rod that only turns "
@@ -448,7 +448,7 @@ def _telescope(
     u = towards * axes[slider].along  # a joint moves its child
     base = _pivot(axes[:slider], u, leg)
     platform = _pivot(axes[:slider:-1], u, leg)
-    base, platform, idle_spins = _with_spins(base, platform, u, leg)
+    base, platform, idle_spins = _with_spins(base, platform, leg)
     origin = axes[slider].point
     A, B, miss = _on_slider(base, platform, u, origin)
     what = f"its axis through the {_END[platform.type]} misses the base joint"

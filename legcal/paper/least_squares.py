@@ -133,7 +133,6 @@ class IpoptSolution:
     residuals: Array  # (m,), times the square roots of their weights
     jacobian: csc_array[np.float64]  # (m, n), the same
     n_shared: int  # the first unknowns are shared by many observations
-    n_iterations: int  # of IPOPT, over all weights
     status: str  # of IPOPT at the end
 
     @property
@@ -187,7 +186,7 @@ def _solved(problem: LeastSquares) -> IpoptSolution:
     if problem.exact_hessian:  # coordinates of one kind; some columns of J may vanish
         scale = np.full_like(scale, scale.min())
     block = problem._robust_blocks()
-    root_weight, z, n_iterations, status = np.ones(len(block)), 0.0 * scale, 0, ""
+    root_weight, z, status = np.ones(len(block)), 0.0 * scale, ""
     for k in range(1 + (_REWEIGHTINGS if np.any(block >= 0) else 0)):
         if k > 0:
             residuals = _dense(compiled.residuals(problem.start + scale * z, observed))
@@ -205,14 +204,12 @@ def _solved(problem: LeastSquares) -> IpoptSolution:
                 "observations, or reject the ones with large residuals."
             )
         status = str(stats["return_status"])
-        n_iterations += int(stats["iter_count"])
     x = problem.start + scale * z
     return IpoptSolution(
         x=x,
         residuals=root_weight * _dense(compiled.residuals(x, observed)),
         jacobian=csc_array(diags_array(root_weight) @ _sparse(compiled.jacobian(x, observed))),
         n_shared=len(x) if problem.n_shared is None else problem.n_shared,
-        n_iterations=n_iterations,
         status=status,
     )
 

@@ -111,7 +111,7 @@ class Remedy:
 
 @dataclass(frozen=True)
 class CameraIntrinsics:
-    """What the legs tell of one camera, its four numbers looked for together with all others."""
+    """What the legs determine of one camera, its four numbers estimated with all others."""
 
     camera: str  # the view after whose name the intrinsics are called
     determined: bool  # whether the legs determine all four
@@ -149,7 +149,7 @@ class Identifiability:
     # the smallest sets of views, fewest first; None where views were given
     recommendation: tuple[Recommendation, ...] | None
     notes: tuple[str, ...]  # what the reader should know
-    # what the legs tell of the cameras of a dataset with images; empty without them
+    # what the legs determine of the cameras of a dataset with images; empty without them
     intrinsics: tuple[CameraIntrinsics, ...] = ()
 
     @property

@@ -39,7 +39,7 @@ _MAX_VARIANCE_SHARE = 0.5  # of the variance of that prior, after the measuremen
 _NOMINAL_SIGMA = 0.01  # of the mean leg length: how far a nominal model is off along what is held
 _MANY_REJECTED = 0.1  # of all outlines
 _MOST_REJECTED = 0.5  # of those of a leg or a view
-_MIN_COUNT = 3  # rejected outlines of a leg or a view, at least, before it is spoken of
+_MIN_COUNT = 3  # rejected outlines of a leg or a view, at least, before it is noted
 _RADIUS_SIGMAS = 3.0  # of the prior of a radius, between all radii and the model's
 _RADIUS_SPREAD = 0.25  # of their common difference
 _MAX_NAMES = 4  # names, before they are only counted
@@ -68,7 +68,7 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
                 f"The prior of {problem.named[i]} contradicts the measurements: it says {mean:.6g} "
                 f"+- {sigma:.2g} {unit}, they say about {found.value:.4g} {unit}, "
                 f"{found.apart:.0f} standard deviations apart; at most {_SIGNIFICANT:g} are "
-                "believed; correct the prior or leave it out."
+                "accepted; correct the prior or leave it out."
             )
     if problems:
         raise DidNotConverge(problems)
@@ -152,7 +152,7 @@ class _Comparison:
         return (
             f"The {'prior' if self.sigma else 'fixed value'} of {self.name} contradicts the "
             f"measurements: it is {stated}, they say about {self.found:.4g} {self.unit}, "
-            f"{apart:.0f} standard deviations apart; at most {_SIGNIFICANT:g} are believed; "
+            f"{apart:.0f} standard deviations apart; at most {_SIGNIFICANT:g} are accepted; "
             f"correct it, {'' if self.sigma else 'give it a prior, '}or let it free."
         )
 

@@ -65,24 +65,6 @@ class PlatformError:
         return float(self.rotation.max())
 
 
-def predict_platform_error(
-    legs: Sequence[Leg],
-    parametrization: Parametrization,
-    covariance: Array,
-    frame_legs: Sequence[int],
-    T_Rb_Re: Sequence[RigidTransform],
-) -> PlatformError:
-    """Return the predicted platform error at poses, one standard deviation.
-
-    Raises
-    ------
-    NotIdentifiable
-        If the readings do not determine a pose.
-    """
-    J = platform_by_parameters(legs, parametrization, frame_legs, T_Rb_Re)
-    return expected_error(J, covariance)
-
-
 def platform_by_parameters(
     legs: Sequence[Leg],
     parametrization: Parametrization,
@@ -187,13 +169,11 @@ def _workspace_poses(machine: Machine, legs: Sequence[Leg]) -> Sequence[RigidTra
         return None
     nearby = [platform_in_base(machine, T) for T in drawn.poses]
     poses = poses_at_readings(machine, legs, drawn.readings, nearby)
-    reached = [
-        T for T, q in zip(poses, drawn.readings, strict=True) if _is_reached(machine, legs, q, T)
-    ]
+    reached = [T for T, q in zip(poses, drawn.readings, strict=True) if _is_reached(legs, q, T)]
     return reached or None
 
 
-def _is_reached(machine: Machine, legs: Sequence[Leg], q: Array, T_Rb_Re: RigidTransform) -> bool:
+def _is_reached(legs: Sequence[Leg], q: Array, T_Rb_Re: RigidTransform) -> bool:
     """Say whether legs have the lengths of readings (n_legs,) at a pose: some have them nowhere."""
     return all(
         abs(np.linalg.norm(T_Rb_Re.apply(leg.B) - leg.A) - leg.length_at(reading)) < _REACHED
