@@ -237,9 +237,7 @@ PASSIVE = "hexapod with a passive leg"
     [
         ("hexapod", Request(error=["lengths=1mm"]), "--error lengths .* found none in the"),
         ("hexapod", Request(error=["axes=1deg"]), "--error axes .* found none in the mechanism"),
-        ("3-rps", Request(error=["twists=1deg"]), "--error twists .* found none in the mechanism"),
         ("hexapod", Request(error=["none"], coplanar=True), "--coplanar .* no errors of joints"),
-        ("hexapod", Request(poses="p.csv", sampling=Sampling.EXTREME), "--sampling with a file"),
         (PASSIVE, Request(sampling=Sampling.WORKSPACE), "--sampling for a machine whose motors"),
         (
             "hexapod",
@@ -269,7 +267,6 @@ def test_no_errors_of_what_a_machine_has_not_may_be_given() -> None:
         ({"sigma_px": -0.1}, "-0.1 as the noise of edge points, needed 0 to 100 px"),
         ({"sigma_px": float("nan")}, "nan as the noise of edge points"),
         ({"sigma_px": "0.1px"}, "sigma_px, needed a number"),
-        ({"sigma_px": 1e9}, "1e\\+09"),
         ({"readings": 2e-6}, "readings, needed a Spread"),
         ({"readings": Spread(-1e-6)}, "noise of readings, needed 0 to 1 m"),
         ({"errors": None}, "errors, needed a ParameterErrors"),
@@ -286,8 +283,6 @@ def test_no_errors_of_what_a_machine_has_not_may_be_given() -> None:
         ({"seed": 1.5}, "seed"),
         ({"seed": -1}, "seed, needed a whole number of 0 or more"),
         ({"poses": 1000, "views": 100, "images": 2}, "200000 images"),
-        ({"hand_held": True}, "a camera in the hand without a board"),
-        ({"board_pose": True}, "the pose of a board without a board"),
         ({"board": "charuco", "hand_held": True, "images": 2}, "2 images of each pose"),
         ({"board": "charuco", "hand_held": True, "views": "c.yaml"}, "and a file of cameras"),
         ({"board": 3}, "3 as board, needed a Board"),
@@ -321,10 +316,9 @@ def test_numbers_choices_and_paths_of_any_type_count(tmp_path: Path) -> None:
 
 
 def test_cameras_of_too_many_pixels_or_images_are_refused(tmp_path: Path) -> None:
-    for size in ((4_000_000_000, 3000), (20_000, 20_000)):
-        large = settings(poses=1, views=1, camera=small_camera(tmp_path, *size))
-        with pytest.raises(DatasetError, match=f"found {size[0]} x {size[1]} px, needed at most"):
-            simulate("hexapod", tmp_path / "set", large)
+    large = settings(poses=1, views=1, camera=small_camera(tmp_path, 4_000_000_000, 3000))
+    with pytest.raises(DatasetError, match="found 4000000000 x 3000 px, needed at most"):
+        simulate("hexapod", tmp_path / "set", large)
     place = "{T_base_camera: {xyz: [1, 0, 0.2], quat_xyzw: [0, 0, 0, 1]}}"
     path = tmp_path / "cameras.yaml"
     path.write_text(f"views: {{a: {place}, b: {place}}}\n")
@@ -487,7 +481,6 @@ def _folder_for_a_file(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "before", "named"),
     [
-        ("", lambda folder: write(folder, {"notes.txt": "mine"}), r"folder with (other )?files"),
         ("", lambda folder: write(folder, {"dataset.yaml": "legcal_dataset: 1\n"}), "files"),
         ("", _folder_for_a_file, r"found (a simulated dataset|dataset\.yaml, which is a folder)"),
         ("file", lambda folder: write(folder, {"file": "mine"}), "found a file of that name"),

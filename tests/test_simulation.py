@@ -7,10 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
-from staged_sessions import exact_session
 
 from legcal.errors import DidNotConverge
-from legcal.geometry.lines import moment
 from legcal.machine import load_mechanism, to_vector
 from legcal.simulation import (
     OutlineNoise,
@@ -21,8 +19,6 @@ from legcal.simulation import (
     look_at,
     paper_hexapod,
     perturb,
-    sample_camera,
-    shifted_outlines,
 )
 from legcal.simulation.hexapod import follow_from_home, leg_vectors, poses_with_lengths
 from legcal.simulation.poses import JITTER
@@ -123,25 +119,6 @@ def test_a_camera_sees_its_target_on_its_optical_axis_and_up_as_up() -> None:
     assert np.allclose(T.apply(np.zeros(3))[:2], 0.0, atol=1e-12)
     assert T.apply(np.zeros(3))[2] > 0.0
     assert T.apply([0.0, 0.0, 0.1])[1] < 0.0
-
-
-def test_exact_outlines_touch_the_cylinder_on_the_side_of_their_edge() -> None:
-    session = exact_session()
-    outlines, axes = session.outlines, session.axes
-    assert outlines is not None
-    epsilon = np.where(outlines.edge == 1, 1.0, -1.0)
-    distance = np.sum(outlines.h * np.repeat(axes.M, 2, axis=0), axis=1)
-    assert np.allclose(distance, 0.010 * epsilon, atol=1e-10)
-    assert np.all(np.sum(outlines.h * np.repeat(moment(axes.u, axes.M), 2, axis=0), axis=1) > 0)
-
-
-def test_a_shift_of_an_outline_in_pixels_is_the_offset_that_the_camera_measures() -> None:
-    session = exact_session()
-    assert session.outlines is not None
-    camera, outlines = sample_camera(), session.outlines
-    h, _ = shifted_outlines(camera, outlines.h, outlines.ends, np.array([0.3, -0.2]))
-    offset = camera.line_offset(h[:, None], camera.undistort(outlines.ends))
-    assert np.allclose(offset, [-0.3, 0.2], atol=2e-3)
 
 
 def test_the_covariance_of_an_outline_is_that_of_a_line_fitted_to_white_points() -> None:

@@ -16,7 +16,7 @@ import pytest
 from toy_studies import Deadly, Draws, Mistaken
 
 from legcal.errors import DidNotConverge, OutOfResources, UsageError
-from legcal.simulation import child_seed, run_study
+from legcal.simulation import run_study
 from legcal.simulation.checkpoint import CHECKPOINT_NAME, header, open_checkpoint
 from legcal.simulation.study import DOCUMENT_NAME
 
@@ -33,11 +33,6 @@ def test_results_depend_neither_on_the_number_of_processes_nor_on_their_order() 
     results = [run_study(study, 40, seed=3, workers=n).document() for n in (1, 2, 3)]
     assert results[0] == results[1] == results[2]
     assert results[0]["n"] == 40
-
-
-def test_the_seed_of_a_run_is_the_child_of_that_number_however_many_there_are() -> None:
-    for run, spawned in enumerate(np.random.SeedSequence(5).spawn(7)):
-        assert np.array_equal(child_seed(5, run).generate_state(4), spawned.generate_state(4))
 
 
 def test_more_runs_are_added_to_those_that_are_there_and_missing_ones_made_up_for(
@@ -128,56 +123,48 @@ def test_a_full_disk_is_told_and_the_study_goes_on_when_there_is_room(
     assert run_study(Draws(), 100, output=tmp_path).document() == run_study(Draws(), 100).document()
 
 
-def test_figures_that_cannot_be_written_lose_no_run(tmp_path: Path) -> None:
+def test_figures_and_checkpoints_that_cannot_be_written_are_told_and_no_run_is_lost(
+    tmp_path: Path,
+) -> None:
+    run_study(Draws(), 1, output=tmp_path)
+    (tmp_path / "total.txt").unlink()
     (tmp_path / "total.txt").mkdir()
     (tmp_path / "total.txt" / "mine").touch()
-    run_study(Draws(), 1, output=tmp_path / "out")
-    (tmp_path / "out" / "total.txt").unlink()
-    (tmp_path / "total.txt").rename(tmp_path / "out" / "total.txt")
     with pytest.raises(OutOfResources, match=r"result of the study.*all runs are kept"):
-        run_study(Draws(), 3, output=tmp_path / "out")
-    assert len(_lines(tmp_path / "out")) == 4
-
-
-def test_a_checkpoint_that_cannot_be_opened_is_told(tmp_path: Path) -> None:
+        run_study(Draws(), 3, output=tmp_path)
+    assert len(_lines(tmp_path)) == 4
     with (
         pytest.raises(OutOfResources, match="could not be opened"),
-        open_checkpoint(tmp_path, header("draws", {}, 0), Draws().is_record),
+        open_checkpoint(tmp_path / "total.txt", header("draws", {}, 0), Draws().is_record),
     ):
         pass
 
 
 @pytest.mark.parametrize(
-    "rest", [b'{"run":11,"rec', b'{"run":11,"record":{"x":1.0}}', b"\0\0\0\0\n"]
+    ("kept", "rest"),
+    [
+        (12, b'{"run":11,"rec'),
+        (12, b'{"run":11,"record":{"x":1.0}}'),
+        (12, b"\0\0\0\0\n"),
+        (0, b""),
+        (0, b'{"legcal_study":'),  # half of the first line
+    ],
 )
-def test_a_half_written_last_line_is_done_again(tmp_path: Path, rest: bytes) -> None:
-    run_study(Draws(), 11, output=tmp_path)
-    with open(tmp_path / CHECKPOINT_NAME, "ab") as file:
-        file.write(rest)
-    assert run_study(Draws(), 20, output=tmp_path).document() == run_study(Draws(), 20).document()
-    assert len(_lines(tmp_path)) == 21
+def test_a_half_written_last_line_is_done_again(tmp_path: Path, kept: int, rest: bytes) -> None:
+    run_study(Draws(), 11, output=tmp_path / "whole")
+    lines = _lines(tmp_path / "whole")
+    assert len(lines) == 12
+    assert kept or lines[0].startswith(rest)
+    folder = tmp_path / "damaged"
+    folder.mkdir()
+    (folder / CHECKPOINT_NAME).write_bytes(b"".join([*lines[:kept], rest]))
+    assert run_study(Draws(), 20, output=folder).document() == run_study(Draws(), 20).document()
+    assert len(_lines(folder)) == 21
 
 
-def test_a_checkpoint_that_was_hardly_begun_is_begun_again(tmp_path: Path) -> None:
-    expected = run_study(Draws(), 3, output=tmp_path).document()
-    path = tmp_path / CHECKPOINT_NAME
-    begun = path.read_bytes()[:17]
-    for left in (b"", begun):
-        folder = tmp_path / f"left {len(left)}"
-        folder.mkdir()
-        (folder / CHECKPOINT_NAME).write_bytes(left)
-        assert run_study(Draws(), 3, output=folder).document() == expected
-    (tmp_path / DOCUMENT_NAME).write_text("mine")
-    path.write_bytes(b"")  # no study yet, and files that no study wrote
-    with pytest.raises(UsageError, match="a folder with other files"):
-        run_study(Draws(), 3, output=tmp_path)
-    assert (tmp_path / DOCUMENT_NAME).read_text() == "mine"
-
-
-def test_a_damaged_line_is_refused(tmp_path: Path) -> None:
-    run_study(Draws(), 5, output=tmp_path)
-    before = _lines(tmp_path)
-    for damaged in (
+@pytest.mark.parametrize(
+    "damaged",
+    [
         b'{"run":1,\n',
         b"[" * 100_000 + b"\n",
         b"[1]\n",
@@ -189,16 +176,45 @@ def test_a_damaged_line_is_refused(tmp_path: Path) -> None:
         b'{"run":1,"record":{"x":"1.0"}}\n',
         b'{"run":1,"failure":"x"}\n',
         b'{"run":1,"failure":{"kind":1,"message":"x"}}\n',
-    ):
-        # As the last line, half of one may be what a killed run left.
-        lines = [*before[:2], damaged, *before[3 : 3 + (not damaged.endswith(b"}\n"))]]
-        (tmp_path / CHECKPOINT_NAME).write_bytes(b"".join(lines))
-        with pytest.raises(UsageError, match="found line 3 damaged"):
-            run_study(Draws(), 5, output=tmp_path)
-        assert _lines(tmp_path) == lines
-    (tmp_path / CHECKPOINT_NAME).write_bytes(b"[" * 100_000 + b"\n")
-    with pytest.raises(UsageError, match="no checkpoint of legcal"):
+    ],
+    ids=range(11),
+)
+def test_a_damaged_line_is_refused(tmp_path: Path, damaged: bytes) -> None:
+    run_study(Draws(), 5, output=tmp_path)
+    before = _lines(tmp_path)
+    # As the last line, half of one may be what a killed run left.
+    lines = [*before[:2], damaged, *before[3 : 3 + (not damaged.endswith(b"}\n"))]]
+    (tmp_path / CHECKPOINT_NAME).write_bytes(b"".join(lines))
+    with pytest.raises(UsageError, match="found line 3 damaged"):
         run_study(Draws(), 5, output=tmp_path)
+    assert _lines(tmp_path) == lines
+
+
+NO_CHECKPOINT, DEEP = "no checkpoint of legcal", "[" * 100_000 + "\n"
+LONG = "long" * 100
+
+
+@pytest.mark.parametrize(
+    ("there", "output", "message"),
+    [
+        ({"notes.txt": "mine"}, "", "a folder with other files"),
+        ({CHECKPOINT_NAME: "", DOCUMENT_NAME: "mine"}, "", "a folder with other files"),
+        ({"notes.txt": "mine"}, "notes.txt", "a file of that name"),
+        ({"notes.txt": "mine"}, "notes.txt/below", "needed a folder that can be created and read"),
+        ({}, LONG, "needed a folder that can be created and read"),
+        ({CHECKPOINT_NAME: "mine\n", "notes.txt": "mine"}, "", NO_CHECKPOINT),
+        ({CHECKPOINT_NAME: DEEP}, "", NO_CHECKPOINT),
+    ],
+    ids=range(7),
+)
+def test_a_folder_or_a_file_of_somebody_else_is_refused_and_kept(
+    tmp_path: Path, there: dict[str, str], output: str, message: str
+) -> None:
+    for name, text in there.items():
+        (tmp_path / name).write_text(text)
+    with pytest.raises(UsageError, match=message):
+        run_study(Draws(), 3, output=tmp_path / output)
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == there
 
 
 @pytest.mark.parametrize(
@@ -221,22 +237,6 @@ def test_a_checkpoint_of_another_study_is_refused_and_kept(
     with pytest.raises(UsageError, match=message):
         run_study(study, 5, seed=seed, output=tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
-def test_a_folder_or_a_file_of_somebody_else_is_refused_and_kept(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(UsageError, match="a folder with other files"):
-        run_study(Draws(), 5, output=tmp_path)
-    with pytest.raises(UsageError, match="a file of that name"):
-        run_study(Draws(), 5, output=tmp_path / "notes.txt")
-    for impossible in (tmp_path / "notes.txt" / "below", tmp_path / ("long" * 100)):
-        with pytest.raises(UsageError, match="needed a folder that can be created and read"):
-            run_study(Draws(), 5, output=impossible)
-    (tmp_path / CHECKPOINT_NAME).write_text("mine\n")
-    with pytest.raises(UsageError, match="no checkpoint of legcal"):
-        run_study(Draws(), 5, output=tmp_path)
-    assert (tmp_path / CHECKPOINT_NAME).read_text() == "mine\n"
-    assert {path.name for path in tmp_path.iterdir()} == {"notes.txt", CHECKPOINT_NAME}
 
 
 def test_numbers_that_make_no_sense_are_refused() -> None:
