@@ -1111,7 +1111,7 @@ def _scenes() -> Iterable[Refusal]:
         )  # fmt: skip
     wide = keyed("camera_info.yaml", image_width=20000, image_height=20000)
     yield Refusal("scene-huge", f"{command} --camera {{in}}/camera_info.yaml",
-                  ("20000 x 20000", "65535"), "plain", (wide,))  # fmt: skip
+                  ("20000 x 20000", "100000000"), "plain", (wide,))  # fmt: skip
     yield Refusal(
         "scene-board", f"{command} --board {{in}}/b.yaml", ("board",), "", (text("b.yaml", "a: 1"),)
     )
