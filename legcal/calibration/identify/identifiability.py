@@ -96,7 +96,7 @@ def identifiability(
     board: bool = False,
     hand_held: bool = False,
 ) -> Identifiability:
-    """Judge what images of some views can tell of a mechanism's parameters.
+    """Judge what images of some views determine of a mechanism's parameters.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def identifiability_of_dataset(
     # parameters that are fixed or known from elsewhere, and twists that are looked for
     choices: Choices = NO_CHOICES,
 ) -> Identifiability:
-    """Judge what a dataset can tell: its readings, its cameras and the legs of its views.
+    """Judge what a dataset determines: its readings, its cameras and the legs of its views.
 
     Raises DidNotConverge if the readings do not lead to closed poses.
     """

@@ -395,7 +395,7 @@ class EstimatedGamma:
         )
 
     def __str__(self) -> str:
-        hardly = ", and its outlines hardly tell it" * (self.sigma > _VAGUE_SIGMA)
+        hardly = ", and its outlines hardly determine it" * (self.sigma > _VAGUE_SIGMA)
         return (
             f"The gamma of the camera of {few_views(self.views)} is not given{hardly}: found "
             f"{self.gamma:.2f} +- {self.gamma * self.sigma:.2f} by outlines measured with "

@@ -51,7 +51,7 @@ class Determinacy:
     # (12, 12): of a step: displacement and rotation of the base about world axes, of the tool about
     # platform axes [m, rad]; zero along what is held
     covariance: Array
-    held: tuple[OpenPart, ...]  # what no pose of the machine tells
+    held: tuple[OpenPart, ...]  # what no pose of the machine determines
     words: str  # the same for people; "" where everything is determined
     weak: tuple[str, ...]  # what is known badly, one sentence each
 
@@ -226,7 +226,7 @@ def _workspace(observations: ToolObservations) -> PosePairs:
 def _check_machine(
     observations: ToolObservations, found: FrameFit, basis: Array, workspace: PosePairs, name: str
 ) -> None:
-    """Refuse what other poses would tell, and what holding the tool does not close."""
+    """Refuse what other poses would determine, and what holding the tool does not close."""
     pairs = observations.pairs
     seen = jacobian(found.frames, workspace) * pairs.unit[:, None] * pairs.scale
     beyond = _shown_elsewhere(basis, seen.reshape(-1, N_STEP), oriented=observations.is_oriented)
@@ -298,7 +298,7 @@ def _weak(
         known = f"{1e3 * sigma:.2g} mm" if kind == "position" else f"{np.degrees(sigma):.2g} deg"
         sentences.append(
             f"Known badly is {part.words}: {known} (1 sigma); poses that differ more, above all in "
-            "rotations about several axes, would tell it better."
+            "rotations about several axes, would determine it better."
         )
     return tuple(sentences)
 

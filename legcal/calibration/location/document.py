@@ -165,7 +165,7 @@ class MeasurementNoise:
 
 @dataclass(frozen=True)
 class OpenPart:
-    """A part of the frames that poses do not tell, or hardly."""
+    """A part of the frames that poses do not determine, or hardly."""
 
     frame: Frame  # {"base", "tool"}: whose
     kind: Kind  # {"position", "orientation"}: of what

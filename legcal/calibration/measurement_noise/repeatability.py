@@ -54,7 +54,7 @@ def group_rows(measurements: Measurements, rows: IntArray) -> list[Repeats]:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """What the repeats of one orientation tell about one quantity."""
+    """What the repeats of one orientation say about one quantity."""
 
     covariance: Array  # (d, d) of the repeats
     claimed: Array  # (d, d) mean of the covariances that the method claims
