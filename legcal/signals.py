@@ -51,9 +51,15 @@ def stopped_by_signals() -> Iterator[None]:
         if not _State.holding:
             raise KeyboardInterrupt
 
+    def report(unraisable: "sys.UnraisableHookArgs") -> None:
+        if not isinstance(unraisable.exc_value, KeyboardInterrupt):  # it is raised again
+            report_before(unraisable)
+
     alarm = signal.getsignal(signal.SIGALRM) if _HAS_TIMER else None
+    report_before = sys.unraisablehook
     try:
         _State.handling = True
+        sys.unraisablehook = report
         for number in heard:
             signal.signal(number, stop)
         yield
@@ -68,6 +74,7 @@ def stopped_by_signals() -> Iterator[None]:
             signal.signal(signal.SIGALRM, alarm)
         for number in heard:
             signal.signal(number, before[number])
+        sys.unraisablehook = report_before
         _State.handling = _State.stopped = False
 
 
