@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
-from machines import HOME, MACHINES, SHIPPED, SHIPPED_URDF, displaced, of_types, ring
+from machines import HOME, MACHINES, SHIPPED, displaced, of_types, ring
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
@@ -183,30 +183,6 @@ def test_a_start_in_another_assembly_mode_stays_there() -> None:
     q = inverse_kinematics(hexapod, home) + 0.01
     above_T, below_T = forward_kinematics(hexapod, q), forward_kinematics(hexapod, q, start=below)
     np.testing.assert_allclose(below_T.translation, above_T.translation * mirror, atol=1e-9)
-
-
-def test_another_reader_of_the_urdf_places_every_link_alike() -> None:
-    from yourdfpy import URDF
-
-    hexapod = machine_of("hexapod")
-    robot = URDF.load(str(SHIPPED_URDF), load_meshes=False)
-    configuration = hexapod.home_configuration
-    values = {
-        joint.name: float(configuration[hexapod.chain.q_index(joint.name)])
-        for joint in hexapod.urdf.joints.values()
-        if joint.type in ("revolute", "prismatic")
-    }
-    q = inverse_kinematics(hexapod, hexapod.home)
-    assert [values[str(leg.prismatic)] for leg in hexapod.legs] == pytest.approx(q, abs=1e-12)
-    robot.update_cfg(values)
-    for j in range(1, 7):
-        for link in ("b1_link", "b2_link", "tube", "end"):
-            ours = hexapod.chain.pose(configuration, "platform", f"leg{j}_{link}")
-            theirs = robot.get_transform(f"leg{j}_{link}", "platform")
-            np.testing.assert_allclose(ours.as_matrix(), theirs, atol=1e-12)
-        # the second reader knows no loops: closed by us, its leg ends at the base joint too
-        end = hexapod.home.apply(robot.get_transform(f"leg{j}_end", "platform")[:3, 3])
-        np.testing.assert_allclose(end, hexapod.A_base[j - 1], atol=1e-12)
 
 
 def test_a_3_rpr_agrees_with_its_distance_equations() -> None:

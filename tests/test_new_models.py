@@ -120,14 +120,6 @@ def test_published_machines_have_their_published_values() -> None:
     assert 1e-3 < np.abs(real.A_base - nominal.A_base).max() < 10e-3
 
 
-def test_urdf_numbers_are_read_back_as_written_by_another_reader() -> None:
-    yourdfpy = pytest.importorskip("yourdfpy")
-    robot = yourdfpy.URDF.load(str(ROOT / "urdf" / "3-upu-tilted.urdf"), load_meshes=False)
-    for j, B in enumerate(load_mechanism("3-upu-tilted").B_platform):
-        seat = robot.get_transform(f"leg{j + 1}_seat", "platform")
-        np.testing.assert_allclose(seat[:3, 3], B, atol=1e-15)
-
-
 # --- tables -------------------------------------------------------------------------------------
 
 TYPES = (

@@ -26,8 +26,6 @@ from legcal.paper.gibbs import (
     axis_frames,
     axis_slope,
     gibbs_of,
-    moved,
-    moved_points,
     turned_frame,
 )
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
@@ -180,18 +178,6 @@ def test_the_number_of_nonzeros_grows_with_the_number_of_poses_and_no_faster() -
 
 
 # Unknown motions and axes
-
-
-def test_points_moved_in_casadi_are_those_moved_by_the_rigid_motion() -> None:
-    rng = np.random.default_rng(0)
-    start = RigidTransform.from_components(rng.normal(size=3), Rotation.random(rng=rng))
-    points, step = rng.normal(size=(4, 3)), rng.normal(size=6)
-    symbol = ca.SX.sym("step", 6)
-    R, t = ca.SX(ca.DM(start.rotation.as_matrix())), ca.SX(ca.DM(start.translation))
-    function = ca.Function("f", [symbol], [moved_points(symbol, R, t, ca.SX(ca.DM(points.T)))])
-    expected = moved(step, start).apply(points)
-    assert np.allclose(function(step).full().T, expected, atol=1e-12)
-    assert np.allclose(moved(np.zeros(6), start).as_matrix(), start.as_matrix())
 
 
 @given(turns=st.tuples(*[st.floats(-1.0, 1.0)] * 2), seed=st.integers(0, 10**6))

@@ -150,6 +150,14 @@ def test_thin_rods_cover_their_area(width_px: float) -> None:
     assert covered.sum() == pytest.approx(width_px * length, rel=0.02)
 
 
+@pytest.mark.parametrize("turn", [0.0, math.pi])
+def test_a_cylinder_seen_along_its_axis_shows_its_near_cap(turn: float) -> None:
+    T = RigidTransform.from_components([0.0, 0.0, 1.0], Rotation.from_rotvec([turn, 0.0, 0.0]))
+    covered = (clean([solid(Cylinder(0.1, 0.2), T, albedo=0.6)]) - 0.02) / 0.58
+    near = 0.1 / 0.9  # of the cap, 0.9 m away
+    assert covered.sum() == pytest.approx(math.pi * near**2 * F * 1.01 * F, rel=0.01)
+
+
 def test_nearer_solids_hide_farther_ones_whatever_their_order() -> None:
     near = solid(Sphere(0.1), RigidTransform.from_translation([0.0, 0.0, 0.8]), albedo=0.9)
     far = solid(Box((0.6, 0.6, 0.1)), RigidTransform.from_translation([0.0, 0.0, 1.2]), albedo=0.3)
@@ -206,6 +214,19 @@ def test_a_shadow_falls_opposite_the_lamp_and_soft_lamps_make_it_soft(size: floa
     across = image[v, u : u + 70] / image[v, u + 70]
     half_shadow = np.count_nonzero((across > 0.05) & (across < 0.95))
     assert half_shadow <= 6 if size == 0.0 else half_shadow > 12
+
+
+def test_light_on_a_wall_falls_with_the_square_of_the_distance_of_its_lamp() -> None:
+    wall = solid(Box((3.0, 3.0, 0.02)), RigidTransform.from_translation([0.0, 0.0, 1.51]))
+    looks = Appearance.clean(lights=(Light((-0.5, 0.0, -1.0), distance=1.0),), ambient=0.0)
+    prepared = prepare_view([wall], LENSES["pinhole"], IDENTITY, looks, np.random.default_rng(0))
+    lamp = prepared.painter.light.lamps[0].position
+    row = prepared.render([wall], np.random.default_rng(0))[122, 10:310:50].astype(float)
+    u = np.arange(10, 310, 50)
+    P = 1.5 * np.stack([(u - 157.3) / F, np.zeros(len(u)), np.ones(len(u))], axis=-1)
+    expected = (1.5 - lamp[2]) / np.linalg.norm(lamp - P, axis=1) ** 3  # cosine over square
+    assert np.ptp(expected) > 0.3 * expected.max()
+    assert row / row.max() == pytest.approx(expected / expected.max(), rel=0.01)
 
 
 def test_every_solid_of_every_mechanism_is_shown_where_it_is(shipped: Machine) -> None:
