@@ -3,11 +3,13 @@
 from pathlib import Path
 
 import pytest
-from characterisation.inputs import ROOT
+from characterisation.inputs import ROOT, made_input
 from fuzzing.crafted import harmful_files, special_files
 from fuzzing.running import count_cases, drawn_cases, run_cases
 
 from legcal import LegcalError, load_mechanism
+from legcal.errors import DatasetError
+from legcal.vision import read_camera
 
 PARTS = 4
 
@@ -63,3 +65,15 @@ def test_a_hyphen_inside_a_name_is_part_of_it(tmp_path: Path) -> None:
         (tmp_path / name).write_text(text)
     machine = load_mechanism(tmp_path / "models/hexapod.yaml")
     assert "leg1-prismatic=a@b+c" in machine.urdf.joints
+
+
+def test_cameras_are_as_large_as_the_largest_sensors(tmp_path: Path) -> None:
+    text = (made_input("plain") / "camera_info.yaml").read_text()
+    for width, height, is_read in ((12_000, 8_300, True), (12_000, 8_400, False)):
+        path = tmp_path / f"{height}.yaml"
+        path.write_text(text.replace("width: 64", f"width: {width}").replace("48", f"{height}"))
+        if is_read:
+            assert read_camera(path).width == width
+            continue
+        with pytest.raises(DatasetError, match="12000 x 8400 px, needed at most 30000"):
+            read_camera(path)

@@ -54,8 +54,7 @@ _TIFF_FORMATS = {2: "signed", 3: "floating-point"}  # of samples, others than un
 _TIFF_BYTES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}  # others have one
 
 
-MAX_SIDE = 30_000  # [px]
-MAX_PIXELS = 100_000_000  # of an image or a camera; the largest sensors have as many
+MAX_SIDE, MAX_AREA = 30_000, 100_000_000  # [px] of an image or a camera; the largest sensors
 _MOST_SCANS = 200  # of a JPEG: each is another pass over all pixels
 _MOST_TAGS, _MOST_STRIPS = 200, 100_000  # of a TIFF
 _STRIP = 256  # rows of an image that become grey levels at once
@@ -141,9 +140,9 @@ def image_size(content: bytes) -> ImageSize:
 
 def size_problem(width: int, height: int) -> tuple[str, str] | None:
     """Return found and needed of a size that no image and no camera can have, else None."""
-    if min(width, height) > 0 and max(width, height) <= MAX_SIDE and width * height <= MAX_PIXELS:
+    if min(width, height) > 0 and max(width, height) <= MAX_SIDE and width * height <= MAX_AREA:
         return None
-    needed = f"at most {MAX_SIDE} px a side and {MAX_PIXELS} px in all"
+    needed = f"at most {MAX_SIDE} px a side and {MAX_AREA} px in all"
     return f"{width} x {height} px", needed
 
 
@@ -241,7 +240,7 @@ def _tiff_size(content: bytes) -> ImageSize:
             raise _BadImage(f"a TIFF of {count} strips", f"at most {_MOST_STRIPS}")
         if count and tag in _TIFF_TAGS and kind in _TIFF_INTEGERS and ends[-1] <= len(content):
             tags[tag] = struct.unpack_from(f"{order}{count}{_TIFF_INTEGERS[kind]}", content, start)
-    if max(tags.get(322, (0,))) * max(tags.get(323, (0,))) > MAX_PIXELS:
+    if max(tags.get(322, (0,))) * max(tags.get(323, (0,))) > MAX_AREA:
         raise _BadImage("a TIFF of tiles that are larger than any image")
     starts, lengths = tags.get(273, tags.get(324, ())), tags.get(279, tags.get(325, ()))
     ends += [start + length for start, length in zip(starts, lengths, strict=False)]
