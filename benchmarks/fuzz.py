@@ -12,12 +12,13 @@ import argparse
 import os
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from fuzzing.running import DEEP_SHARE, Count, count_cases, drawn_cases
+
+from legcal.workers import worker_pool
 
 
 def main() -> None:
@@ -35,8 +36,8 @@ def main() -> None:
     cases = [case for case in cases if asked.only in case.subject.name]
     parts = [cases[k :: asked.workers] for k in range(asked.workers)]
     total = Count()
-    with ProcessPoolExecutor(asked.workers) as pool:
-        for count in pool.map(count_cases, parts):
+    with worker_pool(asked.workers, "The inputs could not be read") as run:
+        for count in run(count_cases, parts):
             total.include(count)
     seconds = time.perf_counter() - begin
     print(f"{total.n_cases} inputs in {seconds:.0f} s: exit codes {dict(total.codes)}")

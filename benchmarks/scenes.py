@@ -20,8 +20,7 @@ of them are not on their leg's edge.
 import argparse
 import json
 import time
-from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,6 +43,7 @@ from legcal.perception.recognition import recognise
 from legcal.perception.view_fit import refine_views
 from legcal.simulation import silhouette
 from legcal.simulation.visibility import field_of_view
+from legcal.workers import worker_pool
 
 WRONG_PX = 3.0  # an outline this far from the true one is another edge
 SAME_TURN, SAME_PLACE = np.deg2rad(10.0), 0.15  # of one camera: angle, part of the distance
@@ -199,15 +199,6 @@ def run(seed: int) -> dict[str, Any]:
     return judge(scene, find(scene.given))
 
 
-def portion(seeds: Sequence[int], workers: int) -> Iterable[dict[str, Any]]:
-    """Yield the lines of scenes, in any order."""
-    if workers == 1:
-        yield from map(run, seeds)
-        return
-    with ProcessPoolExecutor(workers) as pool:
-        yield from pool.map(run, seeds)
-
-
 def table(lines: Sequence[dict[str, Any]]) -> str:
     """Return the table of results."""
     groups: list[tuple[str, str, Any]] = [("all", "", None)]
@@ -326,8 +317,13 @@ def main() -> None:
         known = [json.loads(text) for text in options.results.read_text().splitlines()]
         lines = {line["seed"]: line for line in known}
     seeds = range(options.first, options.first + options.number)
-    with options.results.open("a") as results:
-        for line in portion([seed for seed in seeds if seed not in lines], options.workers):
+    missing = [seed for seed in seeds if seed not in lines]
+    failure = "The scenes could not be searched"
+    with (
+        options.results.open("a") as results,
+        worker_pool(options.workers, failure, in_order=False) as work,
+    ):
+        for line in work(run, missing):
             lines[line["seed"]] = line
             results.write(json.dumps(line) + "\n")
             results.flush()

@@ -1,17 +1,18 @@
-"""Work on images one after the other or in several processes: the results are the same, bit by bit.
+"""The one pool of processes: results are the same in one process and in several, bit by bit.
 
 Threads do not pay: the work is many short steps, and they would wait for each other.
 """
 
 import copyreg
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
-from multiprocessing import get_context
-from multiprocessing.connection import Connection, wait
+from itertools import islice
+from multiprocessing import connection, get_context, resource_tracker
 from threading import Thread
 from typing import Any, Protocol, TypeVar
 
@@ -20,6 +21,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import OutOfResources
 from legcal.signals import held_back_signals, leave_interrupts_to_parent, raise_if_stopped
 
+S = TypeVar("S")
 T = TypeVar("T")
 
 
@@ -34,32 +36,47 @@ def _reduced(motion: RigidTransform) -> tuple[Any, ...]:
 copyreg.pickle(RigidTransform, _reduced)
 
 _CHUNKS = 4  # tasks for each process: few enough to spare messages, enough to share the work
+_AHEAD = 2  # tasks for each process that are handed out where results come as they are finished
+_ONE_THREAD = (  # of these libraries, read when a process loads them
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+)
 
 
 class Run(Protocol):
-    """How work is carried out for all rows; results come in the order of the rows."""
+    """How work is carried out for all rows; results come in the order that the pool was given."""
 
-    def __call__(self, task: Callable[[int], T], rows: Sequence[int], /) -> Iterable[T]:
+    def __call__(self, task: Callable[[S], T], rows: Iterable[S], /) -> Iterable[T]:
         """Return the results."""
 
 
-def in_turn(task: Callable[[int], T], rows: Sequence[int], /) -> Iterable[T]:
+def in_turn(task: Callable[[S], T], rows: Iterable[S], /) -> Iterable[T]:
     """Work on one row after the other, in this process."""
     return map(task, rows)
 
 
 @contextmanager
-def worker_pool(workers: int) -> Iterator[Run]:
+def worker_pool(
+    workers: int, failure: str = "The images could not be worked on", *, in_order: bool = True
+) -> Iterator[Run]:
     """Give a way to work in that many processes; one means in this process.
 
     Processes are started when they are first needed, anew and not as copies: a program that
-    uses them must be safe to import (``if __name__ == "__main__":``). When the block is left by
-    an exception, they end at once, in the middle of their work.
+    uses them must be safe to import (``if __name__ == "__main__":``). Libraries have one thread
+    in each. When the block is left by an exception, they end at once, in the middle of their work.
 
     Parameters
     ----------
     workers : int
         Number of processes.
+    failure : str
+        What could not be done if one of them is ended from outside: the message begins so.
+    in_order : bool
+        Whether results come in the order of the rows. Otherwise they come as they are finished,
+        and rows are taken as processes get free: memory does not grow with their number.
 
     Raises
     ------
@@ -69,23 +86,18 @@ def worker_pool(workers: int) -> Iterator[Run]:
     if workers <= 1:
         yield in_turn
         return
+    _start_tracker()
     context = get_context("spawn")
     held, lifeline = context.Pipe(duplex=False)
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with, initargs=(held,))
-
-    def run(task: Callable[[int], T], rows: Sequence[int], /) -> Iterable[T]:
-        chunk = max(1, len(rows) // (_CHUNKS * workers))
-        with held_back_signals():  # processes are started in it
-            return pool.map(task, rows, chunksize=chunk)
-
+    run = _in_order if in_order else _as_they_come
     try:
-        yield run
+        yield partial(run, pool, workers)
     except BrokenProcessPool as error:
         raise_if_stopped()  # the signal may have reached them first
         raise OutOfResources(
-            f"The images could not be worked on: found that one of {workers} processes was ended "
-            "from outside, needed all of them to the end; see that there is enough memory and try "
-            "again."
+            f"{failure}: found that one of {workers} processes was ended from outside, needed all "
+            "of them to the end; see that there is enough memory and start the same command again."
         ) from error
     except BaseException:
         lifeline.close()  # nobody waits for work that is not wanted any more
@@ -98,8 +110,67 @@ def worker_pool(workers: int) -> Iterator[Run]:
             held.close()
 
 
-def _end_with(lifeline: Connection) -> None:
-    """Leave the answer to Ctrl-C to the process that started this one, and end when it says so.
+def _in_order(
+    pool: ProcessPoolExecutor, workers: int, task: Callable[[S], T], rows: Iterable[S], /
+) -> Iterable[T]:
+    rows = list(rows)
+    with _starting():
+        return pool.map(task, rows, chunksize=max(1, len(rows) // (_CHUNKS * workers)))
+
+
+def _as_they_come(
+    pool: ProcessPoolExecutor, workers: int, task: Callable[[S], T], rows: Iterable[S], /
+) -> Iterable[T]:
+    rest = iter(rows)
+    running: set[Future[T]] = set()
+    while True:
+        with _starting():
+            more = islice(rest, _AHEAD * workers - len(running))
+            running |= {pool.submit(task, row) for row in more}
+        if not running:
+            return
+        done, running = wait(running, return_when=FIRST_COMPLETED)
+        for future in sorted(done, key=lambda future: future.exception() is not None):
+            yield future.result()  # before an error of another one
+
+
+# How processes start and end
+
+
+def _start_tracker() -> None:
+    """Start the process that removes semaphores of a killed program, without its warning.
+
+    It lets Ctrl-C and SIGTERM through when it starts, so that it cannot start with the others.
+    """
+    if os.name != "posix":
+        return
+    quiet = "ignore:resource_tracker"
+    with held_back_signals():  # it is not to end by SIGHUP
+        sys.warnoptions.append(quiet)  # handed to the processes that are started
+        try:
+            resource_tracker.ensure_running()
+        finally:
+            sys.warnoptions.remove(quiet)
+
+
+@contextmanager
+def _starting() -> Iterator[None]:
+    """Let processes start with signals held back and with one thread for each library."""
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    with held_back_signals():
+        os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+        try:
+            yield
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    os.environ.pop(name, None)
+                else:
+                    os.environ[name] = value
+
+
+def _end_with(lifeline: connection.Connection) -> None:
+    """Leave the answer to Ctrl-C to the process that started this one, and end when it does.
 
     The other end of the lifeline closes when the pool is stopped, or its process killed: a pool's
     processes would then wait for work for ever.
@@ -108,6 +179,6 @@ def _end_with(lifeline: Connection) -> None:
     Thread(target=_wait_for_end, args=(lifeline,), daemon=True).start()
 
 
-def _wait_for_end(lifeline: Connection) -> None:
-    wait([lifeline])
+def _wait_for_end(lifeline: connection.Connection) -> None:
+    connection.wait([lifeline])
     os._exit(1)

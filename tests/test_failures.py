@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
@@ -171,6 +172,48 @@ def test_what_goes_to_another_process_and_back_is_the_same_bit_by_bit() -> None:
         found = list(run(motions.__getitem__, range(64)))
     for one, other in zip(motions, found, strict=True):
         assert one.as_matrix().tobytes() == other.as_matrix().tobytes()
+
+
+def test_libraries_have_one_thread_in_each_process_and_as_many_as_before_in_this_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.delenv("OPENCV_FOR_THREADS_NUM", raising=False)
+    with worker_pool(2) as run:
+        found = list(run(os.getenv, ["OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"]))
+    assert found == ["1", "1"]
+    assert (os.getenv("OMP_NUM_THREADS"), os.getenv("OPENCV_FOR_THREADS_NUM")) == ("3", None)
+
+
+def test_results_come_as_they_are_finished_and_rows_are_taken_as_processes_get_free(
+    tmp_path: Path,
+) -> None:
+    taken = []
+
+    def rows() -> Iterator[int]:
+        for row in range(40):
+            taken.append(row)
+            yield row
+
+    work = partial(_row_zero_after_row_five, tmp_path / "done")
+    with worker_pool(2, in_order=False) as run:
+        found = iter(run(work, rows()))
+        first = next(found)
+        assert len(taken) == 4
+        rest = list(found)
+    assert first != 0
+    assert sorted([first, *rest]) == taken == list(range(40))
+    (tmp_path / "done").unlink()
+    with worker_pool(2) as run:
+        assert list(run(work, range(6))) == list(range(6))
+
+
+def _row_zero_after_row_five(done: Path, row: int) -> int:
+    while row == 0 and not done.exists():
+        time.sleep(0.01)
+    if row == 5:
+        done.touch()
+    return row
 
 
 def test_processes_do_not_finish_work_that_is_not_wanted_any_more() -> None:

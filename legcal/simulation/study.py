@@ -8,29 +8,21 @@ at a time, so that neither the order nor memory depends on how they were compute
 from __future__ import annotations
 
 import json
-import os
-import sys
 import tempfile
-import time
-import warnings
 from collections import Counter
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from multiprocessing import resource_tracker
+from functools import partial
 from pathlib import Path
-from threading import Thread
 from typing import Any, Protocol
 
 import numpy as np
-from joblib import Parallel, delayed, parallel_config
-from joblib.externals.loky.process_executor import BrokenProcessPool
 
 from legcal.errors import DidNotConverge, LegcalError, OutOfResources, UsageError
 from legcal.files import TEMPORARY_SUFFIX, write_atomically
 from legcal.processors import processors
 from legcal.progress import Report, no_progress
-from legcal.signals import held_back_signals, leave_interrupts_to_parent, raise_if_stopped
 from legcal.simulation.checkpoint import (
     CHECKPOINT_NAME,
     Checkpoint,
@@ -38,6 +30,7 @@ from legcal.simulation.checkpoint import (
     is_begun,
     open_checkpoint,
 )
+from legcal.workers import worker_pool
 
 DOCUMENT_NAME = "study.json"
 MOST_RUNS = 1_000_000
@@ -127,7 +120,8 @@ def run_study(
     seed : int
         Seed of the study.
     workers : int
-        Number of processes; more than a few for each core are not started.
+        Number of processes; more than a few for each core are not started. With more than one,
+        the program must be safe to import (``if __name__ == "__main__":``).
     output : Path, optional
         Folder for the checkpoint, the document and the figures. One that holds a checkpoint of
         the same study is continued; more runs than before are added to those that are there.
@@ -272,38 +266,9 @@ def lines_of_runs(
     Chunks are handed out as processes get free, so that memory does not grow with their number.
     """
     workers = min(workers, max(len(runs), 1), _PROCESSES * processors())
-    chunks = _chunks(runs, workers)
-    if workers == 1:
-        for chunk in chunks:
-            yield run_chunk(study, seed, chunk)
-        return
-    with (
-        _without_advice(),
-        parallel_config(
-            "loky",
-            n_jobs=workers,
-            inner_max_num_threads=1,
-            initializer=_follow,
-            initargs=(os.getpid(),),
-        ),
-    ):
-        parallel = Parallel(
-            return_as="generator_unordered", pre_dispatch="2 * n_jobs", batch_size=1
-        )
-        tasks = (delayed(run_chunk)(study, seed, chunk) for chunk in chunks)
-        try:
-            if os.name == "posix":  # it lets signals through again when it starts
-                resource_tracker.ensure_running()
-            with held_back_signals():  # processes are started in it
-                chunks_of_lines = parallel(tasks)
-            yield from chunks_of_lines
-        except BrokenProcessPool as error:
-            raise_if_stopped()  # the signal may have reached them first
-            raise OutOfResources(
-                f"The study could not be finished: found that one of {workers} processes was "
-                "ended from outside, needed all of them to the end; see that there is enough "
-                "memory and start the same command again."
-            ) from error
+    failure = "The study could not be finished"
+    with worker_pool(workers, failure, in_order=False) as run:
+        yield from run(partial(run_chunk, study, seed), _chunks(runs, workers))
 
 
 def run_chunk(study: Study, seed: int, runs: Iterable[int]) -> list[dict[str, Any]]:
@@ -325,28 +290,3 @@ def failure_of(error: LegcalError) -> dict[str, str]:
 def _chunks(runs: Sequence[int], workers: int) -> Iterator[Sequence[int]]:
     size = min(max(len(runs) // (_CHUNKS * workers), 1), _LARGEST_CHUNK)
     return (runs[first : first + size] for first in range(0, len(runs), size))
-
-
-@contextmanager
-def _without_advice() -> Iterator[None]:
-    """Keep joblib from advising its user where a study is stopped or killed before its end."""
-    of_processes = "ignore:resource_tracker"  # handed to those that joblib starts
-    sys.warnoptions.append(of_processes)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", r"\d+ tasks (which were|have been) ", UserWarning)
-            yield
-    finally:
-        sys.warnoptions.remove(of_processes)
-
-
-def _follow(parent: int) -> None:
-    """Leave the answer to Ctrl-C to the process that started this one, and end when it does."""
-    leave_interrupts_to_parent()
-    Thread(target=_end_with, args=(parent,), daemon=True).start()
-
-
-def _end_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    os._exit(1)
