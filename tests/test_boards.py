@@ -24,7 +24,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.data import Corners, Measurements, View, found_corners, join_corners
 from legcal.errors import DatasetError, NotVisible
 from legcal.perception import (
-    camera_poses,
+    camera_poses_by_board,
     describe_image,
     detect_corners,
     find_corners,
@@ -319,7 +319,7 @@ def test_without_noise_the_pose_is_exact(board: Board, camera: Camera) -> None:
     places = [before(board, 0.6), before(board, 0.6) * turned]
     corners = _corners(board, places, camera=camera, sigma=0.0)
     for pose, T in zip(
-        camera_poses(corners, board, _measurements((1, 1), camera))[0], places, strict=True
+        camera_poses_by_board(corners, board, _measurements((1, 1), camera))[0], places, strict=True
     ):
         assert pose is not None
         assert pose.as_matrix() == pytest.approx(T.as_matrix(), abs=1e-8)
@@ -336,7 +336,7 @@ def test_errors_are_as_large_as_the_information_says_and_images_add_up() -> None
         turn = (best.T_camera_plane.rotation * truth.rotation.inv()).as_rotvec()
         d = np.concatenate([turn, best.T_camera_plane.translation - truth.translation])
         squares.append(d @ best.information @ d / 6.0)
-        pose = camera_poses(corners, CHARUCO, _measurements((4,)))[0][0]
+        pose = camera_poses_by_board(corners, CHARUCO, _measurements((4,)))[0][0]
         joint.append((float(np.linalg.norm(turn)), _turn(pose, T)))
     assert 0.6 < np.mean(squares) < 1.5
     alone, together = np.sqrt(np.mean(np.square(joint), axis=0))
@@ -345,11 +345,11 @@ def test_errors_are_as_large_as_the_information_says_and_images_add_up() -> None
 
 def test_a_view_without_the_board_has_no_pose_and_is_refused_only_where_it_is_needed() -> None:
     corners, m = _corners(CHARUCO, [before(CHARUCO)]), _measurements((1, 2))
-    assert camera_poses(corners, CHARUCO, m)[0][1] is None
+    assert camera_poses_by_board(corners, CHARUCO, m)[0][1] is None
     with pytest.raises(NotVisible, match=r"view c2: .* none of its 2 images, needed them in one"):
-        camera_poses(corners, CHARUCO, m, ["c2"])
+        camera_poses_by_board(corners, CHARUCO, m, ["c2"])
     line = corners.choose(corners.corner < CHARUCO.grid[0])
-    assert camera_poses(line, CHARUCO, _measurements((1,)))[0] == (None,)
+    assert camera_poses_by_board(line, CHARUCO, _measurements((1,)))[0] == (None,)
 
 
 def test_two_poses_that_explain_a_board_alike_are_refused_or_told_apart_by_more_images() -> None:
@@ -360,10 +360,10 @@ def test_two_poses_that_explain_a_board_alike_are_refused_or_told_apart_by_more_
     assert len(both) == 2
     assert 0.0 <= both[1].cost - both[0].cost < 12.0
     with pytest.raises(NotVisible, match=r"two poses that explain the 30 corners .* degrees apart"):
-        camera_poses(one, board, _measurements((1,)), ["c1"])
-    assert camera_poses(one, board, _measurements((1,)))[0] == (None,)
+        camera_poses_by_board(one, board, _measurements((1,)), ["c1"])
+    assert camera_poses_by_board(one, board, _measurements((1,)))[0] == (None,)
     many = _corners(board, [T] * 12, 2, sigma=0.2)
-    pose = camera_poses(many, board, _measurements((12,)), ["c1"])[0][0]
+    pose = camera_poses_by_board(many, board, _measurements((12,)), ["c1"])[0][0]
     assert _turn(pose, T) < np.deg2rad(2.0)
 
 
@@ -372,10 +372,13 @@ def test_a_board_that_moved_in_an_image_is_named_with_how_far(shift: float) -> N
     T = before(CHARUCO, 0.6)
     moved = RigidTransform.from_translation([shift, 0.0, 0.0]) * T
     with pytest.raises(DatasetError, match=r"view c1: .* in 2.png than in \d.png, by up") as caught:
-        camera_poses(_corners(CHARUCO, [T, T, moved, T]), CHARUCO, _measurements((4,)))
+        camera_poses_by_board(_corners(CHARUCO, [T, T, moved, T]), CHARUCO, _measurements((4,)))
     apart = float(str(caught.value).split("by up to ")[1].split(" mm")[0])
     assert apart == pytest.approx(1e3 * shift, rel=0.3)
-    assert camera_poses(_corners(CHARUCO, [T] * 4), CHARUCO, _measurements((4,)))[0][0] is not None
+    assert (
+        camera_poses_by_board(_corners(CHARUCO, [T] * 4), CHARUCO, _measurements((4,)))[0][0]
+        is not None
+    )
 
 
 OTHER_LENS = replace(LENS, K=LENS.K * np.array([[0.6], [1.0], [1.0]]))
@@ -395,7 +398,7 @@ def test_corners_of_another_board_or_lens_are_refused(
 ) -> None:
     corners = _corners(true, [before(true)])
     with pytest.raises(DatasetError, match=f"view c1: .* pose of the {true.kind} .*{words}"):
-        camera_poses(corners, stated, _measurements((1,), camera))
+        camera_poses_by_board(corners, stated, _measurements((1,), camera))
 
 
 def test_corners_that_no_one_pose_has_before_the_camera_are_refused() -> None:
@@ -409,7 +412,7 @@ def test_corners_that_no_one_pose_has_before_the_camera_are_refused() -> None:
         px, sigma = LENS.project(P[here]), np.full(len(here), SIGMA)
         tables.append(found_corners(np.full(len(here), row), here, px, sigma))
     with pytest.raises(DatasetError, match=r"found no one pose of the charuco .* all its images"):
-        camera_poses(join_corners(tables), CHARUCO, _measurements((2,)))
+        camera_poses_by_board(join_corners(tables), CHARUCO, _measurements((2,)))
 
 
 def test_an_outlier_is_rejected_and_does_not_bend_the_pose() -> None:
@@ -417,9 +420,9 @@ def test_an_outlier_is_rejected_and_does_not_bend_the_pose() -> None:
     corners = _corners(CHARUCO, [T], 3)
     px = corners.px.copy()
     px[4] += [6.0, -4.0]
-    poses, kept = camera_poses(replace(corners, px=px), CHARUCO, _measurements((1,)))
+    poses, kept = camera_poses_by_board(replace(corners, px=px), CHARUCO, _measurements((1,)))
     assert np.flatnonzero(~kept.used).tolist() == [4]
     assert "px from where the other corners put it" in kept.reason[4]
-    clean = camera_poses(corners, CHARUCO, _measurements((1,)))[0][0]
+    clean = camera_poses_by_board(corners, CHARUCO, _measurements((1,)))[0][0]
     assert clean is not None
     assert _turn(poses[0], clean) < 4e-3

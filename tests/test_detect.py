@@ -31,7 +31,7 @@ from legcal.perception.overlays import (
     marks_of_image,
     short_reason,
 )
-from legcal.perception.photographs import ImageObservations, Photographs, observe
+from legcal.perception.photographs import ImageObservations, Photographs, place_and_measure
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.visibility import PredictedLeg, predict_legs
@@ -158,9 +158,9 @@ def test_legs_are_drawn_by_the_radii_that_were_searched_by(
             for j, of_leg in enumerate(photographs.cylinders)
         ]
         wrong = replace(photographs, machine=photographs.machine.with_cylinders(cylinders))
-        return replace(observe(photographs, *others), photographs=wrong)
+        return replace(place_and_measure(photographs, *others), photographs=wrong)
 
-    monkeypatch.setattr("legcal.calibration.outline_detection.observe", thicker)
+    monkeypatch.setattr("legcal.calibration.outline_detection.place_and_measure", thicker)
     found = detect(one_image.path)
     legs = {leg.leg: leg for leg in found.predicted(0)}
     assert len(legs) == 6

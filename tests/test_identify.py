@@ -41,8 +41,8 @@ from legcal.machine import (
     Machine,
     create_model,
     describe_direction,
-    joined,
     leg_labels,
+    list_in_words,
     parametrization_of,
 )
 from legcal.machine.family import Family, describe_family
@@ -385,7 +385,7 @@ def test_legs_views_and_numbers_in_words() -> None:
     assert legs_in_words((0, 1), ("leg3", "centre")) == "legs 3 and centre"
     assert legs_in_words((0, 2, 3), LEGS) == "legs 1, 3 and 4"
     assert legs_in_words((1,), LEGS) == "leg 2"
-    assert joined([]) == ""
+    assert list_in_words([]) == ""
     names = ("a", "a.b", "centre")  # dots, and each other
     assert describe_direction(("a.b.base.x",), names) == "x of base joint a.b"
     assert describe_direction(("a.base.x",), names) == "x of base joint a"

@@ -21,8 +21,8 @@ from legcal.calibration.identify.information import (
     expected_intrinsics,
     image_rows,
     intrinsics_changes,
-    leg_equations,
     problem_of,
+    whitened_leg_equations,
 )
 from legcal.calibration.identify.predicted_observations import (
     SIGMA_PX,
@@ -52,7 +52,7 @@ from legcal.machine import (
     forward_kinematics_many,
     geometries,
     parametrize,
-    random_poses,
+    random_poses_of_legs,
 )
 from legcal.machine import leg_equations as linearize_leg
 from legcal.vision import outlines_of_axis
@@ -134,7 +134,7 @@ def leg_values(session: PredictedObservations, step: Array, x: Array) -> Array:
 def test_rows_equal_finite_differences_of_axes_cut_in_the_camera_and_of_legs(seed: int) -> None:
     session = random_session(seed)
     n_p, scale = len(session.unit), turns(session)
-    images, legs = image_rows(session), leg_equations(session)
+    images, legs = image_rows(session), whitened_leg_equations(session)
     exact = np.concatenate([legs.by_pose[0], legs.by_parameters[0]], axis=1)
     assert exact.shape[0] == len(legs.leg) == len(legs.demand)
     ends = at_base_joints(session), at_platform_joints(session)
@@ -368,7 +368,7 @@ def test_poses_out_of_reach_are_refused_and_rare_ones_found(
     away = np.tile([5.0, 5.0], (6, 1))
     away[0] = [0.01, 0.01]
     with pytest.raises(DidNotConverge, match="0 of 3 random poses"):
-        random_poses(geometries(machine), machine.frame_legs, home, away, 3, rng)
+        random_poses_of_legs(geometries(machine), machine.frame_legs, home, away, 3, rng)
     monkeypatch.setattr(
         "legcal.machine.configurations._Drive.is_regular",
         lambda _self, _R, t: rng.random(len(t)) < 0.75,  # in each of five steps

@@ -31,7 +31,7 @@ from legcal.paper.joints_in_base import JointsInBase, register_views
 from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
 from legcal.paper.least_squares import LeastSquares
 from legcal.paper.leg_directions import directions_through_joints
-from legcal.paper.platform import RigidProblem, build_rigid
+from legcal.paper.platform import RigidProblem, build_rigid_platform
 from legcal.paper.platform_printed import build_mean_distances
 from legcal.paper.unknowns import Unknowns
 from legcal.simulation import PaperHexapod, nominal_of
@@ -202,10 +202,10 @@ def test_default_ranks_are_those_of_the_problems_that_the_steps_solve(
     base = true_base(machine, joints)
     directions = directions_through_joints(axes, m, base)
     q0 = machine.parameters.offsets
-    step2 = joints_in_base.build_rigid(nominal, joints, base.T_Rb_camera)
+    step2 = joints_in_base.build_rigid_base(nominal, joints, base.T_Rb_camera)
     step3 = offsets.build_constant_distances(nominal, directions, q0, m.sigma_q)
     unknowns = Unknowns.of_platform(nominal)
-    step4 = build_rigid(RigidProblem.of(nominal, unknowns, base, directions, m.sigma_q))
+    step4 = build_rigid_platform(RigidProblem.of(nominal, unknowns, base, directions, m.sigma_q))
     built = [
         3 * int(joints.located.sum()),
         rank_of_first(step2, 12),

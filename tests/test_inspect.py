@@ -13,7 +13,7 @@ from machines import ROOT, read_family
 from rich.console import Console
 
 from legcal import evaluate, load_mechanism
-from legcal.machine import create_model, describe
+from legcal.machine import create_model, machine_document
 from legcal.report import accuracy_table, inspect_table
 
 
@@ -27,7 +27,7 @@ def _printed(what: object) -> str:
 
 
 def _described(name: str | Path) -> dict[str, Any]:
-    document = json.loads(json.dumps(describe(load_mechanism(name)), allow_nan=False))
+    document = json.loads(json.dumps(machine_document(load_mechanism(name)), allow_nan=False))
     assert isinstance(document, dict)
     return document
 
@@ -93,7 +93,7 @@ def test_motors_that_are_too_many_or_hold_nothing_are_noted(
     sizes: dict[str, Any] = {"base_radius": 300.0, "platform_radius": 150.0, "height": 400.0}
     if family.endswith("RPR"):
         del sizes["height"]
-    description = describe(create_model(read_family(family, **sizes), tmp_path).machine)
+    description = machine_document(create_model(read_family(family, **sizes), tmp_path).machine)
     assert found in _printed(inspect_table(description))
     said = [note for note in description["diagnostics"] if "motors" in note or "cannot" in note]
     assert len(said) == len(notes)

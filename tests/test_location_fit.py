@@ -23,8 +23,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.calibration.location.fit import FrameFit, fit
 from legcal.calibration.location.frames import (
     PosePairs,
+    frames_after,
     jacobian,
-    moved,
     residuals,
     tool_motions,
 )
@@ -61,7 +61,7 @@ def test_residuals_are_the_step_that_was_made_and_zero_where_nothing_was_measure
     step = 1e-4 * np.random.default_rng(9).normal(size=12)
     oriented = np.arange(len(pairs)) < 3
     some = replace(pairs, oriented=oriented)
-    r = residuals(moved(frames, -step), some)
+    r = residuals(frames_after(frames, -step), some)
     np.testing.assert_allclose(r, jacobian(frames, some) @ step, atol=1e-7)
     assert np.all((r[:, 3:] != 0.0).any(axis=1) == oriented)
 
@@ -178,7 +178,7 @@ def test_errors_are_as_large_as_the_covariance_says(case: str) -> None:
         if case == "readings":
             rows = replace(rows, readings=at_tool @ np.swapaxes(at_tool, 1, 2))
         by_model = common if case == "model" else None
-        found = fit(pairs, moved(truth, 1e-3 * chance.normal(size=12)), rows, by_model)
+        found = fit(pairs, frames_after(truth, 1e-3 * chance.normal(size=12)), rows, by_model)
         error = frame_errors(found.frames, BASE, TOOL) / pairs.scale
         squares.append(error @ found.information @ error / 12.0)
         factors.append(found.noise.factor)

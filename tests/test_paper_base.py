@@ -15,7 +15,7 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis, turned_axis
 from legcal.machine import JointType, Leg, LegKind
 from legcal.paper import Criteria, NominalMachine, joints_in_camera, run_base_steps
-from legcal.paper.camera_poses import camera_poses
+from legcal.paper.camera_poses import candidate_camera_poses
 from legcal.paper.joints_in_base import locate_joints_in_base
 from legcal.paper.joints_in_camera import (
     joint_residuals,
@@ -307,7 +307,7 @@ def test_axes_across_the_line_of_two_joints_place_a_camera_unless_two_places_fit
 
 def test_opposite_legs_of_a_symmetric_base_leave_two_candidates_of_a_camera() -> None:
     A, v = SQUARE[[0, 2]], SYMMETRIC[[0, 2]]
-    poses, fixed = camera_poses(A, v, A, v)
+    poses, fixed = candidate_camera_poses(A, v, A, v)
     assert (len(poses), fixed) == (2, True)
 
 

@@ -24,7 +24,7 @@ from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, IntArray, normal_basis
 from legcal.machine import EquationKind, LegKind, leg_equations, load_mechanism
 from legcal.paper import Transformation, platform, run_base_steps, run_platform_steps
-from legcal.paper.gibbs import axis_frames, moved
+from legcal.paper.gibbs import axis_frames, motion_after
 from legcal.paper.least_squares import IpoptSolution, LeastSquares, solve_least_squares
 from legcal.paper.leg_directions import LegDirections, directions_through_joints
 from legcal.paper.leg_equations import (
@@ -309,7 +309,7 @@ def test_as_printed_18_is_what_another_solver_finds_of_noisy_ends() -> None:
 
 def test_a_camera_is_placed_by_the_rays_to_the_base_joints() -> None:
     T = poses(6)[0]
-    start = moved(np.array([0.01, -0.02, 0.01, 0.02, 0.01, -0.02]), T)
+    start = motion_after(np.array([0.01, -0.02, 0.01, 0.02, 0.01, -0.02]), T)
     found = register_by_rays(B_RE, T.apply(B_RE), start)
     assert np.abs(found.as_matrix() - T.as_matrix()).max() < 1e-9
     assert np.abs(start.as_matrix() - T.as_matrix()).max() > 0.01

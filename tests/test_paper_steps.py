@@ -28,12 +28,12 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry import Array
 from legcal.machine import LegKind, from_vector, load_mechanism, parametrize, to_vector
 from legcal.paper import Criteria, Transformation, run_base_steps
-from legcal.paper.joints_in_base import build_rigid as build_base
+from legcal.paper.joints_in_base import build_rigid_base as build_base
 from legcal.paper.joints_in_base import build_scalar_products
 from legcal.paper.least_squares import IpoptSolution, LeastSquares
 from legcal.paper.leg_directions import directions_through_joints, observed_directions
 from legcal.paper.offsets import build_consecutive, build_constant_distances, leg_ends
-from legcal.paper.platform import RigidProblem, build_rigid
+from legcal.paper.platform import RigidProblem, build_rigid_platform
 from legcal.paper.platform_pose import build_rays
 from legcal.paper.platform_printed import build_mean_distances
 from legcal.paper.unknowns import Unknowns
@@ -293,7 +293,7 @@ def test_the_rigid_criterion_has_the_rank_that_is_predicted(name: str) -> None:
     ]
     observed = planned(session, machine.sign)
     rigid = rigid_problem(observed)
-    problem = build_rigid(rigid)
+    problem = build_rigid_platform(rigid)
     J, residuals = problem.jacobian(problem.start), problem.residuals(problem.start)
     information = IpoptSolution(problem.start, residuals, J, len(rigid.unknowns), "").information()
     kept = [i for i, name in enumerate(rigid.unknowns.names) if "offset" not in name]
@@ -472,7 +472,7 @@ def problems(name: str) -> dict[str, LeastSquares]:
         "(9)": build_scalar_products(machine, joints),
         "step 3": build_constant_distances(known, directions, q0, 2e-6),
         "(14)": build_consecutive(known, single),
-        "step 4": build_rigid(rigid),
+        "step 4": build_rigid_platform(rigid),
         "(16)": build_mean_distances(known, rigid.unknowns, single),
         "(18)": build_rays(B, ends, centre, group, (R, t)),
     }

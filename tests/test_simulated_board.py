@@ -14,7 +14,7 @@ from legcal.data import load_dataset
 from legcal.errors import DatasetError, NotVisible
 from legcal.files import motion_from_xyz_quat
 from legcal.machine import Machine, load_mechanism
-from legcal.perception import camera_poses, find_corners
+from legcal.perception import camera_poses_by_board, find_corners
 from legcal.simulation import Level, SimulationSettings, simulate
 from legcal.simulation.board import chosen_board
 from legcal.vision import parse_board
@@ -79,7 +79,9 @@ def test_every_hand_held_image_has_its_own_place_and_the_board_gives_it(held: Pa
     assert dataset.corners is not None
     assert dataset.board is not None
     assert [view.name for view in m.views] == [f"c1-{k + 1}" for k in range(m.n_rows)]
-    poses, _ = camera_poses(dataset.corners, dataset.board, m, [view.name for view in m.views])
+    poses, _ = camera_poses_by_board(
+        dataset.corners, dataset.board, m, [view.name for view in m.views]
+    )
     truth = _truth(held)
     _, T_base_board = parse_board(truth["board"], held)
     assert T_base_board is not None

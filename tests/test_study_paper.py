@@ -25,7 +25,7 @@ from legcal.simulation import (
     platform_errors,
     run_study,
 )
-from legcal.simulation.hexapod import noncoplanar_hexapod, random_poses
+from legcal.simulation.hexapod import noncoplanar_hexapod, random_hexapod_poses
 from legcal.simulation.paper import ESTIMATORS, expected_errors, expected_norm
 from legcal.simulation.paper_report import SCALARS, Means
 from legcal.simulation.study import StudyResult
@@ -42,7 +42,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[StudyResult, Path]
 
 
 def _poses(machine: PaperHexapod, n: int = 10) -> RigidTransform:
-    return random_poses(machine, n, np.random.default_rng(0))
+    return random_hexapod_poses(machine, n, np.random.default_rng(0))
 
 
 def _printed(result: StudyResult) -> str:

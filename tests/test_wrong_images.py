@@ -34,7 +34,7 @@ from legcal.perception.diagnostics import (
     reject_images,
 )
 from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
-from legcal.perception.photographs import ImageObservations, observe
+from legcal.perception.photographs import ImageObservations, place_and_measure
 from legcal.progress import no_progress
 from legcal.workers import in_turn
 
@@ -172,7 +172,7 @@ def _session(made: Spoiled) -> OrderedDataset:
 def _observed(made: Spoiled) -> ImageObservations:
     session = _session(made)
     scene, _ = rough_placement(session)
-    return observe(session.photographs, scene, no_progress)
+    return place_and_measure(session.photographs, scene, no_progress)
 
 
 def test_images_are_read_once_to_be_looked_at_and_once_to_be_measured(tmp_path: Path) -> None:
@@ -186,7 +186,7 @@ def test_images_are_read_once_to_be_looked_at_and_once_to_be_measured(tmp_path: 
         read.append(row)
         return photographs.load(row)
 
-    observed = observe(replace(photographs, load=load), scene, no_progress)
+    observed = place_and_measure(replace(photographs, load=load), scene, no_progress)
     assert observed.placement.unplaced == {}
     rows = photographs.detect.tolist()
     assert read[: 2 * len(rows)] == [*rows, *rows]

@@ -25,7 +25,7 @@ from legcal.data import (
 )
 from legcal.errors import DatasetError, NotVisible
 from legcal.geometry import IntArray, pose_distance
-from legcal.perception import FAR_OFF, camera_poses, detect_corners, require_board
+from legcal.perception import FAR_OFF, camera_poses_by_board, detect_corners, require_board
 from legcal.vision import Board
 
 Poses = Sequence[RigidTransform | None]  # one a view
@@ -119,7 +119,7 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
         corners = detect_corners(dataset.board, load, rows, data.pool, data.progress)
         shown = needed if len(corners) else {view.name for view in used}
         require_board(dataset.board, corners, load, measurements, shown)
-    T_board_camera, corners = camera_poses(corners, dataset.board, measurements, needed)
+    T_board_camera, corners = camera_poses_by_board(corners, dataset.board, measurements, needed)
     if all(T is None for T in T_board_camera):
         raise NotVisible(
             f"{dataset.yaml_path}: the calibration board could not be used: found no image with "

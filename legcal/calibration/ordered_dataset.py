@@ -35,7 +35,7 @@ from legcal.machine import (
     Machine,
     followed_poses,
     geometries,
-    joined,
+    list_in_words,
     platform_in_base,
     solve_poses,
 )
@@ -114,7 +114,7 @@ class OrderedDataset:
         if len(off) > _MAX_NAMED:
             names.append(f"{len(off) - _MAX_NAMED} more")
         return [
-            f"The nominal model does not reach the readings of {joined(names)}: its legs "
+            f"The nominal model does not reach the readings of {list_in_words(names)}: its legs "
             f"miss them by up to {1e3 * float(residual.max()):.2f} mm at the nearest pose, from "
             "which the fit started."
         ]

@@ -35,7 +35,7 @@ from legcal.perception import (
     Placement,
     given_outlines,
     hint_notes,
-    observe,
+    place_and_measure,
 )
 from legcal.progress import Report, no_progress
 from legcal.workers import worker_pool
@@ -118,7 +118,7 @@ def _detected(data: OrderedDataset, images: IntArray) -> Detection:
     unplaced, notes = dict[str, str](), list[str]()
     if len(photographs.detect):
         T_board_camera = None if board is None else board.T_board_camera
-        seen = observe(photographs, scene, data.progress, T_board_camera)
+        seen = place_and_measure(photographs, scene, data.progress, T_board_camera)
         cameras, cylinders = seen.placement.T_base_camera, seen.photographs.cylinders
         placed = np.array([T is not None for T in cameras])
         row = seen.outlines.row

@@ -74,7 +74,7 @@ from legcal.perception import (
     hint_notes,
     measure_photographs,
     nominal_placement,
-    observe,
+    place_and_measure,
 )
 from legcal.progress import Report, no_progress
 from legcal.workers import worker_pool
@@ -257,7 +257,7 @@ def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimat
         return replace(estimate, image_notes=data.plan.notes, fit_notes=_notes_on_images(estimate))
     # 2. Recognise, and measure the outlines.
     T_board_camera = None if board is None else board.T_board_camera
-    seen = observe(photographs, placement, data.progress, T_board_camera, together=False)
+    seen = place_and_measure(photographs, placement, data.progress, T_board_camera, together=False)
     seen.placement.require_one()
     other_radii = bool(seen.placement.radii.factor)
     if other_radii:

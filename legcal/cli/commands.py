@@ -176,10 +176,10 @@ def inspect(
 ) -> None:
     """Show a mechanism as legcal understands it: legs, joints, frames, mobility."""
     from legcal import report
-    from legcal.machine import describe, load_mechanism, write_model
+    from legcal.machine import load_mechanism, machine_document, write_model
 
     machine = load_mechanism(model)
-    description = describe(machine)
+    description = machine_document(machine)
     if write is not None:
         for path in write_model(machine, write):
             typer.echo(f"Wrote {path}.", err=True)
@@ -341,7 +341,7 @@ def new(
     }
     model = machine.described(table, family=family, unit=unit, name=name, dimensions=dimensions)
     created = machine.create_model(model, output, force=force)
-    description = machine.describe(created.machine)
+    description = machine.machine_document(created.machine)
     paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
     written = f"written: {paths['yaml']} {paths['urdf']}"
     show(

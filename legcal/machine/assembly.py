@@ -21,7 +21,7 @@ from legcal.machine.description import (
 )
 from legcal.machine.equations import pose_equations
 from legcal.machine.leg import EquationKind, Leg, LegKind
-from legcal.machine.solver import moved, solve
+from legcal.machine.solver import poses_after, solve
 
 TRIALS = 40
 CLOSED = 1e-10  # of the size of the machine
@@ -73,7 +73,7 @@ class Assembled:
 def assemble(described: Description) -> Assembled:
     """Return a described machine with its home, lengths and axes."""
     _refuse(wrong_sizes(described))
-    home = find_home(described)
+    home = home_of_description(described)
     T = home.motion()
     A = np.array([leg.A_base for leg in described.legs])
     B = T.apply(np.array([leg.B_platform for leg in described.legs]))
@@ -195,7 +195,7 @@ def _refuse(problems: list[str]) -> None:
         raise ModelError(problems)
 
 
-def find_home(described: Description) -> Home:
+def home_of_description(described: Description) -> Home:
     """Return a pose in which a machine closes, projected onto what its legs keep constant.
 
     Without a given one it is the pose where all motors are at the middle of their travel that
@@ -254,7 +254,7 @@ class _Closure:
     def nearest(self, T: RigidTransform) -> RigidTransform:
         """Return the nearest pose that closes, as far as steps get nearer to one."""
         found = solve(
-            self, moved, T.as_matrix()[None, :3], tolerance=1e-16, unit=self.unit, steps=30
+            self, poses_after, T.as_matrix()[None, :3], tolerance=1e-16, unit=self.unit, steps=30
         )
         return motion_of(found.points[0, :, :3], found.points[0, :, 3])
 
@@ -337,7 +337,7 @@ def _search(closure: _Closure, *, turning: bool) -> Home | None:
         by_pose[:, :, :3] *= turning
         return values, by_pose
 
-    found = solve(equations, moved, starts, tolerance=1e-15, unit=closure.unit, damped=True)
+    found = solve(equations, poses_after, starts, tolerance=1e-15, unit=closure.unit, damped=True)
     best: tuple[float, RigidTransform] | None = None
     for pose in found.points[found.worst <= CLOSED]:
         T = motion_of(pose[:, :3], pose[:, 3])

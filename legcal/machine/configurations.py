@@ -20,7 +20,7 @@ from legcal.machine.kinematics import follow, solve_poses
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.mobility import free_motions, project, singularity
 from legcal.machine.model import Machine, joint_values, platform_pose, slider_columns
-from legcal.machine.solver import RANK, moved
+from legcal.machine.solver import RANK, poses_after
 
 MAX_DRAWS = 40  # draws for each configuration
 SHARES = 1.3 * 0.8 ** np.arange(MAX_DRAWS)  # how far from home draws go, at most all of the way
@@ -192,7 +192,7 @@ def beyond_travel(machine: Machine, configuration: Array) -> BoolArray:
     return np.asarray(outside | (machine.lengths_at(values) <= 0.0))
 
 
-def random_poses(
+def random_poses_of_legs(
     legs: Sequence[Leg],
     frame_legs: Sequence[int],
     home: RigidTransform,
@@ -315,7 +315,7 @@ class _Drive:
             rng.normal(size=(n, len(self.columns))) * share * FREE @ left.T
         )
         pose = np.concatenate([self.R, self.t[..., None]], axis=2)
-        poses = moved(np.repeat(pose, n, axis=0), step)
+        poses = poses_after(np.repeat(pose, n, axis=0), step)
         return poses[:, :, :3], poses[:, :, 3]
 
     def is_closed(self, R: Array, t: Array, wanted: Array) -> BoolArray:

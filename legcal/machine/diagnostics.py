@@ -8,7 +8,7 @@ from legcal.machine.schema import LegcalBlock
 _MIN_SINGULARITY = 1e-4  # singularity measure: less than that is the rounding of a file
 
 
-def diagnose(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]:
+def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]:
     """Return what deserves attention in a mechanism, one sentence each."""
     notes = []
     if not home_is_given:

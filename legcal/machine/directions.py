@@ -58,7 +58,7 @@ _NOUN = {
 }
 
 
-def joined(words: Sequence[str]) -> str:
+def list_in_words(words: Sequence[str]) -> str:
     """Return words as a list in a sentence."""
     if len(words) < 2:
         return "".join(words)
@@ -86,7 +86,7 @@ def describe_direction(parameters: Sequence[str], leg_names: Sequence[str]) -> s
         coordinates.setdefault((kind, owner), []).append(which)
     groups: dict[tuple[str, str], list[str]] = {}
     for (kind, owner), found in coordinates.items():
-        axes = joined(sorted(found))
+        axes = list_in_words(sorted(found))
         if kind == "radius":  # a tube and a rod of one leg
             axes = ""
         elif kind.endswith("_axis"):
@@ -96,12 +96,12 @@ def describe_direction(parameters: Sequence[str], leg_names: Sequence[str]) -> s
     for (kind, axes), owners in groups.items():
         noun = _NOUN[kind][len(owners) > 1]
         ordered = _labelled(owners, leg_names)
-        phrases.append(f"{axes + ' of ' if axes else ''}{noun} {joined(ordered)}")
+        phrases.append(f"{axes + ' of ' if axes else ''}{noun} {list_in_words(ordered)}")
     if len(phrases) > _MAX_GROUPS:
         more = len(phrases) - _MAX_GROUPS + 1
         phrases = [*phrases[: _MAX_GROUPS - 1], f"{more} more such changes"]
     together = " together" if len(coordinates) > 1 else ""
-    return f"{joined(phrases)}{together}"
+    return f"{list_in_words(phrases)}{together}"
 
 
 def _labelled(owners: Sequence[str], leg_names: Sequence[str]) -> list[str]:

@@ -176,7 +176,7 @@ def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
                 f"{path}: name_mot could not be used: found '{name}', which stands for "
                 f"{kind} (joint_name.{i}), needed a joint with one reading; remove it."
             )
-        if axes_of(kind) is None:
+        if rotation_letters(kind) is None:
             problems.append(
                 f"{path}: joint_type.{i} could not be used: found '{kind}', needed SPHERICAL, "
                 "FIXED, or UJOINT_ and two different letters of X, Y, Z; correct it."
@@ -185,7 +185,7 @@ def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
         raise ModelError(problems)
 
 
-def axes_of(kind: str) -> str | None:
+def rotation_letters(kind: str) -> str | None:
     """Return the letters of the axes that a joint type turns about, in order; None if unknown."""
     if kind in ("SPHERICAL", "FIXED"):
         return "XYZ" if kind == "SPHERICAL" else ""
@@ -204,7 +204,7 @@ def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) ->
             element.set("type", "fixed")
             continue
         replaced[name] = joint.child
-        letters = str(axes_of(kind))
+        letters = str(rotation_letters(kind))
         parent = joint.parent
         added = UrdfBuilder(dict(text.links), dict(text.joints))
         for i, letter in enumerate(letters):

@@ -19,7 +19,7 @@ from legcal.machine.kinematics import project_pose
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine, platform_pose, readings_at
 from legcal.machine.parameters import in_links
-from legcal.machine.solver import moved, solve
+from legcal.machine.solver import poses_after, solve
 
 TRIALS = 200
 MIN_TRIALS = 20  # trials, where one of them found a pose above the base
@@ -36,9 +36,10 @@ def closed_home(machine: Machine, home: RigidTransform | None) -> tuple[RigidTra
     Raises
     ------
     ModelError, DidNotConverge
-        As :func:`project_home`, :func:`find_home` and :func:`legcal.machine.closing.close_at`.
+        As :func:`project_home`, :func:`home_at_mid_travel` and
+        :func:`legcal.machine.closing.close_at`.
     """
-    start = find_home(machine) if home is None else home
+    start = home_at_mid_travel(machine) if home is None else home
     projected = project_home(machine, start)
     configuration = close_at(machine, projected, exact=False)
     constrained = is_constrained(machine)
@@ -65,7 +66,7 @@ def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
     return projected
 
 
-def find_home(machine: Machine) -> RigidTransform:
+def home_at_mid_travel(machine: Machine) -> RigidTransform:
     """Return a pose where every leg is at the middle of its travel.
 
     Of all that seeded starts find, the one that turns the platform least is taken, and of the
@@ -145,7 +146,7 @@ def _with_lengths(
     unit = np.array([1.0 / reach] * 3 + [1.0] * 3)
     found = solve(
         equations,
-        moved,
+        poses_after,
         poses,
         tolerance=1e-14 * reach,
         unit=unit,

@@ -40,7 +40,7 @@ from legcal.machine.model import (
     readings_at,
     slider_columns,
 )
-from legcal.machine.solver import moved, newton, solve, walk_in_steps
+from legcal.machine.solver import newton, poses_after, solve, walk_in_steps
 
 CONTRACTION = 0.5  # of the step before; of 1 rad or a leg length for the first
 TOLERANCE = 1e-13  # of a leg length
@@ -317,7 +317,7 @@ def solve_poses(
         return values, jacobian
 
     poses = np.concatenate([R, t[..., None]], axis=2)
-    found = solve(equations, moved, poses, tolerance=1e-15, rank=DEPENDENT, steps=steps)
+    found = solve(equations, poses_after, poses, tolerance=1e-15, rank=DEPENDENT, steps=steps)
     return SolvedPoses(found.points[:, :, :3], found.points[:, :, 3], found.worst, found.size)
 
 
@@ -344,7 +344,9 @@ def project_pose(
         return found.values[:, constraints], found.by_pose[:, constraints]
 
     unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
-    found = solve(equations, moved, T.as_matrix()[None, :3], tolerance=TOLERANCE * scale, unit=unit)
+    found = solve(
+        equations, poses_after, T.as_matrix()[None, :3], tolerance=TOLERANCE * scale, unit=unit
+    )
     projected = motion_of(found.points[0, :, :3], found.points[0, :, 3])
     if found.worst[0] <= 1e-9 * scale:
         return projected, None
@@ -439,7 +441,7 @@ def follow_pose(
         unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
         found = newton(
             equations,
-            moved,
+            poses_after,
             pose,
             tolerance=TOLERANCE * scale,
             contraction=CONTRACTION,

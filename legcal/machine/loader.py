@@ -14,7 +14,7 @@ from legcal.machine.bodies import Bodies, rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.classification import CONCURRENT, PERPENDICULAR, leg_of
 from legcal.machine.cylinders import at_visible_heights, visual_cylinders, with_cylinders
-from legcal.machine.diagnostics import diagnose, proposal_notes
+from legcal.machine.diagnostics import mechanism_notes, proposal_notes
 from legcal.machine.equations import leg_equations
 from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home
@@ -109,7 +109,9 @@ def _load(source: Source) -> Machine:
     machine = replace(machine, mobility=mobility(machine))
     check_equations(machine)
     proposed = proposal_notes(file.legcal, machine)
-    found = map(source.in_format_terms, diagnose(machine, home_is_given=block.home is not None))
+    found = map(
+        source.in_format_terms, mechanism_notes(machine, home_is_given=block.home is not None)
+    )
     return replace(machine, diagnostics=(*source.notes, *proposed, *found))
 
 

@@ -180,7 +180,7 @@ def joint_values(machine: Machine, configuration: Array) -> Array:
     return values
 
 
-def describe(machine: Machine) -> dict[str, Any]:
+def machine_document(machine: Machine) -> dict[str, Any]:
     """Return the document of ``legcal inspect --json``: legs with types, frames, mobility.
 
     A is in the base link and B in the platform link [m], twist in [rad]; ``n_d`` is the number of

@@ -142,7 +142,7 @@ def walk_in_steps(attempt: Callable[[float], bool], min_step: float) -> float:
     return done
 
 
-def moved(poses: Array, step: Array) -> Array:
+def poses_after(poses: Array, step: Array) -> Array:
     """Return poses (k, 3, 4), rotation beside position, after rotations and displacements (k, 6).
 
     Steps that turn far are shortened.

@@ -23,7 +23,7 @@ _TURNS = 720
 _MAX_RATIO = 0.25  # squared errors of lengths, in those from the other side
 
 
-def camera_poses(
+def candidate_camera_poses(
     A_Rb: Array, v_Rb: Array, A_camera: Array, v_camera: Array, *, signed: bool = False
 ) -> tuple[list[RigidTransform], bool]:
     """Return the T_Rb_camera where a camera may have stood, most likely first, and if that is all.
@@ -103,7 +103,7 @@ def side_of_plane(
     errors = []
     for sign in (1.0, -1.0):
         seen = np.tile(sign * normal, (len(legs), 1))
-        poses, _ = camera_poses(A_Rb, up, A_camera, seen, signed=True)
+        poses, _ = candidate_camera_poses(A_Rb, up, A_camera, seen, signed=True)
         if not poses:
             return 0.0
         errors.append(_length_errors(machine, axes, measurements, poses[0], A_camera, legs))

@@ -29,7 +29,7 @@ def turned_points(w: ca.SX, points: ca.SX) -> ca.SX:
     return turn @ points
 
 
-def moved(step: Array, start: RigidTransform) -> RigidTransform:
+def motion_after(step: Array, start: RigidTransform) -> RigidTransform:
     """Return the motion of :func:`moved_points` for numbers."""
     w = step[3:]
     size = float(np.linalg.norm(w))

@@ -27,12 +27,12 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, components, whitener
 from legcal.machine import LegColumns
-from legcal.paper.camera_poses import camera_poses, signs_seen
+from legcal.paper.camera_poses import candidate_camera_poses, signs_seen
 from legcal.paper.criteria import Criteria
 from legcal.paper.gibbs import (
     axis_frames,
     axis_slope,
-    moved,
+    motion_after,
     moved_points,
     turned_frame,
     turned_points,
@@ -185,7 +185,7 @@ def _candidates(
     """Return the candidate poses of the camera of a view, and whether there are no others."""
     A_Rb, v_Rb = machine.parameters.base_joints, machine.base_normals
     located, with_axis = joints.located[view], joints.axis_located[view]
-    return camera_poses(
+    return candidate_camera_poses(
         A_Rb[located],
         v_Rb[with_axis],
         joints.A_camera[view, located],
@@ -225,7 +225,7 @@ def _registered(
                 axes = np.flatnonzero(joints.axis_located[v])
                 signs[v, axes] = signs_seen(v_Rb[axes], joints.v_camera[v, axes], T)
         try:
-            return solve_least_squares(build_rigid(machine, with_signs(joints, signs), start))
+            return solve_least_squares(build_rigid_base(machine, with_signs(joints, signs), start))
         except DidNotConverge as failure:  # the wrong one of two candidates may end anywhere
             return failure
 
@@ -246,13 +246,13 @@ def _registered(
     if isinstance(solution, DidNotConverge):
         raise solution
     steps = iter(solution.x[solution.n_shared :].reshape(-1, 6))
-    cameras = [None if T is None else moved(next(steps), T.inv()).inv() for T in start]
+    cameras = [None if T is None else motion_after(next(steps), T.inv()).inv() for T in start]
     return solution, tuple(
         T if is_fixed else None for T, is_fixed in zip(cameras, fixed, strict=True)
     )
 
 
-def build_rigid(
+def build_rigid_base(
     machine: NominalMachine,
     joints: JointsInCamera,
     start: Sequence[RigidTransform | None],

@@ -20,7 +20,7 @@ import numpy as np
 from legcal.data import LegAxes, Measurements
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis, turned_axis
-from legcal.paper.camera_poses import camera_poses, side_of_plane, signs_seen
+from legcal.paper.camera_poses import candidate_camera_poses, side_of_plane, signs_seen
 from legcal.paper.criteria import Criteria
 from legcal.paper.nominal import NominalMachine
 
@@ -166,7 +166,7 @@ def oriented(machine: NominalMachine, joints: JointsInCamera) -> JointsInCamera:
     signs = np.ones(joints.located.shape)
     for v, (located, with_axis) in enumerate(zip(joints.located, joints.axis_located, strict=True)):
         seen = joints.v_camera[v, with_axis]
-        poses, _ = camera_poses(
+        poses, _ = candidate_camera_poses(
             A_Rb[located], nominal[with_axis], joints.A_camera[v, located], seen
         )
         if poses:

@@ -83,7 +83,7 @@ def locate_platform_joints(
     rigid = RigidProblem.of(machine, unknowns, base, directions, sigma_q, transformation)
     # What is not determined is judged near the nominal model: there the platform moves as it
     # should. Axes that the poses show too poorly to converge without it stay near the nominal ones.
-    problem = build_rigid(rigid)
+    problem = build_rigid_platform(rigid)
     n, terms = len(unknowns), problem.terms
     twisting = [leg.twist is not None for leg in machine.legs]
     turns = unknowns.place[twisting, LegColumns.BASE_AXIS.start :]
@@ -210,7 +210,7 @@ def _covariance_of_A(directions: LegDirections, base: JointsInBase) -> Array:
     return np.where(placed[directions.view, None, None], together[directions.leg], alone)
 
 
-def build_rigid(rigid: RigidProblem) -> LeastSquares:
+def build_rigid_platform(rigid: RigidProblem) -> LeastSquares:
     """Build the rigid criterion in standard deviations; the legs of ``rigid`` are the start.
 
     Axes in closed form from poses of noisy ends are further off than the nominal model. Raises

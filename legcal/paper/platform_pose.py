@@ -28,7 +28,7 @@ from legcal.geometry import (
     register_in_plane,
 )
 from legcal.paper.criteria import Transformation
-from legcal.paper.gibbs import moved, moved_points
+from legcal.paper.gibbs import motion_after, moved_points
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
 
@@ -46,7 +46,7 @@ class PlatformPoses:
     def stepped(self, steps: Array, poses: IntArray) -> tuple[Array, Array]:
         """Return R and t of some poses after steps (n_poses, 6) of all, as ``moved`` has them."""
         start = motions_of(self.R[poses], self.t[poses])
-        return components([moved(*each) for each in zip(steps[poses], start, strict=True)])
+        return components([motion_after(*each) for each in zip(steps[poses], start, strict=True)])
 
 
 def locate_platform(
@@ -115,7 +115,7 @@ def register_by_rays(P_from: Array, P_camera: Array, start: RigidTransform) -> R
     R, t = start.rotation.as_matrix()[None], np.array(start.translation)[None]
     group = np.zeros(len(P_from), dtype=np.intp)
     problem = build_rays(P_from, P_camera, np.zeros_like(P_camera), group, (R, t))
-    return moved(solve_least_squares(problem).x, start)
+    return motion_after(solve_least_squares(problem).x, start)
 
 
 @cache

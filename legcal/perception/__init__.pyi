@@ -5,7 +5,7 @@ from .board_corners import describe_image as describe_image
 from .board_corners import detect_corners as detect_corners
 from .board_corners import find_corners as find_corners
 from .board_corners import require_board as require_board
-from .board_poses import camera_poses as camera_poses
+from .board_poses import camera_poses_by_board as camera_poses_by_board
 from .board_poses import plane_poses as plane_poses
 from .diagnostics import BEFORE_FIT as BEFORE_FIT
 from .diagnostics import FAR_OFF as FAR_OFF
@@ -30,6 +30,6 @@ from .photographs import detection_settings as detection_settings
 from .photographs import given_outlines as given_outlines
 from .photographs import measure_photographs as measure_photographs
 from .photographs import nominal_placement as nominal_placement
-from .photographs import observe as observe
 from .photographs import place as place
+from .photographs import place_and_measure as place_and_measure
 from .placement import Placement as Placement

@@ -92,7 +92,7 @@ def _angle(one: PlanePose, other: PlanePose) -> float:
     return float(turn.magnitude())
 
 
-def camera_poses(
+def camera_poses_by_board(
     corners: Corners,
     board: Board,
     measurements: Measurements,

@@ -22,7 +22,7 @@ from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.detection import NOT_PLACED
 from legcal.perception.outline import HIDDEN, OUTSIDE
 from legcal.perception.pair_matching import CameraPoses, Picture, leg_segments, match_pairs
-from legcal.perception.placement import Placement, Search, corners_of
+from legcal.perception.placement import Placement, Search, sensor_extent
 from legcal.workers import Run
 
 TOLERANCE = 0.006  # of an axis from its edge pair [m]
@@ -68,7 +68,7 @@ class OutlineCount(NamedTuple):
         return self.used / self.visible
 
 
-def diagnose(
+def find_wrong_images(
     search: Search,
     placement: Placement,
     outlines: Outlines,
@@ -275,7 +275,7 @@ def _picture(
     """Return pairs with what a view should show at the reading of a row."""
     wanted = np.flatnonzero(search.wanted[view]) if legs is None else legs
     targets = leg_segments(search.A_base[row], search.B_base[row], search.cylinders, wanted)
-    return Picture(pairs, targets, corners_of(search.measurements.views[view].camera))
+    return Picture(pairs, targets, sensor_extent(search.measurements.views[view].camera))
 
 
 def _share(

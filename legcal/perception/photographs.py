@@ -1,7 +1,8 @@
 """The photographs of a dataset turned into outlines: detected, kept, given or edited.
 
-:func:`observe` reads as the method: images are inspected, legs are recognised and the cameras
-placed, outlines are measured near there, parts that were not found are tried with other radii,
+:func:`place_and_measure` reads as the method: images are inspected, legs are recognised and the
+cameras placed, outlines are measured near there, parts that were not found are tried with other
+radii,
 views are fitted to their outlines and missing legs looked for, and what is wrong with an image is
 noted. Once a joint fit has placed everything, :func:`measure_photographs` measures near it.
 """
@@ -29,7 +30,7 @@ from legcal.machine import Cylinder, Machine
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.detection import measure_outlines
 from legcal.perception.diagnostics import (
-    diagnose,
+    find_wrong_images,
     is_visible,
     reject_images,
 )
@@ -148,7 +149,7 @@ def nominal_placement(
     return Placement(A_base[measurements.pose], B_base[measurements.pose], hints)
 
 
-def observe(
+def place_and_measure(
     photographs: Photographs,
     nominal: Placement,
     report: Report,
@@ -195,7 +196,7 @@ def observe(
         progress=_counted(report, "Looking for missing legs", len(usable)),
     )
     outlines = join_outlines([merge_edited(found, own), others])
-    placement, reasons = diagnose(
+    placement, reasons = find_wrong_images(
         search, placement, outlines, photographs.detect, defects, photographs.run
     )
     view, known = photographs.measurements.view, ~np.isnan(blur)

@@ -53,7 +53,7 @@ class Search:
         """Return what the image of a row shows, and what it should."""
         view = int(self.measurements.view[row])
         camera = self.measurements.views[view].camera
-        return Picture(self.pairs(row, view), self.targets(row, view), corners_of(camera))
+        return Picture(self.pairs(row, view), self.targets(row, view), sensor_extent(camera))
 
     def pairs(self, row: int, view: int) -> CandidatePairs:
         """Return the edge pairs of an image as if the camera of a view had taken it."""
@@ -72,7 +72,7 @@ class Search:
         return replace(picture, targets=self.targets(row, int(self.measurements.view[row])))
 
 
-def corners_of(camera: Camera) -> Array:
+def sensor_extent(camera: Camera) -> Array:
     """Return the least and the greatest x and y (2, 2) of the sensor plane that an image shows."""
     x, y = camera.width - 1.0, camera.height - 1.0
     border = np.array(

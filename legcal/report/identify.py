@@ -18,7 +18,7 @@ from legcal.calibration import (
     legs_in_words,
     views_in_words,
 )
-from legcal.machine import joined, leg_labels
+from legcal.machine import leg_labels, list_in_words
 from legcal.report.render import report as blocks
 from legcal.report.render import table
 
@@ -164,7 +164,7 @@ def _board(board: BoardReport, of: int) -> str:
     verb = "raises" if board.present else "on the base would raise"
     text = f"{subject} {verb}"
     if board.needed_for:
-        needed = joined(
+        needed = list_in_words(
             [_NEEDS.get(name, _CONDITIONS.get(name, name)) for name in board.needed_for]
         )
         where = "" if board.present else " on the base"
@@ -186,7 +186,7 @@ def _intrinsics(found: CameraIntrinsics) -> str:
     camera = f"Camera of {found.camera}: the legs"
     known = {name: sigma for name, sigma in found.sigma.items() if sigma is not None}
     if not found.determined:
-        open_ = joined([name for name in found.sigma if name not in known])
+        open_ = list_in_words([name for name in found.sigma if name not in known])
         return f"{camera} do not determine {open_}; calibrate it with legcal camera."
     sigmas = ", ".join(f"{name} {_two_digits(sigma)}" for name, sigma in known.items())
     return f"{camera} determine its intrinsics too (sigma to expect: {sigmas} px)."
@@ -232,5 +232,5 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
         lines.append(Text(hidden, style="dim"))
     failed = [_CONDITIONS[c.name] for c in report.conditions if c.fails]
     if failed:
-        lines.append(f"The paper's conditions fail: {joined(failed)}.")
+        lines.append(f"The paper's conditions fail: {list_in_words(failed)}.")
     return [*lines, *(f"note: {note}" for note in report.notes)]

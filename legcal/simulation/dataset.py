@@ -33,7 +33,7 @@ from legcal.simulation.folder import (
     write_session,
     write_truth,
 )
-from legcal.simulation.observe import corners_of
+from legcal.simulation.observe import corners_in_images
 from legcal.simulation.poses import are_extreme
 from legcal.simulation.request import Level
 from legcal.simulation.session import (
@@ -152,7 +152,9 @@ def simulate(
         if session.axes is not None:
             write_axis_table(folder / AXES_NAME, *session.axes, m, legs)
         if session.board is not None:
-            exact_corners = corners_of(session.scene, session.posed_machines, session.board, 0.0)
+            exact_corners = corners_in_images(
+                session.scene, session.posed_machines, session.board, 0.0
+            )
             write_corners(folder / TRUTH / CORNERS_NAME, exact_corners, m)
         if session.corners is not None:
             write_corners(folder / CORNERS_NAME, session.corners, m)

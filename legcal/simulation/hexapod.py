@@ -27,7 +27,7 @@ from legcal.simulation.observe import (
     OutlineNoise,
     Scene,
     TableNoise,
-    axes_of,
+    axes_in_images,
     outlines_of,
     plain_scene,
 )
@@ -197,7 +197,9 @@ def extreme_poses(machine: PaperHexapod, n_poses: int, rng: np.random.Generator)
     return _drawn(machine, n_poses, lambda: near_ends(rng.integers(0, 2, n), rng.random(n)))
 
 
-def random_poses(machine: PaperHexapod, n_poses: int, rng: np.random.Generator) -> RigidTransform:
+def random_hexapod_poses(
+    machine: PaperHexapod, n_poses: int, rng: np.random.Generator
+) -> RigidTransform:
     """Return random poses with every leg length drawn uniformly from its travel.
 
     They are followed from home as those of :func:`extreme_poses`.
@@ -340,6 +342,6 @@ def observed(
 ) -> tuple[Outlines | None, LegAxes]:
     """Return outlines, unless Table 1 has the noise, and axes of a scene; exact without *rng*."""
     if isinstance(noise, TableNoise):
-        return None, axes_of_table(*axes_of(scene, noise, rng))
+        return None, axes_of_table(*axes_in_images(scene, noise, rng))
     outlines = outlines_of(scene, noise, rng)
     return outlines, axes_from_outlines(outlines, measurements, machine.radius_of_part())

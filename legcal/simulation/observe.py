@@ -211,7 +211,9 @@ class AxisTable(NamedTuple):
     sigmas: Array  # (n, 4) their standard deviations
 
 
-def axes_of(scene: Scene, noise: TableNoise, rng: np.random.Generator | None = None) -> AxisTable:
+def axes_in_images(
+    scene: Scene, noise: TableNoise, rng: np.random.Generator | None = None
+) -> AxisTable:
     """Return the axes of all legs that images show, by row and leg; exact without *rng*.
 
     A leg parallel to the image x axis has no point M_LS = (x, 0, z) and is left out.
@@ -269,7 +271,7 @@ def table_of_lines(u: Array, A: Array) -> Array:
 # Corners
 
 
-def corners_of(
+def corners_in_images(
     scene: Scene,
     posed_machines: Sequence[PosedMachine],  # in every pose, with the board beside them
     placed: PlacedBoard,

@@ -46,7 +46,7 @@ from legcal.simulation.hexapod import (
     paper_hexapod,
     perturb,
     poses_with_lengths,
-    random_poses,
+    random_hexapod_poses,
 )
 from legcal.simulation.observe import TableNoise
 from legcal.simulation.paper_report import BOUND, INITIAL, SCALARS, PaperSummary
@@ -119,7 +119,7 @@ class PaperStudy:
             n_poses=self.n_poses,
             n_images=self.n_images,
         )
-        checked = random_poses(machine, self.n_checked, rng)
+        checked = random_hexapod_poses(machine, self.n_checked, rng)
         exact = observed(machine, session.scene, session.measurements, self.noise, None)[1]
         covariance = bound_covariance(session, exact)
         found = {INITIAL: _errors(machine, nominal.parameters, covariance, checked)}

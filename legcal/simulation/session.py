@@ -34,8 +34,8 @@ from legcal.simulation.observe import (
     AxisTable,
     OutlineNoise,
     Scene,
-    axes_of,
-    corners_of,
+    axes_in_images,
+    corners_in_images,
     outlines_of,
 )
 from legcal.simulation.poses import commanded_poses, given_poses
@@ -148,9 +148,11 @@ def simulate_session(
         noise = OutlineNoise(settings.sigma_px, n_points=None)
         outlines = outlines_of(scene, noise, chance["observations"])
     elif settings.level is Level.AXES:
-        axes = axes_of(scene, settings.table, chance["observations"])
+        axes = axes_in_images(scene, settings.table, chance["observations"])
     if placed is not None and settings.level is not Level.PHOTOGRAPHS:
-        corners = corners_of(scene, posed_machines, placed, settings.sigma_px, chance["corners"])
+        corners = corners_in_images(
+            scene, posed_machines, placed, settings.sigma_px, chance["corners"]
+        )
     width = max(2, len(str(len(poses.poses))))
     labels = tuple(f"p{k + 1:0{width}d}" for k in range(len(poses.poses)))
     measurements = _recorded(

@@ -68,7 +68,7 @@ class WhitenedEquations:
         return replace(self, by_pose=self.by_pose[poses], by_parameters=self.by_parameters[poses])
 
 
-def leg_equations(predicted: PredictedObservations) -> WhitenedEquations:
+def whitened_leg_equations(predicted: PredictedObservations) -> WhitenedEquations:
     """Return what readings and legs demand of the poses of a session."""
     equations = pose_equations(predicted.legs, predicted.R, predicted.t)
     sigma = np.where(equations.measured, predicted.sigma_q, SIGMA_EXACT)[:, None]

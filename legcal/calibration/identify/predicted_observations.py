@@ -24,12 +24,12 @@ from legcal.machine import (
     Machine,
     Parametrization,
     geometries,
-    joined,
     leg_labels,
+    list_in_words,
     main_cylinders,
     moved_legs,
     parametrization_of,
-    random_poses,
+    random_poses_of_legs,
 )
 from legcal.vision import shared_cameras
 
@@ -224,7 +224,7 @@ def planned_observations(
     legs, length, rng = machine_near(machine, home)
     A, B = joints_at(legs, home)
     n_poses = images * len(views)
-    R, t = random_poses(
+    R, t = random_poses_of_legs(
         legs, machine.frame_legs, home, travel_of(machine), max(n_poses, REACHED), rng
     )
     seen = np.zeros((len(views), len(legs)), dtype=np.bool_)
@@ -271,11 +271,11 @@ def recorded_observations(
         R, t = Frames.of(nominal_poses(machine, m)[0])
     else:
         travel = travel_of(machine)
-        R, t = random_poses(legs, machine.frame_legs, home, travel, m.n_poses, rng)
+        R, t = random_poses_of_legs(legs, machine.frame_legs, home, travel, m.n_poses, rng)
     parametrization = parametrization_of(machine, twists=twists)
     R_reached, t_reached = R, t
     if 3 * len(t) < len(parametrization):  # too few to tell what no pose would show
-        more = random_poses(
+        more = random_poses_of_legs(
             legs, machine.frame_legs, home, travel_of(machine), REACHED - len(t), rng
         )
         R_reached, t_reached = np.concatenate([R, more[0]]), np.concatenate([t, more[1]])
@@ -491,7 +491,7 @@ def steps_apart(ring: Sequence[int], leg: int, others: Sequence[int]) -> int:
 def legs_in_words(legs: Sequence[int], leg_names: Sequence[str]) -> str:
     """Return legs as a sentence names them: ``legs 1, 2 and 5``."""
     labels = leg_labels(leg_names)
-    return f"leg{'s' * (len(legs) > 1)} {joined([labels[leg_names[j]] for j in legs])}"
+    return f"leg{'s' * (len(legs) > 1)} {list_in_words([labels[leg_names[j]] for j in legs])}"
 
 
 def views_in_words(views: Sequence[str]) -> str:

@@ -10,9 +10,9 @@ import numpy as np
 from legcal.calibration.identify.information import (
     WhitenedEquations,
     image_rows,
-    leg_equations,
     prior_of,
     problem_of,
+    whitened_leg_equations,
 )
 from legcal.calibration.identify.predicted_observations import PredictedObservations
 from legcal.calibration.identify.report import Ranks, RmsMotion, StepRank, WeakDirection
@@ -73,7 +73,7 @@ class Analysis:
     @cached_property
     def equations(self) -> WhitenedEquations:
         """The equations of readings and legs."""
-        return leg_equations(self.predicted)
+        return whitened_leg_equations(self.predicted)
 
     @cached_property
     def prior(self) -> GaussianPrior:

@@ -35,7 +35,7 @@ from legcal.calibration.identify.report import (
 from legcal.calibration.identify.steps import base_by_frames, offsets_from_distances, scattered
 from legcal.estimation import compress, eliminate, marginal_rows
 from legcal.geometry import Array, IntArray
-from legcal.machine import JointType, Machine, joined
+from legcal.machine import JointType, Machine, list_in_words
 from legcal.paper import Condition, count_conditions, three_legs_at_once
 
 _CAMERA = 6  # unknowns of its pose
@@ -374,7 +374,7 @@ def _known_parameters(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _S
         choices.append(tuple(first))
     for which in choices:
         known = [names.index(name) for name in which]
-        yield f"fix {joined(which)}", partial(_score, analysis, known)
+        yield f"fix {list_in_words(which)}", partial(_score, analysis, known)
 
 
 def _other_views(analysis: Analysis, replanning: Replanning | None) -> tuple[Remedy, ...]:

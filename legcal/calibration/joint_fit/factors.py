@@ -55,7 +55,7 @@ class Observed(NamedTuple):
         return np.unique(np.concatenate([self.outlines.view, self.axes.view, self.corners.view]))
 
 
-def observe(
+def observed_arrays(
     measurements: Measurements,
     legs: FittedLegs,
     outlines: Outlines,

@@ -22,7 +22,7 @@ from legcal.calibration.joint_fit.factors import (
     ObservedCorners,
     ObservedOutlines,
     Readings,
-    observe,
+    observed_arrays,
     observed_axes,
     observed_corners,
     observed_readings,
@@ -233,7 +233,7 @@ def build_fit(
     cameras = tuple(
         _with_values(camera, owner, choices) for camera, owner in zip(given, owners, strict=True)
     )
-    observed = observe(measurements, legs, outlines, axes, board, cameras)
+    observed = observed_arrays(measurements, legs, outlines, axes, board, cameras)
     problem = _built(legs, choices, observed, cameras, owners, measurements.n_poses, settings)
     equations = problem.n_equations + len(problem.priors.mean)
     if equations < problem.n_unknowns:

@@ -14,7 +14,7 @@ from legcal.calibration.location.document import (
     OpenPart,
     direction_of,
     direction_words,
-    joined,
+    open_parts_in_words,
 )
 from legcal.calibration.location.fit import (
     RANK_TOLERANCE,
@@ -235,13 +235,15 @@ def _check_machine(
     start = f"{name}: base and tool could not be located, because"
     if beyond.shape[1]:
         raise NotIdentifiable(
-            f"{start} {joined(_open_parts(beyond, found.frames))} cannot be told from the poses: "
+            f"{start} {open_parts_in_words(_open_parts(beyond, found.frames))} cannot be told from "
+            "the poses: "
             f"found {len(pairs)} poses that {here.words}"
             f"{_needed_words(here, there, _scatter(observations, found))}."
         )
     if not _is_resolved_by_the_tool(basis):
         raise NotIdentifiable(
-            f"{start} no pose of this machine tells {joined(_open_parts(basis, found.frames))}: "
+            f"{start} no pose of this machine tells "
+            f"{open_parts_in_words(_open_parts(basis, found.frames))}: "
             f"found a platform whose poses {there.words}, needed a part that holding the tool in "
             "the platform closes; measure orientations too, or the base itself."
         )
@@ -267,7 +269,7 @@ def _held_words(parts: list[OpenPart], workspace: PosePairs, tool_position: Arra
     else:
         why = f"the platform of this machine takes poses that {machine.words}"
     at = ", ".join(f"{x:g}" for x in tool_position)
-    with_it = f" from {joined(base)}" if base else ""
+    with_it = f" from {open_parts_in_words(base)}" if base else ""
     taken = [
         f"the tool is taken at ({at}) m in the platform"
         if part.kind == "position"
@@ -275,7 +277,8 @@ def _held_words(parts: list[OpenPart], workspace: PosePairs, tool_position: Arra
         for part in tool
     ]
     return (
-        f"No pose tells {joined(tool)} apart{with_it}, because {why}: {' and '.join(taken)} there, "
+        f"No pose tells {open_parts_in_words(tool)} apart{with_it}, because {why}: "
+        f"{' and '.join(taken)} there, "
         "and the base follows; where the tool is in the world does not depend on it."
     )
 

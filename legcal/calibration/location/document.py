@@ -188,7 +188,7 @@ class OpenPart:
         return f"{start} {how} {direction_words(self.directions[0])} of {link}"
 
 
-def joined(parts: list[OpenPart]) -> str:
+def open_parts_in_words(parts: list[OpenPart]) -> str:
     """Return parts in one phrase, the tool's first."""
     words = [part.words for part in sorted(parts, key=lambda part: part.frame != "tool")]
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation
 from legcal.calibration.location.frames import (
     N_STEP,
     PosePairs,
+    frames_after,
     frames_from,
     jacobian,
-    moved,
     residuals,
     tool_motions,
 )
@@ -298,7 +298,7 @@ def hold_tool(
         away = np.concatenate([(tool_position - frames[1, :, 3]) / pairs.length, turn])
         slide = basis @ np.linalg.lstsq(basis[6:], away, rcond=None)[0]
         size = float(np.linalg.norm(slide[[3, 4, 5, 9, 10, 11]]))
-        frames = moved(frames, slide * min(1.0, 0.5 / max(size, 1e-300)) * pairs.scale)
+        frames = frames_after(frames, slide * min(1.0, 0.5 / max(size, 1e-300)) * pairs.scale)
         of_tool = np.concatenate([np.zeros_like(basis[:6]), basis[6:]])
         frames = _most_likely(pairs, frames, found.noise, observations.by_model, of_tool)
         if np.abs(slide).max() < _HOLD_TOLERANCE:

@@ -68,7 +68,7 @@ def transforms(frames: Array) -> tuple[RigidTransform, RigidTransform]:
     return base, tool
 
 
-def moved(frames: Array, step: Array) -> Array:
+def frames_after(frames: Array, step: Array) -> Array:
     """Return frames after steps (..., 12)."""
     steps = step.reshape(*step.shape[:-1], 2, 6)
     R = rotation_matrices(steps[..., 3:]) @ frames[..., :3]

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 from legcal.calibration.location.frames import (
     N_STEP,
     PosePairs,
+    frames_after,
     frames_from,
     jacobian,
-    moved,
     residuals,
 )
 from legcal.geometry import Array, BoolArray, IntArray, nearest_rotation
@@ -188,7 +188,9 @@ def _descended(pairs: PosePairs, frames: Array, rows: Array | int, max_iteration
 
     def retract(frames: Array, step: Array) -> Array:
         turn = np.linalg.norm(step[:, [3, 4, 5, 9, 10, 11]], axis=1)
-        return moved(frames, step * np.minimum(1.0, _MAX_TURN / np.maximum(turn, 1e-300))[:, None])
+        return frames_after(
+            frames, step * np.minimum(1.0, _MAX_TURN / np.maximum(turn, 1e-300))[:, None]
+        )
 
     return solve(
         equations,
