@@ -35,7 +35,8 @@ MARK = "LEGCAL_KILL"  # in the environment of the command and of all that it sta
 
 # Tests may run with Ctrl-C ignored, which programs that they start inherit.
 WITH_SIGNALS = (
-    "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); "
+    "import os, signal, sys; "
+    "[signal.signal(n, signal.SIG_DFL) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]; "
     "os.execv(sys.executable, [sys.executable, '-m', 'legcal', *sys.argv[1:]])"
 )
 
