@@ -4,8 +4,6 @@ import sys
 
 from legcal.signals import stopped_by_signals
 
-_INTERRUPTED = 130
-
 
 def main() -> None:
     """Run the command line and exit with 0, 1 (data), 2 (use), 3 (internal) or 130 (stopped)."""
@@ -16,9 +14,9 @@ def main() -> None:
 
             code = run(as_json=as_json)
     except KeyboardInterrupt:
-        from legcal.cli.options import print_failure
+        from legcal.cli.options import INTERRUPTED, print_failure
 
         print_failure("Interrupted", "Stopped before the end.", as_json=as_json)
-        code = _INTERRUPTED
+        code = INTERRUPTED
         exec("")  # else Python, if interrupted in code from a text, ends as if nobody caught it
     sys.exit(code)

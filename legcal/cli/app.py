@@ -16,7 +16,7 @@ import typer
 
 from legcal.cli.calibrate import calibrate
 from legcal.cli.commands import camera, detect, evaluate, identify, inspect, locate, new, noise
-from legcal.cli.options import print_failure
+from legcal.cli.options import INTERRUPTED, print_failure
 from legcal.cli.simulate import simulate
 from legcal.cli.study import study
 from legcal.errors import LegcalError, UsageError, printable
@@ -24,7 +24,6 @@ from legcal.signals import raise_if_stopped
 from legcal.version import __version__
 
 ISSUES = "the issue tracker of legcal"
-INTERRUPTED = 130  # exit code
 NO_COMMAND = "Nothing was done: found no command, needed one of those above."
 
 app = typer.Typer(

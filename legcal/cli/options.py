@@ -15,6 +15,7 @@ import typer
 from legcal.errors import OutOfResources, UsageError, printable
 from legcal.processors import processors
 
+INTERRUPTED = 130  # exit code of a command that a signal stopped
 MAX_IMAGE_WORKERS = 4  # processes that search images; each takes about 150 MB
 
 ModelArgument = Annotated[
