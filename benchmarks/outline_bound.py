@@ -77,7 +77,7 @@ def information_of(design: Design, sigma_q: float, radius_sigma: float) -> Array
     by_pose, by_shared = _outline_rows(design)
     demands = pose_equations(design.legs.nominal, design.R, design.t)
     by_parameters = demands.by_parameters(design.parametrization)
-    held, read = ~demands.measured, demands.measured
+    constraints, read = ~demands.measured, demands.measured
     columns = list(freedoms(design.legs.frame_legs))
     pose = design.pose[design.outlines.row]
     parameters = slice(n_cameras, n_cameras + n_parameters)
@@ -90,9 +90,9 @@ def information_of(design: Design, sigma_q: float, radius_sigma: float) -> Array
         own = np.concatenate([by_pose[seen].reshape(-1, 6)[:, columns], F[read] / sigma_q])
         shared = np.concatenate([by_shared[seen].reshape(-1, by_shared.shape[-1]), of_readings])
         # A pose follows the parameters where F d_pose + G d_xi = 0; the rest of it is free.
-        _, singular, right = np.linalg.svd(F[held])
+        _, singular, right = np.linalg.svd(F[constraints])
         rank = int(np.sum(singular > _RANK * singular.max(initial=1.0)))
-        shared[:, parameters] -= own @ np.linalg.pinv(F[held], rcond=_RANK) @ G[held]
+        shared[:, parameters] -= own @ np.linalg.pinv(F[constraints], rcond=_RANK) @ G[constraints]
         rows.append(_without(own @ right[rank:].T, shared))
     radius = np.array([design.legs.radii[part] for part in design.parts])
     known = np.zeros((len(radius), n_cameras + n_parameters + len(radius)))

@@ -31,7 +31,7 @@ from legcal.simulation import (
     prepare_view,
     write_true_model,
 )
-from legcal.simulation.solids import Box, Cylinder, Material, PlacedSolid, PosedMachine, Solid
+from legcal.simulation.solids import Box, Material, PlacedSolid, PosedMachine, Solid, SolidCylinder
 from legcal.vision.camera import Camera
 
 SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
@@ -54,7 +54,7 @@ class Given:
         One row for each of them, in one view without T_base_camera.
     A_base, B_base : (n_images, n_legs, 3) array
         Joint centres by the nominal model at the readings [m].
-    cylinders : tuple, for each leg a tuple of Cylinder
+    cylinders : tuple, for each leg a tuple of SolidCylinder
         What can be seen of the nominal legs.
     leg_names : tuple of str
     """
@@ -81,7 +81,7 @@ class Truth:
     T_base_camera : RigidTransform
     A_base, B_base : (n_images, n_legs, 3) array
         Joint centres [m].
-    cylinders : tuple, for each leg a tuple of Cylinder
+    cylinders : tuple, for each leg a tuple of SolidCylinder
     shown : tuple, for each image a tuple of LegView, one for each leg
         What can be seen of the legs.
     width : (n_images, n_legs) array
@@ -301,9 +301,9 @@ def _occluder(
     z = max(nearest, 0.15 * P[2]) * rng.uniform(0.5, 0.85)
     pixel = z / float(camera.K[0, 0])
     picture = camera.height * pixel
-    shape: Box | Cylinder
+    shape: Box | SolidCylinder
     if rng.random() < 0.5:
-        shape = Cylinder(picture * rng.uniform(0.02, 0.06), picture * rng.uniform(0.5, 2.0))
+        shape = SolidCylinder(picture * rng.uniform(0.02, 0.06), picture * rng.uniform(0.5, 2.0))
         flat = Rotation.from_euler("xz", [0.5 * np.pi, rng.uniform(0.0, np.pi)])
         turn = T.rotation * Rotation.from_euler("z", rng.uniform(0.0, np.pi)) * flat
     else:
@@ -325,7 +325,7 @@ def _beside(machine: PosedMachine, solids: tuple[PlacedSolid, ...]) -> PosedMach
     vertices, faces, n = [machine.vertices], [machine.faces], len(machine.vertices)
     for placed in solids:
         shape = placed.solid.shape
-        if isinstance(shape, Cylinder):
+        if isinstance(shape, SolidCylinder):
             mesh = trimesh.creation.cylinder(shape.radius, shape.length)
         else:
             assert isinstance(shape, Box)

@@ -13,8 +13,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.geometry.types import Array, Image
 from legcal.simulation import Appearance, Light, prepare_view
 from legcal.simulation.rendering.rays import in_view
-from legcal.simulation.rendering.scene import Canvas, develop
-from legcal.simulation.solids import Cylinder, Material, PlacedSolid, Solid
+from legcal.simulation.rendering.scene import FrameBuffer, develop
+from legcal.simulation.solids import Material, PlacedSolid, Solid, SolidCylinder
 from legcal.vision import Grey
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
@@ -148,7 +148,8 @@ def photograph(looks: Looks, rng: np.random.Generator, times: int = PHOTOGRAPHS)
     towards = Rotation.align_vectors(u[None], np.array([[0.0, 0.0, 1.0]]))[0]
     pose = RigidTransform.from_components(middle, towards)
     solid = PlacedSolid(
-        Solid("leg", None, Cylinder(radius, 2.0 * reach), RigidTransform.identity(), material), pose
+        Solid("leg", None, SolidCylinder(radius, 2.0 * reach), RigidTransform.identity(), material),
+        pose,
     )
     dark, bright = (
         _radiance(solid, camera, replace(appearance, background=level, samples=21))
@@ -175,7 +176,7 @@ def _radiance(solid: PlacedSolid, camera: Camera, appearance: Appearance) -> Gre
     K[2, 2] = 1.0
     camera = replace(camera, K=K, width=FINE * camera.width, height=FINE * camera.height)
     scene = prepare_view([solid], camera, RigidTransform.identity(), appearance, rng)
-    canvas = Canvas(scene.canvas.z.copy(), scene.canvas.terms.sum(axis=0)[None])
+    canvas = FrameBuffer(scene.canvas.z.copy(), scene.canvas.terms.sum(axis=0)[None])
     scene.painter.paint(canvas, in_view([solid], scene.T_camera_base))
     return np.asarray(canvas.terms[0, 0].reshape(camera.height, camera.width))
 

@@ -26,7 +26,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.data.dataset import load_dataset
 from legcal.data.outlines import no_outlines
 from legcal.machine import forward_kinematics
-from legcal.perception import Photographs, Placement, measure_photographs, place
+from legcal.perception import Photographs, Placement, measure_photographs, recognise_and_place
 from legcal.perception.detection import measure_outlines
 from legcal.perception.image_quality import measure_exposure
 from legcal.perception.placement import group_views
@@ -91,8 +91,13 @@ def measure_speed() -> None:
         replace(photographs, detect=begin), scene, no_progress
     )  # what is computed only once
     watch("exposure and blur", lambda: [measure_exposure(image) for image in decoded])
-    near = watch("recognition near poses", lambda: place(photographs, scene, no_progress))
-    watch("recognition without", lambda: place(photographs, without_poses(scene), no_progress))
+    near = watch(
+        "recognition near poses", lambda: recognise_and_place(photographs, scene, no_progress)
+    )
+    watch(
+        "recognition without",
+        lambda: recognise_and_place(photographs, without_poses(scene), no_progress),
+    )
     search = photographs.search(scene)
     once, blur = watch(
         "outlines in brief", lambda: measure_outlines(search, near, rows, together=False)
@@ -144,7 +149,9 @@ def peak_memory(n: int) -> float:
     scene = replace(scene, A_base=scene.A_base[rows], B_base=scene.B_base[rows])
     for row in range(n):
         measure_exposure(photographs.load(row))
-    measure_photographs(photographs, place(photographs, scene, no_progress), no_progress)
+    measure_photographs(
+        photographs, recognise_and_place(photographs, scene, no_progress), no_progress
+    )
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 

@@ -20,7 +20,7 @@ _HAS_TIMER = hasattr(signal, "setitimer")
 _HAS_MASK = hasattr(signal, "pthread_sigmask")
 
 
-class _State:
+class _SignalState:
     """What the handlers know; one process has one main thread."""
 
     handling = False  # inside stopped_by_signals
@@ -35,7 +35,7 @@ def stopped_by_signals() -> Iterator[None]:
     A block that heard a signal ends with KeyboardInterrupt, whatever became of the first one. A
     signal that was ignored before, as by ``nohup``, stays so. Blocks in the block do nothing.
     """
-    if _State.handling:
+    if _SignalState.handling:
         yield
         return
     before = {number: signal.getsignal(number) for number in _NUMBERS}
@@ -44,11 +44,11 @@ def stopped_by_signals() -> Iterator[None]:
     def stop(_number: int, _frame: FrameType | None) -> None:
         for number in heard:  # by the system, as Python may be kept from answering
             signal.signal(number, signal.SIG_DFL)
-        _State.stopped = True
+        _SignalState.stopped = True
         if _HAS_TIMER:
             signal.signal(signal.SIGALRM, _raise_again)
             signal.setitimer(signal.ITIMER_REAL, _AGAIN, _AGAIN)
-        if not _State.holding:
+        if not _SignalState.holding:
             raise KeyboardInterrupt
 
     def report(unraisable: "sys.UnraisableHookArgs") -> None:
@@ -58,7 +58,7 @@ def stopped_by_signals() -> Iterator[None]:
     alarm = signal.getsignal(signal.SIGALRM) if _HAS_TIMER else None
     report_before = sys.unraisablehook
     try:
-        _State.handling = True
+        _SignalState.handling = True
         sys.unraisablehook = report
         for number in heard:
             signal.signal(number, stop)
@@ -69,13 +69,13 @@ def stopped_by_signals() -> Iterator[None]:
             raise_if_stopped()
         raise
     finally:
-        if _State.stopped and _HAS_TIMER:
+        if _SignalState.stopped and _HAS_TIMER:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             signal.signal(signal.SIGALRM, alarm)
         for number in heard:
             signal.signal(number, before[number])
         sys.unraisablehook = report_before
-        _State.handling = _State.stopped = False
+        _SignalState.handling = _SignalState.stopped = False
 
 
 def _raise_again(_number: int, _frame: FrameType | None) -> None:
@@ -85,13 +85,13 @@ def _raise_again(_number: int, _frame: FrameType | None) -> None:
         if isinstance(error, KeyboardInterrupt | GeneratorExit):
             return
         error = error.__context__
-    if not _State.holding:
+    if not _SignalState.holding:
         raise KeyboardInterrupt
 
 
 def raise_if_stopped() -> None:
     """Raise KeyboardInterrupt if a signal was heard: before anything is recorded."""
-    if _State.stopped:
+    if _SignalState.stopped:
         raise KeyboardInterrupt
 
 
@@ -102,11 +102,11 @@ def held_back_signals() -> Iterator[None]:
     Threads and processes that are started in the block hear none either: they inherit that.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _NUMBERS) if _HAS_MASK else ()
-    _State.holding += 1
+    _SignalState.holding += 1
     try:
         yield
     finally:
-        _State.holding -= 1
+        _SignalState.holding -= 1
         if _HAS_MASK:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
     raise_if_stopped()  # another thread may have taken it
@@ -114,7 +114,7 @@ def held_back_signals() -> Iterator[None]:
 
 def is_waiting() -> bool:
     """Say whether a signal waits for the end of a block."""
-    return _State.stopped or (_HAS_MASK and not signal.sigpending().isdisjoint(_NUMBERS))
+    return _SignalState.stopped or (_HAS_MASK and not signal.sigpending().isdisjoint(_NUMBERS))
 
 
 def leave_interrupts_to_parent() -> None:

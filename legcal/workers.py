@@ -88,8 +88,10 @@ def worker_pool(
         return
     _start_tracker()
     context = get_context("spawn")
-    held, lifeline = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with, initargs=(held,))
+    watched, lifeline = context.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(
+        workers, mp_context=context, initializer=_end_with, initargs=(watched,)
+    )
     run = _in_order if in_order else _as_they_come
     try:
         yield partial(run, pool, workers)
@@ -107,7 +109,7 @@ def worker_pool(
             pool.shutdown(cancel_futures=True)
         finally:
             lifeline.close()
-            held.close()
+            watched.close()
 
 
 def _in_order(

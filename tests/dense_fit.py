@@ -83,7 +83,7 @@ def allowed(problem: FitProblem, state: State) -> Array:
     """Return an orthonormal basis (size, f) of the steps that constraints and holds leave."""
     eye = np.eye(problem.size)
     C = by_differences(problem, state, lambda s: violations(problem, s), eye)
-    held = np.zeros((len(problem.held), problem.size))
-    held[:, : problem.held.shape[1]] = problem.held
+    held = np.zeros((len(problem.held_directions), problem.size))
+    held[:, : problem.held_directions.shape[1]] = problem.held_directions
     C = np.concatenate([C, held])
     return np.asarray(null_space(C, rcond=1e-6)) if len(C) else eye

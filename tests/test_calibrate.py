@@ -191,7 +191,7 @@ def test_a_contradicted_focal_length_counts_in_the_verdict(
     planar: tuple[Path, Calibration],
 ) -> None:
     assert _judged(planar[1]).verdict.trustworthy
-    assert not _judged(planar[1], focal_doubt=10.0).verdict.trustworthy
+    assert not _judged(planar[1], focal_error=10.0).verdict.trustworthy
 
 
 # Recovery from outlines and axes.

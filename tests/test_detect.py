@@ -31,7 +31,7 @@ from legcal.perception.overlays import (
     marks_of_image,
     short_reason,
 )
-from legcal.perception.photographs import ImageObservations, Photographs, place_and_measure
+from legcal.perception.photographs import MeasuredImages, Photographs, place_and_measure
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.visibility import PredictedLeg, predict_legs
@@ -152,7 +152,7 @@ def test_captions_say_only_of_a_camera_with_a_hint_where_it_was_expected(
 def test_legs_are_drawn_by_the_radii_that_were_searched_by(
     one_image: RepeatedImages, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def thicker(photographs: Photographs, *others: Any) -> ImageObservations:
+    def thicker(photographs: Photographs, *others: Any) -> MeasuredImages:
         cylinders = [
             [replace(c, radius=c.radius * (2.0 + j)) for c in of_leg]
             for j, of_leg in enumerate(photographs.cylinders)

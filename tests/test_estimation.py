@@ -121,7 +121,7 @@ def test_fixed_numbers_stay_and_tied_ones_move_together() -> None:
 def test_held_directions_do_not_move() -> None:
     problem = waves(np.random.default_rng(4), all_free(N_SHARED, 1))
     direction = np.array([[1.0, 1.0, 0.0]]) / np.sqrt(2.0)
-    found = minimise(replace(problem, held=direction), AWAY)
+    found = minimise(replace(problem, held_directions=direction), AWAY)
     change = (found.state.phase - AWAY.phase)[:, 0]
     assert np.abs(change).max() > 1e-3
     assert direction[0] @ change == pytest.approx(0.0, abs=1e-12)

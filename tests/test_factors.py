@@ -49,7 +49,7 @@ from legcal.calibration.joint_fit import (
 from legcal.calibration.joint_fit.outline_errors import N_KINDS, EdgeBiases
 from legcal.calibration.location import fit as location_fit
 from legcal.calibration.location.fit import fit
-from legcal.calibration.location.observations import PoseNoise
+from legcal.calibration.location.tool_poses import PoseNoise
 from legcal.calibration.outlier_images import outlier_images
 from legcal.data import axes_from_outlines, no_outlines
 from legcal.estimation import Frames, Problem, PseudoHuber, linearize, normal_equations, solver
@@ -314,7 +314,7 @@ def test_a_step_is_that_of_the_whole_system_inside_the_constraints(
     problem, state = _problem(name)
     if is_held:
         held = np.random.default_rng(1).normal(size=(problem.n_kept, 2))
-        problem = replace(problem, held=np.linalg.qr(held)[0].T)
+        problem = replace(problem, held_directions=np.linalg.qr(held)[0].T)
     linear = linearize(problem, state)
     H, g = np.zeros((problem.size, problem.size)), np.zeros(problem.size)
     for kind, J in jacobians(problem, linear).items():
@@ -325,7 +325,7 @@ def test_a_step_is_that_of_the_whole_system_inside_the_constraints(
             H += Ji.T @ (w * np.eye(len(ri)) - k * w**3 * np.outer(ri, ri)) @ Ji
             g += w * Ji.T @ ri
     N = allowed(problem, state)
-    assert N.shape[1] == problem.n_unknowns - len(problem.held)
+    assert N.shape[1] == problem.n_unknowns - len(problem.held_directions)
     inside = N.T @ H @ N
     scale = 1.0 / np.sqrt(np.diag(inside))
     free = np.linalg.solve(scale[:, None] * inside * scale, scale * (N.T @ g))

@@ -25,11 +25,11 @@ from legcal.machine import (
     forward_kinematics,
     forward_kinematics_many,
     inverse_kinematics,
-    leg_vectors,
     load_mechanism,
     pose_equations,
     random_configurations,
     slider_columns,
+    vectors_A_to_B,
 )
 
 machine_of = cache(load_mechanism)
@@ -84,7 +84,7 @@ def test_random_configurations_are_closed_inside_the_travel_and_unflipped(name: 
         assert np.all((q >= lower - 1e-9) & (q <= upper + 1e-9))
         np.testing.assert_allclose(configuration[columns], q[sliding], atol=1e-12)
         np.testing.assert_allclose(inverse_kinematics(machine, T), q, atol=1e-11)
-        vectors = leg_vectors(machine, T)
+        vectors = vectors_A_to_B(machine, T)
         lengths = (machine.sign * q + machine.q0)[sliding]
         assert lengths.min() > 0.0
         np.testing.assert_allclose(lengths, np.linalg.norm(vectors, axis=1)[sliding], atol=1e-11)
@@ -208,7 +208,7 @@ def test_a_planar_platform_stays_in_its_plane(virtual: str, tmp_path: Path) -> N
         axis = (T * machine.home.inv()).rotation.as_rotvec()
         assert np.abs(np.cross(axis, n)).max() < 1e-12
         assert abs((T.translation - machine.home.translation) @ n) < 1e-12
-        lengths = np.linalg.norm(leg_vectors(machine, T), axis=1)
+        lengths = np.linalg.norm(vectors_A_to_B(machine, T), axis=1)
         np.testing.assert_allclose(lengths, machine.sign * q + machine.q0, atol=1e-12)
 
 
@@ -290,7 +290,7 @@ def test_revolutes_that_do_not_turn_so_far_are_refused(tmp_path: Path) -> None:
 
 def _lines(machine: Machine, T: RigidTransform) -> float:
     """Return the determinant of the leg lines of a hexapod, written down once more."""
-    u = leg_vectors(machine, T)
+    u = vectors_A_to_B(machine, T)
     arms = T.apply(machine.B_platform) - T.translation
     return float(np.linalg.det(np.hstack([np.cross(arms, u), u])))
 

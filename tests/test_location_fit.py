@@ -28,8 +28,8 @@ from legcal.calibration.location.frames import (
     residuals,
     tool_motions,
 )
-from legcal.calibration.location.observations import PoseNoise, motions_by_readings
 from legcal.calibration.location.search import search, solve_by_kronecker, solve_by_opencv
+from legcal.calibration.location.tool_poses import PoseNoise, motions_by_readings
 from legcal.geometry import Array, nearest_rotation, rotation_matrices
 from legcal.machine import forward_kinematics
 

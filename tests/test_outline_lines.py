@@ -12,8 +12,8 @@ from legcal.perception import pooled_fit as pool
 from legcal.perception.blocks import (
     COMMON_BIAS,
     TILT_BIAS,
+    BlockLine,
     Blocks,
-    Line,
     estimate_blur,
     fit_blocks,
     fit_lines,
@@ -263,11 +263,11 @@ def test_blur_is_estimated_from_the_picture(blur: float) -> None:
     assert estimate == pytest.approx(blur, rel=0.1)
 
 
-def fit_straight(position: Array, shift: Array, variance: Array) -> Line | None:
+def fit_straight(position: Array, shift: Array, variance: Array) -> BlockLine | None:
     return fit_lines(np.array([0, len(position)]), position, shift, variance)[0]
 
 
-def fitted(line: Line | None) -> Line:
+def fitted(line: BlockLine | None) -> BlockLine:
     assert line is not None
     return line
 

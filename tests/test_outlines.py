@@ -12,7 +12,7 @@ from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
 from legcal.machine import Cylinder
-from legcal.perception.blocks import Line
+from legcal.perception.blocks import BlockLine
 from legcal.perception.detection import measure_outlines
 from legcal.perception.outline import NARROW_BIAS, WRONG_WIDTH, PartVerdict, verdict
 from legcal.perception.part_edges import MIN_LONE_SCORE, EdgePair, _alone
@@ -367,7 +367,7 @@ def _edge(v: Array, *, sigma: float = 0.1, kept: float = 1.0, is_step: bool = Tr
     on_line = np.arange(N) < kept * N
     position = (np.flatnonzero(on_line) + 0.5) / N
     n = len(position)
-    line = Line(np.zeros(2), on_line, 1.0, position, np.zeros(n), np.full(n, 0.01))
+    line = BlockLine(np.zeros(2), on_line, 1.0, position, np.zeros(n), np.full(n, 0.01))
     return MeasuredEdge(v, line, 50.0, is_step, 1.0, sigma**2 * np.eye(2))
 
 

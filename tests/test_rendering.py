@@ -19,12 +19,12 @@ from legcal.machine import Machine, load_mechanism
 from legcal.simulation import Appearance, Level, Light, prepare_view, render, simulate
 from legcal.simulation.solids import (
     Box,
-    Cylinder,
     Material,
     Mesh,
     PlacedSolid,
     Shape,
     Solid,
+    SolidCylinder,
     Sphere,
     link_poses,
     placed,
@@ -83,7 +83,7 @@ def bar(angle: float, radius: float, tilt: float = 0.1) -> tuple[PlacedSolid, Ar
     M = np.array([0.013, -0.007, 1.0])
     turn = Rotation.align_vectors([u], [[0.0, 0.0, 1.0]])[0]
     T = RigidTransform.from_components(M, turn)
-    return solid(Cylinder(radius, 8.0), T, albedo=0.6), u, M
+    return solid(SolidCylinder(radius, 8.0), T, albedo=0.6), u, M
 
 
 def edge_errors(image: Array, camera: Camera, h: Array, inward: Array) -> Array:
@@ -153,7 +153,7 @@ def test_thin_rods_cover_their_area(width_px: float) -> None:
 @pytest.mark.parametrize("turn", [0.0, math.pi])
 def test_a_cylinder_seen_along_its_axis_shows_its_near_cap(turn: float) -> None:
     T = RigidTransform.from_components([0.0, 0.0, 1.0], Rotation.from_rotvec([turn, 0.0, 0.0]))
-    covered = (clean([solid(Cylinder(0.1, 0.2), T, albedo=0.6)]) - 0.02) / 0.58
+    covered = (clean([solid(SolidCylinder(0.1, 0.2), T, albedo=0.6)]) - 0.02) / 0.58
     near = 0.1 / 0.9  # of the cap, 0.9 m away
     assert covered.sum() == pytest.approx(math.pi * near**2 * F * 1.01 * F, rel=0.01)
 
@@ -186,7 +186,7 @@ def test_a_mesh_looks_like_the_shape_that_it_is_of() -> None:
 
 def test_surfaces_darken_towards_their_outline_as_the_material_says() -> None:
     T = RigidTransform.from_components([0.0, 0.0, 1.0], Rotation.from_euler("x", 90, degrees=True))
-    row = clean([solid(Cylinder(0.1, 2.0), T, albedo=0.8, limb=0.5)], limb=1.0)[122]
+    row = clean([solid(SolidCylinder(0.1, 2.0), T, albedo=0.8, limb=0.5)], limb=1.0)[122]
     x = (np.arange(WIDTH) - 157.3) / F
     t = (1.0 - np.sqrt(np.maximum(1.0 - (1.0 + x**2) * (1.0 - 0.01), 0.0))) / (1.0 + x**2)
     P = np.stack([t * x, t], axis=-1)

@@ -168,7 +168,7 @@ def notes_on_focal_lengths(solution: Solution) -> list[str]:
 def test_a_focal_length_wrong_by_one_percent_is_noticed(camera: Camera, factor: float) -> None:
     solution = fitted(irregular_hexapod(12, camera=camera), 0, factor)
     (note,) = notes_on_focal_lengths(solution)
-    assert solution.focal_doubt == pytest.approx(0.01, abs=0.004)
+    assert solution.focal_error == pytest.approx(0.01, abs=0.004)
     found = float(note.partition("found fx = ")[2].partition(" +-")[0])
     assert found == pytest.approx(1290.0, abs=5.0)
     assert note.startswith("The focal length of c1 does not agree with the measurements")
@@ -180,7 +180,7 @@ def test_a_right_focal_length_is_left_alone() -> None:
     for seed in range(4):
         solution = fitted(session, seed, 1.0)
         assert notes_on_focal_lengths(solution) == []
-        assert solution.focal_doubt == 0.0
+        assert solution.focal_error == 0.0
 
 
 def test_nothing_is_said_where_the_noise_hides_it() -> None:

@@ -22,9 +22,9 @@ from legcal.machine import (
     Machine,
     forward_kinematics,
     inverse_kinematics,
-    leg_vectors,
     load_mechanism,
     singularity,
+    vectors_A_to_B,
 )
 from legcal.machine.mobility import determinant_sign
 from legcal.simulation import Sampling, commanded_poses, draw_poses, write_true_model
@@ -166,7 +166,7 @@ def test_no_poses_and_unknown_samplings_are_refused(n: int, sampling: str) -> No
 
 def _along(machine: Machine, T: RigidTransform, j: int, n: int = 40) -> list[tuple[Array, float]]:
     """Return points of the axes of a leg's cylinders, and their radii."""
-    vector = leg_vectors(machine, T)[j]
+    vector = vectors_A_to_B(machine, T)[j]
     length = float(np.linalg.norm(vector))
     return [
         (machine.A_base[j] + np.linspace(*c.span(length), n)[:, None] * vector / length, c.radius)

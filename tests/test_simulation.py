@@ -20,7 +20,7 @@ from legcal.simulation import (
     paper_hexapod,
     perturb,
 )
-from legcal.simulation.hexapod import follow_from_home, leg_vectors, poses_with_lengths
+from legcal.simulation.hexapod import follow_from_home, poses_with_lengths, simulated_leg_vectors
 from legcal.simulation.poses import JITTER
 
 
@@ -46,14 +46,14 @@ def test_forward_kinematics_returns_the_lengths_it_was_given(seed: int) -> None:
     lengths = rng.uniform(0.40, 0.44, (1, 6))
     start = RigidTransform.concatenate([machine.home])
     pose = poses_with_lengths(machine.parameters, lengths, start)
-    found = np.linalg.norm(leg_vectors(machine.parameters, pose), axis=-1)
+    found = np.linalg.norm(simulated_leg_vectors(machine.parameters, pose), axis=-1)
     assert np.abs(found - lengths).max() < 1e-13
 
 
 def test_extreme_poses_have_every_leg_near_an_end_of_its_travel() -> None:
     machine = paper_hexapod()
     poses = extreme_poses(machine, 10, np.random.default_rng(1))
-    lengths = np.linalg.norm(leg_vectors(machine.parameters, poses), axis=-1)
+    lengths = np.linalg.norm(simulated_leg_vectors(machine.parameters, poses), axis=-1)
     part = (lengths - machine.travel[:, 0]) / np.ptp(machine.travel, axis=1)
     assert np.all((part < JITTER + 1e-9) | (part > 1.0 - JITTER - 1e-9))
     assert np.any(part < JITTER)
@@ -67,7 +67,7 @@ def test_poses_followed_from_home_have_their_lengths_and_others_stay_on_the_way(
     lengths[2, ::2] = 0.01
     poses, reached = follow_from_home(machine, lengths)
     assert reached.tolist() == [True, True, False]
-    found = np.linalg.norm(leg_vectors(machine.parameters, poses), axis=-1)
+    found = np.linalg.norm(simulated_leg_vectors(machine.parameters, poses), axis=-1)
     assert np.abs(found - lengths)[:2].max() < 1e-13
     assert np.linalg.norm(poses[2].translation - machine.home.translation) < 0.2
 
@@ -99,7 +99,7 @@ def test_errors_of_readings_have_their_standard_deviation_and_shape(uniform: boo
         n_poses=60,
     )
     m = session.measurements
-    lengths = np.linalg.norm(leg_vectors(machine.parameters, session.T_Rb_Re), axis=-1)
+    lengths = np.linalg.norm(simulated_leg_vectors(machine.parameters, session.T_Rb_Re), axis=-1)
     error = (m.q[m.first_rows] - (lengths - machine.parameters.offsets)) / 1e-5
     assert error.std() == pytest.approx(1.0, rel=0.1)
     assert (np.abs(error).max() < np.sqrt(3.0) + 1e-6) == uniform

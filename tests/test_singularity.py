@@ -18,9 +18,9 @@ from legcal.machine import (
     Machine,
     forward_kinematics,
     inverse_kinematics,
-    leg_vectors,
     load_mechanism,
     singularity,
+    vectors_A_to_B,
 )
 
 machine_of = cache(load_mechanism)
@@ -35,7 +35,7 @@ def _turned(machine: Machine, degrees: float, height: float = 0.4) -> RigidTrans
 
 def _lines(machine: Machine, T: RigidTransform) -> Array:
     """Return the unit leg lines, moments first, about the mean platform joint in mean lengths."""
-    vectors = leg_vectors(machine, T)
+    vectors = vectors_A_to_B(machine, T)
     lengths = np.linalg.norm(vectors, axis=1)
     u = vectors / lengths[:, None]
     arms = T.rotation.apply(machine.B_platform - machine.B_platform.mean(axis=0))
@@ -104,7 +104,7 @@ def test_a_planar_platform_is_singular_where_its_legs_meet_in_a_point() -> None:
     measures = [singularity(machine, at(a)) for a in angles]
     # both triangles are regular: legs meet in the centre where the platform's corners face them
     best = float(angles[int(np.argmin(measures))])
-    lines = leg_vectors(machine, at(best))[:, :2]
+    lines = vectors_A_to_B(machine, at(best))[:, :2]
     moments = A[:, 0] * lines[:, 1] - A[:, 1] * lines[:, 0]
     assert min(measures) < 4e-3
     assert abs(np.linalg.det(np.column_stack([lines, moments]))) < 2e-4

@@ -11,7 +11,7 @@ from yourdfpy import URDF
 from legcal.errors import ModelError
 from legcal.machine import Machine, load_mechanism
 from legcal.simulation import draw_poses, dressed
-from legcal.simulation.solids import Box, Cylinder, Mesh, Sphere, link_poses, placed, solids_of
+from legcal.simulation.solids import Box, Mesh, SolidCylinder, Sphere, link_poses, placed, solids_of
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted(p.stem for p in (ROOT / "models").glob("*.yaml"))
@@ -129,7 +129,7 @@ def test_visuals_stand_where_the_scene_of_yourdfpy_shows_them(name: str) -> None
                 if np.abs(T_root @ T - found).max() < 1e-12
                 and float(solid.radius) == vars(p.solid.shape)["radius"]
             }
-            assert p.solid.shape == Cylinder(*size)
+            assert p.solid.shape == SolidCylinder(*size)
 
 
 def test_a_mesh_is_scaled_and_placed_as_yourdfpy_shows_it(tmp_path: Path) -> None:
@@ -163,7 +163,7 @@ def test_dressing_carries_every_joint_and_leaves_the_legs_free(name: str) -> Non
     assert len(plates) == 2
     middles = 0.5 * (A + B)
     for plate in plates:
-        assert isinstance(plate.solid.shape, Cylinder)
+        assert isinstance(plate.solid.shape, SolidCylinder)
         local = plate.T_base_solid.inv().apply(np.concatenate([A, B, middles]))
         assert np.abs(local[:, 2]).min() > 0.5 * plate.solid.shape.length
         assert len(set(np.sign(local[:, 2]))) == 1  # all joints on one side of it
@@ -180,7 +180,7 @@ def test_plates_of_a_planar_machine_lie_below_its_legs_and_each_other() -> None:
     thickness = max(
         s.shape.length
         for s in dressed(machine)
-        if s.name.endswith("_plate") and isinstance(s.shape, Cylinder)
+        if s.name.endswith("_plate") and isinstance(s.shape, SolidCylinder)
     )
     assert base + thickness < platform
     assert platform + thickness < min(h for name, h in heights.items() if "ball" in name)

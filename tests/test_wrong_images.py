@@ -34,7 +34,7 @@ from legcal.perception.diagnostics import (
     reject_images,
 )
 from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
-from legcal.perception.photographs import ImageObservations, place_and_measure
+from legcal.perception.photographs import MeasuredImages, place_and_measure
 from legcal.progress import no_progress
 from legcal.workers import in_turn
 
@@ -169,7 +169,7 @@ def _session(made: Spoiled) -> OrderedDataset:
     return order_dataset(dataset, in_turn, no_progress)
 
 
-def _observed(made: Spoiled) -> ImageObservations:
+def _observed(made: Spoiled) -> MeasuredImages:
     session = _session(made)
     scene, _ = rough_placement(session)
     return place_and_measure(session.photographs, scene, no_progress)

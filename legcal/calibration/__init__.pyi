@@ -37,7 +37,7 @@ from .location.document import load_location as load_location
 from .location.document import location_document as location_document
 from .location.document import write_location as write_location
 from .location.locate import locate as locate
-from .location.observations import ToolPoses as ToolPoses
+from .location.tool_poses import ToolPoses as ToolPoses
 from .location.urdf import write_located_model as write_located_model
 from .measurement_noise.comparison import measure_noise as measure_noise
 from .measurement_noise.document import CALLED as CALLED

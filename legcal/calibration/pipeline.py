@@ -67,7 +67,7 @@ from legcal.geometry import IntArray
 from legcal.machine import Machine
 from legcal.paper import Criteria, Transformation
 from legcal.perception import (
-    ImageObservations,
+    MeasuredImages,
     Placement,
     detection_settings,
     given_outlines,
@@ -323,7 +323,7 @@ def _fit(
 def _measure_again(
     data: OrderedDataset,
     estimate: Estimate,
-    seen: ImageObservations,
+    seen: MeasuredImages,
     board: BoardViews | None,
     options: Options,
 ) -> Estimate:
@@ -368,9 +368,7 @@ def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
     return machine.with_cylinders(cylinders)
 
 
-def _fitted_placement(
-    data: OrderedDataset, solution: Solution, seen: ImageObservations
-) -> Placement:
+def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredImages) -> Placement:
     """Return where a fit puts the legs, R_b laid on the nominal one; no camera is placed anew."""
     T_base_Rb = data.machine.T_base_Rb
     A = T_base_Rb.apply(np.array([leg.A for leg in solution.legs]))
@@ -409,7 +407,7 @@ def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
 
 
 def _refuse_too_few(
-    data: OrderedDataset, rows: IntArray, seen: ImageObservations, choices: Choices
+    data: OrderedDataset, rows: IntArray, seen: MeasuredImages, choices: Choices
 ) -> None:
     """Raise NotIdentifiable if the images that are left do not determine the parameters."""
     cameras, notes = seen.placement.T_base_camera, seen.placement.all_notes
@@ -519,5 +517,5 @@ def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
     return [
         f"The focal length of {view} that does not agree is that of "
         f"{dataset.camera_paths[names.index(view)]}."
-        for view in solution.doubtful_cameras
+        for view in solution.contradicted_cameras
     ]

@@ -92,11 +92,11 @@ def judge(
     if platform is None:
         verdict = _verdict_on_parameters(dataset, solution)
     else:
-        verdict = _verdict_on_platform(platform, solution.focal_doubt)
+        verdict = _verdict_on_platform(platform, solution.focal_error)
     return Calibration(dataset, solution, steps, platform, verdict, tuple(notes), held_out, corners)
 
 
-def _verdict_on_platform(platform: PlatformAccuracy, focal_doubt: float) -> Verdict:
+def _verdict_on_platform(platform: PlatformAccuracy, focal_error: float) -> Verdict:
     """Compare the change of the platform with its uncertainty, in displacement.
 
     A focal length that the measurements contradict counts with what it does to the platform.
@@ -109,7 +109,7 @@ def _verdict_on_platform(platform: PlatformAccuracy, focal_doubt: float) -> Verd
         "(1 sigma)"
     )
     of_focal = [e.error.mean_displacement for e in platform.effects if "focal" in e.what]
-    doubt = focal_doubt / FOCAL_PART * max(of_focal, default=0.0)
+    doubt = focal_error / FOCAL_PART * max(of_focal, default=0.0)
     if doubt > 0.0:
         found += f"; a focal length that the measurements contradict may add {1e3 * doubt:.3f} mm"
     return _verdict(

@@ -186,7 +186,7 @@ def check(
     earlier = read_result(result)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     dataset = _as_calibrated(dataset, earlier)
-    prior = _Prior.of(dataset.machine, earlier)
+    prior = _EarlierEstimate.of(dataset.machine, earlier)
     choices = _choices(dataset, earlier, prior)
     with worker_pool(workers) as pool:
         data = order_dataset(dataset, pool, progress, fingerprint=outline_key(dataset, choices))
@@ -236,7 +236,7 @@ def _model_difference(calibrated: Machine, given: Machine) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class _Prior:
+class _EarlierEstimate:
     """The parameters that may have moved: where they were, and how far they may be now."""
 
     names: tuple[str, ...]
@@ -246,7 +246,7 @@ class _Prior:
     held_sigma: float  # the same along directions that are held [m]
 
     @classmethod
-    def of(cls, machine: Machine, earlier: EarlierResult) -> _Prior:
+    def of(cls, machine: Machine, earlier: EarlierResult) -> _EarlierEstimate:
         """Return what an earlier result says of the parameters of its mechanism."""
         legs, found = geometries(machine), parametrization_of(machine, twists=True)
         values = vector_of(found, legs, legs)
@@ -258,7 +258,7 @@ class _Prior:
         return cls(earlier.names, values[chosen], covariance, sigma, held_sigma)
 
 
-def _choices(dataset: Dataset, earlier: EarlierResult, prior: _Prior) -> Choices:
+def _choices(dataset: Dataset, earlier: EarlierResult, prior: _EarlierEstimate) -> Choices:
     """Return priors that leave room for whatever may have moved."""
     means, sigmas = prior.old.tolist(), prior.sigma.tolist()
     priors = {
@@ -285,7 +285,7 @@ def _compare(
     dataset: Dataset,
     earlier: EarlierResult,
     solution: Solution,
-    prior: _Prior,
+    prior: _EarlierEstimate,
     significance: float,
 ) -> Check:
     """Return what the fit of the new images says against the earlier result."""

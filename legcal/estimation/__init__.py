@@ -17,7 +17,7 @@ their derivatives by the blocks that ``touches`` names, in that order, and by th
 
 **Problem** Kept variables, one block of eliminated ones (platform poses, boards in images: each
 measurement touches one of them at most, and the Schur complement removes them), factors, an exact
-``constraint`` on the eliminated elements, and ``held`` directions that may not move.
+``constraint`` on the eliminated elements, and ``held_directions`` that may not move.
 
 ::
 

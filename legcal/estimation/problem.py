@@ -271,7 +271,9 @@ class Problem(Generic[S]):
     eliminated: Variables | None
     factors: tuple[Factor[S], ...]
     constraint: Constraint[S] | None = None
-    held: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (w, m <= n_kept) fixed gauge
+    held_directions: Array = field(
+        default_factory=lambda: np.zeros((0, 0))
+    )  # (w, m <= n_kept) fixed gauge
     name: str = "fit"  # in messages, with what to do where it fails
     remedy: str = "check the starting values and the measurements"
     _layout: _Layout | None = field(default=None, repr=False)  # made here

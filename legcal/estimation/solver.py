@@ -208,7 +208,7 @@ class NormalEquations:
     g_kept: Array  # (n_kept,) gradient of the cost
     g_elements: Array  # (n_elements, f)
     tangent: Tangent | None  # None where eliminated elements are free
-    held: Array  # (w, n_kept) directions that stay
+    held_directions: Array  # (w, n_kept) directions that stay
 
     @cached_property
     def V_inverse(self) -> Array:
@@ -241,9 +241,9 @@ class NormalEquations:
     def kept_covariance(self) -> Array:
         """Return the inverse of the reduced matrix, held directions left out."""
         R = self.reduced()
-        if len(self.held) == 0:
+        if len(self.held_directions) == 0:
             return inverse_on_range(R)
-        N = null_space(self.held)
+        N = null_space(self.held_directions)
         return np.asarray(N @ inverse_on_range(N.T @ R @ N) @ N.T)
 
     def step(self, damping: float) -> tuple[Array, float]:
@@ -257,8 +257,8 @@ class NormalEquations:
         U = _damped(self.U, damping)
         R = U - _coupled(WV, self.W)
         right = -self.g_kept + _flat(WV) @ self.g_elements.ravel()
-        if len(self.held):
-            N = null_space(self.held)
+        if len(self.held_directions):
+            N = null_space(self.held_directions)
             kept = N @ _solve(N.T @ R @ N, N.T @ right)
         else:
             kept = _solve(R, right)
@@ -341,8 +341,8 @@ def _of_rows(
         W = _by_element(W + QV, Z)
         V = np.swapaxes(Z, 1, 2) @ V @ Z
         g_elements = np.einsum("kpf,kp->kf", Z, g_elements)
-    held = np.zeros((len(problem.held), problem.n_kept))
-    held[:, : problem.held.shape[1]] = problem.held
+    held = np.zeros((len(problem.held_directions), problem.n_kept))
+    held[:, : problem.held_directions.shape[1]] = problem.held_directions
     return NormalEquations(U, W, V, g_kept, g_elements, motion, held)
 
 

@@ -228,8 +228,8 @@ def scores_of_block(problem: Problem[S], state: S, name: str) -> tuple[Array, Ar
     others = np.setdiff1d(np.arange(len(R)), effects)
     of_prior = 1.0 / block.prior.sigma**2
     R_others, R_mixed = R[np.ix_(others, others)], R[np.ix_(others, effects)]
-    if len(normal.held):
-        N = null_space(normal.held[:, others])
+    if len(normal.held_directions):
+        N = null_space(normal.held_directions[:, others])
         inverse = N @ inverse_on_range(N.T @ R_others @ N) @ N.T
     else:
         inverse = inverse_on_range(R_others)

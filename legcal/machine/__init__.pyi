@@ -56,11 +56,11 @@ from .mobility import leg_scale as leg_scale
 from .mobility import singularity as singularity
 from .model import Machine as Machine
 from .model import joint_values as joint_values
-from .model import leg_vectors as leg_vectors
 from .model import machine_document as machine_document
 from .model import platform_pose as platform_pose
 from .model import readings_at as readings_at
 from .model import slider_columns as slider_columns
+from .model import vectors_A_to_B as vectors_A_to_B
 from .model_builder import create_model as create_model
 from .model_writer import check_closes as check_closes
 from .model_writer import mechanism_text as mechanism_text

@@ -204,7 +204,7 @@ def home_of_description(described: Description) -> Home:
     """
     if described.home is not None:
         return _project(described, described.home)
-    closure = _Closure(described, mid_travel=True)
+    closure = _ClosingEquations(described, mid_travel=True)
     found = _search(closure, turning=False) or _search(closure, turning=True)
     if found is None:
         raise ModelError(
@@ -215,7 +215,7 @@ def home_of_description(described: Description) -> Home:
     return found
 
 
-class _Closure:
+class _ClosingEquations:
     """The equations of home: lengths, axes of R joints, and in a plane parallel axes.
 
     Residuals are parts of the machine's size.
@@ -304,7 +304,7 @@ def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool) -> Leg:
 
 def _project(described: Description, home: Home) -> Home:
     """Return the pose nearest to home that closes where legs leave no choice."""
-    closure, T = _Closure(described, mid_travel=False), home.motion()
+    closure, T = _ClosingEquations(described, mid_travel=False), home.motion()
     if closure.residual(T) < ROUNDING:
         return home
     if closure.residual(T) < MAX_HOME_RESIDUAL:
@@ -320,7 +320,7 @@ def _project(described: Description, home: Home) -> Home:
     )
 
 
-def _search(closure: _Closure, *, turning: bool) -> Home | None:
+def _search(closure: _ClosingEquations, *, turning: bool) -> Home | None:
     """Return the best of the poses that seeded starts find; without turning first."""
     rng = np.random.default_rng(1965)
     centre = closure.A.mean(axis=0) - closure.B.mean(axis=0)

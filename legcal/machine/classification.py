@@ -146,7 +146,7 @@ def _twist(
     return angle - math.pi * math.ceil(angle / math.pi - 0.5 - 1e-10)
 
 
-Ends = tuple[Pivot, Pivot, Array, Array, Array, int]  # base, platform, A, B, u, idle spins
+LegEnds = tuple[Pivot, Pivot, Array, Array, Array, int]  # base, platform, A, B, u, idle spins
 
 
 def _pivot(axes: Sequence[Axis], along: Array | None, leg: str) -> Pivot:
@@ -320,7 +320,7 @@ def _check_axes(base: Pivot, platform: Pivot, u: Array, leg: str) -> None:
                 )
 
 
-def _rod(axes: Sequence[Axis], leg: str) -> tuple[int, Ends]:
+def _rod(axes: Sequence[Axis], leg: str) -> tuple[int, LegEnds]:
     """Return how many joints of a leg without slider are at the base, and its ends.
 
     A revolute along the rod passes through both centres, and may belong to either joint: the one
@@ -331,7 +331,7 @@ def _rod(axes: Sequence[Axis], leg: str) -> tuple[int, Ends]:
     OutOfClass
         If no split makes two joints, each with one centre, and axes as the method needs them.
     """
-    found: list[tuple[float, int, Ends]] = []
+    found: list[tuple[float, int, LegEnds]] = []
     problems: dict[int, OutOfClass] = {}
     for n_lower in range(1, len(axes)):
         try:
@@ -362,7 +362,7 @@ def _rod(axes: Sequence[Axis], leg: str) -> tuple[int, Ends]:
     )
 
 
-def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str) -> Ends:
+def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str) -> LegEnds:
     """Return the ends of a rod whose first joints are at the base."""
     lower, upper = axes[:n_lower], axes[: n_lower - 1 : -1]
     A, B = _on_rod(_pivot(lower, None, leg), _pivot(upper, None, leg))
@@ -433,7 +433,7 @@ _END = {
 
 def _telescope(
     axes: Sequence[Axis], slider: int, towards: float, platform_origin: Array, leg: str
-) -> Ends:
+) -> LegEnds:
     """Return the ends of a leg whose slider, one of its joints, moves *towards* along its axis.
 
     Between joints with a centre the leg's axis is the line through one of them along the slider.

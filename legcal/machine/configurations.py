@@ -261,18 +261,21 @@ class _Drive:
         self.q0 = np.array([leg.q0 for leg in legs])
         motors = [j for j, leg in enumerate(legs) if leg.kind is LegKind.ACTUATED]
         self.driven = np.array([], dtype=np.intp)
-        held = self.slopes(R, t)[0]
+        constrained = self.slopes(R, t)[0]
         self.driven = np.array(motors, dtype=np.intp)
         every = self.slopes(R, t)[0]
-        rank_every, rank_held = (
-            int(np.linalg.matrix_rank(J, tol=DEPENDENT)) if J.size else 0 for J in (every, held)
+        rank_every, rank_constrained = (
+            int(np.linalg.matrix_rank(J, tol=DEPENDENT)) if J.size else 0
+            for J in (every, constrained)
         )
-        count = rank_every - rank_held
+        count = rank_every - rank_constrained
         if count < len(motors):
             size = np.where(np.array(self.columns) < 3, self.lengths(R, t).mean(), 1.0)
             found = pose_equations(legs, R, t, by_local=False)
             rows = found.by_pose[0][found.measured][:, self.columns] / size
-            left = np.eye(len(size)) - np.linalg.pinv(held / size, rcond=RANK) @ (held / size)
+            left = np.eye(len(size)) - np.linalg.pinv(constrained / size, rcond=RANK) @ (
+                constrained / size
+            )
             order = qr((rows @ left).T, mode="r", pivoting=True)[1]
             self.driven = np.array([motors[k] for k in order[:count]], dtype=np.intp)
 
@@ -282,7 +285,7 @@ class _Drive:
         return np.asarray(np.linalg.norm(B @ np.swapaxes(R, 1, 2) + t[:, None] - A, axis=2))
 
     def equations(self, R: Array, t: Array) -> PoseEquations:
-        """Return what is held: the constraints, and the lengths of driven motors."""
+        """Return what poses must satisfy: the constraints, and the lengths of driven motors."""
         found = pose_equations(self.legs, R, t, by_local=False)
         return found.of(~found.measured | np.isin(found.leg, self.driven))
 

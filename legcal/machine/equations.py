@@ -318,7 +318,7 @@ class _Placed(NamedTuple):
 _NOTHING = np.zeros(3)
 
 
-class _Row(NamedTuple):
+class _EquationRow(NamedTuple):
     """One equation at k poses: its residual, and its gradients by what it depends on."""
 
     value: Array  # (k,)
@@ -330,29 +330,29 @@ class _Row(NamedTuple):
     by_twist: Array | float = 0.0
 
 
-def _length(at: _Placed) -> _Row:
+def _length(at: _Placed) -> _EquationRow:
     """Return |AB| - q0."""
-    return _Row(at.length - at.leg.q0, at.u, by_q0=-1.0)
+    return _EquationRow(at.length - at.leg.q0, at.u, by_q0=-1.0)
 
 
-def _base_axis(at: _Placed) -> _Row:
+def _base_axis(at: _Placed) -> _EquationRow:
     """Return v . u of eq (7) at the base."""
     v = np.broadcast_to(_given(at.leg.base_axis), at.u.shape)
-    return _Row(_dot(v, at.u), at.by_leg(v), by_base_axis=at.u)
+    return _EquationRow(_dot(v, at.u), at.by_leg(v), by_base_axis=at.u)
 
 
-def _platform_axis(at: _Placed) -> _Row:
+def _platform_axis(at: _Placed) -> _EquationRow:
     """Return v . u of eq (7) at the platform."""
     return _component(at, _given(at.leg.platform_axis))
 
 
-def _component(at: _Placed, tied: Array) -> _Row:
+def _component(at: _Placed, tied: Array) -> _EquationRow:
     """Return the component of u along a direction of the platform."""
     v = at.in_base(tied)
-    return _Row(_dot(v, at.u), at.by_leg(v), tied=tied, by_tied=at.u)
+    return _EquationRow(_dot(v, at.u), at.by_leg(v), tied=tied, by_tied=at.u)
 
 
-def _twist(at: _Placed) -> _Row:
+def _twist(at: _Placed) -> _EquationRow:
     """Return sin(angle - twist) of the axes p and w in the leg, and its gradients."""
     leg, u, tau = at.leg, at.u, float(at.leg.twist or 0.0)
     b = _given(leg.platform_axis)
@@ -367,7 +367,7 @@ def _twist(at: _Placed) -> _Row:
             size = np.linalg.norm(cross(axis, u), axis=1)[:, None]
             by_u = by_u + cross(by_axes[i], axis) / size
             by_axes[i] = cross(u, by_axes[i]) / size
-    return _Row(
+    return _EquationRow(
         twist_residual(p, w, u, tau, _ROWS),
         at.by_leg(by_u),
         by_base_axis=by_axes[0],
@@ -377,7 +377,7 @@ def _twist(at: _Placed) -> _Row:
     )
 
 
-_RESIDUALS: dict[EquationKind, Callable[[_Placed], _Row]] = {
+_RESIDUALS: dict[EquationKind, Callable[[_Placed], _EquationRow]] = {
     EquationKind.LENGTH: _length,
     EquationKind.BASE_AXIS: _base_axis,
     EquationKind.PLATFORM_AXIS: _platform_axis,

@@ -18,7 +18,7 @@ from legcal.machine.equations import is_constrained, machine_equations
 from legcal.machine.kinematics import project_pose
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine, platform_pose, readings_at
-from legcal.machine.parameters import in_links
+from legcal.machine.parameters import legs_in_links
 from legcal.machine.solver import poses_after, solve
 
 TRIALS = 200
@@ -125,7 +125,7 @@ def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> Rig
             platform_axis=wanted.platform_axis,
             twist=wanted.twist,
         )
-        for leg, wanted in zip(machine.legs, in_links(machine, legs), strict=True)
+        for leg, wanted in zip(machine.legs, legs_in_links(machine, legs), strict=True)
     )
     home, problem = project_pose(replace(machine, legs=changed), machine.home, max_error)
     return None if problem is not None else home

@@ -35,10 +35,10 @@ from legcal.machine.mobility import (
 )
 from legcal.machine.model import (
     Machine,
-    leg_vectors,
     platform_pose,
     readings_at,
     slider_columns,
+    vectors_A_to_B,
 )
 from legcal.machine.solver import newton, poses_after, solve, walk_in_steps
 
@@ -518,5 +518,5 @@ def _is_reversed(machine: Machine, T: RigidTransform) -> bool:
         leg.is_fixed_to_platform
         and leg.platform_axis is not None
         and float(T.rotation.apply(leg.platform_axis) @ vector) <= 0.0
-        for leg, vector in zip(machine.legs, leg_vectors(machine, T), strict=True)
+        for leg, vector in zip(machine.legs, vectors_A_to_B(machine, T), strict=True)
     )

@@ -30,7 +30,7 @@ from legcal.machine.leg import (
     LegKind,
 )
 from legcal.machine.mobility import CONFIGURATIONS, generic_configurations, mobility
-from legcal.machine.model import Machine, leg_vectors, platform_pose, slider_columns
+from legcal.machine.model import Machine, platform_pose, slider_columns, vectors_A_to_B
 from legcal.machine.parameters import n_frame_legs
 from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.spanning_tree import Source
@@ -40,7 +40,7 @@ from legcal.machine.topology import (
     check_plane,
     check_type,
     find_chains,
-    in_links,
+    normals_in_links,
     normals_of_closures,
     plane_of_motion,
     propose_block,
@@ -133,7 +133,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         turn = bodies.T_body_link[virtual.parent].rotation.inv()
         normal = None if normals is None else np.asarray(turn.apply(normals[0]))
         check_plane(virtual, normal, yaml_path)
-    in_plane = None if normals is None else in_links(normals, ends)
+    in_plane = None if normals is None else normals_in_links(normals, ends)
     shown = visual_cylinders(urdf)
     if normals is not None:
         chains = at_visible_heights(chains, shown, bodies)
@@ -424,7 +424,7 @@ def check_unit(machine: Machine) -> None:
         If one is longer than 20 m or shorter than 1 mm, its motor moves further than 20 m, or a
         cylinder along it is thicker than half of it or thinner than 2e-4 of it.
     """
-    lengths = np.linalg.norm(leg_vectors(machine, machine.home), axis=1)
+    lengths = np.linalg.norm(vectors_A_to_B(machine, machine.home), axis=1)
     fixed = np.array([leg.is_fixed_to_platform for leg in machine.legs])
     odd = np.flatnonzero(~fixed & ((lengths < MIN_LENGTH) | (lengths > MAX_LENGTH)))
     if len(odd):

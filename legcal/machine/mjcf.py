@@ -50,7 +50,7 @@ Defaults = dict[str, dict[str, str]]  # attributes by element
 LinkFrame = tuple[str, RigidTransform]  # a frame in a link
 
 
-class Part(NamedTuple):
+class BodyElement(NamedTuple):
     """An element of a body: the body, the frame it is written in, its default class."""
 
     element: etree._Element
@@ -131,9 +131,9 @@ class MjcfReader:
             if element.tag in ("body", "joint", "freejoint"):
                 self._names.add(str(element.get("name")))
         visuals: list[TextCylinder] = []
-        pending: list[Part] = []
+        pending: list[BodyElement] = []
         for world in self.root.findall("worldbody"):
-            part = Part(world, WORLD, EYE, world.get("childclass", "main"))
+            part = BodyElement(world, WORLD, EYE, world.get("childclass", "main"))
             _, bodies, cylinders = self._contents(part)
             visuals += cylinders
             pending += bodies
@@ -141,16 +141,18 @@ class MjcfReader:
         while pending:
             pending = self._body(pending.pop(0)) + pending
 
-    def _contents(self, body: Part) -> tuple[list[Part], list[Part], list[TextCylinder]]:
+    def _contents(
+        self, body: BodyElement
+    ) -> tuple[list[BodyElement], list[BodyElement], list[TextCylinder]]:
         """Return joints, bodies and cylinders of a body, also in its frames; note its sites."""
-        joints, bodies, cylinders = list[Part](), list[Part](), list[TextCylinder]()
+        joints, bodies, cylinders = list[BodyElement](), list[BodyElement](), list[TextCylinder]()
         pending = [body._replace(element=part) for part in body.element]
         while pending:
             part = pending.pop(0)
             element, tag = part.element, part.element.tag
             if tag == "frame":
                 T = part.T_body_frame * self._pose(element, _attributes_of(element))
-                inner = Part(element, part.body, T, self._childclass(part))
+                inner = BodyElement(element, part.body, T, self._childclass(part))
                 pending = [inner._replace(element=inside) for inside in element] + pending
             elif tag == "body":
                 bodies.append(part)
@@ -165,7 +167,7 @@ class MjcfReader:
                 self.problems.add(element, "is no element of a body", "correct or remove it")
         return joints, bodies, cylinders
 
-    def _body(self, part: Part) -> list[Part]:
+    def _body(self, part: BodyElement) -> list[BodyElement]:
         """Write a body with its joints, and return the bodies on it."""
         element = part.element
         name = element.get("name", "")
@@ -177,7 +179,7 @@ class MjcfReader:
             name = self._unused(f"body{len(self.poses)}")
         T_parent_body = part.T_body_frame * self._pose(element, _attributes_of(element))
         self.poses[name] = self.poses[part.body] * T_parent_body
-        inside = Part(element, name, EYE, self._childclass(part))
+        inside = BodyElement(element, name, EYE, self._childclass(part))
         joints, bodies, cylinders = self._contents(inside)
         at, T_at_body = part.body, T_parent_body
         if at == WORLD and self._is_free(joints):
@@ -191,7 +193,7 @@ class MjcfReader:
         self.tree.link(name, tuple(cylinders))
         return bodies
 
-    def _is_free(self, joints: list[Part]) -> bool:
+    def _is_free(self, joints: list[BodyElement]) -> bool:
         """Say whether the joints of a body, none of them driven, leave it all six freedoms."""
         axes: dict[str, list[Array]] = {"slide": [], "hinge": [], "ball": []}
         for part in joints:
@@ -206,7 +208,7 @@ class MjcfReader:
         return _span_space(axes["slide"]) and turns_freely and len(axes["hinge"]) in (0, 3)
 
     def _joint(
-        self, part: Part, at: str, T_at_body: RigidTransform, *, last: bool, only: bool
+        self, part: BodyElement, at: str, T_at_body: RigidTransform, *, last: bool, only: bool
     ) -> LinkFrame:
         """Write one joint of a body; return the link after it and the body's frame in that link."""
         element, attributes = part.element, self._attributes(part)
@@ -258,7 +260,7 @@ class MjcfReader:
 
     def _one_axis(
         self,
-        part: Part,
+        part: BodyElement,
         attributes: Attributes,
         name: str,
         kind: str,
@@ -305,7 +307,7 @@ class MjcfReader:
             return None
         return lower, upper
 
-    def _cylinder(self, part: Part) -> TextCylinder | None:
+    def _cylinder(self, part: BodyElement) -> TextCylinder | None:
         """Return the cylinder of a geom that is a cylinder or a capsule, else None."""
         element, attributes = part.element, self._attributes(part)
         kind = attributes.get("type", "sphere")
@@ -329,7 +331,7 @@ class MjcfReader:
             return None
         return TextCylinder(part.T_body_frame * T, float(size[0]), length)
 
-    def _site(self, part: Part) -> None:
+    def _site(self, part: BodyElement) -> None:
         """Note a site by its name."""
         element, name = part.element, str(part.element.get("name"))
         if name in self.sites:
@@ -482,7 +484,7 @@ class MjcfReader:
 
     # Attributes, with defaults and compiler options
 
-    def _attributes(self, part: Part) -> dict[str, str]:
+    def _attributes(self, part: BodyElement) -> dict[str, str]:
         """Return the attributes of an element over those of its default class."""
         own = _attributes_of(part.element)
         classes = self._default(part.element, own.get("class", part.childclass))
@@ -502,7 +504,7 @@ class MjcfReader:
             name = "main"
         return self._defaults[name]
 
-    def _childclass(self, part: Part) -> str:
+    def _childclass(self, part: BodyElement) -> str:
         """Return the default class that holds within a body or frame."""
         name = part.element.get("childclass", part.childclass)
         known = self._default(part.element, name) is self._defaults.get(name)
@@ -650,18 +652,18 @@ def _without_loose_bodies(
     loose = {link for links, closed in moving_groups(urdf, frames) if not closed for link in links}
     if not loose:
         return urdf, []
-    held = [j for j in urdf.joints.values() if j.child in loose]
-    other = [j.name for j in held if j.moves and j.type != "floating"]
+    joints = [j for j in urdf.joints.values() if j.child in loose]
+    other = [j.name for j in joints if j.moves and j.type != "floating"]
     if other:
         raise OutOfClass(
             f"{urdf.path}: the mechanism could not be read: found joints of something else beside "
             f"it ('{other[0]}'), needed one mechanism in the file; remove the other bodies."
         )
-    for joint in held:
+    for joint in joints:
         del tree.joints[joint.name]
     for link in loose:
         del tree.links[link]
-    freed = [f"'{j.child}'" for j in held if j.type == "floating"]
+    freed = [f"'{j.child}'" for j in joints if j.type == "floating"]
     return parse_urdf(urdf.path, tree.robot(name), travel_needed=False), freed
 
 

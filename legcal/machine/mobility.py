@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array
 from legcal.machine.equations import equations_at, is_constrained
-from legcal.machine.model import Machine, leg_vectors
+from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.machine.solver import solve
 
 CLOSED = 1e-12  # [m], and [rad] for frames
@@ -24,7 +24,7 @@ MAX_CHANGE = 0.5  # norm of J0^-1 J1 - 1 that leaves no room for a singularity b
 
 def leg_scale(machine: Machine, T_base_platform: RigidTransform) -> float:
     """Return the mean length of the legs at a pose [m]."""
-    return float(np.linalg.norm(leg_vectors(machine, T_base_platform), axis=1).mean())
+    return float(np.linalg.norm(vectors_A_to_B(machine, T_base_platform), axis=1).mean())
 
 
 def mobility(machine: Machine) -> int:

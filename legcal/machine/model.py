@@ -147,7 +147,7 @@ def _fixed(array: Array) -> Array:
     return array
 
 
-def leg_vectors(machine: Machine, T_base_platform: RigidTransform) -> Array:
+def vectors_A_to_B(machine: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the vectors from base to platform joint of every leg, (n_legs, 3), base link [m]."""
     matrix = T_base_platform.as_matrix()  # RigidTransform.apply is slow on few points
     return np.asarray(machine.B_platform @ matrix[:3, :3].T + matrix[:3, 3] - machine.A_base)
@@ -155,7 +155,7 @@ def leg_vectors(machine: Machine, T_base_platform: RigidTransform) -> Array:
 
 def readings_at(machine: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the joint value of every leg at a pose, q = sign (|AB| - q0), (n_legs,) [m]."""
-    lengths = np.linalg.norm(leg_vectors(machine, T_base_platform), axis=1)
+    lengths = np.linalg.norm(vectors_A_to_B(machine, T_base_platform), axis=1)
     return np.asarray(machine.sign * (lengths - machine.q0))
 
 

@@ -15,7 +15,7 @@ from legcal.machine.leg import JointType, LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.schema import mechanism_yaml
-from legcal.machine.spanning_tree import UrdfBuilder, along, limit, place, visual
+from legcal.machine.spanning_tree import UrdfBuilder, along, limit, origin_at, visual
 
 TURN = (-3.15, 3.15)  # [rad]
 VISIBLE = 0.9  # part of the shortest leg that its tube and its rod cover
@@ -79,7 +79,7 @@ def _joint(
     moving: str = "",
 ) -> None:
     """Connect two links; without numbers their frames coincide."""
-    at = place(np.zeros(3) if xyz is None else xyz, np.eye(3) if rotation is None else rotation)
+    at = origin_at(np.zeros(3) if xyz is None else xyz, np.eye(3) if rotation is None else rotation)
     tree.connect(name, kind, links, at + moving)
 
 

@@ -19,7 +19,7 @@ from legcal.geometry import Array, rotation_between
 from legcal.machine.bodies import Bodies, frame_link, rigid_bodies
 from legcal.machine.leg import Leg, LegChain, Step
 from legcal.machine.model import Machine
-from legcal.machine.parameters import in_links, twist_after
+from legcal.machine.parameters import legs_in_links, twist_after
 from legcal.machine.urdf import UrdfJoint
 
 _ROUNDING = 1e-14  # [rad]: what turns less does not turn
@@ -39,7 +39,7 @@ def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[Rigi
         seen = seen.inv() if handle.is_inverse else seen
         found[joint.name] = seen.of(T_parent_origin), is_turned or seen.turn is not None
 
-    for leg, wanted in zip(machine.legs, in_links(machine, legs), strict=True):
+    for leg, wanted in zip(machine.legs, legs_in_links(machine, legs), strict=True):
         chain = leg.urdf_chain
         at_base, at_platform = _ends(leg, wanted)
         grown = wanted.q0 - leg.q0, _twisted(leg, wanted, at_platform)

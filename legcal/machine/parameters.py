@@ -114,7 +114,7 @@ def geometries(machine: Machine) -> tuple[Leg, ...]:
     )
 
 
-def in_links(machine: Machine, legs: Sequence[Leg]) -> tuple[Leg, ...]:
+def legs_in_links(machine: Machine, legs: Sequence[Leg]) -> tuple[Leg, ...]:
     """Return legs in R_b and R_e as they stand in the links, the inverse of :func:`geometries`."""
     return _in_frames(legs, machine.T_base_Rb, machine.T_platform_Re)
 

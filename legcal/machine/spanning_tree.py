@@ -129,10 +129,10 @@ class UrdfBuilder:
 
 def origin(T_parent_origin: RigidTransform) -> str:
     """Return the ``<origin>`` of a rigid motion [m, rad]."""
-    return place(np.asarray(T_parent_origin.translation), T_parent_origin.rotation.as_matrix())
+    return origin_at(np.asarray(T_parent_origin.translation), T_parent_origin.rotation.as_matrix())
 
 
-def place(xyz: Array, rotation: Array) -> str:
+def origin_at(xyz: Array, rotation: Array) -> str:
     """Return the ``<origin>`` at a point [m] with a rotation matrix."""
     return f'<origin xyz="{_numbers(xyz)}" rpy="{_numbers(roll_pitch_yaw(rotation))}"/>'
 

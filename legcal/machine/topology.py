@@ -180,7 +180,9 @@ def plane_of_motion(chains: Sequence[LegChain]) -> Normals | None:
     return first
 
 
-def in_links(normals: Normals, T_body_link: tuple[RigidTransform, RigidTransform]) -> Normals:
+def normals_in_links(
+    normals: Normals, T_body_link: tuple[RigidTransform, RigidTransform]
+) -> Normals:
     """Return the normals in the links of base and platform.
 
     The last component that is not zero is positive in the base.
@@ -193,7 +195,7 @@ def in_links(normals: Normals, T_body_link: tuple[RigidTransform, RigidTransform
 
 
 def normals_of_closures(
-    in_links: Normals | None, closures: Sequence[Closure], block: LegcalBlock, urdf: Urdf
+    in_link_frames: Normals | None, closures: Sequence[Closure], block: LegcalBlock, urdf: Urdf
 ) -> list[Array | None]:
     """Return for which closures it is enough to hold in the plane, with its normal there.
 
@@ -201,7 +203,7 @@ def normals_of_closures(
     its axes are rounded. All are held in the plane alone; but where a floating joint carries the
     platform, one more is needed to hold that in the plane.
     """
-    if in_links is None:
+    if in_link_frames is None:
         return [None] * len(closures)
     poses, parents = reference_poses(urdf), {j.child: j for j in urdf.joints.values()}
     virtual = None if block.platform_joint is None else urdf.joints[block.platform_joint]
@@ -211,9 +213,9 @@ def normals_of_closures(
         link = above = frame_link(urdf, closure.frame_1)
         while above in parents and parents[above] is not virtual:
             above = parents[above].parent
-        root, normal = (block.base, in_links[0])
+        root, normal = (block.base, in_link_frames[0])
         if above in parents and floats:
-            root, normal = (block.platform, in_links[1])
+            root, normal = (block.platform, in_link_frames[1])
         turn = poses[link].rotation.inv() * poses[root].rotation
         normals.append(np.asarray(turn.apply(normal)) if closure.kind == "6d" else None)
     return [None, *normals[1:]] if floats else normals

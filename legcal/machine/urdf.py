@@ -256,7 +256,7 @@ def _short(text: str) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-JointType = Literal["fixed", "revolute", "continuous", "prismatic", "floating", "planar"]
+UrdfJointType = Literal["fixed", "revolute", "continuous", "prismatic", "floating", "planar"]
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "floating", "planar")
 LOOP_TAGS = ("loop_joint", "constraint")
 
@@ -266,7 +266,7 @@ class UrdfJoint:
     """One joint of a URDF."""
 
     name: str  # as in the file; ``parent`` and ``child`` are links
-    type: JointType  # as in the file; ``parent`` and ``child`` are links
+    type: UrdfJointType  # as in the file; ``parent`` and ``child`` are links
     parent: str  # as in the file; ``parent`` and ``child`` are links
     child: str  # as in the file; ``parent`` and ``child`` are links
     T_parent_origin: RigidTransform  # the joint frame in the parent link, at joint value zero [m]
@@ -380,7 +380,7 @@ def _joint(element: etree._Element, problems: Problems, travel_needed: bool) -> 
     parent, child = ("" if end is None else end.get("link", "") for end in ends)
     return UrdfJoint(
         name=element.get("name", ""),
-        type=cast("JointType", kind),
+        type=cast("UrdfJointType", kind),
         parent=parent,
         child=child,
         T_parent_origin=origin_of(element),

@@ -25,7 +25,7 @@ def direction_of_leg() -> ca.Function:
 
     B is the known part of it, R and t are the pose at step zero.
     """
-    leg = _Leg.symbols()
+    leg = _SymbolicLeg.symbols()
     u, basis, W = ca.SX.sym("u", 3), ca.SX.sym("basis", 2, 3), ca.SX.sym("W", 2, 2)
     residual = W @ (basis @ leg.vector / ca.dot(u, leg.vector))
     return ca.Function("direction", [leg.local, *leg.known, u, basis, W], [residual])
@@ -34,7 +34,7 @@ def direction_of_leg() -> ca.Function:
 @cache
 def length_of_leg() -> ca.Function:
     """Return (local; B, R, t, A, reading, sigma) -> |A B| less reading + q0, in sigmas."""
-    leg = _Leg.symbols()
+    leg = _SymbolicLeg.symbols()
     reading, sigma = ca.SX.sym("reading"), ca.SX.sym("sigma")
     residual = (ca.norm_2(leg.vector) - (reading + leg.local[3])) / sigma
     return ca.Function("length", [leg.local, *leg.known, reading, sigma], [residual])
@@ -51,7 +51,7 @@ def constraint_of_leg(
     direction in the platform both components of u across v, about the twist the sine of how far the
     inner axes are from it.
     """
-    leg = _Leg.symbols()
+    leg = _SymbolicLeg.symbols()
     a, b = ca.SX.sym("a", 3, 3), ca.SX.sym("b", 3, 3)
     twist, sigma = ca.SX.sym("twist"), ca.SX.sym("sigma")
     u, frame = leg.vector / ca.norm_2(leg.vector), leg.in_base(turned_frame(leg.local[6:8], b))
@@ -103,7 +103,7 @@ def _sine_of_twist(
 _SYMBOLS = VectorOps(ca.dot, ca.cross, lambda v: v / ca.norm_2(v), ca.cos, ca.sin)
 
 
-class _Leg(NamedTuple):
+class _SymbolicLeg(NamedTuple):
     """A leg at an unknown pose."""
 
     local: ca.SX  # unknowns
@@ -111,7 +111,7 @@ class _Leg(NamedTuple):
     vector: ca.SX  # from A to B
 
     @classmethod
-    def symbols(cls) -> _Leg:
+    def symbols(cls) -> _SymbolicLeg:
         local, B, A = ca.SX.sym("local", N_UNKNOWNS), ca.SX.sym("B", 3), ca.SX.sym("A", 3)
         R, t = ca.SX.sym("R", 3, 3), ca.SX.sym("t", 3)
         vector = moved_points(local[9:], R, t, local[:3] + B) - A

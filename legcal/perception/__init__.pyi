@@ -24,12 +24,12 @@ from .overlays import draw as draw
 from .overlays import marks_of_image as marks_of_image
 from .overlays import short_reason as short_reason
 from .part_edges import LegPart as LegPart
-from .photographs import ImageObservations as ImageObservations
+from .photographs import MeasuredImages as MeasuredImages
 from .photographs import Photographs as Photographs
 from .photographs import detection_settings as detection_settings
 from .photographs import given_outlines as given_outlines
 from .photographs import measure_photographs as measure_photographs
 from .photographs import nominal_placement as nominal_placement
-from .photographs import place as place
 from .photographs import place_and_measure as place_and_measure
+from .photographs import recognise_and_place as recognise_and_place
 from .placement import Placement as Placement

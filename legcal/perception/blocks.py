@@ -65,7 +65,7 @@ class Blocks:
     moved: Array  # (n,) [px]
     contrast: Array  # (n,) step to the leg [grey levels]
     sharp: Array  # (n,) how clearly it is a step and not a bend of the shading [chi^2]
-    lines: list["Line | None"]
+    lines: list["BlockLine | None"]
 
     @classmethod
     def read(
@@ -286,7 +286,7 @@ def estimate_blur(
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class BlockLine:
     """A line through the blocks of an outline, with those that lie on it."""
 
     ends: Array  # (2,) shift of the outline at t = 0 and at t = length [px of the band]
@@ -324,7 +324,7 @@ class Line:
 
 def fit_lines(
     bounds: IntArray, position: Array, shift: Array, variance: Array, largest: float = np.inf
-) -> list[Line | None]:
+) -> list[BlockLine | None]:
     """Fit a line to each of several outlines by iteratively reweighted least squares.
 
     From positions (n,) as fractions of the length, shifts [px], and their variances by noise
@@ -376,7 +376,7 @@ def fit_lines(
     residual = moved - ends[:, :1] - (ends[:, 1:] - ends[:, :1]) * along
     scaled = floored * factor[:, None] ** 2
     return [
-        Line(
+        BlockLine(
             ends[i],
             on_line[i, : counts[i]],
             float(np.count_nonzero(on_line[i]) / n_usable[i]),

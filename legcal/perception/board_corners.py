@@ -168,7 +168,7 @@ def _fit_saddle(
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _CornerFit:
     """A fitted model: place, angles of the edges and blur, and its derivatives and residual."""
 
     x: Array
@@ -189,7 +189,7 @@ def _window(grey: NDArray[np.float32], start: Array) -> tuple[Array, Array, Arra
     return u, v, levels
 
 
-def _fitted(p: Array, levels: Array, x: Array) -> _Fit | None:
+def _fitted(p: Array, levels: Array, x: Array) -> _CornerFit | None:
     """Fit the model to pixels (2, n) by Gauss-Newton, its linear parameters eliminated."""
     linear, residual, J = _linearised(x, p, levels)
     for _ in range(_MAX_ITERATIONS):
@@ -200,7 +200,7 @@ def _fitted(p: Array, levels: Array, x: Array) -> _Fit | None:
         x[4] = np.clip(x[4], *_BLURS)
         linear, residual, J = _linearised(x, p, levels)
         if np.abs(step[:2]).max() < _CONVERGED_PX:
-            return _Fit(x, linear, residual, J, levels)
+            return _CornerFit(x, linear, residual, J, levels)
     return None
 
 
@@ -227,7 +227,7 @@ def _linearised(x: Array, p: Array, levels: Array) -> tuple[Array, Array, Array]
     return linear, residual, np.concatenate([centre, turn, blur[None]])
 
 
-def _saddle(fit: _Fit) -> _Saddle | None:
+def _saddle(fit: _CornerFit) -> _Saddle | None:
     """Return the corner with what its residual is worth; None where the model does not fit."""
     A = np.concatenate([fit.J, fit.linear], axis=0).T
     n, free = A.shape

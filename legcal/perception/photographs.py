@@ -124,8 +124,8 @@ class Photographs:
 
 
 @dataclass(frozen=True, eq=False)
-class ImageObservations:
-    """What the images show."""
+class MeasuredImages:
+    """Images with the legs that were recognised and the outlines that were measured."""
 
     photographs: Photographs  # the images, and the mechanism with the radii that they show
     placement: Placement  # with views that could not be placed, and notes on views and images
@@ -156,7 +156,7 @@ def place_and_measure(
     joined: Joined = None,
     *,
     together: bool = True,
-) -> ImageObservations:
+) -> MeasuredImages:
     """Place the cameras, measure the outlines, and leave out the images that are wrong.
 
     ``joined`` are T_board_camera of views that show a calibration board, which are placed together;
@@ -202,12 +202,10 @@ def place_and_measure(
     view, known = photographs.measurements.view, ~np.isnan(blur)
     of_views = [blur[known & (view == v)] for v in range(len(photographs.measurements.views))]
     usual = tuple(float(np.median(own)) if len(own) else np.nan for own in of_views)
-    return ImageObservations(
-        photographs, placement, reject_images(outlines, reasons), reasons, usual
-    )
+    return MeasuredImages(photographs, placement, reject_images(outlines, reasons), reasons, usual)
 
 
-def place(
+def recognise_and_place(
     photographs: Photographs, nominal: Placement, report: Report, joined: Joined = None
 ) -> Placement:
     """Recognise the legs in the images, and place the cameras by them."""

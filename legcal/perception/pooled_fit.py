@@ -103,7 +103,7 @@ def _common_blur(found: _Iterate, seen: BoolArray) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Pixels:
+class _BlockPixels:
     """The pixels of short blocks, of which a few make a block of the pool."""
 
     d: Array  # (n, m) from the lines on which the blocks had converged [px]
@@ -130,7 +130,7 @@ class _Pixels:
         first = np.flatnonzero(np.diff(self.joined[some], prepend=-1))
         return np.asarray(np.add.reduceat(U.swapaxes(1, 2) @ U, first, axis=0))
 
-    def changed_by_gamma(self) -> "_Pixels":
+    def changed_by_gamma(self) -> "_BlockPixels":
         """Return how the light of these pixels changes with ln gamma, in place of it."""
         light, weight = self.light + self.level[self.edge][:, None] * self.weight, self.weight
         of_block = np.maximum(light.sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-9), 1e-9)
@@ -146,7 +146,7 @@ class _Pixels:
 class _Pool:
     """The blocks of all edges, and which belong together."""
 
-    pixels: _Pixels
+    pixels: _BlockPixels
     power: Array  # (n,) sum of squares of the light of each block
     n_samples: Array  # (n,)
     gain: Array  # (n,)
@@ -183,7 +183,7 @@ class _Pool:
         rise = 2.0 * blocks.position[usable] - 1.0
         along = np.stack([np.ones_like(rise), rise, 1.5 * rise**2 - 0.5], axis=1)
         joined = _joined(np.bincount(edge, minlength=n_edges))
-        pixels = _Pixels(d, weight, light, blocks.gain[usable], along, edge, joined, level)
+        pixels = _BlockPixels(d, weight, light, blocks.gain[usable], along, edge, joined, level)
         first = np.flatnonzero(np.diff(joined, prepend=-1))
         n_joined = np.diff(first, append=len(joined))
 

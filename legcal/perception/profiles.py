@@ -130,7 +130,7 @@ class _Nodes:
     offset: Array  # (n_edges, n_nodes) x, or y of flat outlines [px]
     slope: Array  # (n_edges, n_nodes) the change of offset by along
     across: Array  # (n_edges, n_nodes) how offset changes inwards; only its sign is of use
-    gain: Array  # (n_edges, n_nodes) px of offset, along held, by px of v
+    gain: Array  # (n_edges, n_nodes) px of offset at the same along, by px of v
 
     def rows(self, n_rows: int) -> _Rows:
         """Return the rows of all whole blocks."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from legcal.geometry import Array
-from legcal.perception.blocks import Blocks, Line, depth_for_blur, estimate_blur
+from legcal.perception.blocks import BlockLine, Blocks, depth_for_blur, estimate_blur
 from legcal.perception.pooled_fit import PooledLines, fit_pooled
 from legcal.perception.profiles import Edge
 from legcal.vision import Camera, Grey
@@ -33,7 +33,7 @@ class MeasuredEdge:
     """The line of an outline."""
 
     v: Array  # (2,) offsets at both ends of the band [px]
-    line: Line  # how the blocks lie about it
+    line: BlockLine  # how the blocks lie about it
     contrast: float  # median step from the background to the leg, without sign [grey levels]
     is_step: bool  # whether most blocks show a step or a limb, not only a bend of the shading
     blur: float  # standard deviation of the blur of the image [px]
@@ -138,6 +138,6 @@ def _measured(
     return found
 
 
-def _moved(edge: Edge, v: Array, line: Line | None) -> Array:
+def _moved(edge: Edge, v: Array, line: BlockLine | None) -> Array:
     """Return the offsets of an edge moved by a line of shifts towards the inside."""
     return v if line is None else np.asarray(v + edge.epsilon * line.ends)

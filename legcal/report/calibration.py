@@ -193,7 +193,7 @@ def _holdout_lines(found: Holdout) -> list[str]:
     ]
     pair = found.platform
     if pair is None:
-        return [*lines, "They show too few legs at once to tell the platform's pose alone."]
+        return [*lines, "They show too few legs at once to determine the platform's pose alone."]
     return [
         *lines,
         f"At the platform, its pose by what {pair.poses} of {found.poses} poses show alone is "
@@ -222,7 +222,7 @@ def check_summary(check: Check) -> RenderableType:
         else:
             lines.append(f"It is explained by {what}: {amount}.")
             named = ", ".join(other.change.what for other in others[:_EXPLANATIONS])
-            lines += [f"These images cannot tell that from: {named}."] if named else []
+            lines += [f"These images cannot distinguish that from: {named}."] if named else []
     style = "bold red" if movement.moved else "bold green"
     return report([*lines, Text(check.sentence, style=style)])
 

@@ -140,7 +140,7 @@ def _without_rounding(
     return from_vector(vector, len(parameters.offsets), frame_legs)
 
 
-def leg_vectors(parameters: KinematicParameters, T_Rb_Re: RigidTransform) -> Array:
+def simulated_leg_vectors(parameters: KinematicParameters, T_Rb_Re: RigidTransform) -> Array:
     """Return A_j B_j of every leg in R_b at one or several poses, (..., n_legs, 3) [m]."""
     arms = parameters.platform_joints @ np.swapaxes(T_Rb_Re.rotation.as_matrix(), -1, -2)
     return np.asarray(arms + T_Rb_Re.translation[..., None, :] - parameters.base_joints)
@@ -171,7 +171,7 @@ def follow_from_home(machine: PaperHexapod, lengths: Array) -> tuple[RigidTransf
     R = np.tile(machine.home.rotation.as_matrix(), (n, 1, 1))
     t = np.tile(machine.home.translation, (n, 1))
     reached = np.ones(n, dtype=np.bool_)
-    first = np.linalg.norm(leg_vectors(parameters, machine.home), axis=-1)
+    first = np.linalg.norm(simulated_leg_vectors(parameters, machine.home), axis=-1)
     size = float(np.mean(np.linalg.norm(parameters.platform_joints, axis=-1)))
     unit = np.repeat([size, 1.0], 3)
     for part in np.linspace(0.0, 1.0, _N_STEPS + 1)[1:]:
@@ -295,7 +295,7 @@ def hexapod_session(
     view = np.repeat(np.arange(n_views), n_poses * n_images)
     pose = np.repeat(np.arange(n_views * n_poses), n_images)
     pose = (pose % n_poses if share_poses else pose).astype(np.intp)
-    legs = leg_vectors(machine.parameters, T_Rb_Re)
+    legs = simulated_leg_vectors(machine.parameters, T_Rb_Re)
     q = (np.linalg.norm(legs, axis=-1) - machine.parameters.offsets) * machine.sign
     if noisy and uniform_readings:
         half_width = np.sqrt(3.0) * sigma_q

@@ -40,13 +40,13 @@ from legcal.simulation.hexapod import (
     follow_from_home,
     hexapod_cameras,
     hexapod_session,
-    leg_vectors,
     noncoplanar_hexapod,
     observed,
     paper_hexapod,
     perturb,
     poses_with_lengths,
     random_hexapod_poses,
+    simulated_leg_vectors,
 )
 from legcal.simulation.observe import TableNoise
 from legcal.simulation.paper_report import BOUND, INITIAL, SCALARS, PaperSummary
@@ -184,7 +184,7 @@ def poses_of_readings(
     machine: PaperHexapod, parameters: KinematicParameters, T_Rb_Re: RigidTransform
 ) -> RigidTransform:
     """Return the poses that other parameters compute from the readings of true poses."""
-    lengths = np.linalg.norm(leg_vectors(machine.parameters, T_Rb_Re), axis=-1)
+    lengths = np.linalg.norm(simulated_leg_vectors(machine.parameters, T_Rb_Re), axis=-1)
     changed = lengths - machine.parameters.offsets + parameters.offsets
     return poses_with_lengths(parameters, changed, T_Rb_Re)
 

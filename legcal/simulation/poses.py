@@ -28,11 +28,11 @@ from legcal.machine import (
     follow,
     forward_kinematics,
     joint_values,
-    leg_vectors,
     platform_pose,
     random_walk,
     singularity,
     slider_columns,
+    vectors_A_to_B,
 )
 from legcal.progress import Report, no_progress
 from legcal.simulation.request import Sampling
@@ -252,7 +252,7 @@ class Feasibility:
 
     def _touching(self, T_base_platform: RigidTransform) -> BoolArray:
         """Return which pairs of cylinders are nearer than the sum of their radii."""
-        vectors = leg_vectors(self._machine, T_base_platform)
+        vectors = vectors_A_to_B(self._machine, T_base_platform)
         lengths = np.linalg.norm(vectors, axis=1)
         u = (vectors / lengths[:, None])[self._leg]
         along = self._ends + np.where(self._on_platform, lengths[self._leg], 0.0)[:, None]

@@ -40,7 +40,7 @@ _FLAT_JOINTS = 1e-3  # thickness of joint centres that lie in a plane, of their 
 
 
 @dataclass(frozen=True)
-class Cylinder:
+class SolidCylinder:
     """A closed cylinder about the z axis, its middle at the origin."""
 
     radius: float  # [m]
@@ -69,7 +69,7 @@ class Mesh:
     faces: IntArray  # (m, 3) the corners of each triangle
 
 
-Shape = Cylinder | Sphere | Box | Mesh
+Shape = SolidCylinder | Sphere | Box | Mesh
 
 
 def _check(urdf_path: Path, element: etree._Element) -> None:
@@ -114,7 +114,7 @@ def _shown(urdf_path: Path, visual: etree._Element) -> tuple[Shape, RigidTransfo
     numbers = [float(x) for name in _SIZES[str(shape.tag)] for x in shape.get(name, "").split()]
     T = origin_of(visual)
     if shape.tag == "cylinder":
-        return Cylinder(*numbers), T
+        return SolidCylinder(*numbers), T
     if shape.tag == "sphere":
         return Sphere(*numbers), T
     x, y, z = numbers
@@ -266,7 +266,7 @@ def solids_of(machine: Machine) -> tuple[Solid, ...]:
                 continue
             number += 1
             leg = None
-            if isinstance(shape, Cylinder):
+            if isinstance(shape, SolidCylinder):
                 leg = _leg_along(shape, product(poses[link], T), link, machine)
             named = visual.find("material")
             colour = None
@@ -295,7 +295,7 @@ def placed(solids: Sequence[Solid], poses: Mapping[str, RigidTransform]) -> tupl
 
 
 def _leg_along(
-    shape: Cylinder, T_base_shape: RigidTransform, link: str, machine: Machine
+    shape: SolidCylinder, T_base_shape: RigidTransform, link: str, machine: Machine
 ) -> int | None:
     """Return the leg that has a visual of a link, at home, among its cylinders."""
     half = np.array([0.0, 0.0, 0.5 * shape.length])
@@ -314,7 +314,7 @@ def _leg_along(
 def _material(shape: Shape, colour: tuple[float, float, float] | None, leg: Leg | None) -> Material:
     """Return the surface of a visual: its colour if it has one, else what it most likely is."""
     material = PART
-    if leg is not None and isinstance(shape, Cylinder):
+    if leg is not None and isinstance(shape, SolidCylinder):
         thickest = max(c.radius for c in leg.cylinders)
         material = TUBE if shape.radius > 0.999 * thickest else ROD
     if colour is None:
@@ -380,7 +380,7 @@ def _end(
     for j, (joint, R) in enumerate(zip(joints, radii, strict=True)):
         length = outside - float(joint @ away)
         middle = RigidTransform.from_components(joint + 0.5 * length * away, turn)
-        post = Cylinder(_POST_SIZE * float(R), length)
+        post = SolidCylinder(_POST_SIZE * float(R), length)
         solids.append(Solid(f"{link}_post{j + 1}", link, post, middle, _POST))
     middle = joints.mean(axis=0)
     across = joints - middle
@@ -389,7 +389,7 @@ def _end(
     size = float(np.linalg.norm(across, axis=1).max()) + _PLATE_RIM * thickest
     at = middle + (outside + 0.5 * thickness - float(middle @ away)) * away
     pose = RigidTransform.from_components(at, turn)
-    solids.append(Solid(f"{link}_plate", link, Cylinder(size, thickness), pose, _PLATE))
+    solids.append(Solid(f"{link}_plate", link, SolidCylinder(size, thickness), pose, _PLATE))
     return solids
 
 
@@ -490,7 +490,7 @@ def triangles(shape: Shape) -> Any:
     """Return a shape as triangles."""
     import trimesh
 
-    if isinstance(shape, Cylinder):
+    if isinstance(shape, SolidCylinder):
         return trimesh.creation.cylinder(shape.radius, shape.length, sections=_SECTIONS)
     if isinstance(shape, Sphere):
         return trimesh.creation.icosphere(_SUBDIVISIONS, shape.radius)
@@ -501,7 +501,7 @@ def triangles(shape: Shape) -> Any:
 
 def _is_in(shape: Shape, point: Array) -> bool:
     """Say whether a point (3,) in the frame of a shape is inside it."""
-    if isinstance(shape, Cylinder):
+    if isinstance(shape, SolidCylinder):
         beside = np.hypot(point[0], point[1]) < shape.radius
         return bool(beside and abs(point[2]) < 0.5 * shape.length)
     if isinstance(shape, Sphere):

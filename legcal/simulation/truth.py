@@ -41,7 +41,7 @@ from legcal.simulation.settings import (
     ParameterErrors,
     Spread,
 )
-from legcal.simulation.solids import Cylinder, solids_of
+from legcal.simulation.solids import SolidCylinder, solids_of
 
 # of the thinnest cylinder
 _MAX_RADIUS_ERROR = {Distribution.UNIFORM: 0.5, Distribution.NORMAL: 0.1}
@@ -106,7 +106,7 @@ def draw_radii(
     radii: dict[tuple[str, int], float] = {}
     tubes: dict[tuple[int, int], list[tuple[str, int]]] = {}
     for solid in solids_of(nominal):
-        if isinstance(solid.shape, Cylinder) and solid.link is not None:
+        if isinstance(solid.shape, SolidCylinder) and solid.link is not None:
             place = solid.link, counts.setdefault(solid.link, 0)
             counts[solid.link] += 1
             if solid.leg is not None:

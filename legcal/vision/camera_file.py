@@ -17,7 +17,7 @@ from legcal.geometry import Array
 from legcal.vision.camera import DISTORTION_MODELS, Camera, DistortionModel, intrinsic_names
 from legcal.vision.image_file import quiet_opencv, size_problem
 
-Pixels = Annotated[int, Field(gt=0)]
+_PixelCount = Annotated[int, Field(gt=0)]
 Sigma = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 CALIBRATED = "legcal_camera"  # the key under which legcal camera says what it found
 
@@ -68,8 +68,8 @@ class CalibratedEntry(_OpenSchema):
 class RosEntry(_OpenSchema):
     """A ROS camera_info file."""
 
-    image_width: Pixels
-    image_height: Pixels
+    image_width: _PixelCount
+    image_height: _PixelCount
     camera_matrix: CameraMatrix
     distortion_model: DistortionModel = "plumb_bob"
     distortion_coefficients: MatrixEntry
@@ -79,8 +79,8 @@ class RosEntry(_OpenSchema):
 class OpenCVEntry(_OpenSchema):
     """An OpenCV FileStorage, as its calibration sample writes it."""
 
-    image_width: Pixels
-    image_height: Pixels
+    image_width: _PixelCount
+    image_height: _PixelCount
     camera_matrix: CameraMatrix
     distortion_coefficients: MatrixEntry
     fisheye_model: int = 0
@@ -93,7 +93,7 @@ class KalibrEntry(_OpenSchema):
     distortion_model: Literal["radtan", "equidistant", "none"]
     intrinsics: tuple[float, float, float, float]
     distortion_coeffs: list[float] = Field(default_factory=list)
-    resolution: tuple[Pixels, Pixels]
+    resolution: tuple[_PixelCount, _PixelCount]
 
 
 _OPENCV_MARKS = re.compile(rb"\A\s*(%YAML:1\.0|<\?xml|<opencv_storage)|opencv-matrix")

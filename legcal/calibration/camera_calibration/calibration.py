@@ -132,7 +132,7 @@ def calibrate_camera(
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
+class _CornerSearch:
     """The search of an image, for any process."""
 
     board: Board
@@ -154,7 +154,7 @@ def _search(
     """Return the corners in every image."""
     progress(_STAGE, 0, len(paths))
     found = []
-    for corners in run(_Search(board, tuple(paths), size), range(len(paths))):
+    for corners in run(_CornerSearch(board, tuple(paths), size), range(len(paths))):
         found.append(corners)
         progress(_STAGE, len(found), len(paths))
     return found

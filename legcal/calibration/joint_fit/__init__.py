@@ -14,7 +14,7 @@ that reject outlines and estimate their noise, checks of the result, its assembl
 ``fit``               the order of all of it
 ``determinacy``       open directions: refused, or held at nominal
 ``rounds``            rejection of outliers and estimation of noise
-``contradictions``    stated priors and fixed values against the measurements
+``diagnostics``       stated priors and fixed values against the measurements
 ``sensitivity``       errors of what counts as known; focal lengths tested
 ``held_out``          what a fit predicts of images that were not fitted
 ``platform``          what a fit means at the platform

@@ -35,7 +35,7 @@ _MIN_SPREAD = 1e-12  # [m] a spread that counts as none
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class HeldDirections:
     """Directions of the parameters that are open and do not move the platform."""
 
     basis: Array  # (w, n_named) in the values of named unknowns, each over its unit, orthonormal
@@ -44,7 +44,7 @@ class Held:
     names: tuple[str, ...] = ()  # parameters that a slightly wrong nominal model would move
 
 
-def open_directions(problem: FitProblem, state: State, normal: NormalEquations) -> Held:
+def open_directions(problem: FitProblem, state: State, normal: NormalEquations) -> HeldDirections:
     """Return the open directions that hardly move the platform.
 
     *problem* holds nothing yet; *normal* is its information at the state.
@@ -89,11 +89,11 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
         is_weak = _HELD_SIGMA * length * np.linalg.norm(harmless, axis=0) > sigma
         weak = tuple(names[i] for i in np.flatnonzero(is_weak))
     directions = (_in_words(names, row, problem.legs.names) for row in sparse_basis(harmless))
-    return Held(harmless, unit, tuple(directions), weak)
+    return HeldDirections(harmless, unit, tuple(directions), weak)
 
 
 def refuse_undetermined_inliers(
-    problem: FitProblem, state: State, normal: NormalEquations, held: Held
+    problem: FitProblem, state: State, normal: NormalEquations, held: HeldDirections
 ) -> None:
     """Refuse a fit whose accepted outlines leave more open than was held before rejections.
 
@@ -119,7 +119,9 @@ def refuse_undetermined_inliers(
         )
 
 
-def held_at_nominal(problem: FitProblem, state: State, held: Held) -> tuple[FitProblem, State]:
+def held_at_nominal(
+    problem: FitProblem, state: State, held: HeldDirections
+) -> tuple[FitProblem, State]:
     """Return the problem with these directions held, and the state with them at nominal."""
     legs, free, n = problem.legs, problem.free, problem.n_kinematic
     rows = (held.basis / held.unit) @ problem.jacobian(state)
@@ -130,10 +132,12 @@ def held_at_nominal(problem: FitProblem, state: State, held: Held) -> tuple[FitP
     wanted = values - held.unit[:n] * (along @ held.basis[:, :n])
     where = np.flatnonzero(free).tolist()
     moved = with_values(state.legs, legs, dict(zip(where, wanted.tolist(), strict=True)))
-    return replace(problem, held=orthonormal), replace(state, legs=problem.parameters.tied(moved))
+    return replace(problem, held_directions=orthonormal), replace(
+        state, legs=problem.parameters.tied(moved)
+    )
 
 
-def held_spread(problem: FitProblem, state: State, held: Held) -> Array:
+def held_spread(problem: FitProblem, state: State, held: HeldDirections) -> Array:
     """Return the covariance (n_kinematic, n_kinematic) of steps along what is held.
 
     Nominal errors e of variance D^2, of which all but what is held (the rows of H) is found, leave

@@ -174,7 +174,7 @@ class ObservedOutlines:
         r = r - np.einsum("nc,ncq->nq", state.biases[self.bias_index], self.bias_shift)
         return np.asarray(r)
 
-    def _local(self, keys: tuple[str, ...], state: State) -> tuple[Array, _Ends, Array]:
+    def _local(self, keys: tuple[str, ...], state: State) -> tuple[Array, _EndsInCamera, Array]:
         ends = _ends_in_camera(state, self.leg, self.view, self.pose)
         xy, by_intrinsics = _on_sensor(state.cameras, keys, self.view, self.feet, self.pixels)
         parts = [ends.A, ends.B, state.radii[self.radius, None], xy.reshape(len(self), 4)]
@@ -726,7 +726,7 @@ def _on_sensor(
 
 
 @dataclass(frozen=True, eq=False)
-class _Ends:
+class _EndsInCamera:
     """Both ends of legs in the camera frame, and what their derivatives are made of."""
 
     A: Array  # (n, 3) from the camera, in its directions, and B likewise
@@ -751,13 +751,13 @@ class _Ends:
         return J, np.concatenate([cross(self.arm[:, None], b), b], axis=-1)
 
 
-def _ends_in_camera(state: State, leg: IntArray, view: IntArray, pose: IntArray) -> _Ends:
+def _ends_in_camera(state: State, leg: IntArray, view: IntArray, pose: IntArray) -> _EndsInCamera:
     """Return both ends of legs in the camera frames of views at poses."""
     R_camera, t = state.camera_pose.R[view], state.camera_pose.t[view]
     arm = state.arms[pose, leg]
     A = (state.A @ np.swapaxes(state.camera_pose.R, 1, 2))[view, leg]
     B = _times(R_camera, state.platform_pose.t[pose] + arm)
-    return _Ends(A + t, B + t, A, B, arm, R_camera, state.platform_pose.R[pose])
+    return _EndsInCamera(A + t, B + t, A, B, arm, R_camera, state.platform_pose.R[pose])
 
 
 def _times(R: Array, v: Array) -> Array:

@@ -9,17 +9,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from legcal.calibration.joint_fit.contradictions import (
+from legcal.calibration.joint_fit.determinacy import (
+    held_at_nominal,
+    open_directions,
+    refuse_undetermined_inliers,
+)
+from legcal.calibration.joint_fit.diagnostics import (
     naming_stated_values,
     refuse_contradicted_priors,
     refuse_contradicted_values,
     refuse_other_board,
     rejected_notes,
-)
-from legcal.calibration.joint_fit.determinacy import (
-    held_at_nominal,
-    open_directions,
-    refuse_undetermined_inliers,
 )
 from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.outline_errors import NoiseModel, noise_of_the_median

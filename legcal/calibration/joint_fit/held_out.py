@@ -32,7 +32,7 @@ from legcal.machine import pose_differences
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """Held-out images, and what a fit predicts of them."""
+    """HeldDirections-out images, and what a fit predicts of them."""
 
     problem: FitProblem  # their outlines and readings; the unknowns of the fit, their own biases
     state: State  # where the fit ended, at the poses of these images
@@ -225,7 +225,7 @@ _RANK_TOLERANCE = 1e-18  # of the largest eigenvalue of what readings say of a p
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Held-out images compared with the predictions of a fit.
+    """HeldDirections-out images compared with the predictions of a fit.
 
     Offsets are without the biases that outlines share with fitted ones. What is expected is one
     standard deviation, by the noise of outlines and readings and the covariance of all that the fit

@@ -68,7 +68,7 @@ class Choices:
 
 NO_CHOICES = Choices()
 
-Kind = Literal["kinematic", "radius", "intrinsic", "board"]
+ParameterKind = Literal["kinematic", "radius", "intrinsic", "board"]
 BOARD_SCALE = "board.scale"  # the factor on the dimensions of a calibration board
 _RATIO = 10.0  # between a radius or length and its nominal value: more is a mistake of the unit
 _FOCAL_RATIO = 2.0
@@ -81,7 +81,7 @@ class KnownParameter:
 
     nominal: float  # its value in the model or camera file [unit]
     unit: str  # its unit; "" for coefficients of distortion and for the size of a board
-    kind: Kind  # what it belongs to
+    kind: ParameterKind  # what it belongs to
     least: float  # limits of a stated value [unit]
     most: float  # limits of a stated value [unit]
     # what its camera file says of its uncertainty, one standard deviation [unit]

@@ -172,7 +172,7 @@ class FocalLength:
     sigma: float  # standard deviation of that
 
     @property
-    def is_doubtful(self) -> bool:
+    def is_contradicted(self) -> bool:
         """Whether the measurements disagree with what was given."""
         return abs(self.change) > _SIGNIFICANT * self.sigma
 

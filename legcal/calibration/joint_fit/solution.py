@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit.contradictions import rejected_notes, scale_notes
-from legcal.calibration.joint_fit.determinacy import Held, held_spread, named_units
+from legcal.calibration.joint_fit.determinacy import HeldDirections, held_spread, named_units
+from legcal.calibration.joint_fit.diagnostics import rejected_notes, scale_notes
 from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.outline_errors import (
     GAMMA_SUFFIX,
@@ -50,7 +50,7 @@ from legcal.machine import (
 from legcal.vision import Camera
 
 _SIGNIFICANT = 5.0  # standard deviations of chi2
-Status = Literal["estimated", "fixed", "weak"]
+ParameterStatus = Literal["estimated", "fixed", "weak"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class Solution:
     # Of every parameter by name [m, rad, px]: kinematic, radii, intrinsics, size of the board.
     values: Mapping[str, float]
     units: Mapping[str, str]
-    status: Mapping[str, Status]  # weak: part of a direction that is held at nominal
+    status: Mapping[str, ParameterStatus]  # weak: part of a direction that is held at nominal
     names: tuple[str, ...]  # the estimated parameters, in the order of ``values``
     covariance: Array  # (n, n) of these, with cameras and poses unknown
     sigma: Array  # (n,)
@@ -98,8 +98,8 @@ class Solution:
     iterations: int  # of the solver, all rounds
     posterior: Posterior  # what it predicts of other images; in the order that was fitted
     notes: tuple[str, ...] = ()  # one sentence each
-    focal_doubt: float = 0.0  # by what part of itself a focal length is contradicted
-    doubtful_cameras: tuple[str, ...] = ()  # views that stand for such cameras
+    focal_error: float = 0.0  # relative error of a focal length that the measurements contradict
+    contradicted_cameras: tuple[str, ...] = ()  # views that stand for such cameras
 
     @property
     def parameters(self) -> KinematicParameters:
@@ -108,7 +108,7 @@ class Solution:
 
 
 def assemble_solution(
-    fit: Fit, held: Held, outlines: Outlines, label: str, settings: RefinementSettings
+    fit: Fit, held: HeldDirections, outlines: Outlines, label: str, settings: RefinementSettings
 ) -> Solution:
     """Put together what was found.
 
@@ -143,7 +143,7 @@ def assemble_solution(
     biases = zip(problem.block("biases").labels, state.biases.tolist(), strict=True)
     wide, wide_linear = with_known_intrinsics(problem, state)
     focal = focal_lengths(wide, state, wide_linear)
-    doubtful = [f for f in focal if f.is_doubtful]
+    contradicted = [f for f in focal if f.is_contradicted]
     gammas = _gammas(problem, state, kept, outlines)
     return Solution(
         legs=state.legs,
@@ -183,8 +183,8 @@ def assemble_solution(
         start=label,
         iterations=fit.iterations,
         posterior=Posterior(problem, state, fit.edge_biases, fit.noise, kept),
-        focal_doubt=max((abs(f.change) for f in doubtful), default=0.0),
-        doubtful_cameras=tuple(f.view for f in doubtful),
+        focal_error=max((abs(f.change) for f in contradicted), default=0.0),
+        contradicted_cameras=tuple(f.view for f in contradicted),
         notes=(
             *fit.notes,
             *rejected_notes(problem, fit.accepted),
@@ -192,7 +192,7 @@ def assemble_solution(
             *map(str, gammas),
             *scale_notes(problem, state, settings),
             *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
-            *(str(f) for f in doubtful),
+            *(str(f) for f in contradicted),
         ),
     )
 
@@ -233,11 +233,13 @@ def _values(problem: FitProblem, state: State) -> dict[str, float]:
     return values | {name: value for name, value in named if name not in biases}
 
 
-def _status(problem: FitProblem, held: Held) -> dict[str, Status]:
+def _status(problem: FitProblem, held: HeldDirections) -> dict[str, ParameterStatus]:
     """Return the status of every parameter."""
     legs, biases = problem.legs, problem.block("biases").labels
     names = [radius_name(legs.names[leg], part) for leg, part in problem.outlines.parts]
-    status: dict[str, Status] = dict.fromkeys((*legs.parametrization.names, *names), "fixed")
+    status: dict[str, ParameterStatus] = dict.fromkeys(
+        (*legs.parametrization.names, *names), "fixed"
+    )
     status |= {name: "estimated" for name in problem.named if name not in biases}
     return status | dict.fromkeys(held.names, "weak")
 

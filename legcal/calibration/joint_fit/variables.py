@@ -324,10 +324,10 @@ class LegConstraints:
             return Tangent(Z, Q[:-1])
         _, s, vt = np.linalg.svd(rows.by_pose[:, :, free])
         n = s.shape[1]
-        held = s > _RANK * s[:, :1]
-        least = int(held.sum(axis=1).min(initial=n))
+        binding = s > _RANK * s[:, :1]
+        least = int(binding.sum(axis=1).min(initial=n))
         basis = np.swapaxes(vt, -1, -2)[:, :, least:].copy()
-        basis[:, :, : n - least] *= ~held[:, None, least:]
+        basis[:, :, : n - least] *= ~binding[:, None, least:]
         Z = np.zeros((n_poses, 6, basis.shape[2]))
         Z[:, free] = basis
         inverse = np.zeros((n_poses, 6, len(rows.leg)))

@@ -1,5 +1,5 @@
 """Base in the world and tool in the platform from measured tool poses.
 
-`locate` is the job: read `observations`, `search` from many starts, `fit` by maximum likelihood to
+`locate` is the job: read `tool_poses`, `search` from many starts, `fit` by maximum likelihood to
 the inliers, `determinacy`, and the files in `document` and `urdf`; `frames` has the geometry.
 """

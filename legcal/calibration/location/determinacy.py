@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from legcal.calibration.location.document import (
-    Frame,
-    Kind,
+    LocatedFrame,
     OpenPart,
+    PoseComponent,
     direction_of,
     direction_words,
     open_parts_in_words,
@@ -23,7 +23,7 @@ from legcal.calibration.location.fit import (
     hold_tool,
 )
 from legcal.calibration.location.frames import N_STEP, PosePairs, jacobian
-from legcal.calibration.location.observations import ToolObservations
+from legcal.calibration.location.tool_poses import ToolMeasurements
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray
 from legcal.machine import random_configurations
@@ -35,7 +35,7 @@ _AXIS_TOLERANCE = 0.02  # of the largest rotations: what is less is about the sa
 _RESOLVED = 1e-3  # of a unit direction
 _N_POSES, _SEED = 30, 1  # of the workspace
 _WEAK = 25.0  # times worse known than by one measured pose
-_BLOCKS: tuple[tuple[slice, Frame, Kind], ...] = (
+_BLOCKS: tuple[tuple[slice, LocatedFrame, PoseComponent], ...] = (
     (slice(0, 3), "base", "position"),
     (slice(3, 6), "base", "orientation"),
     (slice(6, 9), "tool", "position"),
@@ -57,7 +57,7 @@ class Determinacy:
 
 
 def determine(
-    observations: ToolObservations,
+    measurements: ToolMeasurements,
     found: FrameFit,
     # (3,): where the tool is taken in the platform where the machine leaves that open [m]
     tool_position: Array,
@@ -68,15 +68,15 @@ def determine(
     Raises NotIdentifiable if other poses of the machine would determine what these leave open, or
     if more than the tool would have to be fixed.
     """
-    pairs, oriented = observations.pairs, observations.is_oriented
+    pairs, oriented = measurements.pairs, measurements.is_oriented
     basis = _open_directions(found.frame_design, oriented=oriented)
     parts: list[OpenPart] = []
     words = ""
     if basis.shape[1]:
-        workspace = _workspace(observations)
-        _check_machine(observations, found, basis, workspace, name)
-        found = hold(observations, found, tool_position)
-        basis = _open_at(observations, found, basis.shape[1], found.frames)
+        workspace = _workspace(measurements)
+        _check_machine(measurements, found, basis, workspace, name)
+        found = hold(measurements, found, tool_position)
+        basis = _open_at(measurements, found, basis.shape[1], found.frames)
         parts = _open_parts(basis, found.frames)
         words = _held_words(parts, workspace, tool_position)
     scale = pairs.scale
@@ -87,13 +87,13 @@ def determine(
     )
 
 
-def hold(observations: ToolObservations, found: FrameFit, tool_position: Array) -> FrameFit:
+def hold(measurements: ToolMeasurements, found: FrameFit, tool_position: Array) -> FrameFit:
     """Return a fit moved along what it leaves open until the tool is where it is held."""
-    k = _open_directions(found.frame_design, oriented=observations.is_oriented).shape[1]
+    k = _open_directions(found.frame_design, oriented=measurements.is_oriented).shape[1]
     if k == 0:
         return found
     return hold_tool(
-        observations, found, lambda frames: _open_at(observations, found, k, frames), tool_position
+        measurements, found, lambda frames: _open_at(measurements, found, k, frames), tool_position
     )
 
 
@@ -199,37 +199,37 @@ def _needed_words(found: _PoseSpread, possible: _PoseSpread, scatter: str) -> st
     )
 
 
-def _open_at(observations: ToolObservations, found: FrameFit, k: int, frames: Array) -> Array:
+def _open_at(measurements: ToolMeasurements, found: FrameFit, k: int, frames: Array) -> Array:
     """Return the k directions (12, k) that are known least at some frames."""
-    n = 12 if observations.is_oriented else 9
-    design = frame_design_at(observations.pairs, frames, found.noise, observations.by_model)
+    n = 12 if measurements.is_oriented else 9
+    design = frame_design_at(measurements.pairs, frames, found.noise, measurements.by_model)
     _, _, Vt = np.linalg.svd(design[:, :n], full_matrices=True)
     basis = np.zeros((12, k))
     basis[:n] = Vt[n - k :].T
     return basis
 
 
-def _workspace(observations: ToolObservations) -> PosePairs:
+def _workspace(measurements: ToolMeasurements) -> PosePairs:
     """Return poses all over the workspace, as if each had been measured."""
-    sampled = random_configurations(observations.machine, _N_POSES, _SEED)
+    sampled = random_configurations(measurements.machine, _N_POSES, _SEED)
     matrices = np.array([T.as_matrix() for T in sampled.poses])
     return PosePairs(
         R=matrices[:, :3, :3],
         t=matrices[:, :3, 3],
         M=np.tile(np.eye(3), (_N_POSES, 1, 1)),
         p=np.zeros((_N_POSES, 3)),
-        oriented=np.full(_N_POSES, observations.is_oriented),
-        length=observations.pairs.length,
+        oriented=np.full(_N_POSES, measurements.is_oriented),
+        length=measurements.pairs.length,
     )
 
 
 def _check_machine(
-    observations: ToolObservations, found: FrameFit, basis: Array, workspace: PosePairs, name: str
+    measurements: ToolMeasurements, found: FrameFit, basis: Array, workspace: PosePairs, name: str
 ) -> None:
     """Refuse what other poses would determine, and what holding the tool does not close."""
-    pairs = observations.pairs
+    pairs = measurements.pairs
     seen = jacobian(found.frames, workspace) * pairs.unit[:, None] * pairs.scale
-    beyond = _shown_elsewhere(basis, seen.reshape(-1, N_STEP), oriented=observations.is_oriented)
+    beyond = _shown_elsewhere(basis, seen.reshape(-1, N_STEP), oriented=measurements.is_oriented)
     here = _pose_spread(pairs.R, pairs.t, pairs.length)
     there = _pose_spread(workspace.R, workspace.t, pairs.length)
     start = f"{name}: base and tool could not be located, because"
@@ -238,7 +238,7 @@ def _check_machine(
             f"{start} {open_parts_in_words(_open_parts(beyond, found.frames))} cannot be told from "
             "the poses: "
             f"found {len(pairs)} poses that {here.words}"
-            f"{_needed_words(here, there, _scatter(observations, found))}."
+            f"{_needed_words(here, there, _scatter(measurements, found))}."
         )
     if not _is_resolved_by_the_tool(basis):
         raise NotIdentifiable(
@@ -249,10 +249,10 @@ def _check_machine(
         )
 
 
-def _scatter(observations: ToolObservations, found: FrameFit) -> str:
+def _scatter(measurements: ToolMeasurements, found: FrameFit) -> str:
     """Return the standard deviations of a measured component."""
     sigma = found.noise.rms
-    turn = f" and {np.degrees(sigma[1]):.2g} deg" if observations.is_oriented else ""
+    turn = f" and {np.degrees(sigma[1]):.2g} deg" if measurements.is_oriented else ""
     return f"{1e3 * sigma[0]:.2g} mm{turn}"
 
 

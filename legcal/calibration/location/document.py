@@ -25,10 +25,10 @@ from legcal.files import (
 )
 from legcal.geometry import Array
 
-Frame = Literal["base", "tool"]
-Kind = Literal["position", "orientation"]
+LocatedFrame = Literal["base", "tool"]
+PoseComponent = Literal["position", "orientation"]
 Direction = tuple[float, float, float]
-Status = Literal["located", "located in part", "doubtful"]
+LocationStatus = Literal["located", "located in part", "doubtful"]
 NAMES = tuple(
     f"{frame}.{component}"
     for frame in ("T_world_base", "T_platform_tool")
@@ -104,7 +104,7 @@ class Location:
     p_value: float | None
     tool_position_sigma: float
     tool_angle_sigma: float | None
-    status: Status
+    status: LocationStatus
     sentence: str
     notes: tuple[str, ...]
 
@@ -167,8 +167,8 @@ class MeasurementNoise:
 class OpenPart:
     """A part of the frames that poses do not determine, or hardly."""
 
-    frame: Frame  # {"base", "tool"}: whose
-    kind: Kind  # {"position", "orientation"}: of what
+    frame: LocatedFrame  # {"base", "tool"}: whose
+    kind: PoseComponent  # {"position", "orientation"}: of what
     # unit vectors: of the base in the base link, of the tool in the platform link
     directions: tuple[Direction, ...]
 
@@ -216,14 +216,14 @@ def _rms(vectors: list[tuple[float, float, float]]) -> float:
     return float(np.sqrt(np.mean(np.square(vectors))))
 
 
-class _Frame(MotionEntry):
+class _FrameEntry(MotionEntry):
     """A frame with its standard deviations, which the covariance repeats in full."""
 
     sigma_xyz: _Vector
     sigma_rotation: _Vector | None
 
 
-class _Held(FileSchema):
+class _OpenPartEntry(FileSchema):
     """A part that the machine leaves open."""
 
     frame: Literal["base", "tool"]
@@ -236,7 +236,7 @@ class _Determined(FileSchema):
 
     everything: bool
     tool_orientation: bool
-    held: list[_Held]
+    held: list[_OpenPartEntry]
     tool_position: _Vector
     words: str
 
@@ -252,7 +252,7 @@ class _Noise(FileSchema):
     model: bool
 
 
-class _Row(FileSchema):
+class _RowEntry(FileSchema):
     """Residuals of a row."""
 
     row: Annotated[int, Field(ge=1)]
@@ -261,7 +261,7 @@ class _Row(FileSchema):
     left_out: str
 
 
-class _Residuals(FileSchema):
+class _ResidualsEntry(FileSchema):
     """What is left of the measured poses."""
 
     chi2: _Size
@@ -269,7 +269,7 @@ class _Residuals(FileSchema):
     p_value: _Size | None
     rms_position: _Size
     rms_angle: _Size | None
-    rows: Annotated[list[_Row], Field(min_length=1)]
+    rows: Annotated[list[_RowEntry], Field(min_length=1)]
 
 
 class _Tool(FileSchema):
@@ -286,7 +286,7 @@ class _Covariance(FileSchema):
     matrix: list[list[Number]]
 
 
-class _Document(FileSchema):
+class _LocationFile(FileSchema):
     """The file."""
 
     legcal_location: Version
@@ -294,12 +294,12 @@ class _Document(FileSchema):
     verdict: str
     model: str
     poses: str
-    T_world_base: _Frame
-    T_platform_tool: _Frame
+    T_world_base: _FrameEntry
+    T_platform_tool: _FrameEntry
     determined: _Determined
     noise: _Noise
     tool_in_world_sigma: _Tool
-    residuals: _Residuals
+    residuals: _ResidualsEntry
     covariance: _Covariance
     notes: list[str]
 
@@ -405,7 +405,7 @@ def load_location(file: str | Path) -> Location:
             f"{path}: the {_WHAT} could not be read: found no key '{_KEY}', needed a file that "
             "legcal locate wrote; give that file."
         )
-    document = validate(_Document, found, path)
+    document = validate(_LocationFile, found, path)
     determined, residuals = document.determined, document.residuals
     return Location(
         model=document.model,

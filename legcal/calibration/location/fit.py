@@ -27,8 +27,8 @@ from legcal.calibration.location.frames import (
     residuals,
     tool_motions,
 )
-from legcal.calibration.location.observations import PoseNoise, ToolObservations
 from legcal.calibration.location.search import kept_rows
+from legcal.calibration.location.tool_poses import PoseNoise, ToolMeasurements
 from legcal.estimation import (
     Factor,
     Frames,
@@ -83,13 +83,13 @@ class FrameFit:
         return np.asarray(F.T @ F)
 
 
-def fit_observations(observations: ToolObservations, start: Array) -> FrameFit:
-    """Return the most likely frames of observations, from a start.
+def fit_measurements(measurements: ToolMeasurements, start: Array) -> FrameFit:
+    """Return the most likely frames of measurements, from a start.
 
     Errors of the readings move the tool through the frames that are estimated: their covariance
     follows the frames.
     """
-    o = observations
+    o = measurements
     found = fit(o.pairs, start, o.noise_at(start), o.by_model)
     for _ in range(_READING_ROUNDS if o.by_readings is not None else 0):
         found = fit(o.pairs, found.frames, o.noise_at(found.frames), o.by_model)
@@ -201,7 +201,7 @@ def _most_likely(
                 whitening=noise.whitening(pairs.oriented),
             ),
         ),
-        held=held.reshape(-1, N_STEP),
+        held_directions=held.reshape(-1, N_STEP),
         name="fit of the frames",
         remedy="check that readings and poses belong together",
     )
@@ -281,7 +281,7 @@ def _whitened(r: Array, design: Array, W: Array) -> tuple[Array, Array]:
 
 
 def hold_tool(
-    observations: ToolObservations,
+    measurements: ToolMeasurements,
     found: FrameFit,
     open_at: Callable[[Array], Array],  # returns the open directions (12, k) at frames
     tool_position: Array,  # (3,): in the platform [m]
@@ -291,7 +291,7 @@ def hold_tool(
     Along open directions the tool is brought as near to the given position, and to the axes of the
     platform, as they allow; all else stays most likely.
     """
-    pairs, frames = observations.pairs, found.frames
+    pairs, frames = measurements.pairs, found.frames
     for _ in range(_MAX_HOLD_ROUNDS):
         basis = open_at(frames)
         turn = Rotation.from_matrix(frames[1, :, :3]).inv().as_rotvec()
@@ -300,10 +300,10 @@ def hold_tool(
         size = float(np.linalg.norm(slide[[3, 4, 5, 9, 10, 11]]))
         frames = frames_after(frames, slide * min(1.0, 0.5 / max(size, 1e-300)) * pairs.scale)
         of_tool = np.concatenate([np.zeros_like(basis[:6]), basis[6:]])
-        frames = _most_likely(pairs, frames, found.noise, observations.by_model, of_tool)
+        frames = _most_likely(pairs, frames, found.noise, measurements.by_model, of_tool)
         if np.abs(slide).max() < _HOLD_TOLERANCE:
             break
-    return fit_at(pairs, frames, found.noise, observations.by_model)
+    return fit_at(pairs, frames, found.noise, measurements.by_model)
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,16 +318,16 @@ class Inliers:
     factor: Array  # (2,): the scatter of the inliers, as a factor of :class:`PoseNoise`
 
 
-def find_inliers(observations: ToolObservations, start: Array) -> Inliers:
+def find_inliers(measurements: ToolMeasurements, start: Array) -> Inliers:
     """Return which rows agree with each other, from frames that most rows agree with.
 
     A row is never left out for what stated standard deviations allow.
     """
-    pairs, noise = observations.pairs, observations.noise
+    pairs, noise = measurements.pairs, measurements.noise
     n = len(pairs)
     distance = ((residuals(start, pairs) * pairs.unit) ** 2).sum(axis=1)
     inside = np.zeros(n, dtype=np.bool_)
-    inside[np.argsort(distance, kind="stable")[: kept_rows(n, observations.fewest)]] = True
+    inside[np.argsort(distance, kind="stable")[: kept_rows(n, measurements.fewest)]] = True
     frames = start
     while True:
         found = _fit_to(pairs.of(inside), frames, noise.of(inside))

@@ -11,18 +11,23 @@ from scipy import stats
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.location.determinacy import Determinacy, determine, hold
-from legcal.calibration.location.document import Location, MeasurementNoise, RowResidual, Status
-from legcal.calibration.location.fit import FrameFit, Inliers, find_inliers, fit, fit_observations
+from legcal.calibration.location.document import (
+    Location,
+    LocationStatus,
+    MeasurementNoise,
+    RowResidual,
+)
+from legcal.calibration.location.fit import FrameFit, Inliers, find_inliers, fit, fit_measurements
 from legcal.calibration.location.frames import jacobian, residuals, transforms
-from legcal.calibration.location.observations import (
+from legcal.calibration.location.search import FrameCandidates, likely_mistake, search
+from legcal.calibration.location.tool_poses import (
     MAX_ANGLE_SIGMA,
     MIN_SIGMA,
-    ToolObservations,
+    ToolMeasurements,
     ToolPoses,
-    observations_of,
     read_tool_poses,
+    tool_measurements,
 )
-from legcal.calibration.location.search import FrameCandidates, likely_mistake, search
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.files import describe
 from legcal.geometry import Array, pose_distance
@@ -88,7 +93,7 @@ def locate(
     machine = model if isinstance(model, Machine) else load_mechanism(model)
     name = "The tool poses" if isinstance(poses, ToolPoses) else str(poses)
     measured = poses if isinstance(poses, ToolPoses) else read_tool_poses(Path(poses), machine)
-    observations = observations_of(
+    measurements = tool_measurements(
         machine,
         measured,
         name,
@@ -96,17 +101,17 @@ def locate(
         angle_sigma=angle_sigma,
         encoder_sigma=encoder_sigma,
     )
-    candidates = search(observations.pairs, observations.fewest)
-    _check_plausible(observations, candidates, name)
-    inliers = find_inliers(observations, candidates.frames[0])
-    _check_outliers(observations, candidates, inliers, name)
-    used = observations.of(inliers.is_inlier)
-    found = fit_observations(used, inliers.frames)
+    candidates = search(measurements.pairs, measurements.fewest)
+    _check_plausible(measurements, candidates, name)
+    inliers = find_inliers(measurements, candidates.frames[0])
+    _check_outliers(measurements, candidates, inliers, name)
+    used = measurements.of(inliers.is_inlier)
+    found = fit_measurements(used, inliers.frames)
     _check_scatter(used, found, name)
     at = np.zeros(3) if tool_position is None else np.asarray(tool_position, dtype=np.float64)
     determined = determine(used, found, at, name)
     _check_unique(used, determined, candidates, at, name)
-    return _judge(observations, name, inliers, determined, at, is_given=tool_position is not None)
+    return _judge(measurements, name, inliers, determined, at, is_given=tool_position is not None)
 
 
 def _check_numbers(
@@ -136,22 +141,22 @@ def _check_numbers(
 
 
 def _check_plausible(
-    observations: ToolObservations, candidates: FrameCandidates, name: str
+    measurements: ToolMeasurements, candidates: FrameCandidates, name: str
 ) -> None:
     """Refuse poses that no frames explain, with the mistake that would explain them.
 
     The rows that agree best are looked at: most are right, or all are wrong in one way.
     """
-    pairs = observations.pairs
+    pairs = measurements.pairs
     spread = float(np.sqrt(pairs.p.var(axis=0).sum()))
     left = float(np.sqrt(candidates.cost[0]))  # in lengths of the machine, and [rad]
     part = left / min(1.0, spread / pairs.length + 1e-12)
     if part <= _LARGE_RESIDUAL:
         return
-    _refuse_mistakes(observations, candidates, name)
+    _refuse_mistakes(measurements, candidates, name)
     if part > _MAX_RESIDUAL:
         size = f"{1e3 * left * pairs.length:.3g} mm"
-        turn = f" or {np.degrees(left):.3g} deg" * observations.is_oriented
+        turn = f" or {np.degrees(left):.3g} deg" * measurements.is_oriented
         raise DatasetError(
             f"{name}: base and tool could not be located: found poses about {size}{turn} from "
             "where the readings put them, whatever the frames, needed poses measured at these "
@@ -160,10 +165,10 @@ def _check_plausible(
 
 
 def _refuse_mistakes(
-    observations: ToolObservations, candidates: FrameCandidates, name: str
+    measurements: ToolMeasurements, candidates: FrameCandidates, name: str
 ) -> None:
     """Refuse poses that a common mistake explains."""
-    mistake = likely_mistake(observations.pairs, float(candidates.cost[0]), observations.fewest)
+    mistake = likely_mistake(measurements.pairs, float(candidates.cost[0]), measurements.fewest)
     if mistake is not None:
         raise DatasetError(
             f"{name}: base and tool could not be located: found poses that look like {mistake[0]}, "
@@ -173,15 +178,15 @@ def _refuse_mistakes(
 
 
 def _check_outliers(
-    observations: ToolObservations, candidates: FrameCandidates, inliers: Inliers, name: str
+    measurements: ToolMeasurements, candidates: FrameCandidates, inliers: Inliers, name: str
 ) -> None:
     """Refuse poses of which too many disagree."""
-    n, n_out = len(observations.pairs), int(np.sum(~inliers.is_inlier))
+    n, n_out = len(measurements.pairs), int(np.sum(~inliers.is_inlier))
     most = max(1, n // _MAX_OUTLIERS)
     if n_out <= most:
         return
-    _refuse_mistakes(observations, candidates, name)
-    rows = ", ".join(str(i) for i in observations.poses.numbers[~inliers.is_inlier])
+    _refuse_mistakes(measurements, candidates, name)
+    rows = ", ".join(str(i) for i in measurements.poses.numbers[~inliers.is_inlier])
     raise DatasetError(
         f"{name}: base and tool could not be located: found {n_out} of {n} rows that disagree with "
         f"the others ({rows}), needed at most {most}; check that readings and poses of these rows "
@@ -189,22 +194,22 @@ def _check_outliers(
     )
 
 
-def _check_scatter(observations: ToolObservations, found: FrameFit, name: str) -> None:
+def _check_scatter(measurements: ToolMeasurements, found: FrameFit, name: str) -> None:
     """Refuse to estimate a scatter from rows that leave nothing over."""
     for kind, (what, option) in enumerate(
         (("positions", "--position-sigma"), ("orientations", "--angle-sigma"))
     ):
-        if not observations.noise.stated[kind] and found.kind_dof[kind] < _MIN_DOF:
+        if not measurements.noise.stated[kind] and found.kind_dof[kind] < _MIN_DOF:
             raise NotIdentifiable(
                 f"{name}: the uncertainty could not be estimated: found {what} of "
-                f"{len(observations.pairs)} rows that leave {found.kind_dof[kind]:.2g} degrees of "
+                f"{len(measurements.pairs)} rows that leave {found.kind_dof[kind]:.2g} degrees of "
                 f"freedom, needed at least {_MIN_DOF:g}; measure more poses, or state how precise "
                 f"they are with {option}."
             )
 
 
 def _check_unique(
-    observations: ToolObservations,
+    measurements: ToolMeasurements,
     determined: Determinacy,
     candidates: FrameCandidates,
     at: Array,
@@ -217,20 +222,20 @@ def _check_unique(
         start = candidates.frames[i]
         if candidates.cost[i] > _SAME_COST * candidates.cost[0] + _ROUNDING:
             break
-        if not determined.held and _are_one(best.frames, start, observations.pairs.length):
+        if not determined.held and _are_one(best.frames, start, measurements.pairs.length):
             continue
         try:
-            other = fit(observations.pairs, start, noise, observations.by_model)
-            other = hold(observations, other, at)
+            other = fit(measurements.pairs, start, noise, measurements.by_model)
+            other = hold(measurements, other, at)
         except (DidNotConverge, np.linalg.LinAlgError):
             continue
-        is_other = not _are_one(best.frames, other.frames, observations.pairs.length)
+        is_other = not _are_one(best.frames, other.frames, measurements.pairs.length)
         if is_other and other.chi2 < best.chi2 + _SAME_CHI2:
             shift, turn = _apart(best.frames, other.frames)
             raise NotIdentifiable(
                 f"{name}: base and tool could not be located: found two answers, "
                 f"{1e3 * shift:.3g} mm and {np.degrees(turn):.3g} deg apart, that explain the "
-                f"{len(observations.pairs)} poses equally well, needed one; add poses from all "
+                f"{len(measurements.pairs)} poses equally well, needed one; add poses from all "
                 "over the workspace."
             )
 
@@ -249,7 +254,7 @@ def _apart(one: Array, other: Array) -> tuple[float, float]:
 
 
 def _judge(
-    observations: ToolObservations,
+    measurements: ToolMeasurements,
     name: str,  # what the poses are called
     inliers: Inliers,  # the rows that the frames rest on
     determined: Determinacy,
@@ -261,33 +266,33 @@ def _judge(
     found = determined.fit
     p_value, too_large, too_small = _tested(found)
     base, tool = transforms(found.frames)
-    if not observations.is_oriented:
+    if not measurements.is_oriented:
         tool = RigidTransform.from_translation(tool.translation)
-    tool_position, tool_angle = _at_the_tool(observations, determined)
-    left_out = observations.poses.numbers[~inliers.is_inlier].tolist()
-    status: Status = "located in part" if determined.held else "located"
+    tool_position, tool_angle = _at_the_tool(measurements, determined)
+    left_out = measurements.poses.numbers[~inliers.is_inlier].tolist()
+    status: LocationStatus = "located in part" if determined.held else "located"
     if too_large:
         status = "doubtful"
     return Location(
-        model=str(observations.machine.yaml_path),
+        model=str(measurements.machine.yaml_path),
         poses=name,
         T_world_base=base,
         T_platform_tool=tool,
-        has_tool_orientation=observations.is_oriented,
+        has_tool_orientation=measurements.is_oriented,
         covariance=0.5 * (determined.covariance + determined.covariance.T),
         held=determined.held,
         held_at=(float(at[0]), float(at[1]), float(at[2])),
         held_words=determined.words,
-        noise=_noise(observations, found),
-        rows=tuple(_rows(observations, inliers, found)),
+        noise=_noise(measurements, found),
+        rows=tuple(_rows(measurements, inliers, found)),
         chi2=found.chi2,
         dof=found.dof,
         p_value=p_value,
         tool_position_sigma=tool_position,
         tool_angle_sigma=tool_angle,
         status=status,
-        sentence=_sentence(observations, determined, left_out, too_large),
-        notes=tuple(_notes(observations, determined, inliers, too_small, is_given=is_given)),
+        sentence=_sentence(measurements, determined, left_out, too_large),
+        notes=tuple(_notes(measurements, determined, inliers, too_small, is_given=is_given)),
     )
 
 
@@ -312,27 +317,27 @@ def _tested(found: FrameFit) -> tuple[float | None, str, str]:
     return p_value, " and ".join(large) if p_value < _MIN_P else "", too_small
 
 
-def _noise(observations: ToolObservations, found: FrameFit) -> MeasurementNoise:
+def _noise(measurements: ToolMeasurements, found: FrameFit) -> MeasurementNoise:
     """Return what was stated or found of the measurement."""
     rms = found.noise.rms
-    oriented = observations.is_oriented
+    oriented = measurements.is_oriented
     return MeasurementNoise(
         position=float(rms[0]),
         angle=float(rms[1]) if oriented else None,
-        position_stated=observations.noise.stated[0],
-        angle_stated=observations.noise.stated[1] and oriented,
-        reading=observations.encoder_sigma,
-        model=observations.by_model is not None,
+        position_stated=measurements.noise.stated[0],
+        angle_stated=measurements.noise.stated[1] and oriented,
+        reading=measurements.encoder_sigma,
+        model=measurements.by_model is not None,
     )
 
 
-def _rows(observations: ToolObservations, inliers: Inliers, found: FrameFit) -> list[RowResidual]:
+def _rows(measurements: ToolMeasurements, inliers: Inliers, found: FrameFit) -> list[RowResidual]:
     """Return the residuals of all rows; errors of the model are not taken out of them."""
-    pairs = observations.pairs
+    pairs = measurements.pairs
     r = residuals(found.frames, pairs)
     rows = []
-    for i, number in enumerate(observations.poses.numbers.tolist()):
-        reason = "" if inliers.is_inlier[i] else _off(observations, inliers, i)
+    for i, number in enumerate(measurements.poses.numbers.tolist()):
+        reason = "" if inliers.is_inlier[i] else _off(measurements, inliers, i)
         rows.append(
             RowResidual(
                 number,
@@ -344,47 +349,47 @@ def _rows(observations: ToolObservations, inliers: Inliers, found: FrameFit) -> 
     return rows
 
 
-def _off(observations: ToolObservations, inliers: Inliers, i: int) -> str:
+def _off(measurements: ToolMeasurements, inliers: Inliers, i: int) -> str:
     """Return how far a row is from where the others predict it."""
-    sigma = inliers.factor * observations.noise.sigma[i]
+    sigma = inliers.factor * measurements.noise.sigma[i]
     found = f"{1e3 * inliers.distance[i]:.3g} mm"
     scatter = f"{1e3 * sigma[0]:.2g} mm"
-    if observations.pairs.oriented[i]:
+    if measurements.pairs.oriented[i]:
         found += f" and {np.degrees(inliers.angle[i]):.3g} deg"
         scatter += f" and {np.degrees(sigma[1]):.2g} deg"
     return f"{found} from where the other rows predict it, which scatter {scatter}"
 
 
 def _at_the_tool(
-    observations: ToolObservations, determined: Determinacy
+    measurements: ToolMeasurements, determined: Determinacy
 ) -> tuple[float, float | None]:
     """Return how well the frames put the tool in the world, rms over the poses [m], [rad]."""
-    J = jacobian(determined.fit.frames, observations.pairs)
+    J = jacobian(determined.fit.frames, measurements.pairs)
     variance = np.einsum("nij,jk,nik->ni", J, determined.covariance, J)
     position = float(np.sqrt(variance[:, :3].sum(axis=1).mean()))
-    oriented = observations.pairs.oriented
+    oriented = measurements.pairs.oriented
     if not oriented.any():
         return position, None
     return position, float(np.sqrt(variance[oriented, 3:].sum(axis=1).mean()))
 
 
 def _sentence(
-    observations: ToolObservations, determined: Determinacy, left_out: Sequence[int], too_large: str
+    measurements: ToolMeasurements, determined: Determinacy, left_out: Sequence[int], too_large: str
 ) -> str:
     """Return the verdict."""
-    used = len(observations.poses) - len(left_out)
+    used = len(measurements.poses) - len(left_out)
     sigma = np.sqrt(np.maximum(np.diagonal(determined.covariance), 0.0)).reshape(4, 3)
     size = np.linalg.norm(sigma, axis=1)
     base = f"{1e3 * size[0]:.2g} mm and {np.degrees(size[1]):.2g} deg"
     known = [
         f"{1e3 * size[2]:.2g} mm" * bool(size[2] > _FIXED_TOLERANCE),
         f"{np.degrees(size[3]):.2g} deg"
-        * bool(observations.is_oriented and size[3] > _FIXED_TOLERANCE),
+        * bool(measurements.is_oriented and size[3] > _FIXED_TOLERANCE),
     ]
     tool = " and ".join(words for words in known if words)
     tool = f", the tool in the platform to {tool}" if tool else ""
-    tool += "" if observations.is_oriented else " (its position only)"
-    rows = f"{used} of {len(observations.poses)} poses" if left_out else f"{used} poses"
+    tool += "" if measurements.is_oriented else " (its position only)"
+    rows = f"{used} of {len(measurements.poses)} poses" if left_out else f"{used} poses"
     out = ""
     if left_out:
         several = len(left_out) > 1
@@ -401,13 +406,13 @@ def _sentence(
     start = "Base and tool are located" + " in part" * bool(determined.held)
     return (
         f"{start} from {rows}: the base in the world to {base}{tool} "
-        f"(1 sigma{'' if observations.by_model is not None else ', if the model is right'})."
+        f"(1 sigma{'' if measurements.by_model is not None else ', if the model is right'})."
         f"{' ' * bool(determined.words)}{determined.words}{out}"
     )
 
 
 def _notes(
-    observations: ToolObservations,
+    measurements: ToolMeasurements,
     determined: Determinacy,
     inliers: Inliers,
     too_small: str,
@@ -415,16 +420,16 @@ def _notes(
     is_given: bool,
 ) -> list[str]:
     """Return what else a reader should know."""
-    notes = [*observations.poses.notes, *determined.weak]
-    if observations.by_model is None:
+    notes = [*measurements.poses.notes, *determined.weak]
+    if measurements.by_model is None:
         notes.append(
             "Nothing is known of the errors of the model, which move all poses at once: the "
             "standard deviations hold for a model without errors; locate the model in the folder "
             "of its calibration, or state how precise the measurement is to have it tested."
         )
-    if int(inliers.is_inlier.sum()) == observations.fewest:
+    if int(inliers.is_inlier.sum()) == measurements.fewest:
         notes.append(
-            f"A wrong row among the {observations.fewest} poses could not have been noticed; "
+            f"A wrong row among the {measurements.fewest} poses could not have been noticed; "
             "measure more."
         )
     if too_small:

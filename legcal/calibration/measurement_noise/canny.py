@@ -35,7 +35,7 @@ QUANTUM = 1.0 / 12.0  # variance of a coordinate that is rounded to whole pixels
 
 
 @dataclass(frozen=True, eq=False)
-class _Line:
+class _CannyLine:
     """A line through edge points: offsets at the band's ends, used stretch, covariance there."""
 
     v: Array  # (2,) [px]
@@ -96,7 +96,7 @@ def _measured(search: ImageSearch, part: LegPart, xy: Array) -> Outlines:
     return part_outlines(search, leg, link, reasons, found, found=part)
 
 
-def _line(t: Array, v: Array, start: Array, length: float, free: float) -> _Line | None:
+def _line(t: Array, v: Array, start: Array, length: float, free: float) -> _CannyLine | None:
     """Return the line of the points near a line known to a pixel; None if there are too few."""
     ends = np.asarray(start, dtype=np.float64)
     chosen = np.zeros(len(t), dtype=np.bool_)
@@ -115,7 +115,7 @@ def _line(t: Array, v: Array, start: Array, length: float, free: float) -> _Line
     design = np.column_stack([1.0 - along, along])
     variance = max(float(residual @ residual) / (len(t) - 2), QUANTUM / len(t))
     covariance = variance * np.linalg.inv(design.T @ design)
-    return _Line(ends, place, np.asarray(covariance), len(t) / free)
+    return _CannyLine(ends, place, np.asarray(covariance), len(t) / free)
 
 
 def _least_squares(t: Array, v: Array, length: float) -> Array:
@@ -127,7 +127,7 @@ def _least_squares(t: Array, v: Array, length: float) -> Array:
     return np.asarray(centre[1] + slope * (np.array([0.0, length]) - centre[0]))
 
 
-def _reasons(part: LegPart, lines: Sequence[_Line | None]) -> tuple[str, str]:
+def _reasons(part: LegPart, lines: Sequence[_CannyLine | None]) -> tuple[str, str]:
     """Return why each outline is not to be used, "" if it is."""
     least = max(MIN_LENGTH[0], MIN_LENGTH[1] * 2.0 * part.half_width)
     reasons = []

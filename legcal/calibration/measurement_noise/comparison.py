@@ -37,7 +37,7 @@ from legcal.perception import (
     measure,
     measure_photographs,
     nominal_placement,
-    place,
+    recognise_and_place,
 )
 from legcal.progress import Report, no_progress
 from legcal.vision import EPSILON
@@ -174,7 +174,7 @@ def _search(
     views = {group.view for group in repeats}  # placed by one image of every pose
     groups = group_rows(measurements, every.detect)
     rows = np.sort([group.rows[0] for group in groups if group.view in views])
-    placement = place(replace(every, detect=rows), nominal, progress)
+    placement = recognise_and_place(replace(every, detect=rows), nominal, progress)
     placement.require_one()
     repeated = replace(every, detect=np.sort(np.concatenate([group.rows for group in repeats])))
     found = {

@@ -16,7 +16,7 @@ from legcal.simulation.rendering.rays import (
     is_hidden,
     normals,
 )
-from legcal.simulation.solids import Box, Cylinder, Sphere
+from legcal.simulation.solids import Box, SolidCylinder, Sphere
 
 _TINY = 1e-12
 _SMALLEST = 1e-5  # [m] half-shadow of a point-like lamp
@@ -44,13 +44,15 @@ class Occluders:
     """Solids that stand between points and lamps: long ones around a line, others in a ball."""
 
     def __init__(self, solids: Sequence[SolidInView]) -> None:
-        long = [isinstance(s.shape, Cylinder) and s.shape.length > s.shape.radius for s in solids]
+        long = [
+            isinstance(s.shape, SolidCylinder) and s.shape.length > s.shape.radius for s in solids
+        ]
         self._lines = [i for i, is_long in enumerate(long) if is_long]
         self._balls = [i for i, is_long in enumerate(long) if not is_long]
         self.solids = tuple(solids)
         self._u = np.array([solids[i].R[:, 2] for i in self._lines]).reshape(-1, 3)
         self._w = np.array([solids[i].w for i in self._lines]).reshape(-1, 3)
-        self._radius = np.array([s.shape.radius if isinstance(s.shape, Cylinder) else 0.0
+        self._radius = np.array([s.shape.radius if isinstance(s.shape, SolidCylinder) else 0.0
                                  for s in (solids[i] for i in self._lines)])  # fmt: skip
         self._centre = np.array([solids[i].centre for i in self._balls]).reshape(-1, 3)
         self._reach = np.array([solids[i].reach for i in self._balls])
@@ -103,7 +105,7 @@ def seen_of_lamp(lamp: Lamp, P: Single, occluders: Occluders, own: IntArray | in
 def _past(solid: SolidInView, lamp: Lamp, P: Single, to_lamp: Single) -> Single:
     """Return the share of the lamp seen past a solid."""
     shape = solid.shape
-    if isinstance(shape, Cylinder):
+    if isinstance(shape, SolidCylinder):
         return _past_cylinder(solid, shape, lamp, P, to_lamp)
     if isinstance(shape, Sphere):
         return _past_sphere(solid, shape, lamp, P, to_lamp)
@@ -113,7 +115,7 @@ def _past(solid: SolidInView, lamp: Lamp, P: Single, to_lamp: Single) -> Single:
 
 
 def _past_cylinder(
-    solid: SolidInView, shape: Cylinder, lamp: Lamp, P: Single, to_lamp: Single
+    solid: SolidInView, shape: SolidCylinder, lamp: Lamp, P: Single, to_lamp: Single
 ) -> Single:
     """Return the share of the lamp seen past a cylinder."""
     R = solid.R.T.astype(np.float32)
@@ -291,7 +293,7 @@ class CoarseSurface:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class VisibleSolid:
     """What is seen of one solid."""
 
     solid: int  # the solid, as an index
@@ -325,7 +327,7 @@ class Part:
 
 
 def shares_of_lamps(
-    parts: Sequence[Part], lamps: Sequence[Lamp], occluders: Occluders, rays: PixelRays
+    parts: Sequence[VisibleSolid], lamps: Sequence[Lamp], occluders: Occluders, rays: PixelRays
 ) -> list[list[Single | None]]:
     """Return the share of each lamp that each part sees, for each part and lamp.
 
@@ -362,6 +364,6 @@ def shares_of_lamps(
     return found
 
 
-def _traced(part: Part, some: IntArray) -> Single:
+def _traced(part: VisibleSolid, some: IntArray) -> Single:
     """Return a point of each of some pixels, (3, n)."""
     return part.shaded.P[:, some if part.first is None else part.first[some]]

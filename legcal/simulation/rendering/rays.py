@@ -12,7 +12,7 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array, IntArray
-from legcal.simulation.solids import Box, Cylinder, Material, Mesh, PlacedSolid, Shape, Sphere
+from legcal.simulation.solids import Box, Material, Mesh, PlacedSolid, Shape, SolidCylinder, Sphere
 from legcal.vision import Camera
 
 Single = NDArray[np.float32]
@@ -140,7 +140,7 @@ def holding_sphere(shape: Shape) -> tuple[Array, float]:
         low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
         middle = 0.5 * (low + high)
         return middle, float(np.linalg.norm(shape.vertices - middle, axis=1).max())
-    if isinstance(shape, Cylinder):
+    if isinstance(shape, SolidCylinder):
         return np.zeros(3), float(np.hypot(shape.radius, 0.5 * shape.length))
     if isinstance(shape, Sphere):
         return np.zeros(3), shape.radius
@@ -184,7 +184,7 @@ def _caster(mesh: Mesh) -> Any:
 def intersect(solid: SolidInView, x: Single, y: Single) -> tuple[Single, Faces]:
     """Return where rays enter a solid."""
     shape = solid.shape
-    if isinstance(shape, Cylinder):
+    if isinstance(shape, SolidCylinder):
         return _cylinder(solid, shape, x, y)
     if isinstance(shape, Sphere):
         return _sphere(solid, shape, x, y)
@@ -199,7 +199,7 @@ def normals(solid: SolidInView, P: Single, face: Faces) -> Single:
     w = solid.w.astype(np.float32)[:, None]
     if isinstance(shape, Sphere):
         return np.asarray((P - w) * np.float32(1.0 / shape.radius))
-    if isinstance(shape, Cylinder):
+    if isinstance(shape, SolidCylinder):
         u = solid.R[:, 2].astype(np.float32)
         away = P - w
         s = u @ away
@@ -218,7 +218,9 @@ def normals(solid: SolidInView, P: Single, face: Faces) -> Single:
     return np.asarray(n.T.astype(np.float32))
 
 
-def _cylinder(solid: SolidInView, shape: Cylinder, x: Single, y: Single) -> tuple[Single, Faces]:
+def _cylinder(
+    solid: SolidInView, shape: SolidCylinder, x: Single, y: Single
+) -> tuple[Single, Faces]:
     """Return depths and faces of a closed cylinder."""
     ux, uy, uz = solid.R[:, 2].tolist()
     wx, wy, wz = solid.w.tolist()
@@ -303,7 +305,7 @@ def footprint(rays: PixelRays, solid: SolidInView) -> IntArray:
 def surrounding_points(solid: SolidInView) -> Array:
     """Return points whose convex hull holds the solid, (n, 3), in the camera frame [m]."""
     shape = solid.shape
-    if isinstance(shape, Cylinder):
+    if isinstance(shape, SolidCylinder):
         n = 12
         angles = 2.0 * np.pi * np.arange(n) / n
         outer = shape.radius / np.cos(np.pi / n)

@@ -16,7 +16,7 @@ from legcal.simulation.rendering.light import (
     Lamp,
     Lighting,
     Occluders,
-    Part,
+    VisibleSolid,
     shade,
     shares_of_lamps,
 )
@@ -34,12 +34,12 @@ from legcal.simulation.rendering.rays import (
 )
 from legcal.simulation.solids import (
     Box,
-    Cylinder,
     Material,
     Mesh,
     PlacedSolid,
     Shape,
     Solid,
+    SolidCylinder,
     Sphere,
 )
 from legcal.vision import Camera
@@ -85,7 +85,7 @@ def _table(
 def _lowest(placed: PlacedSolid, up: Array) -> float:
     """Return the height of the lowest point of a solid."""
     shape, T = placed.solid.shape, placed.T_base_solid
-    if isinstance(shape, Cylinder):
+    if isinstance(shape, SolidCylinder):
         c = abs(float(T.rotation.as_matrix()[:, 2] @ up))
         down = 0.5 * shape.length * c + shape.radius * max(1.0 - c * c, 0.0) ** 0.5
         return float(T.translation @ up) - float(down)
@@ -112,7 +112,7 @@ def _piece(
     kind = rng.choice(3, p=[0.5, 0.4, 0.1])
     shape: Shape
     if kind == 0:
-        shape = Cylinder(size * rng.uniform(0.03, 0.15), size * rng.uniform(1.5, 4.0))
+        shape = SolidCylinder(size * rng.uniform(0.03, 0.15), size * rng.uniform(1.5, 4.0))
     elif kind == 1:
         a, b, c = (size * rng.uniform(0.3, 1.2, 3)).tolist()
         shape = Box((a, b, c))
@@ -154,7 +154,7 @@ def _cable(
         "xz", [np.pi / 2 + rng.uniform(-0.3, 0.3), rng.uniform(0.0, np.pi)]
     )
     where = eye + t * way + width * aside
-    shape = Cylinder(width * rng.uniform(0.006, 0.02), 6.0 * width)
+    shape = SolidCylinder(width * rng.uniform(0.006, 0.02), 6.0 * width)
     return _placed(f"cable{number + 1}", shape, RigidTransform.from_components(where, turn), _CABLE)
 
 
@@ -191,7 +191,7 @@ def develop(radiance: Single, appearance: Appearance, rng: np.random.Generator) 
 
 
 @dataclass(frozen=True, eq=False)
-class Canvas:
+class FrameBuffer:
     """A picture being painted."""
 
     z: Single  # (n,) depth of what every pixel's centre shows [m]; infinite for the background
@@ -207,7 +207,10 @@ class Painter:
         self.rays, self.light, self.samples = rays, light, samples
 
     def paint(
-        self, canvas: Canvas, solids: Sequence[SolidInView], bystanders: Sequence[SolidInView] = ()
+        self,
+        canvas: FrameBuffer,
+        solids: Sequence[SolidInView],
+        bystanders: Sequence[SolidInView] = (),
     ) -> None:
         """Paint solids over a picture, where they are in front of what it shows."""
         behind = canvas.z.copy()
@@ -224,7 +227,7 @@ class Painter:
                 x, y = self.rays.x.take(inside), self.rays.y.take(inside)
                 ink = printed_inside(solid, self.rays, inside, face[inside], self.samples)
                 shaded = shade(solid, x, y, canvas.z[inside], face[inside], self.light, ink)
-                parts.append(Part(i, inside, shaded))
+                parts.append(VisibleSolid(i, inside, shaded))
         seen = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
         for part, shares in zip(parts, seen, strict=True):
             canvas.terms[:, :, part.pixels] = part.radiance(shares, len(canvas.terms))
@@ -296,7 +299,7 @@ class Painter:
 
     def _paint_edge(
         self,
-        canvas: Canvas,
+        canvas: FrameBuffer,
         pixels: IntArray,
         behind: Single,
         solids: Sequence[SolidInView],
@@ -333,7 +336,7 @@ class Painter:
                 x, y, face = X.take(at), Y.take(at), faces.take(at)
                 ink = printed(solids[i], x, y, face)
                 shaded = shade(solids[i], x, y, Z.take(at), face, self.light, ink)
-                parts.append(Part(i, at[first] // S, shaded, first))
+                parts.append(VisibleSolid(i, at[first] // S, shaded, first))
                 weights.append(weight)
         seen = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
         for part, shares, weight in zip(parts, seen, weights, strict=True):
@@ -361,7 +364,7 @@ def _thickness(solid: SolidInView) -> float:
     shape = solid.shape
     if isinstance(shape, Box):
         return min(shape.size)
-    if isinstance(shape, Cylinder):
+    if isinstance(shape, SolidCylinder):
         return min(2.0 * shape.radius, shape.length)
     if isinstance(shape, Sphere):
         return 2.0 * shape.radius
@@ -375,7 +378,7 @@ class RenderedView:
     T_camera_base: RigidTransform  # pose of the base frame in the camera
     appearance: Appearance
     painter: Painter  # paints with the camera and the light
-    canvas: Canvas  # the surroundings, their light apart by lamp
+    canvas: FrameBuffer  # the surroundings, their light apart by lamp
     bystanders: tuple[SolidInView, ...]  # what stands around and casts shadows on the machine
     foreground: tuple[SolidInView, ...]  # what hangs in front of it
 
@@ -383,7 +386,7 @@ class RenderedView:
         """Return a photograph of solids in this scene."""
         rays = self.painter.rays
         solids = [*in_view(placed, self.T_camera_base), *self.foreground]
-        canvas = Canvas(self.canvas.z.copy(), self._backdrop(solids))
+        canvas = FrameBuffer(self.canvas.z.copy(), self._backdrop(solids))
         self.painter.paint(canvas, solids, self.bystanders)
         radiance = canvas.terms[0].reshape(-1, rays.height, rays.width)
         grey = (
@@ -481,7 +484,7 @@ def _lighting(
 
 def _empty(
     rays: PixelRays, light: Lighting, appearance: Appearance, rng: np.random.Generator
-) -> Canvas:
+) -> FrameBuffer:
     """Return the background alone."""
     n = rays.width * rays.height
     terms = np.zeros((1 + len(light.lamps), light.n_channels, n), dtype=np.float32)
@@ -489,4 +492,4 @@ def _empty(
     if appearance.background_contrast > 0.0:
         picture = background(rays.width, rays.height, appearance.background_contrast, rng)
         terms[0] *= picture.ravel()
-    return Canvas(np.full(n, np.inf, dtype=np.float32), terms)
+    return FrameBuffer(np.full(n, np.inf, dtype=np.float32), terms)

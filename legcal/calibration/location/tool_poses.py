@@ -242,8 +242,8 @@ class PoseNoise:
 
 
 @dataclass(frozen=True, eq=False)
-class ToolObservations:
-    """Measured poses with all that is known of their errors."""
+class ToolMeasurements:
+    """Measured tool poses with all that is known of their errors."""
 
     machine: Machine
     poses: ToolPoses  # as measured
@@ -256,7 +256,7 @@ class ToolObservations:
     by_model: Array | None
     fewest: int  # poses that can determine the frames
 
-    def of(self, rows: BoolArray) -> ToolObservations:
+    def of(self, rows: BoolArray) -> ToolMeasurements:
         """Return some rows, with the measured poses as they were."""
         return replace(
             self,
@@ -279,7 +279,7 @@ class ToolObservations:
         return bool(self.pairs.oriented.any())
 
 
-def observations_of(
+def tool_measurements(
     machine: Machine,
     poses: ToolPoses,
     name: str,  # what they are called in messages
@@ -289,7 +289,7 @@ def observations_of(
     position_sigma: float | None,
     angle_sigma: float | None,
     encoder_sigma: float,
-) -> ToolObservations:
+) -> ToolMeasurements:
     """Return measured poses beside those of the platform, with what is known of their errors.
 
     Raises NotIdentifiable if there are too few poses, or the motors do not determine the pose;
@@ -312,7 +312,7 @@ def observations_of(
         length=_RADIAN * leg_scale(machine, machine.home),
     )
     by_model = _motions_by_model(machine, T)
-    return ToolObservations(
+    return ToolMeasurements(
         machine=machine,
         poses=poses,
         pairs=pairs,

@@ -11,7 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from legcal.calibration.joint_fit.determinacy import Held, held_at_nominal, open_directions
+from legcal.calibration.joint_fit.determinacy import (
+    HeldDirections,
+    held_at_nominal,
+    open_directions,
+)
 from legcal.calibration.joint_fit.parameter_choices import BOARD_SCALE, Prior
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
@@ -248,7 +252,9 @@ def _wide_prior(problem: FitProblem, state: State, name: str, value: float, sigm
     return Prior(value, max(float(wide), sigma))
 
 
-def _fitted(problem: FitProblem, state: State, settings: RefinementSettings) -> tuple[Fit, Held]:
+def _fitted(
+    problem: FitProblem, state: State, settings: RefinementSettings
+) -> tuple[Fit, HeldDirections]:
     """Return the fit with what was fixed free, and what it holds."""
     first = first_minimum(problem, state, settings)
     normal = information(problem, first.state, first.linear, PseudoHuber(settings.loss_width))
@@ -262,7 +268,7 @@ def _fitted(problem: FitProblem, state: State, settings: RefinementSettings) -> 
 
 def _compared(
     fit: Fit,
-    held: Held,
+    held: HeldDirections,
     stated: Mapping[str, tuple[float, float]],
     wide: Mapping[str, Prior],
     settings: RefinementSettings,
@@ -305,7 +311,7 @@ def _compared(
     return comparisons
 
 
-def _held_information(problem: FitProblem, held: Held, length: float) -> Array:
+def _held_information(problem: FitProblem, held: HeldDirections, length: float) -> Array:
     """Return the normal matrix (n_named, n_named) of a nominal model along what is held.
 
     Where the fit holds a direction at nominal that stated values would determine, as radii do the
