@@ -3,10 +3,11 @@
 from functools import cache
 
 import numpy as np
+from rendering import photograph
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array, Image
-from legcal.simulation import Appearance, PlacedBoard, render
+from legcal.simulation import Appearance, PlacedBoard
 from legcal.simulation.solids import Box, Material, PlacedSolid, Solid
 from legcal.vision.board import APRIL_TAGS, Board
 from legcal.vision.camera import Camera
@@ -46,7 +47,7 @@ def picture(
         "samples": 34,
     }
     appearance = Appearance.clean(**{**how, **looks})
-    image = render(placed, LENS, T_board_camera, appearance, np.random.default_rng(1))
+    image = photograph(placed, LENS, T_board_camera, appearance, np.random.default_rng(1))
     return np.asarray(image, dtype=np.float32) / (257.0 if image.dtype == np.uint16 else 1.0)
 
 

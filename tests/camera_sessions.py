@@ -5,11 +5,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 from boards import before
+from rendering import photograph
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
 from legcal.perception import BoardImages
-from legcal.simulation import Appearance, PlacedBoard, render
+from legcal.simulation import Appearance, PlacedBoard
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import ImageSize
@@ -111,7 +112,7 @@ def photographs(
         turn = np.array([0.5 * np.cos(2.4 * k), 0.5 * np.sin(2.4 * k), rng.uniform(-0.3, 0.3)])
         distance = rng.uniform(0.36, 0.44) * (0.55 if camera.model == "equidistant" else 1.0)
         aside = RigidTransform.from_translation([*rng.uniform(-0.03, 0.03, 2), 0.0])
-        image = render([plate], camera, before(board, distance, turn) * aside, looks, rng)
+        image = photograph([plate], camera, before(board, distance, turn) * aside, looks, rng)
         paths.append(folder / f"b{k:02d}.png")
         assert cv2.imwrite(str(paths[-1]), np.asarray(image))
     return paths

@@ -18,7 +18,7 @@ from legcal import simulation
 from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.variables import FittedLegs, Start, fitted_legs, start_from
 from legcal.data import LegAxes, Measurements, Outlines, View
-from legcal.data.axes import axes_of_table, table_of_axes
+from legcal.data.axes import axes_of_table
 from legcal.data.corners import Corners, found_corners
 from legcal.geometry import Array, components, motions_of
 from legcal.machine import (
@@ -39,6 +39,7 @@ from legcal.machine import (
 from legcal.simulation import (
     PAPER_VIEWS,
     OutlineNoise,
+    Scene,
     TableNoise,
     Viewpoint,
     hexapod_cameras,
@@ -49,6 +50,7 @@ from legcal.simulation import (
     perturb,
     plain_scene,
 )
+from legcal.simulation.observe import axes_in_images
 from legcal.vision import Board, Camera
 
 K = np.array([[1290.0, 0.0, 518.0], [0.0, 1280.0, 380.0], [0.0, 0.0, 1.0]])
@@ -441,6 +443,7 @@ class AxesSession:
     legs: FittedLegs
     measurements: Measurements
     axes: LegAxes
+    scene: Scene
     truth: Start
 
     @property
@@ -452,9 +455,7 @@ class AxesSession:
         """Return readings and axes with the errors that they claim."""
         rng, m = np.random.default_rng(seed), self.measurements
         error = rng.normal(scale=m.sigma_q, size=(m.n_poses, len(self.legs.names)))
-        values, sigmas = table_of_axes(self.axes)
-        values += sigmas * rng.normal(size=values.shape)
-        axes = axes_of_table(self.axes.row, self.axes.leg, values, sigmas)
+        axes = axes_of_table(*axes_in_images(self.scene, TableNoise(), rng))
         return replace(m, q=m.q + error[m.pose]), axes
 
     def start(self, seed: int = 7, joints: float = 0.002) -> Start:
@@ -504,6 +505,7 @@ def axes_session(
         FittedLegs(machine.leg_names, legs_true, machine.sign, machine.frame_legs, {}),
         replace(session.measurements, views=near.measurements.views),
         session.axes,
+        session.scene,
         Start(
             legs_true,
             tuple(camera.T_Rb_camera.inv() for camera in cameras),

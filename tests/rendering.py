@@ -12,11 +12,23 @@ import yaml
 from scipy.spatial.transform import RigidTransform
 
 from legcal.files import motion_to_xyz_quat
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, Image
 from legcal.machine import Machine, load_mechanism, random_configurations
-from legcal.simulation import look_at
+from legcal.simulation import Appearance, look_at, prepare_view
+from legcal.simulation.solids import PlacedSolid
 from legcal.vision.camera import Camera
 from legcal.vision.visibility import visible_segments
+
+
+def photograph(
+    placed: Sequence[PlacedSolid],
+    camera: Camera,
+    T_base_camera: RigidTransform,
+    appearance: Appearance,
+    rng: np.random.Generator,
+) -> Image:
+    """Return a photograph of solids by the renderer of the package."""
+    return prepare_view(placed, camera, T_base_camera, appearance, rng).render(placed, rng)
 
 
 @dataclass(frozen=True, eq=False)

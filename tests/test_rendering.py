@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from rendering import photograph
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings
 from thinned import thinned
@@ -16,7 +17,7 @@ from legcal.data.outlines import read_observations
 from legcal.errors import UsageError
 from legcal.geometry import Array
 from legcal.machine import Machine, load_mechanism
-from legcal.simulation import Appearance, Level, Light, prepare_view, render, simulate
+from legcal.simulation import Appearance, Level, Light, prepare_view, simulate
 from legcal.simulation.solids import (
     Box,
     Material,
@@ -118,7 +119,7 @@ def edge_errors(image: Array, camera: Camera, h: Array, inward: Array) -> Array:
 def clean(placed: list[PlacedSolid], **changes: Any) -> Array:
     """Return radiance of solids before a pinhole at the origin, 0 to 1."""
     looks = Appearance.clean(**changes)
-    image = render(placed, LENSES["pinhole"], IDENTITY, looks, np.random.default_rng(0))
+    image = photograph(placed, LENSES["pinhole"], IDENTITY, looks, np.random.default_rng(0))
     return np.asarray(image / (2.0**looks.bits - 1.0))
 
 
@@ -130,7 +131,9 @@ def test_outlines_are_where_the_tangent_planes_are(lens: str, radius: float) -> 
     for degrees in range(0, 180, 15):
         placed, u, M = bar(math.radians(degrees) + 1e-3, radius)
         looks = Appearance.clean()
-        image = render([placed], camera, IDENTITY, looks, np.random.default_rng(0)).astype(float)
+        image = photograph([placed], camera, IDENTITY, looks, np.random.default_rng(0)).astype(
+            float
+        )
         for h, epsilon in zip(outlines_of_axis(u, M, radius), (1.0, -1.0), strict=True):
             errors = edge_errors(image, camera, h, epsilon * h[:2])
             assert len(errors) > 100
@@ -232,7 +235,7 @@ def test_light_on_a_wall_falls_with_the_square_of_the_distance_of_its_lamp() -> 
 def test_every_solid_of_every_mechanism_is_shown_where_it_is(shipped: Machine) -> None:
     solids = placed(solids_of(shipped), link_poses(shipped, shipped.home_configuration))
     camera, T = LENSES["pinhole"], looking_at(shipped, solids)
-    image = render(solids, camera, T, Appearance.clean(), np.random.default_rng(0)) / 65535.0
+    image = photograph(solids, camera, T, Appearance.clean(), np.random.default_rng(0)) / 65535.0
     middles = T.inv().apply(np.array([p.T_base_solid.translation for p in solids]))
     for u, v in np.rint(camera.project(middles)).astype(int):
         assert image[v, u] > 0.3

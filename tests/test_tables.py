@@ -23,13 +23,14 @@ from legcal.data import (
     axes_of_table,
     join_axes,
     no_outlines,
+    write_axis_table,
     write_observations,
 )
-from legcal.data.axes import read_axes, write_axes
+from legcal.data.axes import read_axes
 from legcal.data.measurements import row_names
 from legcal.data.outlines import ENCODING, QUALITY, read_observations, reject_unused_legs
 from legcal.errors import DatasetError
-from legcal.geometry import Array
+from legcal.geometry import Array, IntArray
 
 FAST = settings(
     deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -38,16 +39,23 @@ MEASUREMENTS = recorded(labels=["", "", "a", "b"])
 OPTIONAL = (*QUALITY, *ENCODING)
 
 
-def axes_of(seed: int = 0) -> LegAxes:
+AxisTable = tuple[IntArray, IntArray, Array, Array]  # row, leg, values and sigmas of Table 1
+
+
+def axis_table(seed: int = 0) -> AxisTable:
     rng = np.random.default_rng(seed)
     row, leg = np.divmod(np.arange(12, dtype=np.intp), 3)
     values = rng.uniform([-1.2, -1.2, -0.3, 0.6], [1.2, 1.2, 0.3, 1.2], (12, 4))
-    return axes_of_table(row, leg, values, rng.uniform(1e-4, 1e-3, (12, 4)))
+    return row, leg, values, rng.uniform(1e-4, 1e-3, (12, 4))
 
 
-def written(folder: Path, table: Outlines | LegAxes) -> Path:
-    if isinstance(table, LegAxes):
-        write_axes(folder / "axes.csv", table, MEASUREMENTS, LEG_NAMES)
+def axes_of(seed: int = 0) -> LegAxes:
+    return axes_of_table(*axis_table(seed))
+
+
+def written(folder: Path, table: Outlines | AxisTable) -> Path:
+    if isinstance(table, tuple):
+        write_axis_table(folder / "axes.csv", *table, MEASUREMENTS, LEG_NAMES)
         return folder / "axes.csv"
     write_observations(folder / "observations.csv", table, MEASUREMENTS, LEG_NAMES)
     return folder / "observations.csv"
@@ -109,7 +117,7 @@ def test_outlines_are_read_exactly_as_they_were_written(tmp_path: Path, seed: in
 
 
 def test_axes_are_read_as_they_were_written(tmp_path: Path) -> None:
-    found, expected = read_again(written(tmp_path, axes_of())), axes_of()
+    found, expected = read_again(written(tmp_path, axis_table())), axes_of()
     assert isinstance(found, LegAxes)
     assert np.array_equal(found.row, expected.row)
     assert np.array_equal(found.leg, expected.leg)
@@ -129,21 +137,22 @@ def test_axes_are_read_as_they_were_written(tmp_path: Path) -> None:
             "view,image,leg,part,edge,a,b,c,u0,v0,u1,v1,s00,s01,s11,verdict,reason,source,"
             "contrast,length,residual,gamma,by_gamma",
         ),
-        (axes_of(), "view,image,leg,psi,theta,x,z,sigma_psi,sigma_theta,sigma_x,sigma_z"),
+        (axis_table(), "view,image,leg,psi,theta,x,z,sigma_psi,sigma_theta,sigma_x,sigma_z"),
     ],
 )
 def test_headers_are_those_of_the_contract(
-    tmp_path: Path, table: Outlines | LegAxes, header: str
+    tmp_path: Path, table: Outlines | AxisTable, header: str
 ) -> None:
     path = written(tmp_path, table)
     assert path.read_text().splitlines()[0] == header
-    assert len(read_again(path)) == len(table)
+    n_rows = len(table[0]) if isinstance(table, tuple) else len(table)
+    assert len(read_again(path)) == n_rows
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize("table", [outlines_of(4), axes_of(4)])
+@pytest.mark.parametrize("table", [outlines_of(4), axis_table(4)])
 def test_column_order_line_ends_and_byte_order_mark_do_not_matter(
-    tmp_path: Path, table: Outlines | LegAxes
+    tmp_path: Path, table: Outlines | AxisTable
 ) -> None:
     path = written(tmp_path, table)
     expected = read_again(path)
@@ -173,7 +182,7 @@ def test_rows_without_image_are_named_by_label_or_else_by_number(tmp_path: Path)
     assert row_names(shared) == ("x", "x", "y", "y")
     clash = recorded(["x", "", "", ""], ["", "y", "x", "z"])
     assert row_names(clash) == ("x", "y", "3", "z")
-    with written(tmp_path, axes_of()).open(newline="") as file:
+    with written(tmp_path, axis_table()).open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["image"] for row in rows[::3]] == ["i/2.png", "i/1.png", "a", "b"]
     assert rows[2]["leg"] == "leg, C"
@@ -272,14 +281,14 @@ def test_legs_that_a_view_leaves_out_are_rejected() -> None:
             ("columns s00, s01, s11", "(1, 2, 1)"),
         ),
         (outlines_of(3), 1, {"verdict": "rejected", "a": "left"}, ("column a", "'left'")),
-        (axes_of(), 5, {"z": "-1e300"}, ("column z", "-1000 to 1000 m")),
-        (axes_of(), 5, {"psi": "1.5707963"}, ("columns psi, theta", "(x, 0, z)")),
-        (axes_of(), 5, {"sigma_theta": "3"}, ("column sigma_theta", "1e-09 to 1 rad")),
-        (axes_of(), 5, {"theta": "-inf"}, ("column theta", "'-inf'", "finite")),
+        (axis_table(), 5, {"z": "-1e300"}, ("column z", "-1000 to 1000 m")),
+        (axis_table(), 5, {"psi": "1.5707963"}, ("columns psi, theta", "(x, 0, z)")),
+        (axis_table(), 5, {"sigma_theta": "3"}, ("column sigma_theta", "1e-09 to 1 rad")),
+        (axis_table(), 5, {"theta": "-inf"}, ("column theta", "'-inf'", "finite")),
     ],
 )
 def test_a_wrong_cell_is_one_problem_of_its_row(
-    tmp_path: Path, table: Outlines | LegAxes, row: int, cells: dict[str, str], named: tuple[str]
+    tmp_path: Path, table: Outlines | AxisTable, row: int, cells: dict[str, str], named: tuple[str]
 ) -> None:
     (problem,) = problems(edited(written(tmp_path, table), row, **cells))
     assert f"row {row} (line {row + 1})" in problem
@@ -292,7 +301,7 @@ def test_many_problems_are_listed_at_once_and_said_shortly(tmp_path: Path) -> No
     edited(path, 4, a="x", b="y")
     edited(path, 6, a="9", s00="-1")
     assert len(problems(path)) == 7
-    path = written(tmp_path, axes_of())
+    path = written(tmp_path, axis_table())
     for row in range(1, 13):
         edited(path, row, theta=str(-90 - row))
     with pytest.raises(DatasetError) as refusal:

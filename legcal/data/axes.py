@@ -29,11 +29,9 @@ from legcal.files import Column, format_table, read_table, write_atomically
 from legcal.geometry import Array, IntArray, nearest_point_to_line, normal_basis
 from legcal.vision import (
     Camera,
-    angles_of_direction,
     axis_of_outlines,
     direction_derivative,
     direction_of_angles,
-    point_with_zero_y,
 )
 
 VALUES = ("psi", "theta", "x", "z")
@@ -277,40 +275,12 @@ def axes_of_table(
     return LegAxes(row, leg, u, M, basis, scaled @ np.swapaxes(scaled, -1, -2))
 
 
-def table_of_axes(axes: LegAxes) -> tuple[Array, Array]:
-    """Return angles and points M_LS of axes with their standard deviations.
-
-    Correlations between the four, which the table has no place for, are left out; axes that
-    came from :func:`axes_of_table` have none.
-    """
-    M = point_with_zero_y(axes.u, axes.M)
-    # The same line and its covariance, written at M_LS.
-    shift = np.sum((M - axes.M) * axes.u, axis=-1)
-    move = np.tile(np.eye(4), (len(axes), 1, 1))
-    move[:, 2, 0] = move[:, 3, 1] = shift
-    psi, theta = angles_of_direction(axes.u)
-    to_table = np.linalg.inv(_table_derivative(axes.basis, psi, theta)) @ move
-    covariance = to_table @ axes.covariance @ np.swapaxes(to_table, -1, -2)
-    sigmas = np.sqrt(np.einsum("nii->ni", covariance))
-    return np.stack([psi, theta, M[:, 0], M[:, 2]], axis=-1), sigmas
-
-
 def _table_derivative(basis: Array, psi: Array, theta: Array) -> Array:
     """Return d (alpha, beta) / d (psi, theta, x, z), (n, 4, 4)."""
     derivative = np.zeros((len(basis), 4, 4))
     derivative[:, :2, :2] = basis @ direction_derivative(psi, theta)
     derivative[:, 2:, 2:] = basis[:, :, [0, 2]]
     return derivative
-
-
-def write_axes(
-    path: Path, axes: LegAxes, measurements: Measurements, leg_names: Sequence[str]
-) -> None:
-    """Write axes, the file complete or not at all; correlations of angles and point are left out.
-
-    Raises NotVisible if an axis has no point M_LS, OSError if the file cannot be written.
-    """
-    write_axis_table(path, axes.row, axes.leg, *table_of_axes(axes), measurements, leg_names)
 
 
 def write_axis_table(

@@ -34,7 +34,6 @@ from .poses import draw_poses as draw_poses
 from .rendering.appearance import Appearance as Appearance
 from .rendering.appearance import Light as Light
 from .rendering.scene import prepare_view as prepare_view
-from .rendering.scene import render as render
 from .request import Level as Level
 from .request import Request as Request
 from .request import Sampling as Sampling

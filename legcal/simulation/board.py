@@ -140,19 +140,24 @@ class PlacedBoard:
         return 1.0 if self.board.kind == "aprilgrid" else -1.0
 
     @cached_property
+    def plate_size(self) -> tuple[float, float, float]:
+        """Width, height and thickness of the plate [m]."""
+        sides = self.board.extent.max(axis=0) - self.board.extent.min(axis=0)
+        longer = float(sides.max())
+        width, height, _ = (sides + 2.0 * _RIM * longer).tolist()
+        return width, height, _THICKNESS * longer
+
+    @cached_property
     def plate(self) -> PlacedSolid:
         """The plate that the board is printed on."""
         low, high = self.board.extent.min(axis=0), self.board.extent.max(axis=0)
-        longer = float((high - low).max())
-        thickness = _THICKNESS * longer
-        x, y, _ = (high - low + 2.0 * _RIM * longer).tolist()
-        middle = 0.5 * (low + high) - [0.0, 0.0, 0.5 * self.towards_viewer * thickness]
+        middle = 0.5 * (low + high) - [0.0, 0.0, 0.5 * self.towards_viewer * self.plate_size[2]]
         T_board_plate = RigidTransform.from_translation(middle)
         face = 5 if self.towards_viewer > 0.0 else 2
         sheet = BoardPrint.of(self.board, face, middle[:2])
         material = Material(albedo=0.8, specular=0.0, shininess=10.0, limb=0.0, sheet=sheet)
         T = self.T_base_board * T_board_plate
-        solid = Solid("calibration board", None, Box((x, y, thickness)), T, material)
+        solid = Solid("calibration board", None, Box(self.plate_size), T, material)
         return PlacedSolid(solid, T)
 
     def beside(self, posed: PosedMachine) -> PosedMachine:
@@ -167,9 +172,7 @@ class PlacedBoard:
 
     def runs_through(self, posed: PosedMachine) -> bool:
         """Say whether the plate runs through a machine, or something lies right on its print."""
-        size = self.plate.solid.shape
-        assert isinstance(size, Box)
-        half = 0.5 * np.array(size.size)
+        half = 0.5 * np.array(self.plate_size)
         for corner in ([-1.0, -1.0], [1.0, -1.0]):  # rays from two corners to the sides across
             for height in (-0.5, 0.5, 2.0):  # in the plate, and above its print
                 steps = np.linspace(-1.0, 1.0, 13)
@@ -198,9 +201,7 @@ class PlacedBoard:
         cosine = self.towards_viewer * sight[..., 2] / np.linalg.norm(sight, axis=-1)
         _, inside = pixels_in_image(camera, T_base_camera.inv().apply(base))
         free = (inside & (cosine.ravel() > _MIN_COSINE)).copy()
-        size = self.plate.solid.shape
-        assert isinstance(size, Box)
-        margin = np.full(int(free.sum()), _IN_FRONT * size.size[2])
+        margin = np.full(int(free.sum()), _IN_FRONT * self.plate_size[2])
         if free.any():
             free[free] = ~posed.hidden(centre, base[free], margin)
         seen = np.all(free.reshape(points.shape[:2]), axis=1)

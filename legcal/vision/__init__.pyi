@@ -28,7 +28,6 @@ from .cylinder import axis_of_outlines as axis_of_outlines
 from .cylinder import direction_derivative as direction_derivative
 from .cylinder import direction_of_angles as direction_of_angles
 from .cylinder import outlines_of_axis as outlines_of_axis
-from .cylinder import point_with_zero_y as point_with_zero_y
 from .image_file import Grey as Grey
 from .image_file import ImageSize as ImageSize
 from .image_file import enlarged as enlarged

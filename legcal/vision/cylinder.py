@@ -64,19 +64,6 @@ def axis_of_outlines(
     return u, M
 
 
-def point_with_zero_y(
-    u: Array,  # (..., 3)
-    M: Array,  # (..., 3)
-) -> Array:
-    """Return the point M_LS = (x, 0, z) of axes, the paper's choice among the points of eq (5)."""
-    if np.any(np.abs(u[..., 1]) < 1e-9):
-        raise NotVisible(
-            "M_LS = (x, 0, z) does not exist for a leg parallel to the image x axis; "
-            "use the point nearest to the camera centre instead."
-        )
-    return np.asarray(M - u * (M[..., 1:2] / u[..., 1:2]))
-
-
 def direction_of_angles(
     psi: Array,  # (...)
     theta: Array,  # (...)

@@ -134,7 +134,6 @@ class RobustFit:
     images: tuple[int, ...]  # the number that each of these images had
     left_out: dict[int, str]  # images that disagree, and how
     n_left_out: int  # single corners that were left out of the other images
-    extra_px: float  # scatter of the corners beyond what they claim, one standard deviation [px]
     scale: float  # factor on the covariance, by the residuals
 
 
@@ -149,7 +148,7 @@ def robust_fit(seen: BoardImages, size: ImageSize, model: DistortionModel) -> Ro
     camera, poses = first.camera, list(first.T_camera_board)
     kept = np.ones(len(seen.image), dtype=np.bool_)
     left_out: dict[int, str] = {}
-    adjusted, extra = first, 0.0
+    adjusted = first
     for _ in range(_MAX_ROUNDS):
         part, images = _part(seen, kept, n_images)
         found = _all_adjusted(camera, [poses[k] for k in images], part)
@@ -158,8 +157,7 @@ def robust_fit(seen: BoardImages, size: ImageSize, model: DistortionModel) -> Ro
         adjusted, camera = found, found.camera
         for k, T in zip(images, found.T_camera_board, strict=True):
             poses[k] = T
-        extra = _extra(found.residual, claimed[kept])
-        sigma = np.hypot(claimed, extra)
+        sigma = np.hypot(claimed, _extra(found.residual, claimed[kept]))
         judged = kept.copy()
         judged[kept] = np.linalg.norm(found.residual, axis=1) < OUTLIER_SIGMAS * sigma[kept]
         left_out |= _outlier_images(found.residual, part, images)
@@ -188,7 +186,6 @@ def robust_fit(seen: BoardImages, size: ImageSize, model: DistortionModel) -> Ro
         images,
         left_out,
         int(np.count_nonzero(~kept & others)),
-        extra,
         _scale(adjusted, part, len(images)),
     )
 

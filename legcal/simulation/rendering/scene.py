@@ -441,17 +441,6 @@ def prepare_view(
     )
 
 
-def render(
-    placed: Sequence[PlacedSolid],
-    camera: Camera,
-    T_base_camera: RigidTransform,
-    appearance: Appearance,
-    rng: np.random.Generator,
-) -> Image:
-    """Return one photograph; :func:`prepare_view` saves half of the time for more of a view."""
-    return prepare_view(placed, camera, T_base_camera, appearance, rng).render(placed, rng)
-
-
 def _lighting(
     centre: Array, radius: float, T_camera_base: RigidTransform, appearance: Appearance
 ) -> Lighting:
