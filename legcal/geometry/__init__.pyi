@@ -12,6 +12,7 @@ from .motions import components as components
 from .motions import frame_on_points as frame_on_points
 from .motions import motion_of as motion_of
 from .motions import motions_of as motions_of
+from .motions import moved_poses as moved_poses
 from .motions import pose_distance as pose_distance
 from .motions import product as product
 from .motions import register_groups as register_groups

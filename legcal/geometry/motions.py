@@ -74,6 +74,15 @@ def components(motions: Sequence[RigidTransform]) -> tuple[Array, Array]:
     return T[:, :3, :3].copy(), T[:, :3, 3].copy()
 
 
+def moved_poses(R: Array, t: Array, turn: Array, shift: Array) -> tuple[Array, Array]:
+    """Return poses (..., 3, 3), (..., 3) after rotation vectors from the left and displacements.
+
+    The exponential map of the rotation beside the translation: Exp(turn) R, t + shift. Estimates
+    use Cayley's map instead (:func:`turned`), which agrees to second order.
+    """
+    return rotation_matrices(turn) @ R, t + shift
+
+
 def register_points(P_from: Array, P_to: Array) -> RigidTransform:
     """Return the rigid motion that lays points on points best, unweighted, in closed form.
 

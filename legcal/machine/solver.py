@@ -10,9 +10,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from legcal.geometry import Array, BoolArray
+from legcal.geometry import Array, BoolArray, moved_poses
 
 Equations = Callable[[Array], tuple[Array, Array]]  # points (k, ...) to (k, m) and (k, m, n)
 Retraction = Callable[[Array, Array], Array]  # points (k, ...) and steps (k, n) to points
@@ -149,8 +148,8 @@ def poses_after(poses: Array, step: Array) -> Array:
     """
     turn = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
     step = step * np.minimum(1.0, MAX_TURN / np.maximum(turn, 1e-300))
-    R = Rotation.from_rotvec(step[:, :3]).as_matrix() @ poses[:, :, :3]
-    return np.concatenate([R, (poses[:, :, 3] + step[:, 3:])[..., None]], axis=2)
+    R, t = moved_poses(poses[:, :, :3], poses[:, :, 3], step[:, :3], step[:, 3:])
+    return np.concatenate([R, t[..., None]], axis=2)
 
 
 def _rows(chosen: BoolArray) -> BoolArray | slice:

@@ -1,18 +1,20 @@
 """Unknown motions and axes inside the steps, in CasADi and for numbers.
 
 Unknown rotations are Gibbs vectors w = tan(angle / 2) along the axis, counted from a start: they
-have no branches and no square root. An unknown axis is turned about its normal basis e1, e2 by
-two turns, w = (turn_1 e1 + turn_2 e2) / 2: its :func:`~legcal.geometry.axis_angles` but for a
-factor near one (:func:`gibbs_of`).
+have no branches and no square root. It is the chart of :class:`legcal.estimation.Frames`, except
+that a small w is half of a rotation vector, and that steps begin with the translation.
+
+An unknown axis is turned about its normal basis e1, e2 by two turns, w = (turn_1 e1 + turn_2 e2) /
+2: its :func:`~legcal.geometry.axis_angles` but for a factor near one (:func:`gibbs_of`).
 """
 
 from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, normal_basis, turned_axis
+from legcal.geometry import Array, motion_of, normal_basis, turned, turned_axis
 
 # Unknown motions
 
@@ -29,12 +31,16 @@ def turned_points(w: ca.SX, points: ca.SX) -> ca.SX:
     return turn @ points
 
 
+def stepped_poses(R: Array, t: Array, steps: Array) -> tuple[Array, Array]:
+    """Return the poses (n, 3, 3), (n, 3) of :func:`moved_points` for numbers, steps (n, 6)."""
+    return turned(R, 2.0 * steps[:, 3:]), t + steps[:, :3]
+
+
 def motion_after(step: Array, start: RigidTransform) -> RigidTransform:
-    """Return the motion of :func:`moved_points` for numbers."""
-    w = step[3:]
-    size = float(np.linalg.norm(w))
-    turn = Rotation.from_rotvec(w * (2.0 * np.arctan(size) / size if size > 0.0 else 2.0))
-    return RigidTransform.from_components(start.translation + step[:3], turn * start.rotation)
+    """Return one pose of :func:`stepped_poses` as a motion."""
+    matrix = start.as_matrix()[None]
+    R, t = stepped_poses(matrix[:, :3, :3], matrix[:, :3, 3], step[None])
+    return motion_of(R[0], t[0])
 
 
 # Unknown axes

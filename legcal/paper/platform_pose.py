@@ -22,13 +22,11 @@ from scipy.spatial.transform import RigidTransform
 from legcal.geometry import (
     Array,
     IntArray,
-    components,
-    motions_of,
     register_groups,
     register_in_plane,
 )
 from legcal.paper.criteria import Transformation
-from legcal.paper.gibbs import motion_after, moved_points
+from legcal.paper.gibbs import motion_after, moved_points, stepped_poses
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
 
@@ -45,8 +43,7 @@ class PlatformPoses:
 
     def stepped(self, steps: Array, poses: IntArray) -> tuple[Array, Array]:
         """Return R and t of some poses after steps (n_poses, 6) of all, as ``moved`` has them."""
-        start = motions_of(self.R[poses], self.t[poses])
-        return components([motion_after(*each) for each in zip(steps[poses], start, strict=True)])
+        return stepped_poses(self.R[poses], self.t[poses], steps[poses])
 
 
 def locate_platform(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array, BoolArray, IntArray, cross_matrices, rotation_matrices
+from legcal.geometry import Array, BoolArray, IntArray, cross_matrices, moved_poses
 
 N_STEP = 12
 
@@ -71,8 +71,8 @@ def transforms(frames: Array) -> tuple[RigidTransform, RigidTransform]:
 def frames_after(frames: Array, step: Array) -> Array:
     """Return frames after steps (..., 12)."""
     steps = step.reshape(*step.shape[:-1], 2, 6)
-    R = rotation_matrices(steps[..., 3:]) @ frames[..., :3]
-    return np.concatenate([R, (frames[..., 3] + steps[..., :3])[..., None]], axis=-1)
+    R, t = moved_poses(frames[..., :3], frames[..., 3], steps[..., 3:], steps[..., :3])
+    return np.concatenate([R, t[..., None]], axis=-1)
 
 
 def predicted(frames: Array, pairs: PosePairs) -> tuple[Array, Array]:
