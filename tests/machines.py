@@ -10,7 +10,7 @@ from layouts import LegSpec, MachineSpec
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry import Array
-from legcal.machine import Machine, create_model, described
+from legcal.machine import Machine, create_model, description_of
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
@@ -141,13 +141,13 @@ def write_table(folder: Path, **changes: Any) -> Path:
 
 def read_table(path: Path, unit: str | None = None, name: str | None = None) -> Any:
     """Return what a table describes."""
-    return described(path, family=None, unit=unit, name=name, dimensions={})
+    return description_of(path, family=None, unit=unit, name=name, dimensions={})
 
 
 def read_family(family: str, unit: str | None = "mm", **dimensions: Any) -> Any:
     """Return what a family with some dimensions describes."""
     name = dimensions.pop("name", None)
-    return described(None, family=family, unit=unit, name=name, dimensions=dimensions)
+    return description_of(None, family=family, unit=unit, name=name, dimensions=dimensions)
 
 
 def made(folder: Path, **changes: Any) -> Machine:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -18,14 +17,7 @@ from legcal.cli.options import (
     show,
 )
 from legcal.errors import UsageError
-
-
-class Model(StrEnum):
-    """How a lens distorts."""
-
-    PLUMB_BOB = "plumb_bob"
-    RATIONAL_POLYNOMIAL = "rational_polynomial"
-    EQUIDISTANT = "equidistant"
+from legcal.vision import DistortionModel
 
 
 def camera(
@@ -48,8 +40,8 @@ def camera(
         Path, typer.Option("--output", "-o", metavar="FILE", help="The camera_info YAML to write.")
     ],
     model: Annotated[
-        Model, typer.Option(help="How the lens distorts; equidistant for a fisheye.")
-    ] = Model.PLUMB_BOB,
+        DistortionModel, typer.Option(help="How the lens distorts; equidistant for a fisheye.")
+    ] = "plumb_bob",
     workers: WorkersOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -60,7 +52,7 @@ def camera(
         found = calibration.calibrate_camera(
             images,
             board,
-            model=model.value,
+            model=model,
             output=output,
             progress=progress,
             workers=image_workers(workers),
@@ -339,7 +331,9 @@ def new(
         "leg_radius": leg_radius,
         "tilt": tilt,
     }
-    model = machine.described(table, family=family, unit=unit, name=name, dimensions=dimensions)
+    model = machine.description_of(
+        table, family=family, unit=unit, name=name, dimensions=dimensions
+    )
     created = machine.create_model(model, output, force=force)
     description = machine.machine_document(created.machine)
     paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}

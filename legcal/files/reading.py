@@ -17,7 +17,15 @@ MAX_DOCUMENT = 32_000_000  # of a JSON document that legcal wrote
 MAX_IMAGE = 256_000_000
 MAX_MESH = 64_000_000
 
-NO_FILE = "a folder or a device"
+
+class NotRegular(OSError):
+    """Something that is not a regular file."""
+
+
+class TooLarge(OSError):
+    """A file of more bytes than are read."""
+
+    n_bytes = 0  # how many it has, as far as is known
 
 
 def open_regular(path: Path, most: int | None = None) -> BinaryIO:
@@ -26,23 +34,30 @@ def open_regular(path: Path, most: int | None = None) -> BinaryIO:
     Raises
     ------
     OSError
-        If it is anything else; its ``strerror`` is what was found.
+        :class:`NotRegular`, :class:`TooLarge` or as the system says; ``strerror`` is what was
+        found.
     """
+    not_regular = NotRegular(errno.EINVAL, "a folder or a device", str(path))
     if not stat.S_ISREG(os.stat(path).st_mode):
-        raise OSError(errno.EINVAL, NO_FILE, str(path))
+        raise not_regular
     # another file may have taken its place: a pipe that is opened so is not waited for
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     file = os.fdopen(os.open(path, flags), "rb")
     found = os.fstat(file.fileno())
-    problem = ""
     if not stat.S_ISREG(found.st_mode):
-        problem = NO_FILE
-    elif most is not None and found.st_size > most:
-        problem = f"{found.st_size} bytes, which are more than {most}"
-    if problem:
         file.close()
-        raise OSError(errno.EINVAL, problem, str(path))
+        raise not_regular
+    if most is not None and found.st_size > most:
+        file.close()
+        raise _too_large(path, found.st_size, most)
     return file
+
+
+def _too_large(path: Path, n_bytes: int, most: int) -> TooLarge:
+    """Return the error of a file of more than *most* bytes."""
+    error = TooLarge(errno.EINVAL, f"{n_bytes} bytes, which are more than {most}", str(path))
+    error.n_bytes = n_bytes
+    return error
 
 
 def read_bytes(path: Path, most: int) -> bytes:
@@ -50,7 +65,7 @@ def read_bytes(path: Path, most: int) -> bytes:
     with open_regular(path, most) as file:
         content = file.read(most + 1)
     if len(content) > most:  # it grew, or tells no size
-        raise OSError(errno.EINVAL, f"more than {most} bytes", str(path))
+        raise _too_large(path, len(content), most)
     return content
 
 

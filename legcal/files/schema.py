@@ -22,7 +22,7 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from legcal.errors import DatasetError
-from legcal.files.reading import MAX_TEXT, MAX_YAML, read_bytes
+from legcal.files.reading import MAX_TEXT, MAX_YAML, NotRegular, TooLarge, read_bytes
 
 MAX_NODES = 100_000  # aliases let a small file stand for a tree without bound
 MAX_DEPTH = 100
@@ -199,24 +199,23 @@ def read_text(path: Path, what: str, most: int = MAX_TEXT) -> bytes:
         raise DatasetError(
             f"{path}: the {what} could not be read: found no such file, needed one; {remedy}."
         )
-    if not path.is_file():
-        raise DatasetError(
-            f"{path}: the {what} could not be read: found a folder or a device, needed a file; "
-            f"{remedy}."
-        )
     try:
-        size = path.stat().st_size
-        if size <= most:
-            return read_bytes(path, most)
+        return read_bytes(path, most)
+    except NotRegular as error:
+        raise DatasetError(
+            f"{path}: the {what} could not be read: found {error.strerror}, needed a file; "
+            f"{remedy}."
+        ) from error
+    except TooLarge as error:
+        raise DatasetError(
+            f"{path}: the {what} could not be read: found {error.n_bytes} bytes, needed at most "
+            f"{most}; {remedy}."
+        ) from error
     except OSError as error:
         raise DatasetError(
             f"{path}: the {what} could not be read: found '{error.strerror}', needed a readable "
             "file; check its permissions."
         ) from error
-    raise DatasetError(
-        f"{path}: the {what} could not be read: found {size} bytes, needed at most {most}; "
-        f"{remedy}."
-    )
 
 
 def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:

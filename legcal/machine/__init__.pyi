@@ -24,7 +24,7 @@ from .equations import leg_equations as leg_equations
 from .equations import pose_equations as pose_equations
 from .equations import pose_sensitivity as pose_sensitivity
 from .equations import twist_residual as twist_residual
-from .family import described as described
+from .family import description_of as description_of
 from .files import DATASET_YAML as DATASET_YAML
 from .files import shipped_folders as shipped_folders
 from .files import shipped_names as shipped_names

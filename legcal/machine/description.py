@@ -4,7 +4,7 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.files import motion_from_xyz_quat
 from legcal.geometry import Array
@@ -88,6 +88,11 @@ class Home:
 
     xyz: tuple[float, ...]  # position [m]
     quat_xyzw: tuple[float, ...]  # unit quaternion, as far as its digits go
+
+    @classmethod
+    def of(cls, xyz: tuple[float, ...], turn: Rotation) -> "Home":
+        """Return a home with the quaternion of a rotation as files write it."""
+        return cls(xyz, tuple(float(x) for x in turn.as_quat(canonical=True)))
 
     def motion(self) -> RigidTransform:
         """Return T_base_platform."""

@@ -1,6 +1,13 @@
-"""The table of a machine: YAML or CSV, read strictly, lengths in the unit that it states."""
+"""The table of a machine: YAML or CSV, read strictly, lengths in the unit that it states.
+
+A CSV becomes the mapping that the same table would be in YAML (:func:`read_columns`); the mapping
+is validated as a :class:`TableFile`, whose entries are checked against each other before they
+become a :class:`Description` in metres, whose legs are checked against their types. An entry is
+one value for all legs, or a list with one (or null) for each leg.
+"""
 
 import math
+from collections.abc import Callable
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -33,42 +40,10 @@ from legcal.machine.leg import MAX_LEGS, LegKind
 MAX_NUMBER = 1e9  # of any number, whatever its unit
 
 
-def _number(value: object) -> bool:
+def _is_number(value: object) -> bool:
     return (
         isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < MAX_NUMBER
     )
-
-
-def _wanted(value: Any, fits: bool, needed: str) -> Any:
-    """Return a value if it fits, else refuse it."""
-    if not fits:
-        raise ValueError(f"found {describe(value)}, needed {needed}; correct it.")
-    return value
-
-
-def _numbers(value: Any) -> Any:
-    entries = value if isinstance(value, list) else [value]
-    return _wanted(
-        value,
-        all(_number(x) or (x is None and isinstance(value, list)) for x in entries),
-        f"a number below {MAX_NUMBER:g}, or a list with a number (or null) for each leg",
-    )
-
-
-def is_pair(value: object) -> bool:
-    """Say whether a value is one pair of readings."""
-    return isinstance(value, list) and len(value) == 2 and all(_number(x) for x in value)
-
-
-def _travel(value: Any) -> Any:
-    fits = is_pair(value) or (
-        isinstance(value, list) and all(x is None or is_pair(x) for x in value)
-    )
-    _wanted(value, fits, "[lowest, highest] reading, or a list with that pair (or null) a leg")
-    for pair in [value] if is_pair(value) or not isinstance(value, list) else value:
-        if pair is not None and not pair[0] < pair[1]:
-            raise ValueError(f"found {pair}, needed the lower reading first; correct it.")
-    return value
 
 
 def _is_radius(value: Any) -> bool:
@@ -76,25 +51,39 @@ def _is_radius(value: Any) -> bool:
         return (
             bool(value)
             and value.keys() <= {"tube", "rod"}
-            and all(_number(x) and x > 0 for x in value.values())
+            and all(_is_number(x) and x > 0 for x in value.values())
         )
-    return _number(value) and value > 0
+    return _is_number(value) and value > 0
 
 
-def _radius(value: Any) -> Any:
-    entries = value if isinstance(value, list) else [value]
-    return _wanted(
-        value,
-        all(_is_radius(x) or (x is None and isinstance(value, list)) for x in entries),
-        "a positive number, {tube: ..., rod: ...}, or a list with one of these (or null) a leg",
-    )
+def _is_pair(value: object) -> bool:
+    """Say whether a value is one pair of readings."""
+    return isinstance(value, list) and len(value) == 2 and all(_is_number(x) for x in value)
+
+
+def _of_legs(fits: Callable[[Any], bool], needed: str) -> BeforeValidator:
+    """Return a validator of one value for all legs, or of a list with one (or null) for each."""
+
+    def check(value: Any) -> Any:
+        of_each = isinstance(value, list) and all(x is None or fits(x) for x in value)
+        if not (of_each or fits(value)):
+            raise ValueError(f"found {describe(value)}, needed {needed}; correct it.")
+        return value
+
+    return BeforeValidator(check)
+
+
+def _lower_first(value: Any) -> Any:
+    for pair in [value] if _is_pair(value) else value:
+        if pair is not None and not pair[0] < pair[1]:
+            raise ValueError(f"found {pair}, needed the lower reading first; correct it.")
+    return value
 
 
 def _points(value: Any) -> Any:
     rows = value if isinstance(value, list) else [value]
     for i, row in enumerate(rows):
-        fits = isinstance(row, list) and len(row) in (2, 3) and all(_number(x) for x in row)
-        if not fits:
+        if not (isinstance(row, list) and len(row) in (2, 3) and all(map(_is_number, row))):
             raise ValueError(
                 f"found {describe(row)} in row {i + 1}, needed three numbers below "
                 f"{MAX_NUMBER:g}, x y z (two in the plane); correct it."
@@ -108,7 +97,7 @@ def _directions(value: Any) -> Any:
         fits = row is None or (
             isinstance(row, list)
             and len(row) == 3
-            and all(_number(x) for x in row)
+            and all(map(_is_number, row))
             and float(np.linalg.norm(row)) > 1e-6
         )
         if not fits:
@@ -148,6 +137,24 @@ def _type(value: object) -> object:
 
 Points = Annotated[list[Any], BeforeValidator(_points)]
 Directions = Annotated[list[Any], BeforeValidator(_directions)]
+Lengths = Annotated[
+    Any,
+    _of_legs(
+        _is_number, f"a number below {MAX_NUMBER:g}, or a list with a number (or null) for each leg"
+    ),
+]
+Travel = Annotated[
+    Any,
+    BeforeValidator(_lower_first),  # the last one is applied first
+    _of_legs(_is_pair, "[lowest, highest] reading, or a list with that pair (or null) a leg"),
+]
+Radius = Annotated[
+    Any,
+    _of_legs(
+        _is_radius,
+        "a positive number, {tube: ..., rod: ...}, or a list with one of these (or null) a leg",
+    ),
+]
 
 
 class HomeEntry(FileSchema):
@@ -169,10 +176,10 @@ class TableFile(FileSchema):
     legs: list[PlainName] | None = None
     base_joints: Points
     platform_joints: Points
-    offsets: Annotated[Any, BeforeValidator(_numbers)] = None
-    lengths: Annotated[Any, BeforeValidator(_numbers)] = None
-    travel: Annotated[Any, BeforeValidator(_travel)] = None
-    radius: Annotated[Any, BeforeValidator(_radius)] = None
+    offsets: Lengths = None
+    lengths: Lengths = None
+    travel: Travel = None
+    radius: Radius = None
     kinds: Annotated[Any, BeforeValidator(_kinds)] = None
     base_axes: Directions | None = None
     platform_axes: Directions | None = None
@@ -306,11 +313,11 @@ def read_description(path: Path, unit: str | None = None, name: str | None = Non
             f"{path}: the unit could not be decided: found --unit {unit} and '{file.unit}' in the "
             "table, needed one of them; leave out --unit."
         )
-    problems = _contradictions(file, str(path))
+    problems = _conflicting_entries(file, str(path))
     if problems:
         raise ModelError(problems)
     description = _description(file, str(path))
-    problems = _disagreements(description)
+    problems = _impossible_legs(description)
     if problems:
         raise ModelError(problems)
     return description
@@ -327,8 +334,8 @@ def _types(file: TableFile, n: int) -> list[LegType]:
     return [found for text in texts if (found := leg_type(text)) is not None]
 
 
-def _contradictions(file: TableFile, source: str) -> list[str]:
-    """Return which numbers of legs and names contradict each other."""
+def _conflicting_entries(file: TableFile, source: str) -> list[str]:
+    """Return which entries of a table do not fit together: counts, names, types."""
     if (file.type is None) == (file.types is None):
         found = "both" if file.type else "neither"
         return [
@@ -342,7 +349,11 @@ def _contradictions(file: TableFile, source: str) -> list[str]:
         "base_axes", "platform_axes",
     ):  # fmt: skip
         value = getattr(file, key)
-        if isinstance(value, list) and not (key == "travel" and is_pair(value)) and len(value) != n:
+        if (
+            isinstance(value, list)
+            and not (key == "travel" and _is_pair(value))
+            and len(value) != n
+        ):
             problems.append(
                 f"{source}: {key} could not be used: found {len(value)} entries and {n} "
                 "base_joints, needed one for each leg; correct their number."
@@ -364,7 +375,7 @@ def _contradictions(file: TableFile, source: str) -> list[str]:
         f"{source}: legs could not be used: found '{leg}' twice, needed unique names; rename it."
         for leg in sorted({leg for leg in names if names.count(leg) > 1})
     ]
-    problems += _unused(file, source, names)
+    problems += _useless_entries(file, source, names)
     frame = file.base_frame or []
     problems += [
         f"{source}: base_frame could not be used: found '{leg}', which is not a leg; "
@@ -385,13 +396,13 @@ def _contradictions(file: TableFile, source: str) -> list[str]:
     return problems
 
 
-def _unused(file: TableFile, source: str, names: list[str]) -> list[str]:
+def _useless_entries(file: TableFile, source: str, names: list[str]) -> list[str]:
     """Return which entries are for legs that have no use for them."""
     has_slider = [leg.has_slider for leg in _types(file, len(names))]
     problems = []
     for key, of_sliders in (("lengths", False), ("offsets", True), ("travel", True)):
         value = getattr(file, key)
-        shared = not isinstance(value, list) or is_pair(value)
+        shared = not isinstance(value, list) or _is_pair(value)
         entries = [value] * len(names) if shared else value
         useless = [
             leg
@@ -421,7 +432,7 @@ def _description(file: TableFile, source: str) -> Description:
         return value if isinstance(value, list) else [value] * n
 
     names = file.legs or [f"leg{j + 1}" for j in range(n)]
-    travel = [file.travel] * n if is_pair(file.travel) else per_leg(file.travel)
+    travel = [file.travel] * n if _is_pair(file.travel) else per_leg(file.travel)
     legs = []
     for j, (name, kind_of_leg, kind, radius) in enumerate(
         zip(names, _types(file, n), per_leg(file.kinds), per_leg(file.radius), strict=True)
@@ -433,14 +444,14 @@ def _description(file: TableFile, source: str) -> Description:
         offset = per_leg(file.lengths if constant else file.offsets)[j]
         reads_length = kind is LegKind.PASSIVE and offset is None  # a pair for all means readings
         limits = metres(travel[j])
-        if constant or (reads_length and is_pair(file.travel)):
+        if constant or (reads_length and _is_pair(file.travel)):
             limits = None
         legs.append(
             LegEntry(
                 name, kind_of_leg, kind,
                 np.array(metres(file.base_joints[j])), np.array(metres(file.platform_joints[j])),
                 metres(offset), None if limits is None else (limits[0], limits[1]), tube, rod,
-                _unit_table(file.base_axes, j), _unit_table(file.platform_axes, j),
+                _unit_axis(file.base_axes, j), _unit_axis(file.platform_axes, j),
             )
         )  # fmt: skip
     frame = None if file.base_frame is None else tuple(file.base_frame)
@@ -456,7 +467,7 @@ def _radii(radius: Any, unit: str) -> tuple[float | None, float | None]:
     return tube, rod
 
 
-def _unit_table(axes: list[Any] | None, j: int) -> Array | None:
+def _unit_axis(axes: list[Any] | None, j: int) -> Array | None:
     """Return one direction of a list, of length one."""
     if axes is None or axes[j] is None:
         return None
@@ -472,11 +483,11 @@ def _home(file: TableFile) -> Home | None:
     if file.home.quat_xyzw is not None:
         return Home(xyz, file.home.quat_xyzw)
     turn = Rotation.from_euler("xyz", file.home.rpy_deg or (0.0, 0.0, 0.0), degrees=True)
-    return Home(xyz, tuple(float(x) for x in turn.as_quat(canonical=True)))
+    return Home.of(xyz, turn)
 
 
-def _disagreements(described: Description) -> list[str]:
-    """Return what legs of their types lack or cannot have."""
+def _impossible_legs(described: Description) -> list[str]:
+    """Return what legs lack or cannot have by their types, and which legs coincide."""
     problems = []
     for leg in described.legs:
         where = f"{described.source}: leg '{leg.name}' could not be used: found "
@@ -505,13 +516,7 @@ def _disagreements(described: Description) -> list[str]:
                     f"{where}an axis for {joint} at the {side}, needed axes of R and U joints "
                     f"only; write null in {side}_axes."
                 )
-    problems += _coincident(described)
-    return problems
-
-
-def _coincident(described: Description) -> list[str]:
-    """Return which legs begin and end in the same two points."""
-    problems = []
+    # Legs that begin and end in the same two points, and joints all in one point.
     legs = described.legs
     for j, one in enumerate(legs):
         for two in legs[j + 1 :]:

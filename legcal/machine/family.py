@@ -43,16 +43,16 @@ class Family:
 
 
 def describe_family(given: Family) -> Description:
-    """Return the machine of a family."""
+    """Return the machine of a family: joints on circles, its legs at home with default lengths."""
     match = _FAMILY.fullmatch(given.family)
-    letters = None if match is None else leg_type(match[2])
-    if match is None or letters is None or not 2 <= int(match[1]) <= MAX_LEGS:
+    of_legs = None if match is None else leg_type(match[2])
+    if match is None or of_legs is None or not 2 <= int(match[1]) <= MAX_LEGS:
         raise UsageError(
             f"The family could not be understood: found '{given.family}', needed a number of legs "
             f"from 2 to {MAX_LEGS} and their type, such as 6-UPS: {NEEDED_TYPE}; correct --family."
         )
-    in_plane = letters.is_planar
-    problems = _problems(given, in_plane) + _pointless(given, int(match[1]), letters, in_plane)
+    count = int(match[1])
+    problems = [*_wrong_dimensions(given, of_legs), *_unused_dimensions(given, count, of_legs)]
     if problems:
         raise UsageError(problems)
     unit = str(given.unit)
@@ -60,29 +60,48 @@ def describe_family(given: Family) -> Description:
     def metres(value: float | None) -> float:
         return 0.0 if value is None else in_metres(value, unit)
 
-    count = int(match[1])
     base_angles, platform_angles = _angles(count, given)
-    A = metres(given.base_radius) * _ring(base_angles)
-    B = metres(given.platform_radius) * _ring(platform_angles)
-    turn = given.turn if given.turn is not None else TURN_IN_PLANE * in_plane
+    A = metres(given.base_radius) * _unit_circle(base_angles)
+    B = metres(given.platform_radius) * _unit_circle(platform_angles)
+    turn = given.turn if given.turn is not None else TURN_IN_PLANE * of_legs.is_planar
     z_turn = Rotation.from_euler("z", turn, degrees=True)
     T = RigidTransform.from_components([0.0, 0.0, metres(given.height)], z_turn)
-    tilt = float(np.radians(given.tilt))
     legs = []
     for j in range(count):
         vector = T.apply(B[j]) - A[j]
-        axes = _tilted_axes(letters, vector, A[j], tilt)
-        length = float(np.linalg.norm(vector))
+        length = float(np.linalg.norm(vector))  # at home
+        radius = _default(RADIUS * length)
+        if given.leg_radius is not None:
+            radius = metres(given.leg_radius)
+        kind = LegKind.CONSTANT
+        offset: float | None = None
+        travel: tuple[float, float] | None = None
+        if of_legs.has_slider:
+            kind, offset = LegKind.ACTUATED, _default(SHORTEST * length)
+            travel = (0.0, _default(STROKE * length))
+            if given.offset is not None:
+                offset = in_metres(given.offset, unit)
+            if given.travel is not None:
+                travel = metres(given.travel[0]), metres(given.travel[1])
+        base_axis, platform_axis = _tilted_axes(
+            of_legs, vector, A[j], float(np.radians(given.tilt))
+        )
+        if platform_axis is not None:
+            platform_axis = np.asarray(T.rotation.inv().apply(platform_axis))
         legs.append(
-            _leg(given, f"leg{j + 1}", letters, (A[j], B[j]), length, axes, T)
+            LegEntry(
+                f"leg{j + 1}", of_legs, kind, A[j], B[j], offset, travel, radius, radius,
+                base_axis, platform_axis,
+            )
         )  # fmt: skip
-    home = Home((0.0, 0.0, metres(given.height)), _quaternion(z_turn))
+    home = Home.of((0.0, 0.0, metres(given.height)), z_turn)
     name = given.name or given.family.lower()
     return Description(name, f"--family {given.family}", unit, tuple(legs), home, None)
 
 
-def _problems(given: Family, in_plane: bool) -> list[str]:
+def _wrong_dimensions(given: Family, of_legs: LegType) -> list[str]:
     """Return what is missing or impossible among the dimensions."""
+    in_plane = of_legs.is_planar
     where = f"The family {given.family} could not be built"
     needed = {
         "--base-radius": given.base_radius,
@@ -135,16 +154,17 @@ def _problems(given: Family, in_plane: bool) -> list[str]:
     return problems
 
 
-def _pointless(given: Family, count: int, letters: LegType, in_plane: bool) -> list[str]:
+def _unused_dimensions(given: Family, count: int, of_legs: LegType) -> list[str]:
     """Return which given dimensions a machine of this family does not have."""
-    no_axes = not (letters.base.has_axis or letters.platform.has_axis)
+    in_plane = of_legs.is_planar
+    no_axes = not (of_legs.base.has_axis or of_legs.platform.has_axis)
     found = {
         "--height": in_plane and bool(given.height) and "a planar machine",
         "--tilt": (in_plane or no_axes) and bool(given.tilt) and "axes that cannot tilt",
         "--base-spread": count != 6 and given.base_spread is not None and f"{count} legs",
         "--platform-spread": count != 6 and given.platform_spread is not None and f"{count} legs",
-        "--offset": not letters.has_slider and given.offset is not None and "legs without P",
-        "--travel": not letters.has_slider and given.travel is not None and "legs without P",
+        "--offset": not of_legs.has_slider and given.offset is not None and "legs without P",
+        "--travel": not of_legs.has_slider and given.travel is not None and "legs without P",
     }
     return [
         f"The family {given.family} could not be built: found {option} for {what}, needed none; "
@@ -167,55 +187,27 @@ def _angles(count: int, given: Family) -> tuple[Array, Array]:
     return np.radians(base), np.radians(platform)
 
 
-def _ring(angles: Array) -> Array:
+def _unit_circle(angles: Array) -> Array:
     """Return points of the unit circle in the plane z = 0."""
     ring = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
     return np.where(np.abs(ring) < 1e-15, 0.0, ring)
 
 
 def _tilted_axes(
-    letters: LegType, vector: Array, A: Array, tilt: float
-) -> tuple[Array | None, ...]:
+    of_legs: LegType, vector: Array, A: Array, tilt: float
+) -> tuple[Array | None, Array | None]:
     """Return the tilted axes at base and platform, in the base; None for the default ones."""
     if tilt == 0.0:
         return None, None
     u = vector / np.linalg.norm(vector)
     across = across_leg(u, A)
-    axes = list[Array | None]()
-    for joint, sense in ((letters.base, 1.0), (letters.platform, -1.0)):
+
+    def tilted(joint: JointType, angle: float) -> Array | None:
         up = np.cross(u, across) if joint is JointType.REVOLUTE else np.array([0.0, 0.0, 1.0])
-        tilted = np.cos(tilt) * across + sense * np.sin(tilt) * up
-        axes.append(tilted if joint.has_axis else None)
-    return tuple(axes)
+        axis = np.cos(angle) * across + np.sin(angle) * up
+        return np.asarray(axis) if joint.has_axis else None
 
-
-def _leg(
-    given: Family,
-    name: str,
-    letters: LegType,
-    joints: tuple[Array, Array],
-    length: float,
-    axes: tuple[Array | None, ...],
-    T: RigidTransform,
-) -> LegEntry:
-    """Return a leg of a length at home [m]."""
-    unit = str(given.unit)
-    kind = LegKind.ACTUATED if letters.has_slider else LegKind.CONSTANT
-    radius = _default(RADIUS * length)
-    if given.leg_radius is not None:
-        radius = in_metres(given.leg_radius, unit)
-    offset: float | None = None
-    travel: tuple[float, float] | None = None
-    if letters.has_slider:
-        offset, travel = _default(SHORTEST * length), (0.0, _default(STROKE * length))
-        if given.offset is not None:
-            offset = in_metres(given.offset, unit)
-        if given.travel is not None:
-            travel = in_metres(given.travel[0], unit), in_metres(given.travel[1], unit)
-    at_platform = None if axes[1] is None else np.asarray(T.rotation.inv().apply(axes[1]))
-    return LegEntry(
-        name, letters, kind, *joints, offset, travel, radius, radius, axes[0], at_platform
-    )
+    return tilted(of_legs.base, tilt), tilted(of_legs.platform, -tilt)
 
 
 def _default(length: float) -> float:
@@ -223,12 +215,7 @@ def _default(length: float) -> float:
     return max(round(length, 4), 1e-4)
 
 
-def _quaternion(turn: Rotation) -> tuple[float, ...]:
-    """Return a rotation as files write it."""
-    return tuple(float(x) for x in turn.as_quat(canonical=True))
-
-
-def described(
+def description_of(
     table: Path | None,
     *,
     family: str | None,

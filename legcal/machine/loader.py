@@ -1,4 +1,10 @@
-"""Loading a mechanism: files, tree, closures, legs and home, each checked before the next."""
+"""Loading a mechanism: files, tree, closures, legs and home, each checked before the next.
+
+A :class:`Source` is a URDF with the mechanism YAML that says which frames close (other formats are
+converted to that). Loops cut the links into rigid bodies, chains of joints between base and
+platform are classified as legs, and a closed pose is found; every check below names what is wrong
+with the file.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,7 +15,6 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import LegcalError, ModelError, OutOfClass
 from legcal.files import MotionEntry, closest, motion_to_xyz_quat
-from legcal.geometry import Array
 from legcal.machine.bodies import Bodies, rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.classification import CONCURRENT, PERPENDICULAR, leg_of
@@ -85,29 +90,33 @@ def load_mechanism(model: str | Path) -> Machine:
 def _load(source: Source) -> Machine:
     """Return the mechanism of a source."""
     file, urdf = source.file, source.urdf
-    check_origins(urdf)
-    check_names(file, urdf, source.path)
-    pairs = sorted(zip(file.closed_loop, file.type, strict=True))  # sums depend on their order
+    _check_origins(urdf)
+    _check_names(file, urdf, source.path)
+    # The closures: in one order, since sums depend on it.
+    pairs = sorted(zip(file.closed_loop, file.type, strict=True))
     closures = [Closure("3d" if kind == "3d" else "6d", one, two) for (one, two), kind in pairs]
+    # Base, platform and legs, as the file has them or proposed; home from a drawing, if any.
     block = file.legcal or propose_block(urdf, closures, file.name_mot, source.path)
     if block.home is None and source.poses is not None:
         T = source.poses[block.base].inv() * source.poses[block.platform]
         drawn = MotionEntry.model_validate(motion_to_xyz_quat(T))
         block = block.model_copy(update={"home": drawn})
     machine = _assemble(source, block, closures)
+    # Home: a pose that closes.
     given = machine.home if block.home is not None else None
     if given is None:
-        check_spread(machine)  # before a home of kilometres is looked for
+        _check_spread(machine)  # before a home of kilometres is looked for
     else:
-        check_unit(machine)  # before lengths of hundreds of metres fail to close
+        _check_unit(machine)  # before lengths of hundreds of metres fail to close
     if file.legcal is not None and file.legcal.home is not None:  # a drawing may be anywhere
         check_home_travel(machine)
     pose, configuration = closed_home(machine, given)
     machine = replace(machine, home=pose, home_configuration=configuration)
-    check_unit(machine)
-    check_across(machine)
+    _check_unit(machine)
+    # What the geometry says must be what Pinocchio finds.
+    _check_across(machine)
     machine = replace(machine, mobility=mobility(machine))
-    check_equations(machine)
+    _check_equations(machine)
     proposed = proposal_notes(file.legcal, machine)
     found = map(
         source.in_format_terms, mechanism_notes(machine, home_is_given=block.home is not None)
@@ -120,14 +129,14 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     file, urdf, yaml_path = source.file, source.urdf, source.path
     check_type(block, urdf, yaml_path)
     bodies = rigid_bodies(urdf, closures, block.platform_joint)
-    chains = legs_in_order(
+    chains = _legs_in_order(
         find_chains(bodies, urdf, block.base, block.platform), bodies, urdf, block, yaml_path
     )
-    check_motors(file, chains, urdf, yaml_path)
+    _check_motors(file, chains, urdf, yaml_path)
     check_bodies(block, bodies, urdf, yaml_path)
     ends = bodies.T_body_link[block.base], bodies.T_body_link[block.platform]
     normals = plane_of_motion(chains)
-    check_count(chains, spatial=normals is None, path=yaml_path)
+    _check_count(chains, spatial=normals is None, path=yaml_path)
     if block.platform_joint is not None:
         virtual = urdf.joints[block.platform_joint]
         turn = bodies.T_body_link[virtual.parent].rotation.inv()
@@ -176,7 +185,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         base_normal=base_normal,
         platform_normal=platform_normal,
     )
-    check_frames(machine)
+    _check_frames(machine)
     return machine
 
 
@@ -186,7 +195,7 @@ def _travel(chain: LegChain, urdf: Urdf) -> tuple[float, float]:
     return (0.0, 0.0) if limits is None else limits
 
 
-def legs_in_order(
+def _legs_in_order(
     chains: Sequence[LegChain], bodies: Bodies, urdf: Urdf, block: LegcalBlock, path: Path
 ) -> list[LegChain]:
     """Return the leg chains in the order of the YAML.
@@ -233,7 +242,7 @@ def _is_on(joint: str, chain: LegChain, bodies: Bodies, urdf: Urdf) -> bool:
     return not entry.moves and bodies.body_of[entry.child] in chain.bodies
 
 
-def check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
+def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
     """Check that the URDF has every link and joint that the YAML names.
 
     Raises
@@ -260,7 +269,8 @@ def check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
         if block.platform_joint is not None:
             named.append(("legcal.platform_joint", block.platform_joint, "joint", joints))
     problems = [
-        _unknown(path, place, name, what, urdf, known)
+        f"{path}: {place} could not be used: found the {what} '{name}', which is not in "
+        f"{urdf.path.name}; {closest(name, sorted(known))}"
         for place, name, what, known in named
         if name not in known
     ]
@@ -279,15 +289,7 @@ def check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
         raise ModelError(problems)
 
 
-def _unknown(path: Path, place: str, name: str, what: str, urdf: Urdf, known: set[str]) -> str:
-    """Return that a name is not in the URDF."""
-    return (
-        f"{path}: {place} could not be used: found the {what} '{name}', which is not in "
-        f"{urdf.path.name}; {closest(name, sorted(known))}"
-    )
-
-
-def check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:
+def _check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:
     """Check that there are as many legs as define a frame, not far more, no fixed one in a plane.
 
     Raises
@@ -318,7 +320,7 @@ def check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> Non
         )
 
 
-def check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, path: Path) -> None:
+def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, path: Path) -> None:
     """Check that every motor is the slider of a leg.
 
     Raises
@@ -345,7 +347,7 @@ def check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, pa
         raise OutOfClass(problems)
 
 
-def check_frames(machine: Machine) -> None:
+def _check_frames(machine: Machine) -> None:
     """Check that the joint centres of the frame legs span a frame on base and platform.
 
     Raises
@@ -376,7 +378,7 @@ def check_frames(machine: Machine) -> None:
         raise ModelError(problems)
 
 
-def check_origins(urdf: Urdf) -> None:
+def _check_origins(urdf: Urdf) -> None:
     """Check that no joint is so far out that rounding hides how joints lie to each other.
 
     Raises
@@ -394,7 +396,7 @@ def check_origins(urdf: Urdf) -> None:
             )
 
 
-def check_spread(machine: Machine) -> None:
+def _check_spread(machine: Machine) -> None:
     """Check that the joints are as near each other as metres put them, before home is looked for.
 
     Raises
@@ -415,7 +417,7 @@ def check_spread(machine: Machine) -> None:
             )
 
 
-def check_unit(machine: Machine) -> None:
+def _check_unit(machine: Machine) -> None:
     """Check that the legs are as long at home, and move as far, as those written in metres.
 
     Raises
@@ -441,12 +443,7 @@ def check_unit(machine: Machine) -> None:
                 f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m, needed at most 20 m; write the "
                 "limits of its slider in metres (are they millimetres?)."
             )
-    _check_radii(machine, np.where(fixed, lengths.max(), lengths))
-
-
-def _check_radii(machine: Machine, lengths: Array) -> None:
-    """Check that what a camera sees of each leg is no thicker and no thinner than a leg is."""
-    for leg, length in zip(machine.legs, lengths, strict=True):
+    for leg, length in zip(machine.legs, np.where(fixed, lengths.max(), lengths), strict=True):
         for cylinder in leg.cylinders:
             if not MIN_RADIUS < cylinder.radius / length < MAX_RADIUS:
                 raise ModelError(
@@ -457,7 +454,7 @@ def _check_radii(machine: Machine, lengths: Array) -> None:
                 )
 
 
-def check_across(machine: Machine) -> None:
+def _check_across(machine: Machine) -> None:
     """Check that the closures of a planar mechanism hold across its plane too.
 
     Raises
@@ -483,7 +480,7 @@ def check_across(machine: Machine) -> None:
         raise OutOfClass(problems)
 
 
-def check_equations(machine: Machine) -> None:
+def _check_equations(machine: Machine) -> None:
     """Check the equations of all legs against Pinocchio at home and at poses near it.
 
     The closed configurations come from the URDF alone, the equations from the geometry that was
@@ -505,7 +502,7 @@ def check_equations(machine: Machine) -> None:
             if leg.kind is not LegKind.CONSTANT:
                 values[0] -= leg.sign * configuration[slider_columns(machine, (j,))[0][0]]
             for kind, value in zip(equations.kinds, np.abs(values), strict=True):
-                problem = _problem(kind, float(value))
+                problem = _broken_equation(kind, float(value))
                 if problem is not None:
                     problems.setdefault(
                         leg.name,
@@ -516,7 +513,7 @@ def check_equations(machine: Machine) -> None:
         raise OutOfClass(list(problems.values()))
 
 
-def _problem(kind: EquationKind, value: float) -> str | None:
+def _broken_equation(kind: EquationKind, value: float) -> str | None:
     """Return how an equation is broken, None if it is kept."""
     if kind is EquationKind.LENGTH:
         if value <= CONCURRENT:

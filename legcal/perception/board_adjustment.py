@@ -127,7 +127,7 @@ def adjust_board(
                 robust=True,
             ),
         ),
-        name="calibration of the camera",
+        name="calibration of the camera" if names else "pose of the board",
     )
     state = _State(camera, Frames.of(poses))
     if not np.all(np.isfinite(problem.factor("corners").rows(state).r)):

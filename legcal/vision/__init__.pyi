@@ -10,7 +10,6 @@ from .board_file import parse_board as parse_board
 from .board_file import read_board_file as read_board_file
 from .camera import DISTORTION_MODELS as DISTORTION_MODELS
 from .camera import Camera as Camera
-from .camera import DistortionModel as DistortionModel
 from .camera import camera_numbers as camera_numbers
 from .camera import distort_derivatives as distort_derivatives
 from .camera import intrinsic_names as intrinsic_names
@@ -28,6 +27,7 @@ from .cylinder import axis_of_outlines as axis_of_outlines
 from .cylinder import direction_derivative as direction_derivative
 from .cylinder import direction_of_angles as direction_of_angles
 from .cylinder import outlines_of_axis as outlines_of_axis
+from .distortion import DistortionModel as DistortionModel
 from .image_file import Grey as Grey
 from .image_file import ImageSize as ImageSize
 from .image_file import enlarged as enlarged

@@ -1,7 +1,8 @@
 """The camera: a pinhole with a distortion model of OpenCV, and its intrinsics by their names.
 
-A distortion model is one entry of ``DISTORTION_MODELS`` and its name in ``DistortionModel``: files,
-fits and the calibration of cameras take from there what they need of it.
+A distortion model is one entry of ``DISTORTION_MODELS`` and its name in
+:mod:`legcal.vision.distortion`: files, fits and the calibration of cameras take from there what
+they need of it.
 
 Views whose cameras have the same intrinsics are taken to show one camera: they share these, named
 after the first of them in the order of names.
@@ -11,14 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import cv2
 import numpy as np
 
 from legcal.geometry import Array
-
-DistortionModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
+from legcal.vision.distortion import DistortionModel
 
 _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
 _STEP = 1e-6  # of the central differences of undistortion, in units of the sensor plane

@@ -14,7 +14,8 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from legcal.errors import DatasetError
 from legcal.files import FileSchema, parse_yaml, read_text, validate
 from legcal.geometry import Array
-from legcal.vision.camera import DISTORTION_MODELS, Camera, DistortionModel, intrinsic_names
+from legcal.vision.camera import DISTORTION_MODELS, Camera, intrinsic_names
+from legcal.vision.distortion import DistortionModel
 from legcal.vision.image_file import quiet_opencv, size_problem
 
 _PixelCount = Annotated[int, Field(gt=0)]
