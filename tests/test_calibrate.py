@@ -19,7 +19,7 @@ import pytest
 import yaml
 from hexapod_example import HEXAPOD, ROOT, TRUTH, Run, copy_of_the_example
 from scipy.spatial.transform import RigidTransform, Rotation
-from simulated import files_of, settings
+from simulated import files_of, settings, simulated
 
 from legcal import calibrate, evaluate, load_dataset, load_mechanism, simulate
 from legcal.calibration import Calibration, poses_at_readings, result_of
@@ -74,7 +74,7 @@ def _pulls(calibration: Calibration, truth: Path) -> Array:
 def _simulated(
     folder: Path, model: str = PLANAR, *, poses: int = 6, **changes: Any
 ) -> SimulatedDataset:
-    return simulate(model, folder / "set", settings(poses=poses, **changes))
+    return simulated(folder / "set", model, poses=poses, **changes)
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +211,7 @@ def test_a_contradicted_focal_length_counts_in_the_verdict(
     ],
 )
 def test_fit_and_steps_come_nearer_to_the_truth(model: str, tmp_path: Path) -> None:
-    made = _simulated(tmp_path, model, poses=8, views=3)
+    made = simulate(model, tmp_path / "set", settings(poses=8, views=3))
     found = calibrate(made.folder, transformation="cross_product")
     assert found.verdict.trustworthy
     assert found.steps.failure == ""
@@ -342,35 +342,35 @@ def test_a_leg_that_views_leave_out_is_left_to_the_readings(hexapod: Path, tmp_p
 def in_the_hand(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[SimulatedDataset, Calibration]:
-    """3 x 5 images of a board and a hexapod, each by a camera whose pose is not given."""
+    """3 x 4 images of a board and a machine, each by a camera whose pose is not given."""
     folder = tmp_path_factory.mktemp("board")
-    changes = {"board": "chessboard", "hand_held": True, "views": 3, "seed": 4}
-    made = _simulated(folder, "hexapod", poses=5, **changes)
+    given = settings(board="chessboard", hand_held=True, views=3, poses=4, seed=4)
+    made = simulate(PLANAR, folder / "set", given)
     return made, calibrate(made.folder, output=folder / "result")
 
 
 def test_hand_held_cameras_need_no_poses(in_the_hand: tuple[SimulatedDataset, Calibration]) -> None:
     made, calibration = in_the_hand
-    assert len(calibration.solution.T_camera_Rb) == 15
+    assert len(calibration.solution.T_camera_Rb) == 12
     assert np.sqrt(np.mean(_pulls(calibration, made.truth_path) ** 2)) < 1.8
     assert abs(calibration.solution.values[BOARD_SCALE] - 1.0) < 2e-3
     assert not any("calibration board" in note for note in calibration.notes)
     result = json.loads((made.folder.parent / "result/result.json").read_text())
     assert result["board"]["given"] is None
-    assert len(result["views"]) == 15
+    assert len(result["views"]) == 12
     assert (made.folder.parent / "result/corners.csv").is_file()
 
 
 def test_a_board_joins_views_that_share_no_leg(
     in_the_hand: tuple[SimulatedDataset, Calibration], tmp_path: Path
 ) -> None:
-    """Two legs a view: steps 3 and 4 have too little, yet 1 and 2 place the cameras."""
+    """One leg a view: steps 3 and 4 have too little, yet 1 and 2 place the cameras."""
 
-    def two_legs(entry: dict[str, Any]) -> None:
-        for view, legs in zip(entry["views"].values(), ((1, 2), (3, 4), (5, 6)), strict=True):
-            view["legs"] = [f"leg{number}" for number in legs]
+    def one_leg(entry: dict[str, Any]) -> None:
+        for number, view in enumerate(entry["views"].values(), 1):
+            view["legs"] = [f"leg{number}"]
 
-    calibration = calibrate(_edited(in_the_hand[0].folder, tmp_path / "pairs", two_legs))
+    calibration = calibrate(_edited(in_the_hand[0].folder, tmp_path / "single", one_leg))
     assert calibration.steps.legs is None
     assert np.sqrt(np.mean(_pulls(calibration, in_the_hand[0].truth_path) ** 2)) < 2.0
 
@@ -393,7 +393,7 @@ def test_a_wrong_pose_of_the_board_is_noted_and_changes_nothing(
 
 
 def test_corners_that_are_too_few_are_refused(tmp_path: Path) -> None:
-    folder = _simulated(tmp_path, poses=2, board="charuco").folder
+    folder = _simulated(tmp_path, poses=2, views=1, board="charuco").folder
     _change(folder / "corners.csv", lambda rows: rows[:2])
     with pytest.raises(NotVisible, match="found no image with 4 of its corners or more"):
         calibrate(folder)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from machines import made
 from scipy.spatial.transform import RigidTransform, Rotation
-from simulated import settings
+from simulated import settings, simulated
 
 import legcal
 from legcal import calibrate, simulate
@@ -109,7 +109,7 @@ def test_a_reading_that_the_nominal_model_does_not_reach_is_used_and_told(tmp_pa
     turned = Rotation.from_euler("z", 12, degrees=True)
     near = legcal.inverse_kinematics(model, RigidTransform.from_components([0, 0, 0], turned))
     poses = with_pose(tmp_path, model, near)
-    made_set = simulate(model, tmp_path / "set", settings(poses=poses, views=2))
+    made_set = simulated(tmp_path / "set", "3-rpr", poses=poses)
     short = made(
         tmp_path, name="short", type="3-RPR", offsets=224, travel=[0, 140],
         base_joints=[[0, -400, 0], [346.41, 200, 0], [-346.41, 200, 0]],
@@ -132,7 +132,7 @@ def test_a_reading_that_the_nominal_model_does_not_reach_is_used_and_told(tmp_pa
 def test_a_reading_out_of_reach_is_named(tmp_path: Path) -> None:
     model = legcal.load_mechanism("3-rpr")
     poses = with_pose(tmp_path, model, READINGS[0])
-    folder = simulate(model, tmp_path / "set", settings(poses=poses, views=1)).folder
+    folder = simulated(tmp_path / "set", "3-rpr", poses=poses, views=1).folder
     table = folder / "measurements.csv"
     lines = table.read_text().splitlines()
     typed = lines[4].split(",")
@@ -175,7 +175,7 @@ def test_a_3_upu_not_far_from_its_constraint_singularity_is_calibrated(tmp_path:
 def two_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Outlines of a hexapod in two views."""
     folder = tmp_path_factory.mktemp("two") / "set"
-    return simulate("hexapod", folder, settings(poses=8, views=2, seed=1)).folder
+    return simulated(folder, "hexapod", poses=8, seed=1).folder
 
 
 @pytest.fixture(scope="module")
@@ -226,7 +226,7 @@ def test_a_leg_that_no_view_shows_is_found_from_its_readings(
 
 
 def test_a_platform_that_only_translates_has_its_determined_part_found(tmp_path: Path) -> None:
-    made_set = simulate("3-upu", tmp_path / "set", settings(poses=6, views=2, seed=1))
+    made_set = simulated(tmp_path / "set", "3-upu", poses=6, seed=1)
     calibration = calibrate(made_set.folder, output=tmp_path / "out")
     before, after = errors(calibration, made_set.folder, tmp_path / "out")
     assert calibration.verdict.trustworthy

@@ -211,7 +211,7 @@ def test_two_priors_that_contradict_each_other_are_refused() -> None:
     ("values", "found"),
     [
         ({"leg1.offset": 0.0042}, "they say about {true:.3g}"),
-        ({"leg1.offset": -0.15}, "they say about {true:.3g}"),
+        pytest.param({"leg1.offset": -0.15}, "they say about {true:.3g}", marks=pytest.mark.slow),
         ({"leg2.offset": 0.0, "leg3.base.x": 2e-3, "leg4.platform.y": 0.0}, "leg3.base.x"),
     ],
 )
@@ -244,7 +244,7 @@ def test_other_stated_values_that_contradict_measurements_are_refused(
 
 
 @pytest.mark.parametrize("scale", thinned([1.0, 4.0], [4.0]))
-@pytest.mark.parametrize("part", thinned(["offset", "platform", "radius"], ["platform", "radius"]))
+@pytest.mark.parametrize("part", thinned(["offset", "platform", "radius"], ["platform"]))
 def test_right_fixed_values_are_accepted_whatever_outlines_claim(part: str, scale: float) -> None:
     exact = machine_session("hexapod", n_poses=10)
     measurements, outlines = exact.noisy(5)

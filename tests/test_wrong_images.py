@@ -12,9 +12,9 @@ import pytest
 from hexapod_example import Picture, Spoiled, spoiled
 from outline_tables import outlines_of
 from scipy.spatial.transform import RigidTransform, Rotation
-from simulated import settings
+from simulated import simulated
 
-from legcal import calibrate, detect, load_dataset, simulate
+from legcal import calibrate, detect, load_dataset
 from legcal.calibration import Calibration, Detection
 from legcal.calibration.joint_fit import DISAGREES
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
@@ -39,7 +39,7 @@ from legcal.progress import no_progress
 from legcal.workers import in_turn
 
 WITHOUT_GAMMA = "The gamma of "  # a note on the cameras of the example
-N = 6
+N = 8  # images of a view: with fewer good ones its rough pose gives way to a long search
 
 
 def _mirror(picture: Picture) -> Picture:
@@ -234,8 +234,8 @@ def test_an_image_alone_in_its_view_is_judged_by_those_of_other_views(tmp_path: 
 
 
 def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
-    made = spoiled(tmp_path / "views", 4)
-    for k in range(4):
+    made = spoiled(tmp_path / "views", 3)
+    for k in range(3):
         made.change("c1", k, _mirror)
     views = made.entry["views"]
     for name in ("c2", "c3"):
@@ -281,7 +281,7 @@ def test_a_rough_pose_may_be_off_by_what_rough_poses_are() -> None:
 def test_radii_that_are_wrong_by_a_fifth_are_found(
     tmp_path: Path, leg: str, factor: float, n: int, words: str
 ) -> None:
-    made = spoiled(tmp_path / "radii", n)
+    made = spoiled(tmp_path / "radii", n, ("c1", "c2"))
     made.scale_radii(factor, leg)
     observed = _observed(made)
     found = observed.placement
@@ -335,7 +335,7 @@ def test_a_blurred_image_that_is_alone_in_its_view_is_named(tmp_path: Path) -> N
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
     """A calibration of a hexapod from outlines."""
-    made = simulate("hexapod", tmp_path_factory.mktemp("outlines") / "set", settings(poses=6))
+    made = simulated(tmp_path_factory.mktemp("outlines") / "set", "hexapod", poses=6)
     return calibrate(made.folder)
 
 

@@ -303,20 +303,26 @@ def _as_png(found: PaperSummary) -> bytes:
     """Return the figure as a PNG picture."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     grid, names = _panels(found), list(map(_label, found.names))
     n_rows, n_columns = len(grid), len(grid[0])
-    figure = Figure(
-        figsize=(7.0 * n_columns, 2.9 * n_rows + 0.6), layout=ConstrainedLayoutEngine(h_pad=0.12)
-    )
+    width, height = 7.0 * n_columns, 2.9 * n_rows + 0.6
+    figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
-    axes = figure.subplots(n_rows, n_columns, squeeze=False)
+    place = {  # in inches; a layout that matplotlib finds takes as long as all the rest
+        "left": 0.8 / width,
+        "right": 1.0 - 0.75 / width,
+        "bottom": 0.95 / height,
+        "top": 1.0 - 0.65 / height,
+        "wspace": 0.27,
+        "hspace": 0.4,
+    }
+    axes = figure.subplots(n_rows, n_columns, squeeze=False, gridspec_kw=place)
     for axis, panel in zip(axes.flat, (panel for row in grid for panel in row), strict=True):
         handles = _draw(axis, panel, names)
         axis.set_ylim(_limits(grid))
-    figure.suptitle(_title(found), fontsize=11)
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9)
+    figure.suptitle(_title(found), fontsize=11, y=1.0 - 0.15 / height)
+    figure.legend(handles=handles, loc="lower center", ncols=len(handles), fontsize=9)
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
     return content.getvalue()

@@ -183,9 +183,8 @@ def _calibrated(folder: Path, *words: str, many: bool = False) -> Any:
     return facts(run(command, many=many).document)
 
 
-@pytest.mark.parametrize(
-    "name", ["3-rpr-axes", pytest.param("3-rpr-outlines", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["3-rpr-axes", "3-rpr-outlines"])
 def test_order_does_not_matter(name: str, tmp_path: Path) -> None:
     found = []
     for change in (lambda folder: None, _reversed_session):
