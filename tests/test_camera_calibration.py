@@ -13,6 +13,7 @@ from camera_sessions import CAMERAS, NOISE_PX, PINHOLE, SIZE, drawings, photogra
 
 from legcal import calibrate_camera, cli
 from legcal.calibration import CameraCalibration
+from legcal.calibration.camera_calibration import calibration
 from legcal.calibration.camera_calibration.adjustment import RobustFit, robust_fit
 from legcal.calibration.camera_calibration.diagnostics import refuse_undetermined, warnings
 from legcal.calibration.joint_fit.parameter_choices import Prior, known_parameters, resolve
@@ -199,6 +200,27 @@ def test_pictures_give_the_camera_that_took_them(found: CameraCalibration) -> No
     assert tilts[:N_IMAGES] == pytest.approx([0.5] * N_IMAGES, abs=0.05)  # as they were drawn
     assert tilts[N_IMAGES] is None
     assert [i["sigma"] for i in document["intrinsics"]] == found.sigma.tolist()
+
+
+def test_sigmas_follow_residuals_and_not_what_corners_claim(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = seen_corners(CAMERAS["plumb_bob"], N_IMAGES, 1)
+    number = {tuple(point): k for k, point in enumerate(board_of(SPEC).points)}
+
+    def stated(claim: float) -> Array:
+        images = iter(range(N_IMAGES))
+
+        def corners(*_: object) -> tuple[Array, Array, Array]:
+            own = seen.image == next(images)
+            numbers = np.array([number[tuple(point)] for point in seen.points[own]])
+            return numbers, seen.px[own], claim * seen.sigma_px[own]
+
+        monkeypatch.setattr(calibration, "find_corners", corners)
+        paths = [folder / f"b{k:02d}.png" for k in range(N_IMAGES)]
+        return calibrate_camera(paths, SPEC, workers=1).sigma
+
+    np.testing.assert_allclose(stated(4.0), stated(1.0), rtol=0.01)
 
 
 def test_the_file_is_a_camera_info_whose_sigmas_become_priors(

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from types import ModuleType
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -54,7 +54,9 @@ from legcal.calibration.outlier_images import outlier_images
 from legcal.data import axes_from_outlines, no_outlines
 from legcal.estimation import Frames, Problem, PseudoHuber, linearize, normal_equations, solver
 from legcal.geometry import Array
-from legcal.perception import adjust_board, board_adjustment
+from legcal.perception import adjust_board, board_adjustment, view_fit
+from legcal.perception.placement import Search, group_views
+from legcal.perception.view_fit import fit_view
 from legcal.vision import Camera, intrinsic_names, outlines_of_axis
 
 K = 0.1
@@ -238,6 +240,24 @@ def _outlier_image() -> None:
     assert outlier_images(session.measurements, load_mechanism("hexapod"), rejected)
 
 
+def _view_of_outlines() -> None:
+    session = machine_session("3-rps", n_poses=2)
+    m, start = session.measurements, session.start
+    A, B = (np.array([getattr(leg, end) for leg in start.legs]) for end in "AB")
+    ends = np.array([T.apply(B) for T in start.T_Rb_Re])
+    every = np.ones((len(m.views), len(A)), dtype=np.bool_)
+    cylinders = [leg.cylinders for leg in start.legs]
+    search = Search(_no_image, m, np.broadcast_to(A, ends.shape), ends, cylinders, every, m.image)
+    rough = [T.inv() for T in start.T_camera_Rb]
+    to_first = [start.T_camera_Rb[0] * T for T in rough]  # two cameras on one mount
+    (group, _) = group_views(m, np.arange(m.n_rows), rough, [*to_first[:2], None])
+    fit_view(search, group, rough[0], np.zeros((len(A), 2, 3)), session.outlines)
+
+
+def _no_image(row: int) -> NoReturn:
+    raise AssertionError(f"image {row} was opened")
+
+
 CLIENTS: dict[str, tuple[ModuleType, Callable[[], None]]] = {
     "board before a known camera": (board_adjustment, _board),
     **{
@@ -249,6 +269,7 @@ CLIENTS: dict[str, tuple[ModuleType, Callable[[], None]]] = {
     },
     "tool poses with errors of the model": (location_fit, _tool_poses),
     "outlines of one image": (outlier_images_module, _outlier_image),
+    "camera by the outlines of its views": (view_fit, _view_of_outlines),
 }
 
 
@@ -259,11 +280,14 @@ def test_problems_of_other_clients_have_them_too(
     module, run = CLIENTS[client]
     seen: list[tuple[Problem[Any], Any]] = []
 
+    entry = "minimise" if hasattr(module, "minimise") else "linearize"  # with steps of its own
+    unwatched = getattr(module, entry)
+
     def watched(problem: Problem[Any], state: Any, *more: Any, **options: Any) -> Any:
         seen.append((problem, state))
-        return solver.minimise(problem, state, *more, **options)
+        return unwatched(problem, state, *more, **options)
 
-    monkeypatch.setattr(module, "minimise", watched)
+    monkeypatch.setattr(module, entry, watched)
     run()
     problem, state = seen[0]
     J = jacobian(problem, linearize(problem, state))

@@ -275,6 +275,32 @@ def test_intrinsics_move_outlines_as_motions_of_the_leg_do(seed: int, number: in
         )
 
 
+def test_distances_of_ends_follow_the_lengths_of_their_legs() -> None:
+    session = planned_observations(legcal.load_mechanism("hexapod"), [range(4), range(2, 6)], 3)
+    rows, weight, key = Analysis(session).distances
+    change = 1e-6 * np.random.default_rng(0).normal(size=session.n_legs)
+    ends = session.A + session.length[..., None] * session.u
+    moved = ends + change[:, None] * session.u
+    _, pose, j, g = key.T
+    before, after = (np.linalg.norm(e[pose, j] - e[pose, g], axis=1) for e in (ends, moved))
+    np.testing.assert_allclose(rows @ change, weight * (after - before), rtol=1e-4, atol=1e-9)
+
+
+def test_what_is_determined_does_not_depend_on_the_size_of_the_machine() -> None:
+    """A thousand times as large and as far, before the same cameras: relative figures stay."""
+    session, size = planned_observations(legcal.load_mechanism("3-rps"), [range(3)] * 3, 3), 1e3
+    lengths = {k: size * getattr(session, k) for k in ("radius", "t", "t_reached", "camera")}
+    legs = tuple(
+        replace(leg, A=size * leg.A, B=size * leg.B, q0=size * leg.q0) for leg in session.legs
+    )
+    larger = replace(session, legs=legs, sigma_q=size * session.sigma_q, **lengths)
+    one, other = Analysis(session), Analysis(larger)
+    sigma = [intrinsics_sigma(["c"] * 3, each) for each in (one, other)]
+    np.testing.assert_allclose(sigma[1], sigma[0], rtol=1e-3)
+    singular = [np.linalg.svd(each.information, compute_uv=False) for each in (one, other)]
+    np.testing.assert_allclose(size * singular[1], singular[0], rtol=1e-3)
+
+
 @cache
 def example() -> Analysis:
     return Analysis(recorded_observations(load_dataset(HEXAPOD, check_images=False)))

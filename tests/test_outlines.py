@@ -247,6 +247,21 @@ def test_what_is_not_there_is_rejected_with_the_reason() -> None:
     assert not np.any(detect(cam, bars[:1], noise).used)
 
 
+def test_a_mirrored_image_shows_mirrored_outlines_at_its_border_too() -> None:
+    """What lies beyond a border is not seen, on the right as on the left."""
+    cam = camera()
+    K = cam.K.copy()
+    K[0, 2] = cam.width - 1.0 - K[0, 2]
+    other, across = replace(cam, K=K), np.array([-1.0, 1.0, 1.0])
+    b = bar(0.2, 0.0, 150.0)
+    mirrored = Bar(across * b.A, across * b.B, b.radius, b.albedo)
+    image = np.rint(render(cam, [b], 30.0, blur=0.5, supersample=2)).astype(np.uint8)
+    found = detect(cam, [b], image, off=0.0)
+    again = detect(other, [mirrored], image[:, ::-1].copy(), off=0.0)
+    assert found.reason == again.reason[::-1]
+    np.testing.assert_array_equal(found.used, [False, True])
+
+
 def test_a_leg_of_another_radius_is_not_trusted() -> None:
     cam = camera()
     bars = [bar(0.0, 0.03, 150.0, radius=0.02)]

@@ -363,8 +363,10 @@ def test_turned_cameras_and_other_orders_change_nothing(
     for one, other in zip([first.legs[j] for j in legs], second.legs, strict=True):
         for a, b in ((one.A, other.A), (one.B, other.B), (one.q0, other.q0)):
             assert np.allclose(a, b, rtol=0.0, atol=1e-7)
-        if one.base_axis is not None and other.base_axis is not None:
-            assert np.allclose(one.base_axis, other.base_axis, atol=1e-6)
+        for key in ("base_axis", "platform_axis"):
+            a, b = getattr(one, key), getattr(other, key)
+            assert (a is None) == (b is None)
+            assert a is None or np.allclose(a, b, atol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [0.01, 100.0])

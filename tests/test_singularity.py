@@ -174,6 +174,33 @@ def test_forward_kinematics_does_not_pass_a_singular_attitude() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("name", "place", "turn", "place_beyond", "turn_beyond"),
+    [
+        ("nategh-agheli", (0.24, 0.02, 0.31), (-0.61, 0.61, 0.88),
+         (0.26, 0.02, 0.29), (-0.66, 0.66, 0.95)),
+        ("6-sps", (0.27, -0.01, 0.51), (-2.58, -1.44, -0.58),
+         (0.34, -0.01, 0.52), (-3.28, -1.82, -0.73)),
+    ],
+)  # fmt: skip
+def test_readings_from_a_little_beyond_a_singularity_are_met_on_this_side(
+    name: str,
+    place: tuple[float, ...],
+    turn: tuple[float, ...],
+    place_beyond: tuple[float, ...],
+    turn_beyond: tuple[float, ...],
+) -> None:
+    """A single Newton step from here ends beyond."""
+    machine = machine_of(name)
+    here, beyond = (
+        RigidTransform.from_components(t, Rotation.from_rotvec(r) * machine.home.rotation)
+        for t, r in ((place, turn), (place_beyond, turn_beyond))
+    )
+    found = forward_kinematics(machine, inverse_kinematics(machine, beyond), start=here)
+    sides = [np.sign(np.linalg.det(_lines(machine, T))) for T in (here, beyond, found)]
+    assert sides[0] == -sides[1] == sides[2]
+
+
 def test_readings_of_long_travels_are_reached_in_the_mode_of_home_or_refused() -> None:
     machine = machine_of("nategh-agheli")
     lower, upper = np.array([leg.travel for leg in machine.legs]).T
