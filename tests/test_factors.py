@@ -52,6 +52,7 @@ from legcal.calibration.location.fit import fit
 from legcal.calibration.location.tool_poses import PoseNoise
 from legcal.calibration.outlier_images import outlier_images
 from legcal.data import axes_from_outlines, no_outlines
+from legcal.errors import DidNotConverge
 from legcal.estimation import Frames, Problem, PseudoHuber, linearize, normal_equations, solver
 from legcal.geometry import Array
 from legcal.perception import adjust_board, board_adjustment, view_fit
@@ -434,6 +435,15 @@ def test_poses_go_back_to_their_constraints_the_shortest_way() -> None:
     assert np.abs(left).max() > 1e-7
     assert np.abs(free @ left.ravel()).max() < 1e-10
     assert of_poses.shape[0] == free.shape[1]
+
+
+def test_poses_that_do_not_come_to_rest_on_their_constraints_are_refused() -> None:
+    session = _session("3-rps")
+    problem = build_fit(session.legs, session.measurements, session.outlines)
+    far = 0.2 * np.random.default_rng(18).normal(size=problem.size)
+    far[problem.n_kinematic : problem.n_kept] = 0.0
+    with pytest.raises(DidNotConverge, match=r"a pose that still moves by \d"):
+        problem.projected(problem.moved(problem.begin(session.start), far))
 
 
 def _turn(there: Frames, here: Frames) -> Array:

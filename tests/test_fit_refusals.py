@@ -17,8 +17,11 @@ from fit_sessions import (
 )
 
 from legcal.calibration.joint_fit import (
+    FitProblem,
+    RefinementSettings,
     Start,
     cameras_from_hints,
+    fit,
     fitted_legs,
     platform_poses,
     refine,
@@ -178,6 +181,21 @@ def test_a_start_far_away_is_refused(session: HexapodSession) -> None:
     assert len(refused.value.problems) == 1
     with pytest.raises(DidNotConverge, match="needs at least one"):
         refine_from_best(session.legs, session.measurements, session.outlines, [])
+
+
+def test_the_start_of_the_lowest_cost_is_refined_wherever_it_stands(
+    session: HexapodSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starts = [replace(at_truth(session), label=label) for label in ("second", "first", "third")]
+    costs = {"first": 1.0, "second": 2.0, "third": 3.0}
+    unwatched = fit._first
+
+    def with_cost(problem: FitProblem, start: Start, settings: RefinementSettings) -> object:
+        return unwatched(problem, start, settings)[0], costs[start.label]
+
+    monkeypatch.setattr(fit, "_first", with_cost)
+    found = refine_from_best(session.legs, session.measurements, session.outlines, starts)
+    assert found.start == "first"
 
 
 def test_views_without_a_rough_pose_are_named(session: HexapodSession) -> None:

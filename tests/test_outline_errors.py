@@ -53,6 +53,7 @@ from legcal.calibration.joint_fit.outline_errors import (
     N_KINDS,
     RECOVERED_SHARE,
     EdgeBiases,
+    NoiseModel,
     estimated_biases,
 )
 from legcal.calibration.joint_fit.rounds import (
@@ -64,7 +65,7 @@ from legcal.calibration.joint_fit.rounds import (
 from legcal.calibration.outline_detection import detect
 from legcal.data import Measurements, Outlines, no_outlines
 from legcal.errors import DidNotConverge
-from legcal.estimation import linearize, scores_of_block
+from legcal.estimation import information, linearize, score_test, scores_of_block
 from legcal.geometry import Array, BoolArray
 from legcal.simulation import moved_outlines
 from legcal.simulation import simulate as simulate_folder
@@ -293,6 +294,19 @@ def test_scores_are_those_of_the_residuals_of_a_fit(session: HexapodSession) -> 
     left = B_all - basis @ (basis.T @ B_all)
     np.testing.assert_allclose(K, left.T @ B_all, atol=1e-6 * np.abs(K).max())
     np.testing.assert_allclose(z, left.T @ r_all, atol=1e-6 * np.abs(z).max())
+    normal = information(problem, state, linear)
+    for found, expected in zip(
+        score_test(problem, linear, normal, {"outlines": B}), (z, K), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_errors_of_an_outline_are_its_noise_and_those_of_both_ends() -> None:
+    claimed = np.diag([0.03, 0.05])[None] ** 2
+    noise = NoiseModel(2.0, bias_px=0.2, tilt_px=0.1).covariance(claimed)[0]
+    ends = np.array([[1.0, 1.0], [1.0, -1.0]])  # by the mean of both, and half their difference
+    expected = 4.0 * claimed[0] + ends.T @ np.diag([0.2, 0.1]) ** 2 @ ends
+    np.testing.assert_allclose(noise, expected)
 
 
 def test_scores_do_not_depend_on_the_biases_that_are_fitted(session: HexapodSession) -> None:

@@ -129,6 +129,13 @@ def test_a_freed_radius_has_no_prior(session: MachineSession) -> None:
     with_priors = fitted(wrong)
     off = [abs(with_priors.radii[part] - r) for part, r in session.legs.radii.items()]
     assert min(off) > 1e-9
+    sigmas = [(with_priors.radii[part] / r - 1.0) / 0.02 for part, r in radii.items()]
+    assert with_priors.chi2 == pytest.approx(np.sum(np.square(sigmas)), rel=1e-3)
+    much = {part: 2.2 * r for part, r in session.legs.radii.items()}
+    with pytest.raises(DidNotConverge, match="mm; they must agree to a half"):
+        fitted(
+            replace(session, legs=replace(session.legs, radii=much)), Choices(free=frozenset(names))
+        )
 
 
 @pytest.mark.parametrize(
@@ -158,9 +165,12 @@ def test_an_intrinsic_fixed_at_its_value_is_used(session: MachineSession) -> Non
 
 
 def test_a_freed_intrinsic_that_nothing_determines_is_refused(session: MachineSession) -> None:
-    with pytest.raises(NotIdentifiable, match=r"leave open .*of camera c1"):
-        fitted(session, Choices(free=frozenset({"c1.k1", "c1.k2", "c1.k3", "c1.fx", "c1.fy",
-                                                "c1.p1", "c1.p2", "c1.cx", "c1.cy"})))  # fmt: skip
+    for names, n_open in (
+        (("k3",), 1),
+        (("k1", "k2", "k3", "fx", "fy", "p1", "p2", "cx", "cy"), 2),
+    ):
+        with pytest.raises(NotIdentifiable, match=rf"found {n_open} .* leave open .*of camera c1"):
+            fitted(session, Choices(free=frozenset(f"c1.{name}" for name in names)))
 
 
 def test_priors_determine_what_images_do_not() -> None:
