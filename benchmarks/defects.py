@@ -77,7 +77,7 @@ class Defect:
     what: str
     old: str
     new: str
-    tests: tuple[str, ...]  # of the old suite
+    tests: tuple[str, ...]  # files that are about it
     cases: str  # words for pytest -k, of any other suite
 
 
