@@ -102,7 +102,7 @@ def test_motors_that_are_too_many_or_hold_nothing_are_noted(
 
 def test_the_mobility_is_that_of_other_poses_where_home_is_singular(tmp_path: Path) -> None:
     """Legs of a 3-UPU that are parallel leave the platform two turns more, at home alone."""
-    sizes = {"base_radius": 300.0, "platform_radius": 300.0, "height": 400.0}
+    sizes: dict[str, Any] = {"base_radius": 300.0, "platform_radius": 300.0, "height": 400.0}
     machine = create_model(read_family("3-UPU", **sizes), tmp_path).machine
     assert machine.mobility == 3
     assert any("is singular at home" in note for note in machine.diagnostics)
