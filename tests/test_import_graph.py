@@ -34,6 +34,13 @@ def _modules() -> dict[str, Path]:
 
 
 @cache
+def _statements(module: str) -> list[ast.Import | ast.ImportFrom]:
+    """Return what a module says to import, wherever it says so."""
+    nodes = ast.walk(ast.parse(_modules()[module].read_text()))
+    return [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
+
+
+@cache
 def _handed_out(facade: str) -> dict[str, str]:
     """Return which module each name of a façade comes from, seen through façades within it."""
     path = _modules()[facade].with_suffix(".pyi")
@@ -50,12 +57,12 @@ def _handed_out(facade: str) -> dict[str, str]:
 
 @cache
 def _imports(module: str) -> frozenset[str]:
-    """Return the modules that a module imports from, wherever it says so, seen through façades."""
+    """Return the modules that a module imports from, seen through façades."""
     names: set[str] = set()
-    for node in ast.walk(ast.parse(_modules()[module].read_text())):
+    for node in _statements(module):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module in _modules():
+        elif node.module in _modules():
             for alias in node.names:
                 name = f"{node.module}.{alias.name}"
                 names.add(
@@ -104,11 +111,10 @@ def test_rooms_are_used_through_their_facades() -> None:
     rooms = {*ROOMS, BESIDE}
     past = set()
     for module in _of(*rooms, *OUTSIDE):
-        for node in ast.walk(ast.parse(_modules()[module].read_text())):
-            names: list[str] = []
+        for node in _statements(module):
             if isinstance(node, ast.Import):
                 names = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom):
+            else:
                 whole = [f"{node.module}.{alias.name}" for alias in node.names]
                 names = [node.module or "", *(name for name in whole if name in _modules())]
             past |= {

@@ -21,7 +21,7 @@ CALIBRATE = "calibrate {in} -o {out}"
 def harmful_files() -> Iterator[tuple[str, Case, str]]:
     """Yield a name, the file, and a word of the refusal."""
     for name, text, word in _yaml():
-        for file in ("plain:dataset.yaml", "plain:camera_info.yaml")[: 1 + (len(text) < 10_000)]:
+        for file in ("small:dataset.yaml", "small:camera_info.yaml")[: 1 + (len(text) < 10_000)]:
             yield f"{name} as {file}", Case(_NAMED[file], made=text), word
     for name, file, made, word in (*_names(), *_tables(), *_models(), *_images()):
         yield f"{name} as {file}", Case(_NAMED[file], made=made), word
@@ -33,17 +33,17 @@ def special_files() -> Iterator[tuple[str, Case]]:
     result = "calibrate {in}/set --check {in}/result"
     places = (
         *((subject.input, subject.file, subject.command) for subject in SUBJECTS),
-        ("plain", "observations.csv", DETECT),
-        ("plain", ".legcal-cache.json", "detect {in} -o {in}/found"),
-        ("plain", "axes.csv", CALIBRATE),
-        ("plain", "corners.csv", CALIBRATE),
-        ("plain", "found/detection.json", "detect {in} -o {in}/found"),
-        ("plain", "found/result.json", "calibrate {in} -o {in}/found"),
-        ("plain", "found/camera.yaml", "camera {in}/images/c1_1.png --board chessboard:5x4:20mm "
+        ("small", "observations.csv", DETECT),
+        ("small", ".legcal-cache.json", "detect {in} -o {in}/found"),
+        ("small", "axes.csv", CALIBRATE),
+        ("small", "corners.csv", CALIBRATE),
+        ("small", "found/detection.json", "detect {in} -o {in}/found"),
+        ("small", "found/result.json", "calibrate {in} -o {in}/found"),
+        ("small", "found/camera.yaml", "camera {in}/images/c1_1.png --board chessboard:5x4:20mm "
          "-o {in}/found/camera.yaml"),
         ("settings", "found/truth/truth.json", "simulate 3-rpr --level axes --poses 4 -o "
          "{in}/found"),
-        ("plain", "study/runs.jsonl", study),
+        ("small", "study/runs.jsonl", study),
         ("result", "set/observations.csv", result),
     )  # fmt: skip
     for source, file, command in places:
@@ -74,20 +74,20 @@ def _yaml() -> Iterator[tuple[str, bytes, str]]:
 
 
 def _names() -> Iterator[tuple[str, str, bytes, str]]:
-    text = (made_input("plain") / "dataset.yaml").read_bytes()
-    table = (made_input("plain") / "measurements.csv").read_bytes()
+    text = (made_input("small") / "dataset.yaml").read_bytes()
+    table = (made_input("small") / "measurements.csv").read_bytes()
     gepetto = (made_input("formats") / "gepetto/robot.yaml").read_bytes()
     planar = (made_input("formats") / "planar.xml").read_bytes()
     for name in (b"=1+1", b"+c1", b"-c1", b'"@c1"', b'"\\e[31mc1"', b'"c1\\u202e"'):
         yield (
             f"view {name!r}",
-            "plain:dataset.yaml",
+            "small:dataset.yaml",
             text.replace(b"  c1:", b"  %s:" % name),
             "name",
         )
         made = table.replace(b"images/c1_1.png", name.strip(b'"'))
         if b"\\" not in name:
-            yield f"image {name!r}", "plain:measurements.csv", made, "= + - @"
+            yield f"image {name!r}", "small:measurements.csv", made, "= + - @"
     made = planar.replace(b'"q0"', b'"=q0"')
     yield "a formula in MJCF", "formats:planar.xml", made, "= + - @"
     made = gepetto.replace(b"leg1_end", b"leg1_ent")
@@ -95,8 +95,8 @@ def _names() -> Iterator[tuple[str, str, bytes, str]]:
 
 
 def _tables() -> Iterator[tuple[str, str, bytes, str]]:
-    table = "plain:measurements.csv"
-    lines = (made_input("plain") / "measurements.csv").read_bytes().splitlines()
+    table = "small:measurements.csv"
+    lines = (made_input("small") / "measurements.csv").read_bytes().splitlines()
     for digits in (b"1" * 130_000 + b"x", b"1" * 130_000, b"." + b"1" * 130_000 + b"e"):
         row = lines[1].rsplit(b",", 1)[0] + b"," + digits
         yield "long digits", table, b"\n".join([lines[0], *[row] * 25]), "number"
@@ -156,9 +156,9 @@ def _chain(n: int, kind: str) -> bytes:
 def _images() -> Iterator[tuple[str, str, bytes, str]]:
     for size in (30_000, 2**31 - 1):
         yield f"{size} px", "settings:board.png", _png(size), "px"
-        yield f"{size} px", "plain:images/c1_1.png", _png(size), "px"
+        yield f"{size} px", "small:images/c1_1.png", _png(size), "px"
     named = _png(64, b"\x1b[3m")
-    yield "a chunk of escapes", "plain:images/c1_1.png", named[:-20] + b"\0" + named[-19:], ""
+    yield "a chunk of escapes", "small:images/c1_1.png", named[:-20] + b"\0" + named[-19:], ""
     heads = (
         b"%YAML:1.0\n---\na: ",
         b'{"opencv-matrix": ',
@@ -167,15 +167,15 @@ def _images() -> Iterator[tuple[str, str, bytes, str]]:
     for head, opening in zip(heads, (b"- ", b"[", b"<a>"), strict=True):
         yield (
             f"{opening!r} in a storage",
-            "plain:camera_info.yaml",
+            "small:camera_info.yaml",
             head + opening * 60_000,
             "lists",
         )
     for camera in (2**31 - 1, 10**30, 20_000):
-        text = (made_input("plain") / "camera_info.yaml").read_bytes()
+        text = (made_input("small") / "camera_info.yaml").read_bytes()
         text = text.replace(b"width: 64", b"width: %d" % camera)
         text = text.replace(b"height: 48", b"height: %d" % camera)
-        yield f"{camera} px", "plain:camera_info.yaml", text, "image"
+        yield f"{camera} px", "small:camera_info.yaml", text, "image"
     tiff = "pictures:images/c1_1.tiff"
     n = 60_000
     tags = struct.pack("<HHI", 273, 4, 270_000) + struct.pack("<I", 8)
@@ -189,7 +189,7 @@ def _images() -> Iterator[tuple[str, str, bytes, str]]:
     encoded = cv2.imencode(".jpg", np.zeros((48, 64), dtype=np.uint8))[1].tobytes()
     at = encoded.index(b"\xff\xda")
     scan = encoded[at:-2]
-    yield "scans", "pictures:images/c1_2.jpg", encoded[:at] + scan * 3000 + b"\xff\xd9", "scans"
+    yield "scans", "pictures:images/c2_1.jpg", encoded[:at] + scan * 3000 + b"\xff\xd9", "scans"
 
 
 def _png(size: int, kind: bytes = b"tEXt") -> bytes:

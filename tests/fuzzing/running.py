@@ -6,6 +6,7 @@ it starts with; a refusal leaves nothing behind, and what it prints is clean tex
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import re
@@ -16,14 +17,15 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cache
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
+import yaml
 from characterisation.inputs import made_input
 from characterisation.running import Outcome, run, words_of
 
@@ -38,7 +40,7 @@ MAX_SECONDS = 5.0  # of work of the processor
 MAX_WAIT = 60.0  # [s] on the wall, with other work beside it
 MAX_BYTES = 1 << 30
 MAX_TEXT = 20_000  # characters that a command prints about a damaged file
-MOST_OF_CHILD = 400  # cases, before another process starts anew
+MOST_OF_CHILD = 600  # cases, before another process starts anew
 DEEP_SHARE = 0.03
 CONTROL = re.compile(
     r"[^\x20-\x7e\xa0-\u2027\u2030-\ud7ff\ue000-\U0010ffff\n]|[\x80-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]"
@@ -137,7 +139,7 @@ def run_cases(cases: Sequence[Case], *, lone: bool = False) -> Iterator[Ended]:
     """
     for case in cases:
         made_input(case.subject.input)
-    _read_shipped_models_once()
+    _shipped()
     context = get_context("fork")
     left = list(cases)
     while left:
@@ -164,22 +166,32 @@ def run_cases(cases: Sequence[Case], *, lone: bool = False) -> Iterator[Ended]:
 
 
 @cache
-def _read_shipped_models_once() -> None:
-    """Let all cases share the models that none of them damages: reading them takes longest."""
-    load = loader._load
-    load_once = cache(load)
-    shipped = {path: read_source(path) for path in map(find_model, ("hexapod", "3-rpr"))}
+def _shipped() -> dict[Path, tuple[Source, Machine]]:
+    """Read the models that no case damages, and import what commands need: all cases share both."""
+    one_of_each = {subject.command.split()[0]: subject for subject in SUBJECTS if not subject.deep}
+    for subject in one_of_each.values():
+        with tempfile.TemporaryDirectory(prefix="legcal-fuzz-") as top:
+            places = {"in": made_input(subject.input), "out": Path(top) / "out"}
+            run(words_of(subject.command, places))
+    sources = {path: read_source(path) for path in map(find_model, ("hexapod", "3-rpr"))}
+    return {path: (source, loader._load(source)) for path, source in sources.items()}
+
+
+def _share_what_is_whole() -> None:
+    """Let the cases of this process read once what they do not damage: it takes longest."""
+    shipped = _shipped()
+    load, parse = loader._load, cache(yaml.load)
 
     def read(model: str | Path) -> Source:
-        return shipped.get(Path(model)) or read_source(model)
+        return shipped[Path(model)][0] if Path(model) in shipped else read_source(model)
 
     def loaded(source: Source) -> Machine:
-        return (load_once if source in shipped.values() else load)(source)
+        known = [machine for whole, machine in shipped.values() if whole is source]
+        return known[0] if known else load(source)
 
-    patch.object(loader, "read_source", read).start()
-    patch.object(loader, "_load", loaded).start()
-    for source in shipped.values():
-        load_once(source)
+    loader.read_source = read
+    loader._load = loaded
+    yaml.load = lambda content, Loader: deepcopy(parse(content, Loader))
 
 
 def _death(exit_code: int | None) -> str:
@@ -205,6 +217,8 @@ def _work(cases: Sequence[Case], pipe: Connection) -> None:
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MAX_BYTES, resource.RLIM_INFINITY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    gc.freeze()  # what the parent left need not be searched again and again
+    _share_what_is_whole()
     with tempfile.TemporaryDirectory(prefix="legcal-fuzz-") as top, open(os.devnull, "w") as null:
         os.dup2(null.fileno(), 1)  # what libraries print past Python
         os.dup2(null.fileno(), 2)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from characterisation.inputs import MAKERS, copy_of, made_input
+from characterisation.inputs import MAKERS, made_input
 
 
 @dataclass(frozen=True)
@@ -41,17 +41,17 @@ SUBJECTS = (
     Subject("model", "models/hexapod.yaml", "inspect {in}/models/hexapod.yaml"),
     Subject("model", "urdf/hexapod.urdf", "inspect {in}/models/hexapod.yaml"),
     Subject("formats", "gepetto/robot.yaml", "inspect {in}/gepetto"),
-    Subject("formats", "gepetto/robot.urdf", "inspect {in}/gepetto"),
-    Subject("formats", "loops.urdf", "inspect {in}/loops.urdf"),
+    Subject("formats", "gepetto/robot.urdf", "inspect {in}/gepetto", share=0.5),
+    Subject("formats", "loops.urdf", "inspect {in}/loops.urdf", share=0.5),
     Subject("formats", "planar.xml", "inspect {in}/planar.xml"),
     Subject("tables", "tripod.csv", "new {in}/tripod.csv --unit mm -o {out}"),
     Subject("tables", "3-rpr.yaml", "new {in}/3-rpr.yaml -o {out}", share=0.5),
-    Subject("plain", "dataset.yaml", "detect {in} -o {out}"),
-    Subject("plain", "measurements.csv", "detect {in} -o {out}"),
-    Subject("plain", "camera_info.yaml", "detect {in} -o {out}"),
-    Subject("plain", "images/c1_1.png", "detect {in} -o {out}"),
+    Subject("small", "dataset.yaml", "detect {in} -o {out}"),
+    Subject("small", "measurements.csv", "detect {in} -o {out}"),
+    Subject("small", "camera_info.yaml", "detect {in} -o {out}"),
+    Subject("small", "images/c1_1.png", "detect {in} -o {out}"),
     Subject("pictures", "images/c1_1.tiff", "detect {in} -o {out}"),
-    Subject("pictures", "images/c1_2.jpg", "detect {in} -o {out}", share=0.15),
+    Subject("pictures", "images/c2_1.jpg", "detect {in} -o {out}", share=0.15),
     Subject("tool-poses", "3-rpr.csv",
             "locate {in}/3-rpr/models/3-rpr.yaml {in}/3-rpr.csv -o {out}", deep=True),
     Subject("3-rpr-axes", "dataset.yaml", "calibrate {in} -o {out}", deep=True),
@@ -74,12 +74,20 @@ SUBJECTS = (
 )  # fmt: skip
 
 
+def _small(folder: Path) -> None:
+    """Keep one picture of each view of a small dataset: where all is valid, each is searched."""
+    shutil.copytree(made_input("plain"), folder, dirs_exist_ok=True)
+    table = folder / "measurements.csv"
+    table.write_text("".join(x for x in table.read_text().splitlines(True) if "_2.png" not in x))
+    for name in ("c1_2", "c2_2"):
+        (folder / f"images/{name}.png").unlink()
+
+
 def _pictures(folder: Path) -> None:
-    """Save two pictures of a small dataset in other formats."""
-    shutil.copytree(copy_of("plain", folder / "plain"), folder, dirs_exist_ok=True)
-    shutil.rmtree(folder / "plain")
+    """Save the two pictures of a small dataset in other formats."""
+    shutil.copytree(made_input("small"), folder, dirs_exist_ok=True)
     text = (folder / "measurements.csv").read_text()
-    for name, suffix in (("c1_1", "tiff"), ("c1_2", "jpg")):
+    for name, suffix in (("c1_1", "tiff"), ("c2_1", "jpg")):
         picture = cv2.imread(str(folder / f"images/{name}.png"), cv2.IMREAD_UNCHANGED)
         assert picture is not None
         cv2.imwrite(str(folder / f"images/{name}.{suffix}"), picture)
@@ -101,4 +109,4 @@ def _settings(folder: Path) -> None:
     cv2.imwrite(str(folder / "board.png"), (40 + 170 * squares).astype(np.uint8))
 
 
-MAKERS |= {"pictures": _pictures, "settings": _settings}
+MAKERS |= {"small": _small, "pictures": _pictures, "settings": _settings}
