@@ -93,7 +93,10 @@ COMMANDS = (
         kept=("out/runs.jsonl",),
     ),
 )
-QUICK = COMMANDS[:2]  # of two seconds
+QUICK = (  # of a second or two
+    COMMANDS[0],
+    Command("new", "new in/3-rpr.yaml -o out", "tables", again="--force"),
+)
 
 
 @dataclass(frozen=True)
@@ -119,7 +122,7 @@ def drawn_kills(count: int, seed: int, commands: Sequence[Command] = COMMANDS) -
     return [
         Kill(
             commands[k % len(commands)],
-            SIGNALS[(k // len(commands) + k) % len(SIGNALS)],
+            SIGNALS[(k // len(commands) + k % len(commands)) % len(SIGNALS)],
             float(chance.uniform(0.0, 1.05)),
             bool(chance.integers(2)),
             bool(chance.integers(2)),

@@ -16,13 +16,14 @@ import signal
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cache
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import yaml
@@ -171,8 +172,8 @@ def _shipped() -> dict[Path, tuple[Source, Machine]]:
     one_of_each = {subject.command.split()[0]: subject for subject in SUBJECTS if not subject.deep}
     for subject in one_of_each.values():
         with tempfile.TemporaryDirectory(prefix="legcal-fuzz-") as top:
-            places = {"in": made_input(subject.input), "out": Path(top) / "out"}
-            run(words_of(subject.command, places))
+            folder = made_input(subject.input)
+            run(words_of(subject.command, {"in": folder, "out": Path(top) / "out"}))
     sources = {path: read_source(path) for path in map(find_model, ("hexapod", "3-rpr"))}
     return {path: (source, loader._load(source)) for path, source in sources.items()}
 
@@ -180,7 +181,8 @@ def _shipped() -> dict[Path, tuple[Source, Machine]]:
 def _share_what_is_whole() -> None:
     """Let the cases of this process read once what they do not damage: it takes longest."""
     shipped = _shipped()
-    load, parse = loader._load, cache(yaml.load)
+    load = loader._load
+    parse: Callable[..., object] = cache(yaml.load)
 
     def read(model: str | Path) -> Source:
         return shipped[Path(model)][0] if Path(model) in shipped else read_source(model)
@@ -189,9 +191,12 @@ def _share_what_is_whole() -> None:
         known = [machine for whole, machine in shipped.values() if whole is source]
         return known[0] if known else load(source)
 
-    loader.read_source = read
-    loader._load = loaded
-    yaml.load = lambda content, Loader: deepcopy(parse(content, Loader))
+    def parsed(content: bytes, Loader: type[yaml.SafeLoader]) -> object:
+        return deepcopy(parse(content, Loader))
+
+    patch.object(loader, "read_source", read).start()
+    patch.object(loader, "_load", loaded).start()
+    patch.object(yaml, "load", parsed).start()
 
 
 def _death(exit_code: int | None) -> str:
