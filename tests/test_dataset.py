@@ -48,7 +48,7 @@ def test_example_is_read_as_it_is_written() -> None:
     assert T is not None
     np.testing.assert_allclose(T.translation, [-0.2253, -0.9482, 0.2459])
     assert dataset.notes == ()
-    assert dataset.read_image(0).shape == (768, 1024)
+    assert dataset.image_reader([0])(0).shape == (768, 1024)
 
 
 def test_a_dataset_is_named_by_its_folder_or_its_file(
@@ -232,7 +232,7 @@ def test_an_image_that_was_not_checked_is_refused_where_it_is_read(folder: Folde
     assert dataset.image_path(3) is None
     for row, words in ((1, r"image .*c1_2\.png could not be read"), (3, "found an empty cell")):
         with pytest.raises(DatasetError, match=f"row {row + 1}: .*{words}"):
-            dataset.read_image(row)
+            dataset.image_reader([row])(0)
 
 
 # --- image files

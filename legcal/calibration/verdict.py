@@ -109,11 +109,13 @@ def _verdict_on_platform(platform: PlatformAccuracy, focal_error: float) -> Verd
         "(1 sigma)"
     )
     of_focal = [e.error.mean_displacement for e in platform.effects if "focal" in e.what]
-    doubt = focal_error / FOCAL_PART * max(of_focal, default=0.0)
-    if doubt > 0.0:
-        found += f"; a focal length that the measurements contradict may add {1e3 * doubt:.3f} mm"
+    focal_effect = focal_error / FOCAL_PART * max(of_focal, default=0.0)
+    if focal_effect > 0.0:
+        found += (
+            f"; a focal length that the measurements contradict may add {1e3 * focal_effect:.3f} mm"
+        )
     return _verdict(
-        change.mean_displacement, float(np.hypot(sigma.mean_displacement, doubt)), found
+        change.mean_displacement, float(np.hypot(sigma.mean_displacement, focal_effect)), found
     )
 
 

@@ -56,10 +56,6 @@ class Dataset:
         image = self.measurements.image[row]
         return self.folder / image if image else None
 
-    def read_image(self, row: int) -> Grey:
-        """Return the image of a row as (height, width) grey levels 0 to 255, float32."""
-        return self.image_reader([row])(0)
-
     def image_reader(self, rows: Sequence[int]) -> ImageReader:
         """Return what reads the images of these rows, in this order, in any process."""
         return ImageReader(

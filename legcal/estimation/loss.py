@@ -45,10 +45,6 @@ class PseudoHuber:
         """1 / width^2."""
         return 1.0 / (self.width * self.width)
 
-    def weights(self, s: Array) -> Array:
-        """Return the weights of iteratively reweighted least squares."""
-        return np.asarray(1.0 / np.sqrt(1.0 + self.k * s))
-
     def cost(self, s: Array) -> float:
         """Return the loss of all measurements."""
         return float(np.sum(s / (1.0 + np.sqrt(1.0 + self.k * s))))

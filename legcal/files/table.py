@@ -2,8 +2,8 @@
 
 A table is declared by its columns. Reading is strict (just these columns, complete rows, cells that
 hold what their column says) and refuses a file with all of its problems at once:
-:func:`read_table` collects what single cells tell, the reader of that table adds with
-:meth:`Table.refuse` what rows tell together, and :meth:`Table.check` raises them in the order of
+:func:`read_table` collects the problems of single cells, the reader of that table adds with
+:meth:`Table.refuse` those of rows together, and :meth:`Table.check` raises them in the order of
 the lines.
 """
 

@@ -154,7 +154,7 @@ def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
                 "prismatic joint."
             )
     words = _NO_BLOCK if file.legcal is None else ()
-    return Source(path, file.model_copy(update=changes), completed, True, words=words)
+    return Source(path, file.model_copy(update=changes), completed, words=words)
 
 
 def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
@@ -265,7 +265,7 @@ def read_loop_source(path: Path, content: bytes) -> Source:
         name_mot=motors,
     )
     urdf = parse_urdf(path, written, travel_needed=False)
-    return Source(path, file, urdf, True, tuple(notes), words=_WORDS)
+    return Source(path, file, urdf, tuple(notes), words=_WORDS)
 
 
 def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: Problems) -> list[Loop]:
@@ -492,6 +492,5 @@ def _with_travel(
     return replace(
         source,
         urdf=parse_urdf(source.urdf.path, content),
-        converted=True,
         notes=(*source.notes, travel_note(names, travel)),
     )

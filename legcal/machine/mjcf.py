@@ -92,7 +92,7 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
     notes = (f"Free bodies that touch no loop were left out: {', '.join(dropped)}.",)
     values = {joint: x for joint, x in reader.references.items() if joint in urdf.joints}
     file = MechanismFile(closed_loop=frames, type=[kind for _, kind in pairs], name_mot=motors)
-    return Source(path, file, urdf, True, notes * bool(dropped), values, words=_WORDS)
+    return Source(path, file, urdf, notes * bool(dropped), values, words=_WORDS)
 
 
 class MjcfReader:

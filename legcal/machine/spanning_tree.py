@@ -40,7 +40,6 @@ class Source:
     path: Path  # closes the loops; messages name it
     file: MechanismFile  # closures, motors and the ``legcal`` block
     urdf: Urdf  # the tree
-    converted: bool = False  # whether ``urdf.content`` was made of another format
     notes: tuple[str, ...] = ()  # what the reader should know of the conversion, one sentence each
     values: Mapping[str, float] = field(default_factory=dict)  # joint values [rad
     poses: Mapping[str, RigidTransform] | None = None

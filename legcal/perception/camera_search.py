@@ -72,7 +72,7 @@ class PoseCandidates:
     score: Array  # (n,) support of all pictures, less what the shifts of the joints cost: legs
     leg_error: Array  # (n_legs,) of legs from their pairs at the first pose, infinite without [m]
     hinted: bool = False  # whether it was searched for near a rough pose only
-    by_outlines: bool | None = None  # whether outlines measured at the poses speak for the first
+    by_outlines: bool | None = None  # whether outlines measured at the poses support the first
     # one; None where pairs were clear
 
     @property

@@ -325,7 +325,7 @@ class LabelPlaces:
         return (int(corner[0]), int(corner[1])), leader
 
     def _cost(self, corner: Array, extent: Array) -> float:
-        """Return what speaks against a place, as an area [px^2]."""
+        """Return the cost of a place, as an area [px^2]."""
         area = float(extent.prod())
         low, high = corner, corner + extent
         inside = np.minimum(high, [self.width, self.height]) - np.maximum(low, 0.0)

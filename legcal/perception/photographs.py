@@ -309,7 +309,7 @@ def _inspect(
 def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[LegRadius]:
     """Return the parts of legs, by leg and radius, of which hardly an outline can be used.
 
-    One that is used although the width of its part is wrong speaks for no radius.
+    One that is used although the width of its part is wrong supports no radius.
     """
     visible = is_visible(outlines)
     which = list(zip(outlines.row.tolist(), outlines.leg.tolist(), outlines.part, strict=True))

@@ -231,7 +231,7 @@ class _Trial:
 
     @property
     def evidence(self) -> float:
-        """How much they speak for it."""
+        """How much they support it."""
         return 0.0 if self.fit is None else self.fit.evidence
 
 
@@ -283,12 +283,12 @@ def _measure_at(search: Search, group: Group, candidates: PoseCandidates, i: int
 
 
 def _best(trials: Sequence[_Trial]) -> int:
-    """Return the pose that outlines speak for most."""
+    """Return the pose that outlines support most."""
     return int(np.argmax([trial.evidence for trial in trials]))
 
 
 def _is_decided(trials: Sequence[_Trial], candidates: PoseCandidates, group: Group) -> bool:
-    """Say whether outlines speak for one pose, and not nearly as much for another one."""
+    """Say whether outlines support one pose, and not nearly as much for another one."""
     best = _best(trials)
     others = [
         trial.evidence

@@ -300,7 +300,7 @@ def _squared_distances(
 
 
 def _evidence(lines: "_Lines", rows: Residuals, state: _State, joint_sigma: float) -> float:
-    """Return how much outlines speak for a state, each leg of an image by itself."""
+    """Return how much outlines support a state, each leg of an image by itself."""
     square, _ = _squared_distances(lines, rows, state.offset, IMAGE_SIGMA)
     n_outlines = np.minimum(0.5 * lines.size, MAX_OUTLINES)
     of_legs = np.maximum(OUTLINE_EVIDENCE * n_outlines - 0.5 * square, 0.0).sum()

@@ -211,7 +211,7 @@ def _differences(
 
 
 def noise_notes(measurements: Measurements, methods: Sequence[MethodNoise]) -> list[str]:
-    """Return what repeats cannot tell, and what is not known of which leg."""
+    """Return what repeated images cannot determine, and what is not known of which leg."""
     notes = [_BIAS, _RANGE]
     for leg in methods[0].legs:
         if not leg.orientations:
