@@ -102,7 +102,7 @@ def test_photographs_show_the_board_where_it_is(tmp_path: Path) -> None:
     dataset = load_dataset(tmp_path / "seen")
     assert dataset.corners is None
     assert dataset.board is not None
-    number, px, sigma = find_corners(dataset.board, dataset.read_image(0))
+    number, px, sigma = find_corners(dataset.board, dataset.image_reader([0])(0))
     truth = _truth(tmp_path / "seen")
     _, T_base_board = parse_board(truth["board"], tmp_path)
     assert T_base_board is not None

@@ -15,11 +15,11 @@ from legcal.machine.leg import JointType, LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.schema import mechanism_yaml
-from legcal.machine.spanning_tree import UrdfBuilder, along, limit, origin_at, visual
+from legcal.machine.spanning_tree import UrdfBuilder, axis_xml, limit_xml, origin_xml_at, visual_xml
 
 TURN = (-3.15, 3.15)  # [rad]
 VISIBLE = 0.9  # part of the shortest leg that its tube and its rod cover
-_AXES = {letter: along(axis) for letter, axis in zip("xyz", np.eye(3), strict=True)}
+_AXES = {letter: axis_xml(axis) for letter, axis in zip("xyz", np.eye(3), strict=True)}
 
 
 def urdf_text(machine: Assembled) -> str:
@@ -79,7 +79,9 @@ def _joint(
     moving: str = "",
 ) -> None:
     """Connect two links; without numbers their frames coincide."""
-    at = origin_at(np.zeros(3) if xyz is None else xyz, np.eye(3) if rotation is None else rotation)
+    at = origin_xml_at(
+        np.zeros(3) if xyz is None else xyz, np.eye(3) if rotation is None else rotation
+    )
     tree.connect(name, kind, links, at + moving)
 
 
@@ -170,7 +172,7 @@ class _Branch:
     ) -> None:
         """Add a joint and go on from its child."""
         self._tree.link(child)
-        moving = _AXES[axis] + limit(limits)
+        moving = _AXES[axis] + limit_xml(limits)
         _joint(self._tree, joint, kind, (self._link, child), at, rotation, moving)
         self._link, self._along = child, np.zeros(3)
 
@@ -186,7 +188,7 @@ class _Branch:
             length = VISIBLE * leg.shortest_shown
             end = length if near else -length
         at = f'<origin xyz="0 0 {0.5 * end!r}" rpy="0 0 0"/>'
-        self._tree.show(self._link, visual(at, radius, length))
+        self._tree.show(self._link, visual_xml(at, radius, length))
 
 
 def _unit(vector: Array) -> Array:

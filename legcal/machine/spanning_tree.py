@@ -84,7 +84,10 @@ class UrdfBuilder:
     def link(self, name: str, cylinders: tuple[TextCylinder, ...] = ()) -> None:
         """Add a link with its visible cylinders."""
         self.show(
-            name, "".join(visual(origin(c.T_link_cylinder), c.radius, c.length) for c in cylinders)
+            name,
+            "".join(
+                visual_xml(origin_xml(c.T_link_cylinder), c.radius, c.length) for c in cylinders
+            ),
         )
 
     def show(self, name: str, visuals: str) -> None:
@@ -105,8 +108,8 @@ class UrdfBuilder:
         """Add a joint; ``axis`` and ``limits`` [rad] or [m] are those of a moving one."""
         moving = ""
         if axis is not None:
-            moving = along(axis) + limit(limits)
-        self.connect(name, kind, (parent, child), origin(T_parent_origin) + moving)
+            moving = axis_xml(axis) + limit_xml(limits)
+        self.connect(name, kind, (parent, child), origin_xml(T_parent_origin) + moving)
 
     def connect(self, name: str, kind: str, links: tuple[str, str], inside: str) -> None:
         """Add a joint between parent and child with its elements, the origin first."""
@@ -126,28 +129,30 @@ class UrdfBuilder:
         return f"{head}{self.body()}\n</robot>\n".encode()
 
 
-def origin(T_parent_origin: RigidTransform) -> str:
+def origin_xml(T_parent_origin: RigidTransform) -> str:
     """Return the ``<origin>`` of a rigid motion [m, rad]."""
-    return origin_at(np.asarray(T_parent_origin.translation), T_parent_origin.rotation.as_matrix())
+    return origin_xml_at(
+        np.asarray(T_parent_origin.translation), T_parent_origin.rotation.as_matrix()
+    )
 
 
-def origin_at(xyz: Array, rotation: Array) -> str:
+def origin_xml_at(xyz: Array, rotation: Array) -> str:
     """Return the ``<origin>`` at a point [m] with a rotation matrix."""
     return f'<origin xyz="{_numbers(xyz)}" rpy="{_numbers(roll_pitch_yaw(rotation))}"/>'
 
 
-def along(axis: Array) -> str:
+def axis_xml(axis: Array) -> str:
     """Return the ``<axis>`` of a joint."""
     return f'<axis xyz="{_numbers(axis)}"/>'
 
 
-def visual(at: str, radius: float, length: float) -> str:
+def visual_xml(at: str, radius: float, length: float) -> str:
     """Return the ``<visual>`` of a cylinder at an ``<origin>``."""
     shape = f'<cylinder radius="{radius!r}" length="{length!r}"/>'
     return f"<visual>{at}<geometry>{shape}</geometry></visual>"
 
 
-def limit(limits: tuple[float, float] | None) -> str:
+def limit_xml(limits: tuple[float, float] | None) -> str:
     """Return the ``<limit>`` of a joint; a URDF must name an effort and a velocity too."""
     ends = ""
     if limits is not None:

@@ -329,11 +329,11 @@ def hexapod_session(
         {(j, part): float(machine.radius[j]) for j, part in enumerate(machine.parts)},
         [cameras[v].legs for v in view.tolist()],
     )
-    outlines, axes = observed(machine, scene, measurements, noise, rng if noisy else None)
+    outlines, axes = outlines_and_axes(machine, scene, measurements, noise, rng if noisy else None)
     return HexapodSession(measurements, outlines, axes, machine, tuple(cameras), T_Rb_Re, scene)
 
 
-def observed(
+def outlines_and_axes(
     machine: PaperHexapod,
     scene: Scene,
     measurements: Measurements,

@@ -41,7 +41,7 @@ from legcal.simulation.hexapod import (
     hexapod_cameras,
     hexapod_session,
     noncoplanar_hexapod,
-    observed,
+    outlines_and_axes,
     paper_hexapod,
     perturb,
     poses_with_lengths,
@@ -120,7 +120,7 @@ class PaperStudy:
             n_images=self.n_images,
         )
         checked = random_hexapod_poses(machine, self.n_checked, rng)
-        exact = observed(machine, session.scene, session.measurements, self.noise, None)[1]
+        exact = outlines_and_axes(machine, session.scene, session.measurements, self.noise, None)[1]
         covariance = bound_covariance(session, exact)
         found = {INITIAL: _errors(machine, nominal.parameters, covariance, checked)}
         for name in self.estimators:

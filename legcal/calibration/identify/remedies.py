@@ -32,7 +32,11 @@ from legcal.calibration.identify.report import (
     Remedy,
     WeakDirection,
 )
-from legcal.calibration.identify.steps import base_by_frames, offsets_from_distances, scattered
+from legcal.calibration.identify.steps import (
+    base_by_frames,
+    by_all_parameters,
+    offsets_from_distances,
+)
 from legcal.estimation import compress, eliminate, marginal_rows
 from legcal.geometry import Array, IntArray
 from legcal.machine import JointType, Machine, list_in_words
@@ -169,13 +173,13 @@ class _Candidates:
         last = np.concatenate([a.default_steps[2].information for a in chosen])
         for k, rows in ((0, self.base_together(chosen)), (2, last)):
             step = replace(chosen[0].default_steps[k], information=rows)
-            if missing(predicted, scattered(step, n_p), self.motion):
+            if missing(predicted, by_all_parameters(step, n_p), self.motion):
                 return False
         together = (
             np.concatenate(parts) for parts in zip(*(a.distances for a in chosen), strict=True)
         )
         offsets = offsets_from_distances(predicted, *together)
-        return not missing(predicted, scattered(offsets, n_p), self.motion)
+        return not missing(predicted, by_all_parameters(offsets, n_p), self.motion)
 
 
 def judge_board(
@@ -211,7 +215,7 @@ def _mended(none: Analysis, every: Analysis) -> tuple[str, ...]:
     """Return the directions that move the platform and that only a board determines, in words."""
     n_p = len(none.predicted.unit)
     pairs = [
-        (scattered(a, n_p), scattered(b, n_p))
+        (by_all_parameters(a, n_p), by_all_parameters(b, n_p))
         for a, b in zip(none.default_steps, every.default_steps, strict=True)
     ]
     found: list[str] = []
@@ -278,7 +282,7 @@ def _score(analysis: Analysis, known: Sequence[int] = ()) -> _Score:
     extra = np.zeros((len(known), len(predicted.unit)))
     extra[np.arange(len(known)), list(known)] = _KNOWN
     steps = [
-        np.concatenate([scattered(step, len(predicted.unit)), extra])
+        np.concatenate([by_all_parameters(step, len(predicted.unit)), extra])
         for step in analysis.default_steps
     ]
     full = np.concatenate([analysis.information, extra])

@@ -244,7 +244,7 @@ def mean_distances(
     return StepInformation("platform_joints", columns, rows[:, columns])
 
 
-def scattered(step: StepInformation, n_parameters: int) -> Array:
+def by_all_parameters(step: StepInformation, n_parameters: int) -> Array:
     """Return a step's rows by all parameters; the others count as known."""
     rows = np.zeros((len(step.information) + n_parameters, n_parameters))
     rows[: len(step.information), step.columns] = step.information

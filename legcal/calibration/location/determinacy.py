@@ -75,7 +75,7 @@ def determine(
     if basis.shape[1]:
         workspace = _workspace(measurements)
         _check_machine(measurements, found, basis, workspace, name)
-        found = hold(measurements, found, tool_position)
+        found = hold_open_part(measurements, found, tool_position)
         basis = _open_at(measurements, found, basis.shape[1], found.frames)
         parts = _open_parts(basis, found.frames)
         words = _held_words(parts, workspace, tool_position)
@@ -87,7 +87,9 @@ def determine(
     )
 
 
-def hold(measurements: ToolMeasurements, found: FrameFit, tool_position: Array) -> FrameFit:
+def hold_open_part(
+    measurements: ToolMeasurements, found: FrameFit, tool_position: Array
+) -> FrameFit:
     """Return a fit moved along what it leaves open until the tool is where it is held."""
     k = _open_directions(found.frame_design, oriented=measurements.is_oriented).shape[1]
     if k == 0:

@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy import stats
 from scipy.spatial.transform import RigidTransform
-from scipy.special import chdtrc
 
-from legcal.calibration.location.determinacy import Determinacy, determine, hold
+from legcal.calibration.location.determinacy import Determinacy, determine, hold_open_part
 from legcal.calibration.location.document import (
     Location,
     LocationStatus,
@@ -226,7 +226,7 @@ def _check_unique(
             continue
         try:
             other = fit(measurements.pairs, start, noise, measurements.by_model)
-            other = hold(measurements, other, at)
+            other = hold_open_part(measurements, other, at)
         except (DidNotConverge, np.linalg.LinAlgError):
             continue
         is_other = not _are_one(best.frames, other.frames, measurements.pairs.length)
@@ -307,7 +307,7 @@ def _tested(found: FrameFit) -> tuple[float | None, str, str]:
         total, dof = found.chi2, float(found.dof)
     else:
         total, dof = float(squares[kinds[0]]), float(found.kind_dof[kinds[0]])
-    p_value = float(chdtrc(dof, total))
+    p_value = float(stats.chi2.sf(total, dof))
     large, small = list[str](), list[str]()
     for k in kinds:
         ratio = float(np.sqrt(squares[k] / found.kind_dof[k]))
