@@ -1,10 +1,7 @@
 """What several test files share."""
 
 import os
-import pickle
 import shutil
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import one_thread  # noqa: F401
@@ -12,38 +9,9 @@ import pytest
 from hexapod_example import Run, copy_of_the_example
 
 from legcal import calibrate
-from legcal.calibration.joint_fit import platform
-from legcal.machine import Configurations, Machine, workspace
 
 LEFT = ("observations.csv", ".legcal-cache.json")  # beside a dataset, for the next run
 STAGES = "stages.txt"
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _workspaces() -> Iterator[None]:
-    """Draw the workspace of a model once, however often the model is read.
-
-    It depends on nothing but the model, and is a third of the calibration of a small machine.
-    """
-    drawn: dict[bytes, Configurations] = {}
-
-    def once(machine: Machine) -> Configurations:
-        model = replace(
-            machine,
-            name="",
-            yaml_path=Path(),
-            urdf_path=Path(),
-            diagnostics=(),
-            urdf=replace(machine.urdf, path=Path()),
-        )
-        content = pickle.dumps(model)
-        if content not in drawn:
-            drawn[content] = workspace(machine)
-        return drawn[content]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(platform, "workspace", once)
-        yield
 
 
 @pytest.fixture(scope="session")

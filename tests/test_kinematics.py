@@ -28,6 +28,7 @@ from legcal.machine import (
     load_mechanism,
     pose_equations,
     random_configurations,
+    random_poses,
     slider_columns,
     vectors_A_to_B,
 )
@@ -92,6 +93,13 @@ def test_random_configurations_are_closed_inside_the_travel_and_unflipped(name: 
             if leg.platform_axis is not None and leg.type == "UP":
                 assert T.rotation.apply(leg.platform_axis) @ u > 0.0
     assert np.ptp(drawn.readings[:, list(machine.motors)], axis=0).min() > 1e-3
+
+
+def test_poses_drawn_together_are_those_of_the_drawn_configurations(name: str) -> None:
+    readings, poses = random_poses(machine_of(name), DRAWN, 5)
+    np.testing.assert_allclose(readings, drawn_of(name).readings, atol=1e-11)
+    for T, reference in zip(poses, drawn_of(name).poses, strict=True):
+        np.testing.assert_allclose(T.as_matrix(), reference.as_matrix(), atol=1e-10)
 
 
 def test_forward_kinematics_inverts_inverse_kinematics_from_any_start(name: str) -> None:

@@ -27,7 +27,7 @@ from legcal.machine import (
     parametrization_of,
     platform_in_base,
     pose_differences,
-    random_configurations,
+    random_poses,
     vector_of,
 )
 
@@ -194,8 +194,7 @@ def _random_poses(
         if turn > 0 and not poses:
             break
         count = WORKSPACE_POSES - len(poses) if turn > 0 else FIRST_POSES
-        drawn = random_configurations(machine, count, rng)
-        for q, T in zip(drawn.readings, drawn.poses, strict=True):
+        for q, T in zip(*random_poses(machine, count, rng), strict=True):
             try:
                 reference_poses.append(forward_kinematics(reference, q))
             except DidNotConverge:  # the reference cannot have these lengths at the same time

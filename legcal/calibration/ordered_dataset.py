@@ -129,6 +129,8 @@ class OrderedDataset:
 
     def at(self, rows: IntArray) -> OrderedDataset:
         """Return some of the images, by their rows here, rising."""
+        if len(rows) == len(self.rows):
+            return self
         return replace(
             self,
             measurements=measurements_at(self.measurements, rows),
@@ -183,7 +185,7 @@ def nominal_poses(
     if not machine.is_determined:
         home = [platform_in_base(machine, machine.home)] * len(q)
         return _least_squares(machine, q, home)[0], np.zeros(len(q))
-    followed = list(followed_poses(machine, q))
+    followed = list(followed_poses(machine, q, on_the_chain=False))
     T = [platform_in_base(machine, pose) for pose, _ in followed]
     off = [k for k, (_, failure) in enumerate(followed) if failure is not None]
     residual = np.zeros(len(q))

@@ -5,6 +5,7 @@ from .configurations import WORKSPACE_SEED as WORKSPACE_SEED
 from .configurations import Configurations as Configurations
 from .configurations import beyond_travel as beyond_travel
 from .configurations import random_configurations as random_configurations
+from .configurations import random_poses as random_poses
 from .configurations import random_poses_of_legs as random_poses_of_legs
 from .configurations import random_walk as random_walk
 from .configurations import workspace as workspace

@@ -7,6 +7,7 @@ manifold of closed configurations.
 """
 
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from typing import NamedTuple
 
 import numpy as np
@@ -14,12 +15,17 @@ from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge
-from legcal.geometry import Array, BoolArray
+from legcal.geometry import Array, BoolArray, motions_of
 from legcal.machine.equations import PoseEquations, freedoms, pose_equations
-from legcal.machine.kinematics import follow, solve_poses
+from legcal.machine.kinematics import follow, follow_poses, solve_poses
 from legcal.machine.leg import Leg, LegKind
-from legcal.machine.mobility import free_motions, project, singularity
-from legcal.machine.model import Machine, joint_values, platform_pose, slider_columns
+from legcal.machine.mobility import free_motions, project, singularities, singularity
+from legcal.machine.model import (
+    Machine,
+    joint_values,
+    platform_pose,
+    slider_columns,
+)
 from legcal.machine.solver import RANK, poses_after
 
 MAX_DRAWS = 40  # draws for each configuration
@@ -97,12 +103,7 @@ def random_configurations(
     chance = np.random.default_rng(rng)
     draw = _drawn if mechanism.is_determined else _wandered
     found = list(draw(mechanism, count, chance))
-    if len(found) < count:
-        raise DidNotConverge(
-            f"{mechanism.yaml_path}: random poses could not be drawn: found {len(found)} of "
-            f"{count} inside the travel in {MAX_DRAWS} tries for each, needed all; check "
-            "legcal.home and the limits of the sliders."
-        )
+    _require(mechanism, count, len(found))
     return Configurations(
         np.array(found).reshape(count, mechanism.chain.nq),
         np.array([joint_values(mechanism, c) for c in found]).reshape(count, mechanism.n_legs),
@@ -110,8 +111,42 @@ def random_configurations(
     )
 
 
-def workspace(machine: Machine) -> Configurations:
-    """Return the configurations that stand for the workspace, the same at every call.
+def random_poses(
+    machine: Machine, count: int, rng: np.random.Generator | int
+) -> tuple[Array, list[RigidTransform]]:
+    """Return the readings and poses of :func:`random_configurations`, at a tenth of the time.
+
+    Where the motors determine the pose it is followed for many draws at once; the chain is closed
+    only where that leaves a doubt.
+
+    Raises
+    ------
+    DidNotConverge
+        As :func:`random_configurations`.
+    """
+    if not machine.is_determined:
+        drawn = random_configurations(machine, count, rng)
+        return drawn.readings, drawn.poses
+    found = list(_drawn_poses(machine, count, np.random.default_rng(rng)))
+    _require(machine, count, len(found))
+    if not found:
+        return np.zeros((0, machine.n_legs)), []
+    readings, poses = (np.array(part) for part in zip(*found, strict=True))
+    return readings, list(motions_of(poses[:, :, :3], poses[:, :, 3]))
+
+
+def _require(machine: Machine, count: int, found: int) -> None:
+    """Refuse a machine of which too few random poses are found."""
+    if found < count:
+        raise DidNotConverge(
+            f"{machine.yaml_path}: random poses could not be drawn: found {found} of "
+            f"{count} inside the travel in {MAX_DRAWS} tries for each, needed all; check "
+            "legcal.home and the limits of the sliders."
+        )
+
+
+def workspace(machine: Machine) -> tuple[Array, list[RigidTransform]]:
+    """Return the readings and poses that stand for the workspace, the same at every call.
 
     Errors over the workspace are those at these poses, whether they are predicted or found by
     comparing two models. The order of the legs does not matter.
@@ -123,41 +158,99 @@ def workspace(machine: Machine) -> Configurations:
     """
     names = sorted(machine.leg_names)
     ordered = machine.with_leg_order(names)
-    drawn = random_configurations(ordered, WORKSPACE_POSES, WORKSPACE_SEED)
-    legs = [names.index(name) for name in machine.leg_names]
-    return drawn._replace(readings=drawn.readings[:, legs])
+    readings, poses = random_poses(ordered, WORKSPACE_POSES, WORKSPACE_SEED)
+    return readings[:, [names.index(name) for name in machine.leg_names]], poses
 
 
 def _drawn(machine: Machine, count: int, chance: np.random.Generator) -> Iterator[Array]:
     """Yield what is reached from home at random readings of the motors."""
-    motors = [machine.legs[j] for j in machine.motors]
-    lower, upper = np.array([leg.travel for leg in motors]).T
-    home = machine.home_configuration[slider_columns(machine, machine.motors)[0]]
-    least = MIN_SINGULARITY * singularity(machine, machine.home)
     drawn = 0
     for turn in range(count):
         if turn == MAX_FAILED and not drawn:
             return
-        for tries, nearer in enumerate(SHARES):
-            q = chance.uniform(lower, upper)
-            if nearer < 1.0:
-                q = np.clip(home + nearer * (q - home), lower, upper)
-            try:
-                reached = follow(
-                    machine,
-                    machine.home_configuration,
-                    q,
-                    min_step=MIN_STEP,
-                    on_the_chain=tries % (ON_THE_CHAIN + 1) < ON_THE_CHAIN,
-                )
-            except DidNotConverge:  # the legs cannot have these lengths at the same time
-                continue
-            if beyond_travel(machine, reached).any():
-                continue
-            if singularity(machine, platform_pose(machine, reached)) >= least:
+        for tries, share in enumerate(SHARES):
+            (q,) = _random_readings(machine, chance, [share])
+            reached = _reached_on_the_chain(machine, q, tries)
+            if reached is not None:
                 drawn += 1
                 yield reached
                 break
+
+
+def _drawn_poses(
+    machine: Machine, count: int, chance: np.random.Generator
+) -> Iterator[tuple[Array, Array]]:
+    """Yield readings (n_legs,) and pose (3, 4) of what :func:`_drawn` yields.
+
+    Draws to come are followed together as if none were in vain, which is so for most machines.
+    """
+    drawn = 0
+    ahead = list[tuple[Array, Array, bool]]()
+    for turn in range(count):
+        if turn == MAX_FAILED and not drawn:
+            return
+        for tries, share in enumerate(SHARES):
+            if not ahead:
+                ahead += _reached(
+                    machine, _random_readings(machine, deepcopy(chance), np.ones(count - turn))
+                )
+            (q,) = _random_readings(machine, chance, [share])
+            readings, pose, is_reached = ahead.pop(0)
+            if share < 1.0 or not is_reached:
+                configuration = _reached_on_the_chain(machine, q, tries)
+                if configuration is None:
+                    continue
+                readings = joint_values(machine, configuration)
+                pose = platform_pose(machine, configuration).as_matrix()[:3]
+            drawn += 1
+            yield readings, pose
+            break
+
+
+def _random_readings(
+    machine: Machine, chance: np.random.Generator, shares: Sequence[float] | Array
+) -> Array:
+    """Return random readings of the motors, each in a share of the travel about home."""
+    motors = list(machine.motors)
+    lower, upper = np.array([machine.legs[j].travel for j in motors]).T
+    home = machine.home_configuration[slider_columns(machine, motors)[0]]
+    q = chance.uniform(lower, upper, (len(shares), len(motors)))
+    share = np.asarray(shares)[:, None]
+    return np.where(share < 1.0, np.clip(home + share * (q - home), lower, upper), q)
+
+
+def _reached_on_the_chain(machine: Machine, q: Array, tries: int) -> Array | None:
+    """Return the configuration at readings of the motors, None where it cannot be used."""
+    try:
+        reached = follow(
+            machine,
+            machine.home_configuration,
+            q,
+            min_step=MIN_STEP,
+            on_the_chain=tries % (ON_THE_CHAIN + 1) < ON_THE_CHAIN,
+        )
+    except DidNotConverge:  # the legs cannot have these lengths at the same time
+        return None
+    if beyond_travel(machine, reached).any():
+        return None
+    least = MIN_SINGULARITY * singularity(machine, machine.home)
+    return reached if singularity(machine, platform_pose(machine, reached)) >= least else None
+
+
+def _reached(machine: Machine, q: Array) -> Iterator[tuple[Array, Array, bool]]:
+    """Yield readings of all legs, pose, and whether it can be used, at readings of the motors."""
+    motors = list(machine.motors)
+    home = machine.home_configuration[slider_columns(machine, motors)[0]]
+    poses, part = follow_poses(machine, machine.home, home, q, MIN_STEP)
+    arms = machine.B_platform @ np.swapaxes(poses[:, :, :3], 1, 2)
+    lengths = np.linalg.norm(arms + poses[:, None, :, 3] - machine.A_base, axis=2)
+    readings = machine.sign * (lengths - machine.q0)
+    readings[:, [leg.kind is LegKind.CONSTANT for leg in machine.legs]] = 0.0
+    readings[:, motors] = q
+    least = MIN_SINGULARITY * singularity(machine, machine.home)
+    usable = (part == 1.0) & ~_outside(machine, readings).any(axis=1)
+    usable &= singularities(machine, poses) >= least
+    return zip(readings, poses, usable.tolist(), strict=True)
 
 
 def _wandered(machine: Machine, count: int, chance: np.random.Generator) -> Iterator[Array]:
@@ -186,7 +279,11 @@ def random_walk(machine: Machine, here: Array, chance: np.random.Generator) -> A
 
 def beyond_travel(machine: Machine, configuration: Array) -> BoolArray:
     """Return which legs are outside their travel, or flipped, (n_legs,)."""
-    values = joint_values(machine, configuration)
+    return _outside(machine, joint_values(machine, configuration))
+
+
+def _outside(machine: Machine, values: Array) -> BoolArray:
+    """Return the same for joint values (..., n_legs)."""
     lower, upper = np.array([leg.travel for leg in machine.legs]).T
     outside = (values < lower - TRAVEL_TOLERANCE) | (values > upper + TRAVEL_TOLERANCE)
     return np.asarray(outside | (machine.lengths_at(values) <= 0.0))

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.geometry import Array, IntArray, motion_of, product
+from legcal.geometry import Array, BoolArray, IntArray, motion_of, motions_of, product
 from legcal.machine.closing import close_at, closure_equations
 from legcal.machine.equations import (
     constraints_at,
@@ -38,13 +38,13 @@ from legcal.machine.model import (
     platform_pose,
     readings_at,
     slider_columns,
-    vectors_A_to_B,
 )
-from legcal.machine.solver import newton, poses_after, solve, walk_in_steps
+from legcal.machine.solver import newton, newton_many, poses_after, solve, walk_in_steps
 
 CONTRACTION = 0.5  # of the step before; of 1 rad or a leg length for the first
 TOLERANCE = 1e-13  # of a leg length
 MIN_STEP = 1.0 / 4096.0  # of the way from known readings to the wanted ones
+LONG_STEP = 1.0 / 16.0  # where another way follows if that does not lead there
 RANDOM_ANGLES = 6  # other angles of all legs that are tried
 FEW_RESTARTS = 2  # of legs that do not close from there
 DEPENDENT = 1e-7  # of the largest singular value: equations that say the same
@@ -165,16 +165,25 @@ def forward_kinematics_many(machine: Machine, q: Array) -> list[RigidTransform]:
 
 
 def followed_poses(
-    machine: Machine, q: Array
+    machine: Machine, q: Array, *, on_the_chain: bool = True
 ) -> Iterator[tuple[RigidTransform, DidNotConverge | None]]:
     """Yield the platform pose at each of many rows of readings, and no failure.
+
+    Where it need not be *on_the_chain*, the equations of the legs alone are followed, if they lead
+    to all rows from home: at a tenth of the time, and as far off as axes of the chain are.
 
     Where a row is not reached, the pose of the nearest row that is, or home, comes with the
     failure. Arguments and other exceptions are those of :func:`forward_kinematics_many`.
     """
+    readings = _readings(machine, np.asarray(q, dtype=np.float64))
     known = [machine.home_configuration[slider_columns(machine, machine.motors)[0]]]
+    if not on_the_chain:
+        poses, part = follow_poses(machine, machine.home, known[0], readings, LONG_STEP)
+        if np.all(part == 1.0):
+            yield from ((T, None) for T in motions_of(poses[:, :, :3], poses[:, :, 3]))
+            return
     configurations = [machine.home_configuration]
-    for i, row in enumerate(_readings(machine, np.asarray(q, dtype=np.float64))):
+    for i, row in enumerate(readings):
         nearest = configurations[int(np.argmin(np.abs(np.array(known) - row).max(axis=1)))]
         try:
             configuration = follow(machine, nearest, row, f" of row {i + 1}")
@@ -400,7 +409,9 @@ def follow(
     T = platform_pose(machine, configuration)
     part = 0.0
     if not on_the_chain:
-        T, part = follow_pose(machine, T, configuration[q_columns], readings, min_step)
+        now = configuration[q_columns]
+        (pose,), (part,) = follow_poses(machine, T, now, readings[None], min_step)
+        T = motion_of(pose[:, :3], pose[:, 3])
     if part < 1.0:
         raise DidNotConverge(
             f"{machine.yaml_path}: the pose at the readings{which} could not be reached: at "
@@ -420,51 +431,52 @@ def follow(
     return closed
 
 
-def follow_pose(
-    machine: Machine, T: RigidTransform, first: Array, last: Array, min_step: float
-) -> tuple[RigidTransform, float]:
-    """Return the pose followed from T at first to last readings, and which part of it is done."""
-    pose, known = T.as_matrix()[:3], dimensionless(machine, T)
+def follow_poses(
+    machine: Machine, start: RigidTransform, first: Array, last: Array, min_step: float
+) -> tuple[Array, Array]:
+    """Return poses (k, 3, 4) followed from one at *first* readings to many *last* (k, n_motors).
+
+    The joints of the chain do not count. With them comes which part of each way is done, (k,).
+    """
+    T = start.as_matrix()[None]
+    poses, known = (np.repeat(x, len(last), axis=0) for x in (T[:, :3], dimensionless(machine, T)))
+    scale = leg_scale(machine, start)
+    unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
     motors = list(machine.motors)
+    done, step = np.zeros(len(last)), np.ones(len(last))
+    while True:
+        rows = np.flatnonzero((done < 1.0) & (step >= min_step))
+        if len(rows) == 0:
+            return poses, done
+        part = np.minimum(done[rows] + step[rows], 1.0)
+        lengthening = machine.sign[motors] * (first + part[:, None] * (last[rows] - first))
 
-    def attempt(part: float) -> bool:
-        nonlocal pose, known
-        readings = last if part == 1.0 else first + part * (last - first)
-        lengthening = machine.sign[motors] * readings
-
-        def equations(poses: Array) -> tuple[Array, Array]:
+        def equations(poses: Array, lengthening: Array = lengthening) -> tuple[Array, Array]:
             found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
             found.values[:, found.measured] -= lengthening
             return found.values, found.by_pose
 
-        scale = leg_scale(machine, motion_of(pose[:, :3], pose[:, 3]))
-        unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
-        found = newton(
+        found = newton_many(
             equations,
             poses_after,
-            pose,
+            poses[rows],
             tolerance=TOLERANCE * scale,
             contraction=CONTRACTION,
             first=scale,
             unit=unit,
         )
-        there = motion_of(found.points[0, :, :3], found.points[0, :, 3])
-        if not (found.converged[0] or found.worst[0] < TOLERANCE * scale) or _is_reversed(
-            machine, there
-        ):
-            return False
-        jacobian = dimensionless(machine, there)
-        if not excludes_singularity(known, jacobian):
-            if known.shape[0] != known.shape[1]:
-                return False
-            signs = [float(np.sign(np.linalg.det(J))) for J in (known, jacobian)]
-            if not signs[0] == signs[1] != 0.0:
-                return False
-        pose, known = found.points[0], jacobian
-        return True
-
-    done = walk_in_steps(attempt, min_step)
-    return motion_of(pose[:, :3], pose[:, 3]), done
+        jacobian = dimensionless(machine, found.points)
+        good = found.converged | (found.worst < TOLERANCE * scale)
+        good &= ~_is_reversed(machine, found.points)
+        for i in np.flatnonzero(good):
+            if not excludes_singularity(known[rows[i]], jacobian[i]):
+                both = np.array([known[rows[i]], jacobian[i]])
+                signs = np.sign(np.linalg.det(both)) if both.shape[1] == 6 else np.zeros(2)
+                good[i] = signs[0] == signs[1] != 0.0
+        reached = rows[good]
+        poses[reached], known[reached] = found.points[good], jacobian[good]
+        done[reached] = part[good]
+        step[rows] *= np.where(good, 2.0, 0.5)
 
 
 def _closed_from(
@@ -512,11 +524,12 @@ def _is_flipped(machine: Machine, configuration: Array) -> bool:
     return bool(np.any(machine.lengths_at(q, rows) <= 0.0))
 
 
-def _is_reversed(machine: Machine, T: RigidTransform) -> bool:
-    """Say whether a leg that is fixed to the platform points the wrong way."""
-    return any(
-        leg.is_fixed_to_platform
-        and leg.platform_axis is not None
-        and float(T.rotation.apply(leg.platform_axis) @ vector) <= 0.0
-        for leg, vector in zip(machine.legs, vectors_A_to_B(machine, T), strict=True)
-    )
+def _is_reversed(machine: Machine, poses: Array) -> BoolArray:
+    """Say at which poses (k, 3, 4) a leg that is fixed to the platform points the wrong way."""
+    R, t = poses[:, :, :3], poses[:, :, 3]
+    found = np.zeros(len(poses), dtype=np.bool_)
+    for leg in machine.legs:
+        if leg.is_fixed_to_platform and leg.platform_axis is not None:
+            along = (R @ leg.platform_axis) * (R @ leg.B + t - leg.A)
+            found |= along.sum(axis=1) <= 0.0
+    return found

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array
-from legcal.machine.equations import equations_at, is_constrained
+from legcal.geometry import Array, cross
+from legcal.machine.equations import is_constrained, machine_equations
 from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.machine.solver import solve
 
@@ -129,10 +129,15 @@ def singularity(mechanism: Machine, T_base_platform: RigidTransform) -> float:
         Zero at a singular pose, and wherever the motors do not determine the pose; of the order
         of the platform's size in leg lengths at a good one.
     """
-    jacobian = dimensionless(mechanism, T_base_platform)
-    if len(jacobian) < 6:
-        return 0.0
-    return float(np.linalg.svd(jacobian, compute_uv=False)[5])
+    return float(singularities(mechanism, T_base_platform.as_matrix()[None])[0])
+
+
+def singularities(machine: Machine, poses: Array) -> Array:
+    """Return the same at poses (k, 3 or 4, 4), (k,)."""
+    jacobian = dimensionless(machine, poses)
+    if jacobian.shape[1] < 6:
+        return np.zeros(len(poses))
+    return np.asarray(np.linalg.svd(jacobian, compute_uv=False)[:, 5])
 
 
 def determinant_sign(machine: Machine, T_base_platform: RigidTransform) -> float:
@@ -140,25 +145,28 @@ def determinant_sign(machine: Machine, T_base_platform: RigidTransform) -> float
 
     Between two poses of different sign lies a singularity.
     """
-    rows = dimensionless(machine, T_base_platform)
+    (rows,) = dimensionless(machine, T_base_platform.as_matrix()[None])
     return float(np.sign(np.linalg.det(rows))) if len(rows) == 6 else 0.0
 
 
-def dimensionless(machine: Machine, T_base_platform: RigidTransform) -> Array:
-    """Return the Jacobian of :func:`singularity`, (n_rows, 6): rotation, displacement."""
-    matrix = T_base_platform.as_matrix()
-    turned = machine.B_platform @ matrix[:3, :3].T
-    vectors = turned + matrix[:3, 3] - machine.A_base
-    lengths = np.linalg.norm(vectors, axis=1)
+def dimensionless(machine: Machine, poses: Array) -> Array:
+    """Return the Jacobians of :func:`singularity`, (k, n_rows, 6): rotation, displacement.
+
+    Poses are matrices T_base_platform (k, 3 or 4, 4).
+    """
+    R, t = poses[:, :3, :3], poses[:, :3, 3]
+    turned = machine.B_platform @ np.swapaxes(R, 1, 2)
+    vectors = turned + t[:, None] - machine.A_base
+    lengths = np.linalg.norm(vectors, axis=2)
+    scale = lengths.mean(axis=1)[:, None, None]
+    centre = turned.mean(axis=1, keepdims=True)
     if is_constrained(machine):
-        jacobian = equations_at(machine, T_base_platform).by_pose[0]
-        gradient, moment, centre = jacobian[:, 3:], jacobian[:, :3], turned.mean(axis=0)
-        return np.hstack([(moment - np.cross(centre, gradient)) / lengths.mean(), gradient])
-    motors = list(machine.motors)  # lines alone; arm x u is written out, np.cross is slow
-    arms = (turned - turned.mean(axis=0))[motors] / lengths.mean()
-    u = (vectors / lengths[:, None])[motors]
-    (x, y, z), (a, b, c) = arms.T, u.T
-    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=1)
+        jacobian = machine_equations(machine, R, t).by_pose
+        gradient, moment = jacobian[:, :, 3:], jacobian[:, :, :3]
+        return np.concatenate([(moment - np.cross(centre, gradient)) / scale, gradient], axis=2)
+    motors = list(machine.motors)  # lines alone
+    u = (vectors / lengths[..., None])[:, motors]
+    return np.concatenate([cross((turned - centre)[:, motors] / scale, u), u], axis=2)
 
 
 def excludes_singularity(known: Array, jacobian: Array) -> bool:

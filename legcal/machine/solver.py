@@ -123,6 +123,39 @@ def newton(
     return Solved(points, values, jacobian, np.array([size]), np.array([converged]))
 
 
+def newton_many(
+    equations: Equations,
+    retract: Retraction,
+    points: Array,
+    *,
+    tolerance: float,
+    contraction: float,
+    first: float = 1.0,
+    unit: Array | float = 1.0,
+    steps: int = 12,
+) -> Solved:
+    """Return where the steps of :func:`newton` from many points (k, ...) lead."""
+    values, jacobian = equations(points)
+    size = np.full(len(points), first)
+    converged = np.abs(values).max(axis=1, initial=0.0) < tolerance
+    moving = ~converged
+    for _ in range(steps):
+        if not moving.any():
+            break
+        step = -_least(jacobian * unit, values, RANK)
+        previous, size = size, np.abs(step).max(axis=1, initial=0.0)
+        moving &= size <= contraction * previous
+        if not moving.any():
+            break
+        points = retract(points, step * unit * moving[:, None])
+        values, jacobian = equations(points)
+        converged |= moving & (
+            (size < tolerance) | (np.abs(values).max(axis=1, initial=0.0) < tolerance)
+        )
+        moving &= ~converged
+    return Solved(points, values, jacobian, size, converged)
+
+
 def walk_in_steps(attempt: Callable[[float], bool], min_step: float) -> float:
     """Return which part of a way is done, walked in steps that are halved where one fails.
 
@@ -177,6 +210,19 @@ def _least(jacobian: Array, values: Array, rank: float) -> Array:
     """Return the shortest least-squares solutions (k, n) of linear equations."""
     if len(values) == 1:
         return _shortest(jacobian[0], values[0], rank)[None]
+    if jacobian.shape[1] == jacobian.shape[2]:
+        try:
+            steps = np.linalg.solve(jacobian, values[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            steps = np.full_like(values, np.inf)
+        far = ~(np.abs(steps).max(axis=1, initial=0.0) < 1.0)
+        if far.any():
+            steps[far] = _shortest_many(jacobian[far], values[far], rank)
+        return np.asarray(steps)
+    return _shortest_many(jacobian, values, rank)
+
+
+def _shortest_many(jacobian: Array, values: Array, rank: float) -> Array:
     return np.asarray((np.linalg.pinv(jacobian, rcond=rank) @ values[..., None])[..., 0])
 
 

@@ -164,12 +164,12 @@ def platform_accuracy(
 def _workspace_poses(machine: Machine, legs: Sequence[Leg]) -> Sequence[RigidTransform] | None:
     """Return where calibrated legs put the platform at readings all over the travel."""
     try:
-        drawn = workspace(machine)
+        readings, drawn = workspace(machine)
     except DidNotConverge:  # travel or home of the model forbid it, which harms no calibration
         return None
-    nearby = [platform_in_base(machine, T) for T in drawn.poses]
-    poses = poses_at_readings(machine, legs, drawn.readings, nearby)
-    reached = [T for T, q in zip(poses, drawn.readings, strict=True) if _is_reached(legs, q, T)]
+    nearby = [platform_in_base(machine, T) for T in drawn]
+    poses = poses_at_readings(machine, legs, readings, nearby)
+    reached = [T for T, q in zip(poses, readings, strict=True) if _is_reached(legs, q, T)]
     return reached or None
 
 

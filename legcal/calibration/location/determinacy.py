@@ -26,7 +26,7 @@ from legcal.calibration.location.frames import N_STEP, PosePairs, jacobian
 from legcal.calibration.location.tool_poses import ToolMeasurements
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray
-from legcal.machine import random_configurations
+from legcal.machine import random_poses
 
 _MAX_SIGMA = 0.1  # [rad], and of the length of the machine: what is known worse is open
 _MACHINE_TOLERANCE = 2e-3  # of the best singular value: what no pose of a machine shows better
@@ -213,8 +213,8 @@ def _open_at(measurements: ToolMeasurements, found: FrameFit, k: int, frames: Ar
 
 def _workspace(measurements: ToolMeasurements) -> PosePairs:
     """Return poses all over the workspace, as if each had been measured."""
-    sampled = random_configurations(measurements.machine, _N_POSES, _SEED)
-    matrices = np.array([T.as_matrix() for T in sampled.poses])
+    _, poses = random_poses(measurements.machine, _N_POSES, _SEED)
+    matrices = np.array([T.as_matrix() for T in poses])
     return PosePairs(
         R=matrices[:, :3, :3],
         t=matrices[:, :3, 3],
