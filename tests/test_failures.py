@@ -17,6 +17,7 @@ from types import FrameType
 import numpy as np
 import pytest
 from dataset_folder import HEXAPOD, Folder, folder
+from pool_work import row_zero_after_row_five
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import cli, load_dataset, load_mechanism
@@ -195,7 +196,7 @@ def test_results_come_as_they_are_finished_and_rows_are_taken_as_processes_get_f
             taken.append(row)
             yield row
 
-    work = partial(_row_zero_after_row_five, tmp_path / "done")
+    work = partial(row_zero_after_row_five, tmp_path / "done")
     with worker_pool(2, in_order=False) as run:
         found = iter(run(work, rows()))
         first = next(found)
@@ -206,14 +207,6 @@ def test_results_come_as_they_are_finished_and_rows_are_taken_as_processes_get_f
     (tmp_path / "done").unlink()
     with worker_pool(2) as run:
         assert list(run(work, range(6))) == list(range(6))
-
-
-def _row_zero_after_row_five(done: Path, row: int) -> int:
-    while row == 0 and not done.exists():
-        time.sleep(0.01)
-    if row == 5:
-        done.touch()
-    return row
 
 
 def test_processes_do_not_finish_work_that_is_not_wanted_any_more() -> None:

@@ -21,6 +21,7 @@ from legcal.geometry import (
     register_points,
     roll_pitch_yaw,
     rotation_between,
+    segment_distance,
     turned,
 )
 
@@ -182,6 +183,22 @@ def test_eq06_no_point_of_a_line_is_nearer_than_its_distance(seed: int) -> None:
     nearest = nearest_point_to_line(u, M, d, N)  # of two lines
     assert distance_to_line(nearest, u, M) < 1e-9 * (1.0 + np.linalg.norm(nearest))
     assert distance_to_line(along, d, N).min() >= distance_to_line(nearest, d, N) - 1e-9
+
+
+@FAST
+@given(SEEDS, st.booleans())
+def test_the_distance_of_two_pieces_is_the_smallest_of_their_points(seed: int, flat: bool) -> None:
+    rng = np.random.default_rng(seed)
+    start, span = rng.normal(size=(2, 1, 2, 3))
+    if flat:
+        span[0, 1] = rng.normal() * span[0, 0]
+    found = float(segment_distance(start[:, 0], span[:, 0], start[:, 1], span[:, 1])[0])
+    s = np.linspace(0.0, 1.0, 201)[:, None]
+    P, Q = (start[0, i] + s * span[0, i] for i in (0, 1))
+    sampled = np.linalg.norm(P[:, None] - Q[None], axis=-1).min()
+    step = np.linalg.norm(span, axis=-1).max() / 200.0
+    assert found <= sampled + 1e-12
+    assert found >= sampled - step
 
 
 @FAST

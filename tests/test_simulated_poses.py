@@ -8,13 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from machines import ROOT
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
-from legcal.geometry import Array, segment_distance
+from legcal.geometry import Array
 from legcal.machine import (
     MIN_SINGULARITY,
     Configurations,
@@ -222,22 +220,6 @@ def test_two_legs_that_cross_are_named(tmp_path: Path) -> None:
     assert touching is not None
     i, j = (thick.leg_names.index(name) for name in touching)
     assert _overlap(thick, turned, i, j) > 0.0
-
-
-@settings(max_examples=40, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), flat=st.booleans())
-def test_the_distance_of_two_pieces_is_the_smallest_of_their_points(seed: int, flat: bool) -> None:
-    rng = np.random.default_rng(seed)
-    start, span = rng.normal(size=(2, 1, 2, 3))
-    if flat:
-        span[0, 1] = rng.normal() * span[0, 0]
-    found = float(segment_distance(start[:, 0], span[:, 0], start[:, 1], span[:, 1])[0])
-    s = np.linspace(0.0, 1.0, 201)[:, None]
-    P, Q = (start[0, i] + s * span[0, i] for i in (0, 1))
-    sampled = np.linalg.norm(P[:, None] - Q[None], axis=-1).min()
-    step = np.linalg.norm(span, axis=-1).max() / 200.0
-    assert found <= sampled + 1e-12
-    assert found >= sampled - step
 
 
 def _csv(folder: Path, machine: Machine, rows: Array, names: list[str] | None = None) -> Path:

@@ -30,8 +30,8 @@ def _lines(folder: Path) -> list[bytes]:
 
 def test_results_depend_neither_on_the_number_of_processes_nor_on_their_order() -> None:
     study = Draws(seconds=0.002)
-    results = [run_study(study, 40, seed=3, workers=n).document() for n in (1, 2, 3)]
-    assert results[0] == results[1] == results[2]
+    results = [run_study(study, 40, seed=3, workers=n).document() for n in (1, 3)]
+    assert results[0] == results[1]
     assert results[0]["n"] == 40
 
 
