@@ -40,6 +40,8 @@ _MIN_NARROWING = 0.8  # of the width: smaller changes of the median do not chang
 _CONVERGED_FALL = 0.01  # of the cost: below, the loss is narrowed in any case
 _NARROWED = 0.5  # of the width, then
 _MAX_ELEMENT_STEPS = 3
+_NEARLY_LINEAR = 0.99  # part of what a step predicted: above, damping is needed no longer
+_NEARLY_LINEAR_DECAY = 1e-3
 _DAMPING_MARGIN = 3.0  # times a damping that failed is tried after one that did not
 _DAMPING_DECAY = 0.3  # of a damping that failed, every step
 _MIN_ITERATIONS = 30  # before the relative tolerance counts
@@ -63,6 +65,8 @@ def minimise(
     loss: Loss = LEAST_SQUARES,
     *,
     max_iterations: int = 200,
+    is_near: bool = False,
+    tolerance: float = _COST_TOLERANCE,
     relative_tolerance: float = 0.0,
     must_converge: bool = True,
 ) -> Minimum[S]:
@@ -76,6 +80,10 @@ def minimise(
         What to minimise, and where to start.
     max_iterations : int
         Steps to try.
+    is_near : bool
+        Whether the start is a minimum with other weights: the first step is not damped.
+    tolerance : float
+        Fall of the cost at which to stop, in squared sigmas.
     relative_tolerance : float
         Relative fall of the cost at which to stop after some steps: where outliers bend the cost,
         the last steps are many and follow these.
@@ -90,7 +98,7 @@ def minimise(
     state = problem.projected(state)
     linear = linearize(problem, state)
     wide = _widened(problem, linear, loss, np.inf)
-    damping, failed, fall_before = _FIRST_DAMPING, 0.0, np.inf
+    damping, failed, fall_before = _MIN_DAMPING if is_near else _FIRST_DAMPING, 0.0, np.inf
     for iteration in range(1, max_iterations + 1):
         cost = robust_cost(problem, linear, wide)
         step, predicted = normal_equations(problem, state, linear, wide).step(damping)
@@ -112,7 +120,7 @@ def minimise(
                 narrower = _of_width(loss, max(loss.width, _NARROWED * wide.width))
             same = narrower.width == wide.width
             smallest = relative_tolerance * (cost - fall) if iteration > _MIN_ITERATIONS else 0.0
-            if same and (converged or expected < max(smallest, _COST_TOLERANCE)):
+            if same and (converged or expected < max(smallest, tolerance)):
                 return Minimum(state, linear, robust_cost(problem, linear, wide), iteration)
             fall_before = predicted if same else np.inf
             wide = narrower
@@ -163,7 +171,8 @@ def _widened(problem: Problem[S], linear: Linearization, loss: Loss, before: flo
 def _next(damping: float, gain: float) -> float:
     """Return the damping after a step that gave that part of what it predicted."""
     if gain > 0.75:
-        return max(0.1 * damping, _MIN_DAMPING)
+        decay = _NEARLY_LINEAR_DECAY if gain > _NEARLY_LINEAR else 0.1
+        return max(decay * damping, _MIN_DAMPING)
     return damping if gain > 0.25 else 4.0 * damping
 
 

@@ -43,6 +43,7 @@ from legcal.vision import EPSILON
 _NOMINAL_SIGMA = 0.1  # of the mean leg length, angles at it
 _BOARD_ROUNDS = 3
 _REJECTION_TOLERANCE = 0.005  # relative, of the cost, in rounds that reject outliers
+_PASSING = 1e-6  # squared sigmas from a minimum that rounds pass through and do not end at
 _MIN_REDUNDANCY = 0.05  # of the equations of corners, beyond what the fit absorbs
 _MIN_SCALE = 0.1
 _MIN_ERROR_PX = 1e-3  # absolute tolerance of standard deviations of errors
@@ -92,6 +93,7 @@ def first_minimum(
         begin,
         loss,
         max_iterations=settings.max_iterations,
+        tolerance=_PASSING,
         relative_tolerance=_REJECTION_TOLERANCE,
     )
     linear = linearize(problem, found.state)
@@ -120,12 +122,14 @@ def fit_in_rounds(
     biases = possible.of_sizes(with_gamma(np.zeros(N_KINDS)))
     problem, state = with_edge_biases(problem, first, biases)
 
-    def solved(relative_tolerance: float = 0.0) -> tuple[FitProblem, Minimum[State]]:
+    def solved(**tolerances: float) -> tuple[FitProblem, Minimum[State]]:
         weighted = problem.weighted(noise, accepted)
         loss, n_steps = PseudoHuber(settings.loss_width), settings.max_iterations
         return weighted, minimise(
-            weighted, state, loss, max_iterations=n_steps, relative_tolerance=relative_tolerance
+            weighted, state, loss, is_near=True, max_iterations=n_steps, **tolerances
         )
+
+    passing = {"tolerance": _PASSING, "relative_tolerance": _REJECTION_TOLERANCE}
 
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before = accepted
@@ -133,12 +137,12 @@ def fit_in_rounds(
         accepted = _accepted(problem, state, noise, settings)
         if np.array_equal(before, accepted):
             break
-        problem, minimum = solved(_REJECTION_TOLERANCE)
+        problem, minimum = solved(**passing)
         state, iterations = minimum.state, iterations + minimum.iterations
     _refuse_disagreement(problem.offsets(state), accepted, settings)
     for _ in range(_BOARD_ROUNDS if len(problem.corners) else 0):
         problem = _with_judged_corners(problem.weighted(noise, accepted), state, settings)
-        problem, minimum = solved(_REJECTION_TOLERANCE)
+        problem, minimum = solved(**passing)
         state, iterations = minimum.state, iterations + minimum.iterations
     with_possible, changes = problem.with_biases(possible), NO_CHANGES
     for _ in range(settings.noise_rounds if len(claimed) else 1):
