@@ -16,7 +16,7 @@ from itertools import pairwise
 from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array, IntArray, components, motions_of, turned
@@ -121,7 +121,7 @@ class Residuals:
     """Residuals r (n, q) of n measurements, and slopes (n, q, l) by what they depend on directly.
 
     ``chain`` turns slopes into derivatives by kept variables and by eliminated ones; it is called
-    only where these are needed.
+    only where these are needed. All is fastest where measurements lie next to each other in memory.
     """
 
     r: Array
@@ -161,7 +161,18 @@ class Residuals:
             return Residuals(float(T) * self.r, float(T) * self.slope, self.chain)
         if T.shape[1:] == (1, 1):
             return Residuals(T[:, 0] * self.r, T * self.slope, self.chain)
-        return Residuals((T @ self.r[..., None])[..., 0], T @ self.slope, self.chain)
+        by_row = np.ascontiguousarray(T.transpose(1, 2, 0))
+        r = np.einsum("ijn,jn->in", by_row, self.r.T)
+        slope = np.einsum("ijn,ljn->lin", by_row, self.slope.T)
+        return Residuals(r.T, slope.T, self.chain)
+
+    def stacked(self, order: IntArray | None) -> Array:
+        """Return [J, r, J_element] of each measurement (n, q, m + 1 + d), in an order."""
+        J, J_element = self._derivatives
+        m = J.shape[-1]
+        rows = np.empty((*self.r.shape, m + 1 + J_element.shape[-1]))
+        rows[..., :m], rows[..., m], rows[..., m + 1 :] = J, self.r, J_element
+        return rows if order is None else rows[order]
 
 
 Touch = tuple[str, IntArray, slice]  # block, element(s) of each measurement, numbers of these
@@ -186,51 +197,86 @@ class Factor(Generic[S]):
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
-    """Which unknowns the measurements of a factor depend on, and the matrices that sum them up."""
+class _Groups:
+    """Measurements of a factor that touch the same kept variables, and cells of these.
 
-    index: IntArray  # (n, m) positions in x; n_kept for what is no unknown
+    A cell has the measurements of a group that touch the same eliminated element; all cells
+    of a factor are of one size, of single measurements where they would not be.
+    """
+
+    order: IntArray | None  # (n,) measurements sorted by group and element; None if they are
+    group: IntArray  # (n,) of each
+    first: IntArray  # (n_groups,) a measurement of each group
+    bounds: tuple[tuple[int, int], ...]  # of each group in that order
+    cell: int  # measurements in each cell
+
+    @classmethod
+    def of(cls, touched: Sequence[IntArray], element: IntArray | None, n: int) -> _Groups:
+        """Return the groups of measurements with the elements of blocks that each touches."""
+        key = np.zeros(n, dtype=np.intp)
+        for column in (c for part in touched for c in part.reshape(n, part.size // max(n, 1)).T):
+            key = key * (int(column.max(initial=0)) + 1) + column
+            if key.max(initial=0) > _MAX_KEY:
+                key = np.unique(key, return_inverse=True)[1].ravel()
+        _, first, group = np.unique(key, return_index=True, return_inverse=True)
+        group = group.ravel()
+        ends = np.cumsum(np.bincount(group)).tolist()
+        order = np.lexsort((np.zeros(n) if element is None else element, group))
+        cell = 1
+        if element is not None and n:
+            starts = np.ones(n, dtype=np.bool_)
+            starts[1:] = (np.diff(group[order]) != 0) | (np.diff(element[order]) != 0)
+            found = np.flatnonzero(starts)
+            cell = n // len(found)
+            cell = cell if np.array_equal(found, cell * np.arange(len(found))) else 1
+        is_sorted = np.array_equal(order, np.arange(n))
+        bounds = tuple(pairwise([0, *ends]))
+        return cls(None if is_sorted else order, group, first, bounds, cell)
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Which unknowns the measurements of a factor depend on, and the matrix that sums them up."""
+
+    groups: _Groups
+    columns: IntArray  # (n_groups, m) positions in x; n_kept for what is no unknown
     element: IntArray | None  # (n,)
     n_kept: int
-    n_elements: int
-    order: IntArray  # (n,) measurements with the same unknowns one after the other: a group
-    bounds: tuple[tuple[int, int], ...]  # of each group in that order
-    columns: IntArray  # (n_groups, m)
-    to_kept: csr_array | None  # ((n_kept + 1) n_elements, n m) sums what couples kept to own
-    to_element: csr_array | None  # (n_elements, n)
+    # ((n_kept + 2 + d) * n_elements, n_cells * (m + 1 + d)) adds [J, r, J_element]^T J_element of
+    # cells to rows of kept unknowns, of no unknown, of the gradient, and of elements
+    to_elements: csc_array | None
+
+    @cached_property
+    def index(self) -> IntArray:
+        """Positions in x of each measurement, (n, m)."""
+        return np.asarray(self.columns[self.groups.group])
 
     @property
-    def groups(self) -> list[tuple[IntArray, IntArray]]:
+    def members(self) -> list[tuple[IntArray | slice, IntArray]]:
         """The measurements of each group and its unknowns."""
-        members = [self.order[start:end] for start, end in self.bounds]
-        return list(zip(members, self.columns, strict=True))
+        order = self.groups.order
+        spans = [slice(start, end) for start, end in self.groups.bounds]
+        return list(
+            zip([s if order is None else order[s] for s in spans], self.columns, strict=True)
+        )
 
 
 def _places(
-    touched: Sequence[IntArray],
-    index: IntArray,
-    element: IntArray | None,
-    n_kept: int,
-    n_elements: int,
+    groups: _Groups, columns: IntArray, element: IntArray | None, n_kept: int, sizes: tuple[int, int]
 ) -> Places:
-    """Return the places of measurements, with the elements of blocks that each touches."""
-    n, m = index.shape
-    group = np.zeros(n, dtype=np.intp)
-    for column in (c for part in touched for c in part.reshape(n, part.size // max(n, 1)).T):
-        group = group * (int(column.max(initial=0)) + 1) + column
-        if group.max(initial=0) > _MAX_KEY:
-            group = np.unique(group, return_inverse=True)[1].ravel()
-    _, first, group = np.unique(group, return_index=True, return_inverse=True)
-    columns, group = index[first], group.ravel()
-    ends = np.cumsum(np.bincount(group)).tolist()
-    order, bounds = np.argsort(group, kind="stable"), tuple(pairwise([0, *ends]))
+    """Return the places of measurements; *sizes* are the number of elements and of their unknowns."""
     if element is None:
-        return Places(index, element, n_kept, n_elements, order, bounds, columns, None, None)
-    row = (index * n_elements + element[:, None]).ravel()
-    shape = (n_kept + 1) * n_elements, n * m
-    to_kept = csr_array((np.ones(n * m), (row, np.arange(n * m))), shape=shape)
-    to_element = csr_array((np.ones(n), (element, np.arange(n))), shape=(n_elements, n))
-    return Places(index, element, n_kept, n_elements, order, bounds, columns, to_kept, to_element)
+        return Places(groups, columns, None, n_kept, None)
+    (n_elements, d), n_groups = sizes, len(columns)
+    of_cell = slice(None, None, groups.cell)
+    order = slice(None) if groups.order is None else groups.order
+    group, cell = groups.group[order][of_cell], element[order][of_cell]
+    following = np.broadcast_to(n_kept + 1 + np.arange(1 + d), (n_groups, 1 + d))
+    row = np.concatenate([columns, following], axis=1)[group] * n_elements + cell[:, None]
+    n = row.size
+    shape = ((n_kept + 2 + d) * n_elements, n)
+    added = csc_array((np.ones(n), row.ravel(), np.arange(n + 1)), shape=shape)
+    return Places(groups, columns, element, n_kept, added)
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,6 +309,32 @@ class _Layout:
     places: tuple[Places, ...]
 
 
+def _same_unknowns(old: _Layout, problem: Problem[Any]) -> bool:
+    """Say whether the unknowns of a problem stand where those of a layout do."""
+    return (
+        old.eliminated is problem.eliminated
+        and len(old.variables) == len(problem.variables)
+        and all(
+            a is b or (a.name == b.name and np.array_equal(a.unknown, b.unknown))
+            for a, b in zip(old.variables, problem.variables, strict=True)
+        )
+    )
+
+
+def _same_touches(
+    factor: Factor[Any], touches: tuple[Touch, ...], element: IntArray | None
+) -> bool:
+    """Say whether the measurements of a factor touch what others did."""
+    return (
+        factor.element is element
+        and len(factor.touches) == len(touches)
+        and all(
+            a[0] == b[0] and a[1] is b[1] and a[2] == b[2]
+            for a, b in zip(factor.touches, touches, strict=True)
+        )
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Problem(Generic[S]):
     """Variables, factors and constraints; see :mod:`legcal.estimation`."""
@@ -284,15 +356,9 @@ class Problem(Generic[S]):
     def _laid_out(self, old: _Layout | None) -> _Layout:
         """Return the layout, with what is left of an old one."""
         touches = tuple((factor.touches, factor.element) for factor in self.factors)
-        known: dict[int, Places] = {}
-        if (
-            old is not None
-            and len(old.variables) == len(self.variables)
-            and all(a is b for a, b in zip(old.variables, self.variables, strict=True))
-            and old.eliminated is self.eliminated
-        ):
+        same = old is not None and _same_unknowns(old, self)
+        if old is not None and same:
             place, n_kept = old.place, old.n_kept
-            known = {id(t): p for (t, _), p in zip(old.touches, old.places, strict=True)}
         else:
             counts = [block.n_unknowns for block in self.variables]
             first = np.cumsum([0, *counts]).tolist()
@@ -301,17 +367,23 @@ class Problem(Generic[S]):
                 block.name: np.where(block.unknown < 0, n_kept, start + block.unknown)
                 for block, start in zip(self.variables, first, strict=False)
             }
-        n_elements = 0 if self.eliminated is None else len(self.eliminated.unknown)
+        known = [] if old is None else list(zip(old.touches, old.places, strict=True))
         places = []
         for factor in self.factors:
-            if id(factor.touches) in known:
-                places.append(known[id(factor.touches)])
+            alike = next((p for (t, e), p in known if _same_touches(factor, t, e)), None)
+            if alike is not None and same:
+                places.append(alike)
                 continue
-            parts = [place[name][element][..., d] for name, element, d in factor.touches]
-            columns = [part.reshape(factor.n, int(np.prod(part.shape[1:]))) for part in parts]
-            index = np.concatenate([np.zeros((factor.n, 0), dtype=np.intp), *columns], axis=1)
             touched = [element for _, element, _ in factor.touches]
-            places.append(_places(touched, index, factor.element, n_kept, n_elements))
+            groups = None if alike is None else alike.groups
+            if groups is None:
+                groups = _Groups.of(touched, factor.element, factor.n)
+            parts = [place[name][e[groups.first]][..., d] for name, e, d in factor.touches]
+            flat = [part.reshape(len(part), int(np.prod(part.shape[1:]))) for part in parts]
+            none = np.zeros((len(groups.first), 0), dtype=np.intp)
+            columns = np.concatenate([none, *flat], axis=1)
+            sizes = self.n_elements, self.d_element
+            places.append(_places(groups, columns, factor.element, n_kept, sizes))
         return _Layout(self.variables, self.eliminated, touches, place, n_kept, tuple(places))
 
     @property

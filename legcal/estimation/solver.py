@@ -360,28 +360,28 @@ def _sums(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the blocks U, W, V of J^T J and both parts of J^T r, all measurements added up."""
     n_kept, n_elements, d = problem.n_kept, problem.n_elements, problem.d_element
-    U, g_kept = np.zeros((n_kept + 1, n_kept + 1)), np.zeros(n_kept + 1)
-    W = np.zeros(((n_kept + 1) * n_elements, d))
-    V, g_elements = np.zeros((n_elements, d * d)), np.zeros((n_elements, d))
+    squares = np.zeros((n_kept + 2, n_kept + 2))  # with one row of no unknown, and r as the last
+    mixed = np.zeros(((n_kept + 2 + d) * n_elements, d))  # the same, then those of the elements
     for where, rows in kinds:
-        n, q, m = rows.J.shape
-        if n == 0:
+        if len(rows.r) == 0:
             continue
-        J, r = rows.J[where.order].reshape(n * q, m), rows.r[where.order].ravel()
-        squares, products = np.empty((len(where.bounds), m, m)), np.empty((len(where.bounds), m))
-        for group, (start, end) in enumerate(where.bounds):
-            of_group = slice(q * start, q * end)
-            squares[group] = J[of_group].T @ J[of_group]
-            products[group] = r[of_group] @ J[of_group]
-        np.add.at(U, (where.columns[:, :, None], where.columns[:, None, :]), squares)
-        np.add.at(g_kept, where.columns, products)
-        if where.to_kept is not None and where.to_element is not None:
-            J_element = rows.J_element
-            W += where.to_kept @ (np.swapaxes(rows.J, 1, 2) @ J_element).reshape(n * m, d)
-            V += where.to_element @ (np.swapaxes(J_element, 1, 2) @ J_element).reshape(n, d * d)
-            g_elements += where.to_element @ np.einsum("nqi,nq->ni", J_element, rows.r)
-    blocks = W.reshape(n_kept + 1, n_elements, d)[:n_kept], V.reshape(n_elements, d, d)
-    return U[:n_kept, :n_kept], *blocks, g_kept[:n_kept], g_elements
+        groups, m = where.groups, where.columns.shape[1]
+        stacked = rows.stacked(groups.order)
+        n, q, width = stacked.shape
+        flat, of_group = stacked.reshape(n * q, width)[:, : m + 1], []
+        for start, end in groups.bounds:
+            own = flat[q * start : q * end]
+            of_group.append(own.T @ own)
+        last = np.full((len(where.columns), 1), n_kept + 1)
+        columns = np.concatenate([where.columns, last], axis=1)
+        np.add.at(squares, (columns[:, :, None], columns[:, None, :]), np.array(of_group))
+        if where.to_elements is not None:
+            cells = stacked.reshape(n // groups.cell, groups.cell * q, width)
+            products = np.swapaxes(cells, 1, 2) @ cells[:, :, m + 1 :]
+            mixed += where.to_elements @ products.reshape(-1, d)
+    by_row = mixed.reshape(n_kept + 2 + d, n_elements, d)
+    V = np.swapaxes(by_row[n_kept + 2 :], 0, 1).copy()
+    return squares[:n_kept, :n_kept], by_row[:n_kept], V, squares[:n_kept, -1], by_row[n_kept + 1]
 
 
 def inverse_on_range(S: Array) -> Array:

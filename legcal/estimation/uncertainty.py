@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import null_space
 
-from legcal.estimation.problem import Linearization, Problem, S, linearize
+from legcal.estimation.problem import Linearization, Places, Problem, Residuals, S, linearize
 from legcal.estimation.solver import NormalEquations, inverse_on_range, normal_equations
 from legcal.geometry import Array, IntArray
 
@@ -68,25 +68,12 @@ def marginal(information: Array, which: IntArray) -> Array:
     return np.asarray(information[np.ix_(which, which)] - mixed.T @ inverse @ mixed)
 
 
-def _reduced_jacobian(
-    problem: Problem[S], linear: Linearization, normal: NormalEquations, name: str
-) -> Array:
-    """Return a factor's derivatives (n, q, n_kept) by kept unknowns, elements following them."""
-    where, rows = problem.places[name], linear[name]
-    n, q, _ = rows.J.shape
-    G = np.zeros((n, q, where.n_kept + 1))
-    measurement, row = np.arange(n)[:, None, None], np.arange(q)[None, :, None]
-    np.add.at(G, (measurement, row, where.index[:, None, :]), rows.J)
-    G = G[..., :-1]
-    if where.element is None:
-        return np.asarray(G)
-    if normal.tangent is not None:
-        G = G + rows.J_element @ np.moveaxis(normal.tangent.Q, 0, 2)[where.element]
-    return np.asarray(
-        G
-        + normal.along_constraints(rows.J_element, where.element)
-        @ normal.elements_by_kept[where.element]
-    )
+def _following(normal: NormalEquations) -> Array:
+    """Return how eliminated elements follow kept unknowns, (n_elements, d, n_kept)."""
+    inside = normal.elements_by_kept
+    if normal.tangent is None:
+        return inside
+    return np.asarray(np.moveaxis(normal.tangent.Q, 0, 2) + normal.tangent.Z @ inside)
 
 
 def explained_share(
@@ -102,16 +89,27 @@ def explained_share(
     *covariance* is that of the kept unknowns, if not that of these equations.
     """
     where, rows = problem.places[name], linear[name]
-    G = _reduced_jacobian(problem, linear, normal, name)
-    share = (G @ (normal.kept_covariance() if covariance is None else covariance)) @ np.swapaxes(
-        G, -1, -2
-    )
-    if where.element is None:
-        return np.asarray(share)
-    J_element = normal.along_constraints(rows.J_element, where.element)
-    return np.asarray(
-        share + J_element @ normal.V_inverse[where.element] @ np.swapaxes(J_element, -1, -2)
-    )
+    if covariance is None:
+        covariance = normal.kept_covariance()
+    share = np.zeros((*rows.r.shape, rows.r.shape[1]))
+    padded = np.pad(covariance, (0, 1))  # no unknown has no variance
+    if where.element is not None:
+        following = _following(normal)
+        with_kept = np.pad(following @ covariance, ((0, 0), (0, 0), (0, 1)))
+        of_elements = with_kept[..., :-1] @ np.swapaxes(following, 1, 2)
+        Z = None if normal.tangent is None else normal.tangent.Z
+        left = normal.V_inverse
+        of_elements += left if Z is None else Z @ left @ np.swapaxes(Z, 1, 2)
+    for member, columns in where.members:
+        J = np.ascontiguousarray(rows.J[member])
+        found = J @ padded[np.ix_(columns, columns)] @ np.swapaxes(J, 1, 2)
+        if where.element is not None:
+            element, own = where.element[member], np.ascontiguousarray(rows.J_element[member])
+            mixed = own @ with_kept[element][..., columns] @ np.swapaxes(J, 1, 2)
+            found += mixed + np.swapaxes(mixed, 1, 2)
+            found += own @ of_elements[element] @ np.swapaxes(own, 1, 2)
+        share[member] = found
+    return share
 
 
 def residual_changes(
@@ -151,19 +149,25 @@ def response(
     elements = np.zeros((problem.n_elements, problem.d_element, n_changes))
     for name, change in changes.items():
         where, rows = problem.places[name], linear[name]
-        for member, column in where.groups:
-            part = np.einsum("nqm,nqc->mc", rows.J[member], change[member], optimize=True)
-            np.add.at(gradient, column, part)
-        if where.to_element is not None:
-            of_element = np.einsum("nqi,nqc->nic", rows.J_element, change)
-            of_element = of_element.reshape(len(change), problem.d_element * n_changes)
-            elements += (where.to_element @ of_element).reshape(elements.shape)
+        _add_products(where, rows, change, gradient, elements)
     kept = gradient[:-1]
     if normal.tangent is not None:
         kept = kept + np.einsum("akp,kpc->ac", normal.tangent.Q, elements, optimize=True)
         elements = np.swapaxes(normal.tangent.Z, 1, 2) @ elements
     kept = kept - np.einsum("akf,kfc->ac", normal.W, normal.V_inverse @ elements, optimize=True)
     return np.asarray(-normal.kept_covariance() @ kept)
+
+
+def _add_products(
+    where: Places, rows: Residuals, columns: Array, kept: Array, elements: Array
+) -> None:
+    """Add J^T times columns (n, q, c) of a factor to sums of (n_kept + 1, c) and of elements."""
+    c = columns.shape[-1]
+    for member, places in where.members:
+        J = rows.J[member]
+        np.add.at(kept, places, J.reshape(-1, J.shape[-1]).T @ columns[member].reshape(-1, c))
+    if where.element is not None:
+        np.add.at(elements, where.element, np.swapaxes(rows.J_element, 1, 2) @ columns)
 
 
 def score_test(
@@ -177,17 +181,16 @@ def score_test(
     *columns* has whitened columns (n, q, c) of factors by name; *normal* is of plain squares.
     """
     c = next(iter(columns.values())).shape[-1]
-    kept, score, left = np.zeros((problem.n_kept, c)), np.zeros(c), np.zeros((c, c))
-    by_element = np.zeros((*normal.V.shape[:2], c))
+    of_kept, score, left = np.zeros((problem.n_kept + 1, c)), np.zeros(c), np.zeros((c, c))
+    of_elements = np.zeros((problem.n_elements, problem.d_element, c))
     for name, v in columns.items():
-        where, rows = problem.places[name], linear[name]
-        G = _reduced_jacobian(problem, linear, normal, name)
-        kept += np.einsum("nqk,nqc->kc", G, v, optimize=True)
-        score += np.einsum("nqc,nq->c", v, rows.r)
+        _add_products(problem.places[name], linear[name], v, of_kept, of_elements)
+        score += np.einsum("nqc,nq->c", v, linear[name].r)
         left += np.einsum("nqc,nqd->cd", v, v)
-        if where.element is not None:
-            J_element = normal.along_constraints(rows.J_element, where.element)
-            np.add.at(by_element, where.element, np.swapaxes(J_element, 1, 2) @ v)
+    kept = of_kept[:-1] + np.einsum("kda,kdc->ac", _following(normal), of_elements, optimize=True)
+    by_element = of_elements
+    if normal.tangent is not None:
+        by_element = np.swapaxes(normal.tangent.Z, 1, 2) @ of_elements
     following, covariance = normal.V_inverse @ by_element, normal.kept_covariance()
     elements = (normal.V_inverse @ normal.g_elements[..., None])[..., 0]
     g_kept = normal.g_kept - np.einsum("akp,kp->a", normal.W, elements)
