@@ -262,9 +262,13 @@ class Places:
 
 
 def _places(
-    groups: _Groups, columns: IntArray, element: IntArray | None, n_kept: int, sizes: tuple[int, int]
+    groups: _Groups,
+    columns: IntArray,
+    element: IntArray | None,
+    n_kept: int,
+    sizes: tuple[int, int],  # number of elements, and of the unknowns of each
 ) -> Places:
-    """Return the places of measurements; *sizes* are the number of elements and of their unknowns."""
+    """Return the places of measurements."""
     if element is None:
         return Places(groups, columns, None, n_kept, None)
     (n_elements, d), n_groups = sizes, len(columns)

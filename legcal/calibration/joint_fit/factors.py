@@ -4,18 +4,18 @@ Each kind is a class of arrays, one row a measurement, with the :class:`legcal.e
 that it is in the fit; :class:`Observed` registers the kinds. A measurement in an image depends on
 both ends of a leg in the camera frame; these depend on joints, camera and platform pose. Rotations
 change by Cayley's map from the left: a camera turns in its own frame, a platform about the origin
-of R_e in the directions of R_b. The residuals are CasADi functions; the chain rule around them is
-written out.
+of R_e in the directions of R_b. Residuals are written with their derivatives, which go backwards
+from each to the ends of the leg and on to the variables. Where there are many measurements, as of
+outlines and readings, arrays have these last: NumPy then works along them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cache, lru_cache
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
-import casadi as ca
 import numpy as np
 
 from legcal.calibration.joint_fit.variables import FittedLegs, State
@@ -82,6 +82,25 @@ def observed_arrays(
     )
 
 
+class Memory:
+    """The last result of a function, as long as the same objects go into it."""
+
+    def __init__(self) -> None:
+        self._last: tuple[tuple[object, ...], Any] | None = None
+
+    def __reduce__(self) -> tuple[type[Memory], tuple[()]]:
+        return Memory, ()
+
+    def of(self, compute: Callable[[], Any], *inputs: object) -> Any:
+        """Return what a function of these objects returns; it is called if one is another."""
+        last = self._last
+        if last is not None and all(a is b for a, b in zip(last[0], inputs, strict=True)):
+            return last[1]
+        found = compute()
+        self._last = inputs, found
+        return found
+
+
 # ------------------------------------------------------------------------------------- outlines
 
 
@@ -112,6 +131,7 @@ class ObservedOutlines:
     # same camera, as one that is held in the hand does; else itself
     series: IntArray
     cameras: tuple[str, ...]  # the view that stands for the camera of each view
+    memory: Memory = field(default_factory=Memory, repr=False)  # of the predicted offsets
 
     @property
     def epsilon(self) -> Array:
@@ -124,11 +144,11 @@ class ObservedOutlines:
     def at(self, which: IntArray) -> ObservedOutlines:
         """Return some of the outlines, by index, without biases."""
         bare = self.without_biases()
-        shared = ("parts", "views", "series", "cameras")
+        shared = ("parts", "views", "series", "cameras", "memory")
         chosen = {
             f.name: getattr(bare, f.name)[which] for f in fields(self) if f.name not in shared
         }
-        return replace(self, **chosen)
+        return replace(self, **chosen, memory=Memory())
 
     def without_biases(self) -> ObservedOutlines:
         """Return the same outlines without common-mode biases."""
@@ -152,33 +172,55 @@ class ObservedOutlines:
 
     def offsets(self, keys: tuple[str, ...], state: State) -> Array:
         """Return how far both ends are from the predicted outline, (n, 2) [px]."""
-        local, *_ = self._local(keys, state)
-        return self._corrected(outline_residual().values(local, self.constants), state)
+        return self._corrected(self._predicted(keys, state)[0], state)
 
     def rows(self, keys: tuple[str, ...], state: State) -> Residuals:
         """Return these offsets with their derivatives."""
-        local, ends, by_intrinsics = self._local(keys, state)
-        r, slope = outline_residual().evaluate(local, self.constants)
-        if not self.bias_index.shape[1] and not keys:
-            return Residuals(r, slope[..., :7], ends.with_others)
-        along = slope[..., 7:].reshape(len(self), 2, 2, 2)  # by (end, coordinate)
-        others = [
-            -np.swapaxes(self.bias_shift, 1, 2),
-            np.einsum("nqec,neck->nqk", along, by_intrinsics),
-        ]
-        slope = np.concatenate([slope[..., :7], *others], axis=-1)
-        return Residuals(self._corrected(r, state), slope, ends.with_others)
+        r, slope, ends = self._predicted(keys, state)
+        if self.bias_index.shape[1]:
+            by_bias = -self.bias_shift.transpose(1, 2, 0)
+            slope = np.concatenate([slope[:7], by_bias, slope[7:]])
+        return Residuals(self._corrected(r, state), slope.T, ends.chain)
 
     def _corrected(self, r: Array, state: State) -> Array:
-        """Return offsets (n, 2) without common-mode biases."""
-        r = r - np.einsum("nc,ncq->nq", state.biases[self.bias_index], self.bias_shift)
-        return np.asarray(r)
+        """Return offsets (n, 2) without common-mode biases, from (2, n) with them."""
+        if not self.bias_index.shape[1]:
+            return r.T
+        biases = state.biases[self.bias_index]
+        return np.asarray(r.T - np.einsum("nc,ncq->nq", biases, self.bias_shift))
 
-    def _local(self, keys: tuple[str, ...], state: State) -> tuple[Array, _EndsInCamera, Array]:
-        ends = _ends_in_camera(state, self.leg, self.view, self.pose)
-        xy, by_intrinsics = _on_sensor(state.cameras, keys, self.view, self.feet, self.pixels)
-        parts = [ends.A, ends.B, state.radii[self.radius, None], xy.reshape(len(self), 4)]
-        return np.concatenate(parts, axis=1), ends, by_intrinsics
+    def _predicted(self, keys: tuple[str, ...], state: State) -> tuple[Array, Array, _EndsInCamera]:
+        """Return offsets (2, n) with biases, derivatives (7 + n_keys, 2, n), and ends of legs."""
+
+        def predicted() -> tuple[Array, Array, _EndsInCamera]:
+            ends = _ends_in_camera(state, self.leg, self.view, self.pose)
+            xy, by_key = self._feet, None
+            if keys:
+                moved, slopes = _on_sensor(state.cameras, keys, self.view, self.feet, self.pixels)
+                xy, by_key = np.ascontiguousarray(moved.T), slopes.transpose(3, 2, 1, 0)
+            radius = state.radii[self.radius]
+            r, slope, by_xy = outline_offsets(ends.A, ends.B, radius, self.epsilon, xy, self._lens)
+            if by_key is not None:
+                slope = np.concatenate([slope, np.einsum("kcqn,cqn->kqn", by_key, by_xy)])
+            return r, slope, ends
+
+        own = self.radius, self.feet, self.constants
+        poses = state.camera_pose, state.platform_pose
+        found: tuple[Array, Array, _EndsInCamera] = self.memory.of(
+            predicted, keys, *own, state.legs, state.radii, state.cameras, *poses
+        )
+        return found
+
+    @cached_property
+    def _feet(self) -> Array:
+        """The feet by coordinate and end, (2, 2, n)."""
+        return np.ascontiguousarray(self.feet.T)
+
+    @cached_property
+    def _lens(self) -> Array:
+        """The inverse transposed derivatives of pixels by row, column and end, (2, 2, 2, n)."""
+        by_end = self.constants[:, :8].reshape(-1, 2, 2, 2)  # column by column
+        return np.ascontiguousarray(by_end.transpose(3, 2, 1, 0))
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor of outlines, whitened with their claimed covariances."""
@@ -227,6 +269,9 @@ def observed_outlines(
     ]
     if problems:
         raise DatasetError(problems)
+    order = np.lexsort((measurements.pose[row], view, leg))  # those of a leg in a view together
+    index, row, leg, view = index[order], row[order], leg[order], view[order]
+    covariance, by_gamma, keys = covariance[order], by_gamma[order], [keys[i] for i in order]
     n, numbers = len(index), {part: i for i, part in enumerate(parts)}
     feet, pixels, constants = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.empty((n, 9))
     constants[:, 8] = EPSILON[outlines.edge[index] - 1]
@@ -343,23 +388,41 @@ class Readings:
     pose: IntArray  # (n,) indices
     length: Array  # (n,) sign * q: the leg length without its offset [m]
     sigma: float  # standard deviation [m]
+    n_legs: int  # of the mechanism
+    memory: Memory = field(default_factory=Memory, repr=False)
 
     def __len__(self) -> int:
         return len(self.leg)
 
     def rows(self, state: State) -> Residuals:
-        """Return the closures of legs (n, 1) [m] with their derivatives."""
-        arm, R_pose = state.arms[self.pose, self.leg], state.platform_pose.R[self.pose]
-        B = state.platform_pose.t[self.pose] + arm
-        local = np.column_stack([state.A[self.leg], B, state.lengths[self.leg]])
-        r, slope = encoder_residual().evaluate(local, self.length[:, None])
+        """Return the closures of legs (n, 1) [m], |AB| - sign q - q0, with their derivatives."""
+        found: Residuals = self.memory.of(
+            lambda: self._rows(state), state.legs, state.platform_pose
+        )
+        return found
+
+    def _rows(self, state: State) -> Residuals:
+        arm, end = (table[:, self._end] for table in _ends_at_poses(state))
+        R_pose = _by_measurement(state.platform_pose.R, self.pose)
+        along = end - state.A.T[:, self.leg]
+        length = np.sqrt(np.einsum("in,in->n", along, along))
+        slope = np.empty((7, 1, len(self)))
+        np.divide(along, length, out=slope[3:6, 0])
+        slope[:3], slope[6] = -slope[3:6], -1.0
 
         def chain(slope: Array) -> tuple[Array, Array]:
-            b = slope[..., 3:6]
-            J = np.concatenate([slope[..., :3], b @ R_pose, slope[..., 6:]], axis=-1)
-            return J, np.concatenate([cross(arm[:, None], b), b], axis=-1)
+            by_length = slope.T
+            b, J = by_length[3:6], np.empty((13, *by_length.shape[1:]))
+            J[:3], J[6], J[10:] = by_length[:3], by_length[6], b
+            np.einsum("jin,jqn->iqn", R_pose, b, out=J[3:6])
+            J[7:10] = _cross(arm[:, None], b)
+            return J[:7].T, J[7:].T
 
-        return Residuals(r, slope, chain)
+        return Residuals((length - self.length - state.lengths[self.leg])[:, None], slope.T, chain)
+
+    @cached_property
+    def _end(self) -> IntArray:
+        return self.pose * self.n_legs + self.leg
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor of readings; no camera matters to them."""
@@ -375,8 +438,8 @@ def observed_readings(measurements: Measurements, legs: FittedLegs) -> Readings:
     """
     length = legs.sign * measurements.q[measurements.first_rows]
     actuated = np.array([leg.kind is LegKind.ACTUATED for leg in legs.nominal], dtype=np.bool_)
-    pose, leg = np.nonzero(np.isfinite(length) & actuated)
-    return Readings(leg, pose, length[pose, leg], measurements.sigma_q)
+    leg, pose = np.nonzero((np.isfinite(length) & actuated).T)
+    return Readings(leg, pose, length[pose, leg], measurements.sigma_q, legs.n_legs)
 
 
 # ----------------------------------------------------------------------------------------- axes
@@ -400,10 +463,9 @@ class ObservedAxes:
 
     def rows(self, state: State) -> Residuals:
         """Return alpha and beta (n, 4) with their derivatives."""
-        data = np.concatenate([self.M, self.basis.reshape(-1, 6)], axis=1)
         ends = _ends_in_camera(state, self.leg, self.view, self.pose)
-        r, slope = axis_residual().evaluate(np.concatenate([ends.A, ends.B], axis=1), data)
-        return Residuals(r, slope, ends.by_unknowns)
+        r, slope = axis_offsets(ends.A, ends.B, self.M.T, self.basis.T)
+        return Residuals(r.T, slope.T, ends.chain)
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor of measured axes, which contain cameras already."""
@@ -494,8 +556,14 @@ class ObservedCorners:
         grown = state.board_scale[0] * arm
         turned = _times(R_camera, grown + state.board_pose.t)
         xy, by_intrinsics = _on_sensor(state.cameras, keys, self.view, self.feet, self.pixels)
-        local = np.concatenate([turned + state.camera_pose.t[self.view], xy], axis=1)
-        r, slope = corner_residual().evaluate(local, self.constants)
+        in_camera = turned + state.camera_pose.t[self.view]
+        depth = in_camera[:, 2:]
+        seen = in_camera[:, :2] / depth
+        lens = np.swapaxes(self.constants.reshape(-1, 2, 2), 1, 2)
+        by_seen = lens / depth[:, None]
+        by_depth = -by_seen @ seen[..., None]
+        r = (lens @ (seen - xy)[..., None])[..., 0]
+        slope = np.concatenate([by_seen, by_depth, -lens], axis=-1)
 
         def chain(slope: Array) -> tuple[Array, Array]:
             in_camera = slope[..., :3]
@@ -508,7 +576,7 @@ class ObservedCorners:
                 in_base @ arm[..., None],
                 slope[..., 3:] @ by_intrinsics,
             ]
-            return np.concatenate(J, axis=-1), np.zeros((*slope.shape[:2], 6))
+            return np.concatenate(J, axis=-1), np.zeros((*slope.shape[:2], 0))
 
         return Residuals(r, slope, chain)
 
@@ -563,142 +631,91 @@ def observed_corners(
 # ------------------------------------------------------------------------------------ residuals
 
 
-@dataclass(frozen=True, eq=False)
-class Residual:
-    """A CasADi residual of one measurement, evaluated for many at once."""
+def outline_offsets(
+    A: Array, B: Array, radius: Array, epsilon: Array, xy: Array, lens: Array
+) -> tuple[Array, Array, Array]:
+    """Return the distances of predicted outlines of legs from points, and their derivatives.
 
-    n_local: int  # numbers that it depends on
-    n_rows: int
-    value: ca.Function  # (local, data) -> residual
-    jacobian: ca.Function  # (local, data) -> residual and its dense Jacobian by local
+    The outline h of the cylinder about AB seen from the origin, eqs (1) and (3), is up to its
+    length, with n = A x B and D = B - A, epsilon r (D x n) - n sqrt(|n|^2 - |D|^2 r^2). The
+    distance is h . (x, y, 1) / |J^-T (h1, h2)|, that of
+    :meth:`legcal.vision.camera.Camera.line_offset` with the derivative J of the lens constant.
 
-    def values(self, local: Array, data: Array) -> Array:
-        """Return residuals (n, n_rows) of n measurements."""
-        r = np.zeros((len(local), self.n_rows))
-        _call(self.value, (local, data), (r,))
-        return r
+    Parameters
+    ----------
+    A, B : (3, n) array
+        Both ends in the camera frame [m].
+    radius, epsilon : (n,) array
+        Radii [m], and +1 or -1 of eq (5).
+    xy : (2, 2, n) array
+        Both points on the sensor plane, by coordinate and point.
+    lens : (2, 2, 2, n) array
+        J^-T at these points [1/px], by row, column and point.
 
-    def evaluate(self, local: Array, data: Array) -> tuple[Array, Array]:
-        """Return residuals (n, n_rows) and Jacobians (n, n_rows, n_local) of n measurements."""
-        n = len(local)
-        r = np.zeros((n, self.n_rows))
-        by_local = np.zeros((n, self.n_local, self.n_rows))  # CasADi stores column by column
-        _call(self.jacobian, (local, data), (r, by_local))
-        return r, np.swapaxes(by_local, 1, 2)
-
-
-def _call(function: ca.Function, inputs: Sequence[Array], results: Sequence[Array]) -> None:
-    """Evaluate a function for all measurements, on NumPy's memory and without copies."""
-    n = len(inputs[0])
-    if n == 0:
-        return
-    buffer: Any
-    buffer, evaluate = _mapped(function, n).buffer()
-    kept = [np.ascontiguousarray(array, dtype=np.float64) for array in inputs]
-    for i, array in enumerate(kept):
-        buffer.set_arg(i, array.data)
-    for i, array in enumerate(results):
-        buffer.set_res(i, array.data)
-    evaluate()
-
-
-@lru_cache(maxsize=64)
-def _mapped(function: ca.Function, n: int) -> ca.Function:
-    """Return the function over n measurements."""
-    return function.map(n)
-
-
-def _residual(name: str, local: ca.SX, data: ca.SX, r: ca.SX) -> Residual:
-    by_local = ca.densify(ca.jacobian(r, local))
-    options = {"cse": True}
-    return Residual(
-        local.size1(),
-        r.size1(),
-        ca.Function(name, [local, data], [r], options),
-        ca.Function(f"{name}_jacobian", [local, data], [r, by_local], options),
-    )
-
-
-def outline_of_leg(A: ca.SX, B: ca.SX, radius: ca.SX, epsilon: ca.SX) -> ca.SX:
-    """Return the outline h of the cylinder about AB seen from the origin, eqs (1) and (3).
-
-    Its length is that of A x B squared, of no matter for a line. With n = A x B and D = B - A
-    eq (3) is h = epsilon r (D x n) - n sqrt(|n|^2 - |D|^2 r^2) up to that, without a division.
+    Returns
+    -------
+    offset : (2, n) array
+        Of both points [px]; NaN where the origin is inside the cylinder.
+    by_leg : (7, 2, n) array
+        Derivatives by A, B and radius.
+    by_xy : (2, 2, n) array
+        Derivatives by the coordinates of the point.
     """
-    n, D = ca.cross(A, B), B - A
-    depth = ca.sqrt(ca.dot(n, n) - radius**2 * ca.dot(D, D))
-    return epsilon * radius * ca.cross(D, n) - depth * n
+    D, n = B - A, _cross(A, B)
+    squared = np.einsum("in,in->n", D, D)
+    across, signed = _cross(D, n), epsilon * radius
+    with np.errstate(invalid="ignore", divide="ignore"):
+        depth = np.sqrt(np.einsum("in,in->n", n, n) - radius * radius * squared)
+        h = signed * across - depth * n
+        normal = np.einsum("ijen,jn->ien", lens, h[:2])
+        size = np.sqrt(np.einsum("ien,ien->en", normal, normal))
+        offset = (h[0] * xy[0] + h[1] * xy[1] + h[2]) / size
+        by_h = np.empty((3, *offset.shape))
+        np.divide(1.0, size, out=by_h[2])
+        by_xy = h[:2, None] * by_h[2]
+        turned = np.einsum("ijen,ien->jen", lens, normal)
+        by_h[:2] = (xy - (offset * by_h[2]) * turned) * by_h[2]
+        along = np.einsum("ien,in->en", by_h, n) / depth
+    n, D = n[:, None], D[:, None]
+    by_n = signed * _cross(by_h, D) - depth * by_h - along * n
+    by_D = signed * _cross(n, by_h) + (along * (radius * radius)) * D
+    by_leg = np.empty((7, *offset.shape))
+    np.subtract(_cross(B[:, None], by_n), by_D, out=by_leg[:3])
+    np.add(_cross(by_n, A[:, None]), by_D, out=by_leg[3:6])
+    np.einsum("ien,in->en", by_h, epsilon * across, out=by_leg[6])
+    by_leg[6] += along * (radius * squared)
+    return offset, by_leg, by_xy
 
 
-def offset_in_image(h: ca.SX, xy: ca.SX, J_inverse_transposed: ca.SX) -> ca.SX:
-    """Return the signed distance [px] of a point of the sensor plane from the line h.
+def axis_offsets(A: Array, B: Array, M: Array, basis: Array) -> tuple[Array, Array]:
+    """Return how far predicted axes of legs are from measured ones, and the derivatives.
 
-    The same as :meth:`legcal.vision.camera.Camera.line_offset`, with the derivative of the
-    lens at the point given as a constant.
-    """
-    normal = J_inverse_transposed @ h[:2]
-    return (h[0] * xy[0] + h[1] * xy[1] + h[2]) / ca.norm_2(normal)
-
-
-@cache
-def outline_residual() -> Residual:
-    """Return the distances [px] of the predicted outline from both ends of the measured one.
-
-    local (11): A and B in the camera frame, radius [m], both ends on the sensor plane. data (9):
-    J^-T at the ends (2 x 4, column by column), epsilon.
-    """
-    local, data = ca.SX.sym("local", 11), ca.SX.sym("data", 9)
-    h = outline_of_leg(local[0:3], local[3:6], local[6], data[8])
-    offsets = [
-        offset_in_image(
-            h, local[7 + 2 * end : 9 + 2 * end], ca.reshape(data[4 * end : 4 + 4 * end], 2, 2)
-        )
-        for end in range(2)
-    ]
-    return _residual("outline", local, data, ca.vertcat(*offsets))
-
-
-@cache
-def axis_residual() -> Residual:
-    """Return how far a leg's predicted axis is from a measured one: alpha1, alpha2, beta1, beta2.
-
-    The measured axis passes through M along e1 x e2. alpha is the predicted direction in e1 and
+    A measured axis passes through M along e1 x e2. alpha is the predicted direction in e1 and
     e2, over its part along the axis; beta is where the predicted axis meets the plane through
     M with these directions, from M [m].
 
-    local (6): A and B in the camera frame [m]. data (9): M, e1, e2.
+    Parameters
+    ----------
+    A, B, M : (3, n) array
+        Both ends and M in the camera frame [m].
+    basis : (3, 2, n) array
+        e1 and e2.
+
+    Returns
+    -------
+    r : (4, n) array
+        alpha1, alpha2, beta1, beta2.
+    by_ends : (6, 4, n) array
+        Derivatives by A and B.
     """
-    local, data = ca.SX.sym("local", 6), ca.SX.sym("data", 9)
-    A, leg = local[0:3], local[3:6] - local[0:3]
-    M, e1, e2 = data[0:3], data[3:6], data[6:9]
-    basis, along = ca.horzcat(e1, e2).T, ca.cross(e1, e2)
-    slope = leg / ca.dot(along, leg)
-    to_A = A - M
-    beta = basis @ (to_A - slope * ca.dot(along, to_A))
-    return _residual("axis", local, data, ca.vertcat(basis @ slope, beta))
-
-
-@cache
-def corner_residual() -> Residual:
-    """Return how far a predicted corner of the calibration board is from the measured one [px].
-
-    local (5): the corner in the camera frame [m], the measured one on the sensor plane. data (4):
-    the derivative of pixels by the sensor plane there (2 x 2, column by column).
-    """
-    local, data = ca.SX.sym("local", 5), ca.SX.sym("data", 4)
-    away = local[:2] / local[2] - local[3:]
-    return _residual("corner", local, data, ca.reshape(data, 2, 2) @ away)
-
-
-@cache
-def encoder_residual() -> Residual:
-    """Return the closure of a leg, |AB| - sign q - q0 [m].
-
-    local (7): A and B in R_b, q0 [m]. data (1): sign * q [m].
-    """
-    local, data = ca.SX.sym("local", 7), ca.SX.sym("data", 1)
-    closure = ca.norm_2(local[3:6] - local[0:3]) - data - local[6]
-    return _residual("encoder", local, data, closure)
+    leg, to_A, axis = B - A, A - M, _cross(basis[:, 0], basis[:, 1])
+    length, height = np.einsum("in,in->n", axis, leg), np.einsum("in,in->n", axis, to_A)
+    alpha = np.einsum("ien,in->en", basis, leg) / length
+    by_leg = (basis - alpha * axis[:, None]) / length
+    beta = np.einsum("ien,in->en", basis, to_A) - alpha * height
+    by_A = np.concatenate([-by_leg, (length + height) * by_leg], axis=1)
+    by_B = np.concatenate([by_leg, -height * by_leg], axis=1)
+    return np.concatenate([alpha, beta]), np.concatenate([by_A, by_B])
 
 
 # ----------------------------------------------------------------------------------- chain rule
@@ -729,35 +746,68 @@ def _on_sensor(
 class _EndsInCamera:
     """Both ends of legs in the camera frame, and what their derivatives are made of."""
 
-    A: Array  # (n, 3) from the camera, in its directions, and B likewise
+    A: Array  # (3, n) from the camera, in its directions, and B likewise
     B: Array
     A_turned: Array  # without the camera's place
     B_turned: Array
-    arm: Array  # (n, 3) from the origin of R_e to B, in R_b
-    R_camera: Array  # (n, 3, 3)
+    arm: Array  # (3, n) from the origin of R_e to B, in R_b
+    R_camera: Array  # (3, 3, n)
     R_pose: Array
 
-    def with_others(self, slope: Array) -> tuple[Array, Array]:
-        """Return the same with what comes after the ends: radius, biases, intrinsics."""
-        J, J_pose = self.by_unknowns(slope[..., :6])
-        return np.concatenate([J, slope[..., 6:]], axis=-1), J_pose
+    def chain(self, slope: Array) -> tuple[Array, Array]:
+        """Return derivatives by A, B, camera and others, and by the pose, from those by both ends.
 
-    def by_unknowns(self, slope: Array) -> tuple[Array, Array]:
-        """Return derivatives by A, B, camera and by the pose from those by both ends."""
-        by_A, by_B = slope[..., :3], slope[..., 3:6]
-        a, b = by_A @ self.R_camera, by_B @ self.R_camera
-        turn = cross(self.A_turned[:, None], by_A) + cross(self.B_turned[:, None], by_B)
-        J = np.concatenate([a, b @ self.R_pose, turn, by_A + by_B], axis=-1)
-        return J, np.concatenate([cross(self.arm[:, None], b), b], axis=-1)
+        *slope* (n, q, l) has after these six numbers those of the others: radius, biases and
+        intrinsics.
+        """
+        by_ends = slope.T
+        by_A, by_B, m = by_ends[:3], by_ends[3:6], 6 + len(by_ends)
+        J = np.empty((m + 6, *by_ends.shape[1:]))
+        b = J[m + 3 :]
+        np.einsum("jin,jqn->iqn", self.R_camera, by_A, out=J[:3])
+        np.einsum("jin,jqn->iqn", self.R_camera, by_B, out=b)
+        np.einsum("jin,jqn->iqn", self.R_pose, b, out=J[3:6])
+        J[6:9] = _cross(self.A_turned[:, None], by_A)
+        J[6:9] += _cross(self.B_turned[:, None], by_B)
+        np.add(by_A, by_B, out=J[9:12])
+        J[12:m] = by_ends[6:]
+        J[m : m + 3] = _cross(self.arm[:, None], b)
+        return J[:m].T, J[m:].T
 
 
 def _ends_in_camera(state: State, leg: IntArray, view: IntArray, pose: IntArray) -> _EndsInCamera:
     """Return both ends of legs in the camera frames of views at poses."""
-    R_camera, t = state.camera_pose.R[view], state.camera_pose.t[view]
-    arm = state.arms[pose, leg]
-    A = (state.A @ np.swapaxes(state.camera_pose.R, 1, 2))[view, leg]
-    B = _times(R_camera, state.platform_pose.t[pose] + arm)
-    return _EndsInCamera(A + t, B + t, A, B, arm, R_camera, state.platform_pose.R[pose])
+    n_legs = len(state.A)
+    R_camera, t = _by_measurement(state.camera_pose.R, view), state.camera_pose.t.T[:, view]
+    of_views = (state.camera_pose.R.transpose(1, 0, 2) @ state.A.T).reshape(3, -1)
+    arm, end = (table[:, pose * n_legs + leg] for table in _ends_at_poses(state))
+    A, B = of_views[:, view * n_legs + leg], np.einsum("ijn,jn->in", R_camera, end)
+    R_pose = _by_measurement(state.platform_pose.R, pose)
+    return _EndsInCamera(A + t, B + t, A, B, arm, R_camera, R_pose)
+
+
+def _ends_at_poses(state: State) -> tuple[Array, Array]:
+    """Return platform joints in R_b from the origin of R_e and from that of R_b.
+
+    (3, n_poses * n_legs) both, poses first.
+    """
+    arms = np.moveaxis(state.arms, -1, 0)
+    ends = arms + state.platform_pose.t.T[..., None]
+    return arms.reshape(3, -1), ends.reshape(3, -1)
+
+
+def _by_measurement(R: Array, which: IntArray) -> Array:
+    """Return the matrix of each measurement, (3, 3, n), of some (k, 3, 3)."""
+    return np.ascontiguousarray(R.transpose(1, 2, 0))[..., which]
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return vector products along the first axis."""
+    product = np.empty((3, *np.broadcast_shapes(a.shape[1:], b.shape[1:])))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        np.multiply(a[j], b[k], out=product[i])
+        product[i] -= a[k] * b[j]
+    return product
 
 
 def _times(R: Array, v: Array) -> Array:

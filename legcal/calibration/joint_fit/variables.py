@@ -102,7 +102,8 @@ class State:
     @cached_property
     def arms(self) -> Array:
         """From the origin of R_e to B in R_b, (n_poses, n_legs, 3) [m]."""
-        return np.asarray(self.B @ np.swapaxes(self.platform_pose.R, 1, 2))
+        by_coordinate = self.platform_pose.R.transpose(1, 0, 2) @ self.B.T  # as factors need them
+        return np.asarray(np.moveaxis(by_coordinate, 0, -1))
 
     @property
     def mean_length(self) -> float:
