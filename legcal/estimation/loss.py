@@ -47,7 +47,9 @@ class PseudoHuber:
 
     def cost(self, s: Array) -> float:
         """Return the loss of all measurements."""
-        return float(np.sum(s / (1.0 + np.sqrt(1.0 + self.k * s))))
+        if self.k == 0.0:
+            return 0.5 * float(s.sum())
+        return float((s / (1.0 + np.sqrt(1.0 + self.k * s))).sum())
 
     def softened(self, r: Array, slope: Array) -> tuple[Array, Array]:
         """Return rows with gradient w r and curvature w (1 - k w^2 r r^T), w = (1 + k s)^-1/2.

@@ -190,10 +190,16 @@ class Factor(Generic[S]):
     element: IntArray | None = None  # (n,) the eliminated element of each; None where there is none
     whitening: Array | float = 1.0  # (n, q, q) T with T C T^T = 1; zero leaves one out
     robust: bool = False  # whether the loss is on it, or plain squares
+    _nothing: list[Residuals] = field(default_factory=list, repr=False)  # rows without any
 
     def linearize(self, state: S) -> Residuals:
         """Return whitened rows at a state."""
-        return self.rows(state).whitened(np.asarray(self.whitening))
+        if self._nothing:
+            return self._nothing[0]
+        rows = self.rows(state).whitened(np.asarray(self.whitening))
+        if self.n == 0:
+            self._nothing.append(rows)
+        return rows
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,38 +99,43 @@ def minimise(
     linear = linearize(problem, state)
     wide = _widened(problem, linear, loss, np.inf)
     damping, failed, fall_before = _MIN_DAMPING if is_near else _FIRST_DAMPING, 0.0, np.inf
+    cost, normal = robust_cost(problem, linear, wide), None
     for iteration in range(1, max_iterations + 1):
-        cost = robust_cost(problem, linear, wide)
-        step, predicted = normal_equations(problem, state, linear, wide).step(damping)
+        normal = normal or normal_equations(problem, state, linear, wide)
+        step, predicted = normal.step(damping)
         converged = predicted < _COST_TOLERANCE + _ROUNDING * cost
         trial = _tried(problem, state, step)
-        if trial is not None and not converged and not robust_cost(problem, trial[1], wide) < cost:
+        there = np.inf if trial is None else robust_cost(problem, trial[1], wide)
+        if trial is not None and not converged and not there < cost:
             trial = _followed(problem, *trial, wide, cost)
-        fall = -np.inf if trial is None else cost - robust_cost(problem, trial[1], wide)
-        if trial is not None and np.isfinite(fall) and (fall > 0.0 or converged):
-            state, linear = trial
-            damping = max(_next(damping, fall / max(predicted, 1e-300)), _DAMPING_MARGIN * failed)
-            failed *= _DAMPING_DECAY
-            rate = predicted / fall_before if np.isfinite(fall_before) else 1.0
-            expected = predicted * min(rate, 1.0)
-            narrower = wide
-            if expected < _SLOW_FALL * (cost - fall):
-                narrower = _widened(problem, linear, loss, wide.width)
-            if narrower.width == wide.width and expected < _CONVERGED_FALL * (cost - fall):
-                narrower = _of_width(loss, max(loss.width, _NARROWED * wide.width))
-            same = narrower.width == wide.width
-            smallest = relative_tolerance * (cost - fall) if iteration > _MIN_ITERATIONS else 0.0
-            if same and (converged or expected < max(smallest, tolerance)):
-                return Minimum(state, linear, robust_cost(problem, linear, wide), iteration)
-            fall_before = predicted if same else np.inf
-            wide = narrower
+            there = np.inf if trial is None else robust_cost(problem, trial[1], wide)
+        fall = cost - there
+        if trial is None or not np.isfinite(fall) or not (fall > 0.0 or converged):
+            failed, damping = damping, 10.0 * damping
+            fall_before = np.inf
+            if damping > _MAX_DAMPING:
+                break
             continue
-        failed, damping = damping, 10.0 * damping
-        fall_before = np.inf
-        if damping > _MAX_DAMPING:
-            break
+        (state, linear), cost, normal = trial, there, None
+        damping = max(_next(damping, fall / max(predicted, 1e-300)), _DAMPING_MARGIN * failed)
+        failed *= _DAMPING_DECAY
+        rate = predicted / fall_before if np.isfinite(fall_before) else 1.0
+        expected = predicted * min(rate, 1.0)
+        narrower = wide
+        if expected < _SLOW_FALL * cost:
+            narrower = _widened(problem, linear, loss, wide.width)
+        if narrower.width == wide.width and expected < _CONVERGED_FALL * cost:
+            narrower = _of_width(loss, max(loss.width, _NARROWED * wide.width))
+        if narrower.width != wide.width:
+            wide, fall_before = narrower, np.inf
+            cost = robust_cost(problem, linear, wide)
+            continue
+        smallest = relative_tolerance * cost if iteration > _MIN_ITERATIONS else 0.0
+        if converged or expected < max(smallest, tolerance):
+            return Minimum(state, linear, cost, iteration)
+        fall_before = predicted
     if not must_converge:
-        return Minimum(state, linear, robust_cost(problem, linear, wide), iteration)
+        return Minimum(state, linear, cost, iteration)
     raise DidNotConverge(
         f"The {problem.name} did not converge: found a cost that still falls by {predicted:.2g} a "
         f"step after {iteration} steps, needed a minimum; {problem.remedy}."
@@ -139,13 +144,13 @@ def minimise(
 
 def robust_cost(problem: Problem[S], linear: Linearization, loss: Loss) -> float:
     """Return half the squares of priors and plain factors, and the loss of all others."""
-    plain, robust = float(np.sum(linear.prior_r**2)), 0.0
+    plain, robust = float(linear.prior_r @ linear.prior_r), 0.0
     for factor in problem.factors:
         rows = linear[factor.name]
         if factor.robust:
             robust += loss.cost(rows.squared_norms)
         else:
-            plain += float(np.sum(rows.r**2))
+            plain += float(rows.squared_norms.sum())
     return 0.5 * plain + robust
 
 
@@ -156,6 +161,8 @@ def _of_width(loss: Loss, width: float) -> Loss:
 
 def _widened(problem: Problem[S], linear: Linearization, loss: Loss, before: float) -> Loss:
     """Return the loss at a width of some medians while most measurements are far off."""
+    if np.isinf(loss.width):
+        return loss
     medians = [0.0]
     for factor in problem.factors:
         if factor.robust:
@@ -275,8 +282,8 @@ class NormalEquations:
         y = -(V_inverse @ pull[..., None])[..., 0]
         linear = float(self.g_kept @ kept + np.sum(self.g_elements * y))
         extra = float(
-            np.sum(np.diagonal(U - self.U) * kept**2)
-            + np.sum(np.einsum("kpp->kp", V - self.V) * y**2)
+            (np.diagonal(U) - np.diagonal(self.U)) @ kept**2
+            + np.sum((np.einsum("kpp->kp", V) - np.einsum("kpp->kp", self.V)) * y**2)
         )
         return self._whole(kept, y), 0.5 * (extra - linear)
 
@@ -438,9 +445,10 @@ def _by_element(W: Array, blocks: Array) -> Array:
 
 def _damped(M: Array, damping: float) -> Array:
     """Return matrices with a part of their diagonal added to it; one where it is zero."""
-    diagonal = np.einsum("...ii->...i", M)
-    added = np.where(diagonal > 0.0, damping * diagonal, 1.0)
-    return np.asarray(M + added[..., None] * np.eye(M.shape[-1]))
+    damped = M.copy()
+    diagonal = np.einsum("...ii->...i", damped)
+    diagonal += np.where(diagonal > 0.0, damping * diagonal, 1.0)
+    return damped
 
 
 def _solve(S: Array, right: Array) -> Array:

@@ -402,7 +402,7 @@ class Readings:
         return found
 
     def _rows(self, state: State) -> Residuals:
-        arm, end = (table[:, self._end] for table in _ends_at_poses(state))
+        arm, end = (table[:, self._end] for table in state.ends_at_poses)
         R_pose = _by_measurement(state.platform_pose.R, self.pose)
         along = end - state.A.T[:, self.leg]
         length = np.sqrt(np.einsum("in,in->n", along, along))
@@ -780,20 +780,10 @@ def _ends_in_camera(state: State, leg: IntArray, view: IntArray, pose: IntArray)
     n_legs = len(state.A)
     R_camera, t = _by_measurement(state.camera_pose.R, view), state.camera_pose.t.T[:, view]
     of_views = (state.camera_pose.R.transpose(1, 0, 2) @ state.A.T).reshape(3, -1)
-    arm, end = (table[:, pose * n_legs + leg] for table in _ends_at_poses(state))
+    arm, end = (table[:, pose * n_legs + leg] for table in state.ends_at_poses)
     A, B = of_views[:, view * n_legs + leg], np.einsum("ijn,jn->in", R_camera, end)
     R_pose = _by_measurement(state.platform_pose.R, pose)
     return _EndsInCamera(A + t, B + t, A, B, arm, R_camera, R_pose)
-
-
-def _ends_at_poses(state: State) -> tuple[Array, Array]:
-    """Return platform joints in R_b from the origin of R_e and from that of R_b.
-
-    (3, n_poses * n_legs) both, poses first.
-    """
-    arms = np.moveaxis(state.arms, -1, 0)
-    ends = arms + state.platform_pose.t.T[..., None]
-    return arms.reshape(3, -1), ends.reshape(3, -1)
 
 
 def _by_measurement(R: Array, which: IntArray) -> Array:
@@ -803,7 +793,7 @@ def _by_measurement(R: Array, which: IntArray) -> Array:
 
 def _cross(a: Array, b: Array) -> Array:
     """Return vector products along the first axis."""
-    product = np.empty((3, *np.broadcast_shapes(a.shape[1:], b.shape[1:])))
+    product = np.empty((3, *np.broadcast(a[0], b[0]).shape))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.multiply(a[j], b[k], out=product[i])
         product[i] -= a[k] * b[j]

@@ -102,8 +102,15 @@ class State:
     @cached_property
     def arms(self) -> Array:
         """From the origin of R_e to B in R_b, (n_poses, n_legs, 3) [m]."""
-        by_coordinate = self.platform_pose.R.transpose(1, 0, 2) @ self.B.T  # as factors need them
-        return np.asarray(np.moveaxis(by_coordinate, 0, -1))
+        shape = 3, len(self.platform_pose.t), len(self.legs)
+        return self.ends_at_poses[0].reshape(shape).transpose(1, 2, 0)
+
+    @cached_property
+    def ends_at_poses(self) -> tuple[Array, Array]:
+        """B of all legs at all poses, (3, n_poses * n_legs): from the origin of R_e, and of R_b."""
+        arms = self.platform_pose.R.transpose(1, 0, 2) @ self.B.T
+        ends = arms + self.platform_pose.t.T[..., None]
+        return arms.reshape(3, -1), ends.reshape(3, -1)
 
     @property
     def mean_length(self) -> float:
@@ -293,6 +300,11 @@ class LegConstraints:
 
     legs: FittedLegs
 
+    @cached_property
+    def binds(self) -> bool:
+        """Whether legs have equations that hold without a reading."""
+        return any(leg.n_constraints for leg in self.legs.nominal)
+
     def project(self, state: State) -> State:
         """Return the state with every pose moved, as little as possible, to where they hold.
 
@@ -300,7 +312,7 @@ class LegConstraints:
         """
         if np.any(state.radii <= 0.0):
             raise DidNotConverge("The joint fit came to a radius that is not positive.")
-        if not any(leg.n_constraints for leg in state.legs):
+        if not self.binds:
             return state
         found = solve_poses(state.legs, self.legs.frame_legs, *state.platform_pose)
         size = float(found.size.max(initial=0.0))
@@ -314,7 +326,7 @@ class LegConstraints:
 
     def tangent(self, problem: Problem[State], state: State) -> Tangent | None:
         """Return the motions of poses that the constraints leave; None where all are free."""
-        if self.legs.spatial and not any(leg.n_constraints for leg in state.legs):
+        if self.legs.spatial and not self.binds:
             return None
         free = list(freedoms(self.legs.frame_legs))
         n_poses, n_kept = problem.n_elements, problem.n_kept
