@@ -8,6 +8,7 @@ fitted again, until these converge.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -122,14 +123,12 @@ def fit_in_rounds(
     biases = possible.of_sizes(with_gamma(np.zeros(N_KINDS)))
     problem, state = with_edge_biases(problem, first, biases)
 
-    def solved(**tolerances: float) -> tuple[FitProblem, Minimum[State]]:
-        weighted = problem.weighted(noise, accepted)
-        loss, n_steps = PseudoHuber(settings.loss_width), settings.max_iterations
-        return weighted, minimise(
-            weighted, state, loss, is_near=True, max_iterations=n_steps, **tolerances
-        )
-
-    passing = {"tolerance": _PASSING, "relative_tolerance": _REJECTION_TOLERANCE}
+    def solved(*, passing: bool = False) -> tuple[FitProblem, Minimum[State]]:
+        weighted, loss = problem.weighted(noise, accepted), PseudoHuber(settings.loss_width)
+        solve = partial(minimise, is_near=True, max_iterations=settings.max_iterations)
+        if passing:
+            solve = partial(solve, tolerance=_PASSING, relative_tolerance=_REJECTION_TOLERANCE)
+        return weighted, solve(weighted, state, loss)
 
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before = accepted
@@ -137,12 +136,12 @@ def fit_in_rounds(
         accepted = _accepted(problem, state, noise, settings)
         if np.array_equal(before, accepted):
             break
-        problem, minimum = solved(**passing)
+        problem, minimum = solved(passing=True)
         state, iterations = minimum.state, iterations + minimum.iterations
     _refuse_disagreement(problem.offsets(state), accepted, settings)
     for _ in range(_BOARD_ROUNDS if len(problem.corners) else 0):
         problem = _with_judged_corners(problem.weighted(noise, accepted), state, settings)
-        problem, minimum = solved(**passing)
+        problem, minimum = solved(passing=True)
         state, iterations = minimum.state, iterations + minimum.iterations
     with_possible, changes = problem.with_biases(possible), NO_CHANGES
     for _ in range(settings.noise_rounds if len(claimed) else 1):
