@@ -37,7 +37,7 @@ from legcal.machine import Leg
 from legcal.simulation import moved_outlines
 
 MACHINES = ("6-spu-coplanar", "3-upu-tilted", "3-rpr")
-N_SEEDS = 3
+N_SEEDS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ def _compared(truth: Truth, posterior: Posterior, outlines: Outlines) -> HeldOut
     return compare_held_out(posterior, truth.measurements, outlines, truth.poses, 4.5)
 
 
-@pytest.mark.parametrize("name", thinned(MACHINES, ["3-upu-tilted"]))
+@pytest.mark.parametrize("name", thinned(MACHINES, ["6-spu-coplanar"]))
 def test_the_true_model_predicts_images_to_their_noise(name: str) -> None:
     truth = _truth(name)
     found = _compared(truth, truth.posterior, truth.outlines)
@@ -90,7 +90,7 @@ def test_the_true_model_predicts_images_to_their_noise(name: str) -> None:
     assert 0.2 < np.mean((found.rotation / found.expected_rotation) ** 2) < 1.8
 
 
-@pytest.mark.parametrize("name", thinned(MACHINES, ["3-upu-tilted", "3-rpr"]))
+@pytest.mark.parametrize("name", thinned(MACHINES, ["6-spu-coplanar", "3-rpr"]))
 def test_a_wrong_model_does_not(name: str) -> None:
     truth = _truth(name)
     first, *others = truth.posterior.state.legs

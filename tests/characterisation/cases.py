@@ -143,7 +143,8 @@ def _models() -> Iterable[Case]:
             input="tables",
             slow=machine != "3-rps",
         )
-        yield Case(f"identify-{machine}", (Step(f"identify {machine} --json"),))
+        alike = machine in {"6-sps", "hexapod-rod"}
+        yield Case(f"identify-{machine}", (Step(f"identify {machine} --json"),), slow=alike)
     yield Case(
         "inspect-text-and-write",
         (
