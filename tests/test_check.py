@@ -104,7 +104,7 @@ def test_a_machine_that_was_left_alone_has_not_moved(result: Path, images: Path)
 def test_a_calibrated_machine_with_axes_has_not_moved(
     model: str, sigma: float, tmp_path: Path
 ) -> None:
-    calibrate(_simulated(tmp_path / "set", model, poses=6, views=3), output=tmp_path / "result")
+    calibrate(_simulated(tmp_path / "set", model, poses=6, views=2), output=tmp_path / "result")
     found = check(_simulated(tmp_path / "new", model, views=2), tmp_path / "result")
     assert not found.movement.moved
     assert found.movement.dof >= 15
