@@ -26,6 +26,11 @@ def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
     [
         (["--help"], {"numpy", "scipy", "pinocchio", "pydantic"}, "calibrate"),
         (["inspect", "hexapod"], {"casadi", "cv2", "trimesh", "yourdfpy", "scipy.stats"}, "SPU"),
+        (
+            ["calibrate", "missing", "-o", "out", "--json"],
+            {"scipy.stats", "scipy.optimize", "scipy.interpolate", "trimesh", "plotly"},
+            "missing",
+        ),
     ],
 )
 def test_commands_load_only_what_they_need(words: list[str], heavy: set[str], printed: str) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from legcal.data import MIN_CORNERS, Corners, Measurements, few, row_names
 from legcal.errors import DatasetError, NotVisible
@@ -230,7 +230,7 @@ def _require_still(
     rows = list(single)
     if len(rows) < 2:
         return
-    limit = float(chi2.isf(SIGNIFICANCE / len(rows), 6)) * scale**2
+    limit = float(chdtri(6, SIGNIFICANCE / len(rows))) * scale**2
     px = {
         row: camera.project(pose.T_camera_plane.apply(board.points)) for row, pose in single.items()
     }

@@ -19,7 +19,6 @@ part in a hundred up to rho = 0.8 (:func:`profile_functions` of :func:`powers`):
 from functools import cache
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
 
 from legcal.geometry import Array
@@ -84,6 +83,8 @@ _REACH, _PER_BLUR = 24.0, 256  # range of the table on both sides, and entries p
 @cache  # where no image is measured nothing is tabulated
 def _tabulate_powers() -> Array:
     """Tabulate the functions and a column of zeros over the range, (n, N_POWERS + 1)."""
+    from scipy.interpolate import CubicSpline  # a tenth of a second
+
     coarse = np.arange(-_REACH, _REACH + 1e-9, 1.0 / 32.0)
     root = np.linspace(0.0, 7.0, 1401)  # substitute x = root^2: the integrands are smooth
     kernel = np.exp(-0.5 * (root**2 - coarse[:, None]) ** 2) / np.sqrt(2.0 * np.pi)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from legcal.calibration.camera_calibration.adjustment import RobustFit
 from legcal.errors import NotIdentifiable
@@ -155,7 +155,7 @@ def _overfit(found: RobustFit) -> list[str]:
         return []
     dof = 2 * len(found.seen.px) - len(full.covariance) - 6 * len(found.images)
     gain = (plain.cost - full.cost) / 3.0 / max(full.cost / max(dof, 1), 1e-30)
-    if gain > 0.0 and f_distribution.sf(gain, 3, max(dof, 1)) < _OVERFIT:
+    if gain > 0.0 and fdtrc(3, max(dof, 1), gain) < _OVERFIT:
         return []
     rms = [float(np.sqrt(np.mean(np.sum(a.residual**2, axis=1)))) for a in (full, plain)]
     return [

@@ -15,8 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtrc, fdtrc
 
 from legcal.calibration.location.frames import (
     N_STEP,
@@ -378,6 +378,6 @@ def _probability(
         part = np.linalg.solve(covariance[:, rows, rows], r[:, rows, None])[:, :, 0]
         distance = (part * r[:, rows]).sum(axis=1)
         # Not F with infinite degrees of freedom: SciPy has no number for that.
-        here = stats.chi2.sf(distance, 3) if at_stated else stats.f.sf(distance / 3.0, 3, dof)
+        here = chdtrc(3, distance) if at_stated else fdtrc(3, dof, distance / 3.0)
         least = np.minimum(least, np.where(pairs.oriented | (kind == 0), here, 1.0))
     return np.minimum(1.0, 2.0 * least)

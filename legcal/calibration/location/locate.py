@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
 from scipy.spatial.transform import RigidTransform
+from scipy.special import chdtrc
 
 from legcal.calibration.location.determinacy import Determinacy, determine, hold_open_part
 from legcal.calibration.location.document import (
@@ -307,7 +307,7 @@ def _tested(found: FrameFit) -> tuple[float | None, str, str]:
         total, dof = found.chi2, float(found.dof)
     else:
         total, dof = float(squares[kinds[0]]), float(found.kind_dof[kinds[0]])
-    p_value = float(stats.chi2.sf(total, dof))
+    p_value = float(chdtrc(dof, total))
     large, small = list[str](), list[str]()
     for k in kinds:
         ratio = float(np.sqrt(squares[k] / found.kind_dof[k]))

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from legcal.data import LegAxes, Measurements, Outlines, axes_from_outlines
 from legcal.errors import NotVisible
@@ -107,7 +107,7 @@ def pool(samples: Sequence[Sample]) -> PooledSpread | None:
     effective = float(dof @ traces) ** 2 / float(dof @ squares)
     tail = 0.5 * (1.0 - CONFIDENCE)
     low, high = (
-        found / claimed * float(np.sqrt(effective / chi2.ppf(p, effective)))
+        found / claimed * float(np.sqrt(effective / (2.0 * gammaincinv(effective / 2.0, p))))
         for p in (1.0 - tail, tail)
     )
     each = [s.sd for s in samples]
