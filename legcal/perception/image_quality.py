@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from legcal.geometry import BoolArray, IntArray
 from legcal.perception.light import reduce
 from legcal.vision import Grey
 
@@ -23,6 +24,9 @@ SCALES = (0.95, 2.5)  # at which slopes are compared, standard deviations [px]
 # where that filter is twice as wide.
 _BLUR_OF_HALF = 0.5 * math.sqrt(SCALES[1] ** 2 - 4.0 * SCALES[0] ** 2 - 0.25)
 STRIDE = 6  # every such row and column is enough for percentiles
+_SMOOTH, _SLOPE = (1.0, 4.0, 6.0, 4.0, 1.0), (1.0, 2.0, 0.0, -2.0, -1.0)  # Sobel's, of 5 pixels
+AROUND = 2  # how far from the middle of a coarse edge the fine one may be [px]
+MARGIN = 3  # of the image of half the size, beyond which edges do not count [px]
 DIRECTIONS = 4  # of edges: what moves is blurred in one
 WEAK = 70.0  # percentile of the slopes from which on a place may be an edge
 STRONG = 95.0  # percentile of the slopes from which on they count
@@ -56,55 +60,82 @@ class Exposure:
 
 def measure_exposure(grey: Grey) -> Exposure:
     """Return the range of grey levels and the blur of an image."""
-    small = reduce(grey, max(1, min(REDUCTION, min(grey.shape) // 16)))
-    low, high = np.percentile(small, [TAIL_PERCENT, 100.0 - TAIL_PERCENT])
-    dark, bright = np.percentile(grey[::STRIDE, ::STRIDE], [TAIL_PERCENT, 100.0 - TAIL_PERCENT])
-    return Exposure(float(dark), float(bright), float(high - low), _blur(grey))
+    half = reduce(grey, 2)
+    small = reduce(half, max(1, min(REDUCTION, min(grey.shape) // 16) // 2))
+    low, high = _tails(small)
+    dark, bright = _tails(grey[::STRIDE, ::STRIDE])
+    return Exposure(dark, bright, high - low, _blur(grey, half))
 
 
-def _blur(grey: Grey) -> float:
-    """Return the blur of sharp edges [px], in all directions but one."""
-    fine, coarse, angle = _edges(grey)
+def _tails(grey: Grey) -> tuple[float, float]:
+    """Return the grey levels between which nearly all of an image is."""
+    n = grey.size
+    k = int(0.01 * TAIL_PERCENT * (n - 1))
+    ordered = np.partition(grey, (k, n - 1 - k), axis=None)
+    return float(ordered[k]), float(ordered[n - 1 - k])
+
+
+def _blur(grey: Grey, half: Grey) -> float:
+    """Return the blur of sharp edges [px] of an image, in all directions but one."""
+    coarse, row, column, angle = _edges(half)
     direction = np.rint(angle / (np.pi / DIRECTIONS)).astype(np.intp) % DIRECTIONS
-    least = max(MIN_EDGES, int(MIN_EDGES_PART * len(fine)))  # else they are corners of others
-    of_direction = [direction == d for d in range(DIRECTIONS)]
-    chosen = [own for own in of_direction if np.count_nonzero(own) >= least]
-    blurs = sorted(_blur_of(fine[own], coarse[own]) for own in chosen)
+    least = max(MIN_EDGES, int(MIN_EDGES_PART * len(coarse)))  # else they are corners of others
+    blurs = []
+    for d in range(DIRECTIONS):
+        own = np.flatnonzero(direction == d)
+        if len(own) >= least:
+            strong = own[_strongest(coarse[own])]
+            fine = _greatest_slopes(grey, 2 * row[strong], 2 * column[strong])
+            blurs.append(_blur_of(fine / coarse[strong]))
     # Shades of one direction may be soft everywhere; what moves is sharp in one direction only.
-    return blurs[min(1, len(blurs) - 1)] if blurs else 0.0
+    return sorted(blurs)[min(1, len(blurs) - 1)] if blurs else 0.0
 
 
-def _edges(grey: Grey) -> tuple[Grey, Grey, Grey]:
-    """Return slopes of edges in their middle, fine and coarse, and their directions [rad]."""
-    height, width = (2 * (size // 2) for size in grey.shape)
-    slope = cv2.magnitude(*_slopes(grey[:height, :width]))
-    rows = np.maximum(slope[::2], slope[1::2])
-    fine = np.maximum(rows[:, ::2], rows[:, 1::2])  # the greatest of four pixels
-    half = cv2.GaussianBlur(reduce(grey, 2), (0, 0), _BLUR_OF_HALF)
-    x, y = _slopes(np.asarray(half, dtype=np.float32))
-    coarse = cv2.magnitude(x, y)
-    # Beside the middle of an edge the ratio says nothing.
-    edge = fine >= cv2.dilate(fine, np.ones((3, 3), np.uint8))
-    edge &= coarse >= np.percentile(coarse[::STRIDE, ::STRIDE], WEAK)
-    coarse = np.maximum(0.5 * coarse[edge], np.float32(1e-3))  # by pixels of the whole image
-    return fine[edge], coarse, np.arctan2(y[edge], x[edge])
+def _edges(half: Grey) -> tuple[Grey, IntArray, IntArray, Grey]:
+    """Return slopes in the middles of edges by pixels of the whole image, and where they are.
+
+    By an image of half the size; rows and columns are those of its pixels, angles in radians.
+    """
+    soft = cv2.GaussianBlur(half, (0, 0), _BLUR_OF_HALF)
+    x, y = (cv2.Sobel(soft, cv2.CV_32F, i, 1 - i, ksize=len(_SMOOTH)) for i in (1, 0))
+    coarse = np.asarray(cv2.magnitude(x, y), dtype=np.float32)
+    few = coarse[::STRIDE, ::STRIDE].ravel()
+    k = int(0.01 * WEAK * (len(few) - 1))
+    weak = np.partition(few, k)[k]
+    # Beside the middle of an edge the ratio of slopes says nothing.
+    edge = coarse >= np.maximum(cv2.dilate(coarse, np.ones((3, 3), np.uint8)), weak)
+    edge[:MARGIN] = edge[-MARGIN:] = edge[:, :MARGIN] = edge[:, -MARGIN:] = False
+    row, column = np.nonzero(edge)
+    of_edges = np.maximum(0.5 * coarse[edge], np.float32(1e-3))
+    return of_edges, row, column, np.arctan2(y[edge], x[edge])
 
 
-def _blur_of(fine: Grey, coarse: Grey) -> float:
-    """Return the blur of the strongest of some edges by their slopes, fine and coarse."""
-    strong = coarse >= np.partition(coarse, -MIN_EDGES)[-MIN_EDGES]
-    strong |= coarse >= np.percentile(coarse, STRONG)
-    ratio = float(np.median(fine[strong] / coarse[strong]))
+def _strongest(slope: Grey) -> BoolArray:
+    """Return which edges of a direction count."""
+    least = np.partition(slope, -MIN_EDGES)[-MIN_EDGES]
+    return np.asarray(slope >= min(float(least), float(np.percentile(slope, STRONG))))
+
+
+def _greatest_slopes(grey: Grey, row: IntArray, column: IntArray) -> Grey:
+    """Return the greatest slopes (n,) of an image within two pixels of squares of four pixels."""
+    n = 2 + 2 * AROUND + len(_SMOOTH) - 1
+    reach = np.arange(n) - AROUND - len(_SMOOTH) // 2
+    square = grey[row[:, None, None] + reach[:, None], column[:, None, None] + reach]
+    smooth, slope = (
+        np.stack([np.convolve(one, taps, "valid") for one in np.eye(n)]).astype(np.float32)
+        for taps in (_SMOOTH, _SLOPE)
+    )
+    x, y = smooth.T @ square @ slope, slope.T @ square @ smooth
+    return np.asarray(np.sqrt((x * x + y * y).max(axis=(1, 2))))
+
+
+def _blur_of(ratios: Grey) -> float:
+    """Return the blur of edges by the ratios of their slopes, fine to coarse."""
+    ratio = float(np.median(ratios))
     one, two = (s**2 for s in SCALES)
     # ratio^2 = (sigma^2 + s2^2) / (sigma^2 + s1^2)
     squared = (two - ratio**2 * one) / max(ratio**2 - 1.0, 1e-3)
     return float(np.sqrt(np.clip(squared, 0.0, MAX_BLUR**2)))
-
-
-def _slopes(grey: Grey) -> tuple[Grey, Grey]:
-    """Return both slopes of an image, a little blurred."""
-    x, y = (cv2.Sobel(grey, cv2.CV_32F, i, 1 - i, ksize=5) for i in (1, 0))
-    return np.asarray(x, dtype=np.float32), np.asarray(y, dtype=np.float32)
 
 
 def image_defects(
