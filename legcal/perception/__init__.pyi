@@ -16,9 +16,11 @@ from .outline import MIN_LONE_KEPT as MIN_LONE_KEPT
 from .outline import OUTSIDE as OUTSIDE
 from .outline import ImageSearch as ImageSearch
 from .outline import Method as Method
+from .outline import OutlineLine as OutlineLine
+from .outline import PartLines as PartLines
 from .outline import find_parts as find_parts
 from .outline import measure as measure
-from .outline import part_outlines as part_outlines
+from .outline import outline_table as outline_table
 from .overlays import PartMarks as PartMarks
 from .overlays import draw as draw
 from .overlays import marks_of_image as marks_of_image

@@ -6,9 +6,16 @@ from functools import partial
 
 import numpy as np
 
-from legcal.data import Outlines, join_outlines
+from legcal.data import Outlines, join_outlines, no_outlines
 from legcal.geometry import Array
-from legcal.perception.outline import OUTSIDE, ImageSearch, Method, measure, part_outlines
+from legcal.perception.outline import (
+    OUTSIDE,
+    ImageSearch,
+    Method,
+    PartLines,
+    measure,
+    outline_table,
+)
 from legcal.perception.placement import Placement, Search
 from legcal.vision import PredictedLeg, predict_legs
 from legcal.workers import Run, in_turn
@@ -75,13 +82,11 @@ def _of_image(
         guided=placement.window is not None,
         blur=None if np.isnan(known) else known,
     )
-    found, blur = (join_outlines([]), np.nan) if T is None else method(one)
+    found, blur = (no_outlines(), np.nan) if T is None else method(one)
     seen = {leg.leg for leg in predicted}
     why = NOT_PLACED if T is None else OUTSIDE
-    others = [
-        part_outlines(one, j, _longest(search, j), (why, why)) for j in wanted if j not in seen
-    ]
-    return join_outlines([found, *others]), blur
+    others = [PartLines(j, _longest(search, j), (why, why)) for j in wanted if j not in seen]
+    return join_outlines([found, outline_table(one, others)]) if others else found, blur
 
 
 def _longest(search: Search, leg: int) -> str:

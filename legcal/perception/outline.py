@@ -8,16 +8,17 @@ the limb model fitted to all outlines of the image; the verdict on each part, wi
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from legcal.data import Outlines, join_outlines
+from legcal.data import Outlines
 from legcal.geometry import Array, IntArray
 from legcal.perception.part_edges import EdgePair, LegPart, block_positions, find_pairs
 from legcal.perception.profiles import Edge
 from legcal.perception.subpixel_edges import MeasuredEdge, measure_edges
-from legcal.vision import EPSILON, Camera, Grey, PredictedLeg, band_of_leg, hidden_by
+from legcal.vision import EPSILON, Band, Camera, Grey, PredictedLeg, band_of_leg, hidden_by
 
 OUTSIDE = "outside the image"  # a reason
 HIDDEN = "hidden by"  # the beginning of one
@@ -59,13 +60,32 @@ Method = Callable[[ImageSearch], tuple[Outlines, float]]
 """Finds the outlines of all parts in one image, and the blur of the image [px] or NaN."""
 
 
+class OutlineLine(NamedTuple):
+    """The line of an outline in the band of its part."""
+
+    v: Array  # (2,) offsets at both ends of the band [px]
+    place: Sequence[float]  # where the used piece begins and ends, as fractions of the band
+    covariance: Array  # (2, 2) of the offsets there [px^2]
+    quality: Sequence[float] = (math.nan,) * 4  # contrast, length, residual, by_gamma of Outlines
+
+
+class PartLines(NamedTuple):
+    """What was found of a part."""
+
+    leg: int
+    part: str
+    reasons: tuple[str, str]  # why each outline is rejected, "" for used ones
+    lines: Sequence[OutlineLine | None] = (None, None)
+    band: Band | None = None  # the frame of the lines
+
+
 def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, float]:
     """Find, measure and judge the outlines of all parts in one image; return its blur too [px].
 
     Two outlines for every part of every leg that is looked for, found or not. Unless all blocks of
     an outline are fitted together, lines are good to a few hundredths of a pixel, in half the time.
     """
-    parts, tables = find_parts(search)
+    parts, found = find_parts(search)
     blur = math.nan
     if parts:
         near = search.blur is not None
@@ -76,19 +96,19 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
         ]
         measured, blur = measure_edges(search.grey, search.camera, edges, together, search.blur)
         for part, one, two in zip(parts, measured[::2], measured[1::2], strict=True):
-            tables.append(_with_verdict(search, part, (one, two), near_fit=near))
-    return join_outlines(tables), blur
+            found.append(_with_verdict(part, (one, two), near_fit=near))
+    return outline_table(search, found), blur
 
 
-def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[Outlines]]:
+def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
     """Find the edges of all parts in one image to about a pixel.
 
-    Return the parts to measure, and the rejected outlines of the others.
+    Return the parts to measure, and the others with the reasons why their outlines are rejected.
     """
-    rejected: list[Outlines] = []
+    rejected: list[PartLines] = []
 
     def reject(leg: PredictedLeg, part: str, why: str) -> None:
-        rejected.append(part_outlines(search, leg.leg, part, (why, why)))
+        rejected.append(PartLines(leg.leg, part, (why, why)))
 
     searched: list[tuple[LegPart, Array]] = []  # with the predicted outlines (2, 3)
     for leg in search.legs:
@@ -135,42 +155,53 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[Outlines]]:
     return parts, rejected
 
 
-def part_outlines(
-    search: ImageSearch,
-    leg: int,
-    part: str,
-    reasons: tuple[str, str],
-    lines: Sequence[tuple[Array, Array, Array] | None] = (None, None),
-    *,
-    found: LegPart | None = None,
-    **quality: Array,
-) -> Outlines:
-    """Return both outlines of a part, NaN where there is no line.
-
-    A line of a part that was found: offsets (2,) at both ends of its band [px], where the used
-    segment begins and ends (2,) as fractions of the band, covariance (2, 2) there [px^2].
-    """
-    h, ends, covariance = np.full((2, 3), np.nan), np.full((2, 2, 2), np.nan), np.zeros((2, 2, 2))
-    covariance[:] = np.nan
-    for i, line in enumerate(lines):
-        if line is not None and found is not None:
-            v, place, covariance[i] = line
-            offset = v[0] + (v[1] - v[0]) * place
-            h[i] = found.band.line(v[0], v[1])
-            xy = found.band.points(place * found.band.length, offset)
-            ends[i] = search.camera.distort(xy)
+def outline_table(search: ImageSearch, parts: Sequence[PartLines]) -> Outlines:
+    """Return both outlines of all parts of an image, NaN where there is no line."""
+    parts = sorted(parts, key=lambda part: (part.leg, part.part))
+    n = 2 * len(parts)
+    h, ends, quality = np.full((n, 3), np.nan), np.full((n, 2, 2), np.nan), np.full((n, 4), np.nan)
+    covariance = np.full((n, 2, 2), np.nan)
+    seen = [
+        (2 * i + edge, part.band, line)
+        for i, part in enumerate(parts)
+        for edge, line in enumerate(part.lines)
+        if part.band is not None and line is not None
+    ]
+    if seen:
+        at, bands, lines = zip(*seen, strict=True)
+        has = list(at)
+        v, place, covariance[has], quality[has] = (np.array(x) for x in zip(*lines, strict=True))
+        origin, along, normal = (
+            np.array(x) for x in zip(*((b.origin, b.along, b.normal) for b in bands), strict=True)
+        )
+        scale, length = np.array([(b.scale, b.length) for b in bands]).T[..., None]
+        first = origin + v[:, :1] * normal / scale
+        step = (length * along + (v[:, 1:] - v[:, :1]) * normal) / scale
+        ray, x, y = first[:, 0] * step[:, 1] - first[:, 1] * step[:, 0], step[:, 0], step[:, 1]
+        of_lines = (
+            np.stack([-y, x, ray], axis=1) * np.sign(x * normal[:, 1] - y * normal[:, 0])[:, None]
+        )
+        h[has] = of_lines / np.linalg.norm(of_lines, axis=1, keepdims=True)
+        xy = first[:, None] + place[..., None] * step[:, None]
+        ends[has] = search.camera.distort(xy)
+    gamma = np.where(np.isnan(quality[:, 3]), np.nan, search.camera.gamma)
+    reasons = tuple(reason for part in parts for reason in part.reasons)
     return Outlines(
-        row=np.full(2, search.row, dtype=np.intp),
-        leg=np.full(2, leg, dtype=np.intp),
-        part=(part, part),
-        edge=np.array([1, 2], dtype=np.intp),
+        row=np.full(n, search.row, dtype=np.intp),
+        leg=np.repeat(np.array([part.leg for part in parts], dtype=np.intp), 2),
+        part=tuple(part.part for part in parts for _ in EPSILON),
+        edge=np.tile(np.array([1, 2], dtype=np.intp), len(parts)),
         h=h,
         ends=ends,
         covariance=covariance,
         used=np.array([not reason for reason in reasons], dtype=np.bool_),
         reason=reasons,
-        source=("detected", "detected"),
-        **quality,
+        source=("detected",) * n,
+        contrast=quality[:, 0],
+        length=quality[:, 1],
+        residual=quality[:, 2],
+        gamma=gamma,
+        by_gamma=quality[:, 3],
     )
 
 
@@ -199,44 +230,31 @@ def _in_front(
 
 
 def _with_verdict(
-    search: ImageSearch,
     part: LegPart,
     measured: tuple[MeasuredEdge | None, MeasuredEdge | None],
     *,
     near_fit: bool,
-) -> Outlines:
-    """Turn the measured edges of a part into outlines with verdicts and how well they were seen."""
+) -> PartLines:
+    """Return the measured edges of a part with verdicts and how well they were seen."""
     length, window = part.band.length, part.window if part.guided else None
     judged = verdict(part.edges, part.predicted, length, measured, window, near_fit=near_fit)
-    lines: list[tuple[Array, Array, Array] | None] = []
-    quality = np.full((2, 4), np.nan)  # rounded to what says something
-    for i, edge in enumerate(measured):
+    lines: list[OutlineLine | None] = []
+    for edge in measured:
         if edge is None:
             lines.append(None)
             continue
         line = edge.line
-        place = np.array([line.first, line.last])
-        lines.append((edge.v, place, edge.covariance + judged.bias**2))
+        position = sorted(line.position.tolist())
         # Hidden and wrong blocks leave gaps between the others.
-        spacing = float(np.min(np.diff(np.sort(line.position))))
-        visible = (len(line.position) - 1) * spacing * length
-        quality[i] = (
+        spacing = min(after - before for before, after in pairwise(position))
+        visible = (len(position) - 1) * spacing * length
+        quality = (
             round(edge.contrast, 2), round(visible, 1), round(line.scatter, 4), edge.by_gamma
         )  # fmt: skip
-    contrast, seen, residual, by_gamma = quality.T
-    return part_outlines(
-        search,
-        part.leg.leg,
-        part.segment.link,
-        judged.reasons,
-        lines,
-        found=part,
-        contrast=contrast,
-        length=seen,
-        residual=residual,
-        gamma=np.where(np.isnan(by_gamma), np.nan, search.camera.gamma),
-        by_gamma=by_gamma,
-    )
+        lines.append(
+            OutlineLine(edge.v, (line.first, line.last), edge.covariance + judged.bias**2, quality)
+        )
+    return PartLines(part.leg.leg, part.segment.link, judged.reasons, lines, part.band)
 
 
 class PartVerdict(NamedTuple):

@@ -13,15 +13,17 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from legcal.data import Outlines, join_outlines
+from legcal.data import Outlines
 from legcal.geometry import Array
 from legcal.perception import (
     MIN_LENGTH,
     MIN_LONE_KEPT,
     ImageSearch,
     LegPart,
+    OutlineLine,
+    PartLines,
     find_parts,
-    part_outlines,
+    outline_table,
 )
 from legcal.vision import Grey
 
@@ -53,8 +55,8 @@ def canny_parts(search: ImageSearch) -> tuple[Outlines, float]:
     parts, results = find_parts(search)
     if parts:
         xy = search.camera.undistort(edge_points(search.grey))
-        results.extend(_measured(search, part, xy) for part in parts)
-    return join_outlines(results), np.nan
+        results += [_measured(part, xy) for part in parts]
+    return outline_table(search, results), np.nan
 
 
 def edge_points(grey: Grey) -> Array:
@@ -79,7 +81,7 @@ def edge_points(grey: Grey) -> Array:
     return np.column_stack([column, row]).astype(np.float64)
 
 
-def _measured(search: ImageSearch, part: LegPart, xy: Array) -> Outlines:
+def _measured(part: LegPart, xy: Array) -> PartLines:
     """Measure both outlines of a part from all edge points of the image, and judge them."""
     t, v = part.band.coordinates(xy)
     n = len(part.hidden)
@@ -91,9 +93,10 @@ def _measured(search: ImageSearch, part: LegPart, xy: Array) -> Outlines:
         _line(t[near], v[near], start, part.band.length, free) if found else None
         for start, found in zip(part.edges.v, part.edges.found, strict=True)
     ]
-    found = [None if line is None else (line.v, line.place, line.covariance) for line in lines]
-    leg, link, reasons = part.leg.leg, part.segment.link, _reasons(part, lines)
-    return part_outlines(search, leg, link, reasons, found, found=part)
+    found = [
+        None if line is None else OutlineLine(line.v, line.place, line.covariance) for line in lines
+    ]
+    return PartLines(part.leg.leg, part.segment.link, _reasons(part, lines), found, part.band)
 
 
 def _line(t: Array, v: Array, start: Array, length: float, free: float) -> _CannyLine | None:
