@@ -20,7 +20,8 @@ from legcal.perception.light import Samples
 from legcal.vision import Band, Camera, Grey, PredictedLeg, Segment
 
 BLOCK_LENGTH = 8.0  # along the part [px]
-ROWS = 4  # of samples in a block
+ROWS, ROWS_NEAR = 4, 2  # of samples in a block, and where all windows are small
+NEAR_WINDOW = 4  # such a window, at most [px]
 MAX_BLOCKS = 80  # of a part
 MARGIN = 6  # columns beyond the search window, to judge what an edge is [px]
 MAX_LINES = 8  # near an edge
@@ -30,6 +31,7 @@ MIN_LONE_SCORE = 0.5  # of an edge that may stand alone
 MIN_LONE_SCORE_GUIDED = 0.35  # the same near a fit to other legs
 MAX_RIVAL = 0.6  # of its score, which no other line may reach
 MIN_RIVAL_DISTANCE = 3.0  # from which on a line is another one, in the middle [px]
+STRIDE = 2  # every such column is enough for the median
 NOISE_LEVELS = 4.0  # an edge this many times as steep as the median counts half
 BESIDE_WEIGHT = 0.8  # what an edge counts in the columns beside it
 MAX_PREDICTION_ERROR = 1.0  # an edge that was found to a pixel may be where it is predicted [px]
@@ -123,23 +125,23 @@ def _best_pair(
     mismatch = (shift2[None, :, :] - shift1[:, None, :]) / (
         WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * width
     )
-    drift = 0.5 * (shift1[:, None, :] + shift2[None, :, :]) / window
-    value = score1[:, None] + score2[None, :]
-    value = value - 0.1 * np.mean(mismatch**2, axis=-1) - 0.1 * np.mean(drift**2, axis=-1)
-    value[np.abs(mismatch).max(axis=-1) > 3.0] = -np.inf
-    i, j = np.unravel_index(int(np.argmax(value)), value.shape)
+    drift = (0.5 / window) * (shift1[:, None, :] + shift2[None, :, :])
+    square = mismatch**2
+    value = score1[:, None] + score2[None, :] - 0.05 * (square + drift**2).sum(axis=-1)
+    value[square.max(axis=-1) > 9.0] = -np.inf
+    i, j = divmod(int(value.argmax()), len(score2))
     if not np.isfinite(value[i, j]) or min(score1[i], score2[j]) < MIN_SCORE:
         return None
-    return int(i), int(j)
+    return i, j
 
 
 def _alone(shift: Array, score: Array, least: float) -> int | None:
     """Return the best line near an edge if it has no rival."""
     if not len(score) or score[0] < least:
         return None
-    middle = shift.mean(axis=1)
-    other = np.abs(middle - middle[0]) > MIN_RIVAL_DISTANCE
-    return None if np.any(score[other] > MAX_RIVAL * score[0]) else 0
+    middle = 0.5 * (shift[:, 0] + shift[:, 1])
+    rival = (np.abs(middle - middle[0]) > MIN_RIVAL_DISTANCE) & (score > MAX_RIVAL * score[0])
+    return None if rival.any() else 0
 
 
 def block_positions(band: Band) -> Array:
@@ -153,31 +155,42 @@ def _edge_lines(grey: Grey, camera: Camera, parts: Sequence[LegPart]) -> list[tu
     halves = [int(np.ceil(part.window)) for part in parts]
     reach = max(halves) + MARGIN
     far = np.array([-float(reach), float(reach)])
+    n_rows = ROWS if max(halves) > NEAR_WINDOW else ROWS_NEAR
     ends, hidden = [], []
     for part in parts:
-        n_rows = len(part.hidden) * ROWS
-        rows = (np.arange(n_rows) + 0.5) / n_rows
-        centre = part.predicted[:, :1] + np.diff(part.predicted, axis=1) * rows
-        v = centre[..., None] + far
-        ends.append(part.band.points((rows * part.band.length)[:, None], v).reshape(-1, 2, 2))
+        n = len(part.hidden)
+        node = np.linspace(0.0, 1.0, n + 1)
+        centre = part.predicted[:, :1] + np.diff(part.predicted, axis=1) * node
+        ends.append(part.band.points((node * part.band.length)[:, None], centre[..., None] + far))
         hidden += [part.hidden] * 2
-    pixels = camera.distort(np.concatenate(ends))
-    # So near an edge the lens moves pixels in proportion to their distance from it.
+    n_blocks = np.array([len(one) for one in hidden])
+    bounds = np.concatenate([[0], np.cumsum(n_blocks)])
+    nodes = camera.distort(np.concatenate([one.reshape(-1, 2, 2) for one in ends]))
+    # Between nodes, and near an edge, the lens moves pixels in proportion to their distance.
+    begin = np.arange(bounds[-1]) + np.repeat(np.arange(len(hidden)), n_blocks)
+    row = (np.arange(n_rows) + 0.5)[:, None, None] / n_rows
+    pixels = nodes[begin, None] + row * (nodes[begin + 1] - nodes[begin])[:, None]
     share = np.linspace(0.0, 1.0, 2 * reach + 1, dtype=np.float32)
-    first, change = (x.astype(np.float32) for x in (pixels[:, 0], np.diff(pixels, axis=1)[:, 0]))
+    first, change = (
+        x.reshape(-1, 2).astype(np.float32)
+        for x in (pixels[:, :, 0], pixels[:, :, 1] - pixels[:, :, 0])
+    )
     x, y = (first[:, k : k + 1] + change[:, k : k + 1] * share for k in (0, 1))
-    inside = (x >= 0.5) & (x <= camera.width - 1.5) & (y >= 0.5) & (y <= camera.height - 1.5)
     values = np.asarray(cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
-    n_columns = len(share)
-    seen = inside.reshape(-1, ROWS, n_columns).all(axis=1) & ~np.concatenate(hidden)[:, None]
-    profiles = values.reshape(-1, ROWS, n_columns).mean(axis=1)
-    bounds = np.cumsum([0, *(len(one) for one in hidden)])
+    seen = np.repeat(~np.concatenate(hidden)[:, None], len(share), axis=1)
+    limits = np.array([camera.width, camera.height]) - 1.5
+    partly = np.any((pixels < 0.5) | (pixels > limits), axis=(1, 2, 3))
+    if partly.any():
+        xy = (one.reshape(-1, n_rows, len(share))[partly] for one in (x, y))
+        inside = [(one >= 0.5) & (one <= last) for one, last in zip(xy, limits, strict=True)]
+        seen[partly] &= (inside[0] & inside[1]).all(axis=1)
+    profiles = values.reshape(-1, n_rows, len(share)).mean(axis=1)
     votes = _sharpness(profiles, seen, bounds) * seen
+    n_seen = np.maximum(np.add.reduceat(seen.any(axis=1).astype(np.intp), bounds[:-1]), 1)
     lines = []
     for k, half in enumerate(np.repeat(halves, 2).tolist()):
         own = slice(bounds[k], bounds[k + 1]), slice(reach - half, reach + half + 1)
-        n_seen = int(seen[bounds[k] : bounds[k + 1]].any(axis=1).sum())
-        lines.append(_lines(votes[own] / max(1, n_seen), half))
+        lines.append(_lines(votes[own] / n_seen[k], half))
     return lines
 
 
@@ -193,8 +206,9 @@ def _sharpness(profiles: Samples, seen: BoolArray, bounds: IntArray) -> Samples:
     beside = np.ones((1, 3), dtype=np.uint8)
     wide = np.asarray(cv2.dilate(gradient, beside), dtype=np.float32)
     peak = np.where(gradient >= wide, gradient, np.float32(0.0))
+    some, here = gradient[:, ::STRIDE], seen[:, ::STRIDE]
     typical = [
-        _median(gradient[first:last][seen[first:last]]) for first, last in pairwise(bounds.tolist())
+        _median(some[first:last][here[first:last]]) for first, last in pairwise(bounds.tolist())
     ]
     level = np.repeat((NOISE_LEVELS * np.array(typical)) ** 2 + 1e-3, np.diff(bounds))
     sharpness = np.asarray(peak**2 / (peak**2 + level[:, None]), dtype=np.float32)
