@@ -31,7 +31,6 @@ MIN_LONE_SCORE = 0.5  # of an edge that may stand alone
 MIN_LONE_SCORE_GUIDED = 0.35  # the same near a fit to other legs
 MAX_RIVAL = 0.6  # of its score, which no other line may reach
 MIN_RIVAL_DISTANCE = 3.0  # from which on a line is another one, in the middle [px]
-STRIDE = 2  # every such column is enough for the median
 NOISE_LEVELS = 4.0  # an edge this many times as steep as the median counts half
 BESIDE_WEIGHT = 0.8  # what an edge counts in the columns beside it
 MAX_PREDICTION_ERROR = 1.0  # an edge that was found to a pixel may be where it is predicted [px]
@@ -206,9 +205,8 @@ def _sharpness(profiles: Samples, seen: BoolArray, bounds: IntArray) -> Samples:
     beside = np.ones((1, 3), dtype=np.uint8)
     wide = np.asarray(cv2.dilate(gradient, beside), dtype=np.float32)
     peak = np.where(gradient >= wide, gradient, np.float32(0.0))
-    some, here = gradient[:, ::STRIDE], seen[:, ::STRIDE]
     typical = [
-        _median(some[first:last][here[first:last]]) for first, last in pairwise(bounds.tolist())
+        _median(gradient[first:last][seen[first:last]]) for first, last in pairwise(bounds.tolist())
     ]
     level = np.repeat((NOISE_LEVELS * np.array(typical)) ** 2 + 1e-3, np.diff(bounds))
     sharpness = np.asarray(peak**2 / (peak**2 + level[:, None]), dtype=np.float32)
