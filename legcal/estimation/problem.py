@@ -233,8 +233,8 @@ class _Groups:
             starts = np.ones(n, dtype=np.bool_)
             starts[1:] = (np.diff(group[order]) != 0) | (np.diff(element[order]) != 0)
             found = np.flatnonzero(starts)
-            cell = n // len(found)
-            cell = cell if np.array_equal(found, cell * np.arange(len(found))) else 1
+            cell = int(found[1]) if len(found) > 1 else n
+            cell = cell if np.array_equal(found, np.arange(0, n, cell)) and n % cell == 0 else 1
         is_sorted = np.array_equal(order, np.arange(n))
         bounds = tuple(pairwise([0, *ends]))
         return cls(None if is_sorted else order, group, first, bounds, cell)

@@ -83,9 +83,9 @@ def _pieces(small: Grey) -> Array:
     """
     levels = _stretched(small)
     slopes = [cv2.Sobel(levels, cv2.CV_16S, i, 1 - i) for i in (1, 0)]
-    some = (slope[::STRIDE, ::STRIDE].astype(np.float32) for slope in slopes)
-    low = float(np.clip(NOISE_LEVELS * np.median(cv2.magnitude(*some)), *MIN_SLOPE))
-    edge = cv2.Canny(*slopes, low, STRONG * low, L2gradient=True)
+    some = [slope[::STRIDE, ::STRIDE].astype(np.float32) for slope in slopes]
+    low = float(np.clip(NOISE_LEVELS * np.median(cv2.magnitude(some[0], some[1])), *MIN_SLOPE))
+    edge = cv2.Canny(slopes[0], slopes[1], low, STRONG * low, L2gradient=True)
     edge[[0, -1]], edge[:, [0, -1]] = 0, 0
     at = np.flatnonzero(edge != 0)
     gradient = np.stack([slope.take(at) for slope in slopes]).astype(np.float32)

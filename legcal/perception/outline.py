@@ -64,7 +64,9 @@ class OutlineLine(NamedTuple):
     """The line of an outline in the band of its part."""
 
     v: Array  # (2,) offsets at both ends of the band [px]
-    place: Sequence[float]  # where the used piece begins and ends, as fractions of the band
+    place: (
+        Array | tuple[float, float]
+    )  # where the used piece begins and ends, as fractions of the band
     covariance: Array  # (2, 2) of the offsets there [px^2]
     quality: Sequence[float] = (math.nan,) * 4  # contrast, length, residual, by_gamma of Outlines
 

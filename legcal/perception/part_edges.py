@@ -139,8 +139,8 @@ def _alone(shift: Array, score: Array, least: float) -> int | None:
     if not len(score) or score[0] < least:
         return None
     middle = 0.5 * (shift[:, 0] + shift[:, 1])
-    rival = (np.abs(middle - middle[0]) > MIN_RIVAL_DISTANCE) & (score > MAX_RIVAL * score[0])
-    return None if rival.any() else 0
+    other = np.abs(middle - middle[0]) > MIN_RIVAL_DISTANCE
+    return None if np.any(score[other] > MAX_RIVAL * score[0]) else 0
 
 
 def block_positions(band: Band) -> Array:
@@ -177,12 +177,12 @@ def _edge_lines(grey: Grey, camera: Camera, parts: Sequence[LegPart]) -> list[tu
     x, y = (first[:, k : k + 1] + change[:, k : k + 1] * share for k in (0, 1))
     values = np.asarray(cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
     seen = np.repeat(~np.concatenate(hidden)[:, None], len(share), axis=1)
-    limits = np.array([camera.width, camera.height]) - 1.5
-    partly = np.any((pixels < 0.5) | (pixels > limits), axis=(1, 2, 3))
+    last = np.array([camera.width, camera.height]) - 1.5
+    partly = np.any((pixels < 0.5) | (pixels > last), axis=(1, 2, 3))
     if partly.any():
-        xy = (one.reshape(-1, n_rows, len(share))[partly] for one in (x, y))
-        inside = [(one >= 0.5) & (one <= last) for one, last in zip(xy, limits, strict=True)]
-        seen[partly] &= (inside[0] & inside[1]).all(axis=1)
+        x, y = (one.reshape(-1, n_rows, len(share))[partly] for one in (x, y))
+        inside = (x >= 0.5) & (x <= camera.width - 1.5) & (y >= 0.5) & (y <= camera.height - 1.5)
+        seen[partly] &= inside.all(axis=1)
     profiles = values.reshape(-1, n_rows, len(share)).mean(axis=1)
     votes = _sharpness(profiles, seen, bounds) * seen
     n_seen = np.maximum(np.add.reduceat(seen.any(axis=1).astype(np.intp), bounds[:-1]), 1)
