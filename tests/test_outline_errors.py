@@ -262,7 +262,9 @@ def shared_errors(
     possible = biases_of(session)
     sigma = np.array([0.0, 0.0, level, level, slope, slope])
     values = sigma[possible.kind] * rng.standard_normal(len(possible))
-    shift = np.einsum("nc,nce->ne", values[possible.index], possible.shift)
+    observed = observed_outlines(session.outlines, session.measurements, session.legs)
+    shift = np.zeros((len(observed), 2))
+    shift[observed.index] = np.einsum("nc,nce->ne", values[possible.index], possible.shift)
     return moved_outlines(noisy_outlines(session, rng), PINHOLE, shift)
 
 

@@ -405,7 +405,7 @@ class Problem(Generic[S]):
         """Positions in x of each kept block, (n, d); ``n_kept`` for what is no unknown."""
         return self._laid.place
 
-    @property
+    @cached_property
     def places(self) -> Mapping[str, Places]:
         """What the measurements of each factor depend on."""
         return dict(zip((f.name for f in self.factors), self._laid.places, strict=True))
@@ -430,7 +430,7 @@ class Problem(Generic[S]):
         """Number of all unknowns."""
         return self.n_kept + self.n_elements * self.d_element
 
-    @property
+    @cached_property
     def named(self) -> tuple[str, ...]:
         """Names of the first unknowns: those of blocks with labels."""
         return tuple(label for block in self.variables for label in block.labels)

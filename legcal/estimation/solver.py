@@ -242,7 +242,16 @@ class NormalEquations:
 
     def reduced(self) -> Array:
         """Return the normal matrix (n_kept, n_kept) of the kept unknowns, the others free."""
-        R = self.U - _coupled(_by_element(self.W, self.V_inverse), self.W)
+        return self._reduced.copy()
+
+    @cached_property
+    def _reduced(self) -> Array:
+        try:
+            root = np.asarray(np.linalg.cholesky(self.V_inverse), dtype=np.float64)
+            half = _by_element(self.W, root)
+            R = self.U - _coupled(half, half)
+        except np.linalg.LinAlgError:  # some elements are not determined
+            R = self.U - _coupled(_by_element(self.W, self.V_inverse), self.W)
         return np.asarray(0.5 * (R + R.T))
 
     def contributions(self) -> Array:
@@ -368,7 +377,7 @@ def _sums(
     """Return the blocks U, W, V of J^T J and both parts of J^T r, all measurements added up."""
     n_kept, n_elements, d = problem.n_kept, problem.n_elements, problem.d_element
     squares = np.zeros((n_kept + 2, n_kept + 2))  # with one row of no unknown, and r as the last
-    mixed = np.zeros(((n_kept + 2 + d) * n_elements, d))  # the same, then those of the elements
+    mixed: Array | None = None  # the same rows for each element, then those of the elements
     for where, rows in kinds:
         if len(rows.r) == 0:
             continue
@@ -385,7 +394,10 @@ def _sums(
         if where.to_elements is not None:
             cells = stacked.reshape(n // groups.cell, groups.cell * q, width)
             products = np.swapaxes(cells, 1, 2) @ cells[:, :, m + 1 :]
-            mixed += where.to_elements @ products.reshape(-1, d)
+            added = where.to_elements @ products.reshape(-1, d)
+            mixed = added if mixed is None else np.add(mixed, added, out=mixed)
+    if mixed is None:
+        mixed = np.zeros(((n_kept + 2 + d) * n_elements, d))
     by_row = mixed.reshape(n_kept + 2 + d, n_elements, d)
     V = np.swapaxes(by_row[n_kept + 2 :], 0, 1).copy()
     return squares[:n_kept, :n_kept], by_row[:n_kept], V, squares[:n_kept, -1], by_row[n_kept + 1]

@@ -97,6 +97,7 @@ def explained_share(
         following = _following(normal)
         with_kept = np.pad(following @ covariance, ((0, 0), (0, 0), (0, 1)))
         of_elements = with_kept[..., :-1] @ np.swapaxes(following, 1, 2)
+        own_numbers = np.arange(problem.d_element)
         Z = None if normal.tangent is None else normal.tangent.Z
         left = normal.V_inverse
         of_elements += left if Z is None else Z @ left @ np.swapaxes(Z, 1, 2)
@@ -105,7 +106,8 @@ def explained_share(
         found = J @ padded[np.ix_(columns, columns)] @ np.swapaxes(J, 1, 2)
         if where.element is not None:
             element, own = where.element[member], np.ascontiguousarray(rows.J_element[member])
-            mixed = own @ with_kept[element][..., columns] @ np.swapaxes(J, 1, 2)
+            by_both = with_kept[np.ix_(element, own_numbers, columns)]
+            mixed = own @ by_both @ np.swapaxes(J, 1, 2)
             found += mixed + np.swapaxes(mixed, 1, 2)
             found += own @ of_elements[element] @ np.swapaxes(own, 1, 2)
         share[member] = found

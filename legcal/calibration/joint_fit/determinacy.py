@@ -63,6 +63,8 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
         int(np.sum(value * (sigma * length) ** 2 < 1.0)) for sigma in (_MAX_SIGMA, _HELD_SIGMA)
     )
     basis, poor = vector[:, :n_open].T, vector[:, :n_poor].T
+    if len(poor) == 0:
+        return HeldDirections(poor, unit)
     others = np.flatnonzero((basis[:, problem.n_kinematic :] ** 2).sum(axis=1) > _MAX_OTHERS**2)
     if len(others):
         basis = basis[others]

@@ -6,7 +6,7 @@ parameter; a fixed value by a wider fit in which it is free.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,7 +29,7 @@ from legcal.estimation import (
     marginal,
     named_information,
 )
-from legcal.geometry import Array, BoolArray
+from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import radius_name
 from legcal.vision import intrinsic_names, intrinsic_unit
 
@@ -326,8 +326,8 @@ def _held_information(problem: FitProblem, held: HeldDirections, length: float) 
 def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
     """Return a note where many outlines, or most of a leg or a view, disagree with the fit."""
     o = problem.outlines
-    legs = _mostly_rejected([problem.legs.names[j] for j in o.leg.tolist()], accepted)
-    views = _mostly_rejected([o.views[v] for v in o.view.tolist()], accepted)
+    legs = _mostly_rejected(o.leg, problem.legs.names, o.index, accepted)
+    views = _mostly_rejected(o.view, o.views, o.index, accepted)
     n, n_rejected = len(accepted), int(np.sum(~accepted))
     if not legs and not views and n_rejected <= _MANY_REJECTED * n:
         return ()
@@ -395,12 +395,12 @@ def _listed(names: list[str]) -> str:
     return ", ".join(names[:_MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
-def _mostly_rejected(names: list[str], accepted: BoolArray) -> dict[str, tuple[int, int]]:
-    """Return names most of whose outlines were rejected: how many of how many."""
-    found = {}
-    for name in dict.fromkeys(names):
-        of_name = accepted[[other == name for other in names]]
-        rejected = int(np.sum(~of_name))
-        if rejected >= _MIN_COUNT and rejected > _MOST_REJECTED * len(of_name):
-            found[name] = (rejected, len(of_name))
-    return found
+def _mostly_rejected(
+    which: IntArray, names: Sequence[str], row: IntArray, accepted: BoolArray
+) -> dict[str, tuple[int, int]]:
+    """Return names most of whose outlines were rejected, in the order of the table: how many."""
+    total = np.bincount(which, minlength=len(names))
+    rejected = np.bincount(which[~accepted], minlength=len(names))
+    most = np.flatnonzero((rejected >= _MIN_COUNT) & (rejected > _MOST_REJECTED * total)).tolist()
+    most.sort(key=lambda i: int(row[which == i].min()))
+    return {names[i]: (int(rejected[i]), int(total[i])) for i in most}

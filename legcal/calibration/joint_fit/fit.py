@@ -214,7 +214,7 @@ def _refined(
     if rejected_notes(fit.problem, fit.accepted):
         refuse_contradicted_values(free, start, state, settings, with_priors=True)
     refuse_contradicted_priors(fit.problem, fit.state, normal)
-    return assemble_solution(fit, held, outlines, start.label, settings)
+    return assemble_solution(fit, normal, held, outlines, start.label, settings)
 
 
 def _refuse_undetermined(problem: FitProblem, state: State) -> None:

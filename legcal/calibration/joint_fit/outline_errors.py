@@ -101,7 +101,7 @@ class NoiseModel:
     def whitening(self, claimed: Array, used: BoolArray | None = None) -> Array:
         """Return lower triangular T (n, 2, 2) with T C T^T = 1 [1/px]; zero where not used."""
         T = whitener(self.covariance(claimed))
-        return np.asarray(T if used is None else np.where(used[:, None, None], T, 0.0))
+        return np.asarray(T if used is None else T * used[:, None, None])
 
     def squared_norms(self, offsets: Array, claimed: Array) -> Array:
         """Return the squared whitened norms (n,) of offsets (n, 2) [px]."""
@@ -156,7 +156,8 @@ def estimate_noise(offsets: Array, explained: Array, claimed: Array) -> NoiseMod
     -------
     NoiseModel
     """
-    moments = offsets[:, :, None] * offsets[:, None, :] + explained
+    moments = offsets.T[:, None] * offsets.T + explained.transpose(1, 2, 0)
+    claimed = np.ascontiguousarray(claimed.transpose(1, 2, 0))
     best = _fitted(moments, claimed, bias=False, tilt=False)
     for _ in range(2):
         wider = [
@@ -172,21 +173,22 @@ def estimate_noise(offsets: Array, explained: Array, claimed: Array) -> NoiseMod
 
 
 def _fitted(moments: Array, claimed: Array, *, bias: bool, tilt: bool) -> NoiseModel:
-    """Return the noise of these kinds with the largest likelihood, by Fisher's scoring."""
+    """Return the noise of these kinds with the largest likelihood, by Fisher's scoring.
+
+    *moments* and *claimed* are (2, 2, n).
+    """
+    modes = [_SUM] * bias + [_DIFFERENCE] * tilt
     shapes = [claimed]
-    if bias:
-        shapes.append(np.broadcast_to(np.outer(_SUM, _SUM), claimed.shape))
-    if tilt:
-        shapes.append(np.broadcast_to(np.outer(_DIFFERENCE, _DIFFERENCE), claimed.shape))
-    share = np.trace(np.linalg.solve(claimed, moments), axis1=1, axis2=2)
+    shapes += [np.broadcast_to(np.outer(m, m)[..., None], claimed.shape) for m in modes]
     variances = np.zeros(len(shapes))
-    variances[0] = max(0.5 * float(np.mean(share)), _MIN_SCALE**2)
+    share = _product(_inverted(claimed)[0], moments) / claimed.shape[-1]
+    variances[0] = max(0.5 * share, _MIN_SCALE**2)
     least = np.array([_MIN_SCALE**2, 0.0, 0.0])[: len(shapes)]
-    for _ in range(_MAX_ITERATIONS):
+    for _ in range(_MAX_ITERATIONS if modes else 0):
         covariance = sum(v * shape for v, shape in zip(variances, shapes, strict=True))
-        inverse = np.linalg.inv(covariance)
-        weighted = [inverse @ shape for shape in shapes]
-        weighted_moments = inverse @ moments
+        inverse, _ = _inverted(np.asarray(covariance))
+        weighted = [_times(inverse, shape) for shape in shapes]
+        weighted_moments = _times(inverse, moments)
         information = np.array([[_product(a, b) for b in weighted] for a in weighted])
         right = np.array([_product(a, weighted_moments) for a in weighted])
         found = np.linalg.lstsq(information, right, rcond=_RANK)[0]
@@ -199,16 +201,28 @@ def _fitted(moments: Array, claimed: Array, *, bias: bool, tilt: bool) -> NoiseM
     return NoiseModel(sigma[0], sigma[1] if bias else 0.0, sigma[-1] if tilt else 0.0)
 
 
+def _inverted(C: Array) -> tuple[Array, Array]:
+    """Return the inverses of matrices (2, 2, n), and their determinants (n,)."""
+    (a, b), (c, d) = C
+    determinant = a * d - b * c
+    return np.stack([np.stack([d, -b]), np.stack([-c, a])]) / determinant, determinant
+
+
+def _times(a: Array, b: Array) -> Array:
+    """Return the products of matrices (2, 2, n)."""
+    return np.asarray(np.einsum("ijn,jkn->ikn", a, b))
+
+
 def _product(a: Array, b: Array) -> float:
-    """Return the sum of the traces of the products of matrices (n, 2, 2)."""
-    return float(np.einsum("nij,nji->", a, b))
+    """Return the sum of the traces of the products of matrices (2, 2, n)."""
+    return float(np.einsum("ijn,jin->", a, b))
 
 
 def _likelihood(noise: NoiseModel, moments: Array, claimed: Array) -> float:
-    """Return the logarithm of the likelihood of second moments (n, 2, 2) [px^2]."""
-    covariance = noise.covariance(claimed)
-    shares = np.trace(np.linalg.solve(covariance, moments), axis1=1, axis2=2)
-    return -0.5 * float(np.sum(np.log(np.linalg.det(covariance)) + shares))
+    """Return the logarithm of the likelihood of second moments (2, 2, n) [px^2]."""
+    covariance = noise.covariance(claimed.transpose(2, 0, 1)).transpose(1, 2, 0)
+    inverse, determinant = _inverted(covariance)
+    return -0.5 * (float(np.sum(np.log(determinant))) + _product(inverse, moments))
 
 
 def _balanced(
@@ -313,12 +327,12 @@ def possible_biases(
     parts = [f"{leg_names[leg]}.{part}" for leg, part in o.parts]
     known = o if fitted is None else fitted
     view = known.series[o.view]
-    found, group = np.unique(np.column_stack([view, o.radius]), axis=0, return_inverse=True)
-    group = group.ravel()
+    key, group = np.unique(view * len(parts) + o.radius, return_inverse=True)
+    found = list(zip(*(part.tolist() for part in np.divmod(key, max(len(parts), 1))), strict=True))
     inward, sideways = o.epsilon, np.full(len(o), SIDEWAYS)
     x, y = _places_in_groups(o, known).T
-    together = [f"{o.views[v]}.{parts[p]}.inward" for v, p in found.tolist()]
-    across = [f"{o.views[v]}.{parts[p]}.sideways" for v, p in found.tolist()]
+    together = [f"{o.views[v]}.{parts[p]}.inward" for v, p in found]
+    across = [f"{o.views[v]}.{parts[p]}.sideways" for v, p in found]
     levels = [
         (("all",), np.zeros(len(o), dtype=np.intp), inward, "", 0),
         (o.views, view, inward, "", 0),

@@ -29,9 +29,9 @@ from legcal.calibration.joint_fit.sensitivity import (
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
 from legcal.data import Dataset, Order, Outlines, inverse, reorder_measurements
 from legcal.estimation import (
+    NormalEquations,
     PseudoHuber,
     WorstDirection,
-    information,
     linearize,
     named_covariance,
     robust_cost,
@@ -108,9 +108,14 @@ class Solution:
 
 
 def assemble_solution(
-    fit: Fit, held: HeldDirections, outlines: Outlines, label: str, settings: RefinementSettings
+    fit: Fit,
+    normal: NormalEquations,
+    held: HeldDirections,
+    outlines: Outlines,
+    label: str,
+    settings: RefinementSettings,
 ) -> Solution:
-    """Put together what was found.
+    """Put together what was found; *normal* is the information where the fit ended.
 
     Raises
     ------
@@ -119,7 +124,6 @@ def assemble_solution(
     """
     problem, state, linear = fit.problem, fit.state, fit.minimum.linear
     loss = PseudoHuber(settings.loss_width)
-    normal = information(problem, state, linear, loss)
     kept = normal.kept_covariance()
     covariance = named_covariance(problem, state, kept)
     values, status = _values(problem, state), _status(problem, held)
