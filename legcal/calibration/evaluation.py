@@ -25,7 +25,7 @@ from legcal.machine import (
     geometries,
     load_mechanism,
     parametrization_of,
-    platform_in_base,
+    platforms_in_base,
     pose_differences,
     random_poses,
     vector_of,
@@ -121,8 +121,8 @@ def evaluate(
         poses = forward_kinematics_many(machine, q)
         reference_poses = forward_kinematics_many(truth, q)
     displacement, rotation = pose_differences(
-        [platform_in_base(machine, T) for T in poses],
-        [platform_in_base(truth, T) for T in reference_poses],
+        platforms_in_base(machine, poses),
+        platforms_in_base(truth, reference_poses),
     )
     parametrization = parametrization_of(truth, twists=True)
     origin = geometries(truth)

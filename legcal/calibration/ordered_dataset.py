@@ -37,6 +37,7 @@ from legcal.machine import (
     geometries,
     list_in_words,
     platform_in_base,
+    platforms_in_base,
     solve_poses,
 )
 from legcal.paper import Criteria, Transformation
@@ -186,7 +187,7 @@ def nominal_poses(
         home = [platform_in_base(machine, machine.home)] * len(q)
         return _least_squares(machine, q, home)[0], np.zeros(len(q))
     followed = list(followed_poses(machine, q, on_the_chain=False))
-    T = [platform_in_base(machine, pose) for pose, _ in followed]
+    T = list(platforms_in_base(machine, [pose for pose, _ in followed]))
     off = [k for k, (_, failure) in enumerate(followed) if failure is not None]
     residual = np.zeros(len(q))
     if off:

@@ -318,10 +318,13 @@ def _order_ends(outlines: Outlines, measurements: Measurements) -> Outlines:
 def _refuse_ends_off_line(table: Table, outlines: Outlines, measurements: Measurements) -> None:
     """Refuse used outlines whose ends do not lie on their line."""
     xy = _rays(outlines, measurements)
-    for i in np.flatnonzero(outlines.used).tolist():
-        camera = measurements.views[measurements.view[outlines.row[i]]].camera
-        offset = float(np.abs(camera.line_offset(outlines.h[i][None], xy[i])).max())
-        if not offset <= LINE_TOLERANCE_PX:
-            found = f"ends {offset:.3g} px from the line (a, b, c)"
-            needed = f"at most {LINE_TOLERANCE_PX:g} px; correct the line or its ends"
-            table.refuse(i, found, needed, *NUMBERS[:7])
+    view = measurements.view[outlines.row]
+    offset = np.zeros(len(outlines))
+    for v in np.unique(view):
+        chosen = (view == v) & outlines.used
+        camera, h = measurements.views[v].camera, outlines.h[chosen][:, None]
+        offset[chosen] = np.abs(camera.line_offset(h, xy[chosen])).max(axis=1)
+    for i in np.flatnonzero(~(offset <= LINE_TOLERANCE_PX)).tolist():
+        found = f"ends {offset[i]:.3g} px from the line (a, b, c)"
+        needed = f"at most {LINE_TOLERANCE_PX:g} px; correct the line or its ends"
+        table.refuse(i, found, needed, *NUMBERS[:7])

@@ -80,6 +80,7 @@ class Table:
         self.where: list[str] = []
         self._lines: list[int] = []
         self._cells: list[list[str]] = []
+        self._numbers: dict[str, Array] = {}  # of the columns of numbers
         self._problems: list[tuple[int, str | tuple[str, ...]]] = []  # by line
 
     def __len__(self) -> int:
@@ -100,6 +101,8 @@ class Table:
 
     def number(self, name: str) -> Array:
         """Return the numbers of a column, (n_rows,); NaN where there is none."""
+        if name in self._numbers:
+            return self._numbers[name].copy()
         return np.array([_number_in(text) for text in self.text(name)], dtype=np.float64)
 
     def numbers(self, names: Iterable[str]) -> Array:
@@ -148,6 +151,7 @@ class Table:
         self.where = [self.where[row] for row in kept_rows]
         self._lines = [self._lines[row] for row in kept_rows]
         self._cells = [self._cells[row] for row in kept_rows]
+        self._numbers = {name: values[kept_rows] for name, values in self._numbers.items()}
         self._problems = [problem for problem in self._problems if problem[0] not in gone]
 
     def check(self) -> None:
@@ -177,11 +181,17 @@ class Table:
         problems = self._problems
         self.keep(np.array([bool(cells) for cells in self._cells], dtype=np.bool_))
         self._problems = problems
-        for place, column in enumerate(columns):
-            for row, cells in enumerate(self._cells):
-                needed = column.problem(cells[place])
-                if needed:
-                    self.refuse_cell(row, column.name, needed)
+        for column in columns:
+            texts = self.text(column.name)
+            doubtful: Sequence[int] = range(len(texts))
+            if column.kind == "number":
+                values = self._numbers[column.name] = self.number(column.name)
+                good = (values >= column.least) & (values <= column.most)
+                doubtful = np.flatnonzero(~good).tolist()
+            faults = {text: column.problem(text) for text in {texts[row] for row in doubtful}}
+            for row in doubtful:
+                if faults[texts[row]]:
+                    self.refuse_cell(row, column.name, faults[texts[row]])
         for group in dict.fromkeys(column.group for column in columns if column.group):
             names = [column.name for column in columns if column.group == group]
             filled = np.array(

@@ -39,6 +39,7 @@ from .kinematics import forward_kinematics as forward_kinematics
 from .kinematics import forward_kinematics_many as forward_kinematics_many
 from .kinematics import inverse_kinematics as inverse_kinematics
 from .kinematics import platform_in_base as platform_in_base
+from .kinematics import platforms_in_base as platforms_in_base
 from .kinematics import pose_differences as pose_differences
 from .kinematics import solve_poses as solve_poses
 from .leg import Cylinder as Cylinder

@@ -267,6 +267,16 @@ def platform_in_base(machine: Machine, T_base_platform: RigidTransform) -> Rigid
     return product(machine.T_base_Rb.inv(), T_base_platform, machine.T_platform_Re)
 
 
+def platforms_in_base(
+    machine: Machine, poses: Sequence[RigidTransform]
+) -> tuple[RigidTransform, ...]:
+    """Return the same for many poses."""
+    if len(poses) == 0:
+        return ()
+    stacked = RigidTransform(np.array([T.as_matrix() for T in poses]), normalize=False)
+    return tuple(platform_in_base(machine, stacked))
+
+
 def pose_differences(
     poses: Sequence[RigidTransform], references: Sequence[RigidTransform]
 ) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ from legcal.machine import (
     Machine,
     Parametrization,
     geometries,
-    platform_in_base,
+    platforms_in_base,
     pose_differences,
     pose_sensitivity,
     workspace,
@@ -167,19 +167,14 @@ def _workspace_poses(machine: Machine, legs: Sequence[Leg]) -> Sequence[RigidTra
         readings, drawn = workspace(machine)
     except DidNotConverge:  # travel or home of the model forbid it, which harms no calibration
         return None
-    nearby = [platform_in_base(machine, T) for T in drawn]
-    poses = poses_at_readings(machine, legs, readings, nearby)
-    reached = [T for T, q in zip(poses, readings, strict=True) if _is_reached(legs, q, T)]
-    return reached or None
-
-
-def _is_reached(legs: Sequence[Leg], q: Array, T_Rb_Re: RigidTransform) -> bool:
-    """Say whether legs have the lengths of readings (n_legs,) at a pose: some have them nowhere."""
-    return all(
-        abs(np.linalg.norm(T_Rb_Re.apply(leg.B) - leg.A) - leg.length_at(reading)) < _REACHED
-        for leg, reading in zip(legs, q, strict=True)
-        if leg.kind is LegKind.ACTUATED
-    )
+    poses = poses_at_readings(machine, legs, readings, platforms_in_base(machine, drawn))
+    R, t = Frames.of(poses)
+    reached = np.ones(len(poses), dtype=np.bool_)  # some legs have some lengths nowhere
+    for leg, q in zip(legs, readings.T, strict=True):
+        if leg.kind is LegKind.ACTUATED:
+            length = np.linalg.norm(R @ leg.B + t - leg.A, axis=1)
+            reached &= np.abs(length - (leg.sign * q + leg.q0)) < _REACHED
+    return [poses[k] for k in np.flatnonzero(reached)] or None
 
 
 def poses_at_readings(

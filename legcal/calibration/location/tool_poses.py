@@ -35,7 +35,7 @@ from legcal.machine import (
     geometries,
     leg_scale,
     parametrization_of,
-    platform_in_base,
+    platforms_in_base,
     pose_equations,
     pose_sensitivity,
 )
@@ -413,7 +413,7 @@ def _motions_by_model(machine: Machine, poses: Sequence[RigidTransform]) -> Arra
 
 def _joint_frames(machine: Machine, poses: Sequence[RigidTransform]) -> tuple[Array, Array]:
     """Return rotations and positions of R_e in R_b."""
-    matrices = np.array([platform_in_base(machine, T).as_matrix() for T in poses])
+    matrices = np.array([T.as_matrix() for T in platforms_in_base(machine, poses)])
     return matrices[:, :3, :3], matrices[:, :3, 3]
 
 
