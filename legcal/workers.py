@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from itertools import islice
 from multiprocessing import connection, get_context, resource_tracker
@@ -64,9 +64,11 @@ def worker_pool(
 ) -> Iterator[Run]:
     """Give a way to work in that many processes; one means in this process.
 
-    Processes are started when they are first needed, anew and not as copies: a program that
-    uses them must be safe to import (``if __name__ == "__main__":``). Libraries have one thread
-    in each. When the block is left by an exception, they end at once, in the middle of their work.
+    Processes are started when they are first needed. On Linux they are copies of this one, with all
+    that it has loaded, if it has no threads, which copies would lack; else they are started anew: a
+    program that uses them must be safe to import (``if __name__ == "__main__":``). Libraries have
+    one thread in each. When the block is left by an exception, they end at once, in the middle of
+    their work.
 
     Parameters
     ----------
@@ -86,30 +88,57 @@ def worker_pool(
     if workers <= 1:
         yield in_turn
         return
-    _start_tracker()
-    context = get_context("spawn")
-    watched, lifeline = context.Pipe(duplex=False)
+    with ExitStack() as stack:
+        started: list[tuple[ProcessPoolExecutor, connection.Connection]] = []
+
+        def run(task: Callable[[S], T], rows: Iterable[S], /) -> Iterable[T]:
+            if not started:
+                started.append(stack.enter_context(_processes(workers)))
+            return (_in_order if in_order else _as_they_come)(started[0][0], workers, task, rows)
+
+        try:
+            yield run
+        except BrokenProcessPool as error:
+            raise_if_stopped()  # the signal may have reached them first
+            raise OutOfResources(
+                f"{failure}: found that one of {workers} processes was ended from outside, needed "
+                "all of them to the end; see that there is enough memory and start the same "
+                "command again."
+            ) from error
+        except BaseException:
+            for _, lifeline in started:
+                lifeline.close()  # nobody waits for work that is not wanted any more
+            raise
+
+
+@contextmanager
+def _processes(workers: int) -> Iterator[tuple[ProcessPoolExecutor, connection.Connection]]:
+    """Give the processes, and the lifeline at whose end they end."""
+    copies = _has_one_thread()
+    if not copies:
+        _start_tracker()
+    context = get_context("fork" if copies else "spawn")
+    held, lifeline = context.Pipe(duplex=False)
+    arguments = (held, lifeline if copies else None)
     pool = ProcessPoolExecutor(
-        workers, mp_context=context, initializer=_end_with, initargs=(watched,)
+        workers, mp_context=context, initializer=_end_with, initargs=arguments
     )
-    run = _in_order if in_order else _as_they_come
     try:
-        yield partial(run, pool, workers)
-    except BrokenProcessPool as error:
-        raise_if_stopped()  # the signal may have reached them first
-        raise OutOfResources(
-            f"{failure}: found that one of {workers} processes was ended from outside, needed all "
-            "of them to the end; see that there is enough memory and start the same command again."
-        ) from error
-    except BaseException:
-        lifeline.close()  # nobody waits for work that is not wanted any more
-        raise
+        yield pool, lifeline
     finally:
         try:
             pool.shutdown(cancel_futures=True)
         finally:
             lifeline.close()
-            watched.close()
+            held.close()
+
+
+def _has_one_thread() -> bool:
+    """Say whether this process has one thread, those of libraries counted; no if unknown."""
+    try:
+        return sys.platform == "linux" and len(os.listdir("/proc/self/task")) == 1
+    except OSError:
+        return False
 
 
 def _in_order(
@@ -171,14 +200,16 @@ def _starting() -> Iterator[None]:
                     os.environ[name] = value
 
 
-def _end_with(lifeline: connection.Connection) -> None:
+def _end_with(held: connection.Connection, lifeline: connection.Connection | None) -> None:
     """Leave the answer to Ctrl-C to the process that started this one, and end when it does.
 
-    The other end of the lifeline closes when the pool is stopped, or its process killed: a pool's
-    processes would then wait for work for ever.
+    The other end of what is held closes when the pool is stopped, or its process killed: a pool's
+    processes would then wait for work for ever. A copied process has a copy of that end.
     """
     leave_interrupts_to_parent()
-    Thread(target=_wait_for_end, args=(lifeline,), daemon=True).start()
+    if lifeline is not None:
+        lifeline.close()
+    Thread(target=_wait_for_end, args=(held,), daemon=True).start()
 
 
 def _wait_for_end(lifeline: connection.Connection) -> None:
