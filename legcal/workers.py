@@ -4,6 +4,7 @@ Threads do not pay: the work is many short steps, and they would wait for each o
 """
 
 import copyreg
+import mmap
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -11,11 +12,14 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from itertools import islice
+from itertools import count, islice
 from multiprocessing import connection, get_context, resource_tracker
 from threading import Thread
 from typing import Any, Protocol, TypeVar
+from weakref import WeakValueDictionary, finalize
 
+import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import OutOfResources
@@ -163,6 +167,79 @@ def _as_they_come(
         done, running = wait(running, return_when=FIRST_COMPLETED)
         for future in sorted(done, key=lambda future: future.exception() is not None):
             yield future.result()  # before an error of another one
+
+
+class KeptArrays:
+    """Arrays of up to two dimensions, by number, that a process and its copies keep for each other.
+
+    What finds no room is not kept. A process that was started anew keeps nothing, nor does any on
+    a system without memory files.
+    """
+
+    def __init__(self, n: int, most_bytes: int) -> None:
+        self._name = (os.getpid(), next(_numbers))
+        _kept_arrays[self._name] = self
+        self._file, first = -1, 8 * _ENTRY * (n + 1)
+        self._most = first + most_bytes
+        if sys.platform != "linux" or n == 0:
+            return
+        try:
+            file = os.memfd_create("arrays")
+            finalize(self, os.close, file)
+            os.truncate(file, self._most)
+            memory = mmap.mmap(file, self._most)  # it is taken as it is written
+        except OSError:
+            return
+        self._file, self._bytes = file, np.frombuffer(memory, dtype=np.uint8)
+        # Where each array begins, its type and shape; in the end where the next one will begin.
+        self._entries = self._bytes[:first].view(np.int64).reshape(-1, _ENTRY)
+        self._entries[n, 0] = first
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _kept_here, self._name
+
+    def get(self, k: int) -> NDArray[Any] | None:
+        """Return a copy of array k, None if it is not kept."""
+        if self._file < 0:
+            return None
+        with self._locked():
+            begin, kind, *shape = self._entries[k].tolist()
+        if not kind:
+            return None
+        dtype = np.dtype(chr(kind))
+        end = begin + shape[0] * shape[1] * dtype.itemsize
+        return self._bytes[begin:end].view(dtype).reshape(shape).copy()
+
+    def keep(self, k: int, values: NDArray[Any]) -> None:
+        """Keep array k if there is room."""
+        if self._file < 0:
+            return
+        with self._locked():
+            begin = int(self._entries[-1, 0])
+            end = begin + values.nbytes
+            if self._entries[k, 1] == 0 and end <= self._most:
+                self._bytes[begin:end] = np.ascontiguousarray(values).view(np.uint8).ravel()
+                self._entries[k] = begin, ord(values.dtype.char), *values.shape
+                self._entries[-1, 0] = -(-end // 8) * 8
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Keep other processes from looking up and keeping; one that is killed lets go."""
+        os.lockf(self._file, os.F_LOCK, 0)
+        try:
+            yield
+        finally:
+            os.lockf(self._file, os.F_ULOCK, 0)
+
+
+_ENTRY = 4  # numbers
+_numbers = count()
+_kept_arrays: WeakValueDictionary[tuple[int, int], KeptArrays] = WeakValueDictionary()
+
+
+def _kept_here(pid: int, number: int) -> KeptArrays:
+    """Return the arrays of a name, if this process made them or is a copy of the one that did."""
+    return _kept_arrays.get((pid, number)) or KeptArrays(0, 0)
 
 
 # How processes start and end

@@ -5,6 +5,7 @@ Python alone shows, and every kind and every fault of an image file.
 """
 
 import struct
+import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -233,6 +234,19 @@ def test_an_image_that_was_not_checked_is_refused_where_it_is_read(folder: Folde
     for row, words in ((1, r"image .*c1_2\.png could not be read"), (3, "found an empty cell")):
         with pytest.raises(DatasetError, match=f"row {row + 1}: .*{words}"):
             dataset.image_reader([row])(0)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs memory files")
+def test_an_image_is_decoded_once(folder: Folder) -> None:
+    read = load_dataset(folder.write()).image_reader([0, 1])
+    first = [read(k) for k in (0, 1)]
+    for path in (folder.path / "images").iterdir():
+        path.unlink()
+    again = [read(k) for k in (0, 1)]
+    assert all(one.dtype == np.float32 for one in again)
+    np.testing.assert_array_equal(again, first)
+    again[0][:] = 0.0
+    np.testing.assert_array_equal(read(0), first[0])
 
 
 # --- image files

@@ -115,7 +115,7 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
         corners = data.order.reorder(dataset.corners)
     else:
         rows = [row for row, image in enumerate(measurements.image) if image]
-        load = dataset.image_reader(data.order.rows.tolist())
+        load = data.photographs.load
         corners = detect_corners(dataset.board, load, rows, data.pool, data.progress)
         shown = needed if len(corners) else {view.name for view in used}
         require_board(dataset.board, corners, load, measurements, shown)

@@ -24,12 +24,14 @@ from legcal.data.overrides import Override
 from legcal.errors import DatasetError
 from legcal.files import closest, describe, path_problem
 from legcal.machine import Machine, load_mechanism, shipped_folders, shipped_names
-from legcal.vision import Board, Camera, Grey, image_problem, parse_board, read_camera, read_image
+from legcal.vision import Board, Camera, Grey, decode_image, image_problem, parse_board, read_camera
+from legcal.workers import KeptArrays
 
 AXES_NAME = "axes.csv"
 CORNERS_NAME = "corners.csv"
 OBSERVATIONS_NAME = "observations.csv"
 CACHE_NAME = ".legcal-cache.json"
+MAX_KEPT = 128 * 2**20  # of decoded images [bytes]
 MIN_CORNERS = 4  # in an image that must place its camera
 
 
@@ -62,6 +64,7 @@ class Dataset:
             tuple(self.image_path(row) for row in rows),
             tuple(self._camera(row) for row in rows),
             tuple(self._where(row) for row in rows),
+            KeptArrays(len(rows), MAX_KEPT),
         )
 
     def image_problem(self, row: int) -> str | None:
@@ -80,11 +83,12 @@ class Dataset:
 
 @dataclass(frozen=True, eq=False)
 class ImageReader:
-    """Reads images by their number."""
+    """Reads images by their number; decodes each once while there is room to keep it."""
 
     paths: tuple[Path | None, ...]  # the files; None where a row has no image
     cameras: tuple[Camera, ...]  # the camera of each image
     places: tuple[str, ...]  # where each image is named, for messages
+    kept: KeptArrays  # those that were read before, in any process
 
     def __call__(self, k: int) -> Grey:
         """Return image k as (height, width) grey levels 0 to 255, float32."""
@@ -94,7 +98,11 @@ class ImageReader:
                 f"{self.places[k]}: its image could not be read: found an empty cell, needed an "
                 f"image; name one or give its outlines in {OBSERVATIONS_NAME}."
             )
-        return read_image(path, self.cameras[k], self.places[k])
+        levels = self.kept.get(k)
+        if levels is None:
+            levels = decode_image(path, self.cameras[k], self.places[k])
+            self.kept.keep(k, levels)
+        return np.asarray(levels, dtype=np.float32)
 
 
 def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:

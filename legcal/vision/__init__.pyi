@@ -30,6 +30,7 @@ from .cylinder import outlines_of_axis as outlines_of_axis
 from .distortion import DistortionModel as DistortionModel
 from .image_file import Grey as Grey
 from .image_file import ImageSize as ImageSize
+from .image_file import decode_image as decode_image
 from .image_file import enlarged as enlarged
 from .image_file import image_problem as image_problem
 from .image_file import image_size as image_size

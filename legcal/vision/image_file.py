@@ -81,6 +81,11 @@ class ImageSize:
 
 def read_image(path: Path, camera: Camera, where: str = "") -> Grey:
     """Read an image of 8 or 16 bits, grey or in colour, as grey levels."""
+    return np.asarray(decode_image(path, camera, where), dtype=np.float32)
+
+
+def decode_image(path: Path, camera: Camera, where: str = "") -> NDArray[np.uint8] | Grey:
+    """Read an image as grey levels: those of 8 bits as they are, which takes the least memory."""
     content, problem = _complete_content(path, camera, where)
     if problem:
         raise DatasetError(problem)
@@ -92,6 +97,8 @@ def read_image(path: Path, camera: Camera, where: str = "") -> Grey:
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         found = "data that cannot be decoded" if pixels is None else f"{pixels.dtype} pixels"
         raise DatasetError(_problem(path, where, found, _LEVELS))
+    if pixels.dtype == np.uint8 and pixels.ndim == 2:
+        return np.asarray(pixels, dtype=np.uint8)
     scale = 255.0 / (2 ** _depth(pixels) - 1) if pixels.dtype == np.uint16 else 1.0
     grey = np.empty(pixels.shape[:2], dtype=np.float32)
     for top in range(0, len(grey), _STRIP):  # colours in 32 bits take more than there may be
