@@ -131,6 +131,8 @@ class Camera:
         """Return the pixels of points (x, y) of the sensor plane, both (..., 2)."""
         if not self.has_distortion:
             return np.asarray(xy @ self.K[:2, :2].T + self.K[:2, 2])
+        if xy.size == 0:  # OpenCV refuses to project nothing
+            return np.zeros(xy.shape)
         flat = np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 1, 2)
         pixels = DISTORTION_MODELS[self.model].distort(flat, self.K, self.distortion)
         return np.asarray(pixels, dtype=np.float64).reshape(xy.shape)
@@ -140,6 +142,8 @@ class Camera:
         if not self.has_distortion:
             centred = pixels - self.K[:2, 2]
             return np.asarray(centred @ np.linalg.inv(self.K[:2, :2]).T)
+        if pixels.size == 0:
+            return np.zeros(pixels.shape)
         flat = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
         xy = DISTORTION_MODELS[self.model].undistort(flat, self.K, self.distortion)
         return np.asarray(xy, dtype=np.float64).reshape(pixels.shape)
