@@ -34,7 +34,11 @@ from legcal.perception.diagnostics import (
     reject_images,
 )
 from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
-from legcal.perception.photographs import MeasuredImages, place_and_measure
+from legcal.perception.photographs import (
+    MeasuredImages,
+    _parts_not_found,
+    place_and_measure,
+)
 from legcal.progress import no_progress
 from legcal.workers import in_turn
 
@@ -96,7 +100,7 @@ def bad(tmp_path_factory: pytest.TempPathFactory) -> Spoiled:
         made.change(view, k, change)
     for one, other in SWAPPED:
         made.swap(one, other)
-    made.entry["views"]["c3"]["legs"] = [f"leg{j}" for j in range(1, 6)]
+    made.entry["views"]["c3"]["legs"] = [f"leg{j}" for j in (1, 3, 4, 5, 6)]
     made.write()
     return made
 
@@ -154,7 +158,7 @@ def test_nothing_else_is_said_and_the_other_images_are_used(
 ) -> None:
     notes = [note for note in detected.notes if not note.startswith(WITHOUT_GAMMA)]
     assert len(notes) == len(CHANGED) + 2 * len(SWAPPED) + 1
-    legs = "view c3: legs leaves out leg6, which its images show clearly; name them there to use"
+    legs = "view c3: legs leaves out leg2, which its images show clearly; name them there to use"
     assert [note.startswith(legs) for note in notes if ": legs " in note] == [True]
     assert detected.unplaced == {}
     named = "".join(detected.notes)
@@ -290,6 +294,20 @@ def test_radii_that_are_wrong_by_a_fifth_are_found(
     assert re.match(words, found.notes[0]), found.notes
     wrong = [c.radius for of_leg in observed.photographs.cylinders for c in of_leg]
     assert np.allclose(wrong, 0.01, rtol=0.06)
+
+
+def test_radii_of_parts_are_doubted_whose_outlines_are_not_found_where_they_can_be(
+    fitted: Calibration,
+) -> None:
+    legs, outlines = fitted.dataset.machine.legs, fitted.solution.outlines
+    assert _parts_not_found(legs, outlines) == []
+    own = outlines.leg == 2
+    (name,) = {outlines.part[k] for k in np.flatnonzero(own)}
+    doubted = [(2, legs[2].radius_of_part[name])]
+    for why, parts in (("edge hardly visible", doubted), ("too short, 17 px in the image", [])):
+        reason = np.where(own, why, outlines.reason).tolist()
+        lost = replace(outlines, used=outlines.used & ~own, reason=tuple(reason))
+        assert _parts_not_found(legs, lost) == parts
 
 
 def test_blur_is_measured_whatever_the_light() -> None:

@@ -26,7 +26,7 @@ from legcal.data import (
     no_outlines,
 )
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Cylinder, Machine
+from legcal.machine import Cylinder, Leg, Machine
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.detection import measure_outlines
 from legcal.perception.diagnostics import (
@@ -52,6 +52,7 @@ from legcal.vision import shared_cameras
 from legcal.workers import Run
 
 DETECTOR_VERSION = 2  # raise it whenever outlines or notes that are kept come out differently
+TOO_SHORT = "px in the image"  # end of the reason for parts that are not looked for
 MAX_USED_SHARE = 0.3  # of the outlines of a part that should be seen
 
 
@@ -172,7 +173,7 @@ def place_and_measure(
 
     placement = recognised()
     outlines, blur = _measured(photographs, search, placement, report, together=together)
-    suspects = _parts_not_found(photographs, outlines)
+    suspects = _parts_not_found(photographs.machine.legs, outlines)
     if suspects:
         other = recognised(suspects)
         if other.radii.factor:
@@ -306,12 +307,14 @@ def _inspect(
     return measure_exposure(image), pairs
 
 
-def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[LegRadius]:
+def _parts_not_found(legs: Sequence[Leg], outlines: Outlines) -> list[LegRadius]:
     """Return the parts of legs, by leg and radius, of which hardly an outline can be used.
 
-    One that is used although the width of its part is wrong supports no radius.
+    One that is used although the width of its part is wrong supports no radius; one that is too
+    short to be measured where it is predicted contradicts none.
     """
-    visible = is_visible(outlines)
+    too_short = np.array([why.endswith(TOO_SHORT) for why in outlines.reason], dtype=np.bool_)
+    visible = is_visible(outlines) & ~too_short
     which = list(zip(outlines.row.tolist(), outlines.leg.tolist(), outlines.part, strict=True))
     of_wrong_width = {
         one for one, why in zip(which, outlines.reason, strict=True) if why.startswith(WRONG_WIDTH)
@@ -319,7 +322,7 @@ def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[LegRa
     used = outlines.used & np.array([one not in of_wrong_width for one in which], dtype=np.bool_)
     part = np.array(outlines.part)
     parts = []
-    for j, leg in enumerate(photographs.machine.legs):
+    for j, leg in enumerate(legs):
         for link, radius in leg.radius_of_part.items():
             own = visible & (outlines.leg == j) & (part == link)
             is_seen = own.any() or not visible.any()
