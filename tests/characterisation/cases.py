@@ -42,6 +42,12 @@ class Case:
     files: tuple[tuple[str, str], ...] = ()  # written first: name, text
     slow: bool = False
 
+    @property
+    def is_rough(self) -> bool:
+        """Whether its numbers come from outlines that were searched in photographs."""
+        searched = "photographs" in self.input or self.input == "repeats"
+        return searched and not self.name.startswith("identify")
+
     def observe(self, folder: Path) -> dict[str, Any]:
         """Run it in an empty folder, and return all facts."""
         places: dict[str, Path | str] = {"out": folder / "out", "here": folder}

@@ -57,7 +57,7 @@ def test_commands_give_what_was_recorded(case: Case, tmp_path: Path) -> None:
         for part in expected.keys() - {"steps"}
         for line in differences(expected[part], found[part], NO_SCALE, f".{part}")
     ]
-    rough = "photographs" in case.name and case.name != "identify-photographs"
+    rough = case.is_rough
     scale = Scale({}, rough)
     for number, step in enumerate(expected.get("steps", [])):
         other = found["steps"][number]
