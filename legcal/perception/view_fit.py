@@ -35,7 +35,7 @@ from legcal.estimation import (
     information,
     linearize,
 )
-from legcal.geometry import Array, BoolArray, IntArray, whitener
+from legcal.geometry import Array, BoolArray, IntArray, cross, whitener
 from legcal.machine import main_cylinders
 from legcal.perception.detection import NOT_PLACED, measure_outlines
 from legcal.perception.outline import OUTSIDE
@@ -67,7 +67,6 @@ SHIFT_COST = (
 )
 MIN_EVIDENCE, MIN_EVIDENCE_OF_IMAGE = 8.0, 1.2  # of a group, and for each of its images
 EDGE_SIGMA = 0.3  # of an outline: what its covariance leaves out, as a wrong gamma [px]
-STEP = 1e-6  # of finite differences [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -431,17 +430,21 @@ def _offsets_of(
     the frame of the camera [m] and radii (n,), at two points (n, 2, 2) of the sensor plane with
     their :func:`_metric_of`.
     """
-    nudges = STEP * np.concatenate([np.zeros((1, 6)), np.eye(6)]).reshape(7, 1, 2, 3)
-    moved = X + nudges
-    u = moved[:, :, 1] - moved[:, :, 0]
+    A, B = X[:, 0], X[:, 1]
+    u = B - A
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
-    both = outlines_of_axis(u, moved[:, :, 0], radius)
-    h = both[:, np.arange(len(X)), edge]  # (7, n, 3)
-    value = np.einsum("knx,nex->kne", h[..., :2], ends) + h[..., 2:]
-    normal = np.einsum("nexy,kny->knex", metric, h[..., :2])
-    offset = value / np.linalg.norm(normal, axis=-1)
-    derivative = np.moveaxis((offset[1:] - offset[0]) / STEP, 0, -1)
-    return offset[0], derivative.reshape(-1, 2, 2, 3)
+    h = outlines_of_axis(u, A, radius)[np.arange(len(X)), edge]  # (n, 3)
+    value = np.einsum("nx,nex->ne", h[:, :2], ends) + h[:, 2:]
+    normal = np.einsum("nexy,ny->nex", metric, h[:, :2])
+    length = np.linalg.norm(normal, axis=-1)
+    offset = value / length
+    by_h = np.ones((len(X), 2, 3))
+    by_h[..., :2] = ends - (offset / length)[..., None] * np.einsum("nexy,nex->ney", metric, normal)
+    # A unit h with h.A = h.B = epsilon R stays one: dh = -(h.dA) a - (h.dB) b.
+    dual = np.stack([cross(B, h), cross(h, A)], axis=2)
+    dual /= np.sum(A * dual[..., 0], axis=1)[:, None, None]
+    along = (by_h @ dual) / length[..., None]  # (n, 2 points, A and B)
+    return offset, -along[..., None] * h[:, None, None]
 
 
 def _metric_of(camera: Camera, ends: Array) -> Array:
@@ -451,7 +454,7 @@ def _metric_of(camera: Camera, ends: Array) -> Array:
 
 def _derivatives_by(D: Array, from_centre: Array, R: Array) -> Array:
     """Return derivatives (n, 2, 15) from those by A and B in the frame of the group."""
-    turning = np.cross(from_centre[:, None], D).sum(axis=2)
+    turning = cross(from_centre[:, None], D).sum(axis=2)
     in_base = D @ R
     of_A, of_B = in_base[:, :, 0], in_base[:, :, 1]
     return np.concatenate([turning, D.sum(axis=2), of_A, of_B, of_B], axis=-1)
@@ -486,7 +489,7 @@ def refine_views(
     found = set(zip(again.row[again.used].tolist(), again.leg[again.used].tolist(), strict=True))
     kept = outlines.choose(~_among(outlines, found))
     outlines = join_outlines([kept, again.choose(_among(again, found))])
-    fits = _fits(search, groups, placement, outlines)
+    fits = _fits(search, groups, placement, outlines, fits, {row for row, _ in found})
     outlines, fits = _without_outliers(search, groups, placement, outlines, fits)
     placement = _without_weak_views(
         search, groups, _placed_by_fits(search, groups, placement, fits), fits
@@ -497,18 +500,21 @@ def refine_views(
 
 
 def _fits(
-    search: Search, groups: Sequence[Group], placement: Placement, outlines: Outlines
+    search: Search,
+    groups: Sequence[Group],
+    placement: Placement,
+    outlines: Outlines,
+    before: Fits,
+    changed: set[int],
 ) -> Fits:
-    """Return the fit of each group."""
-    fits: Fits = []
-    for group in groups:
+    """Return the fit of each group; those before stand where no row of a group has changed."""
+    fits = before.copy()
+    for g, group in enumerate(groups):
         v = group.views[0]
         T = placement.T_base_camera[v]
-        if T is None:
-            fits.append(None)
-            continue
-        T_base_group = T * group.T_group_camera[v].inv()
-        fits.append(fit_view(search, group, T_base_group, placement.shift[v], outlines))
+        if T is not None and not changed.isdisjoint(group.rows):
+            T_base_group = T * group.T_group_camera[v].inv()
+            fits[g] = fit_view(search, group, T_base_group, placement.shift[v], outlines)
     return fits
 
 
@@ -516,7 +522,8 @@ def _fits_or_reversed(
     search: Search, groups: Sequence[Group], placement: Placement, outlines: Outlines
 ) -> Fits:
     """Return fits, with near and far exchanged where outlines suit that better."""
-    fits = _fits(search, groups, placement, outlines)
+    every = {row for group in groups for row in group.rows}
+    fits = _fits(search, groups, placement, outlines, [None] * len(groups), every)
     for g, (group, fit) in enumerate(zip(groups, fits, strict=True)):
         if fit is None or len(group.views) > 1 or fit.is_good:
             continue
@@ -545,7 +552,7 @@ def _without_outliers(
         return outlines, fits
     out = _among(outlines, wrong) & ~is_edited(outlines)  # what people edited stays
     outlines = outlines.reject(out, DISAGREES)
-    return outlines, _fits(search, groups, placement, outlines)
+    return outlines, _fits(search, groups, placement, outlines, fits, {row for row, _ in wrong})
 
 
 def _placed_by_fits(
