@@ -1,5 +1,6 @@
 """The command line: parses, calls a job, prints its document or its report, returns a code."""
 
+import gc
 import sys
 
 from legcal.signals import stopped_by_signals
@@ -19,4 +20,5 @@ def main() -> None:
         print_failure("Interrupted", "Stopped before the end.", as_json=as_json)
         code = INTERRUPTED
         exec("")  # else Python, if interrupted in code from a text, ends as if nobody caught it
+    gc.freeze()  # the end of a process would search all that libraries made for dead cycles
     sys.exit(code)
