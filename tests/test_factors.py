@@ -394,7 +394,7 @@ def test_constraints_hold_at_every_state_that_the_solver_looks_at(
     problem = build_fit(session.legs, session.measurements, session.outlines)
     looked_at: list[State] = []
 
-    def watched(problem: FitProblem, state: State) -> object:
+    def watched(problem: FitProblem, state: State, known: object = None) -> object:
         looked_at.append(state)
         return linearize(problem, state)
 

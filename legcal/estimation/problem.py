@@ -125,8 +125,9 @@ class Residuals:
     """
 
     r: Array
-    slope: Array
+    unwhitened: Array  # slopes before ``whitening``, which is applied where they are needed
     chain: Callable[[Array], tuple[Array, Array]]
+    whitening: Array | None = None  # (q, q, n)
 
     @classmethod
     def of(cls, r: Array, J: Array, J_element: Array | None = None) -> Residuals:
@@ -135,6 +136,13 @@ class Residuals:
         return cls(
             r, np.concatenate([J, own], axis=-1), lambda slope: (slope[..., :m], slope[..., m:])
         )
+
+    @cached_property
+    def slope(self) -> Array:
+        """Slopes (n, q, l) of these residuals."""
+        if self.whitening is None:
+            return self.unwhitened
+        return np.asarray(np.einsum("ijn,ljn->lin", self.whitening, self.unwhitened.T).T)
 
     @cached_property
     def _derivatives(self) -> tuple[Array, Array]:
@@ -163,8 +171,7 @@ class Residuals:
             return Residuals(T[:, 0] * self.r, T * self.slope, self.chain)
         by_row = np.ascontiguousarray(T.transpose(1, 2, 0))
         r = np.einsum("ijn,jn->in", by_row, self.r.T)
-        slope = np.einsum("ijn,ljn->lin", by_row, self.slope.T)
-        return Residuals(r.T, slope.T, self.chain)
+        return Residuals(r.T, self.slope, self.chain, by_row)
 
     def stacked(self, order: IntArray | None) -> Array:
         """Return [J, r, J_element] of each measurement (n, q, m + 1 + d), in an order."""
@@ -530,29 +537,75 @@ class Problem(Generic[S]):
         return J
 
 
+class PriorRows(NamedTuple):
+    """Whitened priors of a block at a state."""
+
+    r: Array  # (n,)
+    # Derivatives by the unknowns of the block (n, n_unknowns), or by one unknown each (n,).
+    slope: Array
+    unknown: IntArray  # (n,) which, in x
+    first: int  # of the block's unknowns, in x
+
+
 @dataclass(frozen=True, eq=False)
 class Linearization:
     """Whitened residuals with derivatives of all factors and priors at a state."""
 
     rows: Mapping[str, Residuals]
-    prior_r: Array  # (n_priors,)
-    prior_J: Array  # (n_priors, n_kept)
+    priors: tuple[PriorRows, ...]  # of blocks that have any
+    n_kept: int
 
     def __getitem__(self, name: str) -> Residuals:
         return self.rows[name]
 
+    @cached_property
+    def prior_r(self) -> Array:
+        """Residuals of all priors, (n_priors,)."""
+        return np.concatenate([np.zeros(0), *(prior.r for prior in self.priors)])
 
-def linearize(problem: Problem[S], state: S) -> Linearization:
-    """Return whitened residuals and derivatives of a problem at a state."""
-    n = len(problem.priors.mean)
-    r, J, row, first = np.zeros(n), np.zeros((n, problem.n_kept)), 0, 0
+    @property
+    def prior_J(self) -> Array:
+        """Their derivatives, (n_priors, n_kept)."""
+        parts = [np.zeros((0, self.n_kept))]
+        for r, slope, unknown, first in self.priors:
+            part = np.zeros((len(r), self.n_kept))
+            if slope.ndim == 1:
+                part[np.arange(len(r)), unknown] = slope
+            else:
+                part[:, first : first + slope.shape[1]] = slope
+            parts.append(part)
+        return np.concatenate(parts)
+
+    def add_priors(self, U: Array, g: Array) -> None:
+        """Add the normal equations of all priors to sums (n_kept, n_kept) and (n_kept,)."""
+        for r, slope, unknown, first in self.priors:
+            if slope.ndim == 1:
+                np.add.at(U, (unknown, unknown), slope * slope)
+                np.add.at(g, unknown, slope * r)
+            else:
+                block = slice(first, first + slope.shape[1])
+                U[block, block] += slope.T @ slope
+                g[block] += slope.T @ r
+
+
+def linearize(
+    problem: Problem[S], state: S, known: Mapping[str, Residuals] | None = None
+) -> Linearization:
+    """Return whitened residuals and derivatives of a problem at a state.
+
+    *known* are rows of factors that were computed there already.
+    """
+    priors, first = [], 0
     for block in problem.variables:
         prior, size = block.prior, block.n_unknowns
         if len(prior.mean):
             value = getattr(state, block.name)
-            rows = slice(row, row := row + len(prior.mean))
-            r[rows] = (block.read(value)[prior.unknown] - prior.mean) / prior.sigma
-            by = np.eye(size) if block.jacobian is None else block.jacobian(value)
-            J[rows, first : first + size] = by[prior.unknown] / prior.sigma[:, None]
+            r = (block.read(value)[prior.unknown] - prior.mean) / prior.sigma
+            slope = 1.0 / prior.sigma
+            if block.jacobian is not None:
+                slope = block.jacobian(value)[prior.unknown] * slope[:, None]
+            priors.append(PriorRows(r, slope, first + prior.unknown, first))
         first += size
-    return Linearization({f.name: f.linearize(state) for f in problem.factors}, r, J)
+    known = {} if known is None else known
+    rows = {f.name: known.get(f.name) or f.linearize(state) for f in problem.factors}
+    return Linearization(rows, tuple(priors), problem.n_kept)

@@ -8,13 +8,14 @@ what the constraints leave (:class:`Tangent`), and every step ends with a projec
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Generic
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, null_space
+from scipy.linalg.lapack import dpotrf, dtrtri
 
 from legcal.errors import DidNotConverge
 from legcal.estimation.loss import LEAST_SQUARES, Loss, PseudoHuber
@@ -47,6 +48,7 @@ _DAMPING_DECAY = 0.3  # of a damping that failed, every step
 _MIN_ITERATIONS = 30  # before the relative tolerance counts
 _RANK_TOLERANCE = 1e-13  # eigenvalues below this part of the largest are rounding
 _MIN_PIVOT = 1e-9  # a scaled block with a pivot below may be singular
+_MANY = 16  # unknowns: larger matrices are inverted by their factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +71,7 @@ def minimise(
     tolerance: float = _COST_TOLERANCE,
     relative_tolerance: float = 0.0,
     must_converge: bool = True,
+    known: Mapping[str, Residuals] | None = None,
 ) -> Minimum[S]:
     """Minimise the robust cost from a state.
 
@@ -89,14 +92,16 @@ def minimise(
         the last steps are many and follow these.
     must_converge : bool
         Whether to refuse where the steps do not come to an end; else the best state is returned.
+    known : mapping, optional
+        Rows of factors at the start.
 
     Raises
     ------
     DidNotConverge
         If no step lowers the cost before it has converged, or after *max_iterations* steps.
     """
-    state = problem.projected(state)
-    linear = linearize(problem, state)
+    begin, state = state, problem.projected(state)
+    linear = linearize(problem, state, known if state is begin else None)
     wide = _widened(problem, linear, loss, np.inf)
     damping, failed, fall_before = _MIN_DAMPING if is_near else _FIRST_DAMPING, 0.0, np.inf
     cost, normal = robust_cost(problem, linear, wide), None
@@ -265,11 +270,14 @@ class NormalEquations:
 
     def kept_covariance(self) -> Array:
         """Return the inverse of the reduced matrix, held directions left out."""
-        R = self.reduced()
+        return self._kept_covariance
+
+    @cached_property
+    def _kept_covariance(self) -> Array:
         if len(self.held_directions) == 0:
-            return inverse_on_range(R)
+            return inverse_on_range(self._reduced)
         N = null_space(self.held_directions)
-        return np.asarray(N @ inverse_on_range(N.T @ R @ N) @ N.T)
+        return np.asarray(N @ inverse_on_range(N.T @ self._reduced @ N) @ N.T)
 
     def step(self, damping: float) -> tuple[Array, float]:
         """Return a Levenberg-Marquardt step (size,) and the predicted fall of the cost.
@@ -319,7 +327,7 @@ def normal_equations(
         rows = linear[factor.name]
         if factor.robust and np.isfinite(loss.width):
             rows = Residuals(*loss.softened(rows.r, rows.slope), rows.chain)
-        weighted[factor.name] = rows
+        weighted[factor.name] = rows, 1.0
     return _of_rows(problem, state, linear, weighted)
 
 
@@ -339,22 +347,25 @@ def information(
     for factor in problem.factors:
         if only is None or factor.name in only:
             rows = linear[factor.name]
+            kept = 1.0
             if factor.robust and np.isfinite(loss.width):
-                rows = rows.whitened(np.asarray(np.sqrt(loss.efficiency(factor.n_rows))))
-            weighted[factor.name] = rows
+                kept = loss.efficiency(factor.n_rows)
+            weighted[factor.name] = rows, kept
     return _of_rows(problem, state, linear, weighted)
 
 
 def _of_rows(
-    problem: Problem[S], state: S, linear: Linearization, weighted: dict[str, Residuals]
+    problem: Problem[S],
+    state: S,
+    linear: Linearization,
+    weighted: dict[str, tuple[Residuals, float]],  # and how much their squares count
 ) -> NormalEquations:
     """Return normal equations, with motions inside the constraints in place of elements."""
     places = problem.places
     U, W, V, g_kept, g_elements = _sums(
-        [(places[name], rows) for name, rows in weighted.items()], problem
+        [(places[name], rows, weight) for name, (rows, weight) in weighted.items()], problem
     )
-    U = U + linear.prior_J.T @ linear.prior_J
-    g_kept = g_kept + linear.prior_J.T @ linear.prior_r
+    linear.add_priors(U, g_kept)
     motion = None
     if problem.constraint is not None:
         motion = problem.constraint.tangent(problem, state)
@@ -372,13 +383,13 @@ def _of_rows(
 
 
 def _sums(
-    kinds: list[tuple[Places, Residuals]], problem: Problem[S]
+    kinds: list[tuple[Places, Residuals, float]], problem: Problem[S]
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the blocks U, W, V of J^T J and both parts of J^T r, all measurements added up."""
     n_kept, n_elements, d = problem.n_kept, problem.n_elements, problem.d_element
     squares = np.zeros((n_kept + 2, n_kept + 2))  # with one row of no unknown, and r as the last
     mixed: Array | None = None  # the same rows for each element, then those of the elements
-    for where, rows in kinds:
+    for where, rows, weight in kinds:
         if len(rows.r) == 0:
             continue
         groups, m = where.groups, where.columns.shape[1]
@@ -387,7 +398,7 @@ def _sums(
         flat, of_group = stacked.reshape(n * q, width)[:, : m + 1], []
         for start, end in groups.bounds:
             own = flat[q * start : q * end]
-            of_group.append(own.T @ own)
+            of_group.append(weight * (own.T @ own))
         last = np.full((len(where.columns), 1), n_kept + 1)
         columns = np.concatenate([where.columns, last], axis=1)
         np.add.at(squares, (columns[:, :, None], columns[:, None, :]), np.array(of_group))
@@ -395,12 +406,14 @@ def _sums(
             cells = stacked.reshape(n // groups.cell, groups.cell * q, width)
             products = np.swapaxes(cells, 1, 2) @ cells[:, :, m + 1 :]
             added = where.to_elements @ products.reshape(-1, d)
+            added *= weight
             mixed = added if mixed is None else np.add(mixed, added, out=mixed)
     if mixed is None:
         mixed = np.zeros(((n_kept + 2 + d) * n_elements, d))
     by_row = mixed.reshape(n_kept + 2 + d, n_elements, d)
     V = np.swapaxes(by_row[n_kept + 2 :], 0, 1).copy()
-    return squares[:n_kept, :n_kept], by_row[:n_kept], V, squares[:n_kept, -1], by_row[n_kept + 1]
+    U, g_kept = squares[:n_kept, :n_kept].copy(), squares[:n_kept, -1].copy()
+    return U, by_row[:n_kept], V, g_kept, by_row[n_kept + 1]
 
 
 def inverse_on_range(S: Array) -> Array:
@@ -410,17 +423,43 @@ def inverse_on_range(S: Array) -> Array:
     """
     if S.size == 0:
         return S.copy()
-    flat = S.reshape(-1, *S.shape[-2:])
-    scale = _scale(flat)
-    scaled = scale[:, :, None] * flat * scale[:, None, :]
-    inverse = np.empty_like(scaled)
+    scale = _scale(S)
+    scaled = scale[..., :, None] * S * scale[..., None, :]
+    if S.ndim == 2 and len(S) > _MANY:
+        inverse = _inverse_of_one(scaled)
+    else:
+        inverse = _inverses(scaled.reshape(-1, *S.shape[-2:])).reshape(S.shape)
+    inverse *= scale[..., :, None]
+    inverse *= scale[..., None, :]
+    return inverse
+
+
+def _inverses(scaled: Array) -> Array:
+    """Return the inverses on their range of matrices (k, n, n) of unit diagonal."""
     safe = _is_regular(scaled)
+    if safe.all():
+        return np.asarray(np.linalg.inv(scaled))
+    inverse = np.empty_like(scaled)
     inverse[safe] = np.linalg.inv(scaled[safe])
-    value, vector = np.linalg.eigh(scaled[~safe])
+    inverse[~safe] = _pseudoinverses(scaled[~safe])
+    return inverse
+
+
+def _inverse_of_one(scaled: Array) -> Array:
+    """Return the same of one large matrix, from the factor that says whether it is regular."""
+    U, failed = dpotrf(scaled.T)
+    if failed or np.diagonal(U).min() ** 2 <= _MIN_PIVOT:
+        return np.asarray(_pseudoinverses(scaled[None])[0])
+    root, _ = dtrtri(U, overwrite_c=True)
+    return np.asarray(root @ root.T)
+
+
+def _pseudoinverses(scaled: Array) -> Array:
+    """Return inverses on the range of any positive semidefinite matrices (k, n, n)."""
+    value, vector = np.linalg.eigh(scaled)
     kept = value > _RANK_TOLERANCE * value[..., -1:]
     reciprocal = np.where(kept, 1.0, 0.0) / np.where(kept, value, 1.0)
-    inverse[~safe] = (vector * reciprocal[..., None, :]) @ np.swapaxes(vector, -1, -2)
-    return np.asarray((scale[:, :, None] * inverse * scale[:, None, :]).reshape(S.shape))
+    return np.asarray((vector * reciprocal[..., None, :]) @ np.swapaxes(vector, -1, -2))
 
 
 def _is_regular(scaled: Array) -> BoolArray:

@@ -15,6 +15,7 @@ from legcal.estimation.problem import Linearization, Places, Problem, Residuals,
 from legcal.estimation.solver import NormalEquations, inverse_on_range, normal_equations
 from legcal.geometry import Array, IntArray
 
+_ROUNDING = 1e-12  # of information, in differences
 _MIN_COMPONENT = 0.3  # components of a direction that are named, relative to the largest
 
 
@@ -238,9 +239,14 @@ def scores_of_block(problem: Problem[S], state: S, name: str) -> tuple[Array, Ar
         inverse = N @ inverse_on_range(N.T @ R_others @ N) @ N.T
     else:
         inverse = inverse_on_range(R_others)
-    K = R[np.ix_(effects, effects)] - np.diag(of_prior) - R_mixed.T @ inverse @ R_mixed
-    # A difference of what nearly cancels where measurements determine little: rounded below zero.
-    eigenvalue, vector = np.linalg.eigh(0.5 * (K + K.T))
-    K = (vector * np.maximum(eigenvalue, 0.0)) @ vector.T
+    every = R[np.ix_(effects, effects)] - np.diag(of_prior)
+    K = every - R_mixed.T @ inverse @ R_mixed
+    K = 0.5 * (K + K.T)
+    try:
+        np.linalg.cholesky(K + _ROUNDING * np.diag(np.diagonal(every)))
+    except np.linalg.LinAlgError:
+        # A difference of what nearly cancels where measurements determine little.
+        eigenvalue, vector = np.linalg.eigh(K)
+        K = (vector * np.maximum(eigenvalue, 0.0)) @ vector.T
     left = g[effects] - of_prior * value - R_mixed.T @ inverse @ g[others]
     return K @ value - left, K
