@@ -50,31 +50,51 @@ class Effects:
 
     def log_likelihood(self, variances: Array) -> float:
         """Return the logarithm of the likelihood of variances (n_kinds,), 0 for none."""
-        some, root, L = self._factor(variances)
-        y = solve_triangular(L, root * self.z[some], lower=True, check_finite=False)
-        return float(0.5 * y @ y - np.log(np.diagonal(L)).sum())
+        return self.at(variances).log_likelihood
 
     def slope(self, variances: Array) -> tuple[Array, Array]:
         """Return its derivatives (n_kinds,) and their covariance (n_kinds, n_kinds)."""
-        some, root, L = self._factor(variances)
-        seen = root[:, None] * np.column_stack([self.K[some], self.z[some]])
-        seen = solve_triangular(L, seen, lower=True, check_finite=False)
-        found = np.column_stack([self.K, self.z]) - seen[:, :-1].T @ seen
-        left, y = found[:, :-1], found[:, -1]
-        of_kind = (self.kind == np.arange(self.n_kinds)[:, None]).astype(np.float64)
-        slope = 0.5 * of_kind @ (y**2 - np.diagonal(left))
-        return slope, np.asarray(0.5 * of_kind @ left**2 @ of_kind.T)
+        return self.at(variances).slope()
 
-    def _factor(self, variances: Array) -> tuple[IntArray, Array, Array]:
-        """Return the effects with a variance, its root, and L L^T = 1 + D^(1/2) K D^(1/2)."""
+    def at(self, variances: Array) -> EffectsAt:
+        """Return the effects at variances, L L^T = 1 + D^(1/2) K D^(1/2) of those that have one."""
         some = np.flatnonzero(variances[self.kind] > 0.0)
         root = np.asarray(np.sqrt(variances[self.kind[some]]))
         spread = root[:, None] * self.K[np.ix_(some, some)] * root
         L = np.asarray(np.linalg.cholesky(np.eye(len(some)) + spread), dtype=np.float64)
-        return np.asarray(some), root, L
+        y = solve_triangular(L, root * self.z[some], lower=True, check_finite=False)
+        return EffectsAt(self, some, root, L, y)
 
 
-def estimate_variances(effects: Effects, least_gain: float) -> tuple[Array, float]:
+@dataclass(frozen=True, eq=False)
+class EffectsAt:
+    """Random effects at some variances."""
+
+    effects: Effects
+    some: IntArray  # (s,) with a variance
+    root: Array  # (s,) of it
+    L: Array  # (s, s)
+    y: Array  # (s,) L^-1 D^(1/2) z
+
+    @property
+    def log_likelihood(self) -> float:
+        """The logarithm of their likelihood."""
+        return float(0.5 * self.y @ self.y - np.log(np.diagonal(self.L)).sum())
+
+    def slope(self) -> tuple[Array, Array]:
+        """Return its derivatives (n_kinds,) and their covariance (n_kinds, n_kinds)."""
+        effects = self.effects
+        seen = self.root[:, None] * effects.K[self.some]
+        seen = solve_triangular(self.L, seen, lower=True, check_finite=False)
+        left, y = effects.K - seen.T @ seen, effects.z - seen.T @ self.y
+        of_kind = (effects.kind == np.arange(effects.n_kinds)[:, None]).astype(np.float64)
+        slope = 0.5 * of_kind @ (y**2 - np.diagonal(left))
+        return slope, np.asarray(0.5 * of_kind @ np.square(left, out=left) @ of_kind.T)
+
+
+def estimate_variances(
+    effects: Effects, least_gain: float, start: Array | None = None
+) -> tuple[Array, float]:
     """Return the variances of random effects by restricted maximum likelihood.
 
     Parameters
@@ -83,6 +103,8 @@ def estimate_variances(effects: Effects, least_gain: float) -> tuple[Array, floa
     least_gain : float
         Twice the log-likelihood that the variances must gain over no effects at all; with less,
         all of them are zero.
+    start : (n_kinds,) array, optional
+        Variances nearby; none at all without it, or where it is less likely.
 
     Returns
     -------
@@ -91,22 +113,28 @@ def estimate_variances(effects: Effects, least_gain: float) -> tuple[Array, floa
     gain : float
         Twice the log-likelihood gained.
     """
-    variances, best = np.zeros(effects.n_kinds), 0.0
+    variances = np.zeros(effects.n_kinds)
+    best = effects.at(variances)
+    if start is not None and start.any():
+        near = effects.at(start)
+        if near.log_likelihood > best.log_likelihood:
+            variances, best = start, near
     for _ in range(_MAX_STEPS):
-        slope, information = effects.slope(variances)
+        slope, information = best.slope()
         step = _step(slope, information, variances > 0.0)
         before = best
         for halving in range(_HALVINGS):
             trial = np.maximum(variances + 0.5**halving * step, 0.0)
-            likelihood = effects.log_likelihood(trial)
-            if likelihood >= best:
-                variances, best = trial, likelihood
+            there = effects.at(trial)
+            if there.log_likelihood >= best.log_likelihood:
+                variances, best = trial, there
                 break
+        gained = best.log_likelihood - before.log_likelihood
         # Even steps like this to the end would not gain enough.
-        hopeless = best < 0.25 * least_gain and best - before < least_gain / (8.0 * _MAX_STEPS)
-        if best - before < _CONVERGED or hopeless:
+        hopeless = gained < least_gain / (8.0 * _MAX_STEPS)
+        if gained < _CONVERGED or (hopeless and best.log_likelihood < 0.25 * least_gain):
             break
-    gain = 2.0 * best
+    gain = 2.0 * best.log_likelihood
     return (variances if gain > least_gain else np.zeros_like(variances)), gain
 
 

@@ -156,13 +156,14 @@ def estimate_noise(offsets: Array, explained: Array, claimed: Array) -> NoiseMod
     -------
     NoiseModel
     """
-    moments = offsets.T[:, None] * offsets.T + explained.transpose(1, 2, 0)
-    claimed = np.ascontiguousarray(claimed.transpose(1, 2, 0))
+    moments = _turned(offsets[:, :, None] * offsets[:, None] + explained)
+    claimed = _turned(claimed)
     best = _fitted(moments, claimed, bias=False, tilt=False)
     for _ in range(2):
+        has = best.bias_px > 0.0, best.tilt_px > 0.0
         wider = [
-            _fitted(moments, claimed, bias=bias, tilt=tilt)
-            for bias, tilt in ((True, best.tilt_px > 0.0), (best.bias_px > 0.0, True))
+            best if kinds == has else _fitted(moments, claimed, bias=kinds[0], tilt=kinds[1])
+            for kinds in ((True, has[1]), (has[0], True))
         ]
         gains = [_likelihood(noise, moments, claimed) for noise in wider]
         gain = 2.0 * (max(gains) - _likelihood(best, moments, claimed))
@@ -172,56 +173,83 @@ def estimate_noise(offsets: Array, explained: Array, claimed: Array) -> NoiseMod
     return best
 
 
+def _turned(C: Array) -> Array:
+    """Return matrices (n, 2, 2) of both ends by their sum and difference over sqrt 2.
+
+    Symmetric ones are their three numbers, (3, n): bias and tilt add to the first and the last.
+    """
+    mean, mixed = 0.5 * (C[:, 0, 0] + C[:, 1, 1]), 0.5 * (C[:, 0, 1] + C[:, 1, 0])
+    return np.stack([mean + mixed, 0.5 * (C[:, 1, 1] - C[:, 0, 0]), mean - mixed])
+
+
 def _fitted(moments: Array, claimed: Array, *, bias: bool, tilt: bool) -> NoiseModel:
     """Return the noise of these kinds with the largest likelihood, by Fisher's scoring.
 
-    *moments* and *claimed* are (2, 2, n).
+    *moments* and *claimed* are (3, n) of :func:`_turned`.
     """
-    modes = [_SUM] * bias + [_DIFFERENCE] * tilt
-    shapes = [claimed]
-    shapes += [np.broadcast_to(np.outer(m, m)[..., None], claimed.shape) for m in modes]
-    variances = np.zeros(len(shapes))
-    share = _product(_inverted(claimed)[0], moments) / claimed.shape[-1]
+    kinds = [True, bias, tilt]
+    shapes = [s for s, is_one in zip((claimed, *_ADDED), kinds, strict=True) if is_one]
+    variances, least = np.zeros(3), np.array([_MIN_SCALE**2, 0.0, 0.0])
+    share = _product(_inverted(claimed)[0], moments) / claimed.shape[1]
     variances[0] = max(0.5 * share, _MIN_SCALE**2)
-    least = np.array([_MIN_SCALE**2, 0.0, 0.0])[: len(shapes)]
-    for _ in range(_MAX_ITERATIONS if modes else 0):
-        covariance = sum(v * shape for v, shape in zip(variances, shapes, strict=True))
-        inverse, _ = _inverted(np.asarray(covariance))
-        weighted = [_times(inverse, shape) for shape in shapes]
-        weighted_moments = _times(inverse, moments)
-        information = np.array([[_product(a, b) for b in weighted] for a in weighted])
-        right = np.array([_product(a, weighted_moments) for a in weighted])
+    k, n = len(shapes), claimed.shape[1]
+    wanted = [_pairs(a, b) for i, a in enumerate(shapes) for b in (moments, *shapes[: i + 1])]
+    coefficients = np.stack(np.broadcast_arrays(*wanted)).reshape(len(wanted), 6 * n)
+    for _ in range(_MAX_ITERATIONS if bias or tilt else 0):
+        a, b, c = _inverted(_covariance(variances, claimed))[0]
+        squares = np.stack([a * a, a * b, b * b, a * c + b * b, b * c, c * c])
+        sums = iter((coefficients @ squares.reshape(6 * n)).tolist())
+        right, information = np.zeros(k), np.zeros((k, k))
+        for i in range(k):
+            right[i] = next(sums)
+            for j in range(i + 1):
+                information[i, j] = information[j, i] = next(sums)
         found = np.linalg.lstsq(information, right, rcond=_RANK)[0]
-        before, variances = variances, np.maximum(found, least)
-        if np.allclose(
-            variances, before, rtol=_VARIANCE_TOLERANCE, atol=_VARIANCE_TOLERANCE * variances[0]
-        ):
+        before, variances = variances, variances.copy()
+        variances[kinds] = np.maximum(found, least[kinds])
+        if np.abs(variances - before).max() <= _VARIANCE_TOLERANCE * variances.max():
             break
-    sigma = np.sqrt(variances).tolist()
-    return NoiseModel(sigma[0], sigma[1] if bias else 0.0, sigma[-1] if tilt else 0.0)
+    return NoiseModel(*np.sqrt(variances).tolist())
+
+
+# By sum and difference: what one unit of bias and of tilt adds.
+_ADDED = (np.array([[2.0], [0.0], [0.0]]), np.array([[0.0], [0.0], [2.0]]))
+
+
+def _covariance(variances: Array, claimed: Array) -> Array:
+    """Return covariances (3, n) of variances: of the scale, bias and tilt."""
+    covariance = variances[0] * claimed
+    covariance[0] += 2.0 * variances[1]
+    covariance[2] += 2.0 * variances[2]
+    return np.asarray(covariance)
+
+
+def _pairs(X: Array, Y: Array) -> Array:
+    """Return what trace(S X S Y) has of the products of the numbers (a, b, c) of S, (6, n).
+
+    Those are a a, a b, b b, a c + b b, b c, and c c; all matrices are (3, n).
+    """
+    (x, xy, y), (u, uv, v) = X, Y
+    first, last = 2.0 * (x * uv + xy * u), 2.0 * (xy * v + y * uv)
+    return np.array([x * u, first, x * v + y * u, 2.0 * xy * uv, last, y * v])
 
 
 def _inverted(C: Array) -> tuple[Array, Array]:
-    """Return the inverses of matrices (2, 2, n), and their determinants (n,)."""
-    (a, b), (c, d) = C
-    determinant = a * d - b * c
-    return np.stack([np.stack([d, -b]), np.stack([-c, a])]) / determinant, determinant
+    """Return the inverses of matrices (3, n), and their determinants (n,)."""
+    a, b, c = C
+    determinant = a * c - b * b
+    return np.stack([c, -b, a]) / determinant, determinant
 
 
-def _times(a: Array, b: Array) -> Array:
-    """Return the products of matrices (2, 2, n)."""
-    return np.asarray(np.einsum("ijn,jkn->ikn", a, b))
-
-
-def _product(a: Array, b: Array) -> float:
-    """Return the sum of the traces of the products of matrices (2, 2, n)."""
-    return float(np.einsum("ijn,jin->", a, b))
+def _product(X: Array, Y: Array) -> float:
+    """Return the sum of the traces of the products of matrices (3, n)."""
+    return float(np.vdot(X, Y) + np.vdot(X[1], Y[1]))
 
 
 def _likelihood(noise: NoiseModel, moments: Array, claimed: Array) -> float:
-    """Return the logarithm of the likelihood of second moments (2, 2, n) [px^2]."""
-    covariance = noise.covariance(claimed.transpose(2, 0, 1)).transpose(1, 2, 0)
-    inverse, determinant = _inverted(covariance)
+    """Return the logarithm of the likelihood of second moments (3, n) [px^2]."""
+    variances = np.array([noise.scale, noise.bias_px, noise.tilt_px]) ** 2
+    inverse, determinant = _inverted(_covariance(variances, claimed))
     return -0.5 * (float(np.sum(np.log(determinant))) + _product(inverse, moments))
 
 
@@ -370,16 +398,22 @@ def possible_biases(
 
 
 def estimated_biases(
-    possible: EdgeBiases, z: Array, K: Array, least: Array | float = 0.0
+    possible: EdgeBiases,
+    z: Array,
+    K: Array,
+    least: Array | float = 0.0,
+    near: EdgeBiases | None = None,
 ) -> EdgeBiases:
     """Return the biases that the residuals show: none at all where they are white.
 
     *z* (b,) and *K* (b, b) are scores of all of them and their covariance (:class:`Effects`);
     *least* (N_KINDS,) are standard deviations known from elsewhere, where the residuals show less
-    [px]. That of a gamma is known, whatever the residuals show.
+    [px]. That of a gamma is known, whatever the residuals show. Those of an earlier fit are *near*.
     """
     sigma = np.zeros(N_KINDS)
-    variances, _ = estimate_variances(Effects(z, K, possible.kind), _MIN_BIAS_GAIN)
+    effects = Effects(z, K, possible.kind)
+    start = None if near is None else near.sigma[: effects.n_kinds] ** 2
+    variances, _ = estimate_variances(effects, _MIN_BIAS_GAIN, start)
     sigma[: len(variances)] = np.sqrt(variances)
     return possible.of_sizes(with_gamma(np.maximum(sigma, least)))
 
