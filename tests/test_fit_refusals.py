@@ -191,7 +191,7 @@ def test_the_start_of_the_lowest_cost_is_refined_wherever_it_stands(
     unwatched = fit._first
 
     def with_cost(problem: FitProblem, start: Start, settings: RefinementSettings) -> object:
-        return unwatched(problem, start, settings)[0], costs[start.label]
+        return replace(unwatched(problem, start, settings), cost=costs[start.label])
 
     monkeypatch.setattr(fit, "_first", with_cost)
     found = refine_from_best(session.legs, session.measurements, session.outlines, starts)

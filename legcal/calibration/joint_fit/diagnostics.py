@@ -96,7 +96,7 @@ def refuse_other_board(
             continue
         choices = replace(problem.choices, free=problem.choices.free | {BOARD_SCALE})
         try:
-            free = first_minimum(problem.with_choices(choices, settings), state, settings)
+            free = first_minimum(problem.with_choices(choices, settings), state, settings=settings)
             size = f"{free.state.board_scale[0]:.4g} times as large as"
         except (DidNotConverge, NotIdentifiable):
             size = "of another size than"
@@ -256,13 +256,13 @@ def _fitted(
     problem: FitProblem, state: State, settings: RefinementSettings
 ) -> tuple[Fit, HeldDirections]:
     """Return the fit with what was fixed free, and what it holds."""
-    first = first_minimum(problem, state, settings)
+    first = first_minimum(problem, state, settings=settings)
     normal = information(problem, first.state, first.linear, PseudoHuber(settings.loss_width))
     held = open_directions(problem, first.state, normal)
     state = first.state
     if len(held.basis):
         problem, state = held_at_nominal(problem, state, held)
-        state = first_minimum(problem, state, settings).state
+        state = first_minimum(problem, state, settings=settings).state
     return fit_in_rounds(problem, state, first.iterations, settings), held
 
 

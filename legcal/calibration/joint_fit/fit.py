@@ -7,7 +7,7 @@ noise of outlines is estimated, outlines that disagree are rejected, and the res
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from legcal.calibration.joint_fit.determinacy import (
     held_at_nominal,
@@ -26,7 +26,7 @@ from legcal.calibration.joint_fit.outline_errors import NoiseModel, noise_of_the
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.rounds import first_minimum, fit_in_rounds
-from legcal.calibration.joint_fit.solution import Solution, assemble_solution, comparable_cost
+from legcal.calibration.joint_fit.solution import Solution, assemble_solution
 from legcal.calibration.joint_fit.variables import (
     DEFAULT_SETTINGS,
     FittedLegs,
@@ -39,6 +39,7 @@ from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation import (
     Minimum,
     PseudoHuber,
+    Residuals,
     information,
     linearize,
     named_covariance,
@@ -98,7 +99,7 @@ def refine(
     problem = build_fit(
         legs, measurements, outlines, settings, axes=axes, board=board, choices=choices
     )
-    minimum, _ = _first(problem, start, settings)
+    minimum = _first(problem, start, settings)
     return _refined(problem, outlines, start, minimum, settings)
 
 
@@ -126,21 +127,22 @@ def refine_from_best(
     problem = build_fit(
         legs, measurements, outlines, settings, axes=axes, board=board, choices=choices
     )
-    candidates: list[tuple[Start, Minimum[State], float]] = []
+    candidates: list[tuple[Start, Minimum[State]]] = []
     notes: list[str] = []
     failures: list[LegcalError] = []
     for start in starts:
         try:
-            minimum, cost = _first(problem, start, settings)
+            minimum = _first(problem, start, settings)
         except (DidNotConverge, NotIdentifiable) as failure:
             failures.append(failure)
             notes.append(f"The start {start.label} was skipped. {failure}")
             continue
         if len(starts) > 1:
-            notes.append(f"The start {start.label} led to a cost of {cost:.6g}.")
-        place = sum(other <= (1.0 + _COST_TOLERANCE) * cost for _, _, other in candidates)
-        candidates.insert(place, (start, minimum, cost))
-    for start, minimum, _ in candidates:
+            notes.append(f"The start {start.label} led to a cost of {minimum.cost:.6g}.")
+        least = (1.0 + _COST_TOLERANCE) * minimum.cost
+        place = sum(other.cost <= least for _, other in candidates)
+        candidates.insert(place, (start, minimum))
+    for start, minimum in candidates:
         try:
             found = _refined(problem, outlines, start, minimum, settings)
         except (DidNotConverge, NotIdentifiable) as failure:
@@ -156,29 +158,30 @@ def refine_from_best(
     )
 
 
-def _first(
-    problem: FitProblem, start: Start, settings: RefinementSettings
-) -> tuple[Minimum[State], float]:
-    """Return the first minimum that a start leads to, and its comparable cost."""
+def _first(problem: FitProblem, start: Start, settings: RefinementSettings) -> Minimum[State]:
+    """Return the first minimum that a start leads to."""
     begin = problem.begin(start)
     try:
-        found = first_minimum(*_held_at_start(problem, begin), settings)
+        return first_minimum(*_held_at_start(problem, begin), settings=settings)
     except DidNotConverge as failure:
         refuse_contradicted_values(problem, start, begin, settings, with_priors=True)
         _refuse_undetermined(problem, begin)
         raise naming_stated_values(problem, failure) from None
-    return found, comparable_cost(problem, found.state, settings)
 
 
-def _held_at_start(problem: FitProblem, begin: State) -> tuple[FitProblem, State]:
-    """Return problem and state with directions held that are open at the start."""
+def _held_at_start(
+    problem: FitProblem, begin: State
+) -> tuple[FitProblem, State, Mapping[str, Residuals] | None]:
+    """Return problem and state with directions held that are open at the start, and known rows."""
     begin = problem.projected(begin)
     linear = linearize(problem, begin)
     try:
         held = open_directions(problem, begin, information(problem, begin, linear))
     except NotIdentifiable:  # by accident of the start, or to be said of the minimum
-        return problem, begin
-    return held_at_nominal(problem, begin, held) if len(held.basis) else (problem, begin)
+        return problem, begin, linear.rows
+    if len(held.basis):
+        return *held_at_nominal(problem, begin, held), None
+    return problem, begin, linear.rows
 
 
 def _refined(
@@ -198,7 +201,7 @@ def _refined(
     try:
         if len(held.basis):
             problem, state = held_at_nominal(problem, state, held)
-            there = first_minimum(problem, state, settings)
+            there = first_minimum(problem, state, settings=settings)
             state, iterations = there.state, iterations + there.iterations
         fit = fit_in_rounds(problem, state, iterations, settings)
         normal = information(fit.problem, fit.state, fit.minimum.linear, loss)

@@ -7,8 +7,8 @@ fitted again, until these converge.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -29,8 +29,10 @@ from legcal.calibration.joint_fit.variables import RefinementSettings, State
 from legcal.errors import DidNotConverge
 from legcal.estimation import (
     GaussianPrior,
+    Linearization,
     Minimum,
     PseudoHuber,
+    Residuals,
     explained_share,
     information,
     linearize,
@@ -72,14 +74,18 @@ class Fit:
 
 
 def first_minimum(
-    problem: FitProblem, begin: State, settings: RefinementSettings
+    problem: FitProblem,
+    begin: State,
+    known: Mapping[str, Residuals] | None = None,
+    *,
+    settings: RefinementSettings,
 ) -> Minimum[State]:
     """Solve with all observations and claimed covariances, regularised towards the nominal model.
 
     Steps along open directions cost nothing, and without a hold they go on: axes of a 3-UPU that
     only translates end half a radian off, where other directions seem to be known. No nominal
     model is wrong by a large part of a leg. The cost and the derivatives that are returned are
-    without that knowledge.
+    without that knowledge. *known* are rows of factors at the begin, with claimed covariances.
     """
     problem, loss = problem.weighted(NoiseModel()), PseudoHuber(settings.loss_width)
     legs, n = problem.legs, problem.n_kinematic
@@ -96,8 +102,9 @@ def first_minimum(
         max_iterations=settings.max_iterations,
         tolerance=_PASSING,
         relative_tolerance=_REJECTION_TOLERANCE,
+        known=known,
     )
-    linear = linearize(problem, found.state)
+    linear = linearize(problem, found.state, found.linear.rows)
     return Minimum(found.state, linear, robust_cost(problem, linear, loss), found.iterations)
 
 
@@ -123,12 +130,19 @@ def fit_in_rounds(
     biases = possible.of_sizes(with_gamma(np.zeros(N_KINDS)))
     problem, state = with_edge_biases(problem, first, biases)
 
-    def solved(*, passing: bool = False) -> tuple[FitProblem, Minimum[State]]:
+    def solved(relative_tolerance: float = 0.0) -> tuple[FitProblem, Minimum[State]]:
+        """Pass through the minimum with this noise and these outlines."""
         weighted, loss = problem.weighted(noise, accepted), PseudoHuber(settings.loss_width)
-        solve = partial(minimise, is_near=True, max_iterations=settings.max_iterations)
-        if passing:
-            solve = partial(solve, tolerance=_PASSING, relative_tolerance=_REJECTION_TOLERANCE)
-        return weighted, solve(weighted, state, loss)
+        found = minimise(
+            weighted,
+            state,
+            loss,
+            is_near=True,
+            max_iterations=settings.max_iterations,
+            tolerance=_PASSING,
+            relative_tolerance=relative_tolerance,
+        )
+        return weighted, found
 
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before = accepted
@@ -136,17 +150,18 @@ def fit_in_rounds(
         accepted = _accepted(problem, state, noise, settings)
         if np.array_equal(before, accepted):
             break
-        problem, minimum = solved(passing=True)
+        problem, minimum = solved(_REJECTION_TOLERANCE)
         state, iterations = minimum.state, iterations + minimum.iterations
     _refuse_disagreement(problem.offsets(state), accepted, settings)
     for _ in range(_BOARD_ROUNDS if len(problem.corners) else 0):
         problem = _with_judged_corners(problem.weighted(noise, accepted), state, settings)
-        problem, minimum = solved(passing=True)
+        problem, minimum = solved(_REJECTION_TOLERANCE)
         state, iterations = minimum.state, iterations + minimum.iterations
     with_possible, changes = problem.with_biases(possible), NO_CHANGES
+    linear = None
     for _ in range(settings.noise_rounds if len(claimed) else 1):
         errors_before, accepted_before = _sizes(noise, biases), accepted
-        noise = _noise(problem, state, noise, accepted, settings)
+        noise = _noise(problem.weighted(noise, accepted), state, linear, noise, accepted, settings)
         accepted = _accepted(problem, state, noise, settings)
         problem, minimum = solved()
         state, iterations = minimum.state, iterations + minimum.iterations
@@ -154,16 +169,26 @@ def fit_in_rounds(
             break
         there = replace(state, biases=_values(problem, state, possible))
         scores = scores_of_block(with_possible.weighted(noise, accepted), there, "biases")
-        biases = estimated_biases(possible, *scores, least)
+        biases = estimated_biases(possible, *scores, least, near=biases)
         if len(biases) or len(state.biases):
             problem, state = with_edge_biases(problem, state, biases)
             problem, minimum = solved()
             state, iterations = minimum.state, iterations + minimum.iterations
+        linear = minimum.linear
         errors = _sizes(noise, biases)
         n_changed = int(np.sum(accepted != accepted_before))
         changes = Changes(errors_before, errors, n_changed, int(accepted.sum()))
         if changes.converged(settings):
             break
+    minimum = minimise(
+        problem,
+        state,
+        PseudoHuber(settings.loss_width),
+        is_near=True,
+        max_iterations=settings.max_iterations,
+        known=minimum.linear.rows,
+    )
+    state, iterations = minimum.state, iterations + minimum.iterations
     _refuse_disagreement(problem.offsets(state), accepted, settings)
     wrong = int(np.sum(minimum.linear["axes"].squared_norms > settings.axis_disagreement**2))
     if 2 * wrong > len(problem.axes):
@@ -194,16 +219,16 @@ def _values(problem: FitProblem, state: State, biases: EdgeBiases) -> Array:
 def _noise(
     problem: FitProblem,
     state: State,
+    linear: Linearization | None,
     noise: NoiseModel,
     accepted: BoolArray,
     settings: RefinementSettings,
 ) -> NoiseModel:
-    """Return the noise of the accepted outlines at a fit."""
+    """Return the noise of the accepted outlines at a fit with another noise."""
     if not accepted.any():
         return noise
     claimed = problem.outlines.covariance
-    problem = problem.weighted(noise, accepted)
-    linear = linearize(problem, state)
+    linear = linearize(problem, state) if linear is None else linear
     normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
     L = np.linalg.cholesky(noise.covariance(claimed))
     share = explained_share(problem, linear, normal, "outlines")
