@@ -25,7 +25,14 @@ SCALES = (0.95, 2.5)  # at which slopes are compared, standard deviations [px]
 _BLUR_OF_HALF = 0.5 * math.sqrt(SCALES[1] ** 2 - 4.0 * SCALES[0] ** 2 - 0.25)
 STRIDE = 6  # every such row and column is enough for percentiles
 _SMOOTH, _SLOPE = (1.0, 4.0, 6.0, 4.0, 1.0), (1.0, 2.0, 0.0, -2.0, -1.0)  # Sobel's, of 5 pixels
+_SQUARE = np.ones((3, 3), dtype=np.uint8)
 AROUND = 2  # how far from the middle of a coarse edge the fine one may be [px]
+_REACH = AROUND + len(_SMOOTH) // 2
+_ROWS, _COLUMNS = np.ogrid[: 2 * _REACH + 2, : 2 * _REACH + 2]
+_SMOOTHED, _SLOPES = (  # of a row of pixels, without the ends
+    np.stack([np.convolve(one, taps, "valid") for one in np.eye(len(_ROWS))]).astype(np.float32)
+    for taps in (_SMOOTH, _SLOPE)
+)
 MARGIN = 3  # of the image of half the size, beyond which edges do not count [px]
 DIRECTIONS = 4  # of edges: what moves is blurred in one
 WEAK = 70.0  # percentile of the slopes from which on a place may be an edge
@@ -78,17 +85,17 @@ def _tails(grey: Grey) -> tuple[float, float]:
 def _blur(grey: Grey, half: Grey) -> float:
     """Return the blur of sharp edges [px] of an image, in all directions but one."""
     coarse, row, column, angle = _edges(half)
-    direction = np.rint(angle / (np.pi / DIRECTIONS)).astype(np.intp) % DIRECTIONS
+    direction = np.rint(angle / np.float32(np.pi / DIRECTIONS)).astype(np.int8) % DIRECTIONS
     least = max(MIN_EDGES, int(MIN_EDGES_PART * len(coarse)))  # else they are corners of others
-    blurs = []
-    for d in range(DIRECTIONS):
-        own = np.flatnonzero(direction == d)
-        if len(own) >= least:
-            strong = own[_strongest(coarse[own])]
-            fine = _greatest_slopes(grey, 2 * row[strong], 2 * column[strong])
-            blurs.append(_blur_of(fine / coarse[strong]))
+    of_directions = [np.flatnonzero(direction == d) for d in range(DIRECTIONS)]
+    strong = [own[_strongest(coarse[own])] for own in of_directions if len(own) >= least]
+    if not strong:
+        return 0.0
+    every = np.concatenate(strong)
+    ratios = _greatest_slopes(grey, 2 * row[every], 2 * column[every]) / coarse[every]
+    blurs = [_blur_of(own) for own in np.split(ratios, np.cumsum([len(one) for one in strong]))[:-1]]
     # Shades of one direction may be soft everywhere; what moves is sharp in one direction only.
-    return sorted(blurs)[min(1, len(blurs) - 1)] if blurs else 0.0
+    return sorted(blurs)[min(1, len(blurs) - 1)]
 
 
 def _edges(half: Grey) -> tuple[Grey, IntArray, IntArray, Grey]:
@@ -103,29 +110,26 @@ def _edges(half: Grey) -> tuple[Grey, IntArray, IntArray, Grey]:
     k = int(0.01 * WEAK * (len(few) - 1))
     weak = np.partition(few, k)[k]
     # Beside the middle of an edge the ratio of slopes says nothing.
-    edge = coarse >= np.maximum(cv2.dilate(coarse, np.ones((3, 3), np.uint8)), weak)
+    around = cv2.dilate(coarse, _SQUARE)
+    edge = coarse >= cv2.max(around, float(weak))
     edge[:MARGIN] = edge[-MARGIN:] = edge[:, :MARGIN] = edge[:, -MARGIN:] = False
-    row, column = np.nonzero(edge)
-    of_edges = np.maximum(0.5 * coarse[edge], np.float32(1e-3))
-    return of_edges, row, column, np.arctan2(y[edge], x[edge])
+    at = np.flatnonzero(edge)
+    row, column = np.divmod(at, half.shape[1])
+    of_edges = np.maximum(0.5 * coarse.take(at), np.float32(1e-3))
+    return of_edges, row, column, np.arctan2(y.take(at), x.take(at))
 
 
 def _strongest(slope: Grey) -> BoolArray:
     """Return which edges of a direction count."""
-    least = np.partition(slope, -MIN_EDGES)[-MIN_EDGES]
-    return np.asarray(slope >= min(float(least), float(np.percentile(slope, STRONG))))
+    k = min(len(slope) - MIN_EDGES, math.ceil(0.01 * STRONG * (len(slope) - 1)))
+    return np.asarray(slope >= np.partition(slope, k)[k])
 
 
 def _greatest_slopes(grey: Grey, row: IntArray, column: IntArray) -> Grey:
     """Return the greatest slopes (n,) of an image within two pixels of squares of four pixels."""
-    n = 2 + 2 * AROUND + len(_SMOOTH) - 1
-    reach = np.arange(n) - AROUND - len(_SMOOTH) // 2
-    square = grey[row[:, None, None] + reach[:, None], column[:, None, None] + reach]
-    smooth, slope = (
-        np.stack([np.convolve(one, taps, "valid") for one in np.eye(n)]).astype(np.float32)
-        for taps in (_SMOOTH, _SLOPE)
-    )
-    x, y = smooth.T @ square @ slope, slope.T @ square @ smooth
+    corner = (row - _REACH) * grey.shape[1] + (column - _REACH)
+    square = grey.ravel().take(corner[:, None, None] + _ROWS * grey.shape[1] + _COLUMNS)
+    x, y = _SMOOTHED.T @ square @ _SLOPES, _SLOPES.T @ square @ _SMOOTHED
     return np.asarray(np.sqrt((x * x + y * y).max(axis=(1, 2))))
 
 
