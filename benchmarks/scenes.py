@@ -37,7 +37,7 @@ from legcal.geometry.types import Array, Image
 from legcal.perception.camera_search import NOMINAL_JOINT_ERROR, place_camera, refined, scores
 from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
 from legcal.perception.detection import measure_outlines
-from legcal.perception.pair_matching import CameraPoses, Picture, leg_segments
+from legcal.perception.pair_matching import CameraPoses, Picture, Pictures, leg_segments
 from legcal.perception.placement import Placement, Search, group_views
 from legcal.perception.recognition import recognise
 from legcal.perception.view_fit import refine_views
@@ -149,8 +149,9 @@ def has_doubt(scene: Scene) -> bool:
     T = truth.T_base_camera.inv()
     true = CameraPoses.rigid(T.rotation.as_matrix()[None], T.translation[None], n_legs)
     others = place_camera(pictures, n_legs).poses
-    poses = refined(pictures, CameraPoses.joined([true, others]), IDEAL, NOMINAL_JOINT_ERROR)
-    support = scores(pictures, poses, IDEAL[-1])
+    every = Pictures.of(pictures)
+    poses = refined(every, CameraPoses.joined([true, others]), IDEAL, NOMINAL_JOINT_ERROR)
+    support = scores(every, poses, IDEAL[-1])
     apart = [not _same(_pose(poses, i), truth.T_base_camera) for i in range(len(poses))]
     return bool(np.max(support[apart], initial=0.0) >= AS_WELL * support[0])
 

@@ -26,7 +26,9 @@ from legcal.perception.camera_search import (
 )
 from legcal.perception.pair_matching import (
     CameraPoses,
+    PairMatches,
     Picture,
+    Pictures,
     _equations,
     _moved,
     depth_reversed,
@@ -102,7 +104,7 @@ def test_hypotheses_move_with_the_frame_of_the_machine_and_put_two_legs_on_pairs
     (picture,), _ = _scene(4, 5, 1)
     moved = _moved_machine(picture, MOTION)
     one, two = pose_hypotheses(picture, 5), pose_hypotheses(moved, 5)
-    scores = [match_pairs(p, s, 0.05).score for p, s in ((picture, one), (moved, two))]
+    scores = [_matched(p, s, 0.05).score for p, s in ((picture, one), (moved, two))]
     assert np.mean((scores[0] > 0.1).sum(axis=1) >= 2) > 0.5
     assert abs(len(one) - len(two)) <= 0.02 * len(one)
     assert len(np.unique(one.R.round(9), axis=0)) > 0.7 * len(one)  # two turns of each
@@ -134,21 +136,27 @@ def test_segments_lie_on_their_legs_and_make_up_all_that_is_seen_of_them() -> No
     assert set(targets.radius.tolist()) == {lp.TUBE, lp.ROD}
 
 
+def _matched(picture: Picture, poses: CameraPoses, tolerance: float) -> PairMatches:
+    """Return the matches of one picture, without those of others."""
+    score, pair, visible = match_pairs(Pictures.of([picture]), poses, tolerance)
+    return PairMatches(score[0], pair[0], visible[0])
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_the_true_pose_matches_and_a_scaled_or_shifted_one_does_not(seed: int) -> None:
     pictures, T = _scene(seed)
-    matches = [match_pairs(picture, _pose(T), 2e-3) for picture in pictures]
+    matches = [_matched(picture, _pose(T), 2e-3) for picture in pictures]
     score = np.concatenate([m.score[0][m.visible[0] > 0.9] for m in matches])
     assert np.median(score) > 0.9
     assert np.mean(score > 0.5) > 0.8  # pairs of edges of crossing legs may be taken as well
     away = _pose(T)
     away = replace(away, t=away.t + np.array([0.05, 0.0, 0.0]))
-    assert all(match_pairs(p, away, 2e-3).score.mean() < 0.2 for p in pictures)
+    assert all(_matched(p, away, 2e-3).score.mean() < 0.2 for p in pictures)
     for picture, m in zip(pictures, matches, strict=True):  # a third farther and thinner
         wide = replace(
             picture, targets=replace(picture.targets, radius=1.33 * picture.targets.radius)
         )
-        assert match_pairs(wide, _pose(T), 2e-3).score.sum() < 0.4 * m.score.sum()
+        assert _matched(wide, _pose(T), 2e-3).score.sum() < 0.4 * m.score.sum()
 
 
 def test_a_pair_counts_for_the_segment_that_it_suits_best() -> None:
@@ -158,7 +166,7 @@ def test_a_pair_counts_for_the_segment_that_it_suits_best() -> None:
     })  # fmt: skip
     n = len(picture.targets)
     doubled.ends[n:] += 1.5e-3  # as good a pose, but for these segments
-    m = match_pairs(replace(picture, targets=doubled), _pose(T), 0.01)
+    m = _matched(replace(picture, targets=doubled), _pose(T), 0.01)
     both = (m.score[0, :n] > 0.5) & (m.score[0, n:] > 0.1) & (m.pair[0, :n] == m.pair[0, n:])
     assert both.sum() > 5
     better = np.maximum(m.score[0, :n], m.score[0, n:])[both]
@@ -171,24 +179,55 @@ def test_scores_depend_on_no_frame_and_not_on_other_poses() -> None:
     (picture, *_), T = _scene(1)
     poses = CameraPoses.joined([_pose(T)] * 300)
     poses = replace(poses, t=poses.t + np.linspace(0.0, 0.1, 300)[:, None] * [1.0, 0.0, 0.0])
-    together = match_pairs(picture, poses, 0.01)
+    together = _matched(picture, poses, 0.01)
     for i in (0, 127, 128, 299):
-        alone = match_pairs(picture, poses.take(np.array([i])), 0.01)
+        alone = _matched(picture, poses.take(np.array([i])), 0.01)
         np.testing.assert_allclose(alone.score[0], together.score[i], atol=1e-6)
-    moved = match_pairs(_moved_machine(picture, MOTION), _pose(MOTION * T), 0.01)
+    moved = _matched(_moved_machine(picture, MOTION), _pose(MOTION * T), 0.01)
     np.testing.assert_allclose(moved.score[0], together.score[0], atol=1e-4)
     C = RigidTransform.from_components([0.1, 0.2, -0.1], Rotation.from_rotvec([0.2, -0.5, 0.3]))
     joined = replace(picture, R=C.rotation.as_matrix(), t=C.translation)
-    other = match_pairs(joined, _pose(T * C), 0.01)
+    other = _matched(joined, _pose(T * C), 0.01)
     np.testing.assert_allclose(other.score[0], together.score[0], atol=1e-4)
     for angle in (np.pi, 1.2):  # behind the camera, beside the picture
         away = T * RigidTransform.from_rotation(Rotation.from_euler("y", angle))
-        assert not match_pairs(picture, _pose(away), 0.01).visible.any()
+        assert not _matched(picture, _pose(away), 0.01).visible.any()
     empty = replace(picture, pairs=picture.pairs.take(np.zeros(0, dtype=np.intp)))
-    nothing = match_pairs(empty, _pose(T), 0.01)
+    nothing = _matched(empty, _pose(T), 0.01)
     assert not nothing.score.any()
-    still = gauss_newton_step([empty], _pose(T), [nothing], 0.01, 0.006)
+    assert nothing.visible.any()
+    none = Pictures.of([empty])
+    still = gauss_newton_step(none, _pose(T), match_pairs(none, _pose(T), 0.01), 0.01, 0.006)
     np.testing.assert_allclose(still.t, _pose(T).t)
+
+
+def test_pictures_together_say_what_each_of_them_says() -> None:
+    pictures, T = _scene(2, 6, 4)
+    pictures[0] = replace(pictures[0], pairs=pictures[0].pairs.take(np.arange(3)))
+    pictures[1] = replace(pictures[1], targets=lp.pieces(*np.zeros((2, 0, 3))))
+    pictures[2] = replace(pictures[2], pairs=pictures[2].pairs.take(np.arange(0)))
+    n = 70
+    poses = CameraPoses.joined([_pose(T)] * n)
+    poses = replace(poses, t=poses.t + np.linspace(-0.02, 0.02, n)[:, None] * [1.0, 0.5, 0.0])
+    every = Pictures.of(pictures)
+    together = match_pairs(every, poses, 0.02)
+    for k, picture in enumerate(pictures):
+        alone, m = _matched(picture, poses, 0.02), len(picture.targets)
+        for one, all_of_them in zip(alone, together, strict=True):
+            np.testing.assert_allclose(all_of_them[k, :, :m], one, atol=1e-6)
+            assert not all_of_them[k, :, m:].any()
+    assert together.score[3].any()
+    # What shows no pair changes no step, nor does what fills arrays up.
+    picture = pictures[3]
+    empty = replace(picture, pairs=picture.pairs.take(np.arange(0)))
+    single, double = Pictures.of([picture]), Pictures.of([empty, picture])
+    for joint_error in (0.0, 6e-3):
+        by_one, by_two = (
+            gauss_newton_step(some, poses, match_pairs(some, poses, 0.02), 0.02, joint_error)
+            for some in (single, double)
+        )
+        np.testing.assert_allclose(by_one.t, by_two.t, atol=1e-12)
+        np.testing.assert_allclose(by_one.shift, by_two.shift, atol=1e-12)
 
 
 @pytest.mark.parametrize("joined", [False, True])
@@ -201,14 +240,15 @@ def test_derivatives_of_residuals_are_those_by_differences(joined: bool) -> None
     poses = _pose(T * C)
     rng = np.random.default_rng(0)
     poses = replace(poses, shift=rng.uniform(-5e-3, 5e-3, poses.shift.shape))
-    found = match_pairs(picture, poses, 0.02)
-    matched = found.score[0] > 0.3
+    own = Pictures.of([picture])
+    found = match_pairs(own, poses, 0.02)
+    matched = found.score[0, 0] > 0.3
     assert matched.sum() > 5
-    J, J_leg, _, weight = _equations(picture, poses, found, 0.01)
+    J, J_leg, _, weight = (x[0] for x in _equations(own, poses, found, 0.01))
     assert np.all(weight[0, matched] > 0.0)
 
     def residual(at: CameraPoses) -> Array:
-        return np.asarray(_equations(picture, at, found, 0.01)[2][0])
+        return np.asarray(_equations(own, at, found, 0.01)[2][0, 0])
 
     # Fixed while a segment moves are its place along the pair, which matters by the product of two
     # small residuals, and how obliquely its plane is seen, which matters a little for the width.
@@ -227,7 +267,6 @@ def test_derivatives_of_residuals_are_those_by_differences(joined: bool) -> None
         change = ((residual(replace(poses, shift=shift)) - residual(poses)) / step)[matched]
         error = np.abs(change[:, :2] - J_leg[0, matched, :2, k])
         assert error.max() < 0.05 * np.abs(J_leg[0, matched]).max()
-    assert not J_leg[0, :, 2:].any()  # neither width nor place moves joints
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -239,8 +278,8 @@ def test_steps_lead_back_to_the_true_pose(seed: int) -> None:
     )
     poses = _pose(T * off)
     for tolerance in (0.03, 0.02, 0.01, 0.006, 0.004):
-        matches = [match_pairs(picture, poses, tolerance) for picture in pictures]
-        poses = gauss_newton_step(pictures, poses, matches, tolerance)
+        matches = match_pairs(Pictures.of(pictures), poses, tolerance)
+        poses = gauss_newton_step(Pictures.of(pictures), poses, matches, tolerance)
     away, angle = lp.apart(T, poses.T_base_camera())
     assert away < 0.025
     assert angle < 0.01 < lp.apart(T, T * off)[1]
@@ -256,19 +295,20 @@ def test_a_joint_that_is_elsewhere_is_found_in_the_picture() -> None:
     picture = lp.picture((made.A, B), (A, B), T, rng)
     poses = _pose(T)
     for tolerance in (0.02, 0.01, 0.005, 0.003):
-        matches = match_pairs(picture, poses, tolerance)
-        poses = gauss_newton_step([picture], poses, [matches], tolerance, 0.02)
+        matches = match_pairs(Pictures.of([picture]), poses, tolerance)
+        poses = gauss_newton_step(Pictures.of([picture]), poses, matches, tolerance, 0.02)
     sideways = np.cross(B[2] - A[2], T.rotation.apply([0.0, 0.0, 1.0]))
     sideways /= np.linalg.norm(sideways)
     assert abs(poses.shift[0, 2, 0] @ sideways) > 0.5 * abs(8e-3 * x @ sideways)
     assert np.abs(np.delete(poses.shift[0], 2, axis=0)).max() < 3e-3
     away = T * RigidTransform.from_translation([5e-3, 0.0, 0.0])
     (picture, *_), T = _scene(0)
-    matches = match_pairs(picture, _pose(T), 2e-3)
-    good = matches.score[0] > 0.9
+    own = Pictures.of([picture])
+    matches = match_pairs(own, _pose(T), 2e-3)
+    good = matches.score[0, 0] > 0.9
     away = T * RigidTransform.from_translation([5e-3, 0.0, 0.0])
-    assert np.median(distances(picture, _pose(T), matches)[0, good]) < 2e-4
-    off = distances(picture, _pose(away), matches)[0, good]
+    assert np.median(distances(own, _pose(T), matches)[0, 0, good]) < 2e-4
+    off = distances(own, _pose(away), matches)[0, 0, good]
     assert 2e-3 < off.max() < 6e-3
 
 

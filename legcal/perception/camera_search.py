@@ -19,6 +19,7 @@ from legcal.perception.pair_matching import (
     CameraPoses,
     PairMatches,
     Picture,
+    Pictures,
     depth_reversed,
     distances,
     gauss_newton_step,
@@ -146,7 +147,8 @@ def place_camera(
     """
     merits = [float(p.pairs.merit[:8].sum()) if len(p.pairs) else 0.0 for p in pictures]
     best_first = [pictures[k] for k in np.argsort(-np.array(merits), kind="stable").tolist()]
-    best = _candidates(pictures, CameraPoses.none(n_legs))
+    every = Pictures.of(pictures)
+    best = _candidates(every, CameraPoses.none(n_legs))
     done = 0
     for n in starts:
         if done >= len(pictures):
@@ -156,8 +158,9 @@ def place_camera(
         poses = CameraPoses.joined([best.poses, *suggested])
         if len(poses) == 0:
             continue
-        poses = refined(best_first[:done], poses, TOLERANCES[2:4], NOMINAL_JOINT_ERROR)
-        some = best_first[: max(SOME_PICTURES, done)]
+        first = Pictures.of(best_first[:done])
+        poses = refined(first, poses, TOLERANCES[2:4], NOMINAL_JOINT_ERROR)
+        some = Pictures.of(best_first[: max(SOME_PICTURES, done)])
         score = scores(some, poses, TOLERANCES[3])
         poses = poses.take(_distinct(poses, score, N_KEPT[2]))
         poses = CameraPoses.joined(
@@ -166,14 +169,14 @@ def place_camera(
         poses = refined(some, poses, TOLERANCES[3:], NOMINAL_JOINT_ERROR)
         score = scores(some, poses, TOLERANCES[-1])
         poses = poses.take(_best(score, N_KEPT[3]))
-        poses = CameraPoses.joined([poses, _polished(some[:POLISHING], poses)])
-        best = _candidates(pictures, refined(pictures, poses, LAST_TOLERANCES, NOMINAL_JOINT_ERROR))
+        poses = CameraPoses.joined([poses, _polished(some.take(slice(POLISHING)), poses)])
+        best = _candidates(every, refined(every, poses, LAST_TOLERANCES, NOMINAL_JOINT_ERROR))
         if best.is_clear:
             break
     return best
 
 
-def _polished(pictures: Sequence[Picture], poses: CameraPoses) -> CameraPoses:
+def _polished(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
     """Return for each of the best poses the best one around it that steps lead to.
 
     A leg on a wrong pair keeps a pose, and the joints moved for it, from where all legs agree.
@@ -188,15 +191,15 @@ def _polished(pictures: Sequence[Picture], poses: CameraPoses) -> CameraPoses:
     return CameraPoses.joined([*found, poses.take(np.zeros(0, dtype=np.intp))])
 
 
-def _reversed(pictures: Sequence[Picture], poses: CameraPoses) -> CameraPoses:
+def _reversed(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
     """Return the poses that show a flat machine alike from far: near and far exchanged."""
-    ends = np.concatenate([picture.targets.ends.reshape(-1, 3) for picture in pictures])
+    ends = pictures.all_ends
     return depth_reversed(poses, ends) if len(ends) else poses
 
 
-def _around(pictures: Sequence[Picture], R: Array, t: Array, n_legs: int) -> CameraPoses:
+def _around(pictures: Pictures, R: Array, t: Array, n_legs: int) -> CameraPoses:
     """Return poses around one: the machine turned a little, further, nearer, or as it is."""
-    ends = np.concatenate([picture.targets.ends.reshape(-1, 3) for picture in pictures])
+    ends = pictures.all_ends
     middle = ends.mean(axis=0) if len(ends) else np.zeros(3)
     turns = POLISH_TURN * np.concatenate([np.zeros((3, 3)), np.eye(3), -np.eye(3)])
     further = 1.0 + POLISH_FURTHER * np.array([0.0, 1.0, -1.0, *np.zeros(6)])
@@ -212,9 +215,10 @@ def place_near(
     turns = NEAR_STARTS * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
     poses = CameraPoses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
-    poses = refined(pictures, poses, TOLERANCES[:3])
-    poses = refined(pictures, poses, (*TOLERANCES[2:], *LAST_TOLERANCES), NOMINAL_JOINT_ERROR)
-    found = _candidates(pictures, poses)
+    every = Pictures.of(pictures)
+    poses = refined(every, poses, TOLERANCES[:3])
+    poses = refined(every, poses, (*TOLERANCES[2:], *LAST_TOLERANCES), NOMINAL_JOINT_ERROR)
+    found = _candidates(every, poses)
     return replace(found, hinted=True)
 
 
@@ -229,35 +233,34 @@ def with_first(
         support=placed.support[order],
         expected=placed.expected[order],
         score=placed.score[order],
-        leg_error=_leg_error(pictures, pose),
+        leg_error=_leg_error(Pictures.of(pictures), pose),
     )
 
 
-def _candidates(pictures: Sequence[Picture], poses: CameraPoses) -> PoseCandidates:
+def _candidates(pictures: Pictures, poses: CameraPoses) -> PoseCandidates:
     """Return poses with their support, best first, without those that say the same."""
     n_legs = poses.shift.shape[1]
     if len(poses) == 0:
         empty = np.zeros((0, len(pictures)))
         return PoseCandidates(poses, empty, empty, np.zeros(0), np.full(n_legs, np.inf))
-    found = [match_pairs(picture, poses, FINAL_TOLERANCE) for picture in pictures]
-    values = [one.exclusive_score for one in found]
-    shares = [picture.targets.share for picture in pictures]
-    support = np.stack([v @ s for v, s in zip(values, shares, strict=True)], axis=1)
-    expected = np.stack([f.visible @ s for f, s in zip(found, shares, strict=True)], axis=1)
+    found = match_pairs(pictures, poses, FINAL_TOLERANCE)
+    value = found.exclusive_score
+    support, expected = (_by_legs(pictures, x).T for x in (value, found.visible))
     cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / NOMINAL_JOINT_ERROR**2
     score = support.sum(axis=1) - SHIFT_COST * cost
-    order = _different(pictures, poses, found, [v >= MIN_MATCH_SCORE for v in values], score)
+    order = _different(pictures, poses, found, value >= MIN_MATCH_SCORE, score)
     best = poses.take(order[:1])
     error = _leg_error(pictures, best)
     return PoseCandidates(poses.take(order), support[order], expected[order], score[order], error)
 
 
+def _by_legs(pictures: Pictures, value: Array) -> Array:
+    """Return values of segments (n_pictures, n_poses, n_segments) added up to legs, (.., ..)."""
+    return np.asarray((value @ pictures.share[..., None])[..., 0])
+
+
 def _different(
-    pictures: Sequence[Picture],
-    poses: CameraPoses,
-    found: Sequence[PairMatches],
-    matched: Sequence[BoolArray],
-    score: Array,
+    pictures: Pictures, poses: CameraPoses, found: PairMatches, matched: BoolArray, score: Array
 ) -> IntArray:
     """Return the poses, best first, that put other legs on other pairs than better ones do.
 
@@ -265,13 +268,10 @@ def _different(
     pairs from below.
     """
     common = np.zeros((len(score), len(score)))
-    for picture, agreed, match in zip(pictures, found, matched, strict=True):
-        if len(picture.pairs) == 0:
-            continue
-        same = _one_leg(picture.pairs)
-        for j in range(len(picture.targets)):
-            pair, has = agreed.pair[:, j], match[:, j]
-            common += same[np.ix_(pair, pair)] & has[:, None] & has[None, :]
+    if pictures.pairs.shape[1]:
+        for pairs, pair, match in zip(pictures.pairs, found.pair, matched, strict=True):
+            same = _one_leg(pairs)[pair[:, None], pair[None]]
+            common += np.sum(same & match[:, None] & match[None], axis=2)
     least = np.maximum(np.diag(common), 1.0)
     kept: list[int] = []
     for i in np.argsort(-score, kind="stable").tolist():
@@ -281,27 +281,27 @@ def _different(
     return np.array(kept, dtype=np.intp)
 
 
-def _one_leg(pairs: CandidatePairs) -> BoolArray:
-    """Return which pairs (n, n) may be of one leg: they continue each other or overlap."""
-    apart = np.abs(
-        np.einsum("ijx,ix->ij", pairs.middle[None] - pairs.middle[:, None], pairs.normal)
-    )
-    near = np.maximum(apart, apart.T) <= SAME_LEG[1] * pairs.width.mean(axis=1)[:, None]
-    return np.asarray(near & (np.abs(pairs.along @ pairs.along.T) >= np.cos(SAME_LEG[0])))
+def _one_leg(pairs: Array) -> BoolArray:
+    """Return which pairs (n, n) may be of one leg: they continue each other or overlap.
+
+    Pairs (n, 9) are as in :class:`legcal.perception.pair_matching.Pictures`.
+    """
+    middle, along, normal, width = pairs[:, :2], pairs[:, 2:4], pairs[:, 4:6], pairs[:, 8]
+    apart = np.abs(np.sum(middle * normal, axis=1)[:, None] - normal @ middle.T)
+    near = np.maximum(apart, apart.T) <= SAME_LEG[1] * width[:, None]
+    return np.asarray(near & (np.abs(along @ along.T) >= np.cos(SAME_LEG[0])))
 
 
-def _leg_error(pictures: Sequence[Picture], pose: CameraPoses) -> Array:
+def _leg_error(pictures: Pictures, pose: CameraPoses) -> Array:
     """Return the root mean square distance (n_legs,) of legs from their pairs [m]."""
     n_legs = pose.shift.shape[1]
     square, count = np.zeros(n_legs), np.zeros(n_legs)
-    for picture in pictures:
-        if len(picture.pairs) == 0 or len(picture.targets) == 0:
-            continue
-        found = match_pairs(picture, pose, FINAL_TOLERANCE)
-        matched = found.exclusive_score[0] >= MIN_MATCH_SCORE
-        distance = distances(picture, pose, found)[0]
-        np.add.at(square, picture.targets.leg[matched], distance[matched] ** 2)
-        np.add.at(count, picture.targets.leg[matched], 1.0)
+    found = match_pairs(pictures, pose, FINAL_TOLERANCE)
+    matched = found.exclusive_score[:, 0] >= MIN_MATCH_SCORE
+    if matched.any():
+        distance = distances(pictures, pose, found)[:, 0]
+        np.add.at(square, pictures.leg[matched], distance[matched] ** 2)
+        np.add.at(count, pictures.leg[matched], 1.0)
     error = np.sqrt(square / np.maximum(count, 1.0))
     error = np.where(count < MIN_MATCHES, np.maximum(error, MIN_ERROR_OF_FEW), error)
     return np.where(count > 0, error, np.inf)
@@ -315,31 +315,30 @@ def _starts(picture: Picture, n_legs: int) -> CameraPoses:
     # From the frame of the picture to that of the poses.
     back = picture.R.T
     poses = CameraPoses.rigid(back @ poses.R, (poses.t - picture.t) @ picture.R, n_legs)
-    poses = poses.take(_best(scores([picture], poses, TOLERANCES[0]), N_KEPT[0]))
-    poses = refined([picture], poses, TOLERANCES[:3])
-    score = scores([picture], poses, TOLERANCES[2])
+    own = Pictures.of([picture])
+    poses = poses.take(_best(scores(own, poses, TOLERANCES[0]), N_KEPT[0]))
+    poses = refined(own, poses, TOLERANCES[:3])
+    score = scores(own, poses, TOLERANCES[2])
     return poses.take(_distinct(poses, score, N_KEPT[1]))
 
 
 def refined(
-    pictures: Sequence[Picture],
+    pictures: Pictures,
     poses: CameraPoses,
     tolerances: Sequence[float],
     joint_error: float = 0.0,
 ) -> CameraPoses:
     """Return poses after a step towards the pairs for each of some tolerances."""
     for tolerance in tolerances:
-        found = [match_pairs(picture, poses, tolerance) for picture in pictures]
+        found = match_pairs(pictures, poses, tolerance)
         poses = gauss_newton_step(pictures, poses, found, tolerance, joint_error)
     return poses
 
 
-def scores(pictures: Sequence[Picture], poses: CameraPoses, tolerance: float) -> Array:
+def scores(pictures: Pictures, poses: CameraPoses, tolerance: float) -> Array:
     """Return how many legs agree with each pose in all pictures together, (n_poses,)."""
-    found = [match_pairs(picture, poses, tolerance).exclusive_score for picture in pictures]
-    shares = [picture.targets.share for picture in pictures]
-    support = [value @ share for value, share in zip(found, shares, strict=True)]
-    return np.asarray(np.stack(support, axis=1).sum(axis=1))
+    found = match_pairs(pictures, poses, tolerance).exclusive_score
+    return np.asarray(_by_legs(pictures, found).sum(axis=0))
 
 
 def _best(score: Array, n: int) -> IntArray:

@@ -21,7 +21,13 @@ from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, fl
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.detection import NOT_PLACED
 from legcal.perception.outline import HIDDEN, OUTSIDE
-from legcal.perception.pair_matching import CameraPoses, Picture, leg_segments, match_pairs
+from legcal.perception.pair_matching import (
+    CameraPoses,
+    Picture,
+    Pictures,
+    leg_segments,
+    match_pairs,
+)
 from legcal.perception.placement import Placement, Search, sensor_extent
 from legcal.workers import Run
 
@@ -286,10 +292,10 @@ def _share(
     if T is None or len(picture.targets) == 0:
         return 0.0
     pose = CameraPoses.one(T, placement.shift[view])
-    seen = match_pairs(picture, pose, tolerance)
+    seen = match_pairs(Pictures.of([picture]), pose, tolerance)
     share = picture.targets.share
-    visible = float((seen.visible @ share)[0])
-    return float(seen.exclusive_score[0] @ share) / visible if visible > 0.0 else 0.0
+    visible = float(seen.visible[0, 0] @ share)
+    return float(seen.exclusive_score[0, 0] @ share) / visible if visible > 0.0 else 0.0
 
 
 def _found(outlines: Outlines, rows: Sequence[int]) -> dict[int, OutlineCount]:

@@ -93,7 +93,9 @@ def _blur(grey: Grey, half: Grey) -> float:
         return 0.0
     every = np.concatenate(strong)
     ratios = _greatest_slopes(grey, 2 * row[every], 2 * column[every]) / coarse[every]
-    blurs = [_blur_of(own) for own in np.split(ratios, np.cumsum([len(one) for one in strong]))[:-1]]
+    blurs = [
+        _blur_of(own) for own in np.split(ratios, np.cumsum([len(one) for one in strong]))[:-1]
+    ]
     # Shades of one direction may be soft everywhere; what moves is sharp in one direction only.
     return sorted(blurs)[min(1, len(blurs) - 1)]
 
@@ -111,7 +113,7 @@ def _edges(half: Grey) -> tuple[Grey, IntArray, IntArray, Grey]:
     weak = np.partition(few, k)[k]
     # Beside the middle of an edge the ratio of slopes says nothing.
     around = cv2.dilate(coarse, _SQUARE)
-    edge = coarse >= cv2.max(around, float(weak))
+    edge = coarse >= np.maximum(around, weak)
     edge[:MARGIN] = edge[-MARGIN:] = edge[:, :MARGIN] = edge[:, -MARGIN:] = False
     at = np.flatnonzero(edge)
     row, column = np.divmod(at, half.shape[1])

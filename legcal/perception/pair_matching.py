@@ -5,11 +5,12 @@ few hundred poses are scored at once by all pictures of a view, and improved by 
 in which joints may be off what the model says.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry import Array, IntArray, cross, cross_matrices, rotation_matrices
@@ -27,7 +28,8 @@ LINE_ERROR, LINE_PIXELS = 2e-3, 0.7  # of an axis beside its pair: [m], [px]
 ALONG_ERROR = 0.1  # of the middle of a pair that is as long as its segment, in its length
 MIN_LINE_SHARE = 1.0 / 6.0  # at least this part of the tolerance
 MIN_OVERLAP = 0.8  # share of a pair that should lie along the leg
-CHUNK = 128  # poses scored together
+CHUNK = 128  # poses of a picture, or of several, that are worked on together
+FAR = 1e3  # on the sensor plane, where no leg is
 TURN_SIGMA, DISPLACEMENT_SIGMA = 0.3, 0.1  # prior of a step: angle [rad], by the distance
 MAX_TURN, MAX_DISPLACEMENT = 0.4, 0.2  # the same, at most
 
@@ -112,7 +114,7 @@ class CameraPoses:
         """Return the number of poses."""
         return len(self.R)
 
-    def take(self, chosen: IntArray) -> "CameraPoses":
+    def take(self, chosen: IntArray | slice) -> "CameraPoses":
         """Return some of the poses."""
         return CameraPoses(self.R[chosen], self.t[chosen], self.shift[chosen])
 
@@ -129,93 +131,198 @@ class Picture:
     t: Array = field(default_factory=lambda: np.zeros(3))
 
 
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """Pictures of one camera in arrays, where all have as many segments and pairs as the most.
+
+    Segments that fill up count for nothing, pairs that do are far from everything.
+    """
+
+    ends: Array  # (n_pictures, n_segments, 2, 3), place, leg, radius and share as in LegSegments
+    place: Array
+    leg: IntArray
+    radius: Array
+    share: Array  # 0 of those that fill up
+    pairs: Array  # (n_pictures, n_pairs, 9): middle, along, normal, half length, width as
+    # of a leg that looks like this, width
+    pixel: Array  # (n_pictures,) how well edges are known
+    R: Array  # (n_pictures, 3, 3) their camera frames, as in Picture
+    t: Array  # (n_pictures, 3)
+    corners: Array  # (n_pictures, 2, 2)
+    n_pairs: IntArray  # (n_pictures,) without those that fill up
+
+    @classmethod
+    def of(cls, pictures: Sequence[Picture]) -> "Pictures":
+        """Return pictures in arrays."""
+        targets, pairs = [p.targets for p in pictures], [p.pairs for p in pictures]
+        n_segments = max((len(one) for one in targets), default=0)
+        n_pairs = max((len(one) for one in pairs), default=0)
+        of_pairs = [
+            np.concatenate(
+                [
+                    p.middle,
+                    p.along,
+                    p.normal,
+                    np.stack([p.half_length, pair_widths(p), p.width.mean(axis=1)], axis=1),
+                ],
+                axis=1,
+            )
+            for p in pairs
+        ]
+        nowhere = np.array([FAR, FAR, 1.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
+        return cls(
+            _filled([one.ends for one in targets], n_segments, np.zeros((2, 3))),
+            _filled([one.place for one in targets], n_segments, np.zeros(2)),
+            _filled([one.leg for one in targets], n_segments, np.zeros((), dtype=np.intp)),
+            _filled([one.radius for one in targets], n_segments, np.zeros(())),
+            _filled([one.share for one in targets], n_segments, np.zeros(())),
+            _filled(of_pairs, n_pairs, nowhere),
+            np.array([p.pixel for p in pairs]),
+            np.array([p.R for p in pictures]).reshape(-1, 3, 3),
+            np.array([p.t for p in pictures]).reshape(-1, 3),
+            np.array([p.corners for p in pictures]).reshape(-1, 2, 2),
+            np.array([len(p) for p in pairs], dtype=np.intp),
+        )
+
+    def __len__(self) -> int:
+        """Return the number of pictures."""
+        return len(self.ends)
+
+    @property
+    def all_ends(self) -> Array:
+        """The ends of all segments, (n, 3) [m]."""
+        return self.ends[self.share > 0.0].reshape(-1, 3)
+
+    def take(self, chosen: slice) -> "Pictures":
+        """Return some of the pictures."""
+        return Pictures(*(getattr(self, one.name)[chosen] for one in fields(self)))
+
+    def blocks(self, n_poses: int) -> Iterator["Pictures"]:
+        """Return the pictures a few at a time, fewer for more poses, so that arrays stay small."""
+        n = max(1, CHUNK // max(n_poses, 1))
+        if len(self) <= n:
+            yield self
+            return
+        for first in range(0, len(self), n):
+            yield self.take(slice(first, first + n))
+
+
+def _filled(parts: Sequence[NDArray[Any]], n: int, value: NDArray[Any]) -> NDArray[Any]:
+    """Return arrays (m, ...) one behind the other, filled up to n rows of a value."""
+    found = np.empty((len(parts), n, *value.shape), dtype=value.dtype)
+    for one, part in zip(found, parts, strict=True):
+        one[: len(part)] = part
+        one[len(part) :] = value
+    return found
+
+
 class PairMatches(NamedTuple):
-    """How well poses explain a picture, (n_poses, n_segments) each."""
+    """How well poses explain pictures, (n_pictures, n_poses, n_segments) each."""
 
     score: Array  # of each segment, 0 to 1: how well, times how much of its visible length
-    pair: IntArray  # the edge pair with that score
+    pair: IntArray  # the edge pair of its picture with that score
     visible: Array  # share of each segment that is inside the picture
 
     @property
     def exclusive_score(self) -> Array:
         """The scores, where a pair counts only for the segment that it suits best."""
-        same = self.pair[:, :, None] == self.pair[:, None, :]
-        better = self.score[:, None, :] > self.score[:, :, None]
-        return np.where(np.any(same & better, axis=2), 0.0, self.score)
+        same = self.pair[..., :, None] == self.pair[..., None, :]
+        better = self.score[..., None, :] > self.score[..., :, None]
+        return np.where(np.any(same & better, axis=-1), 0.0, self.score)
+
+    def of_pictures(self, chosen: slice | IntArray) -> "PairMatches":
+        """Return the matches of some pictures."""
+        return PairMatches(self.score[chosen], self.pair[chosen], self.visible[chosen])
 
 
-def match_pairs(picture: Picture, poses: CameraPoses, tolerance: float) -> PairMatches:
-    """Match poses to a picture; ``tolerance`` is how far axes may be from pairs [m]."""
-    n, n_targets = len(poses), len(picture.targets)
-    if n == 0 or n_targets == 0 or len(picture.pairs) == 0:
-        visible = _in_picture(picture, poses)[3] if n and n_targets else np.zeros((n, n_targets))
-        return PairMatches(np.zeros((n, n_targets)), np.zeros((n, n_targets), np.intp), visible)
-    parts = [
-        _match_chunk(picture, poses.take(np.arange(k, min(k + CHUNK, len(poses)))), tolerance)
-        for k in range(0, len(poses), CHUNK)
+def match_pairs(pictures: Pictures, poses: CameraPoses, tolerance: float) -> PairMatches:
+    """Match poses to pictures; ``tolerance`` is how far axes may be from pairs [m]."""
+    n = len(poses)
+    if len(pictures) == 0 or n == 0:
+        nothing = np.zeros((len(pictures), n, pictures.ends.shape[1]))
+        return PairMatches(nothing, nothing.astype(np.intp), nothing)
+    found = [
+        _joined(
+            [
+                _match_block(some, poses.take(slice(k, k + CHUNK)), tolerance)
+                for k in range(0, n, CHUNK)
+            ],
+            1,
+        )
+        for some in pictures.blocks(n)
     ]
-    value, pair, visible = (np.concatenate(x) for x in zip(*parts, strict=True))
-    return PairMatches(value, pair, visible)
+    return _joined(found, 0)
 
 
-def _in_picture(picture: Picture, poses: CameraPoses) -> tuple[Array, Array, Array, Array]:
-    """Return ends X (n, T, 2, 3) [m], points (n, T, 2, 2), widths (n, T, 2), and what is shown."""
-    targets = picture.targets
-    ends = np.broadcast_to(targets.ends, (len(poses), *targets.ends.shape))
+def _joined(parts: Sequence[PairMatches], axis: int) -> PairMatches:
+    """Return matches of several pictures, or of several poses, as one."""
+    if len(parts) == 1:
+        return parts[0]
+    return PairMatches(*(np.concatenate(x, axis=axis) for x in zip(*parts, strict=True)))
+
+
+def _in_picture(pictures: Pictures, poses: CameraPoses) -> tuple[Array, Array, Array, Array]:
+    """Return ends X (K, n, T, 2, 3) [m], points (K, n, T, 2, 2), widths (K, n, T, 2), and shares.
+
+    Of K pictures, n poses and T segments; the shares (K, n, T) are those that are shown.
+    """
+    ends = pictures.ends[:, None]
     if np.any(poses.shift):
-        of_leg = poses.shift[:, targets.leg]  # (n, T, 2, 3)
-        at = targets.place[:, :, None]
-        ends = ends + (1.0 - at) * of_leg[:, :, :1] + at * of_leg[:, :, 1:]
-    n_ends = 2 * len(targets)
-    R, t = picture.R @ poses.R, poses.t @ picture.R.T + picture.t
-    X = ends.reshape(-1, n_ends, 3) @ R.swapaxes(1, 2) + t[:, None, :]
-    X = X.reshape(-1, len(targets), 2, 3)
-    z = np.maximum(X[..., 2:], MIN_DEPTH)
-    xy = X[..., :2] / z
-    normal = cross(X[:, :, 0], X[:, :, 1])
+        of_leg = poses.shift.swapaxes(0, 1)[pictures.leg].swapaxes(1, 2)  # (K, n, T, 2, 3)
+        at = pictures.place[:, None, :, :, None]
+        ends = ends + (1.0 - at) * of_leg[..., :1, :] + at * of_leg[..., 1:, :]
+    K, n, T = len(pictures), len(poses), ends.shape[2]
+    R = pictures.R[:, None] @ poses.R
+    t = poses.t @ pictures.R.swapaxes(1, 2) + pictures.t[:, None]
+    X = ends.reshape(K, ends.shape[1], 2 * T, 3) @ R.swapaxes(2, 3) + t[:, :, None]
+    X = X.reshape(K, n, T, 2, 3)
+    z = np.maximum(X[..., 2], MIN_DEPTH)
+    xy = X[..., :2] / z[..., None]
+    normal = cross(X[..., 0, :], X[..., 1, :])
     level = normal[..., 0] ** 2 + normal[..., 1] ** 2
     flat = np.sqrt(level / (level + normal[..., 2] ** 2 + 1e-24))
-    width = 2.0 * targets.radius[:, None] / (z[..., 0] * np.maximum(flat, 0.1)[..., None])
-    front = (X[..., 2] > MIN_DEPTH).all(axis=-1)
-    return X, xy, width, np.where(front, _shown(xy, picture.corners), 0.0)
+    width = (2.0 * pictures.radius[:, None] / np.maximum(flat, 0.1))[..., None] / z
+    front = (X[..., 0, 2] > MIN_DEPTH) & (X[..., 1, 2] > MIN_DEPTH)
+    front &= pictures.share[:, None] > 0.0
+    return X, xy, width, np.where(front, _shown(xy, pictures.corners[:, None, None]), 0.0)
 
 
 def _shown(xy: Array, corners: Array) -> Array:
-    """Return the share of segments xy (..., 2, 2) that lies within a rectangle, (...)."""
+    """Return the share of segments xy (..., 2, 2) within rectangles (..., 2, 2), (...)."""
     start, step = xy[..., 0, :], xy[..., 1, :] - xy[..., 0, :]
     safe = np.where(np.abs(step) > 1e-9, step, 1e-9)
-    one, two = (corners[0] - start) / safe, (corners[1] - start) / safe
-    enter = np.minimum(one, two).max(axis=-1)
-    leave = np.maximum(one, two).min(axis=-1)
-    return np.asarray(np.clip(np.minimum(leave, 1.0) - np.maximum(enter, 0.0), 0.0, 1.0))
+    one, two = (corners[..., 0, :] - start) / safe, (corners[..., 1, :] - start) / safe
+    near, far = np.minimum(one, two), np.maximum(one, two)
+    enter = np.maximum(np.maximum(near[..., 0], near[..., 1]), 0.0)
+    leave = np.minimum(np.minimum(far[..., 0], far[..., 1]), 1.0)
+    return np.asarray(np.maximum(leave - enter, 0.0))
 
 
-def _match_chunk(
-    picture: Picture, poses: CameraPoses, tolerance: float
-) -> tuple[Array, IntArray, Array]:
-    """Return score, pair and visible of :class:`PairMatches`."""
-    pairs = picture.pairs
-    X, xy, width, visible = _in_picture(picture, poses)
-    reach = _tolerances(pairs, X, tolerance)[..., None].astype(np.float32)
+def _match_block(pictures: Pictures, poses: CameraPoses, tolerance: float) -> PairMatches:
+    """Match a few poses to a few pictures."""
+    X, xy, width, visible = _in_picture(pictures, poses)
+    K, n, T = visible.shape
+    n_pairs = pictures.pairs.shape[1]
+    if T == 0 or n_pairs == 0:
+        return PairMatches(np.zeros((K, n, T)), np.zeros((K, n, T), dtype=np.intp), visible)
+    reach = _tolerances(pictures, X, tolerance)[..., None].astype(np.float32)
     xy, width = xy.astype(np.float32), width.astype(np.float32)
-    frame = np.concatenate([pairs.along, pairs.normal]).T.astype(np.float32)  # (2, 2 n_pairs)
-    own = np.concatenate(
-        [np.sum(pairs.middle * pairs.along, axis=1), np.sum(pairs.middle * pairs.normal, axis=1)]
-    ).astype(np.float32)
-    place = xy @ frame - own
-    n = len(pairs)
-    a0, a1 = place[:, :, 0, :n], place[:, :, 1, :n]
-    o0, o1 = place[:, :, 0, n:], place[:, :, 1, n:]
-    half = pairs.half_length.astype(np.float32)
+    middle, along, normal = (pictures.pairs[..., k : k + 2] for k in (0, 2, 4))
+    axes = np.concatenate([along, normal], axis=1)  # (K, 2 n_pairs, 2)
+    own = np.sum(axes * np.concatenate([middle, middle], axis=1), axis=2).astype(np.float32)
+    frame = axes.astype(np.float32).swapaxes(1, 2)
+    place = (xy.reshape(K, -1, 2) @ frame - own[:, None]).reshape(K, n, T, 2, 2 * n_pairs)
+    a0, a1 = place[..., 0, :n_pairs], place[..., 1, :n_pairs]
+    o0, o1 = place[..., 0, n_pairs:], place[..., 1, n_pairs:]
+    half, seen = (pictures.pairs[:, None, None, :, k].astype(np.float32) for k in (6, 7))
     run = a1 - a0
     run = np.where(np.abs(run) < 1e-6, np.float32(1e-6), run)
     slope = (o1 - o0) / run
     gap = np.abs(o0 - slope * a0) + np.abs(slope) * half
     value = np.maximum(1.0 - (gap / reach) ** 2, 0.0)
-    w0, w1 = width[:, :, 0, None], width[:, :, 1, None]
+    w0, w1 = width[..., 0, None], width[..., 1, None]
     expected = np.maximum(w0 - (w1 - w0) * a0 / run, np.float32(1e-6))
-    seen = pair_widths(pairs).astype(np.float32)
-    sigma = np.hypot(WIDTH_ERROR, WIDTH_PIXELS * pairs.pixel / seen).astype(np.float32)
+    sigma = _width_sigmas(pictures).astype(np.float32)[:, None, None]
     pull = np.log(expected / seen) / (np.float32(MAX_WIDTH_SIGMAS) * sigma)
     value *= np.maximum(1.0 - pull**2, 0.0)
     overlap = np.minimum(half, np.maximum(a0, a1)) - np.maximum(-half, np.minimum(a0, a1))
@@ -223,15 +330,15 @@ def _match_chunk(
     value *= np.minimum(overlap / (np.float32(2.0 * MIN_OVERLAP) * half), 1.0)
     length = np.abs(run) * np.maximum(visible, 0.05)[..., None].astype(np.float32)
     value *= np.minimum(overlap / length, 1.0)
-    best = np.argmax(value, axis=2)
-    found = np.take_along_axis(value, best[..., None], axis=2)[..., 0]
-    return np.where(visible > 0.0, found, 0.0).astype(np.float64), best, visible
+    best = np.argmax(value, axis=-1)
+    found = np.take_along_axis(value, best[..., None], axis=-1)[..., 0]
+    return PairMatches(np.where(visible > 0.0, found, 0.0).astype(np.float64), best, visible)
 
 
-def _tolerances(pairs: CandidatePairs, X: Array, tolerance: float) -> Array:
-    """Return a tolerance [m] on the sensor plane at segments X (n, T, 2, 3), (n, T)."""
-    depth = np.maximum(X[..., 2].mean(axis=-1), MIN_DEPTH)
-    return np.asarray(tolerance / depth + TOLERANCE_PIXELS * pairs.pixel)
+def _tolerances(pictures: Pictures, X: Array, tolerance: float) -> Array:
+    """Return a tolerance [m] on the sensor plane at segments X (K, n, T, 2, 3), (K, n, T)."""
+    depth = np.maximum(0.5 * (X[..., 0, 2] + X[..., 1, 2]), MIN_DEPTH)
+    return np.asarray(tolerance / depth + TOLERANCE_PIXELS * pictures.pixel[:, None, None])
 
 
 def pair_widths(pairs: CandidatePairs) -> Array:
@@ -239,55 +346,65 @@ def pair_widths(pairs: CandidatePairs) -> Array:
     return np.asarray(pairs.width.mean(axis=1) + WIDTH_BIAS_PIXELS * pairs.pixel)
 
 
+def _width_sigmas(pictures: Pictures) -> Array:
+    """Return standard deviations of the logarithms of pairs' widths, (n_pictures, n_pairs)."""
+    pixel = WIDTH_PIXELS * pictures.pixel[:, None]
+    return np.asarray(np.hypot(WIDTH_ERROR, pixel / pictures.pairs[..., 7]))
+
+
 def gauss_newton_step(
-    pictures: Sequence[Picture],
+    pictures: Pictures,
     poses: CameraPoses,
-    matches: Sequence[PairMatches],
+    matches: PairMatches,
     tolerance: float,
     joint_error: float = 0.0,
 ) -> CameraPoses:
     """Return poses after one Gauss-Newton step towards the pairs that they match.
 
-    By pictures of one camera and matches with each, for a tolerance as in :func:`match_pairs`;
+    By pictures of one camera and matches with them, for a tolerance as in :func:`match_pairs`;
     ``joint_error`` is the standard deviation of the model's joints [m], 0 to leave them in place.
     """
     n, n_legs = poses.shift.shape[:2]
     centre = _centre(pictures, poses)
     H, b = _step_prior(centre), np.zeros((n, 6))
-    H_leg, H_cross = np.zeros((n, n_legs, 6, 6)), np.zeros((n, n_legs, 6, 6))
-    b_leg = np.zeros((n, n_legs, 6))
-    for picture, found in zip(pictures, matches, strict=True):
-        if len(picture.pairs) == 0 or len(picture.targets) == 0:
+    of_legs = np.zeros((n, n_legs, 6, 13))  # products with shifts, with motions, with residuals
+    done = 0
+    for some in pictures.blocks(n):
+        found = matches.of_pictures(slice(done, done := done + len(some)))
+        if found.score.size == 0 or some.pairs.shape[1] == 0:
             continue
-        J, J_leg, residual, weight = _equations(picture, poses, found, tolerance)
-        weighted = (J * weight[..., None]).swapaxes(2, 3)  # (n, T, 6, 4)
-        H += (weighted @ J).sum(axis=1)
-        b -= (weighted @ residual[..., None])[..., 0].sum(axis=1)
+        J, J_leg, residual, weight = _equations(some, poses, found, tolerance)
+        rows = np.concatenate([J, residual[..., None]], axis=-1)  # (K, n, T, 4, 7)
+        K, _, T = weight.shape[:3]
+        flat = (K, n, 4 * T, 7)
+        weighted = (J * weight[..., None]).reshape(*flat[:3], 6)
+        products = (weighted.swapaxes(2, 3) @ rows.reshape(flat)).sum(axis=0)
+        H += products[..., :6]
+        b -= products[..., 6]
         if joint_error > 0.0:
-            weighted_leg = (J_leg * weight[..., None]).swapaxes(2, 3)
-            of_leg, cross = weighted_leg @ J_leg, weighted @ J_leg
-            gradient = (weighted_leg @ residual[..., None])[..., 0]
-            for segment, leg in enumerate(picture.targets.leg.tolist()):
-                H_leg[:, leg] += of_leg[:, segment]
-                H_cross[:, leg] += cross[:, segment]
-                b_leg[:, leg] -= gradient[:, segment]
+            of_lines = np.concatenate([J_leg, rows[..., :2, :]], axis=-1)
+            weighted = (J_leg * weight[..., :2, None]).swapaxes(3, 4)
+            products = (weighted @ of_lines).swapaxes(0, 1).reshape(n, K * T, 6 * 13)
+            own = (some.leg.ravel() == np.arange(n_legs)[:, None]).astype(np.float64)
+            of_legs += (own @ products).reshape(n, n_legs, 6, 13)
     if joint_error == 0.0:
         xi = np.asarray(np.linalg.solve(H, b[..., None])[..., 0])
         return _moved(poses, xi, poses.shift, centre)
-    H_leg += np.eye(6) / joint_error**2
-    b_leg -= poses.shift.reshape(n, n_legs, 6) / joint_error**2
-    back = np.linalg.solve(H_leg, np.concatenate([H_cross.swapaxes(2, 3), b_leg[..., None]], -1))
-    H -= np.einsum("nlij,nljk->nik", H_cross, back[..., :6])
-    b -= np.einsum("nlij,nlj->ni", H_cross, back[..., 6])
-    xi = np.asarray(np.linalg.solve(H, b[..., None])[..., 0])
-    change = back[..., 6] - np.einsum("nlij,nj->nli", back[..., :6], xi)
-    return _moved(poses, xi, poses.shift + change.reshape(poses.shift.shape), centre)
+    H_leg = of_legs[..., :6] + np.eye(6) / joint_error**2
+    right = of_legs[..., 6:]
+    right[..., 6] = -right[..., 6] - poses.shift.reshape(n, n_legs, 6) / joint_error**2
+    back = np.linalg.solve(H_leg, right)
+    coupled = right[..., :6].reshape(n, 6 * n_legs, 6).swapaxes(1, 2)
+    taken = coupled @ back.reshape(n, 6 * n_legs, 7)
+    xi = np.asarray(np.linalg.solve(H - taken[..., :6], (b - taken[..., 6])[..., None]))
+    change = back[..., 6] - (back[..., :6] @ xi[:, None])[..., 0]
+    return _moved(poses, xi[..., 0], poses.shift + change.reshape(poses.shift.shape), centre)
 
 
-def _centre(pictures: Sequence[Picture], poses: CameraPoses) -> Array:
+def _centre(pictures: Pictures, poses: CameraPoses) -> Array:
     """Return the middle of the legs in the frame of each pose, (n, 3) [m]."""
-    ends = [p.targets.ends.reshape(-1, 3) for p in pictures if len(p.targets)]
-    middle = np.concatenate(ends).mean(axis=0) if ends else np.zeros(3)
+    ends = pictures.all_ends
+    middle = ends.mean(axis=0) if len(ends) else np.zeros(3)
     return np.asarray(poses.R @ middle + poses.t)
 
 
@@ -303,84 +420,77 @@ def _step_prior(centre: Array) -> Array:
 
 
 def _equations(
-    picture: Picture, poses: CameraPoses, found: PairMatches, tolerance: float
+    pictures: Pictures, poses: CameraPoses, found: PairMatches, tolerance: float
 ) -> tuple[Array, Array, Array, Array]:
     """Return residuals of each segment: two of its line, one of its width, one of its place.
 
-    Derivatives (n, T, 4, 6) by the motion of the camera, and by shifts of A and B of the leg;
-    residuals and weights (n, T, 4).
+    Derivatives (K, n, T, 4, 6) by the motion of the camera, and (K, n, T, 2, 6) of the first two,
+    which alone are accurate enough to move joints, by shifts of A and B of the leg; residuals and
+    weights (K, n, T, 4).
     """
-    pairs, place = picture.pairs, picture.targets.place
-    X, xy, width, _ = _in_picture(picture, poses)
-    along, across = pairs.along[found.pair], pairs.normal[found.pair]
-    to_ends = xy - pairs.middle[found.pair][:, :, None, :]
-    a = np.einsum("ntkx,ntx->ntk", to_ends, along)
-    o = np.einsum("ntkx,ntx->ntk", to_ends, across)
+    X, xy, width, _ = _in_picture(pictures, poses)
+    K, n_pairs = pictures.pairs.shape[:2]
+    table = np.concatenate([pictures.pairs, _width_sigmas(pictures)[..., None]], axis=2)
+    at = found.pair + (n_pairs * np.arange(K))[:, None, None]
+    of_pair = table.reshape(K * n_pairs, -1).take(at, axis=0)
+    middle, axes = of_pair[..., :2], of_pair[..., 2:6].reshape(*at.shape, 2, 2)
+    half, seen, sigma_width = of_pair[..., 6], of_pair[..., 7], of_pair[..., 9]
+    z = np.maximum(X[..., 2], MIN_DEPTH)
+    depth = 0.5 * (z[..., 0] + z[..., 1])
+    # Places of both ends along the pair and across it, and their derivatives by the ends.
+    places = (xy - middle[..., None, :]) @ axes.swapaxes(-1, -2)
+    a, o = places[..., 0], places[..., 1]
+    slopes = np.empty((*at.shape, 2, 2, 3))  # (along and across, ends, x y z)
+    slopes[..., :2] = axes[..., None, :]
+    slopes[..., 2] = -(axes @ xy.swapaxes(-1, -2))
+    slopes /= z[..., None, :, None]
     run = a[..., 1] - a[..., 0]
     run = np.where(np.abs(run) < 1e-6, 1e-6, run)
-    half = pairs.half_length[found.pair]
-    z = np.maximum(X[..., 2], MIN_DEPTH)
-    depth = z.mean(axis=-1)
-    # Derivatives of the offset of each end across the pair and along it, (n, T, 2, 3).
-    g, g_along = _of_offset(xy, across, z), _of_offset(xy, along, z)
-    shares = np.stack([(-half - a[..., 0]) / run, (half - a[..., 0]) / run], axis=-1)
-    parts = np.stack([1.0 - shares, shares], axis=-1)  # (n, T, 2 places, 2 ends)
-    residual = np.einsum("ntpe,nte->ntp", parts, o)
+    parts = np.empty((*at.shape, 2, 2))  # (places, ends)
+    parts[..., 1] = (np.stack([-half, half], axis=-1) - a[..., :1]) / run[..., None]
+    parts[..., 0] = 1.0 - parts[..., 1]
     share = -a[..., 0] / run
+    shares = np.stack([1.0 - share, share], axis=-1)
     expected = np.maximum(width[..., 0] + (width[..., 1] - width[..., 0]) * share, 1e-6)
-    seen = pair_widths(pairs)[found.pair]
-    P = (1.0 - share)[..., None] * X[:, :, 0] + share[..., None] * X[:, :, 1]
-    of_depth = np.zeros_like(P)
-    of_depth[..., 2] = -1.0 / np.maximum(P[..., 2], MIN_DEPTH)
-    # Derivatives (n, T, 4, 2, 3) of the residuals by the two ends in the camera frame.
-    D = np.empty((*P.shape[:2], 4, 2, 3))
-    D[:, :, :2] = parts[..., None] * g[:, :, None]
-    D[:, :, 2, 0] = (1.0 - share)[..., None] * of_depth
-    D[:, :, 2, 1] = share[..., None] * of_depth
-    D[:, :, 3] = 0.5 * g_along
-    D = D @ picture.R  # by the ends in the frame of the poses
-    X = (X - picture.t) @ picture.R
-    turning = cross(X[:, :, None], D).sum(axis=3)
-    J = np.concatenate([turning, D.sum(axis=3)], axis=-1)
-    in_base = D @ poses.R[:, None, None]
-    at = place[:, None, :, None]  # (T, 1, 2, 1)
+    deep = np.maximum(np.sum(shares * X[..., 2], axis=-1), MIN_DEPTH)
+    # Derivatives (K, n, T, 4, 2, 3) of the residuals by the two ends in the camera frame.
+    D = np.zeros((*at.shape, 4, 2, 3))
+    D[..., :2, :, :] = parts[..., None] * slopes[..., None, 1, :, :]
+    D[..., 2, :, 2] = -shares / deep[..., None]
+    D[..., 3, :, :] = 0.5 * slopes[..., 0, :, :]
+    flat = (*at.shape[:2], -1, 3)
+    # By the ends in the frame of the poses, and in the base link.
+    D = (D.reshape(flat) @ pictures.R[:, None]).reshape(D.shape)
+    X = ((X - pictures.t[:, None, None, None]).reshape(flat) @ pictures.R[:, None]).reshape(X.shape)
+    lines = D[..., :2, :, :]
+    in_base = (lines.reshape(flat) @ poses.R).reshape(lines.shape)
+    J = np.concatenate([cross(X[..., None, :, :], D).sum(axis=-2), D.sum(axis=-2)], axis=-1)
+    where = pictures.place[:, None, :, None, :, None]
     J_leg = np.concatenate(
-        [((1.0 - at) * in_base).sum(axis=3), (at * in_base).sum(axis=3)], axis=-1
+        [((1.0 - where) * in_base).sum(axis=-2), (where * in_base).sum(axis=-2)], axis=-1
     )
-    J_leg[:, :, 2:] = 0.0  # not accurate enough to move joints
-    sigma_width = np.hypot(WIDTH_ERROR, WIDTH_PIXELS * pairs.pixel / seen)
+    residual = np.empty((*at.shape, 4))
+    residual[..., :2] = (parts @ o[..., None])[..., 0]
+    residual[..., 2] = np.log(expected / seen)
+    residual[..., 3] = 0.5 * (a[..., 0] + a[..., 1])
     sigma = max(LINE_ERROR, MIN_LINE_SHARE * tolerance) / depth
-    line = found.score / (sigma**2 + (LINE_PIXELS * pairs.pixel) ** 2)
     # A pair as long as the segment has its middle where the segment has it.
     length = np.abs(run)
     sigma_place = ALONG_ERROR * length + 0.5 * np.abs(length - 2.0 * half)
-    return (
-        J,
-        J_leg,
-        np.concatenate(
-            [residual, np.stack([np.log(expected / seen), a.mean(axis=-1)], axis=-1)], axis=-1
-        ),
-        np.stack([line, line, found.score / sigma_width**2, found.score / sigma_place**2], axis=-1),
-    )
+    variance = np.empty_like(residual)
+    pixel = LINE_PIXELS * pictures.pixel[:, None, None]
+    variance[..., 0] = variance[..., 1] = sigma**2 + pixel**2
+    variance[..., 2], variance[..., 3] = sigma_width**2, sigma_place**2
+    return J, J_leg, residual, found.score[..., None] / variance
 
 
-def _of_offset(xy: Array, normal: Array, z: Array) -> Array:
-    """Return derivatives (n, T, 2, 3) of offsets along normals (n, T, 2) of points xy at depths z.
-
-    They are those by the points in the camera frame.
-    """
-    across = np.broadcast_to(normal[:, :, None, :], xy.shape)
-    in_depth = -np.einsum("ntkx,ntx->ntk", xy, normal)[..., None]
-    return np.asarray(np.concatenate([across, in_depth], axis=-1) / z[..., None])
-
-
-def distances(picture: Picture, poses: CameraPoses, found: PairMatches) -> Array:
-    """Return how far segments are from the pairs that agree with them, (n_poses, n_targets) [m].
+def distances(pictures: Pictures, poses: CameraPoses, found: PairMatches) -> Array:
+    """Return how far segments are from the pairs that agree with them, (K, n, T) [m].
 
     Sideways, at the ends of the pairs and at the depth of the segments.
     """
-    _, _, residual, _ = _equations(picture, poses, found, 1.0)
-    X, _, _, _ = _in_picture(picture, poses)
+    _, _, residual, _ = _equations(pictures, poses, found, 1.0)
+    X, _, _, _ = _in_picture(pictures, poses)
     return np.asarray(np.abs(residual[..., :2]).max(axis=-1) * X[..., 2].mean(axis=-1))
 
 

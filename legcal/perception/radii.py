@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from legcal.geometry import Array
+from legcal.geometry import Array, IntArray
 from legcal.machine import Cylinder
 from legcal.perception.pair_matching import (
     CameraPoses,
     PairMatches,
     Picture,
+    Pictures,
     gauss_newton_step,
     match_pairs,
 )
@@ -106,9 +107,11 @@ def estimate_radii(
     """
     samples: dict[LegRadius, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for view, pictures, placed in views:
-        pose = _by_lines(pictures, placed)
-        for picture in pictures:
-            for part, logarithm in _logarithms(picture, pose):
+        every = Pictures.of(pictures)
+        pose = _by_lines(every, placed)
+        found = _whatever_the_width(every, pose, TOLERANCES[-1])
+        for picture, score, pair in zip(pictures, found.score, found.pair, strict=True):
+            for part, logarithm in _logarithms(picture, pose, score[0], pair[0]):
                 samples[part][view].append(logarithm)
     agreed = {part: _agreed(list(of_part.values())) for part, of_part in samples.items()}
     known = {part: found for part, found in agreed.items() if found is not None}
@@ -161,21 +164,20 @@ def _densest(values: Array) -> float:
     return float(np.median(ordered[first : first + most]))
 
 
-def _by_lines(pictures: Sequence[Picture], placed: CameraPoses) -> CameraPoses:
+def _by_lines(pictures: Pictures, placed: CameraPoses) -> CameraPoses:
     """Return a pose by where pairs are, which widths hardly move: joints stay as in the model."""
     pose = CameraPoses.rigid(placed.R[:1], placed.t[:1], placed.shift.shape[1])
     for tolerance in TOLERANCES:
-        found = [_whatever_the_width(picture, pose, tolerance) for picture in pictures]
+        found = _whatever_the_width(pictures, pose, tolerance)
         pose = gauss_newton_step(pictures, pose, found, tolerance)
     return pose
 
 
-def _whatever_the_width(picture: Picture, pose: CameraPoses, tolerance: float) -> PairMatches:
+def _whatever_the_width(pictures: Pictures, pose: CameraPoses, tolerance: float) -> PairMatches:
     """Return the best pairs of segments with any radius; farther factors must be clearly better."""
-    targets = picture.targets
-    best = match_pairs(picture, pose, tolerance)
+    best = match_pairs(pictures, pose, tolerance)
     for factor in FACTORS[1:]:
-        scaled = replace(picture, targets=replace(targets, radius=factor * targets.radius))
+        scaled = replace(pictures, radius=factor * pictures.radius)
         found = match_pairs(scaled, pose, tolerance)
         better = found.score > np.maximum(PREFERRED * best.score, MIN_MATCH_SCORE)
         best = PairMatches(
@@ -186,15 +188,18 @@ def _whatever_the_width(picture: Picture, pose: CameraPoses, tolerance: float) -
     return best
 
 
-def _logarithms(picture: Picture, pose: CameraPoses) -> list[tuple[LegRadius, float]]:
-    """Return the logarithms of the widths of a picture's pairs against the model's."""
+def _logarithms(
+    picture: Picture, pose: CameraPoses, score: Array, pair: IntArray
+) -> list[tuple[LegRadius, float]]:
+    """Return the logarithms of the widths of a picture's pairs against the model's.
+
+    By the scores (n_segments,) of its segments with pairs at a pose.
+    """
     targets = picture.targets
     if len(targets) == 0 or len(picture.pairs) == 0:
         return []
     R, t = picture.R @ pose.R[0], picture.R @ pose.t[0] + picture.t
-    found = _whatever_the_width(picture, pose, TOLERANCES[-1])
-    best, pair = found.score[0], found.pair[0]
-    best = np.where(best >= MIN_MATCH_SCORE, best, 0.0)
+    best = np.where(score >= MIN_MATCH_SCORE, score, 0.0)
     logarithms = []
     for k in np.flatnonzero(best > 0.0).tolist():
         if np.count_nonzero((pair == pair[k]) & (best > 0.0)) > 1:  # whose pair it is, is not known
