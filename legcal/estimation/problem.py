@@ -325,6 +325,24 @@ class _Layout:
     n_kept: int
     places: tuple[Places, ...]
 
+    def is_of(
+        self,
+        variables: tuple[Variables, ...],
+        eliminated: Variables | None,
+        touches: tuple[tuple[tuple[Touch, ...], IntArray | None], ...],
+    ) -> bool:
+        """Say whether it was made for these very objects."""
+        return (
+            self.eliminated is eliminated
+            and len(self.variables) == len(variables)
+            and len(self.touches) == len(touches)
+            and all(a is b for a, b in zip(self.variables, variables, strict=True))
+            and all(
+                a is b and one is other
+                for (a, one), (b, other) in zip(self.touches, touches, strict=True)
+            )
+        )
+
 
 def _same_unknowns(old: _Layout, problem: Problem[Any]) -> bool:
     """Say whether the unknowns of a problem stand where those of a layout do."""
@@ -373,6 +391,8 @@ class Problem(Generic[S]):
     def _laid_out(self, old: _Layout | None) -> _Layout:
         """Return the layout, with what is left of an old one."""
         touches = tuple((factor.touches, factor.element) for factor in self.factors)
+        if old is not None and old.is_of(self.variables, self.eliminated, touches):
+            return old
         same = old is not None and _same_unknowns(old, self)
         if old is not None and same:
             place, n_kept = old.place, old.n_kept

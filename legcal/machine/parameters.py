@@ -301,8 +301,10 @@ def _twist(leg: Leg, nominal: Leg) -> float:
 
     Twists are angles between lines.
     """
+    if leg.twist is None or nominal.twist is None:
+        return 0.0
     twist = twist_after(leg, _turn_between(nominal.platform_axis, leg.platform_axis).inv())
-    if twist is None or nominal.twist is None:
+    if twist is None:
         return 0.0
     return float(twist - np.pi * np.round((twist - nominal.twist) / np.pi))
 

@@ -129,6 +129,7 @@ def fit_in_rounds(
     least[: len(KINDS)] = [problem.choices.least_shared_px.get(kind, 0.0) for kind in KINDS]
     biases = possible.of_sizes(with_gamma(np.zeros(N_KINDS)))
     problem, state = with_edge_biases(problem, first, biases)
+    are_white = False  # whether residuals show no such biases, known after a round
 
     def solved(relative_tolerance: float = 0.0) -> tuple[FitProblem, Minimum[State]]:
         """Pass through the minimum with this noise and these outlines."""
@@ -158,26 +159,32 @@ def fit_in_rounds(
         problem, minimum = solved(_REJECTION_TOLERANCE)
         state, iterations = minimum.state, iterations + minimum.iterations
     with_possible, changes = problem.with_biases(possible), NO_CHANGES
-    linear = None
+    problem = problem.weighted(noise, accepted)
+    linear = linearize(problem, state)
     for _ in range(settings.noise_rounds if len(claimed) else 1):
         errors_before, accepted_before = _sizes(noise, biases), accepted
-        noise = _noise(problem.weighted(noise, accepted), state, linear, noise, accepted, settings)
+        noise = _noise(problem, state, linear, noise, accepted, settings)
         accepted = _accepted(problem, state, noise, settings)
+        n_changed = int(np.sum(accepted != accepted_before))
+        changes = Changes(errors_before, _sizes(noise, biases), n_changed, int(accepted.sum()))
+        if are_white and changes.converged(settings):
+            problem = problem.weighted(noise, accepted)
+            linear = linearize(problem, state)
+            break
         problem, minimum = solved()
-        state, iterations = minimum.state, iterations + minimum.iterations
+        state, iterations, linear = minimum.state, iterations + minimum.iterations, minimum.linear
         if not accepted.any():
             break
         there = replace(state, biases=_values(problem, state, possible))
         scores = scores_of_block(with_possible.weighted(noise, accepted), there, "biases")
         biases = estimated_biases(possible, *scores, least, near=biases)
-        if len(biases) or len(state.biases):
+        are_white = not len(biases) and not len(state.biases)
+        if not are_white:
             problem, state = with_edge_biases(problem, state, biases)
             problem, minimum = solved()
             state, iterations = minimum.state, iterations + minimum.iterations
-        linear = minimum.linear
-        errors = _sizes(noise, biases)
-        n_changed = int(np.sum(accepted != accepted_before))
-        changes = Changes(errors_before, errors, n_changed, int(accepted.sum()))
+            linear = minimum.linear
+        changes = replace(changes, after=_sizes(noise, biases))
         if changes.converged(settings):
             break
     minimum = minimise(
@@ -186,7 +193,7 @@ def fit_in_rounds(
         PseudoHuber(settings.loss_width),
         is_near=True,
         max_iterations=settings.max_iterations,
-        known=minimum.linear.rows,
+        known=linear.rows,
     )
     state, iterations = minimum.state, iterations + minimum.iterations
     _refuse_disagreement(problem.offsets(state), accepted, settings)
@@ -219,7 +226,7 @@ def _values(problem: FitProblem, state: State, biases: EdgeBiases) -> Array:
 def _noise(
     problem: FitProblem,
     state: State,
-    linear: Linearization | None,
+    linear: Linearization,
     noise: NoiseModel,
     accepted: BoolArray,
     settings: RefinementSettings,
@@ -228,7 +235,6 @@ def _noise(
     if not accepted.any():
         return noise
     claimed = problem.outlines.covariance
-    linear = linearize(problem, state) if linear is None else linear
     normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
     L = np.linalg.cholesky(noise.covariance(claimed))
     share = explained_share(problem, linear, normal, "outlines")
