@@ -59,6 +59,7 @@ class Minimum(Generic[S]):
     linear: Linearization
     cost: float
     iterations: int  # steps that were tried
+    rate: float = 1.0  # what the last step predicted to fall, over what the one before did
 
 
 def minimise(
@@ -72,6 +73,7 @@ def minimise(
     relative_tolerance: float = 0.0,
     must_converge: bool = True,
     known: Mapping[str, Residuals] | None = None,
+    rate: float = 1.0,
 ) -> Minimum[S]:
     """Minimise the robust cost from a state.
 
@@ -94,6 +96,9 @@ def minimise(
         Whether to refuse where the steps do not come to an end; else the best state is returned.
     known : mapping, optional
         Rows of factors at the start.
+    rate : float
+        That of a minimum nearby, if the start is one with other weights: where the first step does
+        not have to be followed by another is known then.
 
     Raises
     ------
@@ -117,27 +122,28 @@ def minimise(
         fall = cost - there
         if trial is None or not np.isfinite(fall) or not (fall > 0.0 or converged):
             failed, damping = damping, 10.0 * damping
-            fall_before = np.inf
+            fall_before, rate = np.inf, 1.0
             if damping > _MAX_DAMPING:
                 break
             continue
         (state, linear), cost, normal = trial, there, None
         damping = max(_next(damping, fall / max(predicted, 1e-300)), _DAMPING_MARGIN * failed)
         failed *= _DAMPING_DECAY
-        rate = predicted / fall_before if np.isfinite(fall_before) else 1.0
-        expected = predicted * min(rate, 1.0)
+        if np.isfinite(fall_before):
+            rate = min(predicted / fall_before, 1.0)
+        expected = predicted * rate
         narrower = wide
         if expected < _SLOW_FALL * cost:
             narrower = _widened(problem, linear, loss, wide.width)
         if narrower.width == wide.width and expected < _CONVERGED_FALL * cost:
             narrower = _of_width(loss, max(loss.width, _NARROWED * wide.width))
         if narrower.width != wide.width:
-            wide, fall_before = narrower, np.inf
+            wide, fall_before, rate = narrower, np.inf, 1.0
             cost = robust_cost(problem, linear, wide)
             continue
         smallest = relative_tolerance * cost if iteration > _MIN_ITERATIONS else 0.0
         if converged or expected < max(smallest, tolerance):
-            return Minimum(state, linear, cost, iteration)
+            return Minimum(state, linear, cost, iteration, rate)
         fall_before = predicted
     if not must_converge:
         return Minimum(state, linear, cost, iteration)

@@ -259,11 +259,11 @@ def _fitted(
     first = first_minimum(problem, state, settings=settings)
     normal = information(problem, first.state, first.linear, PseudoHuber(settings.loss_width))
     held = open_directions(problem, first.state, normal)
-    state = first.state
     if len(held.basis):
-        problem, state = held_at_nominal(problem, state, held)
-        state = first_minimum(problem, state, settings=settings).state
-    return fit_in_rounds(problem, state, first.iterations, settings), held
+        problem, state = held_at_nominal(problem, first.state, held)
+        there = first_minimum(problem, state, settings=settings)
+        first = replace(there, iterations=first.iterations + there.iterations)
+    return fit_in_rounds(problem, first, settings), held
 
 
 def _compared(

@@ -197,13 +197,14 @@ def _refined(
     normal = information(problem, first.state, first.linear, loss)
     held = open_directions(problem, first.state, normal)
     refuse_other_board(problem, first.state, normal, settings)
-    free, state, iterations = problem, first.state, first.iterations
+    free, state = problem, first.state
     try:
         if len(held.basis):
             problem, state = held_at_nominal(problem, state, held)
             there = first_minimum(problem, state, settings=settings)
-            state, iterations = there.state, iterations + there.iterations
-        fit = fit_in_rounds(problem, state, iterations, settings)
+            state = there.state
+            first = dataclasses.replace(there, iterations=first.iterations + there.iterations)
+        fit = fit_in_rounds(problem, first, settings)
         normal = information(fit.problem, fit.state, fit.minimum.linear, loss)
         refuse_undetermined_inliers(fit.problem, fit.state, normal, held)
         _refuse_other_radii(problem, fit.state)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -108,13 +109,11 @@ def first_minimum(
     return Minimum(found.state, linear, robust_cost(problem, linear, loss), found.iterations)
 
 
-def fit_in_rounds(
-    problem: FitProblem, first: State, iterations: int, settings: RefinementSettings
-) -> Fit:
-    """Reject outliers until none changes, then estimate the noise and solve, in rounds.
+def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: RefinementSettings) -> Fit:
+    """Reject outliers until hardly any changes, then estimate the noise and solve, in rounds.
 
     Of axes the claimed covariances are taken as they are, and the robust loss alone guards against
-    wrong ones. *first* is what :func:`first_minimum` found in *iterations*.
+    wrong ones. *first* is what :func:`first_minimum` found.
 
     Raises
     ------
@@ -128,51 +127,34 @@ def fit_in_rounds(
     least = np.zeros(N_KINDS)
     least[: len(KINDS)] = [problem.choices.least_shared_px.get(kind, 0.0) for kind in KINDS]
     biases = possible.of_sizes(with_gamma(np.zeros(N_KINDS)))
-    problem, state = with_edge_biases(problem, first, biases)
-    are_white = False  # whether residuals show no such biases, known after a round
-
-    def solved(relative_tolerance: float = 0.0) -> tuple[FitProblem, Minimum[State]]:
-        """Pass through the minimum with this noise and these outlines."""
-        weighted, loss = problem.weighted(noise, accepted), PseudoHuber(settings.loss_width)
-        found = minimise(
-            weighted,
-            state,
-            loss,
-            is_near=True,
-            max_iterations=settings.max_iterations,
-            tolerance=_PASSING,
-            relative_tolerance=relative_tolerance,
-        )
-        return weighted, found
-
+    problem, minimum = _with_edge_biases(problem, first, biases)
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before = accepted
-        noise = noise_of_the_median(problem.offsets(state)[before], claimed[before])
-        accepted = _accepted(problem, state, noise, settings)
-        if np.array_equal(before, accepted):
-            break
-        problem, minimum = solved(_REJECTION_TOLERANCE)
-        state, iterations = minimum.state, iterations + minimum.iterations
-    _refuse_disagreement(problem.offsets(state), accepted, settings)
-    for _ in range(_BOARD_ROUNDS if len(problem.corners) else 0):
-        problem = _with_judged_corners(problem.weighted(noise, accepted), state, settings)
-        problem, minimum = solved(_REJECTION_TOLERANCE)
-        state, iterations = minimum.state, iterations + minimum.iterations
-    with_possible, changes = problem.with_biases(possible), NO_CHANGES
+        noise = noise_of_the_median(problem.offsets(minimum.state)[before], claimed[before])
+        accepted = _accepted(problem, minimum.state, noise, settings)
+        if np.sum(before != accepted) <= settings.error_tolerance * accepted.sum():
+            break  # rounds of noise reject these
+        problem = problem.weighted(noise, accepted)
+        minimum = _passed(problem, minimum, settings, _REJECTION_TOLERANCE)
+    _refuse_disagreement(problem.offsets(minimum.state), accepted, settings)
     problem = problem.weighted(noise, accepted)
-    linear = linearize(problem, state)
+    for _ in range(_BOARD_ROUNDS if len(problem.corners) else 0):
+        problem = _with_judged_corners(problem, minimum.state, settings)
+        minimum = _passed(problem, minimum, settings, _REJECTION_TOLERANCE)
+    with_possible, changes, are_white = problem.with_biases(possible), NO_CHANGES, False
+    linear = linearize(problem, minimum.state)
     for _ in range(settings.noise_rounds if len(claimed) else 1):
         errors_before, accepted_before = _sizes(noise, biases), accepted
-        noise = _noise(problem, state, linear, noise, accepted, settings)
-        accepted = _accepted(problem, state, noise, settings)
+        noise = _noise(problem, minimum.state, linear, noise, accepted, settings)
+        accepted = _accepted(problem, minimum.state, noise, settings)
         n_changed = int(np.sum(accepted != accepted_before))
         changes = Changes(errors_before, _sizes(noise, biases), n_changed, int(accepted.sum()))
+        problem = problem.weighted(noise, accepted)
         if are_white and changes.converged(settings):
-            problem = problem.weighted(noise, accepted)
-            linear = linearize(problem, state)
+            linear = linearize(problem, minimum.state)
             break
-        problem, minimum = solved()
-        state, iterations, linear = minimum.state, iterations + minimum.iterations, minimum.linear
+        minimum = _passed(problem, minimum, settings)
+        state, linear = minimum.state, minimum.linear
         if not accepted.any():
             break
         there = replace(state, biases=_values(problem, state, possible))
@@ -180,22 +162,14 @@ def fit_in_rounds(
         biases = estimated_biases(possible, *scores, least, near=biases)
         are_white = not len(biases) and not len(state.biases)
         if not are_white:
-            problem, state = with_edge_biases(problem, state, biases)
-            problem, minimum = solved()
-            state, iterations = minimum.state, iterations + minimum.iterations
+            problem, minimum = _with_edge_biases(problem, minimum, biases)
+            minimum = _passed(problem, minimum, settings)
             linear = minimum.linear
         changes = replace(changes, after=_sizes(noise, biases))
         if changes.converged(settings):
             break
-    minimum = minimise(
-        problem,
-        state,
-        PseudoHuber(settings.loss_width),
-        is_near=True,
-        max_iterations=settings.max_iterations,
-        known=linear.rows,
-    )
-    state, iterations = minimum.state, iterations + minimum.iterations
+    minimum = _solved(problem, minimum, settings, known=linear.rows)
+    state = minimum.state
     _refuse_disagreement(problem.offsets(state), accepted, settings)
     wrong = int(np.sum(minimum.linear["axes"].squared_norms > settings.axis_disagreement**2))
     if 2 * wrong > len(problem.axes):
@@ -206,7 +180,47 @@ def fit_in_rounds(
             "sigmas."
         )
     notes = check_convergence(changes, claimed, settings)
-    return Fit(problem, minimum, noise, biases, accepted, iterations, notes)
+    return Fit(problem, minimum, noise, biases, accepted, minimum.iterations, notes)
+
+
+def _passed(
+    problem: FitProblem,
+    near: Minimum[State],
+    settings: RefinementSettings,
+    relative_tolerance: float = 0.0,
+) -> Minimum[State]:
+    """Pass through the minimum of a problem *near* that of one with other weights."""
+    return _solved(
+        problem,
+        near,
+        settings,
+        tolerance=_PASSING,
+        relative_tolerance=relative_tolerance,
+        rate=near.rate,
+    )
+
+
+def _solved(
+    problem: FitProblem, near: Minimum[State], settings: RefinementSettings, **options: Any
+) -> Minimum[State]:
+    """Return the minimum of a problem near another one, with the iterations of both."""
+    found = minimise(
+        problem,
+        near.state,
+        PseudoHuber(settings.loss_width),
+        is_near=True,
+        max_iterations=settings.max_iterations,
+        **options,
+    )
+    return replace(found, iterations=near.iterations + found.iterations)
+
+
+def _with_edge_biases(
+    problem: FitProblem, minimum: Minimum[State], biases: EdgeBiases
+) -> tuple[FitProblem, Minimum[State]]:
+    """Return problem and minimum with these biases in place of others."""
+    problem, state = with_edge_biases(problem, minimum.state, biases)
+    return problem, replace(minimum, state=state)
 
 
 def with_edge_biases(

@@ -50,10 +50,13 @@ class Sensitivity:
     steps: Array  # (p, c) steps of all of them [m, rad], for each independent part of the error
 
 
-def with_known_intrinsics(problem: FitProblem, state: State) -> tuple[FitProblem, Linearization]:
+def with_known_intrinsics(
+    problem: FitProblem, state: State, linear: Linearization
+) -> tuple[FitProblem, Linearization]:
     """Return problem and rows with derivatives by intrinsics that count as known, too."""
     wide = problem.with_keys(tuple(dict.fromkeys((*problem.keys, *_KEYS))))
-    return wide, linearize(wide, state)
+    without_cameras = {name: linear[name] for name in ("readings", "axes")}
+    return wide, linearize(wide, state, without_cameras)
 
 
 def sensitivities(

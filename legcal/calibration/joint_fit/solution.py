@@ -130,7 +130,7 @@ def assemble_solution(
     names = tuple(name for name in values if status[name] == "estimated")
     where = [problem.named.index(name) for name in names]
     estimated = covariance[np.ix_(where, where)]
-    offsets = problem.offsets(state)
+    offsets, cost = problem.offsets(state), comparable_cost(problem, state, settings)
     used = offsets[fit.accepted]
     n_rejected = offsets.size - used.size
     n_residuals = problem.n_equations + len(problem.priors.mean) - n_rejected
@@ -145,7 +145,7 @@ def assemble_solution(
     held_values = np.zeros((len(held.basis), len(problem.free)))
     held_values[:, problem.free] = (held.basis * held.unit)[:, : problem.n_kinematic]
     biases = zip(problem.block("biases").labels, state.biases.tolist(), strict=True)
-    wide, wide_linear = with_known_intrinsics(problem, state)
+    wide, wide_linear = with_known_intrinsics(problem, state, linear)
     focal = focal_lengths(wide, state, wide_linear)
     contradicted = [f for f in focal if f.is_contradicted]
     gammas = _gammas(problem, state, kept, outlines)
@@ -168,7 +168,7 @@ def assemble_solution(
         held_basis=held_values,
         weak=worst_directions(estimated, names, named_units(problem, state)[where]),
         held=held.directions,
-        cost=comparable_cost(problem, state, settings),
+        cost=cost,
         chi2=chi2,
         dof=dof,
         rms_px=_rms(used),
