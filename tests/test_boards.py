@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from boards import (
@@ -38,9 +39,10 @@ from legcal.vision import (
     Camera,
     board_document,
     charuco_board,
-    enlarged,
     parse_board,
+    possible_scale,
     reduced,
+    rescaled,
 )
 from legcal.workers import in_turn
 
@@ -198,15 +200,45 @@ def test_corners_of_a_blurred_picture_have_larger_sigmas() -> None:
     assert np.sqrt(np.mean((error / sigma[:, None]) ** 2)) < 1.6
 
 
-def test_pixels_of_an_enlarged_image_are_put_back_where_they_were() -> None:
-    """Corners of small boards are searched in an enlarged image."""
+@pytest.mark.parametrize("scale", [2, 1.6, 0.7])
+def test_pixels_of_a_rescaled_image_are_put_back_where_they_were(scale: float) -> None:
+    """Corners of small boards are searched in an enlarged image, of large images in a smaller."""
     x, y = np.meshgrid(np.arange(60.0), np.arange(40.0))
     spot = 200.0 * np.exp(-0.5 * ((x - 31.3) ** 2 + (y - 17.8) ** 2) / 9.0)
-    image = enlarged(spot.astype(np.uint8), 2)
-    assert image.shape == (80, 120)
-    v, u = np.indices(image.shape)
+    image = rescaled(spot.astype(np.uint8), scale)
+    height, width = image.shape
+    assert (height, width) == (40 * scale, 60 * scale)
+    v, u = np.indices((height, width))
     centroid = np.array([(u * image).sum(), (v * image).sum()]) / image.sum(dtype=np.float64)
-    assert reduced(centroid, 2) == pytest.approx([31.3, 17.8], abs=0.03)
+    assert reduced(centroid, scale) == pytest.approx([31.3, 17.8], abs=0.03)
+
+
+def test_images_are_searched_at_no_more_pixels_than_memory_allows() -> None:
+    image = np.zeros((300, 400), dtype=np.uint8)
+    assert possible_scale(image, 2, 480_000) == 2
+    assert possible_scale(image, 2, 270_000) == 1.5
+    assert possible_scale(image, 1, 30_000) == 0.5
+
+
+def test_corners_of_a_large_picture_are_searched_in_a_smaller_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """They are measured in the large one all the same."""
+    board, _, image = plain_picture("chessboard")
+    number, px, _ = find_corners(board, image)
+    searched = list[int]()
+    search = cv2.findChessboardCornersSBWithMeta
+
+    def count(picture: Any, *options: Any) -> Any:
+        searched.append(picture.size)
+        return search(picture, *options)
+
+    monkeypatch.setattr(cv2, "findChessboardCornersSBWithMeta", count)
+    monkeypatch.setattr("legcal.perception.board_corners._MAX_SEARCHED", image.size // 2)
+    again, px_again, _ = find_corners(board, image)
+    assert max(searched) <= 0.51 * image.size
+    assert np.array_equal(again, number)
+    assert np.abs(px_again - px).max() < 0.01
 
 
 def test_gamma_does_not_move_corners() -> None:

@@ -230,6 +230,16 @@ def test_a_place_that_is_not_free_is_refused_and_stays(case: str, tmp_path: Path
     assert contents(tmp_path) == before
 
 
+def test_a_pipe_in_the_way_of_a_result_is_refused_and_stays(tmp_path: Path) -> None:
+    write_result(tmp_path / "out")
+    pipe = tmp_path / "out/calibrated.urdf"
+    pipe.unlink()
+    os.mkfifo(pipe)
+    with pytest.raises(UsageError, match=r"calibrated\.urdf, which is a pipe or a device"):
+        write_result(tmp_path / "out")
+    assert pipe.is_fifo()
+
+
 def test_folders_without_permission_and_without_a_name_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,7 +20,7 @@ from pydantic import (
 )
 
 from legcal.errors import DatasetError
-from legcal.files import Document, Number, Version, describe, read_text, validate
+from legcal.files import Document, Number, Version, content_of, describe, validate
 
 Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
 AxesByLeg = dict[str, Triple]  # unit vectors
@@ -254,7 +254,7 @@ class Result(Legs, Heading):
         DatasetError
             If it is missing, or no such document.
         """
-        content = read_text(path, "result of an earlier calibration")
+        content = content_of(path, "result of an earlier calibration")
         try:
             found = json.loads(content)
         except (ValueError, RecursionError) as error:

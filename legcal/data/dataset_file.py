@@ -19,9 +19,8 @@ from legcal.files import (
     Quantity,
     Version,
     describe,
-    parse_yaml,
     read_prior,
-    read_text,
+    read_yaml,
     validate,
 )
 from legcal.machine import DATASET_YAML
@@ -127,7 +126,7 @@ def find_dataset_file(given: Path) -> Path:
 
 def read_dataset_file(path: Path) -> DatasetEntry:
     """Return the checked content of dataset.yaml."""
-    found = parse_yaml(read_text(path, "dataset file"), path, "dataset file")
+    found = read_yaml(path, "dataset file")
     version = found.get("legcal_dataset", 1)
     if version != 1 or isinstance(version, bool):
         raise DatasetError(

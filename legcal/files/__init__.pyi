@@ -40,12 +40,13 @@ from .schema import Number as Number
 from .schema import PlainName as PlainName
 from .schema import Version as Version
 from .schema import closest as closest
+from .schema import content_of as content_of
 from .schema import describe as describe
 from .schema import is_name as is_name
 from .schema import is_plain_name as is_plain_name
 from .schema import parse_yaml as parse_yaml
 from .schema import plain_name as plain_name
-from .schema import read_text as read_text
+from .schema import read_yaml as read_yaml
 from .schema import validate as validate
 from .table import Column as Column
 from .table import Table as Table

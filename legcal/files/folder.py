@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from legcal.errors import DatasetError, LegcalError, OutOfResources, UsageError
 from legcal.files.reading import read_json
-from legcal.files.schema import parse_yaml, read_text
+from legcal.files.schema import read_yaml
 from legcal.signals import held_back_signals, raise_if_stopped
 
 TEMPORARY_SUFFIX = ".legcal-part"
@@ -93,7 +93,7 @@ class YamlOutput:
     def _is_own(self, path: Path) -> bool:
         """Say whether a file is of this kind."""
         try:
-            return self.key in parse_yaml(read_text(path, self.what), path, self.what)
+            return self.key in read_yaml(path, self.what)
         except DatasetError:
             return False
 
@@ -234,9 +234,9 @@ def result_folder(
                 os.rename(new, destination)
     except OSError as error:
         raise OutOfResources(
-            f"{destination}: the {kind.noun} could not be written: found '{error.strerror}', "
-            "needed a folder that takes its files; free some space or give another output folder; "
-            "nothing was written."
+            f"{destination}: the {kind.noun} could not be written: found "
+            f"'{error.strerror or error}', needed a folder that takes its files; free some space "
+            "or give another output folder; nothing was written."
         ) from error
 
 
@@ -262,6 +262,8 @@ def _check_places(
         if not found and os.path.lexists(destination / name):
             if (destination / name).is_dir():
                 found = f"{name}, which is a folder"
+            elif (destination / name).exists() and not (destination / name).is_file():
+                found = f"{name}, which is a pipe or a device"
             elif replaceable is not None and name not in replaceable:
                 found = f"{name}, which legcal did not write"
         if found:

@@ -37,7 +37,7 @@ def open_regular(path: Path, most: int | None = None) -> BinaryIO:
         :class:`NotRegular`, :class:`TooLarge` or as the system says; ``strerror`` is what was
         found.
     """
-    not_regular = NotRegular(errno.EINVAL, "a folder or a device", str(path))
+    not_regular = NotRegular(errno.EINVAL, "a folder, pipe or device", str(path))
     if not stat.S_ISREG(os.stat(path).st_mode):
         raise not_regular
     # another file may have taken its place: a pipe that is opened so is not waited for

@@ -134,9 +134,9 @@ class _Loader(yaml.SafeLoader):
         self._n_nodes += 1
         self._depth += 1
         if self._n_nodes > MAX_NODES:
-            raise _TooMuch(f"more than {MAX_NODES} values", "far fewer; split the file")
+            raise _TooMuch(f"more than {MAX_NODES} values", "fewer; split the file")
         if self._depth > MAX_DEPTH:
-            raise _TooMuch(f"more than {MAX_DEPTH} levels", "far fewer; write it without nesting")
+            raise _TooMuch(f"more than {MAX_DEPTH} levels", "fewer; write it without nesting")
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node
@@ -147,7 +147,7 @@ class _Loader(yaml.SafeLoader):
         if self._n_merged > MAX_NODES:
             raise _TooMuch(
                 f"more than {MAX_NODES} values, some repeated through merge keys",
-                "far fewer; write it without them",
+                "fewer; write it without them",
             )
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
@@ -192,8 +192,8 @@ def _at(node: yaml.Node, found: str) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(problem=found, problem_mark=node.start_mark)
 
 
-def read_text(path: Path, what: str, most: int = MAX_TEXT) -> bytes:
-    """Return the bytes of a small text file."""
+def content_of(path: Path, what: str, most: int = MAX_TEXT) -> bytes:
+    """Return the bytes of a file, or refuse it in a sentence."""
     remedy = f"check the path of the {what}"
     if not os.path.exists(path):  # unlike that of a Path, False where a name is too long
         raise DatasetError(
@@ -218,8 +218,13 @@ def read_text(path: Path, what: str, most: int = MAX_TEXT) -> bytes:
         ) from error
 
 
-def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:
+def read_yaml(path: Path, what: str) -> dict[str, Any]:
     """Return the mapping that a YAML file holds, with its keys as text."""
+    return parse_yaml(content_of(path, what, MAX_YAML), path, what)
+
+
+def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:
+    """Return the mapping that the bytes of a YAML file hold, with its keys as text."""
     if len(content) > MAX_YAML:
         raise DatasetError(
             f"{path}: the {what} could not be read: found {len(content)} bytes of YAML, needed at "
@@ -251,7 +256,7 @@ def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:
     if b"*" in content and _exceeds(found, MAX_NODES):  # only aliases repeat what was counted
         raise DatasetError(
             f"{path}: the {what} could not be read: found more than {MAX_NODES} values, some "
-            "repeated through aliases, needed far fewer; write it without aliases."
+            "repeated through aliases, needed fewer; write it without aliases."
         )
     return typing.cast("dict[str, Any]", found)
 

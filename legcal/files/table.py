@@ -21,7 +21,7 @@ from typing import Literal
 import numpy as np
 
 from legcal.errors import DatasetError
-from legcal.files.schema import MAX_PROBLEMS, NAME_NEEDED, closest, describe, is_name, read_text
+from legcal.files.schema import MAX_PROBLEMS, NAME_NEEDED, closest, content_of, describe, is_name
 from legcal.geometry import Array, BoolArray
 
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
@@ -303,7 +303,7 @@ def _read_lines(path: Path, what: str) -> list[tuple[int, list[str]]]:
     A byte-order mark and either kind of line end are accepted.
     """
     try:
-        text = read_text(path, what).decode("utf-8-sig")
+        text = content_of(path, what).decode("utf-8-sig")
         reader = csv.reader(io.StringIO(text, newline=""), strict=True)
         lines: list[tuple[int, list[str]]] = []
         for cells in reader:

@@ -28,9 +28,8 @@ from legcal.files import (
     closest,
     describe,
     is_plain_name,
-    parse_yaml,
     read_table,
-    read_text,
+    read_yaml,
     validate,
 )
 from legcal.geometry import Array
@@ -299,7 +298,7 @@ def read_description(path: Path, unit: str | None = None, name: str | None = Non
                     "give it a name with --name NAME."
                 )
         else:
-            found = parse_yaml(read_text(path, WHAT), path, WHAT)
+            found = read_yaml(path, WHAT)
             found = {key: value for key, value in found.items() if value is not None}
             if name is not None:
                 found["name"] = name

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 from legcal.errors import DatasetError, ModelError
-from legcal.files import read_text
+from legcal.files import content_of
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -82,7 +82,7 @@ def find_urdf(yaml_path: Path, written: str | None) -> Path:
 def read_file(path: Path, what: str) -> bytes:
     """Return the bytes of a mechanism file."""
     try:
-        return read_text(path, what)
+        return content_of(path, what)
     except DatasetError as error:
         raise ModelError(error.problems) from error
 

@@ -206,7 +206,9 @@ def _check_names(elements: list[etree._Element], problems: Problems) -> None:
         if not name.strip():
             problems.add(element, "has no name", "name it")
         elif not is_name(name) and (element.tag == "joint" or not name.isprintable()):
-            problems.add(element, f"has a name that is none, needed {NAME_NEEDED}", "rename it")
+            problems.add(
+                element, f"has a name that cannot be used, needed {NAME_NEEDED}", "rename it"
+            )
         elif name in seen:
             problems.add(
                 element, f"has a name that {counts[name]} of them share", "give each its own name"

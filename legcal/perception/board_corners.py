@@ -24,10 +24,12 @@ from legcal.vision import (
     APRIL_TAGS,
     DICTIONARIES,
     Board,
+    Grey,
     charuco_board,
     dictionary,
-    enlarged,
+    possible_scale,
     reduced,
+    rescaled,
 )
 from legcal.workers import Run
 
@@ -53,13 +55,12 @@ def find_corners(
     Returns numbers (k,); px (k, 2); sigma_px (k,) [px].
     """
     grey = np.ascontiguousarray(image, dtype=np.float32)
-    eight_bits = np.clip(np.rint(grey), 0.0, 255.0).astype(np.uint8)
     search = {
         "chessboard": _search_chessboard,
         "charuco": _search_charuco,
         "aprilgrid": _search_aprilgrid,
     }[board.kind]
-    numbers, rough = search(board, eight_bits)
+    numbers, rough = search(board, grey)
     numbers, first = np.unique(numbers, return_index=True)
     rough = rough[first]
     axes = _axes(board, numbers, rough) if len(numbers) >= MIN_CORNERS else np.zeros((0, 2, 2))
@@ -71,6 +72,19 @@ def find_corners(
         np.array([saddle.px for _, saddle in found]).reshape(-1, 2),
         np.array([saddle.sigma_px for _, saddle in found], dtype=np.float64),
     )
+
+
+def _searched(grey: Grey, wanted: float, max_pixels: int) -> tuple[NDArray[np.uint8], float]:
+    """Return an image as OpenCV searches it, of at most so many pixels, and its scale."""
+    scale = possible_scale(grey, wanted, max_pixels)
+    if scale < 1:  # first, as the conversion takes memory
+        return _eight_bits(rescaled(grey, scale)), scale
+    return rescaled(_eight_bits(grey), scale), scale
+
+
+def _eight_bits(grey: NDArray[np.generic]) -> NDArray[np.uint8]:
+    levels = np.clip(np.rint(grey), 0.0, 255.0)
+    return np.asarray(levels, dtype=np.uint8)
 
 
 def _consistent(found: list[tuple[int, _Saddle]]) -> list[tuple[int, _Saddle]]:
@@ -245,6 +259,7 @@ def _saddle(fit: _CornerFit) -> _Saddle | None:
 _PLAIN = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
 # Slow searches where quick ones fail; corners near each other are separate in a larger image.
 _SEARCHES = ((1, _PLAIN), (2, _PLAIN), (1, _PLAIN | cv2.CALIB_CB_EXHAUSTIVE))
+_MAX_SEARCHED = 3_000_000  # pixels in which OpenCV looks for a chessboard: 170 bytes each
 _STRAIGHT = 0.45  # of a square from a corner
 _MAX_STEP_RATIO = 1.6  # times as long as the one before it is no step to the next line
 _MIN_ALTERNATING = 0.9  # of the neighbours that must be black and white
@@ -253,7 +268,7 @@ _MAX_CROSSING_MISFIT = 0.08  # misfit of a corner; where squares meet a rim it i
 
 def _search_chessboard(
     board: Board,
-    grey: NDArray[np.uint8],  # (height, width) the image
+    grey: Grey,
 ) -> tuple[IntArray, Array]:
     """Return numbers (k,) and rough places (k, 2) [px] of the corners: all of them, or none.
 
@@ -265,21 +280,35 @@ def _search_chessboard(
     return np.arange(board.n_corners), _oriented(grid, grey).reshape(-1, 2)
 
 
-def _inner_corners(
-    grey: NDArray[np.uint8], grid: tuple[int, int], *, quick: bool = False
-) -> Array | None:
+def _inner_corners(grey: Grey, grid: tuple[int, int]) -> Array | None:
     """Return a grid of so many corners along x and y, (ny, nx, 2) [px]; None if there is none."""
-    for scale, flags in _SEARCHES[:1] if quick else _SEARCHES:
-        found, corners = cv2.findChessboardCornersSB(enlarged(grey, scale), grid, flags=flags)
-        if found and corners is not None:
-            px = reduced(np.asarray(corners, dtype=np.float64), scale)
-            lines = px.reshape(grid[1], grid[0], 2)
-            if _is_regular(lines, grey):
-                return lines
+    done = set[tuple[float, int]]()
+    for wanted, flags in _SEARCHES:
+        image, scale = _searched(grey, wanted, _MAX_SEARCHED)
+        if (scale, flags) in done:
+            continue
+        done.add((scale, flags))
+        found = _regular_grid(grey, image, scale, grid, flags)
+        if found is not None:
+            return found
     return None
 
 
-def _is_regular(grid: Array, grey: NDArray[np.uint8]) -> bool:
+def _regular_grid(
+    grey: Grey, image: NDArray[np.uint8], scale: float, grid: tuple[int, int], flags: int
+) -> Array | None:
+    """Return what one search of OpenCV finds, (ny, nx, 2) [px], if that is a regular grid."""
+    if np.ptp(image) < 2.0 * _MIN_CONTRAST:
+        return None
+    found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, grid, flags)
+    if not found or corners is None:
+        return None
+    px = reduced(np.asarray(corners, dtype=np.float64), scale)
+    lines = px.reshape(*np.asarray(meta).shape[:2], 2)
+    return lines if _is_regular(lines, grey) else None
+
+
+def _is_regular(grid: Array, grey: Grey) -> bool:
     """Say whether no line of a grid is left out and its squares are black and white in turn."""
     for lines in (grid, np.swapaxes(grid, 0, 1)):
         steps = np.linalg.norm(np.diff(lines, axis=0), axis=-1)
@@ -293,9 +322,8 @@ def _is_regular(grid: Array, grey: NDArray[np.uint8]) -> bool:
     return bool(max(np.mean(beside > 0.0), np.mean(beside < 0.0)) > _MIN_ALTERNATING)
 
 
-def _continues(grid: Array, grey: NDArray[np.uint8]) -> bool:
+def _continues(grid: Array, grey: Grey) -> bool:
     """Say whether the squares go on beyond a grid of corners, (ny, nx, 2), on one of its sides."""
-    levels = grey.astype(np.float32)
     size = np.array([grey.shape[1], grey.shape[0]])
     for side in (grid, grid[::-1], np.swapaxes(grid, 0, 1), np.swapaxes(grid, 0, 1)[::-1]):
         beyond = 3.0 * side[0] - 3.0 * side[1] + side[2]  # as the last three lines go on
@@ -303,7 +331,7 @@ def _continues(grid: Array, grey: NDArray[np.uint8]) -> bool:
         along = np.gradient(side[0], axis=0)
         inside = np.all((beyond > 0.0) & (beyond < size - 1), axis=1)
         fits = [
-            _fit_saddle(levels, p, np.column_stack([x, y]), _STRAIGHT, 1.0)
+            _fit_saddle(grey, p, np.column_stack([x, y]), _STRAIGHT, 1.0)
             for p, x, y in zip(beyond[inside], along[inside], away[inside], strict=True)
         ]
         crossings = [fit for fit in fits if fit is not None and fit.misfit < _MAX_CROSSING_MISFIT]
@@ -312,7 +340,7 @@ def _continues(grid: Array, grey: NDArray[np.uint8]) -> bool:
     return False
 
 
-def _oriented(grid: Array, grey: NDArray[np.uint8]) -> Array:
+def _oriented(grid: Array, grey: Grey) -> Array:
     """Return the grid with x, y, and the line of sight right-handed, and its first square black."""
     x = grid[:, -1].mean(axis=0) - grid[:, 0].mean(axis=0)
     y = grid[-1].mean(axis=0) - grid[0].mean(axis=0)
@@ -321,13 +349,13 @@ def _oriented(grid: Array, grey: NDArray[np.uint8]) -> Array:
     return grid if _blackness(grid, grey) > 0.0 else grid[::-1, ::-1]
 
 
-def _blackness(grid: Array, grey: NDArray[np.uint8]) -> float:
+def _blackness(grid: Array, grey: Grey) -> float:
     """Return how much darker the squares are that should be black than those beside them."""
     black, levels = _squares(grid, grey)
     return float(levels[~black].mean() - levels[black].mean())
 
 
-def _squares(grid: Array, grey: NDArray[np.uint8]) -> tuple[BoolArray, Array]:
+def _squares(grid: Array, grey: Grey) -> tuple[BoolArray, Array]:
     """Return which squares between corners should be black, and the levels in their middles."""
     middles = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
     column, row = np.rint(np.moveaxis(middles, -1, 0)).astype(np.intp)
@@ -341,20 +369,22 @@ def _squares(grid: Array, grey: NDArray[np.uint8]) -> tuple[BoolArray, Array]:
 _MIN_PERIMETER = 0.01  # perimeter of a marker, as a part of the longer side of the image
 _BORDERS = (2, 1)  # modules of the black frame of a tag: Kalibr's, and the usual one
 _SCALES = (1, 2)  # by which images are enlarged: modules may be only a few pixels wide
+_MAX_PIXELS = 24_000_000  # of an image in which OpenCV looks for markers
 _FIRST_TAG = 0xD5D628584  # of the family 36h11, its modules row by row from the top left
 
 
 def _search_charuco(
     board: Board,
-    grey: NDArray[np.uint8],  # (height, width) the image
+    grey: Grey,
 ) -> tuple[IntArray, Array]:
     """Return numbers (k,) and rough places (k, 2) [px] of the corners that are seen."""
     charuco = cv2.aruco.CharucoParameters()
     charuco.minMarkers = 1  # places are refined later
     detector = cv2.aruco.CharucoDetector(charuco_board(board), charuco, _parameters(1))
     best = _flat(None, None)
-    for scale in _SCALES:
-        corners, numbers, _, _ = detector.detectBoard(enlarged(grey, scale))
+    for wanted in _SCALES:
+        searched, scale = _searched(grey, wanted, _MAX_PIXELS)
+        corners, numbers, _, _ = detector.detectBoard(searched)
         found = _flat(numbers, corners)
         if len(found[0]) > len(best[0]):
             best = found[0], reduced(found[1], scale)
@@ -365,7 +395,7 @@ def _search_charuco(
 
 def _search_aprilgrid(
     board: Board,
-    grey: NDArray[np.uint8],  # (height, width) the image
+    grey: Grey,
 ) -> tuple[IntArray, Array]:
     """Return numbers (k,) and rough places (k, 2) [px] of the corners of the tags that are seen."""
     tags, places = _search_tags(board, grey)
@@ -384,7 +414,7 @@ def _search_aprilgrid(
 
 def _search_tags(
     board: Board,
-    grey: NDArray[np.uint8],  # (height, width) the image
+    grey: Grey,
 ) -> tuple[IntArray, Array]:
     """Return the tags or markers in an image, of whatever board of the same dictionary.
 
@@ -392,13 +422,14 @@ def _search_tags(
     """
     borders = _BORDERS if board.kind == "aprilgrid" else (1,)
     ids, found = np.zeros(0, dtype=np.intp), np.zeros((0, 4, 2))
-    for border, scale in ((border, scale) for border in borders for scale in _SCALES):
+    for border, wanted in ((border, wanted) for border in borders for wanted in _SCALES):
+        searched, scale = _searched(grey, wanted, _MAX_PIXELS)
         detector = cv2.aruco.ArucoDetector(dictionary(board.dictionary), _parameters(border))
-        corners, numbers, _ = detector.detectMarkers(enlarged(grey, scale))
+        corners, numbers, _ = detector.detectMarkers(searched)
         if numbers is not None and len(numbers) > len(ids):
             ids = np.asarray(numbers).ravel().astype(np.intp)
             found = reduced(np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2), scale)
-        if len(ids) and scale == _SCALES[-1]:
+        if len(ids) and wanted == _SCALES[-1]:
             break
     turn = _quarter_turns() if board.dictionary == APRIL_TAGS else 0
     order = [(k + turn) % 4 for k in (3, 2, 1, 0)]
@@ -479,13 +510,13 @@ def require_board(
         problems.append(
             f"view {view.name}: the board could not be found in any of its {len(rows)} "
             f"image{'s' * (len(rows) != 1)}: found {found or 'nothing like it'}, needed "
-            f"{_in_words(board)}; correct the block board of the dataset file, or turn the camera."
+            f"{board_in_words(board)}; correct the block board of the dataset file, or turn the camera."
         )
     if problems:
         raise NotVisible(problems)
 
 
-def _in_words(board: Board) -> str:
+def board_in_words(board: Board) -> str:
     """Return a board in words."""
     what = "tags" if board.kind == "aprilgrid" else "squares"
     whole = ", the whole of it" if board.kind == "chessboard" else ""
@@ -507,32 +538,30 @@ def describe_image(
     image: NDArray[np.generic],  # (height, width) grey levels, 0 to 255
 ) -> str | None:
     """Return what an image shows instead of a board, in words that go after "found"."""
-    grey = np.clip(np.rint(image.astype(np.float32)), 0.0, 255.0).astype(np.uint8)
+    grey = np.ascontiguousarray(image, dtype=np.float32)
+    grey = rescaled(grey, possible_scale(grey, 1, _MAX_SEARCHED))
     if board.kind == "chessboard":
         return _other_squares(board, grey)
     return _other_markers(board, grey)
 
 
-def _other_squares(board: Board, grey: NDArray[np.uint8]) -> str | None:
+def _other_squares(board: Board, grey: Grey) -> str | None:
     """Return which grid of squares is seen."""
+    image, scale = _searched(grey, 1, _MAX_SEARCHED)
+    flags = _PLAIN | cv2.CALIB_CB_LARGER
+    grid = _regular_grid(grey, image, scale, (_MIN_SIDE, _MIN_SIDE), flags)
+    if grid is None:
+        return None
+    if _continues(grid, grey):
+        return "a part of a chessboard of more squares"
     nx, ny = board.grid
-    steps = (0, 1, -1, 2, -2)
-    tried = [(nx + a, ny + b) for a in steps for b in steps] + [(nx // 2 + 1, ny // 2 + 1)]
-    part = None
-    for x, y in dict.fromkeys(tried):
-        if min(x, y) < _MIN_SIDE:
-            continue
-        grid = _inner_corners(grey, (x, y), quick=True)
-        if grid is None:
-            continue
-        if not _continues(grid, grey):
-            seen = f"a chessboard of {x + 1} x {y + 1} squares"
-            return seen + (" or that part of one" if x <= nx and y <= ny else "")
-        part = part or "a part of a chessboard of more squares"
-    return part
+    sides = (grid.shape[:2], grid.shape[1::-1])  # nobody sees which side the columns are along
+    x, y = min(sides, key=lambda side: (abs(side[0] - nx) + abs(side[1] - ny), abs(side[0] - nx)))
+    seen = f"a chessboard of {x + 1} x {y + 1} squares"
+    return seen + (" or that part of one" if x <= nx and y <= ny else "")
 
 
-def _other_markers(board: Board, grey: NDArray[np.uint8]) -> str | None:
+def _other_markers(board: Board, grey: Grey) -> str | None:
     """Return which markers or tags are seen."""
     thing = "tags" if board.kind == "aprilgrid" else "markers"
     count = board.columns * board.rows

@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DatasetError, NotVisible
-from legcal.files import FileSchema, MotionEntry, PlainName, parse_yaml, read_text, validate
+from legcal.files import FileSchema, MotionEntry, PlainName, read_yaml, validate
 from legcal.geometry import Array, motion_of, normal_basis
 from legcal.machine import Machine
 from legcal.progress import Report, no_progress
@@ -122,7 +122,7 @@ def read_lens(path: Path) -> Camera:
 
 def read_cameras(path: Path, camera: Camera) -> dict[str, tuple[Camera, RigidTransform]]:
     """Return the camera and T_base_camera of every view of a file."""
-    found = parse_yaml(read_text(path, "cameras file"), path, "cameras file")
+    found = read_yaml(path, "cameras file")
     entry = validate(CamerasEntry, found, path)
     return {
         name: (

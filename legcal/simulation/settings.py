@@ -31,8 +31,7 @@ from legcal.files import (
     closest,
     describe,
     parse_quantity,
-    parse_yaml,
-    read_text,
+    read_yaml,
     validate,
 )
 from legcal.machine import Machine, parametrization_of
@@ -362,7 +361,7 @@ def _unit(name: str) -> str:
 
 def read_appearance(path: Path) -> Appearance:
     """Return the appearance that a file describes."""
-    found = parse_yaml(read_text(path, "appearance file"), path, "appearance file")
+    found = read_yaml(path, "appearance file")
     entry = validate(_schema(), found, path)
     values = {name: getattr(entry, name) for name in entry.model_fields_set}
     if "lights" in values:

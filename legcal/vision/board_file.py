@@ -20,8 +20,7 @@ from legcal.files import (
     closest,
     describe,
     parse_quantity,
-    parse_yaml,
-    read_text,
+    read_yaml,
     validate,
 )
 from legcal.vision.board import APRIL_TAGS, DICTIONARIES, Board, dictionary_size
@@ -277,7 +276,7 @@ def read_board_file(path: Path) -> Board:
     if not os.path.isfile(path):
         kinds = "; ".join(FORMS.values())
         raise _refused(str(path), describe(str(path)), f"a YAML file or one of: {kinds}")
-    found = parse_yaml(read_text(path, "board file"), path, "board file").get("board")
+    found = read_yaml(path, "board file").get("board")
     if not isinstance(found, dict):
         raise DatasetError(
             f"{path}: the board could not be read: found no block board, needed one as in "

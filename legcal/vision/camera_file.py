@@ -12,7 +12,7 @@ import yaml
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from legcal.errors import DatasetError
-from legcal.files import FileSchema, parse_yaml, read_text, validate
+from legcal.files import FileSchema, content_of, parse_yaml, validate
 from legcal.geometry import Array
 from legcal.vision.camera import DISTORTION_MODELS, Camera, intrinsic_names
 from legcal.vision.distortion import DistortionModel
@@ -112,7 +112,7 @@ _SINGULAR = 1e-9  # smallest focal length, as a part of the image size
 
 def read_camera(path: Path) -> Camera:
     """Read a camera file of any of the three kinds."""
-    content = read_text(path, "camera file")
+    content = content_of(path, "camera file")
     if _OPENCV_MARKS.search(content):
         return _from_opencv(_read_storage(content, path), path)
     found = parse_yaml(content, path, "camera file")

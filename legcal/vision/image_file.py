@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from legcal.files import MAX_IMAGE, read_bytes
 from legcal.geometry import Array
 from legcal.vision.camera import Camera
 
+_Level = TypeVar("_Level", np.uint8, np.float32)
 Grey = NDArray[np.float32]  # (height, width) grey levels, 0 to 255
 
 _lock = threading.Lock()
@@ -63,7 +65,7 @@ _COMPLETE = "a complete PNG, JPEG or TIFF file"
 _LEVELS = "8 or 16 bit grey levels or colours"
 
 
-class _BadImage(ValueError):
+class BadImage(ValueError):
     """What is wrong with the bytes of an image file: found and needed, as parts of a sentence."""
 
     def __init__(self, found: str, needed: str = _COMPLETE) -> None:
@@ -130,7 +132,7 @@ def image_problem(path: Path, camera: Camera, where: str = "") -> str | None:
 def image_size(content: bytes) -> ImageSize:
     """Return the size of an image from the bytes of its file."""
     if not content:
-        raise _BadImage("an empty file")
+        raise BadImage("an empty file")
     readers = {_JPEG_SIGNATURE: _jpeg_size, _PNG_SIGNATURE: _png_size}
     readers |= dict.fromkeys(_TIFF_SIGNATURES, _tiff_size)
     try:
@@ -138,11 +140,11 @@ def image_size(content: bytes) -> ImageSize:
             if content.startswith(signature):
                 size = read(content)
                 if problem := size_problem(size.width, size.height):
-                    raise _BadImage(*problem)
+                    raise BadImage(*problem)
                 return size
     except (struct.error, IndexError) as error:
-        raise _BadImage(f"a file cut off after {len(content)} bytes") from error
-    raise _BadImage("a file that is none of these")
+        raise BadImage(f"a file cut off after {len(content)} bytes") from error
+    raise BadImage("a file that is none of these")
 
 
 def size_problem(width: int, height: int) -> tuple[str, str] | None:
@@ -163,7 +165,7 @@ def _complete_content(path: Path, camera: Camera, where: str) -> tuple[bytes, st
         size = image_size(content)
     except OSError as error:
         return b"", _problem(path, where, f"'{error.strerror}'", "a readable file")
-    except _BadImage as error:
+    except BadImage as error:
         return b"", _problem(path, where, str(error), error.needed)
     if (size.width, size.height) != (camera.width, camera.height):
         return b"", _problem(
@@ -191,7 +193,7 @@ def _jpeg_size(content: bytes) -> ImageSize:
     while True:
         match = _JPEG_MARKER.search(content, at)
         if match is None:
-            raise _BadImage(f"a JPEG cut off after {len(content)} bytes, without its end marker")
+            raise BadImage(f"a JPEG cut off after {len(content)} bytes, without its end marker")
         marker, at = content[match.start() + 1], match.end()
         if marker == 0xD9:
             break
@@ -199,13 +201,13 @@ def _jpeg_size(content: bytes) -> ImageSize:
             continue
         n_scans += marker == 0xDA
         if n_scans > _MOST_SCANS:
-            raise _BadImage(f"a JPEG of more than {_MOST_SCANS} scans", "fewer")
+            raise BadImage(f"a JPEG of more than {_MOST_SCANS} scans", "fewer")
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             height, width = struct.unpack_from(">HH", content, at + 3)
             size = ImageSize(width, height)
         at += struct.unpack_from(">H", content, at)[0]
     if size is None:
-        raise _BadImage("a JPEG without a picture")
+        raise BadImage("a JPEG without a picture")
     return size
 
 
@@ -216,10 +218,10 @@ def _png_size(content: bytes) -> ImageSize:
     while kind != b"IEND":
         length, kind = struct.unpack_from(">I4s", content, at)
         if at + 12 + length > len(content):
-            raise _BadImage(f"a PNG cut off after {len(content)} bytes")
+            raise BadImage(f"a PNG cut off after {len(content)} bytes")
         (checksum,) = struct.unpack_from(">I", content, at + 8 + length)
         if zlib.crc32(memoryview(content)[at + 4 : at + 8 + length]) != checksum:
-            raise _BadImage(f"a PNG whose {kind.decode('latin-1')} chunk has a wrong checksum")
+            raise BadImage(f"a PNG whose {kind.decode('latin-1')} chunk has a wrong checksum")
         at += 12 + length
     return ImageSize(width, height)
 
@@ -230,7 +232,7 @@ def _tiff_size(content: bytes) -> ImageSize:
     (at,) = struct.unpack_from(order + "I", content, 4)
     (n_tags,) = struct.unpack_from(order + "H", content, at)
     if n_tags > _MOST_TAGS:
-        raise _BadImage(f"a TIFF of {n_tags} tags", f"at most {_MOST_TAGS}")
+        raise BadImage(f"a TIFF of {n_tags} tags", f"at most {_MOST_TAGS}")
     ends = [at + 2 + 12 * n_tags + 4]  # the directory, and the pointer to the next one
     tags: dict[int, tuple[int, ...]] = {}
     n_all = 0
@@ -242,38 +244,41 @@ def _tiff_size(content: bytes) -> ImageSize:
         ends.append(start + n_bytes)
         n_all += n_bytes
         if n_all > len(content):  # tags may point to the same bytes, which are read many times
-            raise _BadImage(f"a TIFF cut off after {len(content)} bytes")
+            raise BadImage(f"a TIFF cut off after {len(content)} bytes")
         if count > _MOST_STRIPS and tag in _TIFF_TAGS:
-            raise _BadImage(f"a TIFF of {count} strips", f"at most {_MOST_STRIPS}")
+            raise BadImage(f"a TIFF of {count} strips", f"at most {_MOST_STRIPS}")
         if count and tag in _TIFF_TAGS and kind in _TIFF_INTEGERS and ends[-1] <= len(content):
             tags[tag] = struct.unpack_from(f"{order}{count}{_TIFF_INTEGERS[kind]}", content, start)
     if max(tags.get(322, (0,))) * max(tags.get(323, (0,))) > MAX_AREA:
-        raise _BadImage("a TIFF of tiles that are larger than any image")
+        raise BadImage("a TIFF of tiles that are larger than any image")
     starts, lengths = tags.get(273, tags.get(324, ())), tags.get(279, tags.get(325, ()))
     ends += [start + length for start, length in zip(starts, lengths, strict=False)]
     if max(ends) > len(content):
-        raise _BadImage(f"a TIFF cut off after {len(content)} bytes")
+        raise BadImage(f"a TIFF cut off after {len(content)} bytes")
     if not (starts and lengths and tags.get(256) and tags.get(257)):
-        raise _BadImage("a TIFF without a picture")
+        raise BadImage("a TIFF without a picture")
     bits, form = max(tags.get(258, (1,))), max(tags.get(339, (1,)))
     if bits > _FULL or form in _TIFF_FORMATS:
         kind = _TIFF_FORMATS.get(form, "integer")
-        raise _BadImage(f"a TIFF of {bits} bit {kind} pixels", _LEVELS)
+        raise BadImage(f"a TIFF of {bits} bit {kind} pixels", _LEVELS)
     return ImageSize(tags[256][0], tags[257][0])
 
 
-MAX_PIXELS = 6_000_000  # of an image that is made larger
+def possible_scale(image: NDArray[np.generic], wanted: float, max_pixels: int) -> float:
+    """Return the scale at which an image has at most so many pixels, and no more than wanted."""
+    return min(wanted, float(np.sqrt(max_pixels / image.size)))
 
 
-def enlarged(grey: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
-    """Return an image made larger by a whole factor; a large one as it is."""
-    if scale == 1 or grey.size > MAX_PIXELS:
-        return grey
-    size = (scale * grey.shape[1], scale * grey.shape[0])
-    larger = cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC)
-    return np.asarray(larger, dtype=np.uint8)
+def rescaled(image: NDArray[_Level], scale: float) -> NDArray[_Level]:
+    """Return an image made larger or smaller by a factor, for a search."""
+    if scale == 1:
+        return image
+    height, width = image.shape
+    size = (max(round(scale * width), 1), max(round(scale * height), 1))
+    method = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
+    return np.asarray(cv2.resize(image, size, interpolation=method), dtype=image.dtype)
 
 
-def reduced(px: Array, scale: int) -> Array:
-    """Return pixels of an enlarged image as those of the image; middles of pixels are whole."""
+def reduced(px: Array, scale: float) -> Array:
+    """Return pixels of a rescaled image as those of the image; middles of pixels are whole."""
     return np.asarray((px + 0.5) / scale - 0.5)

@@ -63,7 +63,8 @@ def _yaml() -> Iterator[tuple[str, bytes, str]]:
     yield "deep nesting", b"a: " + b"[" * 100_000, "levels"
     yield "deep mappings", b"a: " + b"{a: " * 30_000, "levels"
     yield "many numbers", b"a: [" + b"1," * 900_000 + b"]", "values"
-    yield "more numbers", b"a: [" + b"1," * 1_900_000 + b"]", "bytes"
+    yield "more numbers", b"a: [" + b"1," * 1_900_000 + b"]", "at most 2000000"
+    yield "two million numbers", b"a: [" + b"1," * 2_000_000 + b"]", "at most 2000000"
     yield "more keys", b"".join(b"k%d: 1\n" % k for k in range(350_000)), "bytes"
     yield "unknown keys", b"".join(b"k%d: 1\n" % k for k in range(10_000)), "k"
     yield "a long number", b"a: " + b"1" * 1_900_000, "a"
@@ -155,8 +156,9 @@ def _chain(n: int, kind: str) -> bytes:
 
 def _images() -> Iterator[tuple[str, str, bytes, str]]:
     for size in (30_000, 2**31 - 1):
-        yield f"{size} px", "settings:board.png", _png(size), "px"
+        yield f"{size} px", "settings:board.png", _png(size), "at most 30000 px"
         yield f"{size} px", "small:images/c1_1.png", _png(size), "px"
+    yield "10,000 px", "settings:board.png", _png(10_000, rows=bytes(100_010_000)), "nothing like"
     named = _png(64, b"\x1b[3m")
     yield "a chunk of escapes", "small:images/c1_1.png", named[:-20] + b"\0" + named[-19:], ""
     heads = (
@@ -192,11 +194,11 @@ def _images() -> Iterator[tuple[str, str, bytes, str]]:
     yield "scans", "pictures:images/c2_1.jpg", encoded[:at] + scan * 3000 + b"\xff\xd9", "scans"
 
 
-def _png(size: int, kind: bytes = b"tEXt") -> bytes:
+def _png(size: int, kind: bytes = b"tEXt", rows: bytes = bytes(1000)) -> bytes:
     header = struct.pack(">IIBBBBB", size, size, 8, 0, 0, 0, 0)
     chunks = (
         (b"IHDR", header),
-        (b"IDAT", zlib.compress(bytes(1000))),
+        (b"IDAT", zlib.compress(rows)),
         (kind, b"x"),
         (b"IEND", b""),
     )

@@ -33,9 +33,10 @@ from legcal.calibration.camera_calibration.document import (
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
 from legcal.files import MAX_IMAGE, describe, read_bytes
 from legcal.geometry import Array, IntArray
-from legcal.perception import BoardImages, describe_image, find_corners
+from legcal.perception import BoardImages, board_in_words, describe_image, find_corners
 from legcal.progress import Report, no_progress
 from legcal.vision import (
+    BadImage,
     Board,
     Camera,
     DistortionModel,
@@ -175,14 +176,13 @@ def _not_visible(board: Board, paths: Sequence[Path], size: ImageSize) -> NotVis
     """Return the refusal of images without the board, and say what they show instead."""
     described = (describe_image(board, _read(path, size)) for path in paths[:_N_DESCRIBED])
     what = next((words for words in described if words), None)
-    thing = "tags" if board.kind == "aprilgrid" else "squares"
     hint = ""
     if what is None and board.kind == "chessboard":
         hint = f" (squares are counted: {board.columns - 1} x {board.rows - 1} inner corners)"
     return NotVisible(
         f"The camera could not be calibrated: found {what or 'nothing like the board'} in its "
-        f"{len(paths)} image{'s' * (len(paths) != 1)}, needed a {board.kind} of {board.columns} x "
-        f"{board.rows} {thing}{hint}; correct --board, or take sharper images of the whole board."
+        f"{len(paths)} image{'s' * (len(paths) != 1)}, needed {board_in_words(board)}"
+        f"{hint}; correct --board, or take sharper images of the whole board."
     )
 
 
@@ -269,18 +269,17 @@ def _common_size(paths: Sequence[Path]) -> ImageSize:
     sizes: dict[ImageSize, list[Path]] = {}
     problems = []
     for path in paths:
-        found = ""
         try:
             sizes.setdefault(image_size(read_bytes(path, MAX_IMAGE)), []).append(path)
+            continue
         except OSError as error:
-            found = f"'{error.strerror}'"
-        except ValueError as error:
-            found = str(error)
-        if found:
-            problems.append(
-                f"{path}: the image could not be read: found {found}, needed a complete PNG, JPEG "
-                "or TIFF file; copy it again or leave it out."
-            )
+            found, needed = f"'{error.strerror}'", "a readable file"
+        except BadImage as error:
+            found, needed = str(error), error.needed
+        problems.append(
+            f"{path}: the image could not be read: found {found}, needed {needed}; copy it again "
+            "or leave it out."
+        )
     if problems:
         raise DatasetError(problems)
     if len(sizes) > 1:

@@ -19,8 +19,7 @@ from legcal.files import (
     Version,
     YamlOutput,
     motion_to_xyz_quat,
-    parse_yaml,
-    read_text,
+    read_yaml,
     validate,
 )
 from legcal.geometry import Array
@@ -399,7 +398,7 @@ def load_location(file: str | Path) -> Location:
         If it is missing or damaged.
     """
     path = Path(file)
-    found = parse_yaml(read_text(path, _WHAT), path, _WHAT)
+    found = read_yaml(path, _WHAT)
     if _KEY not in found:
         raise DatasetError(
             f"{path}: the {_WHAT} could not be read: found no key '{_KEY}', needed a file that "
