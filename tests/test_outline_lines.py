@@ -7,18 +7,18 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import ndtr
 
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import Array
 from legcal.perception import pooled_fit as pool
 from legcal.perception.blocks import (
     COMMON_BIAS,
     TILT_BIAS,
+    BlockFit,
     BlockLine,
     Blocks,
-    estimate_blur,
     fit_blocks,
     fit_lines,
 )
-from legcal.perception.light import Samples, evened_weights, to_light
+from legcal.perception.light import Samples, to_light
 from legcal.perception.limb import (
     HALF,
     N_AMPLITUDES,
@@ -26,10 +26,11 @@ from legcal.perception.limb import (
     RAMP,
     SQUARE,
     THREE_HALVES,
-    basis,
     powers,
     profile_functions,
+    simple_functions,
 )
+from legcal.perception.pixel_sums import PixelBins, PixelSums, evened, noise_ratios
 from legcal.perception.pooled_fit import fit_pooled
 from legcal.perception.profiles import Edge, Profiles, read_profiles
 from legcal.vision.camera import Camera
@@ -134,47 +135,62 @@ def test_hidden_stretches_and_other_blocks_are_left_out() -> None:
     np.testing.assert_array_equal(read([edge_at(1.3)], most=n).position, every.position[::2])
 
 
-# Pixels by their noise.
+# Sums over pixels, and their noise.
 
 N_BLOCKS, ROWS, REACH, NOISY_BLUR = 40, 8, 6, 0.6
 BOUNDS = np.array([0, N_BLOCKS // 2, N_BLOCKS])
 
 
-def noisy_blocks(sides: Array, rng: np.random.Generator) -> tuple[Samples, Samples]:
-    """Return distances and light of blocks across a step, noisy on its sides by edge (2, 2)."""
+def test_sums_over_bins_are_those_over_pixels() -> None:
+    rng = np.random.default_rng(3)
+    d = rng.uniform(-4.0, 4.0, (5, 90)).astype(np.float32)
+    weight = (rng.uniform(0.5, 1.5, d.shape) * (rng.random(d.shape) < 0.8)).astype(np.float32)
+    light = rng.uniform(-50.0, 50.0, d.shape).astype(np.float32)
+    blurs, bounds, square = np.array([0.5, 0.8]), (0, 2, 5), weight.astype(np.float64) ** 2
+    sums = PixelBins.of(d, weight, float(blurs.min())).sums(light)
+    values, slopes = powers(sums.grid / blurs[:, None])
+    at_bins = values, slopes / blurs[:, None, None], bounds
+    products, with_light = sums.products(*at_bins), sums.with_light(*at_bins)
+    at_pixels, _ = powers(d / np.repeat(blurs, [2, 3])[:, None])
+    expected = np.einsum("nm,nmi,nmj->nij", square, at_pixels, at_pixels)
+    scale = np.sqrt(np.einsum("nii->ni", expected))
+    np.testing.assert_array_less(
+        np.abs(products - expected), 0.02 * scale[:, :, None] * scale[:, None]
+    )
+    expected = np.einsum("nm,nm,nmi->ni", square, light, at_pixels)
+    np.testing.assert_array_less(np.abs(with_light - expected), 5.0 * scale)
+    power = np.sum(square * light.astype(np.float64) ** 2, axis=1)
+    np.testing.assert_allclose(sums.power.sum(axis=1), power, rtol=1e-6)
+    np.testing.assert_array_equal(sums.count, np.count_nonzero(weight, axis=1))
+
+
+def noisy_sums(sides: Array, rng: np.random.Generator) -> PixelSums:
+    """Return sums over blocks across a step, noisy on its sides by edge (2, 2)."""
     row = np.arange(-REACH, REACH + 1.0) + rng.uniform(-0.5, 0.5, (N_BLOCKS, ROWS, 1))
     d = row.reshape(N_BLOCKS, -1).astype(np.float32)
     rise = ndtr(d / NOISY_BLUR)
     outer, inner = np.repeat(sides, N_BLOCKS // 2, axis=0).T[..., None]
     noise = np.sqrt(outer**2 + (inner**2 - outer**2) * rise) * rng.normal(size=d.shape)
-    return d, (20.0 + 100.0 * rise + 2.0 * d + noise).astype(np.float32)
-
-
-def evened(d: Samples, light: Samples, weight: Samples, kept: BoolArray | None = None) -> Samples:
-    """Return the weights of noisy_blocks that lie on their edges."""
-    kept = np.ones(len(d), dtype=np.bool_) if kept is None else kept
-    return evened_weights(d, light, weight, BOUNDS, kept, NOISY_BLUR)
+    light = (20.0 + 100.0 * rise + 2.0 * d + noise).astype(np.float32)
+    return PixelBins.of(d, np.ones_like(d), NOISY_BLUR).sums(light)
 
 
 def test_both_sides_are_equally_noisy_when_weighted() -> None:
     sides = np.array([[2.0, 8.0], [6.0, 3.0]])
-    d, light = noisy_blocks(sides, np.random.default_rng(1))
-    unused = np.ones_like(d)
-    unused[:, ::3] = 0.0
-    weight = evened(d, light, np.ones_like(d))
-    for k, (outer, inner) in enumerate(sides):
-        of_edge = slice(BOUNDS[k], BOUNDS[k + 1])
-        far_out, far_in = (
-            np.median(weight[of_edge][side > 3.0]) for side in (-d[of_edge], d[of_edge])
-        )
-        assert far_out * outer == pytest.approx(far_in * inner, rel=0.1)
-    assert np.median(weight[np.abs(d) < 0.05]) == pytest.approx(1.0, abs=0.1)
-    assert np.array_equal(evened(d, light, unused) > 0.0, unused > 0.0)
-    kept = np.ones(N_BLOCKS, dtype=np.bool_)
+    sums, kept = noisy_sums(sides, np.random.default_rng(1)), np.ones(N_BLOCKS, dtype=np.bool_)
+    ratio = noise_ratios(sums, BOUNDS, kept, NOISY_BLUR)
+    np.testing.assert_allclose(ratio, (sides[:, 1] / sides[:, 0]) ** 2, rtol=0.25)
+    weighted = evened(sums, np.repeat(ratio, N_BLOCKS // 2), NOISY_BLUR)
+    share = weighted.weight[:, 0].sum(axis=0) / sums.weight[:, 0].sum(axis=0)
+    assert share[np.argmin(np.abs(sums.grid))] == pytest.approx(1.0, abs=0.1)
+    for edge, first in enumerate(BOUNDS[:-1]):
+        share = weighted.weight[first, 0] / np.maximum(sums.weight[first, 0], 1e-9)
+        seen = np.flatnonzero(sums.weight[first, 0])
+        assert share[seen[0]] / share[seen[-1]] == pytest.approx(ratio[edge], rel=1e-6)
     kept[: BOUNDS[1] - 2] = False  # too few blocks of the first edge
-    weight = evened(d, light, np.ones_like(d), kept)
-    assert np.array_equal(weight[: BOUNDS[1]], np.ones_like(d[: BOUNDS[1]]))
-    assert np.max(weight[BOUNDS[1] :]) > 1.2
+    one, other = noise_ratios(sums, BOUNDS, kept, NOISY_BLUR)
+    assert one == 1.0
+    assert other == ratio[1]
 
 
 # Blocks one by one, and lines through them.
@@ -182,8 +198,18 @@ def test_both_sides_are_equally_noisy_when_weighted() -> None:
 HALF_WIDTH_PX = 14.0
 
 
-def column(value: float, n: int) -> Samples:
-    return np.full((n, 1), value, dtype=np.float32)
+def simple(d: Array, blur: float, half_width: float = HALF_WIDTH_PX) -> tuple[Array, Array]:
+    """Return the functions of single blocks (..., 5) at distances, and their slopes."""
+    values, slopes = simple_functions(np.array([half_width]), np.array([blur]))
+    at, _ = powers(np.asarray(d, dtype=np.float64) / blur)
+    return at @ values[0].T, at @ slopes[0].T
+
+
+def block_fit(d: Samples, grey: Samples, weight: Samples, blur: float = 0.6) -> BlockFit:
+    """Return the fit of blocks of one edge."""
+    sums = PixelBins.of(d, weight, blur).sums(grey)
+    edge = np.zeros(len(d), dtype=np.intp)
+    return fit_blocks(sums, np.array([HALF_WIDTH_PX]), np.array([blur]), edge)
 
 
 def limb_blocks(
@@ -192,30 +218,28 @@ def limb_blocks(
     """Return distances from a line and the grey levels of outlines ``shift`` further inside."""
     rng = np.random.default_rng(1)
     d = rng.uniform(-4.0, 4.0, (n, 120)).astype(np.float32)
-    values, _ = basis(d - np.float32(shift), column(HALF_WIDTH_PX, n), blur)
-    grey = np.einsum("nkm,k->nm", values, amplitude) + noise * rng.standard_normal(d.shape)
+    values, _ = simple(d.astype(np.float64) - shift, blur)
+    grey = values @ np.array(amplitude) + noise * rng.standard_normal(d.shape)
     return d, grey.astype(np.float32)
 
 
 @pytest.mark.parametrize("x", [-1.5, 0.0, 3.0])
 def test_limb_is_a_blurred_square_root(x: float) -> None:
     blur, half_width = 0.7, 1e6  # so wide that sqrt(rho (2 - rho)) is sqrt(2 rho)
-    values, _ = basis(np.array([[x]], dtype=np.float32), column(half_width, 1), blur)
+    values, _ = simple(np.array(x), blur, half_width)
 
     def integrand(depth: float) -> float:
         weight = np.exp(-0.5 * ((x - depth) / blur) ** 2) / (blur * np.sqrt(2.0 * np.pi))
         return float(np.sqrt(2.0 * depth / half_width) * weight)
 
     expected, _ = quad(integrand, 0.0, 12.0, points=[max(x, 0.0)], limit=200)
-    assert values[0, 3, 0] == pytest.approx(expected, rel=3e-3, abs=1e-6)
+    assert values[3] == pytest.approx(expected, rel=3e-3, abs=1e-6)
 
 
 def test_slopes_are_the_derivatives_of_the_basis() -> None:
-    d = np.linspace(-5.0, 5.0, 201, dtype=np.float32)[None]
-    step = np.float32(0.02)
-    before, after = (basis(d + s, column(HALF_WIDTH_PX, 1), 0.6)[0] for s in (-step, step))
-    _, slopes = basis(d, column(HALF_WIDTH_PX, 1), 0.6)
-    np.testing.assert_allclose((after - before) / (2 * step), slopes, atol=2e-2)
+    d, step = np.linspace(-5.0, 5.0, 201), 1e-3
+    before, after = (simple(d + s, 0.6)[0] for s in (-step, step))
+    np.testing.assert_allclose((after - before) / (2 * step), simple(d, 0.6)[1], atol=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -233,7 +257,7 @@ def test_shift_of_an_outline_is_found_whatever_its_contrast(amplitude: list[floa
     moved = np.zeros(len(d))
     for _ in range(5):
         at = d - moved[:, None].astype(np.float32)
-        fit = fit_blocks(at, grey, weight, column(HALF_WIDTH_PX, len(d)), 0.6)
+        fit = block_fit(at, grey, weight)
         moved += fit.shift
     assert np.median(moved) == pytest.approx(0.15, abs=0.01)
 
@@ -241,7 +265,7 @@ def test_shift_of_an_outline_is_found_whatever_its_contrast(amplitude: list[floa
 def test_claimed_variance_is_the_scatter_of_the_blocks() -> None:
     d, grey = limb_blocks(0.0, 0.6, [20.0, 0.0, 120.0, 60.0, 0.0], noise=3.0)
     weight = np.ones(d.shape, dtype=np.float32)
-    fit = fit_blocks(d, grey, weight, column(HALF_WIDTH_PX, len(d)), 0.6)
+    fit = block_fit(d, grey, weight)
     assert np.std(fit.shift) == pytest.approx(np.sqrt(np.median(fit.variance)), rel=0.2)
     assert np.sqrt(np.median(fit.noise)) == pytest.approx(3.0, rel=0.05)
 
@@ -249,9 +273,9 @@ def test_claimed_variance_is_the_scatter_of_the_blocks() -> None:
 def test_flat_blocks_say_nothing() -> None:
     d, grey = limb_blocks(0.0, 0.6, [50.0, 0.0, 0.0, 0.0, 0.0], noise=2.0)
     weight = np.ones(d.shape, dtype=np.float32)
-    fit = fit_blocks(d, grey, weight, column(HALF_WIDTH_PX, len(d)), 0.6)
+    fit = block_fit(d, grey, weight)
     assert np.median(fit.variance) > 0.2
-    hidden = fit_blocks(d, grey, 0.0 * weight, column(HALF_WIDTH_PX, len(d)), 0.6)
+    hidden = block_fit(d, grey, np.zeros_like(weight))
     assert np.all(np.isinf(hidden.variance))
 
 
@@ -259,8 +283,10 @@ def test_flat_blocks_say_nothing() -> None:
 def test_blur_is_estimated_from_the_picture(blur: float) -> None:
     d, grey = limb_blocks(0.1, blur, [20.0, 0.0, 120.0, 60.0, 0.0], noise=1.0, n=60)
     weight = np.ones(d.shape, dtype=np.float32)
-    estimate = estimate_blur(d, grey, weight, column(HALF_WIDTH_PX, len(d)), np.ones(len(d)))
-    assert estimate == pytest.approx(blur, rel=0.1)
+    position, half_width = np.linspace(0.0, 1.0, len(d)), np.array([HALF_WIDTH_PX])
+    blocks = Blocks.of_pixels(d, grey, weight, np.array([0, len(d)]), position, half_width)
+    blocks.contrast[:] = 1.0
+    assert blocks.estimate_blur(2) == pytest.approx(blur, rel=0.1)
 
 
 def fit_straight(position: Array, shift: Array, variance: Array) -> BlockLine | None:
@@ -368,15 +394,15 @@ def outline(
     values, _, _ = profile_functions(single(HALF_WIDTH, 1), single(blur, 1), DEPTH)
     brightness = 1.0 + change * (position - 0.5)
     of_block = brightness[:, None] * amplitude
-    grey = np.einsum("nmp,kp,nk->nm", powers(at / blur)[..., :N_POWERS], values[0], of_block)
+    grey = np.einsum("nmp,kp,nk->nm", powers(at / blur)[0], values[0], of_block)
     grey = grey + noise * rng.standard_normal(grey.shape)
     one: Samples = np.ones(d.shape, dtype=np.float32)
-    zeros = np.zeros(n)
-    return Blocks(
-        d.astype(np.float32), grey.astype(np.float32), one, np.ones(n), np.array([0, n]), position,
-        np.full((n, 1), HALF_WIDTH, dtype=np.float32), np.full(n, -np.inf, dtype=np.float32),
-        zeros, zeros.copy(), zeros.copy(), [None],
+    read = Blocks.of_pixels(
+        d.astype(np.float32), grey.astype(np.float32), one, np.array([0, n]), position,
+        np.array([HALF_WIDTH]),
     )  # fmt: skip
+    read.noise[:] = max(noise, 0.3) ** 2  # as the blocks by themselves show it
+    return read
 
 
 @pytest.mark.parametrize(
@@ -388,7 +414,10 @@ def test_powers_are_means_over_a_gaussian(z: float, column: int, power: float) -
         return float(x**power * np.exp(-0.5 * (x - z) ** 2) / np.sqrt(2.0 * np.pi))
 
     expected, _ = quad(integrand, 0.0, 15.0, points=[max(z, 0.0)], limit=200)
-    assert powers(np.array(z))[column] == pytest.approx(expected, rel=2e-3, abs=1e-5)
+    values, slopes = powers(np.array([z, z - 1e-4, z + 1e-4]))
+    assert values[0, column] == pytest.approx(expected, rel=2e-3, abs=1e-5)
+    slope = (values[2, column] - values[1, column]) / 2e-4
+    assert slope == pytest.approx(slopes[0, column], rel=1e-2, abs=1e-4)
 
 
 @pytest.mark.parametrize("blur", [0.35])
@@ -397,15 +426,15 @@ def test_slopes_and_widenings_are_derivatives_of_profiles(blur: float) -> None:
 
     def profile(d: Array, blur: float) -> Array:
         values, _, _ = profile_functions(half_width, single(blur, 1), DEPTH)
-        return np.asarray(values[0] @ powers(d / blur)[..., :N_POWERS].T)
+        return np.asarray(values[0] @ powers(d / blur)[0].T)
 
     _, slopes, widenings = profile_functions(half_width, single(blur, 1), DEPTH)
-    U = powers(d / blur)[..., :N_POWERS].T
-    step = 0.02
+    U = powers(d / blur)[0].T
+    step = 1e-3
     by_distance = (profile(d + step, blur) - profile(d - step, blur)) / (2.0 * step)
-    np.testing.assert_allclose(by_distance, slopes[0] @ U, atol=0.1)
+    np.testing.assert_allclose(by_distance, slopes[0] @ U, atol=0.01)
     by_blur = (profile(d, blur * np.exp(step)) - profile(d, blur * np.exp(-step))) / (2.0 * step)
-    np.testing.assert_allclose(by_blur, widenings[0] @ U, atol=0.06)
+    np.testing.assert_allclose(by_blur, widenings[0] @ U, atol=0.01)
     assert slopes.shape == (1, N_AMPLITUDES, N_POWERS)
 
 
@@ -443,7 +472,7 @@ def test_covariance_covers_the_errors_and_knows_low_contrast() -> None:
 def test_blocks_of_something_else_do_not_move_the_line() -> None:
     clean = outline(BRIGHT, (0.1, 0.1), 0.5, noise=0.5)
     other = outline(BRIGHT, (0.1, 0.1), 0.5, noise=0.5)
-    other.grey[10:16] = 120.0 - 30.0 * other.d[10:16]
+    other.light[10:16] = 40.0 - 30.0 * other.d[10:16]
     everything = np.ones(40, dtype=np.bool_)
     one, two = (fit_pooled(blocks, everything, 0.5, DEPTH).ends for blocks in (clean, other))
     np.testing.assert_allclose(one, two, atol=0.02)
@@ -461,7 +490,8 @@ def test_outlines_without_blocks_stay_where_they_are() -> None:
 def test_sums_over_pixels_serve_places_and_blurs_nearby(monkeypatch: pytest.MonkeyPatch) -> None:
     blocks, every = outline(GLINT, (0.1, -0.05), 0.5, noise=0.2), np.ones(40, dtype=np.bool_)
     found = fit_pooled(blocks, every, 0.54, DEPTH)
-    monkeypatch.setattr(pool, "MAX_MOVE_OF_PRODUCTS", (0.0, 0.0))  # sums anew in every round
+    for name in ("MAX_MOVE_OF_SUMS", "MAX_MOVE"):  # sums anew in every round
+        monkeypatch.setattr(pool, name, (0.0, 0.0))
     anew = fit_pooled(blocks, every, 0.54, DEPTH)
     np.testing.assert_allclose(found.ends, anew.ends, atol=8e-3)
     np.testing.assert_allclose(found.covariance, anew.covariance, rtol=0.2)
@@ -470,27 +500,24 @@ def test_sums_over_pixels_serve_places_and_blurs_nearby(monkeypatch: pytest.Monk
 
 def test_outlines_that_have_converged_do_not_depend_on_others() -> None:
     slow, quick = outline(GLINT, (0.2, -0.2), 0.5, noise=0.3), outline(BRIGHT, (0.0, 0.0), 0.5)
-    both = replace(
-        slow,
-        bounds=np.array([0, 40, 80]),
-        lines=[None, None],
-        **{
-            name: np.concatenate([getattr(slow, name), getattr(quick, name)])
-            for name in (
-                "d", "grey", "weight", "gain", "position", "half_width", "moved", "contrast",
-                "sharp",
-            )
-        },
-    )  # fmt: skip
+    names = "d", "light", "weight"
+    d, light, weight = (np.concatenate([getattr(x, name) for x in (slow, quick)]) for name in names)
+    half_width, position = np.full(2, HALF_WIDTH), np.concatenate([slow.position, quick.position])
+    both = Blocks.of_pixels(d, light, weight, np.array([0, 40, 80]), position, half_width)
+    both.noise[:] = 0.09
     found = fit_pooled(both, np.ones(80, dtype=np.bool_), 0.5, DEPTH)
     np.testing.assert_allclose(found.ends, [[0.2, -0.2], [0.0, 0.0]], atol=0.02)
 
 
 def read_with(blocks: Blocks, gamma: float) -> Blocks:
     """Return the same blocks as a camera of gamma 2.2 encodes them, read with a gamma."""
-    encoded = (255.0 * (np.maximum(blocks.grey, 0.0) / 255.0) ** (1.0 / 2.2)).astype(np.float32)
+    seen = np.maximum(blocks.light + blocks.level[0], 0.0)
+    encoded = (255.0 * (seen / 255.0) ** (1.0 / 2.2)).astype(np.float32)
     light, weight = to_light(encoded, blocks.weight > 0.0, gamma)
-    return replace(blocks, grey=light, weight=weight)
+    at = blocks.bounds, blocks.position, blocks.half_width
+    read = Blocks.of_pixels(blocks.d, light, weight, *at)
+    read.noise[:] = blocks.noise
+    return read
 
 
 @pytest.mark.parametrize("amplitude", [BRIGHT, DARK], ids=["bright", "dark"])

@@ -5,12 +5,13 @@ import pytest
 from dataset_folder import Folder, folder
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import ndtr
 
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError
 from legcal.perception.blocks import fit_blocks
-from legcal.perception.light import Samples, to_light
-from legcal.perception.limb import basis
+from legcal.perception.light import to_light
+from legcal.perception.pixel_sums import PixelBins
 
 __all__ = ["folder"]
 BLUR, HALF_WIDTH, WHITE = 0.6, 14.0, 255.0
@@ -20,15 +21,16 @@ def found(gamma_of_camera: float, gamma_told: float, dark: float, bright: float)
     """Return where an outline is found that lies 0.15 px inside the line [px]."""
     rng = np.random.default_rng(1)
     d = rng.uniform(-3.5, 3.5, (150, 120)).astype(np.float32)
-    width: Samples = np.full((len(d), 1), HALF_WIDTH, dtype=np.float32)
-    step = basis(d - np.float32(0.15), width, BLUR)[0][:, 2]
+    step = ndtr((d - 0.15) / BLUR)
     light = dark + (bright - dark) * step
     grey = WHITE * light ** (1.0 / gamma_of_camera) + 0.5 * rng.standard_normal(d.shape)
     levels, weight = to_light(grey.astype(np.float32), np.ones(d.shape, np.bool_), gamma_told)
     moved = np.zeros(len(d))
     for _ in range(5):
         at = d - moved[:, None].astype(np.float32)
-        moved += fit_blocks(at, levels, weight, width, BLUR).shift
+        sums = PixelBins.of(at, weight, BLUR).sums(levels)
+        edge = np.zeros(len(d), dtype=np.intp)
+        moved += fit_blocks(sums, np.array([HALF_WIDTH]), np.array([BLUR]), edge).shift
     return float(np.median(moved))
 
 

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception.light import Samples, evened_weights, to_light
-from legcal.perception.limb import N_BASIS, basis
+from legcal.perception.light import Samples, to_light
+from legcal.perception.limb import N_SIMPLE, powers, simple_functions
+from legcal.perception.pixel_sums import PixelBins, PixelSums
 from legcal.perception.profiles import Edge, read_profiles
 from legcal.vision import Camera, Grey
 
@@ -28,9 +29,10 @@ MAX_BLOCK_SIGMA = (1.3, 0.6)  # of a block that counts: in blurs, and [px]
 CONVERGED = 0.1  # movement of every line below which the rounds end [px]
 
 BLURS = (0.3, 2.7, 6)  # trials, least to greatest [px]
-BLUR_BLOCKS, BLUR_ROUNDS = 16, 2  # blocks of an image that give its blur, steps of each trial
+BLUR_BLOCKS = 16  # blocks of an image that give its blur
 # Prior precision of the amplitudes, in units of the contrast of a block.
 RIDGE = np.array([1e-6, 1.0, 1e-2, 0.05, 0.05])
+DEEP = 1.5  # inside, besides the blur, where the step to the leg is read [px]
 BEND = (0, 1, 4)  # functions of the limb model without an edge
 MAX_STEP = 0.8  # largest step of a block [px]
 
@@ -55,17 +57,56 @@ class Blocks:
     """The blocks of all edges of an image, and how far their lines have moved."""
 
     d: Samples  # (n, m) from the lines at which they were read
-    grey: Samples  # (n, m) proportional to light
+    light: Samples  # (n, m) less the mean of the edge
     weight: Samples  # (n, m)
     gain: Array  # (n,)
     bounds: IntArray  # (n_edges + 1,) first block of each edge
     position: Array  # (n,) as fractions of the bands
-    half_width: Samples  # (n, 1)
+    half_width: Array  # (n_edges,)
+    level: Array  # (n_edges,) mean light of each edge
     clipped: Samples  # (n,) up to where the background saturates the picture [px], or -inf
     moved: Array  # (n,) [px]
     contrast: Array  # (n,) step to the leg [grey levels]
     sharp: Array  # (n,) how clearly it is a step and not a bend of the shading [chi^2]
+    noise: Array  # (n,) mean square residual [grey levels^2]
     lines: list["BlockLine | None"]
+    last: tuple[float, Array, PixelBins] | None = None  # blur and moved of the last bins
+
+    @classmethod
+    def of_pixels(
+        cls,
+        d: Samples,
+        light: Samples,
+        weight: Samples,
+        bounds: IntArray,
+        position: Array,
+        half_width: Array,
+        gain: Array | None = None,
+        clipped: Samples | None = None,
+    ) -> "Blocks":
+        """Return blocks of pixels that have not been fitted."""
+        n, n_edges = len(d), len(bounds) - 1
+        total, weights = (np.zeros(n_edges) for _ in range(2))
+        edge = np.repeat(np.arange(n_edges), np.diff(bounds))
+        for sums, values in ((total, light * weight), (weights, weight)):
+            np.add.at(sums, edge, values.sum(axis=1))
+        level = total / np.maximum(weights, 1e-9)
+        return cls(
+            d,
+            light - level.astype(np.float32)[edge][:, None],
+            weight,
+            np.ones(n) if gain is None else gain,
+            bounds,
+            position,
+            half_width,
+            level,
+            np.full(n, -np.inf, dtype=np.float32) if clipped is None else clipped,
+            np.zeros(n),
+            np.zeros(n),
+            np.zeros(n),
+            np.zeros(n),
+            [None] * n_edges,
+        )
 
     @classmethod
     def read(
@@ -91,39 +132,28 @@ class Blocks:
             # Too few pixels of a sharp step are left in short blocks.
             read = read_profiles(grey, camera, edges, v, depths, MIN_ROWS_CLIPPED, most)
         light, weight = to_light(read.grey, read.inside, camera.gamma)
-        n = len(read.position)
-        return cls(
-            read.d,
-            light,
-            weight,
-            read.gain,
-            read.bounds,
-            read.position,
-            np.repeat(half_width, np.diff(read.bounds)).astype(np.float32)[:, None],
-            read.clipped,
-            np.zeros(n),
-            np.zeros(n),
-            np.zeros(n),
-            [None] * len(edges),
+        return cls.of_pixels(
+            read.d, light, weight, read.bounds, read.position, half_width, read.gain, read.clipped
         )
 
-    def samples(self, blocks: slice | BoolArray) -> tuple[Samples, Samples, Samples, Samples]:
-        """Return distances from the current lines, grey levels, weights, half-widths."""
-        d = self.d[blocks] - self.moved[blocks, None].astype(np.float32)
-        return d, self.grey[blocks], self.weight[blocks], self.half_width[blocks]
+    @property
+    def edge(self) -> IntArray:
+        """The edge of each block, (n,)."""
+        return np.repeat(np.arange(len(self.half_width)), np.diff(self.bounds))
 
-    def even_noise(self, kept: BoolArray, blur: float) -> None:
-        """Weigh the pixels by the noise that is seen on both sides of each edge."""
-        d = self.samples(slice(None))[0]
-        self.weight = evened_weights(d, self.grey, self.weight, self.bounds, kept, blur)
+    def bins(self, blur: float) -> PixelBins:
+        """Return the bins of all pixels by their distances from the current lines."""
+        if self.last is not None:
+            of_blur, moved, bins = self.last
+            if of_blur == blur and np.array_equal(moved, self.moved):
+                return bins
+        bins = PixelBins.of(self.d - self.moved[:, None].astype(np.float32), self.weight, blur)
+        self.last = blur, self.moved.copy(), bins
+        return bins
 
     def of_edges(self, values: Array) -> list[Array]:
         """Return values (n,) of blocks, edge by edge."""
         return np.split(values, self.bounds[1:-1])
-
-    def merit(self) -> Array:
-        """Return the weight of each block for the blur: zero where half of the step is cut."""
-        return np.where(self.clipped > self.moved, 0.0, np.abs(self.contrast))
 
     def kept(self) -> BoolArray:
         """Return which blocks lie on the lines of their edges, (n,)."""
@@ -145,13 +175,19 @@ class Blocks:
     def fit(self, blur: float, n_rounds: int) -> None:
         """Fit the blocks and a line to each edge in turn, until no line moves any more."""
         active = np.ones(len(self.lines), dtype=np.bool_)
-        counts = np.diff(self.bounds)
+        counts, edge = np.diff(self.bounds), self.edge
+        of_edges = np.full(len(active), blur)
         largest = min(MAX_BLOCK_SIGMA[0] * blur, MAX_BLOCK_SIGMA[1]) ** 2
         for _ in range(n_rounds):
-            chosen = np.repeat(active, counts)
-            fit = fit_blocks(*self.samples(chosen), blur)
-            self.contrast[chosen] = fit.contrast(self.half_width[chosen], blur)
-            self.sharp[chosen] = fit.sharpness()
+            chosen = active[edge]
+            if np.all(chosen):
+                sums = self.bins(blur).sums(self.light)
+            else:
+                d = self.d[chosen] - self.moved[chosen, None].astype(np.float32)
+                sums = PixelBins.of(d, self.weight[chosen], blur).sums(self.light[chosen])
+            fit = fit_blocks(sums, self.half_width, of_edges, edge[chosen])
+            self.contrast[chosen] = fit.contrast
+            self.sharp[chosen], self.noise[chosen] = fit.sharpness(), fit.noise
             bounds = np.concatenate([[0], np.cumsum(counts[active])])
             gain, position, before = (x[chosen] for x in (self.gain, self.position, self.moved))
             shift = (before + fit.shift) / gain  # a line has the whole shift
@@ -169,6 +205,35 @@ class Blocks:
             if not np.any(active):
                 break
 
+    def estimate_blur(self, n_rounds: int) -> float:
+        """Return the blur [px] that explains best the blocks with most contrast.
+
+        Once each has moved with every blur, in some rounds. Blocks of which half of the step is cut
+        have no say.
+        """
+        merit = np.where(self.clipped > self.moved, 0.0, np.abs(self.contrast))
+        best = np.argsort(-merit, kind="stable")[:BLUR_BLOCKS]
+        blurs = np.geomspace(*BLURS)
+        half_width = np.tile(self.half_width[self.edge[best]], len(blurs))
+        d, light, weight = (
+            np.concatenate([x[best]] * len(blurs)) for x in (self.d, self.light, self.weight)
+        )
+        every = np.arange(len(d))
+        bounds = [*range(0, len(d), len(best)), len(d)]
+        moved = np.tile(self.moved[best], len(blurs))
+        for _ in range(n_rounds):
+            bins = PixelBins.of(d - moved[:, None].astype(np.float32), weight, blurs[0])
+            fit = fit_blocks(
+                bins.sums(light), half_width, np.repeat(blurs, len(best)), every, bounds
+            )
+            moved += fit.shift
+        misfit = np.log(fit.noise + 1e-3).reshape(len(blurs), -1).mean(axis=1)
+        i = int(np.clip(np.argmin(misfit), 1, len(blurs) - 2))
+        left, middle, right = misfit[i - 1 : i + 2]
+        bend = left - 2.0 * middle + right
+        offset = float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0
+        return float(blurs[i] * (blurs[1] / blurs[0]) ** offset)
+
 
 @dataclass(frozen=True, eq=False)
 class BlockFit:
@@ -177,17 +242,11 @@ class BlockFit:
     shift: Array  # of the outline from the current line, positive towards the inside [px]
     variance: Array  # of it by the noise of the block [px^2]; infinite where nothing is seen
     noise: Array  # mean square residual [grey levels^2]
+    contrast: Array  # step to the leg, a pixel and a half inside [grey levels]
     freedom: Array  # samples beyond what is fitted, at least one
-    amplitude: Array  # (n, 5) of the functions of the limb model [grey levels]
-    normal: Array  # (n, 5, 5) products of these functions
+    normal: Array  # (n, 5, 5) products of the functions of the limb model
     right: Array  # (n, 5) of them with the grey levels
     power: Array  # of grey levels
-
-    def contrast(self, half_width: Samples, blur: float) -> Array:
-        """Return the steps (n,) to the leg, a pixel and a half inside [grey levels]."""
-        reference = np.full((len(half_width), 1), 1.5 + blur, dtype=np.float32)
-        at, _ = basis(reference, half_width, blur)
-        return np.asarray(np.sum(at[:, 2:, 0] * self.amplitude[:, 2:], axis=1))
 
     def sharpness(self) -> Array:
         """Return how much chi^2 (n,) falls by there being more than a bend of the shading."""
@@ -200,89 +259,76 @@ class BlockFit:
 
 
 def fit_blocks(
-    d: Samples, grey: Samples, weight: Samples, half_width: Samples, blur: Samples | float
+    sums: PixelSums,
+    half_width: Array,
+    blur: Array,
+    edge: IntArray,
+    bounds: Sequence[int] | None = None,
 ) -> BlockFit:
     """Fit the limb model to blocks, by one Gauss-Newton step from the current line.
 
-    Distances inside the line [px], grey levels proportional to light, and inverse noise in some
-    unit (zero for samples that are not to be used), all (n, m); half-widths (n, 1) and the blur,
-    or (n, 1) blurs, in px.
+    Of edges with half-widths and blurs (n_edges,) [px], one or more blocks each: ``edge`` (n,).
+    Blurs are the same between two successive bounds (n_groups + 1,).
     """
-    X, slopes = basis(d, half_width, blur)
-    n_samples = np.count_nonzero(weight, axis=1).astype(np.float64)
-    level = _products(grey, weight) / np.maximum(weight.sum(axis=1), 1e-3)
-    y = (grey - level.astype(np.float32)[:, None]) * weight
-    X *= weight[:, None, :]
-    normal = (X @ X.swapaxes(1, 2)).astype(np.float64)
-    right, power = _with(X, y), _products(y, y)
-    inverse = _regularised_inverse(normal, right, power, n_samples)
-    amplitude = _applied(inverse, right)
-    residual = y - _sum(X, amplitude)
+    bounds = (0, len(edge)) if bounds is None else bounds
+    of_block = blur[edge]
+    of_group = of_block[np.array(bounds[:-1], dtype=np.intp)][:, None]
+    functions, changes = powers(sums.grid / of_group)
+    at_bins = functions, changes / of_group[..., None], bounds
+    products, with_light = sums.products(*at_bins), sums.with_light(*at_bins)
+    design = np.concatenate(simple_functions(half_width, blur), axis=1)[edge]
+    pairs = design @ products @ design.swapaxes(1, 2)
+    right: Array = (design @ with_light[..., None])[..., 0]
+    # Grey levels less their mean in the block: sums nearly cancel.
+    level = right[:, 0] / np.maximum(pairs[:, 0, 0], 1e-3)
+    power = np.maximum(sums.power.sum(axis=1) - level * right[:, 0], 0.0)
+    right -= level[:, None] * pairs[:, :, 0]
+    simple, turned = slice(0, N_SIMPLE), slice(N_SIMPLE, None)
+    normal, steep = pairs[:, simple, simple], pairs[:, turned, turned]
+    n_samples = sums.count
+    inverse = _regularised_inverse(normal, right[:, simple], power, n_samples)
+    amplitude = _applied(inverse, right[:, simple])
+    left = right - _applied(pairs[:, :, simple], amplitude)  # products with the residuals
     # The outline at distance s further inside lowers d by s.
-    change = _sum(slopes, -amplitude) * weight
-    change -= _sum(X, _applied(inverse, _with(X, change)))
-    information, gradient = _products(change, change), _products(change, residual)
-    freedom = np.maximum(n_samples - N_BASIS - 1.0, 1.0)
-    seen = (information > 1e-9) & (n_samples > 4 * N_BASIS)
+    crossed = _applied(pairs[:, simple, turned], -amplitude)
+    imitated = _applied(inverse, crossed)  # by other amplitudes
+    information = _dot(amplitude, _applied(steep, amplitude)) + _dot(
+        imitated, _applied(normal, imitated) - 2.0 * crossed
+    )
+    gradient = -_dot(amplitude, left[:, turned]) - _dot(imitated, left[:, simple])
+    residual = power - _dot(amplitude, right[:, simple] + left[:, simple])
+    freedom = np.maximum(n_samples - N_SIMPLE - 1.0, 1.0)
+    seen = (information > 1e-9) & (n_samples > 4 * N_SIMPLE)
     safe = np.where(seen, information, 1.0)
     step = np.where(seen, gradient / safe, 0.0)
-    noise = np.maximum(_products(residual, residual) - step * gradient, 0.0) / freedom
+    noise = np.maximum(residual - step * gradient, 0.0) / freedom
     variance = np.where(seen, noise / safe, np.inf)
     shift = np.clip(step, -MAX_STEP, MAX_STEP)
-    return BlockFit(shift, variance, noise, freedom, amplitude, normal, right, power)
+    deep, _ = powers((DEEP + of_block) / of_block)
+    steps = (design[:, 2:N_SIMPLE] @ deep[..., None])[..., 0]
+    contrast = _dot(steps, amplitude[:, 2:])
+    of_model = normal, right[:, simple], power
+    return BlockFit(shift, variance, noise, contrast, freedom, *of_model)
 
 
-def _products(one: Samples, other: Samples) -> Array:
-    """Return the sums of products (n,) in each block."""
-    return np.asarray(np.einsum("nm,nm->n", one, other).astype(np.float64))
-
-
-def _with(functions: Samples, values: Samples) -> Array:
-    """Return the sums of products (n, 5) of functions (n, 5, m) with values (n, m)."""
-    return np.asarray((functions @ values[..., None])[..., 0].astype(np.float64))
-
-
-def _sum(functions: Samples, amplitude: Array) -> Samples:
-    """Return functions (n, 5, m) with amplitudes (n, 5), added up, (n, m)."""
-    return np.asarray((amplitude.astype(np.float32)[:, None] @ functions)[:, 0])
+def _dot(one: Array, other: Array) -> Array:
+    """Return the products (n,) of vectors (n, k)."""
+    return np.asarray(np.einsum("nk,nk->n", one, other), dtype=np.float64)
 
 
 def _applied(matrices: Array, vectors: Array) -> Array:
-    """Return the products (n, 5) of matrices with vectors."""
-    return np.asarray((matrices @ vectors[..., None])[..., 0])
+    """Return the products (n, k) of matrices with vectors."""
+    return np.asarray((matrices @ vectors[..., None])[..., 0], dtype=np.float64)
 
 
 def _regularised_inverse(normal: Array, right: Array, power: Array, n_samples: Array) -> Array:
     """Invert normal matrices, drawing amplitudes that the noise of a block leaves open to zero."""
     count = np.maximum(n_samples, 1.0)
-    power = power / count + 1e-3
-    free = np.linalg.solve(normal + 1e-3 * np.eye(N_BASIS), right[..., None])[..., 0]
-    unexplained = power - np.sum(right * free, axis=1) / count
+    power = np.asarray(power / count + 1e-3, dtype=np.float64)
+    free = np.linalg.solve(normal + 1e-3 * np.eye(N_SIMPLE), right[..., None])[..., 0]
+    unexplained = power - np.einsum("nk,nk->n", right, free) / count
     prior = np.clip(unexplained / power, 1e-4, 1.0)[:, None] * RIDGE
-    return np.asarray(np.linalg.inv(normal + prior[:, :, None] * np.eye(N_BASIS)))
-
-
-def estimate_blur(
-    d: Samples, grey: Samples, weight: Samples, half_width: Samples, merit: Array
-) -> float:
-    """Return the blur [px] that explains those blocks of an image best that have most merit (n,).
-
-    The other arguments are as for :func:`fit_blocks`.
-    """
-    best = np.argsort(-merit, kind="stable")[:BLUR_BLOCKS]
-    d, grey, weight, half_width = d[best], grey[best], weight[best], half_width[best]
-    blurs = np.geomspace(*BLURS)
-    n, blur = len(blurs), np.repeat(blurs, len(d)).astype(np.float32)[:, None]
-    d, grey, weight, half_width = (np.concatenate([x] * n) for x in (d, grey, weight, half_width))
-    for _ in range(BLUR_ROUNDS):
-        fit = fit_blocks(d, grey, weight, half_width, blur)
-        d = d - fit.shift[:, None].astype(np.float32)
-    misfit = np.log(fit.noise + 1e-3).reshape(n, -1).mean(axis=1)
-    i = int(np.clip(np.argmin(misfit), 1, len(blurs) - 2))
-    left, middle, right = misfit[i - 1 : i + 2]
-    bend = left - 2.0 * middle + right
-    offset = float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0
-    return float(blurs[i] * (blurs[1] / blurs[0]) ** offset)
+    return np.asarray(np.linalg.inv(normal + prior[:, :, None] * np.eye(N_SIMPLE)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,9 +6,9 @@ sight, which is sqrt(rho (2 - rho)) at the depth rho = D / R inside the outline 
 half-width R. Diffuse light gives sums of 1, r and r^2, darkening towards the limb higher powers,
 and a highlight near the limb is a bump in r. All is blurred by a Gaussian.
 
-Single blocks are fitted with five functions in single precision (:func:`basis`). All blocks of an
-outline are fitted together with seven, expanded in powers of rho up to rho^2, which is good to a
-part in a hundred up to rho = 0.8 (:func:`profile_functions` of :func:`powers`):
+All blocks of an outline are fitted together with seven functions, expanded in powers of rho up to
+rho^2, which is good to a part in a hundred up to rho = 0.8 (:func:`profile_functions` of
+:func:`powers`); single blocks with five of them (:func:`simple_functions`):
 
     background      outside the outline
     its slope       outside, by the depth that is looked at
@@ -22,56 +22,6 @@ import numpy as np
 from scipy.special import ndtr
 
 from legcal.geometry import Array
-from legcal.perception.light import Samples
-
-N_BASIS = 5
-_BEFORE, _AFTER, _PER_UNIT = 6.0, 40.0, 1024  # range of the table, and entries per unit
-
-
-def _gauss(x: Array) -> Array:
-    return np.asarray(np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi))
-
-
-@cache
-def _tabulate() -> Samples:
-    """Tabulate step, Gaussian, blurred sqrt(max(x, 0)) and its derivative at x, (4, n)."""
-    coarse = np.arange(-_BEFORE, _AFTER + 1e-9, 1.0 / 32.0)
-    root = np.linspace(0.0, 7.0, 2801)  # substitute x = root^2: the integrands are smooth
-    kernel = 2.0 * (root[1] - root[0]) * root**2 * _gauss(coarse[:, None] - root**2)
-    x = np.arange(-_BEFORE, _AFTER + 1e-9, 1.0 / _PER_UNIT)
-    value = np.interp(x, coarse, np.sum(kernel, axis=1))
-    slope = np.interp(x, coarse, np.sum(kernel * (root**2 - coarse[:, None]), axis=1))
-    return np.stack([ndtr(x), _gauss(x), value, slope]).astype(np.float32)
-
-
-def basis(d: Samples, half_width: Samples, blur: Samples | float) -> tuple[Samples, Samples]:
-    """Return five functions (n, 5, m) of the distances d (n, m) inside an outline, and slopes by d.
-
-    Constant, slope of the background, step, limb (one at the depth ``half_width``), depth.
-    Half-widths and blurs (n, 1) in px.
-    """
-    blur = np.asarray(blur, dtype=np.float32)
-    z = d / blur
-    table = _tabulate()
-    place = np.clip((z + _BEFORE) * _PER_UNIT + 0.5, 0.0, table.shape[1] - 1.0)
-    index = place.astype(np.intp)  # the type that needs no conversion: take is slower with others
-    step, peak, root, root_slope = (function.take(index, mode="clip") for function in table)
-    depth = blur * (z * step + peak)  # the blurred ramp max(d, 0)
-    rho = depth / half_width
-    bend = np.sqrt(2.0 - np.clip(rho, 0.0, 1.0))
-    root_scale = np.sqrt(blur / half_width)
-    root *= root_scale
-    root_slope *= root_scale / blur
-    values = np.empty((len(d), N_BASIS, d.shape[1]), dtype=np.float32)
-    slopes = np.empty_like(values)
-    values[:, 0], slopes[:, 0] = 1.0, 0.0
-    values[:, 1], slopes[:, 1] = (depth - d) / half_width, (step - 1.0) / half_width
-    values[:, 2], slopes[:, 2] = step, peak / blur
-    values[:, 3] = root * bend
-    slopes[:, 3] = root_slope * bend - root * step / (2.0 * half_width * bend)
-    values[:, 4], slopes[:, 4] = rho, step / half_width
-    return values, slopes
-
 
 # Columns: 1, z, the Gaussian g(z), z g(z), and blurred powers of max(z, 0) or their products by z.
 ONE, Z, GAUSS, Z_GAUSS, STEP, MINUS_HALF, Z_MINUS_HALF, HALF, RAMP, THREE_HALVES, SQUARE = range(11)
@@ -81,8 +31,8 @@ _REACH, _PER_BLUR = 24.0, 256  # range of the table on both sides, and entries p
 
 
 @cache  # where no image is measured nothing is tabulated
-def _tabulate_powers() -> Array:
-    """Tabulate the functions and a column of zeros over the range, (n, N_POWERS + 1)."""
+def _tabulate_powers() -> tuple[Array, Array]:
+    """Tabulate the functions and their slopes over the range, (n, N_POWERS) each."""
     from scipy.interpolate import CubicSpline  # a tenth of a second
 
     coarse = np.arange(-_REACH, _REACH + 1e-9, 1.0 / 32.0)
@@ -100,18 +50,21 @@ def _tabulate_powers() -> Array:
         np.ones_like(z), z, gauss, z * gauss, step, minus_half, z * minus_half, half, ramp,
         three_halves, square,
     ]  # fmt: skip
-    return np.stack([*columns, np.zeros_like(z)], axis=1)
+    values = np.stack(columns, axis=1)
+    return values, np.gradient(values, 1.0 / _PER_BLUR, axis=0)
 
 
-def powers(z: Array) -> Array:
-    """Return the functions at distances z (...) in units of the blur, and a column of zeros.
+def powers(z: Array) -> tuple[Array, Array]:
+    """Return the functions at distances z (...) in units of the blur, and their slopes by z.
 
-    (..., N_POWERS + 1); the zeros are room for grey levels, so that one product of matrices gives
-    all sums over pixels.
+    Both are (..., N_POWERS).
     """
-    table = _tabulate_powers()
-    entry = np.clip((z + _REACH) * _PER_BLUR + 0.5, 0.0, len(table) - 1.0)
-    return np.asarray(table.take(entry.astype(np.intp), axis=0))  # the nearest ones
+    values, slopes = _tabulate_powers()
+    entry = np.clip((z + _REACH) * _PER_BLUR, 0.0, len(values) - 1.0)
+    node = np.rint(entry)
+    index, rest = node.astype(np.intp), ((entry - node) / _PER_BLUR)[..., None]
+    slope = slopes.take(index, axis=0)
+    return values.take(index, axis=0) + rest * slope, slope
 
 
 BACKGROUND, SLOPE, SURFACE = 0, 1, 2
@@ -130,12 +83,14 @@ _OF_DEPTH = np.array(
 )
 
 
-def profile_functions(half_width: Array, blur: Array, depth: float) -> tuple[Array, Array, Array]:
+def profile_functions(
+    half_width: Array, blur: Array, depth: Array | float
+) -> tuple[Array, Array, Array]:
     """Return what profiles are made of, as coefficients (n, N_AMPLITUDES, N_POWERS) of powers.
 
     The functions above, their derivatives by the distance inside the outline [1/px], and by the
-    logarithm of the blur. Half-widths and blurs (n,) in px; ``depth`` is the distance from an
-    outline that is looked at [px], the unit of the background's slope.
+    logarithm of the blur. Half-widths and blurs (n,) in px; ``depth`` is the unit of the
+    background's slope [px], that of all or of each (n,).
     """
     n = len(blur)
     values, slopes, widenings = (np.zeros((n, N_AMPLITUDES, N_POWERS)) for _ in range(3))
@@ -143,7 +98,7 @@ def profile_functions(half_width: Array, blur: Array, depth: float) -> tuple[Arr
     slopes[:, BACKGROUND, GAUSS] = -1.0 / blur
     widenings[:, BACKGROUND, Z_GAUSS] = 1.0
     values[:, SLOPE, Z], values[:, SLOPE, RAMP] = blur / depth, -blur / depth
-    slopes[:, SLOPE, [ONE, STEP]] = 1.0 / depth, -1.0 / depth
+    slopes[:, SLOPE, ONE], slopes[:, SLOPE, STEP] = 1.0 / depth, -1.0 / depth
     widenings[:, SLOPE, GAUSS] = -blur / depth
     value, slope, widening = (np.zeros((n, 5, N_POWERS)) for _ in range(3))
     scale = blur / half_width
@@ -159,3 +114,21 @@ def profile_functions(half_width: Array, blur: Array, depth: float) -> tuple[Arr
     for of_surface, all_of_it in ((value, values), (slope, slopes), (widening, widenings)):
         all_of_it[:, SURFACE:] = _OF_DEPTH @ of_surface
     return values, slopes, widenings
+
+
+N_SIMPLE = 5
+# Constant, slope of the background, step, limb, and depth, of the functions above.
+_SIMPLE = np.zeros((N_SIMPLE, N_AMPLITUDES))
+_SIMPLE[0, [BACKGROUND, SURFACE]] = 1.0
+_SIMPLE[1, SLOPE] = _SIMPLE[2, SURFACE] = _SIMPLE[3, SURFACE + 1] = 1.0
+_SIMPLE[4, [SURFACE + 2, SURFACE + 4]] = 0.5, 0.125  # rho = r^2 / 2 + r^4 / 8
+
+
+def simple_functions(half_width: Array, blur: Array) -> tuple[Array, Array]:
+    """Return what single blocks are made of, as coefficients (n, N_SIMPLE, N_POWERS) of powers.
+
+    Constant, slope of the background, step, limb r, and depth, both as parts of the half-width; and
+    their derivatives by the distance inside the outline [1/px]. Half-widths and blurs (n,) in px.
+    """
+    values, slopes, _ = profile_functions(half_width, blur, half_width)
+    return _SIMPLE @ values, _SIMPLE @ slopes

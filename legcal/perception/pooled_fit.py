@@ -1,12 +1,12 @@
 """Lines of outlines fitted to the pooled blocks of an image, with the blur and covariance.
 
 The blocks of an outline share amplitudes that change slowly along it, a line, and a blur that is
-nearly that of the whole image; each block adds a little of its own, which is eliminated. Sums over
-pixels are those of products of powers of the distance (:mod:`legcal.perception.limb`), so that a
-round of Gauss-Newton needs no pixel as long as lines and blurs move little.
+nearly that of the whole image; each block adds a little of its own, which is eliminated. A round of
+Gauss-Newton needs no pixel (:mod:`legcal.perception.pixel_sums`) as long as lines turn little.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.blocks import Blocks
 from legcal.perception.limb import N_AMPLITUDES, N_POWERS, powers, profile_functions
+from legcal.perception.pixel_sums import PixelBins, PixelSums, evened, medians, noise_ratios
 
 # Standard deviations of amplitudes, in contrasts of the outline, as limb.py orders them: of
 # what an outline has in common, of its changes along the outline, and of single blocks.
@@ -29,15 +30,17 @@ BLURS = (0.2, 4.0)  # least and greatest [px]
 MIN_SAMPLES = 30  # pixels of a block
 ENOUGH_BLOCKS, MAX_JOINED = 16, 3  # of an outline, to join some blocks, so many at most
 MAX_STEP = (0.7, 0.4)  # of one round: of the line [blurs], of the logarithm of the blur
-MAX_MOVE_OF_PRODUCTS = (0.08, 0.05)  # the same up to which products of powers are not summed again
+MAX_MOVE_OF_SUMS = (1.0, 0.08)  # of middle and ends [blurs], to which sums over pixels serve
+MAX_MOVE = (0.4, 0.15)  # of a line [blurs] and of the logarithm of the blur, to which equations do
 CONVERGED = 0.01  # step of a line below which its rounds end [px]
 ODD_NOISE = (1.5, 4.0)  # of a typical block, from where on one counts less, and not at all
 MIN_NOISE = 0.05  # variance of grey levels [grey levels^2]
+NOISE_ROUNDS, NOISE_CONVERGED = 3, 0.2  # of its estimate, at most; and of its logarithm
 MIN_LIGHT = 1e-3  # of the mean light of a block
 UNKNOWN_SIGMA = 1e3  # standard deviation of what is not known
 
 COMMON_BLUR_SIGMA = 0.03  # of the logarithm of the blur of an outline, about that of the image
-FIRST_ROUNDS, LAST_ROUNDS = 2, 8  # at most
+FIRST_ROUNDS, LAST_ROUNDS = 1, 8  # at most
 
 ONE, OTHER = (0, 1, 2, 1, 2, 2), (0, 0, 0, 1, 1, 2)  # pairs of polynomials
 SHIFT, BLUR, N_UNKNOWNS = N_AMPLITUDES, N_AMPLITUDES + 1, N_AMPLITUDES + 2  # unknowns of a block
@@ -58,8 +61,14 @@ class _Iterate(NamedTuple):
     amplitude: Array  # (n_edges, N_ALONG, N_AMPLITUDES)
     line: Array  # (n_edges, 2) in the middle, and half of the difference of the ends [px]
     log_blur: Array  # (n_edges,)
-    noise: Array  # (n_edges,) [grey levels^2]
-    inverse: Array  # (n_edges, N_ALONG * N_UNKNOWNS, N_ALONG * N_UNKNOWNS)
+
+
+class _Equations(NamedTuple):
+    """What blocks say of the unknowns of all edges near an iterate."""
+
+    design: Array  # (n, N_UNKNOWNS, N_POWERS) functions of the unknowns of blocks
+    elimination: Array  # (n, N_UNKNOWNS, N_UNKNOWNS) of what is a block's own, and its weight
+    system: Array  # (n_edges, N_ALONG * N_UNKNOWNS, N_ALONG * N_UNKNOWNS) normal matrices
 
 
 def fit_pooled(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> PooledLines:
@@ -67,34 +76,54 @@ def fit_pooled(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> Po
 
     From a rough blur [px]; ``depth`` is the distance from the outlines at which blocks end [px].
     """
-    pool = _Pool.of(blocks, kept, depth)
+    pool = _Pool.of(blocks, kept, blur, depth)
     n = len(pool.half_width)
     if n == 0 or not np.any(pool.seen):
         nothing = np.full(n, np.nan)
         return PooledLines(np.zeros((n, 2)), np.tile(np.eye(2), (n, 1, 1)), blur, nothing)
-    start = _Iterate(
-        np.zeros((n, N_ALONG, N_AMPLITUDES)),
-        np.zeros((n, 2)),
-        np.full(n, np.log(blur)),
-        np.full(n, 4.0),
-        np.zeros((n, N_ALONG * N_UNKNOWNS, N_ALONG * N_UNKNOWNS)),
+    prior = np.log(blur), PRIOR_BLUR
+    at = pool.first_amplitudes(
+        _Iterate(np.zeros((n, N_ALONG, N_AMPLITUDES)), np.zeros((n, 2)), np.full(n, prior[0]))
     )
-    found = pool.rounds(pool.first_amplitudes(start), np.log(blur), PRIOR_BLUR, FIRST_ROUNDS)
-    even, sigma = _common_blur(found, pool.seen)
-    found = found._replace(log_blur=np.full(n, even))
+    for _ in range(FIRST_ROUNDS):
+        pool.look(at)
+        equations = pool.equations(at)
+        inverse = pool.inverse(equations, *prior)
+        at = pool.step(at, equations, inverse, *prior)
+    even, sigma = _common_blur(at.log_blur, inverse[:, BLUR, BLUR], pool.seen)
+    at = at._replace(log_blur=np.full(n, even))
     sigma = float(np.hypot(sigma, COMMON_BLUR_SIGMA))
-    found = pool.rounds(found, even, sigma, LAST_ROUNDS)
+    inverse = _with_blur(inverse, sigma**-2 - prior[1] ** -2)
+    prior = even, sigma
+    for _ in range(LAST_ROUNDS):
+        if pool.look(at, MAX_MOVE):
+            equations = pool.equations(at)
+            inverse = pool.inverse(equations, *prior)
+        before, at = at, pool.step(at, equations, inverse, *prior)
+        if np.abs(at.line - before.line).max() < CONVERGED:
+            break
+    pool.look(at)
+    equations = pool.equations(at)
+    inverse = pool.inverse(equations, *prior)
+    by_gamma = pool.shifts_by_gamma(equations, inverse, sigma)
+    at = pool.step(at, equations, inverse, *prior)
     at_ends = np.array([[1.0, -1.0], [1.0, 1.0]])
     line = [SHIFT, N_UNKNOWNS + SHIFT]
-    covariance = at_ends @ found.inverse[:, line][:, :, line] @ at_ends.T
-    by_gamma = _shifts_by_gamma(pool, found, sigma)
-    return PooledLines(found.line @ at_ends.T, covariance, float(np.exp(even)), by_gamma)
+    covariance = at_ends @ inverse[:, line][:, :, line] @ at_ends.T
+    return PooledLines(at.line @ at_ends.T, covariance, float(np.exp(even)), by_gamma)
 
 
-def _common_blur(found: _Iterate, seen: BoolArray) -> tuple[float, float]:
+def _with_blur(covariance: Array, precision: float) -> Array:
+    """Return covariances (n_edges, k, k) of unknowns once the blur is known to more precision."""
+    of_blur = covariance[:, :, BLUR]
+    gain = precision / (1.0 + precision * of_blur[:, BLUR])
+    return covariance - gain[:, None, None] * of_blur[:, :, None] * of_blur[:, None, :]
+
+
+def _common_blur(log_blur: Array, variance: Array, seen: BoolArray) -> tuple[float, float]:
     """Return the logarithm of the blur that most outlines of an image agree on, and its sigma."""
-    log_blur = found.log_blur[seen]
-    weight = 1.0 / (found.inverse[seen, BLUR, BLUR] + BLUR_SCATTER**2)
+    log_blur = log_blur[seen]
+    weight = 1.0 / (variance[seen] + BLUR_SCATTER**2)
     even, robust = 0.0, weight
     for _ in range(6):
         even = float(robust @ log_blur / robust.sum())
@@ -102,366 +131,299 @@ def _common_blur(found: _Iterate, seen: BoolArray) -> tuple[float, float]:
     return even, float(robust.sum() ** -0.5)
 
 
-@dataclass(frozen=True, eq=False)
-class _BlockPixels:
-    """The pixels of short blocks, of which a few make a block of the pool."""
-
-    d: Array  # (n, m) from the lines on which the blocks had converged [px]
-    weight: Array  # (n, m)
-    light: Array  # (n, m) times the weight, less the mean of the edge
-    gain: Array  # (n,)
-    along: Array  # (n, N_ALONG) polynomials at the blocks
-    edge: IntArray  # (n,)
-    joined: IntArray  # (n,) the block of the pool to which each belongs
-    level: Array  # (n_edges,) mean light of each edge
-
-    def products(self, line: Array, log_blur: Array, edges: BoolArray) -> Array:
-        """Return the products of powers and light, summed over blocks of some edges.
-
-        (n_blocks, N_POWERS + 1, N_POWERS + 1)
-        """
-        some = edges[self.edge]
-        edge = self.edge[some]
-        moved = self.gain[some] * np.sum(line[edge] * self.along[some, :2], axis=1)
-        z = (self.d[some] - moved[:, None]) / np.exp(log_blur)[edge][:, None]
-        U = powers(z)  # in double precision: sums nearly cancel
-        U *= self.weight[some][..., None]
-        U[..., -1] = self.light[some]
-        first = np.flatnonzero(np.diff(self.joined[some], prepend=-1))
-        return np.asarray(np.add.reduceat(U.swapaxes(1, 2) @ U, first, axis=0))
-
-    def changed_by_gamma(self) -> "_BlockPixels":
-        """Return how the light of these pixels changes with ln gamma, in place of it."""
-        light, weight = self.light + self.level[self.edge][:, None] * self.weight, self.weight
-        of_block = np.maximum(light.sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-9), 1e-9)
-        part = light / np.maximum(weight * of_block[:, None], 1e-9)
-        change = light * np.log(np.maximum(part, MIN_LIGHT))
-        totals = (np.bincount(self.edge, x.sum(axis=1), len(self.level)) for x in (change, weight))
-        total, weights = totals
-        mean = total / np.maximum(weights, 1e-9)
-        return replace(self, light=change - mean[self.edge][:, None] * weight)
-
-
 @dataclass(eq=False)
 class _Pool:
     """The blocks of all edges, and which belong together."""
 
-    pixels: _BlockPixels
-    power: Array  # (n,) sum of squares of the light of each block
-    n_samples: Array  # (n,)
+    blocks: Blocks
+    usable: BoolArray  # which of the blocks
+    first: IntArray  # (n,) of the usable blocks that are joined, the first ones
     gain: Array  # (n,)
     edge: IntArray  # (n,)
-    bounds: IntArray  # (n_edges + 1,)
+    bounds: list[int]  # n_edges + 1
     along: Array  # (n, N_ALONG) polynomials at the blocks
     half_width: Array  # (n_edges,) [px]
     contrast: Array  # (n_edges,)
+    noise: Array  # (n_edges,) of the blocks by themselves [grey levels^2]
+    noise_ratio: Array  # (n_edges,) inside and outside
+    blur: float  # that bins suit [px]
     depth: float  # distance from the outlines at which blocks end [px]
     seen: BoolArray  # (n_edges,) edges with usable blocks
-    # Products of powers and light of each block, and where the lines were and how wide the blur.
-    products: Array  # (n, N_POWERS + 1, N_POWERS + 1)
-    at_line: Array  # (n_edges, 2) NaN before products are known
-    at_log_blur: Array  # (n_edges,)
+    own: Array  # (n, BLUR) how little amplitudes and places of single blocks scatter: precisions
+    # Sums over pixels by their distances from lines, and of products of powers with a blur.
+    bins: PixelBins  # of all blocks
+    sums: PixelSums  # of the usable ones
+    at_line: Array  # (n_edges, 2) of the sums
+    products: Array  # (n, N_POWERS, N_POWERS)
+    with_light: Array  # (n, N_POWERS)
+    at: _Iterate  # of the products
+    functions: tuple[Array, Array, Array]  # profile_functions there
 
     @classmethod
-    def of(cls, blocks: Blocks, kept: BoolArray, depth: float) -> "_Pool":
+    def of(cls, blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> "_Pool":
         """Return what is needed of some blocks."""
-        n_edges = len(blocks.bounds) - 1
-        of_edge = np.repeat(np.arange(n_edges), np.diff(blocks.bounds))
+        n_edges = len(blocks.half_width)
         usable = kept & (np.count_nonzero(blocks.weight, axis=1) >= MIN_SAMPLES)
-        d, grey, weight, _ = (np.asarray(x, np.float64) for x in blocks.samples(usable))
-        edge = of_edge[usable]
-        n_samples = np.count_nonzero(weight, axis=1)
+        edge = blocks.edge[usable]
+        of_usable = np.searchsorted(edge, np.arange(n_edges + 1)).tolist()
+        noise = np.fmax(medians(blocks.noise[usable], edge, of_usable), MIN_NOISE)
+        first = np.flatnonzero(np.diff(_joined(np.bincount(edge, minlength=n_edges)), prepend=-1))
+        rise = 2.0 * blocks.position[usable] - 1.0
+        along = np.stack([np.ones_like(rise), rise, 1.5 * rise**2 - 0.5], axis=1)
+        means = np.column_stack([blocks.gain[usable], along])
+        if len(first):
+            means = np.add.reduceat(means, first) / np.diff(first, append=len(edge))[:, None]
+        edge = edge[first]
+        bounds = np.searchsorted(edge, np.arange(n_edges + 1)).tolist()
+        bins = blocks.bins(blur)
+        of_all = bins.sums(blocks.light)
+        ratio = noise_ratios(of_all, blocks.bounds, kept, blur)
+        sums = evened(of_all.of_blocks(usable).joined(first), ratio[edge], blur)
 
         def total(values: Array) -> Array:
             return np.asarray(np.bincount(edge, values, n_edges), dtype=np.float64)
 
-        weights = total(weight.sum(axis=1))
-        level = total(np.sum(weight * grey, axis=1)) / np.maximum(weights, 1e-9)
-        light = (grey - level[edge][:, None]) * weight
-        power = np.sum(light**2, axis=1)
-        spread = total(power) / np.maximum(total(n_samples), 1.0)
-        rise = 2.0 * blocks.position[usable] - 1.0
-        along = np.stack([np.ones_like(rise), rise, 1.5 * rise**2 - 0.5], axis=1)
-        joined = _joined(np.bincount(edge, minlength=n_edges))
-        pixels = _BlockPixels(d, weight, light, blocks.gain[usable], along, edge, joined, level)
-        first = np.flatnonzero(np.diff(joined, prepend=-1))
-        n_joined = np.diff(first, append=len(joined))
-
-        def summed(values: Array) -> Array:
-            return np.asarray(np.add.reduceat(values, first, axis=0), dtype=np.float64)
-
-        some = np.minimum(blocks.bounds[:-1], max(len(of_edge) - 1, 0))
+        weights, count = total(sums.weight[:, 0].sum(axis=1)), total(sums.count)
+        lights, power = total(sums.light[:, 0].sum(axis=1)), total(sums.power.sum(axis=1))
+        spread = np.maximum(power - lights**2 / np.maximum(weights, 1e-9), 0.0)
+        contrast = 2.0 * np.sqrt(spread / np.maximum(count, 1.0)) + 1.0
+        own = np.empty((len(edge), BLUR))
+        own[:, :N_AMPLITUDES] = (OF_BLOCKS * contrast[edge][:, None]) ** -2
+        own[:, SHIFT] = ROUGHNESS**-2
+        nowhere = np.zeros((n_edges, 2)), np.full(n_edges, np.nan)
         return cls(
-            pixels,
-            summed(power),
-            summed(n_samples),
-            summed(pixels.gain) / n_joined,
-            edge[first],
-            np.searchsorted(edge[first], np.arange(n_edges + 1)),
-            summed(along) / n_joined[:, None],
-            np.asarray(blocks.half_width[some, 0], dtype=np.float64),
-            2.0 * np.sqrt(spread) + 1.0,
+            blocks,
+            usable,
+            first,
+            means[:, 0],
+            edge,
+            bounds,
+            means[:, 1:],
+            blocks.half_width,
+            contrast,
+            noise,
+            ratio,
+            blur,
             depth,
             weights > 0.0,
-            np.empty((len(first), N_POWERS + 1, N_POWERS + 1)),
-            np.full((n_edges, 2), np.nan),
-            np.full(n_edges, np.nan),
+            own,
+            bins,
+            sums,
+            nowhere[0],
+            np.empty((0, N_POWERS, N_POWERS)),
+            np.empty((0, N_POWERS)),
+            _Iterate(np.empty(0), *nowhere),
+            (np.empty(0), np.empty(0), np.empty(0)),
         )
+
+    def look(self, at: _Iterate, most: tuple[float, float] = (0.0, 0.0)) -> bool:
+        """Sum again what has moved by more than some blurs, or widened; say whether any has."""
+        move = (at.line - self.at.line) / np.exp(at.log_blur)[:, None]
+        moved = np.abs(move).sum(axis=1)
+        widened = np.abs(at.log_blur - self.at.log_blur)
+        if np.all(moved <= most[0]) and np.all(widened <= most[1]):
+            return False
+        turned = np.abs(at.line - self.at_line) / np.exp(at.log_blur)[:, None]
+        if np.any(turned > MAX_MOVE_OF_SUMS):
+            self.at_line = at.line.copy()
+            self.bins = self._bins()
+            self.sums = self._evened(self.bins.sums(self.blocks.light))
+        self.at = at
+        self.functions = profile_functions(self.half_width, np.exp(at.log_blur), self.depth)
+        values, slopes = self._powers()
+        self.products = self.sums.products(values, slopes, self.bounds)
+        self.with_light = self.sums.with_light(values, slopes, self.bounds)
+        return True
+
+    def _bins(self) -> PixelBins:
+        """Return the bins of the pixels of all blocks where lines were looked at."""
+        blocks = self.blocks
+        line, rise = self.at_line[blocks.edge], 2.0 * blocks.position - 1.0
+        moved = blocks.moved + blocks.gain * (line[:, 0] + line[:, 1] * rise)
+        d = blocks.d - moved.astype(np.float32)[:, None]
+        return PixelBins.of(d, blocks.weight, self.blur)
+
+    def _evened(self, sums: PixelSums) -> PixelSums:
+        """Return the sums of the usable blocks, weighted by noise."""
+        own = sums.of_blocks(self.usable).joined(self.first)
+        return evened(own, self.noise_ratio[self.edge], self.blur)
+
+    def _powers(self) -> tuple[Array, Array]:
+        """Return powers of the distance from where the middle of each line is, and slopes by it."""
+        blur = np.exp(self.at.log_blur)[:, None]
+        middle = self.at.line[:, :1] - self.at_line[:, :1]
+        values, slopes = powers((self.sums.grid - middle) / blur)
+        return values, slopes / blur[..., None]
+
+    def _moved(self, line: Array) -> Array:
+        """Return how far lines (n_edges, 2) are inside those that powers are of, (n,) [px]."""
+        change = (line - self.at_line)[self.edge]
+        moved = self.gain * (change[:, 0] + change[:, 1] * self.along[:, 1])
+        return np.asarray(moved - (self.at.line - self.at_line)[self.edge, 0])
 
     def first_amplitudes(self, at: _Iterate) -> _Iterate:
         """Return the amplitudes that an outline has in common, with its line where it is."""
-        self._update_products(at, np.ones(len(self.half_width), dtype=np.bool_))
-        values, _, _ = profile_functions(self.half_width, np.exp(at.log_blur), self.depth)
-        products = self._of_edges(self.products, np.ones((len(self.edge), 1)))[:, 0]
-        of_edge = values @ products[:, :-1, :-1] @ values.swapaxes(1, 2)
-        prior = at.noise[:, None] / (COMMON * self.contrast[:, None]) ** 2 + 1e-9
-        of_edge += prior[:, :, None] * np.eye(N_AMPLITUDES)
-        target = values @ products[:, :-1, -1:]
-        at.amplitude[:, 0] = np.linalg.solve(of_edge, target)[..., 0]
-        return at
+        self.look(at)
+        values, one = self.functions[0], np.ones((len(self.edge), 1))
+        of_edge = values @ self._of_edges(self.products, one)[:, 0] @ values.swapaxes(1, 2)
+        of_edge += _diagonal(self.noise[:, None] / (COMMON * self.contrast[:, None]) ** 2 + 1e-9)
+        target = values @ self._of_edges(self.with_light, one)[:, 0, :, None]
+        amplitude = np.zeros_like(at.amplitude)
+        amplitude[:, 0] = np.linalg.solve(of_edge, target)[..., 0]
+        return at._replace(amplitude=amplitude)
 
-    def rounds(self, at: _Iterate, log_blur: float, sigma: float, n: int) -> _Iterate:
-        """Take Gauss-Newton steps, ``n`` at most, the blur known to ``sigma`` beforehand."""
-        moving = np.ones(len(self.half_width), dtype=np.bool_)
-        for _ in range(n):
-            before = at
-            self._update_products(at, moving)
-            if np.all(moving):
-                at = self._step(at, log_blur, sigma)
-            else:
-                at = _Iterate(*(values.copy() for values in before))
-                some = _Iterate(*(values[moving] for values in before))
-                step = self._part(moving)._step(some, log_blur, sigma)
-                for values, new in zip(at, step, strict=True):
-                    values[moving] = new
-            moved = np.abs(at.line - before.line).max(axis=1)
-            moving = np.maximum(moved, np.abs(at.log_blur - before.log_blur)) >= CONVERGED
-            if not np.any(moving):
-                break
-        return at
-
-    def _update_products(self, at: _Iterate, edges: BoolArray) -> None:
-        """Sum the products of some edges again, those that have moved from where they are."""
-        blur = np.exp(self.at_log_blur)
-        moved = np.abs(at.line - self.at_line).sum(axis=1) / blur
-        widened = np.abs(at.log_blur - self.at_log_blur)
-        stale = edges & ~((moved < MAX_MOVE_OF_PRODUCTS[0]) & (widened < MAX_MOVE_OF_PRODUCTS[1]))
-        if np.any(stale):
-            own = stale[self.edge]
-            if np.any(own):
-                self.products[own] = self.pixels.products(at.line, at.log_blur, stale)
-            self.at_line[stale], self.at_log_blur[stale] = at.line[stale], at.log_blur[stale]
-
-    def _part(self, edges: BoolArray) -> "_Pool":
-        """Return the blocks of some edges."""
-        own = edges[self.edge]
-        edge = (np.cumsum(edges) - 1)[self.edge[own]]
-        return _Pool(
-            self.pixels,
-            self.power[own],
-            self.n_samples[own],
-            self.gain[own],
-            edge,
-            np.searchsorted(edge, np.arange(np.count_nonzero(edges) + 1)),
-            self.along[own],
-            self.half_width[edges],
-            self.contrast[edges],
-            self.depth,
-            self.seen[edges],
-            self.products[own],
-            self.at_line[edges],
-            self.at_log_blur[edges],
-        )
-
-    def _step(self, at: _Iterate, log_blur: float, sigma: float) -> _Iterate:
-        """Take one step of all edges."""
-        normal, right, expected = self._block_equations(at)
-        normal /= at.noise[self.edge][:, None, None]
-        right /= at.noise[self.edge][:, None]
+    def equations(self, at: _Iterate) -> _Equations:
+        """Return the equations of all edges near an iterate that has just been looked at."""
+        values, slopes, widenings = self.functions
+        edge, along, n = self.edge, self.along, len(self.half_width)
+        design = np.empty((len(edge), N_UNKNOWNS, N_POWERS))
+        design[:, :N_AMPLITUDES] = values[edge] - self._moved(at.line)[:, None, None] * slopes[edge]
+        for k, of in ((SHIFT, slopes), (BLUR, widenings)):
+            design[:, k] = (along[:, None] @ (at.amplitude @ of)[edge])[:, 0]
+        design[:, SHIFT] *= -self.gain[:, None]
+        normal = design @ self.products @ design.swapaxes(1, 2)
+        right = (design @ self.with_light[..., None])[..., 0]
+        amplitude = (along[:, None] @ at.amplitude[edge])[:, 0]
+        within = normal[:, :BLUR, :BLUR]
         # A block's own amplitudes and place are eliminated, its blur is that of the edge:
         # what is left is known of what the edge has in common.
-        own = self._own_precision()
-        free = np.asarray(np.linalg.inv(normal[:, :BLUR, :BLUR] + _diagonal(own)), np.float64)
-        fitted = (free @ (right[:, :BLUR] + own * expected)[..., None])[..., 0]
-        noise, weight = self._noise(at, normal[:, :BLUR, :BLUR], right[:, :BLUR], fitted)
-        known = _eliminated(normal, right, free, own)
-        system, target = self._edge_equations(known, weight)
-        precision, pull = self._prior(at, log_blur, sigma)
-        n = len(self.half_width)
-        shape = n, N_ALONG * N_UNKNOWNS
-        whole = system + _diagonal(precision.reshape(shape))
-        inverse = np.linalg.inv(whole)
-        step = (inverse @ (target + pull).reshape(*shape, 1)).reshape(n, N_ALONG, N_UNKNOWNS)
+        for _ in range(NOISE_ROUNDS):
+            own = self.noise[edge][:, None] * self.own
+            free = np.asarray(np.linalg.inv(within + _diagonal(own)), dtype=np.float64)
+            pull = right[:, :BLUR].copy()
+            pull[:, :N_AMPLITUDES] += own[:, :N_AMPLITUDES] * amplitude
+            fitted = _applied(free, pull)
+            explained = fitted * (2.0 * right[:, :BLUR] - _applied(within, fitted))
+            before = self.noise
+            self.noise, weight = self._noise(self.sums.power.sum(axis=1) - explained.sum(axis=1))
+            if np.all(np.abs(np.log(self.noise / before)) < NOISE_CONVERGED):
+                break
+        weight /= self.noise[edge]
+        # N - N (N + P)^-1 N = P (N + P)^-1 N, where P is the own precision.
+        elimination = np.zeros((len(edge), N_UNKNOWNS, N_UNKNOWNS))
+        elimination[:, :BLUR, :BLUR] = own[..., None] * free
+        elimination[:, BLUR, :BLUR] = -(normal[:, None, BLUR, :BLUR] @ free)[:, 0]
+        elimination[:, BLUR, BLUR] = 1.0
+        elimination *= weight[:, None, None]
+        sums = self._of_edges(elimination @ normal, along[:, ONE] * along[:, OTHER])
+        system = np.empty((n, N_ALONG, N_UNKNOWNS, N_ALONG, N_UNKNOWNS))
+        for k, (i, j) in enumerate(zip(ONE, OTHER, strict=True)):
+            system[:, i, :, j] = system[:, j, :, i] = sums[:, k]
+        side = N_ALONG * N_UNKNOWNS
+        return _Equations(design, elimination, system.reshape(n, side, side))
+
+    def step(
+        self, at: _Iterate, equations: _Equations, inverse: Array, log_blur: float, sigma: float
+    ) -> _Iterate:
+        """Take a Gauss-Newton step, by equations near an iterate, with a blur known before."""
+        values, slopes, widenings = self.functions
+        widened = (at.log_blur - self.at.log_blur)[:, None, None]
+        edge, along = self.edge, self.along[:, None]
+        model = (along @ (at.amplitude @ (values + widened * widenings))[edge])[:, 0]
+        steep = (along @ (at.amplitude @ slopes)[edge])[:, 0]
+        model -= self._moved(at.line)[:, None] * steep
+        left = self.with_light - (self.products @ model[..., None])[..., 0]
+        target = self._eliminated(equations, left)
+        precision = self.precision(log_blur, sigma)
+        target[..., :N_AMPLITUDES] -= precision[..., :N_AMPLITUDES] * at.amplitude
+        target[:, :2, SHIFT] -= precision[:, :2, SHIFT] * at.line
+        target[:, 0, BLUR] += precision[:, 0, BLUR] * (log_blur - at.log_blur)
+        step = _applied(inverse, target.reshape(len(inverse), -1)).reshape(target.shape)
         largest = MAX_STEP[0] * np.exp(at.log_blur)[:, None]
         move = np.clip(step[:, :2, SHIFT], -largest, largest)
         widen = np.clip(step[:, 0, BLUR], -MAX_STEP[1], MAX_STEP[1])
         least, most = np.log(BLURS).tolist()
-        widened = np.clip(at.log_blur + widen, least, most)
-        return _Iterate(
-            step[..., :N_AMPLITUDES],
-            at.line + move,
-            np.asarray(widened),
-            noise,
-            np.asarray(inverse),
-        )
+        log_blurs = np.asarray(np.clip(at.log_blur + widen, least, most))
+        return _Iterate(at.amplitude + step[..., :N_AMPLITUDES], at.line + move, log_blurs)
 
-    def response_to_gamma(self, at: _Iterate) -> tuple[Array, Array]:
-        """Return the equations of what a change of ln gamma does to all edges, where they are.
+    def inverse(self, equations: _Equations, log_blur: float, sigma: float) -> Array:
+        """Return the covariances of the unknowns of edges, with the blur known before."""
+        precision = self.precision(log_blur, sigma).reshape(len(self.half_width), -1)
+        return np.asarray(np.linalg.inv(equations.system + _diagonal(precision)))
 
-        Normal matrices (n_edges, k, k), with what is known beforehand of all unknowns but the blur,
-        and right sides (n_edges, k), for the unknowns of N_ALONG polynomials one after the other.
+    def precision(self, log_blur: float, sigma: float) -> Array:
+        """Return what is known beforehand of the unknowns of edges, (n_edges, N_ALONG, N_UNKNOWNS).
+
+        Lines are known by where they start, and the blur to ``sigma`` of its logarithm.
         """
-        every = np.ones(len(self.half_width), dtype=np.bool_)
-        self._update_products(at, every)
-        normal, right, expected = self._block_equations(at)
-        products = self.pixels.changed_by_gamma().products(self.at_line, self.at_log_blur, every)
-        _, change, _ = replace(self, products=products)._block_equations(at)
-        noise = at.noise[self.edge]
-        normal, own = normal / noise[:, None, None], self._own_precision()
-        right, change = right / noise[:, None], change / noise[:, None]
-        free = np.asarray(np.linalg.inv(normal[:, :BLUR, :BLUR] + _diagonal(own)), np.float64)
-        fitted = (free @ (right[:, :BLUR] + own * expected)[..., None])[..., 0]
-        _, weight = self._noise(at, normal[:, :BLUR, :BLUR], right[:, :BLUR], fitted)
-        system, target = self._edge_equations(_eliminated(normal, change, free, own), weight)
-        precision, _ = self._prior(at, 0.0, UNKNOWN_SIGMA)
-        shape = len(every), N_ALONG * N_UNKNOWNS
-        return system + _diagonal(precision.reshape(shape)), target.reshape(shape)
-
-    def _edge_equations(self, known: Array, weight: Array) -> tuple[Array, Array]:
-        """Return what blocks (n, N_UNKNOWNS, N_UNKNOWNS + 1) that count by a weight say of edges.
-
-        Normal matrices (n_edges, k, k) and right sides (n_edges, N_ALONG, N_UNKNOWNS).
-        """
-        sums = self._of_edges(known, self.along[:, ONE] * self.along[:, OTHER] * weight[:, None])
-        n = len(self.half_width)
-        system = np.empty((n, N_ALONG, N_UNKNOWNS, N_ALONG, N_UNKNOWNS))
-        for k, (i, j) in enumerate(zip(ONE, OTHER, strict=True)):
-            system[:, i, :, j] = system[:, j, :, i] = sums[:, k, :, :-1]
-        side = N_ALONG * N_UNKNOWNS
-        return system.reshape(n, side, side), sums[:, :N_ALONG, :, -1]
-
-    def _block_equations(self, at: _Iterate) -> tuple[Array, Array, Array]:
-        """Return the normal equations of all blocks, and the unknowns that are expected."""
-        values, slopes, widenings = profile_functions(
-            self.half_width, np.exp(self.at_log_blur), self.depth
-        )
-        edge = self.edge
-        moved = self.gain * np.sum((at.line - self.at_line)[edge] * self.along[:, :2], axis=1)
-        widened = values + (at.log_blur - self.at_log_blur)[:, None, None] * widenings
-        amplitude = np.einsum("nj,njk->nk", self.along, at.amplitude[edge])
-        design = np.empty((len(edge), N_UNKNOWNS, N_POWERS))
-        design[:, :N_AMPLITUDES] = widened[edge] - moved[:, None, None] * slopes[edge]
-        for k, of in ((SHIFT, slopes), (BLUR, widenings)):
-            of_polynomials = (at.amplitude @ of)[edge]
-            design[:, k] = np.einsum("nj,njp->np", self.along, of_polynomials)
-        design[:, SHIFT] *= -self.gain[:, None]
-        with_light = design @ self.products[:, :-1]
-        normal = with_light[..., :-1] @ design.swapaxes(1, 2)
-        expected = np.zeros((len(edge), BLUR))
-        expected[:, :N_AMPLITUDES] = amplitude
-        return normal, with_light[..., -1], expected
-
-    def _noise(
-        self, at: _Iterate, normal: Array, right: Array, fitted: Array
-    ) -> tuple[Array, Array]:
-        """Return the noise of each edge, and how much each block counts by its own."""
-        explained = 2.0 * right - (normal @ fitted[..., None])[..., 0]
-        explained = np.sum(fitted * explained, axis=1) * at.noise[self.edge]
-        of_block = np.maximum(self.power - explained, 0.0) / np.maximum(self.n_samples - 5.0, 1.0)
-        of_edge = np.ones(len(self.half_width))
-        middle = (self.bounds[:-1] + self.bounds[1:]) // 2
-        of_edge[self.seen] = of_block[np.lexsort((of_block, self.edge))][middle[self.seen]]
-        of_edge = np.asarray(np.maximum(of_edge, MIN_NOISE))
-        excess = of_block / of_edge[self.edge]
-        return of_edge, np.clip((ODD_NOISE[1] - excess) / (ODD_NOISE[1] - ODD_NOISE[0]), 0.0, 1.0)
-
-    def _own_precision(self) -> Array:
-        """Return how little amplitudes and places of single blocks scatter, (n, BLUR)."""
-        precision = np.empty((len(self.edge), BLUR))
-        precision[:, :N_AMPLITUDES] = (OF_BLOCKS * self.contrast[self.edge][:, None]) ** -2
-        precision[:, SHIFT] = ROUGHNESS**-2
-        return precision
-
-    def _prior(self, at: _Iterate, log_blur: float, sigma: float) -> tuple[Array, Array]:
-        """Return what is known of the unknowns of edges beforehand: precision, and its pull."""
         precision = np.full((len(self.half_width), N_ALONG, N_UNKNOWNS), 1e10)
-        pull = np.zeros_like(precision)
         contrast = self.contrast[:, None]
         precision[:, 0, :N_AMPLITUDES] = (COMMON * contrast) ** -2
         precision[:, 1:, :N_AMPLITUDES] = ((ALONG * contrast) ** -2)[:, None, :]
-        near = (START_SIGMA[0] + START_SIGMA[1] * np.exp(log_blur)) ** -2
-        precision[:, :2, SHIFT] = near
-        pull[:, :2, SHIFT] = -at.line * near
+        precision[:, :2, SHIFT] = (START_SIGMA[0] + START_SIGMA[1] * np.exp(log_blur)) ** -2
         precision[:, 0, BLUR] = sigma**-2
-        pull[:, 0, BLUR] = (log_blur - at.log_blur) * sigma**-2
-        return precision, pull
+        return precision
+
+    def shifts_by_gamma(self, equations: _Equations, inverse: Array, sigma: float) -> Array:
+        """Return how far the middles (n_edges,) of outlines move inside with ln gamma [px], or NaN.
+
+        With the covariance of unknowns (n_edges, k, k), the logarithm of the blur known to sigma.
+        """
+        blocks, weight = self.blocks, self.blocks.weight
+        light = blocks.light + blocks.level.astype(np.float32)[blocks.edge][:, None]
+        weights = np.maximum(weight.sum(axis=1), np.float32(1e-9))
+        of_block = np.maximum(np.sum(light * weight, axis=1) / weights, np.float32(1e-9))
+        change = light * np.log(np.maximum(light / of_block[:, None], np.float32(MIN_LIGHT)))
+        bins = self.bins
+        changed = PixelSums(
+            bins.grid, bins.weight, bins.light(change), bins.weight[:, 0], bins.count
+        )
+        with_light = self._evened(changed).with_light(*self._powers(), self.bounds)
+        target = self._eliminated(equations, with_light).reshape(len(self.half_width), -1)
+
+        found = _applied(inverse, target)
+        # The blurs of an image change alike: by as much as edges say whose blur is not known.
+        known, of_blur = sigma**-2, inverse[:, :, BLUR]
+        freed = 1.0 + (PRIOR_BLUR**-2 - known) * of_blur[:, BLUR]
+        counts = self.seen / (of_blur[:, BLUR] / freed + BLUR_SCATTER**2)
+        widened = float(counts @ (found[:, BLUR] / freed) / counts.sum())
+        found += widened * known * of_blur
+        return np.where(self.seen, found[:, SHIFT], np.nan)
+
+    def _eliminated(self, equations: _Equations, left: Array) -> Array:
+        """Return right sides (n_edges, N_ALONG, N_UNKNOWNS) by what is left of light (n, k)."""
+        right = _applied(equations.elimination, _applied(equations.design, left))
+        return self._of_edges(right, self.along)
+
+    def _noise(self, power: Array) -> tuple[Array, Array]:
+        """Return the noise of each edge, and how much blocks (n,) count by their residuals' sum."""
+        of_block = np.maximum(power, 0.0) / np.maximum(self.sums.count - 5.0, 1.0)
+        of_edge = np.fmax(medians(of_block, self.edge, self.bounds), MIN_NOISE)
+        excess = of_block / of_edge[self.edge]
+        return of_edge, np.clip((ODD_NOISE[1] - excess) / (ODD_NOISE[1] - ODD_NOISE[0]), 0.0, 1.0)
 
     def _of_edges(self, values: Array, weight: Array) -> Array:
-        """Return sums over the blocks of each edge, (n_edges, k, i, j).
+        """Return sums over the blocks of each edge, (n_edges, k, ...).
 
-        Of values (n, i, j) times weights (n, k).
+        Of values (n, ...) times weights (n, k).
         """
         n, k = len(self.half_width), weight.shape[1]
         flat = values.reshape(len(values), -1)
         sums = np.empty((n, k, flat.shape[1]))
-        for edge in range(n):
-            own = slice(self.bounds[edge], self.bounds[edge + 1])
-            sums[edge] = weight[own].T @ flat[own]
+        for edge, (first, last) in enumerate(pairwise(self.bounds)):
+            np.matmul(weight[first:last].T, flat[first:last], out=sums[edge])
         return sums.reshape(n, k, *values.shape[1:])
 
 
 def _joined(counts: IntArray) -> IntArray:
     """Return which of successive blocks become one, given how many there are of each edge."""
-    joined, n_before = [np.empty(0, dtype=np.intp)], 0
-    for n in counts.tolist():
-        index = np.arange(n) // int(np.clip(n // ENOUGH_BLOCKS, 1, MAX_JOINED))
-        joined.append(n_before + index)
-        n_before += int(index[-1]) + 1 if n else 0
-    return np.concatenate(joined)
+    number = np.clip(counts // ENOUGH_BLOCKS, 1, MAX_JOINED)
+    n = -(-counts // number)
+    edge = np.repeat(np.arange(len(counts)), counts)
+    before = np.cumsum(counts) - counts
+    return np.asarray(
+        (np.cumsum(n) - n)[edge] + (np.arange(len(edge)) - before[edge]) // number[edge]
+    )
 
 
-def _eliminated(normal: Array, right: Array, free: Array, own: Array) -> Array:
-    """Return normal equations (n, N_UNKNOWNS, N_UNKNOWNS + 1) without what is a block's own.
-
-    ``own`` is the precision with which its unknowns are known to be those of the edge, and ``free``
-    the covariance of all unknowns but the blur, were there no others.
-    """
-    known = np.empty((len(own), N_UNKNOWNS, N_UNKNOWNS + 1))
-    # N - N (N + P)^-1 N = P - P (N + P)^-1 P, where P is the own precision.
-    known[:, :BLUR, :BLUR] = _diagonal(own) - own[:, :, None] * free * own[:, None, :]
-    others = np.stack([normal[:, :BLUR, BLUR], right[:, :BLUR]], axis=-1)
-    solved = free @ others
-    known[:, :BLUR, BLUR:] = own[..., None] * solved
-    known[:, BLUR, :BLUR] = known[:, :BLUR, BLUR]
-    left = np.stack([normal[:, BLUR, BLUR], right[:, BLUR]], axis=-1)
-    known[:, BLUR, BLUR:] = left - np.sum(others[..., :1] * solved, axis=1)
-    return known
+def _applied(matrices: Array, vectors: Array) -> Array:
+    """Return the products (n, i) of matrices (n, i, k) with vectors (n, k)."""
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 
 def _diagonal(values: Array) -> Array:
     """Return diagonal matrices (..., n, n)."""
-    return np.asarray(values[..., None] * np.eye(values.shape[-1]))
-
-
-def _shifts_by_gamma(pool: _Pool, at: _Iterate, even_blur: float) -> Array:
-    """Return how far the middles (n_edges,) of outlines move inside with ln gamma [px], or NaN.
-
-    ``even_blur`` is by how much the logarithms of blurs differ in the image.
-    """
-    normal, right = pool.response_to_gamma(at)
-    moved, inverse = _solve_with_blur(normal, right, 0.0, PRIOR_BLUR)
-    counts = pool.seen / (inverse[:, BLUR, BLUR] + BLUR_SCATTER**2)
-    widened = float(counts @ moved[:, BLUR] / counts.sum())
-    moved, _ = _solve_with_blur(normal, right, widened, even_blur)
-    return np.where(pool.seen, moved[:, SHIFT], np.nan)
-
-
-def _solve_with_blur(
-    normal: Array, right: Array, widened: float, sigma: float
-) -> tuple[Array, Array]:
-    """Return the unknowns of edges (n, k) and their covariance, the blur known to sigma."""
-    whole, target = normal.copy(), right.copy()
-    whole[:, BLUR, BLUR] += sigma**-2
-    target[:, BLUR] += widened * sigma**-2
-    inverse = np.asarray(np.linalg.inv(whole), dtype=np.float64)
-    return (inverse @ target[..., None])[..., 0], inverse
+    matrices = np.zeros((*values.shape, values.shape[-1]))
+    index = np.arange(values.shape[-1])
+    matrices[..., index, index] = values
+    return matrices

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from legcal.geometry import Array
-from legcal.perception.blocks import BlockLine, Blocks, depth_for_blur, estimate_blur
+from legcal.perception.blocks import BlockLine, Blocks, depth_for_blur
+from legcal.perception.pixel_sums import medians
 from legcal.perception.pooled_fit import PooledLines, fit_pooled
 from legcal.perception.profiles import Edge
 from legcal.vision import Camera, Grey
@@ -21,7 +22,9 @@ from legcal.vision import Camera, Grey
 FIRST_BLUR = 1.0  # [px]
 MIN_CHI2_GAIN = 30  # by an edge, from which on a block shows one
 FIRST_BLOCKS = 12  # of an outline
-FIRST_ROUNDS, LAST_ROUNDS = 2, 2  # the last ones at most
+BRIEF_BLOCKS = 16  # the same in brief
+FIRST_ROUNDS = (1, 2)  # of estimates of the blur, one after the other
+LAST_ROUNDS = 2  # of lines, at most
 MAX_BLUR_TRIALS, BLUR_CONVERGED = 3, 0.25  # until its logarithm changes by less
 SHADING = 0.5  # that the model leaves out [grey levels]
 WIDENING = 1.3  # of the standard deviations of a fit of all blocks, which share what is left out
@@ -67,14 +70,14 @@ def measure_edges(
         if len(blocks.moved) == 0:
             return [None] * len(edges), FIRST_BLUR
         blur = FIRST_BLUR
-        for _ in range(FIRST_ROUNDS):
+        for n_rounds in FIRST_ROUNDS:
             blocks.fit(blur, 1)
-            blur = estimate_blur(*blocks.samples(slice(None)), blocks.merit())
+            blur = blocks.estimate_blur(n_rounds)
         v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
     joint = None
     for _ in range(MAX_BLUR_TRIALS):
         tried = blur
-        blocks = Blocks.read(grey, camera, edges, v, tried)
+        blocks = Blocks.read(grey, camera, edges, v, tried, None if together else BRIEF_BLOCKS)
         if len(blocks.moved) == 0:
             return [None] * len(edges), tried
         blocks.fit(tried, LAST_ROUNDS)
@@ -83,7 +86,6 @@ def measure_edges(
         if near:
             blocks.unmove()
         kept = blocks.kept()
-        blocks.even_noise(kept, tried)
         joint = fit_pooled(blocks, kept, tried, depth_for_blur(tried))
         blur = joint.blur
         if abs(np.log(blur / tried)) < BLUR_CONVERGED:
@@ -100,16 +102,18 @@ def _measured(
 ) -> list[MeasuredEdge | None]:
     """Return the lines of edges by their blocks, one by one or all together."""
     found: list[MeasuredEdge | None] = []
+    kept = blocks.kept()
+    edge_of = blocks.edge[kept]
+    bounds = np.searchsorted(edge_of, np.arange(len(edges) + 1)).tolist()
     of_blocks = (np.abs(blocks.contrast), blocks.sharp, blocks.clipped - blocks.moved)
-    of_edges = zip(*(blocks.of_edges(values) for values in of_blocks), strict=True)
-    for i, (edge, at, line, (contrasts, sharp, clipped)) in enumerate(
-        zip(edges, v, blocks.lines, of_edges, strict=True)
+    typical = [medians(values[kept], edge_of, bounds).tolist() for values in of_blocks]
+    for i, (edge, at, line, contrast, sharp, clipped) in enumerate(
+        zip(edges, v, blocks.lines, *typical, strict=True)
     ):
         if line is None:
             found.append(None)
             continue
-        contrast = float(np.median(contrasts[line.kept]))
-        is_step = float(np.median(sharp[line.kept])) > MIN_CHI2_GAIN
+        is_step = sharp > MIN_CHI2_GAIN
         # How far shading moves an outline: its grey levels over the slope of the step.
         bias = float(SHADING * np.sqrt(2.0 * np.pi) * blur / max(contrast, 1e-3))
         moved = _moved(edge, at, line)
@@ -122,7 +126,7 @@ def _measured(
         covariance = 0.5 * (covariance + covariance.T)
         covariance += POOLED_COMMON_BIAS**2 + POOLED_TILT_BIAS**2 * np.eye(2) + bias**2
         ends = joint.ends[i]
-        depth = (float(np.median(clipped[line.kept])) - float(ends.mean())) / blur
+        depth = (clipped - float(ends.mean())) / blur
         found.append(
             MeasuredEdge(
                 moved + edge.epsilon * ends,
