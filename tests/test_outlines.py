@@ -312,13 +312,19 @@ def test_tube_and_rod_are_two_parts() -> None:
 
 def test_an_edge_stands_alone_only_without_a_rival() -> None:
     near, far = np.array([[0.0, 0.5], [1.0, 1.5]]), np.array([[0.0, 0.5], [9.0, 8.0]])
-    for shift, score, expected in (
-        (far, [0.8, 0.3], 0),
-        (far, [0.8, 0.7], None),
-        (near, [0.8, 0.7], 0),  # two lines on one edge
-        (far, [0.4, 0.1], None),
-    ):
-        assert _alone(shift, np.array(score), MIN_LONE_SCORE) == expected
+    cases = (
+        (far, [0.8, 0.3], True),
+        (far, [0.8, 0.7], False),
+        (near, [0.8, 0.7], True),  # two lines on one edge
+        (far, [0.4, 0.1], False),
+        (0.0 * far, [0.0, 0.0], False),  # no line at all
+    )
+    shift, score, expected = (np.array(x) for x in zip(*cases, strict=True))
+    # As the edges of parts, each beside another one of them.
+    other = np.roll(np.arange(len(cases)), 1)
+    both = np.stack([np.arange(len(cases)), other], axis=1)
+    least = np.full(len(cases), MIN_LONE_SCORE)
+    np.testing.assert_array_equal(_alone(shift[both], score[both], least), expected[both])
 
 
 # Which part of a leg shows an outline.

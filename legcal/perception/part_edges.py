@@ -14,6 +14,7 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.light import Samples
@@ -25,6 +26,8 @@ NEAR_WINDOW = 4  # such a window, at most [px]
 MAX_BLOCKS = 80  # of a part
 MARGIN = 6  # columns beyond the search window, to judge what an edge is [px]
 MAX_LINES = 8  # near an edge
+SIZES = 4  # windows are worked on together whose half widths are equal in steps of so much [px]
+SEPARATION = 2  # columns and differences of ends up to which a line is the same as a better one
 WIDTH_TOLERANCE = (1.0, 0.02)  # [px] and share of the width: one standard deviation
 MIN_SCORE = 0.15  # of an edge of a pair: mean sharpness of its blocks
 MIN_LONE_SCORE = 0.5  # of an edge that may stand alone
@@ -90,57 +93,66 @@ def find_pairs(grey: Grey, camera: Camera, parts: Sequence[LegPart]) -> list[Edg
     """Find both edges of parts; None where no two edges are convincing, nor one alone."""
     if not parts:
         return []
-    lines = _edge_lines(grey, camera, parts)
-    return [_pair(*one) for one in zip(parts, lines[::2], lines[1::2], strict=True)]
+    shift, score = _edge_lines(grey, camera, parts)
+    return _pairs(parts, shift.reshape(-1, 2, *shift.shape[1:]), score.reshape(-1, 2, MAX_LINES))
 
 
-def _pair(part: LegPart, *lines: tuple[Array, Array]) -> EdgePair | None:
-    """Return the two outlines of a part among lines near each of them."""
-    predicted = part.predicted
-    together = _best_pair(lines[0], lines[1], predicted[1] - predicted[0], part.window)
-    least = MIN_LONE_SCORE_GUIDED if part.guided else MIN_LONE_SCORE
-    lone = [_alone(*candidates, least) for candidates in lines]
-    if together is not None:
-        shifts = np.stack([lines[edge][0][i] for edge, i in enumerate(together)])
-        alone = np.array([i == k for i, k in zip(together, lone, strict=True)])
-        return EdgePair(predicted + shifts, np.ones(2, dtype=np.bool_), alone)
-    scores = [0.0 if i is None else lines[edge][1][i] for edge, i in enumerate(lone)]
-    edge = int(np.argmax(scores))
-    i = lone[edge]
-    rivalled = max(lines[1 - edge][1], default=0.0) >= MIN_LONE_SCORE
-    if i is None or (rivalled and not part.guided):
-        return None  # two clear edges at another distance are not those of this part
-    found = np.arange(2) == edge
-    return EdgePair(predicted + lines[edge][0][i], found, found)
+def _pairs(parts: Sequence[LegPart], shift: Array, score: Array) -> list[EdgePair | None]:
+    """Return the two outlines of each part, of lines near them, best first.
+
+    Shifts of lines (n_parts, 2, n_lines, 2) [px] and their scores (n_parts, 2, n_lines), 0 of none.
+    """
+    predicted = np.array([part.predicted for part in parts])
+    i, j, together = _best_pairs(parts, predicted, shift, score)
+    guided = np.array([part.guided for part in parts])
+    alone = _alone(shift, score, np.where(guided, MIN_LONE_SCORE_GUIDED, MIN_LONE_SCORE))
+    best = score[..., 0]
+    edge = np.argmax(np.where(alone, best, 0.0), axis=1)
+    every = np.arange(len(parts))
+    rivalled = (best[every, 1 - edge] >= MIN_LONE_SCORE) & ~guided
+    single = alone[every, edge] & ~rivalled  # two clear edges are not those of another distance
+    of_pair = predicted + np.stack([shift[every, 0, i], shift[every, 1, j]], axis=1)
+    convincing = alone & (np.stack([i, j], axis=1) == 0)
+    of_single = predicted + shift[every, edge, 0][:, None]
+    found: list[EdgePair | None] = []
+    for k in every.tolist():
+        if together[k]:
+            found.append(EdgePair(of_pair[k], np.ones(2, dtype=np.bool_), convincing[k]))
+        elif single[k]:
+            own = np.arange(2) == edge[k]
+            found.append(EdgePair(of_single[k], own, own))
+        else:
+            found.append(None)
+    return found
 
 
-def _best_pair(
-    one: tuple[Array, Array], two: tuple[Array, Array], width: Array, window: float
-) -> tuple[int, int] | None:
-    """Return which of the lines near both edges are a pair, None if no two are convincing."""
-    (shift1, score1), (shift2, score2) = one, two
-    if not len(score1) or not len(score2):
-        return None
-    mismatch = (shift2[None, :, :] - shift1[:, None, :]) / (
-        WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * width
-    )
-    drift = (0.5 / window) * (shift1[:, None, :] + shift2[None, :, :])
-    square = mismatch**2
-    value = score1[:, None] + score2[None, :] - 0.05 * (square + drift**2).sum(axis=-1)
-    value[square.max(axis=-1) > 9.0] = -np.inf
-    i, j = divmod(int(value.argmax()), len(score2))
-    if not np.isfinite(value[i, j]) or min(score1[i], score2[j]) < MIN_SCORE:
-        return None
-    return i, j
+def _best_pairs(
+    parts: Sequence[LegPart], predicted: Array, shift: Array, score: Array
+) -> tuple[IntArray, IntArray, BoolArray]:
+    """Return which lines near both edges of each part are a pair, and whether it is convincing."""
+    one, two = shift[:, 0, :, None], shift[:, 1, None]
+    width = (predicted[:, 1] - predicted[:, 0])[:, None, None]
+    window = np.array([part.window for part in parts])[:, None, None, None]
+    mismatch = ((two - one) / (WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * width)) ** 2
+    drift = ((0.5 / window) * (one + two)) ** 2
+    scores = score[:, 0, :, None], score[:, 1, None]
+    value = scores[0] + scores[1] - 0.05 * (mismatch + drift).sum(axis=-1)
+    good = (mismatch.max(axis=-1) <= 9.0) & (scores[0] > 0.0) & (scores[1] > 0.0)
+    value[~good] = -np.inf
+    best = value.reshape(len(parts), -1).argmax(axis=1)
+    i, j = np.divmod(best, score.shape[2])
+    every = np.arange(len(parts))
+    weaker = np.minimum(score[every, 0, i], score[every, 1, j])
+    return i, j, good[every, i, j] & (weaker >= MIN_SCORE)
 
 
-def _alone(shift: Array, score: Array, least: float) -> int | None:
-    """Return the best line near an edge if it has no rival."""
-    if not len(score) or score[0] < least:
-        return None
-    middle = 0.5 * (shift[:, 0] + shift[:, 1])
-    other = np.abs(middle - middle[0]) > MIN_RIVAL_DISTANCE
-    return None if np.any(score[other] > MAX_RIVAL * score[0]) else 0
+def _alone(shift: Array, score: Array, least: Array) -> BoolArray:
+    """Return whether the best line near each edge (n_parts, 2) is good enough without rivals."""
+    middle = shift.sum(axis=-1)
+    other = np.abs(middle - middle[..., :1]) > 2.0 * MIN_RIVAL_DISTANCE
+    best = score[..., 0]
+    rivalled = np.any(other & (score > MAX_RIVAL * best[..., None]), axis=-1)
+    return np.asarray((best >= least[:, None]) & (best > 0.0) & ~rivalled)
 
 
 def block_positions(band: Band) -> Array:
@@ -149,106 +161,150 @@ def block_positions(band: Band) -> Array:
     return np.asarray((np.arange(n) + 0.5) * (band.length / n))
 
 
-def _edge_lines(grey: Grey, camera: Camera, parts: Sequence[LegPart]) -> list[tuple[Array, Array]]:
-    """Return lines near both edges of each part: shifts at both ends (n, 2) [px], scores (n,)."""
-    halves = [int(np.ceil(part.window)) for part in parts]
-    reach = max(halves) + MARGIN
-    far = np.array([-float(reach), float(reach)])
-    n_rows = ROWS if max(halves) > NEAR_WINDOW else ROWS_NEAR
-    ends, hidden = [], []
-    for part in parts:
-        n = len(part.hidden)
-        node = np.linspace(0.0, 1.0, n + 1)
-        centre = part.predicted[:, :1] + np.diff(part.predicted, axis=1) * node
-        ends.append(part.band.points((node * part.band.length)[:, None], centre[..., None] + far))
-        hidden += [part.hidden] * 2
-    n_blocks = np.array([len(one) for one in hidden])
+def _edge_lines(grey: Grey, camera: Camera, parts: Sequence[LegPart]) -> tuple[Array, Array]:
+    """Return lines near both edges of each part, best first: shifts at both ends, and scores.
+
+    Shifts (2 n_parts, MAX_LINES, 2) [px] and scores (2 n_parts, MAX_LINES), 0 where there is none.
+    """
+    halves = np.repeat([int(np.ceil(part.window)) for part in parts], 2)
+    reach = int(halves.max()) + MARGIN
+    n_rows = ROWS if halves.max() > NEAR_WINDOW else ROWS_NEAR
+    n_blocks = np.repeat([len(part.hidden) for part in parts], 2)
     bounds = np.concatenate([[0], np.cumsum(n_blocks)])
-    nodes = camera.distort(np.concatenate([one.reshape(-1, 2, 2) for one in ends]))
+    edge = np.repeat(np.arange(len(n_blocks)), n_blocks)
+    hidden = np.concatenate([part.hidden for part in parts for _ in range(2)])
+    nodes = camera.distort(_node_points(parts, n_blocks, float(reach)))
     # Between nodes, and near an edge, the lens moves pixels in proportion to their distance.
-    begin = np.arange(bounds[-1]) + np.repeat(np.arange(len(hidden)), n_blocks)
+    begin = np.arange(bounds[-1]) + edge
     row = (np.arange(n_rows) + 0.5)[:, None, None] / n_rows
-    pixels = nodes[begin, None] + row * (nodes[begin + 1] - nodes[begin])[:, None]
+    start = nodes[begin, None]
+    pixels = start + row * (nodes[begin + 1, None] - start)
     share = np.linspace(0.0, 1.0, 2 * reach + 1, dtype=np.float32)
     first, change = (
         x.reshape(-1, 2).astype(np.float32)
         for x in (pixels[:, :, 0], pixels[:, :, 1] - pixels[:, :, 0])
     )
     x, y = (first[:, k : k + 1] + change[:, k : k + 1] * share for k in (0, 1))
-    values = np.asarray(cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
-    seen = np.repeat(~np.concatenate(hidden)[:, None], len(share), axis=1)
+    values = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    seen = np.repeat(~hidden[:, None], len(share), axis=1)
     last = np.array([camera.width, camera.height]) - 1.5
     partly = np.any((pixels < 0.5) | (pixels > last), axis=(1, 2, 3))
     if partly.any():
         x, y = (one.reshape(-1, n_rows, len(share))[partly] for one in (x, y))
         inside = (x >= 0.5) & (x <= camera.width - 1.5) & (y >= 0.5) & (y <= camera.height - 1.5)
         seen[partly] &= inside.all(axis=1)
-    profiles = values.reshape(-1, n_rows, len(share)).mean(axis=1)
-    votes = _sharpness(profiles, seen, bounds) * seen
-    n_seen = np.maximum(np.add.reduceat(seen.any(axis=1).astype(np.intp), bounds[:-1]), 1)
-    lines = []
-    for k, half in enumerate(np.repeat(halves, 2).tolist()):
-        own = slice(bounds[k], bounds[k + 1]), slice(reach - half, reach + half + 1)
-        lines.append(_lines(votes[own] / n_seen[k], half))
-    return lines
+    by_row = np.asarray(values, dtype=np.float32).reshape(-1, n_rows, len(share))
+    profiles = by_row[:, 0].copy()
+    for k in range(1, n_rows):
+        profiles += by_row[:, k]
+    profiles *= np.float32(1.0 / n_rows)
+    votes = _sharpness(profiles, seen, n_blocks) * seen
+    n_seen = np.add.reduceat(seen.any(axis=1).astype(np.float32), bounds[:-1])
+    votes /= np.maximum(n_seen, np.float32(1.0))[edge, None]
+    return _lines(votes[:, MARGIN:-MARGIN], n_blocks, halves)
 
 
-def _sharpness(profiles: Samples, seen: BoolArray, bounds: IntArray) -> Samples:
-    """Return how much each column of profiles (n_blocks, n) looks like an edge, 0 to 1.
+def _node_points(parts: Sequence[LegPart], n_blocks: IntArray, reach: float) -> Array:
+    """Return points (n, 2, 2) of the sensor plane at the ends of blocks, on both sides of edges."""
+    bands = [part.band for part in parts]
+    of_part = np.array(
+        [(*b.origin, *(b.along * (b.length / b.scale)), *(b.normal / b.scale)) for b in bands]
+    ).reshape(-1, 3, 2)
+    predicted = np.array([part.predicted for part in parts]).reshape(-1, 2)
+    n = n_blocks + 1
+    edge = np.repeat(np.arange(len(n)), n)
+    node = (np.arange(len(edge)) - np.repeat(np.cumsum(n) - n, n)) / n_blocks[edge]
+    v = predicted[edge, 0] + (predicted[edge, 1] - predicted[edge, 0]) * node
+    origin, along, normal = of_part[edge // 2].swapaxes(0, 1)
+    middle = origin + node[:, None] * along + v[:, None] * normal
+    side = reach * normal
+    return np.stack([middle - side, middle + side], axis=1)
+
+
+def _sharpness(profiles: Samples, seen: BoolArray, n_blocks: IntArray) -> Samples:
+    """Return how much each column of profiles (n, n_columns) looks like an edge, 0 to 1.
 
     The maxima of the smoothed gradient along each profile against the median of its patch, widened
-    by one column to each side, where they count less. ``bounds`` are the first blocks of patches.
+    by one column to each side, where they count less. ``n_blocks`` are those of each patch.
     """
     smooth = cv2.GaussianBlur(profiles, (5, 1), 0.8)
     gradient = np.zeros_like(profiles)
     gradient[:, 1:-1] = np.abs(smooth[:, 2:] - smooth[:, :-2]) * (seen[:, 2:] & seen[:, :-2])
     beside = np.ones((1, 3), dtype=np.uint8)
     wide = np.asarray(cv2.dilate(gradient, beside), dtype=np.float32)
-    peak = np.where(gradient >= wide, gradient, np.float32(0.0))
-    typical = [
-        _median(gradient[first:last][seen[first:last]]) for first, last in pairwise(bounds.tolist())
-    ]
-    level = np.repeat((NOISE_LEVELS * np.array(typical)) ** 2 + 1e-3, np.diff(bounds))
-    sharpness = np.asarray(peak**2 / (peak**2 + level[:, None]), dtype=np.float32)
+    peak = np.where(gradient >= wide, gradient, np.float32(0.0)) ** 2
+    bounds = np.concatenate([[0], np.cumsum(n_blocks)]).tolist()
+    typical = np.array([_median(gradient[i:j], seen[i:j]) for i, j in pairwise(bounds)])
+    level = np.repeat((NOISE_LEVELS * typical) ** 2 + 1e-3, n_blocks).astype(np.float32)
+    sharpness = peak / (peak + level[:, None])
     widened = np.asarray(cv2.dilate(sharpness, beside), dtype=np.float32)
     return np.asarray(np.maximum(sharpness, np.float32(BESIDE_WEIGHT) * widened), dtype=np.float32)
 
 
-def _median(values: Samples) -> float:
-    """Return the middle value, the upper one of two; 0 of none."""
-    middle = len(values) // 2
-    return float(np.partition(values, middle)[middle]) if len(values) else 0.0
+def _median(values: Samples, seen: BoolArray) -> float:
+    """Return the middle value that is seen, the upper one of two; 0 of none."""
+    some = values.ravel() if seen.all() else values[seen]
+    middle = len(some) // 2
+    return float(np.partition(some, middle)[middle]) if len(some) else 0.0
 
 
-def _lines(votes: Array, half: int) -> tuple[Array, Array]:
-    """Add votes (n_blocks, 2 half + 1) along lines; return shifts and scores of separate maxima."""
+def _lines(votes: Samples, n_blocks: IntArray, halves: IntArray) -> tuple[Array, Array]:
+    """Add the votes of patches along lines; return their separate maxima.
+
+    Votes (n, 2 max(halves) + 1) of all blocks, those in the middle count; shifts (n_patches,
+    MAX_LINES, 2) and scores (n_patches, MAX_LINES), best first, 0 of none.
+    """
+    most, n = int(halves.max()), len(n_blocks)
+    side, middle = 2 * (most + SEPARATION) + 1, most + SEPARATION
+    score = np.zeros((n, side, side), dtype=np.float32)
+    sizes = np.minimum(SIZES * -(-halves // SIZES), most)
+    for half in np.unique(sizes).tolist():
+        own = np.flatnonzero(sizes == half)
+        rows = np.repeat(sizes == half, n_blocks)
+        inner = slice(middle - half, middle + half + 1)
+        of_own = votes[rows, most - half : most + half + 1]
+        score[own, inner, inner] = _added(of_own, n_blocks[own], halves[own], half)
+    flat, every = score.reshape(n, -1), np.arange(n)
+    around = np.arange(-SEPARATION, SEPARATION + 1)
+    around = (around[:, None] * side + around).ravel()
+    at, best = np.zeros((MAX_LINES, n), dtype=np.intp), np.zeros((MAX_LINES, n))
+    for line in range(MAX_LINES):
+        at[line] = flat.argmax(axis=1)
+        best[line] = flat[every, at[line]]
+        flat[every[:, None], at[line, :, None] + around] = 0.0  # of none: at the border
+    tilt, place = np.divmod(at.T, side)
+    change, place = 0.5 * (tilt - middle), place - middle
+    shifts = np.stack([place - change, place + change], axis=-1)
+    return np.where(best.T[..., None] > 0.0, shifts, 0.0), best.T
+
+
+def _added(votes: Samples, n_blocks: IntArray, halves: IntArray, half: int) -> Samples:
+    """Return votes (n, 2 half + 1) added along lines, by the difference of their ends and middles.
+
+    (n_patches, 2 half + 1, 2 half + 1), 0 beyond the half width of each patch, as are votes.
+    """
     n_columns, reach = 2 * half + 1, half // 2 + 1
-    padded = np.zeros((len(votes), n_columns + 2 * reach), dtype=votes.dtype)
-    padded[:, reach:-reach] = votes
-    score = padded.take(_along_lines(len(votes), half)).sum(axis=1)
-    shifts, scores = [], []
-    for _ in range(MAX_LINES):
-        i, j = divmod(int(score.argmax()), n_columns)
-        best = float(score[i, j])
-        if best <= 0.0:
-            break
-        middle, tilt = j - half, 0.5 * (i - half)
-        shifts.append((middle - tilt, middle + tilt))
-        scores.append(best)
-        score[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3] = 0.0
-    return np.array(shifts, dtype=np.float64).reshape(-1, 2), np.array(scores)
+    within = np.abs(np.arange(-half, half + 1)) <= halves[:, None]
+    padded = np.zeros((len(votes), n_columns + 2 * reach), dtype=np.float32)
+    np.multiply(votes, np.repeat(within, n_blocks, axis=0), out=padded[:, reach:-reach])
+    columns = np.concatenate([_columns(n, half) for n in n_blocks.tolist()])
+    begin = columns + (np.arange(len(votes)) * padded.shape[1])[:, None]
+    shape = padded.size - n_columns + 1, n_columns
+    windows = as_strided(padded, shape, 2 * padded.strides[1:], writeable=False)
+    along = windows[begin]  # (n, tilts, middles)
+    added = np.add.reduceat(along, np.cumsum(n_blocks) - n_blocks, axis=0)
+    added *= within[:, :, None] & within[:, None, :]
+    return np.asarray(added, dtype=np.float32)
 
 
 @lru_cache(maxsize=512)
-def _along_lines(n_blocks: int, half: int) -> IntArray:
-    """Return where votes lie along lines, by the difference of their ends and their middle.
+def _columns(n_blocks: int, half: int) -> IntArray:
+    """Return where lines begin to count in each block, by the difference of their ends.
 
-    (2 half + 1, n_blocks, 2 half + 1) places in a table (n_blocks, 2 (half + half // 2) + 3).
+    (n_blocks, 2 half + 1) columns of votes with half // 2 + 1 more on each side.
     """
     position = (np.arange(n_blocks) + 0.5) / n_blocks - 0.5
-    reach = half // 2 + 1
-    column = np.rint(np.arange(-half, half + 1)[:, None] * position).astype(np.intp) + reach
-    row = np.arange(n_blocks) * (2 * half + 1 + 2 * reach)
-    places = (row + column)[..., None] + np.arange(2 * half + 1)
-    places.setflags(write=False)
-    return places
+    columns = np.rint(position[:, None] * np.arange(-half, half + 1)).astype(np.intp)
+    columns += half // 2 + 1
+    columns.setflags(write=False)
+    return columns
