@@ -153,6 +153,19 @@ def test_files_that_were_exchanged_are_told_from_each_other(
         assert f"shows the reading given for image {given};" in _note(detected.notes, image)
 
 
+def test_a_wrong_digit_is_no_exchange_with_an_image_that_shows_its_own_reading(
+    tmp_path: Path,
+) -> None:
+    made = spoiled(tmp_path / "digit", N, ("c1", "c2"))
+    row = made.row("c1", 4)
+    assert row["leg2_prismatic"] == "0.0075626"
+    row["leg2_prismatic"] = "0.0705626"
+    found = detect(made.write())
+    note = _note(found.notes, row["image"])
+    assert "shows the reading given for" not in note
+    assert "check its reading of leg2, 70.56 mm against 7.91 mm," in note
+
+
 def test_nothing_else_is_said_and_the_other_images_are_used(
     bad: Spoiled, detected: Detection
 ) -> None:

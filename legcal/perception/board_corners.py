@@ -510,7 +510,8 @@ def require_board(
         problems.append(
             f"view {view.name}: the board could not be found in any of its {len(rows)} "
             f"image{'s' * (len(rows) != 1)}: found {found or 'nothing like it'}, needed "
-            f"{board_in_words(board)}; correct the block board of the dataset file, or turn the camera."
+            f"{board_in_words(board)}; correct the block board of the dataset file, or turn the "
+            "camera."
         )
     if problems:
         raise NotVisible(problems)

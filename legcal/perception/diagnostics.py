@@ -36,6 +36,7 @@ NOMINAL_TOLERANCE = 0.015  # the same of a leg that nothing has moved from where
 MIN_SHARE = 0.35  # share of the legs that explain
 MIN_GAIN = 2.0, 0.15  # the same against the reading's: factor, more
 MIN_SHARE_OF_USUAL = 0.5  # of the share that the other images of the view reach
+ONE_READING = 3.0  # how many times more than any other one it differs, if it alone is wrong
 AMBIGUOUS = 0.85  # of the best explanation: then another one is about as good
 MIRRORED = "the image is mirrored"  # reasons
 TURNED = "the image is upside down"
@@ -222,8 +223,7 @@ def explain(
         (_share(_picture(search, pairs, other, view), placement, view), other) for other in rows
     ]
     for share, other in _best(readings, suspects):
-        why = f"it shows the reading given for image {measurements.image[other]}"
-        tried.append((share, why, "check which image belongs to which row"))
+        tried.append((share, *_at_other_reading(search, row, other, other in suspects)))
     for w, other_view in enumerate(measurements.views):
         sizes = [(c.width, c.height) for c in (measurements.views[view].camera, other_view.camera)]
         if w == view or placement.T_base_camera[w] is None or sizes[0] != sizes[1]:
@@ -246,6 +246,26 @@ def explain(
     factor, more = MIN_GAIN
     least = max(MIN_SHARE, MIN_SHARE_OF_USUAL * usual.get(view, 0.0), factor * own, own + more)
     return ImageExplanation(own, why, remedy) if share >= least else ImageExplanation(own)
+
+
+def _at_other_reading(search: Search, row: int, other: int, exchanged: bool) -> tuple[str, str]:
+    """Return what an image shows that suits another image's reading, and what to do.
+
+    Where that image shows its own reading, the two were not exchanged: it may be near this pose,
+    and one wrong digit in this reading tells them apart.
+    """
+    measurements = search.measurements
+    image, remedy = measurements.image[other], "check which image belongs to which row"
+    if exchanged:
+        return f"it shows the reading given for image {image}", remedy
+    why = f"its legs are about where the reading of image {image} has them"
+    difference = np.abs(measurements.q[row] - measurements.q[other])
+    *_, second, first = np.argsort(np.nan_to_num(difference))
+    if difference[first] > ONE_READING * difference[second]:
+        given, there = 1e3 * measurements.q[[row, other], first]
+        name = search.leg_names[first]
+        remedy = f"check its reading of {name}, {given:.2f} mm against {there:.2f} mm, and {remedy}"
+    return why, remedy
 
 
 def _best(
