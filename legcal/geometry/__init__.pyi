@@ -2,6 +2,7 @@ from .axes import axis_angles as axis_angles
 from .axes import axis_angles_slope as axis_angles_slope
 from .axes import turned_axis as turned_axis
 from .covariances import whitener as whitener
+from .lines import cross as cross
 from .lines import distance_to_line as distance_to_line
 from .lines import moment as moment
 from .lines import nearest_point_to_line as nearest_point_to_line
@@ -10,6 +11,10 @@ from .lines import normal_basis as normal_basis
 from .lines import segment_distance as segment_distance
 from .motions import components as components
 from .motions import frame_on_points as frame_on_points
+from .motions import matrix_applied as matrix_applied
+from .motions import matrix_inverse as matrix_inverse
+from .motions import matrix_of as matrix_of
+from .motions import matrix_product as matrix_product
 from .motions import motion_of as motion_of
 from .motions import motions_of as motions_of
 from .motions import moved_poses as moved_poses
@@ -18,7 +23,6 @@ from .motions import product as product
 from .motions import register_groups as register_groups
 from .motions import register_in_plane as register_in_plane
 from .motions import register_points as register_points
-from .rotations import cross as cross
 from .rotations import cross_matrices as cross_matrices
 from .rotations import nearest_rotation as nearest_rotation
 from .rotations import roll_pitch_yaw as roll_pitch_yaw

@@ -6,8 +6,7 @@ The angles w of an axis v turn it by exp([w_1 e_1 + w_2 e_2]_x), with e_1, e_2 t
 
 import numpy as np
 
-from legcal.geometry.lines import normal_basis
-from legcal.geometry.rotations import cross
+from legcal.geometry.lines import cross, normal_basis
 from legcal.geometry.types import Array
 
 

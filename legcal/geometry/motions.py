@@ -1,4 +1,7 @@
-"""Rigid motions, as transforms or batched as (R, t), and the ones that lay points on points."""
+"""Rigid motions, as transforms, batched as (R, t) or as matrices (..., 4, 4), and point sets.
+
+Matrices are for chains of motions: SciPy's transforms cost ten times what their product does.
+"""
 
 from collections.abc import Sequence
 
@@ -42,11 +45,37 @@ def motion_of(
     Quick: ``RigidTransform.from_components`` decomposes every matrix anew, which is most of the
     time of reading a model.
     """
+    return RigidTransform(matrix_of(R, t), normalize=False, copy=False)
+
+
+def matrix_of(R: Array, t: Array) -> Array:
+    """Return the matrix (..., 4, 4) of a motion; rounding of the rotation is corrected."""
     matrix = np.zeros((*R.shape[:-2], 4, 4))
     matrix[..., :3, :3] = orthogonal(R)
     matrix[..., :3, 3] = t
     matrix[..., 3, 3] = 1.0
-    return RigidTransform(matrix, normalize=False, copy=False)
+    return matrix
+
+
+def matrix_product(*matrices: Array) -> Array:
+    """Return the matrix (4, 4) of motions one after the other, the last one first."""
+    found = matrices[0]
+    for matrix in matrices[1:]:
+        found = found @ matrix
+    return matrix_of(found[..., :3, :3], found[..., :3, 3])
+
+
+def matrix_inverse(matrix: Array) -> Array:
+    """Return the matrix (4, 4) of the inverse motion."""
+    found = np.eye(4)
+    found[:3, :3] = matrix[:3, :3].T
+    found[:3, 3] = -(found[:3, :3] @ matrix[:3, 3])
+    return found
+
+
+def matrix_applied(matrix: Array, points: Array) -> Array:
+    """Return points (..., 3) moved by the motion of a matrix (4, 4) [m]."""
+    return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3])
 
 
 def pose_distance(one: RigidTransform, other: RigidTransform) -> tuple[float, float]:
@@ -57,10 +86,8 @@ def pose_distance(one: RigidTransform, other: RigidTransform) -> tuple[float, fl
 
 def product(*motions: RigidTransform) -> RigidTransform:
     """Return the product of motions, as ``*`` does, quickly; see :func:`motion_of`."""
-    matrix = motions[0].as_matrix()
-    for motion in motions[1:]:
-        matrix = matrix @ motion.as_matrix()
-    return motion_of(matrix[..., :3, :3], matrix[..., :3, 3])
+    matrix = matrix_product(*[motion.as_matrix() for motion in motions])
+    return RigidTransform(matrix, normalize=False, copy=False)
 
 
 def motions_of(R: Array, t: Array) -> tuple[RigidTransform, ...]:

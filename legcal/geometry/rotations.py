@@ -7,16 +7,6 @@ from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 
 
-def cross(a: Array, b: Array) -> Array:
-    """Return vector products a x b along the last axis; numpy's own is slow on few of them."""
-    x, y, z = a[..., 0], a[..., 1], a[..., 2]
-    i, j, k = b[..., 0], b[..., 1], b[..., 2]
-    first = y * k - z * j
-    product = np.empty((*first.shape, 3))
-    product[..., 0], product[..., 1], product[..., 2] = first, z * i - x * k, x * j - y * i
-    return product
-
-
 def cross_matrices(v: Array) -> Array:
     """Return the matrices (..., 3, 3) of w -> v x w."""
     matrix = np.zeros((*v.shape[:-1], 3, 3))

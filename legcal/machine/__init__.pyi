@@ -94,5 +94,5 @@ from .solver import solve as solve
 from .urdf import Urdf as Urdf
 from .urdf import UrdfPatch as UrdfPatch
 from .urdf import number_list as number_list
-from .urdf import origin_of as origin_of
+from .urdf import origins_of as origins_of
 from .urdf import parse_robot as parse_robot

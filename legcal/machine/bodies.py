@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from scipy.spatial.transform import RigidTransform
+import numpy as np
 
 from legcal.errors import ModelError
-from legcal.geometry import product
+from legcal.geometry import Array, matrix_inverse, matrix_product
 from legcal.machine.chain import Closure
 from legcal.machine.urdf import Urdf
 
@@ -25,9 +25,7 @@ class Connection:
 
     type: ConnectionType
     bodies: tuple[str, str]  # each named by one of its links; of the tree's joints parent, child
-    T_body_joint: tuple[
-        RigidTransform, RigidTransform
-    ]  # the second is the first moved by the joint
+    T_body_joint: tuple[Array, Array]  # (4, 4) each; the second is the first moved by the joint
     joint: str | None  # the URDF joint; None for a closure
     closure: int | None  # the index of the closure; None for a joint of the tree
 
@@ -37,7 +35,7 @@ class Bodies:
     """The bodies and connections of a mechanism."""
 
     body_of: dict[str, str]  # of every link
-    T_body_link: dict[str, RigidTransform]
+    T_body_link: dict[str, Array]  # (4, 4)
     connections: tuple[Connection, ...]  # without the virtual platform joint
 
 
@@ -50,10 +48,11 @@ def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | 
         If a weld closes a loop of bodies that are rigid already.
     """
     body_of = {link: link for link in urdf.links}
-    T_body_link = {link: RigidTransform.identity() for link in urdf.links}
+    T_body_link = {link: np.eye(4) for link in urdf.links}
     for joint in urdf.joints.values():
         if not joint.moves:
-            _merge(body_of, T_body_link, joint.parent, joint.child, joint.T_parent_origin)
+            T = joint.T_parent_origin.as_matrix()
+            _merge(body_of, T_body_link, joint.parent, joint.child, T)
     for closure in closures:
         if closure.kind == "6d":
             one, two = (frame_link(urdf, name) for name in (closure.frame_1, closure.frame_2))
@@ -62,12 +61,15 @@ def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | 
                     f"{urdf.path}: the 6d closure of '{closure.frame_1}' and '{closure.frame_2}' "
                     "could not be used: found both on one rigid body, needed two; remove it."
                 )
-            _merge(body_of, T_body_link, one, two, RigidTransform.identity())
+            _merge(body_of, T_body_link, one, two, np.eye(4))
     tree = [
         Connection(
             "prismatic" if joint.type == "prismatic" else "revolute",
             (body_of[joint.parent], body_of[joint.child]),
-            (product(T_body_link[joint.parent], joint.T_parent_origin), T_body_link[joint.child]),
+            (
+                matrix_product(T_body_link[joint.parent], joint.T_parent_origin.as_matrix()),
+                T_body_link[joint.child],
+            ),
             joint.name,
             None,
         )
@@ -90,15 +92,15 @@ def frame_link(urdf: Urdf, frame: str) -> str:
 
 def _merge(
     body_of: dict[str, str],
-    T_body_link: dict[str, RigidTransform],
+    T_body_link: dict[str, Array],
     keep: str,
     join: str,
-    T_keep_join: RigidTransform,
+    T_keep_join: Array,
 ) -> None:
     """Make the body of one link part of the body of another."""
     into, gone = body_of[keep], body_of[join]
-    T_into_gone = product(T_body_link[keep], T_keep_join, T_body_link[join].inv())
+    T_into_gone = matrix_product(T_body_link[keep], T_keep_join, matrix_inverse(T_body_link[join]))
     for link, body in body_of.items():
         if body == gone:
             body_of[link] = into
-            T_body_link[link] = product(T_into_gone, T_body_link[link])
+            T_body_link[link] = matrix_product(T_into_gone, T_body_link[link])

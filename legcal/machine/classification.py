@@ -15,7 +15,14 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import OutOfClass
-from legcal.geometry import Array, normal_basis, product
+from legcal.geometry import (
+    Array,
+    cross,
+    matrix_applied,
+    matrix_inverse,
+    matrix_product,
+    normal_basis,
+)
 from legcal.machine.leg import Axis, JointType, Leg, LegChain, LegKind, Pivot, Step
 
 CONCURRENT = 10e-6  # [m]
@@ -30,14 +37,14 @@ def classify_leg(steps: Sequence[Step], platform_origin: Array, path: Path) -> L
     OutOfClass
         If it is not a joint, at most one slider, and a joint, with axes as the method needs them.
     """
-    poses, axes = [RigidTransform.identity()], list[Axis]()
+    poses, axes = [np.eye(4)], list[Axis]()
     for step in steps:
         T_near, T_far = (step.connection.T_body_joint[side] for side in (step.near, step.far))
-        T = product(poses[-1], T_near)
+        T = matrix_product(poses[-1], T_near)
         turns = step.connection.type != "sphere"
-        direction = T.as_matrix()[:3, :3] @ step.axis if turns else None
-        axes.append(Axis(step.name, T.as_matrix()[:3, 3], direction))
-        poses.append(product(T, T_far.inv()))
+        direction = T[:3, :3] @ step.axis if turns else None
+        axes.append(Axis(step.name, T[:3, 3], direction))
+        poses.append(matrix_product(T, matrix_inverse(T_far)))
     sliders = [i for i, s in enumerate(steps) if s.connection.type == "prismatic"]
     leg = next((s.connection.joint for s in steps if s.connection.joint), "") or ""
     try:
@@ -53,7 +60,7 @@ def classify_leg(steps: Sequence[Step], platform_origin: Array, path: Path) -> L
                 "is fixed in the platform; this machine cannot be calibrated this way."
             )
         if sliders:
-            origin = np.asarray(poses[-1].apply(platform_origin))
+            origin = matrix_applied(poses[-1], platform_origin)
             n_lower, slider = sliders[0], steps[sliders[0]]
             ends = _telescope(axes, n_lower, -1.0 if slider.near else 1.0, origin, leg)
         else:
@@ -66,7 +73,7 @@ def classify_leg(steps: Sequence[Step], platform_origin: Array, path: Path) -> L
 def leg_of(
     name: str,
     chain: LegChain,
-    T_body_link: tuple[RigidTransform, RigidTransform],
+    T_body_link: tuple[Array, Array],
     *,
     travel: tuple[float, float],
     actuated: bool,
@@ -79,19 +86,19 @@ def leg_of(
     of the length law.
     """
     T_base, T_platform = T_body_link
-    A = np.asarray(T_base.inv().apply(chain.A))
+    A = matrix_applied(matrix_inverse(T_base), chain.A)
     B_last, u_last = chain.line_in(-1, chain.B)
-    B = np.asarray(T_platform.inv().apply(B_last))
+    B = matrix_applied(matrix_inverse(T_platform), B_last)
     sign, kind = 1, LegKind.CONSTANT
     if chain.slider is not None:
         length = None if home is None else float(np.linalg.norm(home.apply(B) - A))
         sign = _sign(chain.reach, travel, length)
         kind = LegKind.ACTUATED if actuated else LegKind.PASSIVE
-    T_zero_platform = product(chain.poses[-1], T_platform)
+    T_zero_platform = matrix_product(chain.poses[-1], T_platform)
     base_axis = _axis(chain, chain.base, T_base)
     platform_axis = _axis(chain, chain.platform, T_zero_platform)
     if chain.platform.type is JointType.FIXED:
-        platform_axis = sign * np.asarray(T_platform.rotation.inv().apply(u_last))
+        platform_axis = sign * (T_platform[:3, :3].T @ u_last)
     return Leg(
         base_joint=chain.base.type,
         platform_joint=chain.platform.type,
@@ -123,25 +130,25 @@ def _sign(reach: float, travel: tuple[float, float], length: float | None) -> in
     return 1 if reach + 0.5 * (travel[0] + travel[1]) > 0.0 else -1
 
 
-def _axis(chain: LegChain, pivot: Pivot, T_zero_link: RigidTransform) -> Array | None:
+def _axis(chain: LegChain, pivot: Pivot, T_zero_link: Array) -> Array | None:
     """Return the axis of a joint in its link, where it is a parameter."""
     if pivot.outer is None or (pivot.type is JointType.UNIVERSAL and chain.twists):
         return None
-    return undirected(np.asarray(T_zero_link.rotation.inv().apply(pivot.outer)))
+    return undirected(T_zero_link[:3, :3].T @ pivot.outer)
 
 
 def _twist(
-    chain: LegChain, sign: int, platform_axis: Array | None, T_zero_platform: RigidTransform
+    chain: LegChain, sign: int, platform_axis: Array | None, T_zero_platform: Array
 ) -> float | None:
     """Return the angle about u between the inner axes of a leg without an S joint [rad]."""
     if chain.twists:
         return None
     p, w = chain.base.inner, chain.platform.inner
     if w is None and platform_axis is not None:
-        w = np.asarray(T_zero_platform.rotation.apply(normal_basis(platform_axis)[0]))
+        w = T_zero_platform[:3, :3] @ normal_basis(platform_axis)[0]
     if p is None or w is None:
         raise ValueError("a leg without an S joint has an axis at both ends")
-    angle = math.atan2(float(sign * chain.u @ np.cross(p, w)), float(p @ w))
+    angle = math.atan2(float(sign * chain.u @ cross(p, w)), float(p @ w))
     # modulo pi; just above -pi/2 is rounding, and means pi/2
     return angle - math.pi * math.ceil(angle / math.pi - 0.5 - 1e-10)
 
@@ -237,19 +244,19 @@ def _meeting(lines: Sequence[Axis], leg: str) -> Array:
 
 def nearest(one: Axis, two: Axis) -> tuple[Array, Array] | tuple[None, None]:
     """Return the points of two axes that are nearest to each other [m], None if parallel."""
-    normal = np.cross(one.along, two.along)
+    normal = cross(one.along, two.along)
     square = float(normal @ normal)
     if square < PERPENDICULAR**2:
         return None, None
     between = two.point - one.point
-    on_one = float(np.cross(between, two.along) @ normal) / square
-    on_two = float(np.cross(between, one.along) @ normal) / square
+    on_one = float(cross(between, two.along) @ normal) / square
+    on_two = float(cross(between, one.along) @ normal) / square
     return one.point + on_one * one.along, two.point + on_two * two.along
 
 
 def parallel(one: Array, two: Array) -> bool:
     """Say whether two unit directions are parallel, or opposite, within 1 mrad."""
-    return bool(np.linalg.norm(np.cross(one, two)) < PERPENDICULAR)
+    return bool(np.linalg.norm(cross(one, two)) < PERPENDICULAR)
 
 
 def off_square(one: Array, two: Array) -> float:
@@ -477,7 +484,7 @@ def _on_slider(base: Pivot, platform: Pivot, u: Array, origin: Array) -> tuple[A
     w = platform.axes[0] if platform.type is JointType.REVOLUTE else None
     if v is not None and w is not None:
         if parallel(v.along, w.along):
-            across = np.cross(v.along, u)
+            across = cross(v.along, u)
             return v.foot(origin), w.foot(origin), abs(float((w.point - v.point) @ across))
         directions = np.stack([v.along, u, -w.along], axis=1)
         if abs(np.linalg.det(directions)) < _COPLANAR:  # one axis is not square to the slider

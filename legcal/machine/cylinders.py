@@ -9,12 +9,11 @@ from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, product
+from legcal.geometry import Array, cross, matrix_applied, matrix_product
 from legcal.machine.bodies import Bodies
 from legcal.machine.leg import Cylinder, JointType, Leg, LegChain, Step
-from legcal.machine.urdf import Urdf, origin_of, parse_robot
+from legcal.machine.urdf import Urdf, origins_of, parse_robot
 
 PARALLEL = 1e-6
 COAXIAL = 1e-4  # [m], at both ends of a cylinder
@@ -26,7 +25,7 @@ class VisualCylinder(NamedTuple):
     """A visual cylinder of the file: its link, its pose there, radius and length [m]."""
 
     link: str
-    T_link_cylinder: RigidTransform
+    T_link_cylinder: Array  # (4, 4)
     radius: float
     length: float
 
@@ -62,15 +61,16 @@ def visual_cylinders(urdf: Urdf) -> list[VisualCylinder]:
     """Return the visual cylinders of a tree."""
     if not urdf.has_cylinders:
         return []
-    found = []
-    for link in parse_robot(urdf.path, urdf.content).findall("link"):
-        for visual in link.findall("visual"):
-            cylinder = visual.find("geometry/cylinder")
-            if cylinder is not None:
-                radius, length = (float(cylinder.get(name, "")) for name in ("radius", "length"))
-                name = link.get("name", "")
-                found.append(VisualCylinder(name, origin_of(visual), radius, length))
-    return found
+    shown = [
+        (link.get("name", ""), visual, cylinder)
+        for link in parse_robot(urdf.path, urdf.content).findall("link")
+        for visual in link.findall("visual")
+        if (cylinder := visual.find("geometry/cylinder")) is not None
+    ]
+    return [
+        VisualCylinder(name, T, float(shape.get("radius", "")), float(shape.get("length", "")))
+        for (name, _, shape), T in zip(shown, origins_of([v for _, v, _ in shown]), strict=True)
+    ]
 
 
 def _along(
@@ -101,7 +101,7 @@ def _halves(leg: Leg, chain: LegChain) -> dict[str, Half]:
         halves[chain.bodies[body - 1]] = side, at, leg.sign * u
         axis = step.line(step.far if side == "base" else step.near)[1]
         return step.connection.type == "revolute" and bool(
-            np.linalg.norm(np.cross(axis, u)) < PARALLEL
+            np.linalg.norm(cross(axis, u)) < PARALLEL
         )
 
     for k in reversed(range(chain.n_lower)):
@@ -129,7 +129,7 @@ def _raised(chain: LegChain, shown: Sequence[VisualCylinder], bodies: Bodies) ->
     for k, centre in ((len(chain.bodies), chain.B), (1, chain.A)):
         for cylinder in shown:
             if bodies.body_of[cylinder.link] == chain.bodies[k - 1]:
-                offset = chain.poses[k].apply(_ends(cylinder, bodies)) - centre
+                offset = matrix_applied(chain.poses[k], _ends(cylinder, bodies)) - centre
                 height = float((offset @ normal).mean())
                 beside = offset - (offset @ chain.u)[:, None] * chain.u - height * normal
                 if np.linalg.norm(beside, axis=1).max() < COAXIAL:
@@ -142,6 +142,6 @@ def _raised(chain: LegChain, shown: Sequence[VisualCylinder], bodies: Bodies) ->
 
 def _ends(cylinder: VisualCylinder, bodies: Bodies) -> Array:
     """Return both ends of a cylinder's axis in the body that it is on, (2, 3) [m]."""
-    T = product(bodies.T_body_link[cylinder.link], cylinder.T_link_cylinder)
+    T = matrix_product(bodies.T_body_link[cylinder.link], cylinder.T_link_cylinder)
     half = np.array([0.0, 0.0, 0.5 * cylinder.length])
-    return np.asarray(T.apply(np.stack([-half, half])))
+    return matrix_applied(T, np.stack([-half, half]))

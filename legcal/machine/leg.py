@@ -15,9 +15,8 @@ from enum import StrEnum
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, distance_to_line
+from legcal.geometry import Array, distance_to_line, matrix_inverse
 from legcal.machine.bodies import Connection
 
 MIN_LENGTH, MAX_LENGTH = 1e-3, 20.0  # [m]; legs beyond are most likely written in another unit
@@ -144,7 +143,7 @@ class Step:
 
     def line(self, side: int) -> tuple[Array, Array]:
         """Return a point [m] and the direction of the axis in the body of one side."""
-        matrix = self.connection.T_body_joint[side].as_matrix()
+        matrix = self.connection.T_body_joint[side]
         return matrix[:3, 3], matrix[:3, :3] @ self.axis
 
 
@@ -200,7 +199,7 @@ class LegChain:
     """The joints of one leg, and its geometry with all of them at zero in the base body's frame."""
 
     steps: tuple[Step, ...]  # from base to platform
-    poses: tuple[RigidTransform, ...]  # of the base body, the bodies of the leg, the platform's
+    poses: tuple[Array, ...]  # (4, 4) of the base body, the bodies of the leg, the platform's
     n_lower: int  # joints on the base side of the slider, or of the rod
     slider: Step | None  # None for a leg of constant length
     base: Pivot
@@ -237,7 +236,7 @@ class LegChain:
 
     def line_in(self, body: int, point: Array) -> tuple[Array, Array]:
         """Return a point and the direction u in one of the bodies, 0 the base's, -1 the last."""
-        matrix = self.poses[body].inv().as_matrix()
+        matrix = matrix_inverse(self.poses[body])
         return matrix[:3, :3] @ point + matrix[:3, 3], matrix[:3, :3] @ self.u
 
 

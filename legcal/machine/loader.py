@@ -15,6 +15,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import LegcalError, ModelError, OutOfClass
 from legcal.files import MotionEntry, closest, motion_to_xyz_quat
+from legcal.geometry import Array
 from legcal.machine.bodies import Bodies, rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.classification import CONCURRENT, PERPENDICULAR, leg_of
@@ -35,7 +36,7 @@ from legcal.machine.leg import (
     LegKind,
 )
 from legcal.machine.mobility import CONFIGURATIONS, generic_configurations, mobility
-from legcal.machine.model import Machine, platform_pose, slider_columns, vectors_A_to_B
+from legcal.machine.model import Machine, joint_values, vectors_A_to_B
 from legcal.machine.parameters import n_frame_legs
 from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.spanning_tree import Source
@@ -115,8 +116,9 @@ def _load(source: Source) -> Machine:
     _check_unit(machine)
     # What the geometry says must be what Pinocchio finds.
     _check_across(machine)
-    machine = replace(machine, mobility=mobility(machine))
-    _check_equations(machine)
+    configurations = generic_configurations(machine, CONFIGURATIONS)
+    machine = replace(machine, mobility=mobility(machine, configurations))
+    _check_equations(machine, configurations)
     proposed = proposal_notes(file.legcal, machine)
     found = map(
         source.in_format_terms, mechanism_notes(machine, home_is_given=block.home is not None)
@@ -139,8 +141,8 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     _check_count(chains, spatial=normals is None, path=yaml_path)
     if block.platform_joint is not None:
         virtual = urdf.joints[block.platform_joint]
-        turn = bodies.T_body_link[virtual.parent].rotation.inv()
-        normal = None if normals is None else np.asarray(turn.apply(normals[0]))
+        turn = bodies.T_body_link[virtual.parent][:3, :3].T
+        normal = None if normals is None else turn @ normals[0]
         check_plane(virtual, normal, yaml_path)
     in_plane = None if normals is None else normals_in_links(normals, ends)
     shown = visual_cylinders(urdf)
@@ -480,8 +482,8 @@ def _check_across(machine: Machine) -> None:
         raise OutOfClass(problems)
 
 
-def _check_equations(machine: Machine) -> None:
-    """Check the equations of all legs against Pinocchio at home and at poses near it.
+def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
+    """Check the equations of all legs against Pinocchio at closed configurations.
 
     The closed configurations come from the URDF alone, the equations from the geometry that was
     found: both must describe one machine. Origins and axes of a file are rounded, so the same
@@ -492,21 +494,24 @@ def _check_equations(machine: Machine) -> None:
     OutOfClass
         If a length is more than 10 um off, or an axis, a direction or a twist more than 1 mrad.
     """
+    poses = [machine.chain.placement(c, machine.base, machine.platform) for c in configurations]
+    R, t = np.array([R for R, _ in poses]), np.array([t for _, t in poses])
+    q = np.array([joint_values(machine, c) for c in configurations])
+    of_legs = []
+    for j, leg in enumerate(machine.legs):
+        equations = leg_equations(leg, R, t, by_local=False)
+        values = equations.values.copy()
+        values[:, 0] -= leg.sign * q[:, j]
+        of_legs.append((leg.name, equations.kinds, np.abs(values)))
     problems: dict[str, str] = {}
-    for configuration in generic_configurations(machine, CONFIGURATIONS):
-        T = platform_pose(machine, configuration)
-        R, t = T.rotation.as_matrix()[None], np.asarray(T.translation)[None]
-        for j, leg in enumerate(machine.legs):
-            equations = leg_equations(leg, R, t, by_local=False)
-            values = equations.values[0].copy()
-            if leg.kind is not LegKind.CONSTANT:
-                values[0] -= leg.sign * configuration[slider_columns(machine, (j,))[0][0]]
-            for kind, value in zip(equations.kinds, np.abs(values), strict=True):
-                problem = _broken_equation(kind, float(value))
+    for k in range(len(configurations)):
+        for name, kinds, values in of_legs:
+            for kind, value in zip(kinds, values[k].tolist(), strict=True):
+                problem = _broken_equation(kind, value)
                 if problem is not None:
                     problems.setdefault(
-                        leg.name,
-                        f"{machine.yaml_path}: leg '{leg.name}' is outside the method: found "
+                        name,
+                        f"{machine.yaml_path}: leg '{name}' is outside the method: found "
                         f"{problem} at a closed pose; check the origins and axes along the leg.",
                     )
     if problems:

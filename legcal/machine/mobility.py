@@ -5,7 +5,7 @@ the platform. What is left of the null space moves no platform: legs with an S j
 spin about themselves. Dependent closures (a planar machine welded in space) do not change it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -27,14 +27,13 @@ def leg_scale(machine: Machine, T_base_platform: RigidTransform) -> float:
     return float(np.linalg.norm(vectors_A_to_B(machine, T_base_platform), axis=1).mean())
 
 
-def mobility(machine: Machine) -> int:
+def mobility(machine: Machine, configurations: Sequence[Array]) -> int:
     """Return the freedoms of the platform; the motors determine it where they are as many.
 
-    The rank is taken where the closures have their largest, at closed configurations near home too,
-    because a symmetric pose may be singular.
+    The rank is taken where the closures have their largest among closed configurations, of which
+    some should be near home only, because a symmetric pose may be singular.
     """
-    found = [freedoms_at(machine, c) for c in generic_configurations(machine, CONFIGURATIONS)]
-    return min(found)[1]
+    return min(freedoms_at(machine, c) for c in configurations)[1]
 
 
 def freedoms_at(machine: Machine, configuration: Array) -> tuple[int, int]:
@@ -46,10 +45,9 @@ def freedoms_at(machine: Machine, configuration: Array) -> tuple[int, int]:
     return null_space.shape[1], int(np.sum(values > RANK_TOLERANCE))
 
 
-def generic_configurations(machine: Machine, count: int) -> Iterator[Array]:
-    """Yield home, then up to ``count - 1`` closed ones a little way off in seeded directions."""
-    chain = machine.chain
-    yield machine.home_configuration
+def generic_configurations(machine: Machine, count: int) -> list[Array]:
+    """Return home, then up to ``count - 1`` closed ones a little way off in seeded directions."""
+    chain, found = machine.chain, [machine.home_configuration]
     rng = np.random.default_rng(1965)
     unit = _column_units(machine)
     jacobian = chain.linearize(machine.home_configuration)[1] * unit
@@ -59,11 +57,12 @@ def generic_configurations(machine: Machine, count: int) -> Iterator[Array]:
         direction -= inverse @ (jacobian @ direction)
         size = float(np.abs(direction).max())
         if size < RANK_TOLERANCE:
-            return  # nothing moves
+            break  # nothing moves
         step = STEP * unit * direction / size
         configuration = project(machine, chain.integrate(machine.home_configuration, step))
         if configuration is not None:
-            yield configuration
+            found.append(configuration)
+    return found
 
 
 def project(machine: Machine, configuration: Array) -> Array | None:

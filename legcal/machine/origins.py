@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import OutOfClass
-from legcal.geometry import Array, rotation_between
+from legcal.geometry import Array, matrix_inverse, matrix_product, rotation_between
 from legcal.machine.bodies import Bodies, frame_link, rigid_bodies
 from legcal.machine.leg import Leg, LegChain, Step
 from legcal.machine.model import Machine
@@ -34,7 +34,9 @@ def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[Rigi
         """Move a joint by a motion that is given in a link of its body."""
         joint, T_body_link = handle.joint, handles.bodies.T_body_link
         T_parent_origin, is_turned = found.get(joint.name, (joint.T_parent_origin, False))
-        there = T_body_link[joint.parent].inv() * T_body_link[body]
+        there = RigidTransform.from_matrix(
+            matrix_product(matrix_inverse(T_body_link[joint.parent]), T_body_link[body])
+        )
         seen = motion.seen_from(there) if body != joint.parent else motion
         seen = seen.inv() if handle.is_inverse else seen
         found[joint.name] = seen.of(T_parent_origin), is_turned or seen.turn is not None

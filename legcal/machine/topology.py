@@ -13,11 +13,10 @@ from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import OutOfClass
 from legcal.files import is_plain_name
-from legcal.geometry import Array
+from legcal.geometry import Array, cross
 from legcal.machine.bodies import Bodies, Connection, frame_link, rigid_bodies
 from legcal.machine.chain import Closure
 from legcal.machine.classification import (
@@ -57,7 +56,7 @@ def find_chains(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[Le
             f"to the base '{base}', needed legs between them; correct legcal.base or "
             "legcal.platform."
         )
-    origin = np.asarray(bodies.T_body_link[platform].translation)
+    origin = bodies.T_body_link[platform][:3, 3]
     return [classify_leg(steps, origin, urdf.path) for steps in _paths(bodies, urdf, *ends)]
 
 
@@ -180,17 +179,12 @@ def plane_of_motion(chains: Sequence[LegChain]) -> Normals | None:
     return first
 
 
-def normals_in_links(
-    normals: Normals, T_body_link: tuple[RigidTransform, RigidTransform]
-) -> Normals:
+def normals_in_links(normals: Normals, T_body_link: tuple[Array, Array]) -> Normals:
     """Return the normals in the links of base and platform.
 
     The last component that is not zero is positive in the base.
     """
-    base, platform = (
-        np.asarray(T.rotation.inv().apply(normal))
-        for normal, T in zip(normals, T_body_link, strict=True)
-    )
+    base, platform = (T[:3, :3].T @ normal for normal, T in zip(normals, T_body_link, strict=True))
     return (base, platform) if np.all(undirected(base) == base) else (-base, -platform)
 
 
@@ -404,7 +398,7 @@ def _normals(chain: LegChain) -> Normals | None:
     v, w = chain.base.inner, chain.platform.inner
     if v is None or (w is not None and not parallel(v, w)):
         return None
-    return v, np.asarray(chain.poses[-1].rotation.inv().apply(v))
+    return v, chain.poses[-1][:3, :3].T @ v
 
 
 def _without_virtual(bodies: Bodies, urdf: Urdf) -> tuple[Connection, ...]:
@@ -490,4 +484,4 @@ def _span(points: Array) -> float:
     """Return the distance of two points [m], or twice the area of a triangle [m^2]."""
     if len(points) == 2:
         return float(np.linalg.norm(points[1] - points[0]))
-    return float(np.linalg.norm(np.cross(points[1] - points[0], points[2] - points[0])))
+    return float(np.linalg.norm(cross(points[1] - points[0], points[2] - points[0])))

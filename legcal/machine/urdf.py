@@ -3,6 +3,7 @@
 import math
 import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -13,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError
 from legcal.files import NAME_NEEDED, describe, is_name
-from legcal.geometry import Array, motion_of, roll_pitch_yaw
+from legcal.geometry import Array, matrix_of, roll_pitch_yaw
 from legcal.machine.files import read_file
 
 MAX_ELEMENTS = 50_000
@@ -344,7 +345,12 @@ def checked_tree(
     for element in (*links, *joints):
         check_numbers(element, problems)
     root = check_tree(links, joints, problems)
-    tree = {j.name: j for e in joints if (j := _joint(e, problems, travel_needed)) is not None}
+    origins = RigidTransform(origins_of(joints), normalize=False, copy=False) if joints else ()
+    tree = {
+        joint.name: joint
+        for element, T in zip(joints, origins, strict=True)
+        if (joint := _joint(element, T, problems, travel_needed)) is not None
+    }
     problems.raise_if_any()
     return Urdf(
         path=path,
@@ -357,7 +363,9 @@ def checked_tree(
     )
 
 
-def _joint(element: etree._Element, problems: Problems, travel_needed: bool) -> UrdfJoint | None:
+def _joint(
+    element: etree._Element, origin: RigidTransform, problems: Problems, travel_needed: bool
+) -> UrdfJoint | None:
     """Return a joint, or None with its problems noted."""
     n_before = len(problems)
     for tag in ("parent", "child", "origin", "axis", "limit"):
@@ -385,20 +393,21 @@ def _joint(element: etree._Element, problems: Problems, travel_needed: bool) -> 
         type=cast("UrdfJointType", kind),
         parent=parent,
         child=child,
-        T_parent_origin=origin_of(element),
+        T_parent_origin=origin,
         axis=axis,
         limits=limits,
         line=cast("int", element.sourceline),
     )
 
 
-def origin_of(element: etree._Element) -> RigidTransform:
-    """Return the pose that the ``<origin>`` of a joint or a visual gives."""
-    origin = element.find("origin")
-    rpy = _vector(origin, "rpy", (0.0, 0.0, 0.0))
-    return motion_of(
-        Rotation.from_euler("xyz", rpy).as_matrix(), _vector(origin, "xyz", (0.0, 0.0, 0.0))
+def origins_of(elements: Sequence[etree._Element]) -> Array:
+    """Return the poses (n, 4, 4) that the ``<origin>`` of joints or visuals give."""
+    origins = [element.find("origin") for element in elements]
+    rpy, xyz = (
+        np.array([_vector(origin, name, (0.0, 0.0, 0.0)) for origin in origins]).reshape(-1, 3)
+        for name in ("rpy", "xyz")
     )
+    return matrix_of(Rotation.from_euler("xyz", rpy).as_matrix(), xyz)
 
 
 def _vector(

@@ -22,7 +22,7 @@ from legcal.machine import (
     Leg,
     Machine,
     number_list,
-    origin_of,
+    origins_of,
     parse_robot,
 )
 
@@ -112,7 +112,7 @@ def _shown(urdf_path: Path, visual: etree._Element) -> tuple[Shape, RigidTransfo
     if shape.tag == "mesh":
         return _mesh(urdf_path, visual), RigidTransform.identity()
     numbers = [float(x) for name in _SIZES[str(shape.tag)] for x in shape.get(name, "").split()]
-    T = origin_of(visual)
+    T = RigidTransform(origins_of([visual])[0], normalize=False, copy=False)
     if shape.tag == "cylinder":
         return SolidCylinder(*numbers), T
     if shape.tag == "sphere":
