@@ -27,7 +27,7 @@ from legcal.estimation import (
     minimise,
     normal_equations,
 )
-from legcal.geometry import Array, IntArray
+from legcal.geometry import Array, IntArray, cross
 from legcal.machine import Machine
 
 MIN_REJECTED = 0.34  # share of an image's outlines that the fit rejected
@@ -121,7 +121,7 @@ def _shown(
     def distances(state: _State) -> Residuals:
         arm = B @ state.pose.R[0].T
         ends = T_camera_Rb.apply(arm + state.pose.t)[legs]
-        J = np.concatenate([np.cross(arm[legs], normal_Rb), normal_Rb], axis=1)
+        J = np.concatenate([cross(arm[legs], normal_Rb), normal_Rb], axis=1)
         return Residuals.of((np.sum(o.h[chosen] * ends, axis=1) - signed)[:, None], J[:, None])
 
     def readings(state: _State) -> tuple[Array, Array]:
@@ -129,7 +129,7 @@ def _shown(
         AB = arm + state.pose.t - A
         length = np.linalg.norm(AB, axis=1)
         u = sign[:, None] * AB / length[:, None]
-        return sign * (length - q0), np.concatenate([np.cross(arm, u), u], axis=1)
+        return sign * (length - q0), np.concatenate([cross(arm, u), u], axis=1)
 
     def differences(state: _State) -> Residuals:
         q, J = readings(state)

@@ -26,7 +26,7 @@ from legcal.data.measurements import (
 from legcal.data.outlines import Outlines
 from legcal.errors import NotVisible
 from legcal.files import Column, format_table, read_table, write_atomically
-from legcal.geometry import Array, IntArray, nearest_point_to_line, normal_basis
+from legcal.geometry import Array, IntArray, cross, nearest_point_to_line, normal_basis
 from legcal.vision import (
     Camera,
     axis_of_outlines,
@@ -208,7 +208,7 @@ def _joined(
     # Carry e1 along so that the covariance keeps its meaning.
     e1 = basis[:, 0] - u * np.sum(u * basis[:, 0], axis=-1, keepdims=True)
     e1 /= np.linalg.norm(e1, axis=-1, keepdims=True)
-    return u, M, np.stack([e1, np.cross(u, e1)], axis=1), covariance
+    return u, M, np.stack([e1, cross(u, e1)], axis=1), covariance
 
 
 def _pairs(outlines: Outlines) -> IntArray:
@@ -255,7 +255,7 @@ def outline_derivative(
     moved = np.linalg.norm(normal, axis=-1)  # d (h . ray) / d offset
     # dh is normal to h, zero on the ray of the other end, and -moved on its own ray.
     other = rays[..., ::-1, :]
-    direction = np.cross(np.broadcast_to(h[..., None, :], rays.shape), other)
+    direction = cross(np.broadcast_to(h[..., None, :], rays.shape), other)
     scale = -moved / np.sum(direction * rays, axis=-1)
     return rays, direction * scale[..., None]
 

@@ -32,7 +32,7 @@ from legcal.files import (
     read_table,
     write_atomically,
 )
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray, cross
 from legcal.machine import Leg
 
 QUALITY = ("contrast", "length", "residual")  # how well an outline was seen
@@ -308,7 +308,7 @@ def _order_ends(outlines: Outlines, measurements: Measurements) -> Outlines:
     """
     xy = _rays(outlines, measurements)
     rays = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1)
-    swap = np.sum(np.cross(rays[:, 1], rays[:, 0]) * outlines.h, axis=-1) < 0.0
+    swap = np.sum(cross(rays[:, 1], rays[:, 0]) * outlines.h, axis=-1) < 0.0
     ends = np.where(swap[:, None, None], outlines.ends[:, ::-1], outlines.ends)
     turned = outlines.covariance[:, ::-1, ::-1]
     covariance = np.where(swap[:, None, None], turned, outlines.covariance)

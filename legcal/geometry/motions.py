@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.geometry.lines import cross
 from legcal.geometry.rotations import nearest_rotation, orthogonal, rotation_matrices
 from legcal.geometry.types import Array, IntArray
 
@@ -24,7 +25,7 @@ def frame_on_points(
     x = points[1] - points[0]
     spread = float(np.linalg.norm(points - points[0], axis=1).max())
     if len(points) == 3:
-        z = np.cross(x, points[2] - points[0])
+        z = cross(x, points[2] - points[0])
     else:
         z = np.array([0.0, 0.0, 1.0]) if normal is None else normal
         x = x - (x @ z) * z
@@ -33,7 +34,7 @@ def frame_on_points(
         raise ValueError("the points that should define a frame coincide or are collinear")
     x = x / np.linalg.norm(x)
     z = z / np.linalg.norm(z)
-    return motion_of(np.column_stack([x, np.cross(z, x), z]), points[0])
+    return motion_of(np.column_stack([x, cross(z, x), z]), points[0])
 
 
 def motion_of(
@@ -58,7 +59,7 @@ def matrix_of(R: Array, t: Array) -> Array:
 
 
 def matrix_product(*matrices: Array) -> Array:
-    """Return the matrix (4, 4) of motions one after the other, the last one first."""
+    """Return the matrix (..., 4, 4) of motions one after the other, the last one first."""
     found = matrices[0]
     for matrix in matrices[1:]:
         found = found @ matrix

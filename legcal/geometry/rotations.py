@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from legcal.geometry.lines import normal_basis
+from legcal.geometry.lines import cross, normal_basis
 from legcal.geometry.types import Array
 
 
@@ -52,7 +52,7 @@ def nearest_rotation(matrix: Array) -> Array:
 
 def rotation_between(one: Array, other: Array) -> Rotation:
     """Return the smallest rotation that takes one unit direction (3,) onto another."""
-    normal = np.cross(one, other)
+    normal = cross(one, other)
     sine, cosine = float(np.linalg.norm(normal)), float(one @ other)
     if sine == 0.0:
         return Rotation.from_rotvec((0.0 if cosine > 0.0 else np.pi) * normal_basis(one)[0])

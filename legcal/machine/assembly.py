@@ -110,7 +110,7 @@ def _in_a_plane(legs: Sequence[AssembledLeg]) -> bool:
     n = legs[0].base_axis
     return all(
         leg.type.is_planar
-        and np.linalg.norm(np.cross(axis, n)) < PARALLEL
+        and np.linalg.norm(cross(axis, n)) < PARALLEL
         and abs(leg.u @ n) < PARALLEL
         for leg in legs
         for axis in (leg.base_axis, leg.platform_axis)
@@ -120,7 +120,7 @@ def _in_a_plane(legs: Sequence[AssembledLeg]) -> bool:
 def is_planar(legs: Sequence[AssembledLeg], T: RigidTransform) -> bool:
     """Say whether the plane of motion is the xy plane of base and platform link."""
     z = np.array([0.0, 0.0, 1.0])
-    upright = np.linalg.norm(np.cross(legs[0].base_axis, z)) < PARALLEL
+    upright = np.linalg.norm(cross(legs[0].base_axis, z)) < PARALLEL
     return _in_a_plane(legs) and bool(upright) and bool(T.rotation.apply(z)[2] > 1.0 - 1e-15)
 
 
@@ -128,7 +128,7 @@ def across_leg(u: Array, outward: Array) -> Array:
     """Return the horizontal direction across a leg; across the way outward for upright legs."""
     z = np.array([0.0, 0.0, 1.0])
     for other in (u, outward, np.array([1.0, 0.0, 0.0])):
-        across = np.cross(z, other)
+        across = cross(z, other)
         if np.linalg.norm(across) > 1e-6 * max(1.0, float(np.linalg.norm(other))):
             across = across - (across @ u) * u
             return np.asarray(across / np.linalg.norm(across))

@@ -255,11 +255,11 @@ def _plane(machine: Machine, R: Array, t: Array) -> PoseEquations:
     scale = np.linalg.norm(vectors, axis=2).mean(axis=1)
     values, by_pose = np.zeros((len(t), 3)), np.zeros((len(t), 3, 6))
     values[:, 0] = (vectors @ normal).mean(axis=1)
-    by_pose[:, 0, :3] = np.cross(arms.mean(axis=1), normal)
+    by_pose[:, 0, :3] = cross(arms.mean(axis=1), normal)
     by_pose[:, 0, 3:] = normal
     for row, e in enumerate(normal_basis(normal), start=1):
         values[:, row] = scale * (carried @ e)
-        by_pose[:, row, :3] = scale[:, None] * np.cross(carried, e)
+        by_pose[:, row, :3] = scale[:, None] * cross(carried, e)
     none = np.zeros((len(t), 3, 0))
     is_read = np.zeros(3, dtype=np.bool_)
     return PoseEquations(values, by_pose, none, np.full(3, -1), (EquationKind.PLANE,) * 3, is_read)

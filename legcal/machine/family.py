@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import UsageError
 from legcal.files import plain_name
-from legcal.geometry import Array
+from legcal.geometry import Array, cross
 from legcal.machine.assembly import across_leg
 from legcal.machine.description import NEEDED_TYPE, Description, Home, LegEntry, LegType, leg_type
 from legcal.machine.description_table import in_metres, read_description
@@ -203,7 +203,7 @@ def _tilted_axes(
     across = across_leg(u, A)
 
     def tilted(joint: JointType, angle: float) -> Array | None:
-        up = np.cross(u, across) if joint is JointType.REVOLUTE else np.array([0.0, 0.0, 1.0])
+        up = cross(u, across) if joint is JointType.REVOLUTE else np.array([0.0, 0.0, 1.0])
         axis = np.cos(angle) * across + np.sin(angle) * up
         return np.asarray(axis) if joint.has_axis else None
 

@@ -406,8 +406,8 @@ def follow(
             return False
         if not excludes_singularity(known, jacobian):
             if here is None:
-                here = determinant_sign(machine, platform_pose(machine, configuration))
-            there = determinant_sign(machine, platform_pose(machine, reached))
+                here = determinant_sign(machine, configuration)
+            there = determinant_sign(machine, reached)
             if not here == there != 0.0:  # not square: only ways on which little changes
                 return False
         configuration, known = reached, jacobian

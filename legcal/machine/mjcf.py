@@ -18,7 +18,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass
 from legcal.files import closest
-from legcal.geometry import Array, rotation_between
+from legcal.geometry import Array, cross, rotation_between
 from legcal.machine.schema import MAX_LOOPS, MechanismFile
 from legcal.machine.spanning_tree import (
     DRAWING,
@@ -564,11 +564,11 @@ class MjcfReader:
             return rotation
         if key == "xyaxes":
             x, y = numbers[:3], numbers[3:]
-            z = np.cross(x, y)
+            z = cross(x, y)
             if not np.linalg.norm(z) > 1e-9 * np.linalg.norm(x) * np.linalg.norm(y):
                 return None
             x, z = x / np.linalg.norm(x), z / np.linalg.norm(z)
-            return Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z]))
+            return Rotation.from_matrix(np.column_stack([x, cross(z, x), z]))
         if not numbers[: 3 if key == "axisangle" else None].any():
             return None
         if key == "axisangle":

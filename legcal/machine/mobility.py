@@ -139,12 +139,13 @@ def singularities(machine: Machine, poses: Array) -> Array:
     return np.asarray(np.linalg.svd(jacobian, compute_uv=False)[:, 5])
 
 
-def determinant_sign(machine: Machine, T_base_platform: RigidTransform) -> float:
+def determinant_sign(machine: Machine, configuration: Array) -> float:
     """Return the sign of the determinant of the legs' equations where they are square, else 0.
 
-    Between two poses of different sign lies a singularity.
+    Between two configurations of different sign lies a singularity.
     """
-    (rows,) = dimensionless(machine, T_base_platform.as_matrix()[None])
+    R, t = machine.chain.placement(configuration, machine.base, machine.platform)
+    (rows,) = dimensionless(machine, np.column_stack([R, t])[None])
     return float(np.sign(np.linalg.det(rows))) if len(rows) == 6 else 0.0
 
 
@@ -162,7 +163,7 @@ def dimensionless(machine: Machine, poses: Array) -> Array:
     if is_constrained(machine):
         jacobian = machine_equations(machine, R, t).by_pose
         gradient, moment = jacobian[:, :, 3:], jacobian[:, :, :3]
-        return np.concatenate([(moment - np.cross(centre, gradient)) / scale, gradient], axis=2)
+        return np.concatenate([(moment - cross(centre, gradient)) / scale, gradient], axis=2)
     motors = list(machine.motors)  # lines alone
     u = (vectors / lengths[..., None])[:, motors]
     return np.concatenate([cross((turned - centre)[:, motors] / scale, u), u], axis=2)

@@ -8,7 +8,7 @@ import numpy as np
 
 from legcal.errors import LegcalError, OutOfResources, UsageError
 from legcal.files import temporary_folder
-from legcal.geometry import Array
+from legcal.geometry import Array, cross
 from legcal.machine.assembly import Assembled, AssembledLeg, assemble
 from legcal.machine.description import Description
 from legcal.machine.leg import JointType, LegKind
@@ -119,9 +119,9 @@ class _Branch:
 
     def _near(self, side: str, joint: JointType, u: Array, axis: Array, at: Array) -> Array:
         """Add the joint that a leg hangs from, and return the frame of the leg there."""
-        y = _unit(np.cross(u, axis))
-        along = np.column_stack([np.cross(y, u), y, u])
-        first = np.column_stack([axis, y, np.cross(axis, y)]) if joint.inner_is_across else along
+        y = _unit(cross(u, axis))
+        along = np.column_stack([cross(y, u), y, u])
+        first = np.column_stack([axis, y, cross(axis, y)]) if joint.inner_is_across else along
         for number, name in enumerate("xyz"[: joint.n_freedoms], start=1):
             place, frame = (at, first) if number == 1 else (None, None)
             if number == 2 and joint.inner_is_across:
@@ -134,12 +134,12 @@ class _Branch:
         leg = self._leg
         if leg.type.platform is JointType.FIXED:
             return R
-        y = _unit(np.cross(leg.u, leg.platform_axis))
-        along = np.column_stack([np.cross(y, leg.u), y, leg.u])
+        y = _unit(cross(leg.u, leg.platform_axis))
+        along = np.column_stack([cross(y, leg.u), y, leg.u])
         if leg.type.platform is JointType.REVOLUTE:
             self._turn("b1", self._along, R.T @ along, "x")
             return along
-        last = np.column_stack([leg.platform_axis, y, np.cross(leg.platform_axis, y)])
+        last = np.column_stack([leg.platform_axis, y, cross(leg.platform_axis, y)])
         self._turn("b2", self._along, R.T @ along, "y")
         self._turn("b1", None, along.T @ last, "x")
         return last

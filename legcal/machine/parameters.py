@@ -17,6 +17,8 @@ from legcal.geometry import (
     BoolArray,
     IntArray,
     axis_angles,
+    cross,
+    matrix_applied,
     normal_basis,
     rotation_between,
     turned_axis,
@@ -123,18 +125,20 @@ def _in_frames(
     legs: Sequence[Leg], T_base: RigidTransform, T_platform: RigidTransform
 ) -> tuple[Leg, ...]:
     """Return legs in other frames of base and platform."""
+    base, platform = T_base.as_matrix(), T_platform.as_matrix()
+    turn = T_platform.rotation
 
-    def turned(T: RigidTransform, axis: Array | None) -> Array | None:
-        return None if axis is None else np.asarray(T.rotation.apply(axis))
+    def turned(matrix: Array, axis: Array | None) -> Array | None:
+        return None if axis is None else matrix[:3, :3] @ axis
 
     return tuple(
         replace(
             leg,
-            A=np.asarray(T_base.apply(leg.A)),
-            B=np.asarray(T_platform.apply(leg.B)),
-            base_axis=turned(T_base, leg.base_axis),
-            platform_axis=turned(T_platform, leg.platform_axis),
-            twist=twist_after(leg, T_platform.rotation),
+            A=matrix_applied(base, leg.A),
+            B=matrix_applied(platform, leg.B),
+            base_axis=turned(base, leg.base_axis),
+            platform_axis=turned(platform, leg.platform_axis),
+            twist=twist_after(leg, turn),
         )
         for leg in legs
     )
@@ -293,7 +297,7 @@ def tied_twist_slope(leg: Leg, nominal: Leg) -> Array:
         return np.zeros(2)
     n = n if n @ u > 0.0 else -n
     e1, e2 = normal_basis(u)
-    return np.array([-e2, e1]) @ np.cross(n, u) / (1.0 + float(n @ u))
+    return np.array([-e2, e1]) @ cross(n, u) / (1.0 + float(n @ u))
 
 
 def _twist(leg: Leg, nominal: Leg) -> float:

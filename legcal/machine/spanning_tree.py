@@ -18,7 +18,7 @@ from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import OutOfClass
-from legcal.geometry import Array, roll_pitch_yaw
+from legcal.geometry import Array, cross, roll_pitch_yaw
 from legcal.machine.bodies import frame_link
 from legcal.machine.schema import MechanismFile
 from legcal.machine.urdf import Urdf
@@ -320,15 +320,15 @@ def _with_axes(
         across = _across(first, np.roll(first, 1))
         across_two = _across(second, R_two_one.apply(across))
         rotations = (
-            _columns(across, np.cross(first, across), first),
-            _columns(across_two, np.cross(second, across_two), second),
+            _columns(across, cross(first, across), first),
+            _columns(across_two, cross(second, across_two), second),
         )
     else:
         along_y = _across(first, R_two_one.inv().apply(second))
         along_x = _across(second, R_two_one.apply(first))
         rotations = (
-            _columns(first, along_y, np.cross(first, along_y)),
-            _columns(along_x, second, np.cross(along_x, second)),
+            _columns(first, along_y, cross(first, along_y)),
+            _columns(along_x, second, cross(along_x, second)),
         )
     return (
         RigidTransform.from_components(one.translation, rotations[0]),

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data import LegAxes, Measurements
-from legcal.geometry import Array, IntArray, register_points
+from legcal.geometry import Array, IntArray, cross, register_points
 from legcal.paper.gibbs import axis_frames
 from legcal.paper.nominal import NominalMachine
 
@@ -40,7 +40,7 @@ def candidate_camera_poses(
     if len(A_Rb) > 2 and spread[1] > _ON_A_LINE * spread[0]:
         return [register_points(A_camera, A_Rb)], True
     line = directions[0]
-    across = np.linalg.norm(np.cross(v_Rb, line), axis=1) > _ALONG
+    across = np.linalg.norm(cross(v_Rb, line), axis=1) > _ALONG
     T_camera_Rb = _laid_along(A_Rb, line, A_camera)
     if not across.any():
         return [T_camera_Rb.inv()], False
@@ -78,7 +78,7 @@ def _candidate_turns(along: Array, v: Array, seen: Array, signed: bool) -> Array
     product = (
         np.sum(seen * axial, axis=1)
         + np.cos(turn)[:, None] * np.sum(seen * across, axis=1)
-        + np.sin(turn)[:, None] * np.sum(seen * np.cross(along, across), axis=1)
+        + np.sin(turn)[:, None] * np.sum(seen * cross(along, across), axis=1)
     )
     error = 1.0 - np.mean(np.maximum(product, 0.0) ** 2 if signed else product**2, axis=1)
     least = np.flatnonzero((error <= np.roll(error, 1)) & (error < np.roll(error, -1)))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.data import LegAxes, Measurements, join_axes
-from legcal.geometry import Array, BoolArray, IntArray, normal_basis
+from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
 from legcal.paper.joints_in_base import JointsInBase
 from legcal.paper.joints_in_camera import JointsInCamera, joint_residuals, residual_jacobian
 from legcal.paper.nominal import NominalMachine
@@ -148,18 +148,18 @@ def _conditioned(
 
     v (n, 3) is zero where there is none; its covariance is (n, 3, 3) [rad^2].
     """
-    residual, spread, cross = joint_residuals(axes, np.arange(len(axes)), A, v)
+    residual, spread, mixed = joint_residuals(axes, np.arange(len(axes)), A, v)
     of_v = np.einsum("ni,nij,nj->n", axes.u, covariance, axes.u) + _MIN_VARIANCE
     spread[:, 2, 2] += np.where(np.any(v != 0.0, axis=1), of_v, _VARIANCE_NO_AXIS)
-    gain = cross @ np.linalg.inv(spread)
+    gain = mixed @ np.linalg.inv(spread)
     alpha = (gain @ residual[..., None])[..., 0]
-    left = axes.covariance[:, :2, :2] - gain @ np.swapaxes(cross, 1, 2)
+    left = axes.covariance[:, :2, :2] - gain @ np.swapaxes(mixed, 1, 2)
     u = axes.u + np.einsum("nia,ni->na", axes.basis, alpha)
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
     e1 = axes.basis[:, 0] - u * np.sum(u * axes.basis[:, 0], axis=-1, keepdims=True)
     e1 /= np.linalg.norm(e1, axis=-1, keepdims=True)
     symmetric = 0.5 * (left + np.swapaxes(left, 1, 2))
-    return u, np.stack([e1, np.cross(u, e1)], axis=1), symmetric
+    return u, np.stack([e1, cross(u, e1)], axis=1), symmetric
 
 
 def _known_normals(base: JointsInBase, view: IntArray, leg: IntArray) -> tuple[Array, Array]:

@@ -24,7 +24,7 @@ from legcal.estimation import (
     minimise,
     normal_equations,
 )
-from legcal.geometry import Array, IntArray
+from legcal.geometry import Array, IntArray, cross
 from legcal.vision import (
     DISTORTION_MODELS,
     Camera,
@@ -154,7 +154,7 @@ def _corners(state: _State, seen: BoardImages, names: Sequence[str]) -> Residual
         nothing = np.full(shape, np.nan)
         return Residuals.of(nothing, np.zeros((*shape, len(names))), np.zeros((*shape, 6)))
     predicted, by_point = camera.project_with_derivative(P)
-    by_turn = np.cross(arm[:, None, :], by_point)  # d(pixel) = by_point . (w x arm)
+    by_turn = cross(arm[:, None, :], by_point)  # d(pixel) = by_point . (w x arm)
     by_pose = np.concatenate([by_turn, by_point], axis=-1)
     by_intrinsics = np.zeros((*shape, 0))
     if names:

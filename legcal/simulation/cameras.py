@@ -20,13 +20,18 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DatasetError, NotVisible
 from legcal.files import FileSchema, MotionEntry, PlainName, read_yaml, validate
-from legcal.geometry import Array, motion_of, normal_basis
+from legcal.geometry import Array, cross, motion_of, normal_basis
 from legcal.machine import Machine
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard
 from legcal.simulation.rendering.rays import in_view, surrounding_points
 from legcal.simulation.solids import PosedMachine
-from legcal.simulation.visibility import Viewpoint, field_of_view, legs_in_image
+from legcal.simulation.visibility import (
+    Viewpoint,
+    field_of_view,
+    legs_in_image,
+    longest_in_images,
+)
 from legcal.vision import Board, Camera, read_camera
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -41,6 +46,7 @@ _LIFTS = (0.1, 0.25, 0.45, 0.7, 0.95, 1.2)  # [rad] above the plane across the m
 _LIFTS_PLANAR = (0.8, 0.95, 1.1, 1.25, 1.4)  # [rad] above the plane of motion
 _N_POSES = 5  # poses at which places are judged
 _SAMPLES = 32  # points of a leg in that
+_ROUNDING = 1e-9  # relative, of the most that a place may show
 _ROLL = 0.08  # [rad] by which cameras are not upright
 _EXTRA_DISTANCE = 0.08  # of the least distance, by which cameras stand further away
 _HAND_ROLL, _HAND_EXTRA_DISTANCE = 0.3, 0.25  # the same for cameras that are held in the hand
@@ -74,9 +80,9 @@ def mild_lens() -> Camera:
 def look_at(position: Array, target: Array, roll: float = 0.0, *, up: Array = UP) -> RigidTransform:
     """Return the pose of a camera that looks at a point, with its y axis down."""
     z = (target - position) / np.linalg.norm(target - position)
-    x = np.cross(z, up)
+    x = cross(z, up)
     x /= np.linalg.norm(x)
-    upright = np.column_stack([x, np.cross(z, x), z])
+    upright = np.column_stack([x, cross(z, x), z])
     return motion_of(upright @ Rotation.from_euler("z", roll).as_matrix(), position)
 
 
@@ -161,9 +167,9 @@ def cameras_around(
             for turn in min(sector, 0.5 * np.pi) * np.array(_TURNS)
             for lift in lifts
         ]
-        scores = [_score(machine, tried, camera, T, board) for T in candidates]
-        found.append(Viewpoint(name, camera, candidates[int(np.argmax(scores))]))
-        least = min(least, max(scores))
+        place, score = _best(machine, tried, camera, candidates, board)
+        found.append(Viewpoint(name, camera, candidates[place]))
+        least = min(least, score)
     progress("Cameras", len(cameras), len(cameras))
     return tuple(found), least
 
@@ -317,6 +323,34 @@ def _lengths(
     ]
 
 
+def _best(
+    machine: Machine,
+    posed_machines: Sequence[PosedMachine],
+    camera: Camera,
+    places: Sequence[RigidTransform],
+    board: PlacedBoard | None,
+) -> tuple[int, float]:
+    """Return the first of the places with the highest score, and that score.
+
+    Places are left out that could not reach it even if nothing were hidden.
+    """
+    T = np.array([place.as_matrix() for place in places])
+    most = np.mean(
+        [
+            longest_in_images(machine.legs, posed, camera, T, samples=_SAMPLES).mean(axis=1)
+            for posed in posed_machines
+        ],
+        axis=0,
+    )
+    most *= 1.0 + _ROUNDING
+    scores = np.full(len(places), -1.0)
+    for k in np.argsort(-most, kind="stable").tolist():
+        if most[k] < scores.max():
+            break
+        scores[k] = _score(machine, posed_machines, camera, places[k], board)
+    return int(np.argmax(scores)), float(scores.max())
+
+
 def _score(
     machine: Machine,
     posed_machines: Sequence[PosedMachine],
@@ -383,7 +417,7 @@ def _facing(board: Board, place: Array, normal: Array, side: Array) -> RigidTran
     if np.linalg.norm(y) < 1e-6:
         y = normal_basis(z)[0]
     y = y / np.linalg.norm(y)
-    turn = Rotation.from_matrix(np.column_stack([np.cross(y, z), y, z]))
+    turn = Rotation.from_matrix(np.column_stack([cross(y, z), y, z]))
     return RigidTransform.from_components(place - turn.apply(board.extent.mean(axis=0)), turn)
 
 

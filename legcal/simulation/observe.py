@@ -15,7 +15,7 @@ import numpy as np
 
 from legcal.data import Corners, Outlines, found_corners, join_corners
 from legcal.errors import NotVisible
-from legcal.geometry import Array, IntArray
+from legcal.geometry import Array, IntArray, cross
 from legcal.simulation.board import PlacedBoard
 from legcal.simulation.solids import PosedMachine
 from legcal.simulation.visibility import Images, LegView, Stretch, Viewpoint, silhouette
@@ -38,8 +38,9 @@ class Scene:
     def leg_in_camera(self, row: int, leg: int) -> tuple[Array, Array]:
         """Return direction u (3,) and base joint A (3,) [m] of a leg in the camera of an image."""
         A, B = (joints[self.images.pose[row], leg] for joints in (self.A, self.B))
-        T = self.views[self.images.view[row]].T_base_camera.inv()
-        return T.rotation.apply((B - A) / np.linalg.norm(B - A)), T.apply(A)
+        T = self.views[self.images.view[row]].T_base_camera.as_matrix()
+        R = T[:3, :3].T
+        return R @ ((B - A) / np.linalg.norm(B - A)), R @ (A - T[:3, 3])
 
 
 def plain_scene(
@@ -163,7 +164,7 @@ def shifted_outlines(camera: Camera, h: Array, ends: Array, offsets: Array) -> t
     moved = ends + offsets[..., None] * normal
     xy = camera.undistort(moved)
     rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
-    n = np.cross(rays[..., 0, :], rays[..., 1, :])
+    n = cross(rays[..., 0, :], rays[..., 1, :])
     n *= np.sign(np.sum(n * h, axis=-1, keepdims=True))
     return n / np.linalg.norm(n, axis=-1, keepdims=True), moved
 
@@ -264,7 +265,7 @@ def table_of_lines(u: Array, A: Array) -> Array:
     across = np.hypot(u_x, u_y)
     psi = 0.5 * np.pi - 2.0 * np.arctan2(np.hypot(across, u_z - 1.0), np.hypot(across, u_z + 1.0))
     theta = np.angle(u_y - 1j * u_x)
-    moment = np.cross(A, u)
+    moment = cross(A, u)
     return np.stack([psi, theta, moment[:, 2] / u_y, -moment[:, 0] / u_y], axis=-1)
 
 

@@ -15,7 +15,16 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError
 from legcal.files import MAX_MESH, open_regular
-from legcal.geometry import Array, BoolArray, IntArray, distance_to_line, product
+from legcal.geometry import (
+    Array,
+    BoolArray,
+    IntArray,
+    cross,
+    distance_to_line,
+    matrix_product,
+    motions_of,
+    product,
+)
 from legcal.machine import (
     COAXIAL,
     Configurations,
@@ -32,6 +41,7 @@ _BALL_SIZE, _POST_SIZE = 1.4, 1.1  # in radii of the leg
 _POST_LENGTH, _PLATE_THICKNESS, _PLATE_RIM = 4.5, 1.8, 3.5  # in radii of the thickest leg
 _DEFAULT_RADIUS = 0.02  # of the distance between joints, where a leg shows no cylinder
 _GAP = 1.5  # between the plates of a planar machine, in radii of the thickest leg
+_GRAZING = 1e-5  # sine of the angle of a ray to a face by which that hides nothing
 _FLAT = 0.2  # cosine between legs and plates below which the legs lie along the plates
 
 _SECTIONS = 48  # sides of a cylinder of triangles: 0.2 % of its radius too thin at most
@@ -283,15 +293,16 @@ def solids_of(machine: Machine) -> tuple[Solid, ...]:
 def link_poses(machine: Machine, configuration: Array) -> dict[str, RigidTransform]:
     """Return T_base_link of every link at a configuration of the chain, (nq,)."""
     chain, base = machine.chain, machine.base
-    return {link: chain.pose(configuration, base, link) for link in machine.urdf.links}
+    links = machine.urdf.links
+    R, t = zip(*[chain.placement(configuration, base, link) for link in links], strict=True)
+    return dict(zip(links, motions_of(np.array(R), np.array(t)), strict=True))
 
 
 def placed(solids: Sequence[Solid], poses: Mapping[str, RigidTransform]) -> tuple[PlacedSolid, ...]:
     """Return solids where the poses of their links, T_base_link, put them."""
-    return tuple(
-        PlacedSolid(s, s.T_link_solid if s.link is None else product(poses[s.link], s.T_link_solid))
-        for s in solids
-    )
+    at = [np.eye(4) if s.link is None else poses[s.link].as_matrix() for s in solids]
+    found = matrix_product(np.array(at), np.array([s.T_link_solid.as_matrix() for s in solids]))
+    return tuple(map(PlacedSolid, solids, motions_of(found[:, :3, :3], found[:, :3, 3])))
 
 
 def _leg_along(
@@ -432,12 +443,16 @@ class PosedMachine:
         ray = points - centre
         distance = np.linalg.norm(ray, axis=-1)
         ray = ray / distance[:, None]
-        hits, index, _ = _caster(self).intersects_location(
+        face, index = _caster(self).intersects_id(
             np.broadcast_to(centre, ray.shape), ray, multiple_hits=False
         )
+        corner = self.vertices[self.faces[face]]
+        normal = cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        towards = np.sum(normal * ray[index], axis=-1)
+        is_hit = np.abs(towards) > _GRAZING * np.linalg.norm(normal, axis=-1)
+        index, reached = index[is_hit], np.sum(normal * (corner[:, 0] - centre), axis=-1)[is_hit]
         hidden = np.zeros(len(points), dtype=np.bool_)
-        reached = np.linalg.norm(np.reshape(hits, (-1, 3)) - centre, axis=-1)
-        hidden[index] = reached < distance[index] - margin[index]
+        hidden[index] = reached / towards[is_hit] < distance[index] - margin[index]
         return hidden
 
     def encloses(self, centre: Array) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import NotVisible, UsageError
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray, cross, matrix_applied
 from legcal.machine import Cylinder, Leg, main_cylinders
 from legcal.progress import Report, no_progress
 from legcal.simulation.solids import PosedMachine
@@ -43,7 +43,7 @@ def contact_offsets(u: Array, A: Array, radius: Array) -> Array:
             "move the camera."
         )
     away = centre / d
-    aside = np.cross(u, away)
+    aside = cross(u, away)
     before = -(R * R / d) * away
     beside = R * np.sqrt(1.0 - (R / d) ** 2) * aside
     return np.stack([before - beside, before + beside], axis=-2)
@@ -56,7 +56,7 @@ def silhouette(u: Array, A: Array, radius: Array) -> tuple[Array, Array]:
     signed as the moment u x P of a point P of that line, eq (3).
     """
     offsets = contact_offsets(u, A, radius)
-    moments = np.cross(u[..., None, :], A[..., None, :] + offsets)
+    moments = cross(u[..., None, :], A[..., None, :] + offsets)
     return moments / np.linalg.norm(moments, axis=-1, keepdims=True), offsets
 
 
@@ -94,30 +94,72 @@ def legs_in_image(
     samples: int = SAMPLES,
 ) -> tuple[LegView, ...]:
     """Return what an image shows of every leg."""
-    length = np.linalg.norm(posed.B - posed.A, axis=-1)
-    u = (posed.B - posed.A) / length[:, None]
-    skins = [_skin(leg.cylinders, float(L), samples) for leg, L in zip(legs, length, strict=True)]
-    s, radius = (np.array([skin[k] for skin in skins]) for k in (0, 1))
-    T_camera_base = T_base_camera.inv()
-    u_camera = u @ T_camera_base.as_matrix()[:3, :3].T
-    A_camera = np.asarray(T_camera_base.apply(posed.A))
-    axis = A_camera[:, None] + s[..., None] * u_camera[:, None]
-    from_axis = np.linalg.norm(np.cross(u_camera, A_camera), axis=-1)
-    radius = np.where(from_axis[:, None] > _END_ON * radius, radius, 0.0)
-    offsets = contact_offsets(u_camera[:, None], axis, radius)
-    pixels, inside = pixels_in_image(camera, axis[:, :, None] + offsets)
-    tested = inside & (radius > 0.0)[..., None]
+    length, skins = _skins(legs, posed, samples)
+    T = T_base_camera.as_matrix()
+    axis, offsets, radius, pixels, tested = _sampled(posed, length, skins, camera, T)
     beside = axis[:, :, None] + (1.0 + _BESIDE) * offsets
     margin = np.broadcast_to(_IN_FRONT * radius[..., None], tested.shape)
     free = tested.copy()
-    free[tested] = ~posed.hidden(
-        T_base_camera.translation, T_base_camera.apply(beside[tested]), margin[tested]
-    )
+    free[tested] = ~posed.hidden(T[:3, 3], matrix_applied(T, beside[tested]), margin[tested])
     both = np.all(free, axis=-1)
     middle = pixels.mean(axis=-2)
     return tuple(
         _leg_view(j, *skin, both[j], middle[j], float(length[j])) for j, skin in enumerate(skins)
     )
+
+
+def longest_in_images(
+    legs: Sequence[Leg],
+    posed: PosedMachine,
+    camera: Camera,
+    T_base_camera: Array,  # (n, 4, 4)
+    *,
+    samples: int = SAMPLES,
+) -> Array:
+    """Return what no length of :func:`legs_in_image` exceeds at many places, (n, n_legs) [px].
+
+    They are those from the first to the last sample in the image, as if nothing hid any.
+    """
+    length, skins = _skins(legs, posed, samples)
+    *_, pixels, tested = _sampled(posed, length, skins, camera, T_base_camera)
+    inside = np.all(tested, axis=-1)
+    steps = np.linalg.norm(np.diff(pixels.mean(axis=-2), axis=-2), axis=-1)
+    begun = np.logical_or.accumulate(inside, axis=-1)[..., :-1]
+    goes_on = np.logical_or.accumulate(inside[..., ::-1], axis=-1)[..., -2::-1]
+    return np.asarray(np.sum(steps, axis=-1, where=begun & goes_on))
+
+
+def _skins(
+    legs: Sequence[Leg], posed: PosedMachine, samples: int
+) -> tuple[Array, list[tuple[Array, Array, tuple[str, ...]]]]:
+    """Return the lengths of legs (n_legs,) [m], and the skin of each."""
+    length = np.linalg.norm(posed.B - posed.A, axis=-1)
+    return length, [
+        _skin(leg.cylinders, L, samples) for leg, L in zip(legs, length.tolist(), strict=True)
+    ]
+
+
+def _sampled(
+    posed: PosedMachine,
+    length: Array,
+    skins: Sequence[tuple[Array, Array, tuple[str, ...]]],
+    camera: Camera,
+    T_base_camera: Array,  # (..., 4, 4)
+) -> tuple[Array, Array, Array, Array, BoolArray]:
+    """Return axes (..., n_legs, n, 3) of legs at their samples, in the camera's frame [m].
+
+    With them come the steps (..., 2, 3) to both outlines, radii (...) [m], pixels (..., 2, 2) and
+    whether these can be seen where nothing hides them (..., 2).
+    """
+    s, radius = (np.array([skin[k] for skin in skins]) for k in (0, 1))
+    R, t = T_base_camera[..., :3, :3], T_base_camera[..., None, :3, 3]
+    u_camera, A_camera = (posed.B - posed.A) / length[:, None] @ R, (posed.A - t) @ R
+    axis = A_camera[..., None, :] + s[..., None] * u_camera[..., None, :]
+    from_axis = np.linalg.norm(cross(u_camera, A_camera), axis=-1)
+    radius = np.where(from_axis[..., None] > _END_ON * radius, radius, 0.0)
+    offsets = contact_offsets(u_camera[..., None, :], axis, radius)
+    pixels, inside = pixels_in_image(camera, axis[..., None, :] + offsets)
+    return axis, offsets, radius, pixels, inside & (radius > 0.0)[..., None]
 
 
 def _leg_view(

@@ -9,7 +9,7 @@ theta far better than psi.
 import numpy as np
 
 from legcal.errors import NotVisible
-from legcal.geometry import Array, moment, nearest_point_to_origin
+from legcal.geometry import Array, cross, moment, nearest_point_to_origin
 
 EPSILON = np.array([1.0, -1.0])
 
@@ -50,7 +50,7 @@ def axis_of_outlines(
 
     Returns u (..., 3); M (..., 3) [m].
     """
-    n = np.cross(h1, h2)
+    n = cross(h1, h2)
     norm = np.linalg.norm(n, axis=-1, keepdims=True)
     if not np.all(norm > 1e-12):
         raise NotVisible(

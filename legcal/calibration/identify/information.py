@@ -32,7 +32,7 @@ from legcal.estimation import (
     information_rows,
     marginal_rows,
 )
-from legcal.geometry import Array, IntArray
+from legcal.geometry import Array, IntArray, cross
 from legcal.machine import EquationKind, freedoms, pose_equations
 
 SIGMA_EXACT = 1e-7  # [m]: of what the mechanism itself demands
@@ -89,7 +89,7 @@ def image_rows(predicted: PredictedObservations) -> Array:
     base, platform = at_base_joints(predicted), at_platform_joints(predicted)
     turns = pose_unit(predicted)
     by_camera = np.concatenate([base.by_camera(), platform.by_camera()], axis=2) * turns
-    turn = np.cross(predicted.arm[predicted.pose][:, :, None], platform.gradient)
+    turn = cross(predicted.arm[predicted.pose][:, :, None], platform.gradient)
     by_pose = np.zeros_like(by_camera)
     by_pose[:, :, 2:] = np.concatenate([turn, platform.gradient], axis=3) * turns
     scatter = predicted.local_to_parameters

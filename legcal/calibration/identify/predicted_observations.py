@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration.ordered_dataset import nominal_poses
 from legcal.data import Dataset
 from legcal.estimation import Frames
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray, cross
 from legcal.machine import (
     Leg,
     LegColumns,
@@ -176,7 +176,7 @@ class Across:
 
     def by_camera(self) -> Array:
         """Return the derivative (n_images, n_legs, 2, 6) by the camera's turn and displacement."""
-        turn = -np.cross(self.point[:, :, None], self.gradient)
+        turn = -cross(self.point[:, :, None], self.gradient)
         return np.concatenate([turn, -self.gradient], axis=3)
 
 
@@ -196,9 +196,9 @@ def _across(predicted: PredictedObservations, point: Array) -> Across:
     u = predicted.u[predicted.pose]
     ray = point - predicted.camera[predicted.view][:, None]
     distance = np.linalg.norm(ray, axis=2)
-    lateral = np.cross(u, ray / distance[..., None])
+    lateral = cross(u, ray / distance[..., None])
     lateral /= np.maximum(np.linalg.norm(lateral, axis=2), _ALONG)[..., None]
-    depth = np.cross(u, lateral)
+    depth = cross(u, lateral)
     sigma_lateral = SIGMA_PX * distance / predicted.focal[predicted.view][:, None]
     sigma_depth = sigma_lateral * distance / predicted.radius
     gradient = np.stack(
@@ -341,9 +341,9 @@ def looking_at(predicted: PredictedObservations) -> Array:
     for place, shown in zip(predicted.camera, predicted.seen, strict=True):
         z = (middle[shown] if shown.any() else middle).mean(axis=0) - place
         z /= np.linalg.norm(z)
-        x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
+        x = cross(np.eye(3)[np.argmin(np.abs(z))], z)
         x /= np.linalg.norm(x)
-        orientations.append(np.column_stack([x, np.cross(z, x), z]))
+        orientations.append(np.column_stack([x, cross(z, x), z]))
     return np.array(orientations).reshape(-1, 3, 3)
 
 
@@ -371,9 +371,9 @@ def default_cameras(
         outward = (middle[list(seen)] - centre).mean(axis=0)
         outward -= axis * (outward @ axis)
         if np.linalg.norm(outward) < 0.02 * size:  # legs all around: any side will do
-            outward = np.cross(axis, rng.normal(size=3))
+            outward = cross(axis, rng.normal(size=3))
         outward /= np.linalg.norm(outward)
-        side = np.cross(axis, outward)
+        side = cross(axis, outward)
         turn, lift = rng.uniform(-0.15, 0.15), rng.uniform(0.05, 0.3)
         if not spatial:
             lift = 0.5 * np.pi - _TILT + rng.uniform(-0.1, 0.1)

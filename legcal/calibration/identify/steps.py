@@ -19,7 +19,7 @@ from legcal.calibration.identify.predicted_observations import (
     at_platform_joints,
 )
 from legcal.estimation import compress, eliminate, grouped
-from legcal.geometry import Array, BoolArray, IntArray, normal_basis
+from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
 from legcal.machine import EquationKind, JointType, LegColumns, freedoms
 
 MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
@@ -274,7 +274,7 @@ def _joint_and_axis(
     rows[:, 2:4, :2] = B.gradient[here, j] @ np.swapaxes(E, 1, 2)
     rows[:, 2:4, 2:5] = B.gradient[here, j]
     rows[:, 4, :2] = (E @ axis) * (predicted.mean_length / length)[:, None]
-    rows[:, 4, 5:] = u @ np.cross(normal_basis(axis), axis).T
+    rows[:, 4, 5:] = u @ cross(normal_basis(axis), axis).T
     rows[:, 4] /= SIGMA_EXACT
     return eliminate(rows, 2)
 
@@ -282,7 +282,7 @@ def _joint_and_axis(
 def _by_camera(predicted: PredictedObservations, j: int, F: Array) -> Array:
     """Return rows F by A and axis of a leg as rows by the turn and displacement of the camera."""
     rows = np.zeros((len(F), 6))
-    rows[:, :3] = -np.cross(predicted.A[j], F[:, :3])
+    rows[:, :3] = -cross(predicted.A[j], F[:, :3])
     rows[:, 3:] = -F[:, :3]
     axis = predicted.legs[j].base_axis
     if axis is not None:
@@ -351,7 +351,7 @@ def _vectors_of(
     for j in np.flatnonzero(located.axis[f]).tolist():
         axis = np.asarray(predicted.legs[j].base_axis)
         turn = np.zeros((3, n_axes))
-        turn[:, 2 * j : 2 * j + 2] = np.cross(normal_basis(axis), axis).T / predicted.mean_length
+        turn[:, 2 * j : 2 * j + 2] = cross(normal_basis(axis), axis).T / predicted.mean_length
         vectors.append(axis)
         slopes.append(_by_leg(np.zeros_like(eye[0]), turn))
     return vectors, slopes

@@ -18,7 +18,7 @@ from scipy.special import gammaincinv
 from legcal.data import LegAxes, Measurements, Outlines, axes_from_outlines
 from legcal.errors import NotVisible
 from legcal.files import Document
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray, cross
 from legcal.machine import Leg
 from legcal.perception import HIDDEN, OUTSIDE
 from legcal.vision import Camera, angles_of_direction
@@ -146,7 +146,7 @@ def axis_values(axes: LegAxes, chosen: BoolArray, radius: float) -> AxisValues:
         up, down = (_values(u + s * du, M + s * dM, u[0], M[0]) for s in (1.0, -1.0))
         derivative[..., k] = (up - down) / (2.0 * _STEP)
     claimed = derivative @ covariance @ derivative.swapaxes(1, 2)
-    normal = np.cross(u, M)
+    normal = cross(u, M)
     inclination = np.arctan2(np.abs(normal[:, 0]), np.abs(normal[:, 1]))
     e_y = basis[:, :, 1]
     sigma_u_y = np.sqrt(np.einsum("ni,nij,nj->n", e_y, covariance[:, :2, :2], e_y))
@@ -171,9 +171,9 @@ def _has_M_LS(u: Array, M: Array, sigma_u_y: Array, claimed: Array, radius: floa
 
 def _values(u: Array, M: Array, u_0: Array, M_0: Array) -> Array:
     """Return the quantities of axes (n, 8) as differences to those of a reference axis."""
-    n = np.cross(u_0, M_0)
+    n = cross(u_0, M_0)
     n /= np.linalg.norm(n)
-    w = np.cross(n, u_0)  # the part of M_0 normal to u_0: away from the camera
+    w = cross(n, u_0)  # the part of M_0 normal to u_0: away from the camera
     psi, theta = angles_of_direction(u)
     psi_0, theta_0 = angles_of_direction(u_0)
     x, z = _M_LS(u, M)
