@@ -186,7 +186,7 @@ def _pivot(axes: Sequence[Axis], along: Array | None, leg: str) -> Pivot:
     tilt = off_square(lines[0].along, lines[1].along)
     if tilt > PERPENDICULAR:
         raise OutOfClass(
-            f"leg '{leg}' could not be understood: the axes of {_names(lines)} are "
+            f"leg '{leg}' could not be classified: the axes of {_names(lines)} are "
             f"{np.degrees(tilt):.4g} deg from perpendicular, needed a universal joint within "
             f"{np.degrees(PERPENDICULAR):.2g} deg; correct their axes."
         )
@@ -199,7 +199,7 @@ def _about_sphere(sphere: Axis, others: Sequence[Axis], leg: str) -> Pivot:
         miss = axis.distance(sphere.point)
         if miss > CONCURRENT:
             raise OutOfClass(
-                f"leg '{leg}' could not be understood: the axis of '{axis.name}' misses the centre "
+                f"leg '{leg}' could not be classified: the axis of '{axis.name}' misses the centre "
                 f"of {sphere.name} by {1e3 * miss:.4g} mm, needed one joint at each end of the leg "
                 "within 0.01 mm; correct their origins."
             )
@@ -229,14 +229,14 @@ def _meeting(lines: Sequence[Axis], leg: str) -> Array:
         if near is None or gap is None or gap > CONCURRENT:
             found = "are parallel" if gap is None else f"miss each other by {1e3 * gap:.4g} mm"
             raise OutOfClass(
-                f"leg '{leg}' could not be understood: the axes of '{one.name}' and '{two.name}' "
+                f"leg '{leg}' could not be classified: the axes of '{one.name}' and '{two.name}' "
                 f"{found}, needed axes that meet within 0.01 mm; correct their origins."
             )
         points.append(near)
     apart = max(float(np.linalg.norm(point - points[0])) for point in points)
     if apart > CONCURRENT:
         raise OutOfClass(
-            f"leg '{leg}' could not be understood: the axes of {_names(lines)} meet in two points "
+            f"leg '{leg}' could not be classified: the axes of {_names(lines)} meet in two points "
             f"{1e3 * apart:.4g} mm apart, needed one point within 0.01 mm; correct their origins."
         )
     return points[0]

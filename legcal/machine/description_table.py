@@ -276,7 +276,7 @@ def _unit(table: Table, given: str | None) -> str:
         )
     if not stated and given is None:
         raise DatasetError(
-            f"{table.path}: the lengths could not be understood: found no unit, needed m or mm; "
+            f"{table.path}: the lengths could not be read: found no unit, needed m or mm; "
             "add a column 'unit', or give --unit mm."
         )
     return stated[0] if stated else str(given)
@@ -338,7 +338,7 @@ def _conflicting_entries(file: TableFile, source: str) -> list[str]:
     if (file.type is None) == (file.types is None):
         found = "both" if file.type else "neither"
         return [
-            f"{source}: the legs could not be understood: found {found} of type and types, needed "
+            f"{source}: the legs could not be read: found {found} of type and types, needed "
             "one: 'type: 6-UPS', or 'types' with one entry for each leg."
         ]
     n = len(file.base_joints)

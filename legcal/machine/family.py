@@ -48,7 +48,7 @@ def describe_family(given: Family) -> Description:
     of_legs = None if match is None else leg_type(match[2])
     if match is None or of_legs is None or not 2 <= int(match[1]) <= MAX_LEGS:
         raise UsageError(
-            f"The family could not be understood: found '{given.family}', needed a number of legs "
+            f"The family could not be read: found '{given.family}', needed a number of legs "
             f"from 2 to {MAX_LEGS} and their type, such as 6-UPS: {NEEDED_TYPE}; correct --family."
         )
     count = int(match[1])

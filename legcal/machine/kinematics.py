@@ -39,7 +39,7 @@ from legcal.machine.model import (
     readings_at,
     slider_columns,
 )
-from legcal.machine.solver import newton, newton_many, poses_after, solve, walk_in_steps
+from legcal.machine.solver import newton, poses_after, solve, walk_in_steps
 
 CONTRACTION = 0.5  # of the step before; of 1 rad or a leg length for the first
 TOLERANCE = 1e-13  # of a leg length
@@ -466,7 +466,7 @@ def follow_poses(
             found.values[:, found.measured] -= lengthening
             return found.values, found.by_pose
 
-        found = newton_many(
+        found = newton(
             equations,
             poses_after,
             poses[rows],
@@ -495,7 +495,7 @@ def _closed_from(
     """Return the configuration closed with the motors fixed, None if not near, and its Jacobian."""
     equations, retract = closure_equations(machine, None, 1.0, free)
     found = newton(
-        equations, retract, configuration, tolerance=0.01 * CLOSED, contraction=CONTRACTION
+        equations, retract, configuration[None], tolerance=0.01 * CLOSED, contraction=CONTRACTION
     )
     return found.points[0] if found.worst[0] < CLOSED else None, found.jacobian[0]
 

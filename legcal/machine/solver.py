@@ -90,42 +90,6 @@ def solve(
 def newton(
     equations: Equations,
     retract: Retraction,
-    point: Array,
-    *,
-    tolerance: float,
-    contraction: float,
-    first: float = 1.0,
-    unit: Array | float = 1.0,
-    steps: int = 12,
-) -> Solved:
-    """Return where steps from one point lead, each smaller than the one before.
-
-    *first* bounds the first step by the same *contraction*. Where steps do not shrink it has not
-    converged, unless its residual is below the tolerance.
-    """
-    points = point[None]
-    values, jacobian = equations(points)
-    size = first
-    converged = False
-    for _ in range(steps):
-        converged = float(np.abs(values).max(initial=0.0)) < tolerance
-        if converged:
-            break
-        step = -_shortest(jacobian[0] * unit, values[0], RANK)
-        previous, size = size, float(np.abs(step).max(initial=0.0))
-        if not size <= contraction * previous:
-            break
-        points = retract(points, (step * unit)[None])
-        values, jacobian = equations(points)
-        converged = size < tolerance
-        if converged:
-            break
-    return Solved(points, values, jacobian, np.array([size]), np.array([converged]))
-
-
-def newton_many(
-    equations: Equations,
-    retract: Retraction,
     points: Array,
     *,
     tolerance: float,
@@ -134,7 +98,11 @@ def newton_many(
     unit: Array | float = 1.0,
     steps: int = 12,
 ) -> Solved:
-    """Return where the steps of :func:`newton` from many points (k, ...) lead."""
+    """Return where steps from points (k, ...) lead, each smaller than the one before.
+
+    *first* bounds the first step by the same *contraction*. Where steps do not shrink a point has
+    not converged, unless its residual is below the tolerance.
+    """
     values, jacobian = equations(points)
     size = np.full(len(points), first)
     converged = np.abs(values).max(axis=1, initial=0.0) < tolerance

@@ -42,7 +42,7 @@ MAX_JOINTS_OF_LEG = 12  # a sphere written as three revolutes at each end, and a
 
 
 def find_chains(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[LegChain]:
-    """Return the legs between two links, each understood as joint, slider, joint.
+    """Return the legs between two links, each classified as joint, slider, joint.
 
     Raises
     ------
