@@ -158,10 +158,8 @@ def identifiability_of_dataset(
 
     Raises DidNotConverge if the readings do not lead to closed poses.
     """
-    twists = any(name.endswith(".twist") for name in (*choices.free, *choices.priors))
-    predicted = recorded_observations(dataset, twists=twists)
-    analysis = Analysis(predicted, choices)
-    report = _judge(dataset.machine, analysis, None, None)
+    analysis = _analysis_of(dataset, choices)
+    predicted, report = analysis.predicted, _judge(dataset.machine, analysis, None, None)
     if dataset.axes is None:
         found = expected_intrinsics(
             predicted,
@@ -178,6 +176,12 @@ def identifiability_of_dataset(
     return replace(report, notes=(*report.notes, note))
 
 
+def _analysis_of(dataset: Dataset, choices: Choices) -> Analysis:
+    """Return the analysis of what a dataset records."""
+    twists = any(name.endswith(".twist") for name in (*choices.free, *choices.priors))
+    return Analysis(recorded_observations(dataset, twists=twists), choices)
+
+
 def check_identifiable(
     # its views are taken to show the legs that they name, or all: what even then stays open cannot
     # be found
@@ -190,19 +194,20 @@ def check_identifiable(
     Raises NotIdentifiable if a direction that moves the platform is not determined by everything at
     once.
     """
-    report = identifiability_of_dataset(dataset, choices)
-    if not report.identifiable:
-        raise NotIdentifiable(_refusal(dataset, report))
+    analysis = _analysis_of(dataset, choices)
+    staged, full = analysis.staged, analysis.full
+    if not full.complete:
+        raise NotIdentifiable(_refusal(dataset, identifiability_of_dataset(dataset, choices)))
     notes = []
-    if any(not weak.harmless for weak in report.staged.weak):
+    if any(not weak.harmless for weak in staged.weak):
         notes.append(
-            f"The four steps alone leave open {_directions(report.staged, harmless=False)}; the "
+            f"The four steps alone leave open {_directions(staged, harmless=False)}; the "
             "joint fit does not."
         )
-    if report.full.weak:  # what is left is harmless
+    if full.weak:  # what is left is harmless
         notes.append(
             "Not determined, and without effect on the platform: "
-            f"{_directions(report.full, harmless=True)}."
+            f"{_directions(full, harmless=True)}."
         )
     return tuple(notes)
 
