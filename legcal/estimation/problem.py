@@ -547,6 +547,11 @@ class Problem(Generic[S]):
         parts = [b.read(getattr(state, b.name)) for b in self.variables if b.labels]
         return np.concatenate([np.zeros(0), *parts])
 
+    @property
+    def is_read_directly(self) -> bool:
+        """Whether these values change as x does: :meth:`jacobian` is one."""
+        return all(not block.labels or block.jacobian is None for block in self.variables)
+
     def jacobian(self, state: S) -> Array:
         """Return the derivative (n_named, n_named) of these values by x."""
         J = np.eye(self.n_named)

@@ -285,6 +285,16 @@ class NormalEquations:
         N = null_space(self.held_directions)
         return np.asarray(N @ inverse_on_range(N.T @ self._reduced @ N) @ N.T)
 
+    def moved_by(self, columns: Array) -> Array:
+        """Return the covariance of the kept unknowns times columns (n_kept, c)."""
+        if len(self.held_directions) == 0 and "_kept_covariance" not in vars(self):
+            scale = _scale(self._reduced)
+            U, failed = dpotrf(scale[:, None] * self._reduced * scale)
+            if not failed and np.diagonal(U).min(initial=1.0) ** 2 > _MIN_PIVOT:
+                right = scale[:, None] * columns
+                return np.asarray(scale[:, None] * cho_solve((U, False), right))
+        return np.asarray(self._kept_covariance @ columns)
+
     def step(self, damping: float) -> tuple[Array, float]:
         """Return a Levenberg-Marquardt step (size,) and the predicted fall of the cost.
 
@@ -292,10 +302,15 @@ class NormalEquations:
         """
         V = _damped(self.V, damping)
         V_inverse = np.asarray(np.linalg.inv(V), dtype=np.float64)
-        WV = _by_element(self.W, V_inverse)
         U = _damped(self.U, damping)
-        R = U - _coupled(WV, self.W)
-        right = -self.g_kept + _flat(WV) @ self.g_elements.ravel()
+        try:
+            root = np.asarray(np.linalg.cholesky(V_inverse), dtype=np.float64)
+            half = _by_element(self.W, root)
+            R = U - _coupled(half, half)
+        except np.linalg.LinAlgError:  # by rounding
+            R = U - _coupled(_by_element(self.W, V_inverse), self.W)
+        following = (V_inverse @ self.g_elements[..., None]).ravel()
+        right = -self.g_kept + _flat(self.W) @ following
         if len(self.held_directions):
             N = null_space(self.held_directions)
             kept = N @ _solve(N.T @ R @ N, N.T @ right)

@@ -48,6 +48,8 @@ def worst_directions(
 def named_covariance(problem: Problem[S], state: S, covariance: Array) -> Array:
     """Return the covariance (n_named, n_named) of coordinates from that of all kept unknowns."""
     n = problem.n_named
+    if problem.is_read_directly:
+        return covariance[:n, :n].copy()
     by_x = problem.jacobian(state)
     return np.asarray(by_x @ covariance[:n, :n] @ by_x.T)
 
@@ -57,6 +59,8 @@ def named_information(problem: Problem[S], state: S, normal: NormalEquations) ->
     R, n = normal.reduced(), problem.n_named
     if n < len(R):
         R = R[:n, :n] - R[:n, n:] @ inverse_on_range(R[n:, n:]) @ R[n:, :n]
+    if problem.is_read_directly:
+        return R
     back = np.linalg.inv(problem.jacobian(state))
     return np.asarray(back.T @ R @ back)
 
@@ -96,7 +100,8 @@ def explained_share(
     padded = np.pad(covariance, (0, 1))  # no unknown has no variance
     if where.element is not None:
         following = _following(normal)
-        with_kept = np.pad(following @ covariance, ((0, 0), (0, 0), (0, 1)))
+        with_kept = (following.reshape(-1, len(covariance)) @ covariance).reshape(following.shape)
+        with_kept = np.pad(with_kept, ((0, 0), (0, 0), (0, 1)))
         of_elements = with_kept[..., :-1] @ np.swapaxes(following, 1, 2)
         own_numbers = np.arange(problem.d_element)
         Z = None if normal.tangent is None else normal.tangent.Z
@@ -158,7 +163,7 @@ def response(
         kept = kept + np.einsum("akp,kpc->ac", normal.tangent.Q, elements, optimize=True)
         elements = np.swapaxes(normal.tangent.Z, 1, 2) @ elements
     kept = kept - np.einsum("akf,kfc->ac", normal.W, normal.V_inverse @ elements, optimize=True)
-    return np.asarray(-normal.kept_covariance() @ kept)
+    return -normal.moved_by(kept)
 
 
 def _add_products(
@@ -194,13 +199,12 @@ def score_test(
     by_element = of_elements
     if normal.tangent is not None:
         by_element = np.swapaxes(normal.tangent.Z, 1, 2) @ of_elements
-    following, covariance = normal.V_inverse @ by_element, normal.kept_covariance()
+    following = normal.V_inverse @ by_element
     elements = (normal.V_inverse @ normal.g_elements[..., None])[..., 0]
     g_kept = normal.g_kept - np.einsum("akp,kp->a", normal.W, elements)
-    score = (
-        score - kept.T @ covariance @ g_kept - np.einsum("kpc,kp->c", following, normal.g_elements)
-    )
-    left = left - kept.T @ covariance @ kept - np.einsum("kpc,kpd->cd", following, by_element)
+    moved = normal.moved_by(kept)
+    score = score - moved.T @ g_kept - np.einsum("kpc,kp->c", following, normal.g_elements)
+    left = left - moved.T @ kept - np.einsum("kpc,kpd->cd", following, by_element)
     return score, left
 
 

@@ -20,7 +20,7 @@ from scipy.linalg import solve_triangular
 
 from legcal.geometry import Array, BoolArray, IntArray
 
-_CONVERGED = 1e-6  # change of the log-likelihood
+_CONVERGED = 1e-4  # change of the log-likelihood
 _MAX_STEPS = 50
 _HALVINGS = 30
 

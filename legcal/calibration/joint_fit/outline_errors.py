@@ -25,7 +25,7 @@ too: the stated uncertainty accounts for that.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -306,6 +306,8 @@ class EdgeBiases:
     sigma: Array  # (N_KINDS,) standard deviation of each kind [px], and of ln gamma
     index: IntArray  # (n, c) which of them each outline has a part in
     shift: Array  # (n, c, 2) how one unit of each moves both ends along the line's normal [px]
+    shown: Array | None = None  # (n_kinds,) variances that residuals show by themselves
+    parts: dict[bytes, EdgeBiases] = field(default_factory=dict, repr=False)  # chosen before
 
     @property
     def sigmas(self) -> Array:
@@ -329,15 +331,18 @@ class EdgeBiases:
     def of_sizes(self, sigma: Array) -> EdgeBiases:
         """Return biases with these standard deviations, without those where it is zero."""
         kept = sigma[self.kind] > 0.0
-        number = np.cumsum(kept) - 1
-        columns = kept[self.index].all(axis=0)  # all biases of a column are of one kind
-        return EdgeBiases(
-            tuple(name for name, is_kept in zip(self.names, kept, strict=True) if is_kept),
-            self.kind[kept],
-            sigma,
-            number[self.index[:, columns]],
-            self.shift[:, columns],
-        )
+        found = self.parts.get(kept.tobytes())
+        if found is None:
+            number = np.cumsum(kept) - 1
+            columns = kept[self.index].all(axis=0)  # all biases of a column are of one kind
+            found = self.parts[kept.tobytes()] = EdgeBiases(
+                tuple(name for name, is_kept in zip(self.names, kept, strict=True) if is_kept),
+                self.kind[kept],
+                sigma,
+                number[self.index[:, columns]],
+                self.shift[:, columns],
+            )
+        return replace(found, sigma=sigma)
 
 
 def possible_biases(
@@ -411,11 +416,10 @@ def estimated_biases(
     [px]. That of a gamma is known, whatever the residuals show. Those of an earlier fit are *near*.
     """
     sigma = np.zeros(N_KINDS)
-    effects = Effects(z, K, possible.kind)
-    start = None if near is None else near.sigma[: effects.n_kinds] ** 2
-    variances, _ = estimate_variances(effects, _MIN_BIAS_GAIN, start)
+    start = None if near is None else near.shown
+    variances, _ = estimate_variances(Effects(z, K, possible.kind), _MIN_BIAS_GAIN, start)
     sigma[: len(variances)] = np.sqrt(variances)
-    return possible.of_sizes(with_gamma(np.maximum(sigma, least)))
+    return replace(possible.of_sizes(with_gamma(np.maximum(sigma, least))), shown=variances)
 
 
 def with_gamma(sigma: Array) -> Array:
