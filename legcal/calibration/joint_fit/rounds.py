@@ -153,18 +153,19 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
         if are_white and changes.converged(settings):
             linear = linearize(problem, minimum.state)
             break
+        if accepted.any():
+            # Scores take the step to the minimum with this noise into account.
+            state = minimum.state
+            there = replace(state, biases=_values(problem, state, possible))
+            scores = scores_of_block(with_possible.weighted(noise, accepted), there, "biases")
+            biases = estimated_biases(possible, *scores, least, near=biases)
+            are_white = not len(biases) and not len(state.biases)
+            if not are_white:
+                problem, minimum = _with_edge_biases(problem, minimum, biases)
         minimum = _passed(problem, minimum, settings)
-        state, linear = minimum.state, minimum.linear
+        linear = minimum.linear
         if not accepted.any():
             break
-        there = replace(state, biases=_values(problem, state, possible))
-        scores = scores_of_block(with_possible.weighted(noise, accepted), there, "biases")
-        biases = estimated_biases(possible, *scores, least, near=biases)
-        are_white = not len(biases) and not len(state.biases)
-        if not are_white:
-            problem, minimum = _with_edge_biases(problem, minimum, biases)
-            minimum = _passed(problem, minimum, settings)
-            linear = minimum.linear
         changes = replace(changes, after=_sizes(noise, biases))
         if changes.converged(settings):
             break
