@@ -8,11 +8,11 @@ their line has moved.
 
 Noise grows with light, and a surface has texture: a dark background is several times quieter than a
 lit leg in front of it, so that the foot of the blurred step determines its place better than the
-top. :func:`evened` weighs the sums by the noise that is seen on both sides.
+top. :func:`even_weights` are those by the noise that is seen on both sides.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 
@@ -22,7 +22,7 @@ from scipy.special import ndtr
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.light import Samples
 
-BINS_PER_BLUR = 3.0
+BINS_PER_BLUR = 2.0
 STEP_END = (1.0, 2.5)  # distance from an outline at which the step is over: [px] and in blurs
 N_SMOOTH = 3  # of the polynomial that describes a side of a block: constant to quadratic
 MIN_PIXELS = 8  # pixels on a side of a block
@@ -99,44 +99,52 @@ def _pairs(k: int) -> tuple[IntArray, IntArray, IntArray]:
 
 @dataclass(frozen=True, eq=False)
 class PixelBins:
-    """The bins of the pixels of blocks (n,), by their distances inside the lines."""
+    """The bins of pixels, by their distances inside the lines."""
 
     grid: Array  # (m,) middles of the bins [px]
-    entry: IntArray  # (n k,) bin of each pixel, those of one block after the other
-    square: Samples  # (n, k) squared weights
-    moment: Samples  # (n, k) times o
+    entry: IntArray  # (n_rows k,) bin of each pixel, those of one block after the other
+    square: Samples  # (n_rows, k) squared weights
+    moment: Samples  # (n_rows, k) times o
     weight: Array  # (n, 3, m), and
     count: Array  # (n,) as in PixelSums
 
     @classmethod
-    def of(cls, d: Samples, weight: Samples, blur: float) -> "PixelBins":
-        """Return bins that suit a blur [px]; pixels (n, k) of no weight do not count."""
-        n, used = len(d), weight > 0.0
+    def of(
+        cls, d: Samples, weight: Samples, blur: float, block: IntArray | None = None
+    ) -> "PixelBins":
+        """Return bins that suit a blur [px]; pixels (n_rows, k) of no weight do not count.
+
+        Rows of pixels are blocks, or parts of a ``block`` (n_rows,), rising from 0 without gaps.
+        """
+        used = weight > 0.0
         per_px = np.float32(BINS_PER_BLUR / blur)
         place = d * per_px
         number = np.rint(place)
         np.copyto(number, 0.0, where=~used)
         first, last = int(number.min(initial=0)), int(number.max(initial=0))
         size = last - first + 1
-        entry = (number + (np.arange(n) * size - first)[:, None]).astype(np.intp).ravel()
+        block = np.arange(len(d)) if block is None else block
+        n = int(block[-1]) + 1 if len(block) else 0
+        entry = (number + (block * size - first)[:, None]).astype(np.intp).ravel()
         offset = (place - number) / per_px
         square = weight * weight
         moment = square * offset
         sums = _binned(entry, n, size, (square, moment, moment * offset))
-        count = np.count_nonzero(used, axis=1).astype(np.float64)
+        count = np.bincount(block, np.count_nonzero(used, axis=1).astype(np.float64), n)
         grid = np.arange(first, last + 1) / float(per_px)
         return cls(grid, entry, square, moment, sums, count)
 
     def light(self, light: Samples) -> Array:
-        """Return sums (n, 2, m) of the light of all pixels (n, k), as in PixelSums."""
+        """Return sums (n, 2, m) of the light of all pixels (n_rows, k), as in PixelSums."""
         of_pixels = self.square * light, self.moment * light
-        return _binned(self.entry, len(light), len(self.grid), of_pixels)
+        return _binned(self.entry, len(self.count), len(self.grid), of_pixels)
 
     def sums(self, light: Samples) -> PixelSums:
-        """Return all sums with the light of all pixels (n, k)."""
-        square = self.square * light * light
-        power = _binned(self.entry, len(light), len(self.grid), (square,))[:, 0]
-        return PixelSums(self.grid, self.weight, self.light(light), power, self.count)
+        """Return all sums with the light of all pixels (n_rows, k)."""
+        bright = self.square * light
+        of_pixels = bright, self.moment * light, bright * light
+        sums = _binned(self.entry, len(self.count), len(self.grid), of_pixels)
+        return PixelSums(self.grid, self.weight, sums[:, :2], sums[:, 2], self.count)
 
 
 def _binned(entry: IntArray, n: int, size: int, values: Sequence[Samples]) -> Array:
@@ -156,8 +164,9 @@ def noise_ratios(sums: PixelSums, bounds: IntArray, kept: BoolArray, blur: float
     beyond = max(STEP_END[0], STEP_END[1] * blur)
     n_edges = len(bounds) - 1
     edge, sides = np.repeat(np.arange(n_edges), np.diff(bounds)), []
-    for side in (-sums.grid, sums.grid):
-        variance = _variance(sums, side > beyond)
+    inside, outside = np.searchsorted(sums.grid, [beyond, -beyond], side="right").tolist()
+    for side in (slice(0, outside), slice(inside, None)):
+        variance = _variance(sums, side)
         known = kept & np.isfinite(variance)
         own = edge[known]
         n_known = np.bincount(own, minlength=n_edges)
@@ -170,36 +179,29 @@ def noise_ratios(sums: PixelSums, bounds: IntArray, kept: BoolArray, blur: float
     return np.asarray(np.clip(ratio, MAX_NOISE_RATIO**-2, MAX_NOISE_RATIO**2))
 
 
-def evened(sums: PixelSums, ratio: Array, blur: float) -> PixelSums:
-    """Return sums over pixels that are weighted by their noise, given its ratio (n,) inside.
+def even_weights(grid: Array, ratio: Array, blur: float) -> Array:
+    """Return squared weights (n, m) at distances inside, given the ratio (n,) of noise there.
 
     Either side of an outline keeps the noise that is seen there; across the blurred step the
     variance changes as light does.
     """
-    rise, ratio = ndtr(sums.grid / blur), ratio[:, None]
+    rise, ratio = ndtr(grid / blur), ratio[:, None]
     # In units of the noise in the middle of the step, which keeps the mean noise about the same.
-    return sums.weighted(0.5 * (1.0 + ratio) / (1.0 + (ratio - 1.0) * rise))
+    return np.asarray(0.5 * (1.0 + ratio) / (1.0 + (ratio - 1.0) * rise))
 
 
-def _variance(sums: PixelSums, side: BoolArray) -> Array:
+def _variance(sums: PixelSums, side: slice) -> Array:
     """Return the variance (n,) of pixels in some bins of each block about a parabola, or NaN."""
-    some = replace(
-        sums,
-        grid=sums.grid[side],
-        weight=sums.weight[:, :, side],
-        light=sums.light[:, :, side],
-        power=sums.power[:, side],
-    )
-    x = some.grid - 2.0 * np.sign(some.grid)
-    values = np.stack([np.ones_like(x), x, x * x], axis=1)
-    slopes = np.stack([np.zeros_like(x), np.ones_like(x), 2.0 * x], axis=1)
-    functions = values[None], slopes[None], (0, len(some.weight))
-    normal, right = some.products(*functions), some.with_light(*functions)
-    count = some.weight[:, 0].sum(axis=1)
+    x = sums.grid[side]
+    powers = (x - x.mean())[:, None] ** np.arange(2 * N_SMOOTH - 1)
+    moments = sums.weight[:, 0, side] @ powers
+    right = sums.light[:, 0, side] @ powers[:, :N_SMOOTH]
+    count = moments[:, 0]
     level = right[:, 0] / np.maximum(count, 1e-3)
-    power = some.power.sum(axis=1) - level * right[:, 0]
-    right = right - level[:, None] * normal[:, :, 0]
-    normal = normal + 1e-6 * np.eye(N_SMOOTH)
+    power = sums.power[:, side].sum(axis=1) - level * right[:, 0]
+    right -= level[:, None] * moments[:, :N_SMOOTH]
+    order = np.arange(N_SMOOTH)
+    normal = moments[:, order[:, None] + order] + 1e-6 * np.eye(N_SMOOTH)
     explained = np.sum(right * np.linalg.solve(normal, right[..., None])[..., 0], axis=1)
     free = np.maximum(count - N_SMOOTH, 1.0)
     return np.where(count >= MIN_PIXELS, np.maximum(power - explained, 0.0) / free, np.nan)

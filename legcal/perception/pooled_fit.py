@@ -5,7 +5,7 @@ nearly that of the whole image; each block adds a little of its own, which is el
 Gauss-Newton needs no pixel (:mod:`legcal.perception.pixel_sums`) as long as lines turn little.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ import numpy as np
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.blocks import Blocks
 from legcal.perception.limb import N_AMPLITUDES, N_POWERS, powers, profile_functions
-from legcal.perception.pixel_sums import PixelBins, PixelSums, evened, medians, noise_ratios
+from legcal.perception.pixel_sums import PixelBins, PixelSums, even_weights, medians, noise_ratios
 
 # Standard deviations of amplitudes, in contrasts of the outline, as limb.py orders them: of
 # what an outline has in common, of its changes along the outline, and of single blocks.
@@ -30,9 +30,9 @@ BLURS = (0.2, 4.0)  # least and greatest [px]
 MIN_SAMPLES = 30  # pixels of a block
 ENOUGH_BLOCKS, MAX_JOINED = 16, 3  # of an outline, to join some blocks, so many at most
 MAX_STEP = (0.7, 0.4)  # of one round: of the line [blurs], of the logarithm of the blur
-MAX_MOVE_OF_SUMS = (1.0, 0.08)  # of middle and ends [blurs], to which sums over pixels serve
+MAX_MOVE_OF_SUMS = (1.0, 0.25)  # of middle and ends [blurs], to which sums over pixels serve
 MAX_MOVE = (0.4, 0.15)  # of a line [blurs] and of the logarithm of the blur, to which equations do
-CONVERGED = 0.01  # step of a line below which its rounds end [px]
+CONVERGED = 0.02  # step of a line below which its rounds end, before the last one [px]
 ODD_NOISE = (1.5, 4.0)  # of a typical block, from where on one counts less, and not at all
 MIN_NOISE = 0.05  # variance of grey levels [grey levels^2]
 NOISE_ROUNDS, NOISE_CONVERGED = 3, 0.2  # of its estimate, at most; and of its logarithm
@@ -137,7 +137,7 @@ class _Pool:
 
     blocks: Blocks
     usable: BoolArray  # which of the blocks
-    first: IntArray  # (n,) of the usable blocks that are joined, the first ones
+    joined: IntArray  # (n_usable,) which of the blocks here each is a part of
     gain: Array  # (n,)
     edge: IntArray  # (n,)
     bounds: list[int]  # n_edges + 1
@@ -151,8 +151,8 @@ class _Pool:
     seen: BoolArray  # (n_edges,) edges with usable blocks
     own: Array  # (n, BLUR) how little amplitudes and places of single blocks scatter: precisions
     # Sums over pixels by their distances from lines, and of products of powers with a blur.
-    bins: PixelBins  # of all blocks
-    sums: PixelSums  # of the usable ones
+    bins: PixelBins | None  # None where sums are those over the blocks as they are
+    sums: PixelSums
     at_line: Array  # (n_edges, 2) of the sums
     products: Array  # (n, N_POWERS, N_POWERS)
     with_light: Array  # (n, N_POWERS)
@@ -167,7 +167,8 @@ class _Pool:
         edge = blocks.edge[usable]
         of_usable = np.searchsorted(edge, np.arange(n_edges + 1)).tolist()
         noise = np.fmax(medians(blocks.noise[usable], edge, of_usable), MIN_NOISE)
-        first = np.flatnonzero(np.diff(_joined(np.bincount(edge, minlength=n_edges)), prepend=-1))
+        joined = _joined(np.bincount(edge, minlength=n_edges))
+        first = np.flatnonzero(np.diff(joined, prepend=-1))
         rise = 2.0 * blocks.position[usable] - 1.0
         along = np.stack([np.ones_like(rise), rise, 1.5 * rise**2 - 0.5], axis=1)
         means = np.column_stack([blocks.gain[usable], along])
@@ -175,10 +176,10 @@ class _Pool:
             means = np.add.reduceat(means, first) / np.diff(first, append=len(edge))[:, None]
         edge = edge[first]
         bounds = np.searchsorted(edge, np.arange(n_edges + 1)).tolist()
-        bins = blocks.bins(blur)
-        of_all = bins.sums(blocks.light)
+        of_all = blocks.bins(blur).sums(blocks.light)
         ratio = noise_ratios(of_all, blocks.bounds, kept, blur)
-        sums = evened(of_all.of_blocks(usable).joined(first), ratio[edge], blur)
+        sums = of_all.of_blocks(usable).joined(first)
+        sums = sums.weighted(even_weights(sums.grid, ratio[edge], blur))
 
         def total(values: Array) -> Array:
             return np.asarray(np.bincount(edge, values, n_edges), dtype=np.float64)
@@ -194,7 +195,7 @@ class _Pool:
         return cls(
             blocks,
             usable,
-            first,
+            joined,
             means[:, 0],
             edge,
             bounds,
@@ -207,7 +208,7 @@ class _Pool:
             depth,
             weights > 0.0,
             own,
-            bins,
+            None,
             sums,
             nowhere[0],
             np.empty((0, N_POWERS, N_POWERS)),
@@ -227,7 +228,10 @@ class _Pool:
         if np.any(turned > MAX_MOVE_OF_SUMS):
             self.at_line = at.line.copy()
             self.bins = self._bins()
-            self.sums = self._evened(self.bins.sums(self.blocks.light))
+            sums = self.bins.sums(self.blocks.light[self.usable])
+            self.sums = sums.weighted(
+                even_weights(sums.grid, self.noise_ratio[self.edge], self.blur)
+            )
         self.at = at
         self.functions = profile_functions(self.half_width, np.exp(at.log_blur), self.depth)
         values, slopes = self._powers()
@@ -236,17 +240,12 @@ class _Pool:
         return True
 
     def _bins(self) -> PixelBins:
-        """Return the bins of the pixels of all blocks where lines were looked at."""
-        blocks = self.blocks
-        line, rise = self.at_line[blocks.edge], 2.0 * blocks.position - 1.0
-        moved = blocks.moved + blocks.gain * (line[:, 0] + line[:, 1] * rise)
-        d = blocks.d - moved.astype(np.float32)[:, None]
-        return PixelBins.of(d, blocks.weight, self.blur)
-
-    def _evened(self, sums: PixelSums) -> PixelSums:
-        """Return the sums of the usable blocks, weighted by noise."""
-        own = sums.of_blocks(self.usable).joined(self.first)
-        return evened(own, self.noise_ratio[self.edge], self.blur)
+        """Return the bins of the pixels of the usable blocks where lines were looked at."""
+        blocks, usable = self.blocks, self.usable
+        line, rise = self.at_line[blocks.edge[usable]], 2.0 * blocks.position[usable] - 1.0
+        moved = blocks.moved[usable] + blocks.gain[usable] * (line[:, 0] + line[:, 1] * rise)
+        d = blocks.d[usable] - moved.astype(np.float32)[:, None]
+        return PixelBins.of(d, blocks.weight[usable], self.blur, self.joined)
 
     def _powers(self) -> tuple[Array, Array]:
         """Return powers of the distance from where the middle of each line is, and slopes by it."""
@@ -359,16 +358,21 @@ class _Pool:
 
         With the covariance of unknowns (n_edges, k, k), the logarithm of the blur known to sigma.
         """
-        blocks, weight = self.blocks, self.blocks.weight
+        blocks = self.blocks
         light = blocks.light + blocks.level.astype(np.float32)[blocks.edge][:, None]
-        weights = np.maximum(weight.sum(axis=1), np.float32(1e-9))
-        of_block = np.maximum(np.sum(light * weight, axis=1) / weights, np.float32(1e-9))
-        change = light * np.log(np.maximum(light / of_block[:, None], np.float32(MIN_LIGHT)))
-        bins = self.bins
-        changed = PixelSums(
-            bins.grid, bins.weight, bins.light(change), bins.weight[:, 0], bins.count
-        )
-        with_light = self._evened(changed).with_light(*self._powers(), self.bounds)
+        weights = np.maximum(blocks.weight.sum(axis=1), np.float32(1e-9))
+        of_block = np.einsum("nm,nm->n", light, blocks.weight) / weights
+        of_block = np.maximum(of_block, np.float32(1e-9))[:, None]
+        change = light * np.log(np.maximum(light / of_block, np.float32(MIN_LIGHT)))
+        if self.bins is None:
+            first = np.flatnonzero(np.diff(self.joined, prepend=-1))
+            own = blocks.bins(self.blur).light(change)[self.usable]
+            changed = np.add.reduceat(own, first, axis=0) if len(first) else own
+        else:
+            changed = self.bins.light(change[self.usable])
+        share = even_weights(self.sums.grid, self.noise_ratio[self.edge], self.blur)
+        changes = replace(self.sums, light=changed * share[:, None])
+        with_light = changes.with_light(*self._powers(), self.bounds)
         target = self._eliminated(equations, with_light).reshape(len(self.half_width), -1)
 
         found = _applied(inverse, target)
