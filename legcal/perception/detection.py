@@ -72,6 +72,7 @@ def _of_image(
         for leg in predicted:
             window[leg.leg] += placement.pixel_error + error[leg.leg] * _pixels_per_metre(leg)
     known = placement.blur[view] if placement.blur else np.nan
+    blur = search.blur.get(row, 0.0) if np.isnan(known) else known
     one = ImageSearch(
         row,
         np.zeros((0, 0), dtype=np.float32) if T is None else search.load(row),
@@ -80,7 +81,8 @@ def _of_image(
         search.leg_names,
         window,
         guided=placement.window is not None,
-        blur=None if np.isnan(known) else known,
+        blur=blur or None,
+        near_fit=not np.isnan(known),
     )
     found, blur = (no_outlines(), np.nan) if T is None else method(one)
     seen = {leg.leg for leg in predicted}

@@ -53,7 +53,8 @@ class ImageSearch:
     names: Sequence[str]  # of all legs, for reasons
     window: Array  # (n_legs,) largest distance from a prediction [px]; NaN: not looked for
     guided: bool = False  # whether a fit to other legs predicts them: one edge is enough
-    blur: float | None = None  # as other images show it, where outlines are known to tenths [px]
+    blur: float | None = None  # as other images show it, or roughly [px]
+    near_fit: bool = False  # whether outlines are known to tenths of a pixel, and the blur as well
 
 
 Method = Callable[[ImageSearch], tuple[Outlines, float]]
@@ -90,13 +91,15 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
     parts, found = find_parts(search)
     blur = math.nan
     if parts:
-        near = search.blur is not None
+        near = search.near_fit
         edges = [
             Edge(part.band, v, float(epsilon), part.half_width, part.hidden)
             for part in parts
             for v, epsilon in zip(part.near if near else part.edges.v, EPSILON, strict=True)
         ]
-        measured, blur = measure_edges(search.grey, search.camera, edges, together, search.blur)
+        measured, blur = measure_edges(
+            search.grey, search.camera, edges, together, search.blur, near_fit=near
+        )
         for part, one, two in zip(parts, measured[::2], measured[1::2], strict=True):
             found.append(_with_verdict(part, (one, two), near_fit=near))
     return outline_table(search, found), blur

@@ -89,9 +89,15 @@ class Photographs:
         )
 
     def search(
-        self, nominal: Placement, pairs: Mapping[int, CandidatePairs] | None = None
+        self,
+        nominal: Placement,
+        pairs: Mapping[int, CandidatePairs] | None = None,
+        blur: Mapping[int, float] | None = None,
     ) -> Search:
-        """Return what is searched for by a model; candidate pairs of some images may be known."""
+        """Return what is searched for by a model.
+
+        Candidate pairs of some images may be known, and roughly the blur [px], by row.
+        """
         return Search(
             self.load,
             self.measurements,
@@ -101,6 +107,7 @@ class Photographs:
             self.wanted,
             self.machine.leg_names,
             {} if pairs is None else pairs,
+            {} if blur is None else blur,
         )
 
     def with_found(self, found: Outlines) -> Outlines:
@@ -163,9 +170,9 @@ def place_and_measure(
     ``joined`` are T_board_camera of views that show a calibration board, which are placed together;
     ``together`` is as for :func:`legcal.perception.outline.measure`.
     """
-    defects, pairs = _inspect_images(photographs, nominal, report, joined)
+    defects, pairs, rough = _inspect_images(photographs, nominal, report, joined)
     usable = np.array([row for row in photographs.detect if row not in defects], dtype=np.intp)
-    search = photographs.search(nominal, pairs)
+    search = photographs.search(nominal, pairs, rough)
     hints = nominal.T_base_camera
 
     def recognised(suspects: Collection[LegRadius] = ()) -> Placement:
@@ -179,7 +186,7 @@ def place_and_measure(
         if other.radii.factor:
             machine = photographs.machine.with_cylinders(other.radii.corrected(search.cylinders))
             corrected = replace(photographs, machine=machine)
-            by_other = corrected.search(nominal, pairs)
+            by_other = corrected.search(nominal, pairs, rough)
             again, also = _measured(corrected, by_other, other, report, together=together)
             blur = np.where(np.isnan(also), blur, also)
             if again.used.sum() > outlines.used.sum():
@@ -277,8 +284,8 @@ def _measured(
 
 def _inspect_images(
     photographs: Photographs, nominal: Placement, report: Report, joined: Joined
-) -> tuple[dict[int, str], dict[int, CandidatePairs]]:
-    """Return why images show nothing, and candidate pairs of those recognised first, by row."""
+) -> tuple[dict[int, str], dict[int, CandidatePairs], dict[int, float]]:
+    """Return why images show nothing, pairs of those recognised first, and blurs [px], by row."""
     rows, measurements = photographs.detect.tolist(), photographs.measurements
     hints = nominal.T_base_camera
     groups = group_views(measurements, photographs.detect, hints, joined)
@@ -294,7 +301,8 @@ def _inspect_images(
     views = measurements.views
     camera = shared_cameras([view.name for view in views], [view.camera for view in views])
     view = {row: int(measurements.view[row]) for row in rows}
-    return image_defects(exposures, view, {row: camera[v] for row, v in view.items()}), pairs
+    defects = image_defects(exposures, view, {row: camera[v] for row, v in view.items()})
+    return defects, pairs, {row: exposure.blur for row, exposure in exposures.items()}
 
 
 def _inspect(

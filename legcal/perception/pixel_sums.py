@@ -22,7 +22,7 @@ from scipy.special import ndtr
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.light import Samples
 
-BINS_PER_BLUR = 2.0
+BINS_PER_BLUR = 3.0
 STEP_END = (1.0, 2.5)  # distance from an outline at which the step is over: [px] and in blurs
 N_SMOOTH = 3  # of the polynomial that describes a side of a block: constant to quadratic
 MIN_PIXELS = 8  # pixels on a side of a block
@@ -130,7 +130,8 @@ class PixelBins:
         square = weight * weight
         moment = square * offset
         sums = _binned(entry, n, size, (square, moment, moment * offset))
-        count = np.bincount(block, np.count_nonzero(used, axis=1).astype(np.float64), n)
+        of_rows = np.count_nonzero(used, axis=1).astype(np.float64)
+        count = np.asarray(np.bincount(block, of_rows, n), dtype=np.float64)
         grid = np.arange(first, last + 1) / float(per_px)
         return cls(grid, entry, square, moment, sums, count)
 

@@ -43,6 +43,7 @@ class Search:
     wanted: BoolArray  # (n_views, n_legs) legs that each view is stated to show
     leg_names: Sequence[str]
     edge_pairs: Mapping[int, CandidatePairs] = field(default_factory=dict)  # of rows seen before
+    blur: Mapping[int, float] = field(default_factory=dict)  # of their images, roughly [px]
 
     @property
     def n_legs(self) -> int:

@@ -21,9 +21,9 @@ from legcal.vision import Camera, Grey
 
 FIRST_BLUR = 1.0  # [px]
 MIN_CHI2_GAIN = 30  # by an edge, from which on a block shows one
-FIRST_BLOCKS = 12  # of an outline
-BRIEF_BLOCKS = 16  # the same in brief
-FIRST_ROUNDS = (1, 2)  # of estimates of the blur, one after the other
+BLURS = (0.3, 2.7)  # that a first one may be [px]
+FIRST_BLOCKS = 16  # of an outline
+ROUNDS, ROUNDS_NEAR = (1, 2), (2,)  # of estimates of the blur, and of one near a rough one
 LAST_ROUNDS = 2  # of lines, at most
 MAX_BLUR_TRIALS, BLUR_CONVERGED = 3, 0.25  # until its logarithm changes by less
 SHADING = 0.5  # that the model leaves out [grey levels]
@@ -56,34 +56,39 @@ def measure_edges(
     edges: Sequence[Edge],
     together: bool = True,
     blur: float | None = None,
+    *,
+    near_fit: bool = False,
 ) -> tuple[list[MeasuredEdge | None], float]:
     """Fit the limb model and straight lines to all edges of an image; return its blur as well [px].
 
     None for an edge that no straight line fits. Unless all blocks are fitted together in the end,
-    lines are good to a few hundredths of a pixel, in half the time. With the blur that other images
-    of the view show, edges are taken to be known to a few tenths of a pixel.
+    lines are good to a few hundredths of a pixel, in half the time. The blur may be known roughly.
+    Near a fit it is that of other images, and edges are known to a few tenths of a pixel.
     """
-    v = [edge.v for edge in edges]
-    near = blur is not None
-    if blur is None:
-        blocks = Blocks.read(grey, camera, edges, v, FIRST_BLUR, FIRST_BLOCKS)
+    v, joint = [edge.v for edge in edges], None
+    n_rounds = ROUNDS if blur is None else ROUNDS_NEAR
+    blur = FIRST_BLUR if blur is None else blur
+    if not near_fit:
+        blur = first = float(np.clip(blur, *BLURS))
+        blocks = Blocks.read(grey, camera, edges, v, first, FIRST_BLOCKS)
         if len(blocks.moved) == 0:
-            return [None] * len(edges), FIRST_BLUR
-        blur = FIRST_BLUR
-        for n_rounds in FIRST_ROUNDS:
+            return [None] * len(edges), first
+        for n in n_rounds:
             blocks.fit(blur, 1)
-            blur = blocks.estimate_blur(n_rounds)
+            blur = blocks.estimate_blur(n)
+        if not together and abs(np.log(blur / first)) < BLUR_CONVERGED:
+            blocks.fit(blur, LAST_ROUNDS)
+            return _measured(edges, v, blocks, blur, None), blur
         v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
-    joint = None
     for _ in range(MAX_BLUR_TRIALS):
         tried = blur
-        blocks = Blocks.read(grey, camera, edges, v, tried, None if together else BRIEF_BLOCKS)
+        blocks = Blocks.read(grey, camera, edges, v, tried, None if together else FIRST_BLOCKS)
         if len(blocks.moved) == 0:
             return [None] * len(edges), tried
         blocks.fit(tried, LAST_ROUNDS)
         if not together:
             break
-        if near:
+        if near_fit:
             blocks.unmove()
         kept = blocks.kept()
         joint = fit_pooled(blocks, kept, tried, depth_for_blur(tried))
