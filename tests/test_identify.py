@@ -162,7 +162,7 @@ def test_the_report_in_words_says_what_a_board_is_needed_for() -> None:
          "raises the ranks from 18 to 24 of 30 step by step, and from 30 to 30"),
         (("halves", True), "fails, not needed with the board"),
         (("weak joint", True), "a calibration board on the base in every view",
-         "and mends: x and y of base joint 6; z of base joint 6."),
+         "and determines: x and y of base joint 6; z of base joint 6."),
         (("weak joint", False), "add a fourth camera position",
          "calibration starts from the nominal model"),
     ):  # fmt: skip
@@ -258,7 +258,7 @@ def test_a_dataset_is_judged_by_itself() -> None:
     (camera,) = found.intrinsics
     assert (camera.camera, camera.determined) == ("c1", True)  # one for all views
     assert found.document()["intrinsics"][0]["sigma"] == camera.sigma
-    assert "determine its intrinsics too (sigma to expect: fx 0." in said(found)
+    assert "determine its intrinsics too (predicted sigma: fx 0." in said(found)
     (camera,) = identifiability_of_dataset(two_images()).intrinsics
     assert not camera.determined
     assert None in camera.sigma.values()

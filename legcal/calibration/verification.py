@@ -87,15 +87,15 @@ class Check:
         """The answer in words."""
         movement, pair = self.movement, self.at_platform
         p = "below 1e-6" if movement.p_value < 1e-6 else f"{movement.p_value:.2g}"
-        test = f"probability {p} if nothing did, significance {100 * movement.significance:g} %"
+        test = f"p-value {p}, significance {100 * movement.significance:g} %"
         known = (
             f"{1e3 * pair.expected_displacement:.3f} mm / "
             f"{np.degrees(pair.expected_rotation):.4f} deg (1 sigma)"
         )
         if not movement.moved:
             return (
-                f"Nothing has moved as far as these images can tell ({test}); they know the "
-                f"platform against the earlier result to {known}."
+                f"No change was detected ({test}); the platform relative to the earlier result is "
+                f"known to {known}."
             )
         found = f"{1e3 * pair.displacement:.3f} mm / {np.degrees(pair.rotation):.4f} deg"
         return (

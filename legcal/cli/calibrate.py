@@ -29,8 +29,8 @@ def calibrate(
     transformation: Annotated[
         Transformation | None,
         typer.Option(
-            help="How they find the platform, eq (18): point equality, or as printed. By default "
-            "as the criteria are."
+            help="How they solve eq (18) for the platform: point equality, or as printed. By "
+            "default it follows the criteria."
         ),
     ] = None,
     fresh: Annotated[
@@ -48,7 +48,7 @@ def calibrate(
         list[str] | None,
         typer.Option(
             metavar="NAME[=VALUE]",
-            help="Leave as the model has it, or at a value.",
+            help="Fix at the nominal value, or at a given one.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None,
@@ -64,8 +64,8 @@ def calibrate(
         float | None,
         typer.Option(
             metavar="PART",
-            help="Keep this part of the images aside (0.2: a fifth) and report how well the fit of "
-            "the others predicts them.",
+            help="Hold out this fraction of the images (0.2: a fifth) and report how well the fit "
+            "of the others predicts them.",
             rich_help_panel=_TESTS,
         ),
     ] = None,
@@ -73,8 +73,8 @@ def calibrate(
         Path | None,
         typer.Option(
             metavar="RESULT",
-            help="Has it moved? Test the result folder of an earlier calibration with the images "
-            "of DATASET; nothing is written. Exit 1 if something has moved.",
+            help="Change detection: test the result folder of an earlier calibration with the "
+            "images of DATASET; nothing is written. Exit 1 if something has moved.",
             rich_help_panel=_TESTS,
         ),
     ] = None,
@@ -82,7 +82,7 @@ def calibrate(
         float | None,
         typer.Option(
             metavar="P",
-            help="Of --check: probability of a false alarm; 0.01 without it.",
+            help="With --check: probability of a false alarm; 0.01 by default.",
             rich_help_panel=_TESTS,
         ),
     ] = None,

@@ -123,11 +123,11 @@ def identify(
             "--view",
             metavar="LEG,LEG,...",
             help="The legs that one camera position shows; once for each position. Without any, "
-            "the smallest sets of views that suffice are recommended.",
+            "the smallest sufficient sets of views are recommended.",
         ),
     ] = None,
     images: Annotated[
-        int | None, typer.Option(help="Images a view, each of another pose; 15 without it.")
+        int | None, typer.Option(help="Images per view, each at another pose; 15 by default.")
     ] = None,
     board: Annotated[
         bool,
@@ -146,7 +146,7 @@ def identify(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Say which parameters a calibration can find, and what would mend what is missing."""
+    """Say which parameters a calibration can identify, and what would identify the others."""
     from legcal import calibration, report
 
     views = [text.split(",") for text in view or []]
@@ -193,25 +193,29 @@ def locate(
     ] = None,
     position_sigma: Annotated[
         str | None,
-        typer.Option(help="Of a measured position, a component: 0.02mm; else from the residuals."),
+        typer.Option(
+            help="Sigma of each coordinate of a position, 0.02mm; by default from the residuals."
+        ),
     ] = None,
     angle_sigma: Annotated[
         str | None,
-        typer.Option(help="Of a measured orientation: 0.01deg; else from the residuals."),
+        typer.Option(help="Sigma of an orientation, 0.01deg; by default from the residuals."),
     ] = None,
-    encoder_sigma: Annotated[str | None, typer.Option(help="Of a reading: 2um; 0 else.")] = None,
+    encoder_sigma: Annotated[
+        str | None, typer.Option(help="Sigma of a reading, 2um; 0 by default.")
+    ] = None,
     tool_position: Annotated[
         str | None,
         typer.Option(
             metavar="X,Y,Z",
-            help="Of the tool in the platform [m], taken where the machine leaves it open; 0,0,0 "
-            "else.",
+            help="Tool in the platform, in metres, where the measured poses do not determine it; "
+            "0,0,0 by default.",
         ),
     ] = None,
-    world_link: Annotated[str, typer.Option(help="Of --urdf: the name of the world link.")] = (
+    world_link: Annotated[str, typer.Option(help="With --urdf: name of the world link.")] = (
         "world"
     ),
-    tool_link: Annotated[str, typer.Option(help="Of --urdf: the name of the tool link.")] = "tool",
+    tool_link: Annotated[str, typer.Option(help="With --urdf: name of the tool link.")] = "tool",
     as_json: JsonOption = False,
 ) -> None:
     """Find the base in the world and the tool in the platform from measured tool poses."""
@@ -287,20 +291,28 @@ def new(
     ] = None,
     unit: Annotated[str | None, typer.Option(help="Unit of all lengths: mm or m.")] = None,
     name: Annotated[str | None, typer.Option(help="Name of the model and its files.")] = None,
-    base_radius: Annotated[float | None, typer.Option(help="Circle of the base joints.")] = None,
-    platform_radius: Annotated[
-        float | None, typer.Option(help="Circle of the platform joints.")
+    base_radius: Annotated[
+        float | None, typer.Option(help="Radius of the circle of base joints.")
     ] = None,
-    height: Annotated[float | None, typer.Option(help="Of the platform over the base.")] = None,
+    platform_radius: Annotated[
+        float | None, typer.Option(help="Radius of the circle of platform joints.")
+    ] = None,
+    height: Annotated[
+        float | None, typer.Option(help="Height of the platform above the base.")
+    ] = None,
     base_spread: Annotated[
-        float | None, typer.Option(help="Angle in a pair of base joints (6 legs), in degrees: 30.")
+        float | None,
+        typer.Option(
+            help="Angle between the base joints of a pair (6 legs), in degrees; default 30."
+        ),
     ] = None,
     platform_spread: Annotated[
-        float | None, typer.Option(help="Angle in a pair of platform joints: 30.")
+        float | None,
+        typer.Option(help="Angle between the platform joints of a pair, in degrees; default 30."),
     ] = None,
     turn: Annotated[
         float | None,
-        typer.Option(help="Of the platform about z, in degrees: 0; planar 30."),
+        typer.Option(help="Rotation of the platform about z, in degrees; default 0, planar 30."),
     ] = None,
     offset: Annotated[float | None, typer.Option(help="Leg length at reading zero.")] = None,
     travel: Annotated[
@@ -309,7 +321,7 @@ def new(
     leg_radius: Annotated[float | None, typer.Option(help="Radius of tube and rod.")] = None,
     tilt: Annotated[
         float | None,
-        typer.Option(help="Of R and U axes from their default, in degrees: 0."),
+        typer.Option(help="Tilt of R and U axes from their default, in degrees; default 0."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
     as_json: JsonOption = False,

@@ -29,7 +29,7 @@ DatasetArgument = Annotated[
     Path, typer.Argument(metavar="DATASET", help="The folder that holds dataset.yaml.")
 ]
 JsonOption = Annotated[
-    bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")
+    bool, typer.Option("--json", help="Print one JSON document on stdout, and nothing else.")
 ]
 
 
@@ -46,8 +46,8 @@ WorkersOption = Annotated[
     int | None,
     typer.Option(
         callback=_at_least_one,
-        help="Processes: as many as there are cores (for images at most "
-        f"{MAX_IMAGE_WORKERS}) without it. Results do not depend on it.",
+        help="Number of processes; by default one for each core (for images at most "
+        f"{MAX_IMAGE_WORKERS}). Results do not depend on it.",
     ),
 ]
 

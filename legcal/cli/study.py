@@ -37,7 +37,7 @@ _BENCHMARKS = {  # that replace studies of earlier versions, and what they measu
 }
 
 study = typer.Typer(
-    help="Measure on many simulated machines what is claimed; their truth is known.",
+    help="Validate the method on many simulated machines whose truth is known.",
     no_args_is_help=True,
 )
 

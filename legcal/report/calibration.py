@@ -150,12 +150,12 @@ def _fit_line(result: Result) -> str:
 
 
 def _direction_lines(result: Result) -> list[str]:
-    """Return which combinations of parameters are known worst, and which are held."""
+    """Return which combinations of parameters are least certain, and which are held."""
     worst = [f"{weak.direction} ({1e3 * weak.sigma_m:.3f} mm)" for weak in result.weakest]
-    lines = [f"Known worst (1 sigma): {'; '.join(worst)}."] if worst else []
+    lines = [f"Least certain combinations (1 sigma): {'; '.join(worst)}."] if worst else []
     if result.held:
         lines.append(
-            "Held at nominal, since nothing determines it and the platform does not move with it: "
+            "Held at nominal, as nothing determines them and they do not move the platform: "
             f"{'; '.join(result.held)}."
         )
     return lines

@@ -96,7 +96,7 @@ def _recommendation(report: Identifiability) -> list[str | RenderableType]:
         words = f"{number} view{'s' * (number != 1)}: {views}"
         rows.append((words, str(found.legs_a_view), sigma + judged))
     columns = ("smallest sets of views that suffice", ">legs each", "sigma [mm]")
-    legend = "sigma: of the platform, to expect; *: judged here"
+    legend = "sigma: predicted error of the platform; *: the set that is judged here"
     return [table(*columns, rows=rows), Text(legend, style="dim")]
 
 
@@ -178,7 +178,7 @@ def _board(board: BoardReport, of: int) -> str:
     shown = list(board.mends[:_MAX_MENDED])
     if len(board.mends) > _MAX_MENDED:
         shown.append(f"{len(board.mends) - _MAX_MENDED} more (see --json)")
-    return f"{text}, and mends: {'; '.join(shown)}."
+    return f"{text}, and determines: {'; '.join(shown)}."
 
 
 def _intrinsics(found: CameraIntrinsics) -> str:
@@ -189,7 +189,7 @@ def _intrinsics(found: CameraIntrinsics) -> str:
         open_ = list_in_words([name for name in found.sigma if name not in known])
         return f"{camera} do not determine {open_}; calibrate it with legcal camera."
     sigmas = ", ".join(f"{name} {_two_digits(sigma)}" for name, sigma in known.items())
-    return f"{camera} determine its intrinsics too (sigma to expect: {sigmas} px)."
+    return f"{camera} determine its intrinsics too (predicted sigma: {sigmas} px)."
 
 
 def _remedies(report: Identifiability) -> Table:
@@ -204,7 +204,7 @@ def _remedies(report: Identifiability) -> Table:
         )
         for r in report.remedies
     ]
-    return table("what would mend it", ">steps", ">joint fit", "", rows=rows)
+    return table("remedy", ">steps", ">joint fit", "", rows=rows)
 
 
 def _verdict(report: Identifiability) -> list[str | RenderableType]:
@@ -221,14 +221,14 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
     if report.platform_sigma is not None:
         sigma = report.platform_sigma
         expected = (
-            f"Platform sigma to expect: {_two_digits(1e3 * sigma.dX_m)} mm, "
+            f"Predicted error of the platform (1 sigma): {_two_digits(1e3 * sigma.dX_m)} mm, "
             f"{_two_digits(degrees(sigma.dE_rad))} deg, from outlines good to 0.1 px "
             "at both ends of a leg."
         )
         lines.append(Text(expected, style="dim"))
     weak = (*report.staged.weak, *report.full.weak)
     if any(direction.dX_m is not None and not direction.harmless for direction in weak):
-        hidden = "What a direction hides is the platform's error for 1 mm in its largest component."
+        hidden = "The platform error of a direction is that for 1 mm in its largest component."
         lines.append(Text(hidden, style="dim"))
     failed = [_CONDITIONS[c.name] for c in report.conditions if c.fails]
     if failed:

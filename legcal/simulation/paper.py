@@ -192,7 +192,7 @@ def poses_of_readings(
 def expected_errors(
     machine: PaperHexapod, covariance: Array, T_Rb_Re: RigidTransform
 ) -> PlatformErrors:
-    """Return the errors of eq (20) to expect of Gaussian parameters, to first order."""
+    """Return the expected errors of eq (20) for Gaussian parameters, to first order."""
     legs, frame_legs = point_like_legs(machine.parameters), machine.frame_legs
     R, t = T_Rb_Re.rotation.as_matrix(), T_Rb_Re.translation
     parametrization = parametrize(machine.leg_names, legs, frame_legs)

@@ -148,13 +148,15 @@ class Request:
     board_pose: bool = field(
         default=False,
         metadata=_option(
-            "Tell where the board is in the base link.", _CAMERAS, flags=("--board-pose",)
+            "Write the pose of the board in the base link into dataset.yaml.",
+            _CAMERAS,
+            flags=("--board-pose",),
         ),
     )
     hand_held: bool = field(
         default=False,
         metadata=_option(
-            "Take every image from a place of its own, with the board in it.",
+            "Every image from another camera position, with the board in it.",
             _CAMERAS,
             flags=("--hand-held",),
         ),
@@ -162,7 +164,7 @@ class Request:
     hints: bool = field(
         default=True,
         metadata=_option(
-            "Tell roughly where cameras stand (15 mm, 1.5 deg), and the legs of each view.",
+            "Write rough camera poses (15 mm, 1.5 deg) and each view's legs into dataset.yaml.",
             _CAMERAS,
             flags=("--hints/--no-hints",),
         ),
@@ -170,7 +172,7 @@ class Request:
     tell_gamma: bool | None = field(
         default=None,
         metadata=_option(
-            "Tell how the cameras encode light.",
+            "Write the gamma of the cameras into dataset.yaml.",
             _LOOK,
             flags=("--gamma/--no-gamma",),
             shown="gamma",
@@ -180,7 +182,7 @@ class Request:
     pixel_noise: str | None = field(
         default=None,
         metadata=_option(
-            "Of each edge point of an outline, and each corner of a board.",
+            "Sigma of each edge point of an outline, and of each corner of a board.",
             _NOISE,
             metavar="SIGMA",
             shown="0.1px",
@@ -195,7 +197,7 @@ class Request:
     )
     encoder_noise: str = field(
         default="2um",
-        metadata=_option("Of readings; 3um:uniform for +-3um.", _NOISE, metavar="SIGMA"),
+        metadata=_option("Sigma of readings; 3um:uniform for +-3um.", _NOISE, metavar="SIGMA"),
     )
     appearance: Path | None = field(
         default=None,

@@ -68,7 +68,7 @@ class Recommendation:
     # the legs that each camera position shows: neighbours around the base
     views: tuple[tuple[str, ...], ...]
     legs_a_view: int  # how many these are
-    # standard deviation of the platform to expect; None where the motors do not determine its pose
+    # predicted standard deviation of the platform; None where the motors do not determine its pose
     platform_sigma: RmsMotion | None
 
 
