@@ -2,13 +2,17 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+import yaml
 from characterisation.inputs import ROOT, made_input
 from fuzzing.crafted import harmful_files, special_files
+from fuzzing.mutations import mutate
 from fuzzing.running import count_cases, drawn_cases, run_cases
 
 from legcal import LegcalError, load_mechanism
 from legcal.errors import DatasetError
+from legcal.files.schema import _PLAIN_TEXT, _Loader, _QuickLoader
 from legcal.vision import read_camera
 
 PARTS = 4
@@ -41,6 +45,23 @@ def test_pipes_devices_and_folders_are_never_read() -> None:
         if ended.fault
     ]
     assert not found
+
+
+@pytest.mark.skipif(not yaml.__with_libyaml__, reason="there is one parser of YAML")
+def test_both_parsers_of_yaml_read_the_same() -> None:
+    chance, n_read = np.random.default_rng(0), 0
+    valid = (made_input("small") / "dataset.yaml").read_bytes()
+    for _ in range(300):
+        content = mutate(valid, "yaml", chance)
+        if not _PLAIN_TEXT.fullmatch(content):
+            continue
+        try:
+            quick = yaml.load(content, Loader=_QuickLoader)
+        except yaml.YAMLError:  # the other one says what is wrong
+            continue
+        n_read += 1
+        assert repr(yaml.load(content, Loader=_Loader)) == repr(quick), content
+    assert n_read > 50
 
 
 def test_text_from_files_is_shown_on_one_short_line_without_control_characters() -> None:

@@ -6,6 +6,7 @@ import re
 import reprlib
 import typing
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -30,6 +31,7 @@ MAX_PROBLEMS = 1000  # of one file that are looked into
 _MOST_NAMES = 10  # that a hint lists
 _LONGEST_WORD = 100  # for which one that is like it is looked for
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+_PLAIN_TEXT = re.compile(rb"[\w\n .,:;#'\"/()+\[\]{}-]*")  # of which all parsers think the same
 
 _NEEDED = {
     "float_type": "a number",
@@ -179,6 +181,16 @@ _Loader.add_implicit_resolver(
 )
 
 
+class _QuickLoader(_Loader):
+    """The same with the parser of libyaml: five times as fast, but says less of what is wrong."""
+
+    def __init__(self, stream: Any) -> None:
+        super().__init__("")
+        parser = yaml.CSafeLoader(stream)
+        for name in ("check_event", "peek_event", "get_event"):
+            setattr(self, name, getattr(parser, name))
+
+
 class _TooMuch(yaml.YAMLError):
     """What is too much in a file: found and needed, as parts of a sentence."""
 
@@ -231,7 +243,7 @@ def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:
             f"most {MAX_YAML}; check the path of the {what}."
         )
     try:
-        found = yaml.load(content, Loader=_Loader)
+        found = _loaded(content)
     except _TooMuch as error:
         raise DatasetError(
             f"{path}: the {what} could not be read: found {error}, needed {error.needed}."
@@ -259,6 +271,14 @@ def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:
             "repeated through aliases, needed fewer; write it without aliases."
         )
     return typing.cast("dict[str, Any]", found)
+
+
+def _loaded(content: bytes) -> Any:
+    """Return what YAML holds, whichever parser there is; both agree where text is plain."""
+    if yaml.__with_libyaml__ and _PLAIN_TEXT.fullmatch(content):
+        with suppress(yaml.YAMLError):
+            return yaml.load(content, Loader=_QuickLoader)
+    return yaml.load(content, Loader=_Loader)
 
 
 def _first_line(error: Exception) -> str:
