@@ -6,14 +6,11 @@ is, and whether it is a leg at all, is not known here.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from legcal.geometry import Array, BoolArray, Image, IntArray
 from legcal.perception.light import Samples, reduce
@@ -82,64 +79,91 @@ def _pieces(small: Grey) -> Array:
     cut until they are straight.
     """
     levels = _stretched(small)
-    slopes = [cv2.Sobel(levels, cv2.CV_16S, i, 1 - i) for i in (1, 0)]
-    some = [slope[::STRIDE, ::STRIDE].astype(np.float32) for slope in slopes]
-    low = float(np.clip(NOISE_LEVELS * np.median(cv2.magnitude(some[0], some[1])), *MIN_SLOPE))
+    slopes = np.empty((2, *small.shape), dtype=np.int16)
+    for k, slope in enumerate(slopes):
+        cv2.Sobel(levels, cv2.CV_16S, 1 - k, k, dst=slope)
+    some = slopes[:, ::STRIDE, ::STRIDE].astype(np.float32)
+    low = NOISE_LEVELS * _middle(cv2.magnitude(some[0], some[1]))
+    low = min(max(low, MIN_SLOPE[0]), MIN_SLOPE[1])
     edge = cv2.Canny(slopes[0], slopes[1], low, STRONG * low, L2gradient=True)
     edge[[0, -1]], edge[:, [0, -1]] = 0, 0
     at = np.flatnonzero(edge != 0)
-    gradient = np.stack([slope.take(at) for slope in slopes]).astype(np.float32)
-    chain = _chains(at, gradient, edge.shape)
+    gradient = slopes.reshape(2, -1).take(at, axis=1).astype(np.float32)
+    chain = _chains(at, gradient, small.shape)
     is_long = np.bincount(chain) >= MIN_PIXELS
     long = np.flatnonzero(is_long[chain])
     number = (np.cumsum(is_long) - 1).astype(np.min_scalar_type(len(at)))  # small: sorted faster
-    chain = number[chain]
-    order = long[np.argsort(chain[long], kind="stable")]
-    at, gradient = at[order], gradient[:, order]
-    pieces = _straight(_edge_middles(slopes, at, gradient), gradient, chain[order].astype(np.intp))
+    chain = number[chain.take(long)]
+    order = np.argsort(chain, kind="stable")
+    at, gradient = at.take(long.take(order)), gradient.take(long.take(order), axis=1)
+    pieces = _straight(_edge_middles(slopes, at, gradient), gradient, chain.take(order))
     length = np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1)
     order = np.argsort(-length, kind="stable")[:MAX_PIECES]
     return np.asarray(pieces[order[length[order] >= MIN_PIECE_LENGTH]])
 
 
-def _chains(at: IntArray, gradient: Samples, shape: tuple[int, int]) -> IntArray:
+def _middle(values: Image) -> float:
+    """Return the median of values of any shape."""
+    n = values.size
+    ordered = np.partition(values, (max(n // 2 - 1, 0), n // 2), axis=None)
+    return 0.5 * float(ordered[(n - 1) // 2] + ordered[n // 2])
+
+
+def _chains(at: IntArray, gradient: Samples, shape: tuple[int, ...]) -> IntArray:
     """Return which chain each edge pixel (n,) belongs to: neighbours in a sector of directions.
 
     Sectors are laid twice, the second time between the first ones: a pixel takes the longer chain.
     """
-    number = np.full(shape[0] * shape[1], -1, dtype=np.int32)
-    number[at] = np.arange(len(at), dtype=np.int32)
-    links = []
-    for step in (1, shape[1] - 1, shape[1], shape[1] + 1):
-        other = number[at + step]
-        here = np.flatnonzero(other >= 0)
-        links.append((here, other[here]))
-    i, j = (np.concatenate(x) for x in zip(*links, strict=True))
+    n = len(at)
+    number = np.full(shape[0] * shape[1], n, dtype=np.int32)
+    number[at] = np.arange(n, dtype=np.int32)
+    neighbours = np.array([1, shape[1] - 1, shape[1], shape[1] + 1])
+    other = number.take(at[:, None] + neighbours).ravel()
+    links = np.flatnonzero(other < n)
+    i, j = links // len(neighbours), other.take(links).astype(np.intp)
     angle = np.arctan2(gradient[1], gradient[0]) * np.float32(0.5 * N_SECTORS / np.pi)
-    found = []
-    for shift in (0.0, 0.5):
+    begins, stops = [], []
+    for lay, shift in enumerate((0.0, 0.5)):
         sector = np.floor(angle + np.float32(shift)).astype(np.int8) % N_SECTORS
-        same = sector[i] == sector[j]
-        ends = i[same], j[same]
-        graph = coo_array((np.ones(len(ends[0]), dtype=np.int8), ends), shape=(len(at), len(at)))
-        chain = connected_components(graph, directed=False)[1]
-        found.append((chain, np.bincount(chain, minlength=1)[chain]))
-    (one, n_one), (two, n_two) = found
-    return np.asarray(np.where(n_two > n_one, 2 * two + 1, 2 * one), dtype=np.intp)
+        same = np.flatnonzero(sector.take(i) == sector.take(j))
+        begins.append(i.take(same) + lay * n)
+        stops.append(j.take(same) + lay * n)
+    chain = _components(np.concatenate(begins), np.concatenate(stops), 2 * n)
+    (one, two), (n_one, n_two) = (x.reshape(2, n) for x in (chain, np.bincount(chain).take(chain)))
+    return np.asarray(np.where(n_two > n_one, two, one), dtype=np.intp)
 
 
-def _edge_middles(slopes: Sequence[Image], at: IntArray, gradient: Samples) -> Array:
+def _components(i: IntArray, j: IntArray, n: int) -> IntArray:
+    """Return which connected component each of n nodes is in, by links from i to greater j."""
+    label: IntArray = np.arange(n)
+    while len(i):  # each round at least halves what still has links to others
+        above: IntArray = np.arange(n)
+        above[j] = i  # each node follows a lesser one, if it has a link to any
+        higher = above.take(above)
+        while not np.array_equal(higher, above):
+            above, higher = higher, higher.take(higher)
+        is_first = above == np.arange(n)
+        tree = (np.cumsum(is_first) - 1).take(above)
+        label, n = tree.take(label), int(np.count_nonzero(is_first))
+        i, j = tree.take(i), tree.take(j)
+        other = np.flatnonzero(i != j)
+        i, j = i.take(other), j.take(other)
+        i, j = np.minimum(i, j), np.maximum(i, j)
+    return label
+
+
+def _edge_middles(slopes: Image, at: IntArray, gradient: Samples) -> Array:
     """Return the points (2, n) next to pixels where light changes most, across their edges."""
-    width = slopes[0].shape[1]
-    level = np.abs(gradient[0]) >= np.abs(gradient[1])  # along x, else along y
+    height, width = slopes.shape[1:]
+    upright = np.abs(gradient[0]) < np.abs(gradient[1])  # light changes along y, else along x
+    place, step = at + upright * (height * width), np.where(upright, width, 1)
     before, here, after = (
-        np.abs(np.where(level, slopes[0].take(at + k), slopes[1].take(at + k * width)))
-        for k in (-1, 0, 1)
+        np.abs(slopes.take(place + k * step)).astype(np.float64) for k in (-1, 0, 1)
     )
     bend = np.maximum(2.0 * here - before - after, 1.0)  # of a parabola
-    off = np.clip(0.5 * (after.astype(np.float64) - before) / bend, -MAX_SUBPIXEL, MAX_SUBPIXEL)
+    off = np.clip(0.5 * (after - before) / bend, -MAX_SUBPIXEL, MAX_SUBPIXEL)
     y, x = np.divmod(at, width)
-    return np.stack([x + off * level, y + off * ~level])
+    return np.stack([x + off * ~upright, y + off * upright])
 
 
 def _straight(points: Array, gradient: Samples, chain: IntArray) -> Array:
@@ -147,48 +171,55 @@ def _straight(points: Array, gradient: Samples, chain: IntArray) -> Array:
 
     What bends is cut where it is farthest from the line between its ends.
     """
-    pixels, found = np.concatenate([points, gradient]), []
+    found = []
+    x, y = points
+    gx, gy = gradient.astype(np.float64)
     for _ in range(MAX_CUTS + 1):
         n = np.bincount(chain)
-        long = n[chain] >= MIN_PIXELS
-        pixels, chain = pixels[:, long], chain[long]
+        long = np.flatnonzero((n >= MIN_PIXELS).take(chain))
+        if len(long) < len(chain):
+            x, y, gx, gy, chain = (one.take(long) for one in (x, y, gx, gy, chain))
         if len(chain) == 0:
             break
-        first = np.flatnonzero(np.diff(chain, prepend=-1))
-        n = np.diff(first, append=len(chain))
-        own = np.repeat(np.arange(len(n)), n)
-        x, y, gx, gy = np.add.reduceat(pixels, first, axis=1) / n
-        dx, dy = pixels[0] - x[own], pixels[1] - y[own]
-        xx, xy, yy = np.add.reduceat(np.stack([dx * dx, dx * dy, dy * dy]), first, axis=1)
+        n = n[n >= MIN_PIXELS]
+        first = np.cumsum(n) - n
+        mx, my, mgx, mgy = (np.add.reduceat(one, first) / n for one in (x, y, gx, gy))
+        dx, dy = x - np.repeat(mx, n), y - np.repeat(my, n)
+        xx, xy, yy = (np.add.reduceat(one, first) for one in (dx * dx, dx * dy, dy * dy))
         turn = 0.5 * np.arctan2(2.0 * xy, xx - yy)
         u = np.stack([np.cos(turn), np.sin(turn)])
-        u *= np.where(u[1] * gx - u[0] * gy >= 0.0, 1.0, -1.0)  # the brighter side on the left
-        place = dx * u[0, own] + dy * u[1, own]
-        off = dy * u[0, own] - dx * u[1, own]
+        u *= np.where(u[1] * mgx - u[0] * mgy >= 0.0, 1.0, -1.0)  # the brighter side on the left
+        ux, uy = np.repeat(u, n, axis=1)
+        place, off = dx * ux + dy * uy, dy * ux - dx * uy
         is_straight = np.maximum.reduceat(np.abs(off), first) <= MAX_SAG
-        ends = [extreme.reduceat(place, first) for extreme in (np.minimum, np.maximum)]
-        lines = np.stack([np.stack([x, y]) + end * u for end in ends]).transpose(2, 0, 1)
+        ends = np.stack([one.reduceat(place, first) for one in (np.minimum, np.maximum)])
+        middle = np.stack([mx, my])
+        lines = (middle + ends[:, None] * u).transpose(2, 0, 1)
         found.append(lines[is_straight])
-        order = np.flatnonzero(~is_straight[own])
-        order = order[np.lexsort([place[order], own[order]])]
-        pixels, place, off, own = pixels[:, order], place[order], off[order], own[order]
-        if len(own) == 0:
+        bent = np.flatnonzero(np.repeat(~is_straight, n))
+        if len(bent) == 0:
             break
-        first = np.flatnonzero(np.diff(own, prepend=-1))
-        n = np.diff(first, append=len(own))
-        last = first + n - 1
-        slope = (off[last] - off[first]) / np.maximum(place[last] - place[first], 1e-9)
-        sag = (
-            off
-            - np.repeat(off[first], n)
-            - np.repeat(slope, n) * (place - np.repeat(place[first], n))
+        x, y, gx, gy, place, off = (one.take(bent) for one in (x, y, gx, gy, place, off))
+        n, ends = n[~is_straight], ends[:, ~is_straight]
+        first = np.cumsum(n) - n
+        # The pixel farthest from the line between the first and the last begins the second half.
+        begin, end = (off[_first_of(place, one, first, n)] for one in ends)
+        slope = (end - begin) / np.maximum(ends[1] - ends[0], 1e-9)
+        sag = np.abs(off - np.repeat(begin - slope * ends[0], n) - np.repeat(slope, n) * place)
+        cut = place[_first_of(sag, np.maximum.reduceat(sag, first), first, n)]
+        half = place >= np.repeat(cut, n)
+        chain = (2 * np.repeat(np.arange(len(n)), n) + half).astype(
+            np.min_scalar_type(len(points.T))
         )
-        sag = np.abs(sag)
-        # The first of the farthest pixels begins the second half.
-        farthest = np.flatnonzero(sag >= np.repeat(np.maximum.reduceat(sag, first), n))
-        cut = farthest[np.searchsorted(farthest, first)]
-        chain = 2 * np.repeat(np.arange(len(n)), n) + (np.arange(len(own)) >= np.repeat(cut, n))
+        order = np.argsort(chain, kind="stable")
+        x, y, gx, gy, chain = (one.take(order) for one in (x, y, gx, gy, chain))
     return np.concatenate([np.zeros((0, 2, 2)), *found])
+
+
+def _first_of(values: Array, value: Array, first: IntArray, n: IntArray) -> IntArray:
+    """Return where each group of n values from a first one on has its value for the first time."""
+    at = np.flatnonzero(values == np.repeat(value, n))
+    return at[np.searchsorted(at, first)]
 
 
 def _stretched(small: Grey) -> NDArray[np.uint8]:
@@ -196,9 +227,21 @@ def _stretched(small: Grey) -> NDArray[np.uint8]:
 
     What is darker than ``DARK`` of the brightest is mostly noise and keeps its distances.
     """
-    top = max(float(np.percentile(small[::4, ::4], 99.5)), 1.0)
-    light = 1.0 + np.clip(small, 0.0, top) / np.float32(DARK * top)
-    return np.asarray((255.0 / math.log1p(1.0 / DARK)) * cv2.log(light), dtype=np.uint8)
+    top = max(_quantile(small[::4, ::4], 0.995), 1.0)
+    light = np.clip(small, 0.0, np.float32(top))
+    light /= np.float32(DARK * top)
+    light += 1.0
+    cv2.log(light, dst=light)
+    light *= 255.0 / math.log1p(1.0 / DARK)
+    return light.astype(np.uint8)
+
+
+def _quantile(values: Image, part: float) -> float:
+    """Return the value that a part of values of any shape is below, between neighbours."""
+    k, share = divmod(part * (values.size - 1), 1.0)
+    near = int(k), min(int(k) + 1, values.size - 1)
+    low, high = np.partition(values, near, axis=None)[list(near)].tolist()
+    return float(low + share * (high - low))
 
 
 def _join(ends: Array) -> tuple[Array, Array]:
@@ -209,7 +252,8 @@ def _join(ends: Array) -> tuple[Array, Array]:
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
     middle = ends.mean(axis=1)
     # Segment j against the line of piece i, the longer one (pieces come longest first).
-    i, j = np.nonzero(np.triu(along @ along.T >= np.cos(MAX_TURN), 1))
+    i, j = np.nonzero(along @ along.T >= np.cos(MAX_TURN))
+    i, j = (x[i < j] for x in (i, j))
     to_ends = ends[j] - middle[i, None]
     offset = np.abs(np.einsum("nkx,nx->nk", to_ends, normal[i])).max(axis=1)
     place = np.einsum("nkx,nx->nk", to_ends, along[i])
@@ -218,8 +262,7 @@ def _join(ends: Array) -> tuple[Array, Array]:
     allowed = MAX_OFFSET * (1.0 + 0.5 * np.maximum(gap, 0.0) / length[i])
     near = (gap <= MAX_GAP * length[j]) & (offset <= np.minimum(allowed, 2 * MAX_OFFSET))
     i, j = i[near], j[near]
-    graph = coo_array((np.ones(len(i)), (i, j)), shape=(len(ends), len(ends)))
-    label: IntArray = np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)
+    label = _components(i, j, len(ends))
     order = np.argsort(label, kind="stable")
     found, covered = _fitted(ends[order], length[order], label[order])
     long = np.linalg.norm(found[:, 1] - found[:, 0], axis=1) >= MIN_LENGTH
@@ -294,27 +337,26 @@ class CandidatePairs:
 def find_candidate_pairs(segments: EdgeSegments, most: int = MAX_PAIRS) -> CandidatePairs:
     """Return the best pairs of edges that may be a cylinder."""
     ends, pixel = segments.ends, segments.pixel
-    i, j = np.triu_indices(len(ends), 1)
     along = ends[:, 1] - ends[:, 0]
     length = np.linalg.norm(along, axis=1)
     along = along / np.where(length > 0.0, length, 1.0)[:, None]
-    cosine = np.sum(along[i] * along[j], axis=1)
-    i, j, cosine = (x[np.abs(cosine) >= np.cos(MAX_CONVERGENCE)] for x in (i, j, cosine))
+    cosines = along @ along.T
+    i, j = np.nonzero(np.abs(cosines) >= np.cos(MAX_CONVERGENCE))
+    i, j = (x[i < j] for x in (i, j))
+    cosine = cosines[i, j]
     axis = along[i] * length[i, None] + np.sign(cosine)[:, None] * along[j] * length[j, None]
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     across = np.stack([-axis[:, 1], axis[:, 0]], axis=1)
-    origin = 0.5 * (ends[i].mean(axis=1) + ends[j].mean(axis=1))
+    middle = 0.5 * (ends[:, 0] + ends[:, 1])
+    origin = 0.5 * (middle[i] + middle[j])
+    frame = np.stack([axis, across], axis=2)
     spans, lines = [], []
     for edge in (i, j):
-        to_ends = ends[edge] - origin[:, None]
-        t, v = np.einsum("nkx,nx->nk", to_ends, axis), np.einsum("nkx,nx->nk", to_ends, across)
+        t, v = ((ends[edge] - origin[:, None]) @ frame).transpose(2, 0, 1)
         slope = (v[:, 1] - v[:, 0]) / (t[:, 1] - t[:, 0])
-        spans.append(np.sort(t, axis=1))
+        spans.append((np.minimum(t[:, 0], t[:, 1]), np.maximum(t[:, 0], t[:, 1])))
         lines.append((v[:, 0] - slope * t[:, 0], slope))
-    first, last = (
-        np.maximum(spans[0][:, 0], spans[1][:, 0]),
-        np.minimum(spans[0][:, 1], spans[1][:, 1]),
-    )
+    first, last = np.maximum(spans[0][0], spans[1][0]), np.minimum(spans[0][1], spans[1][1])
     overlap = last - first
     longer = np.maximum(length[i], length[j])
     offsets = [at + slope * np.stack([first, last]) for at, slope in lines]  # each (2, n)
@@ -350,13 +392,15 @@ def find_candidate_pairs(segments: EdgeSegments, most: int = MAX_PAIRS) -> Candi
 
 def _best(merit: Array, i: IntArray, j: IntArray, n_edges: int, most: int) -> IntArray:
     """Return the best pairs, few of each edge: more than wanted, some of them may be alike."""
-    used = np.zeros(n_edges, dtype=np.intp)
-    chosen: list[int] = []
-    for k in np.argsort(-merit, kind="stable").tolist():
-        if merit[k] <= 0.0 or len(chosen) == 2 * most:
+    order = np.argsort(-merit, kind="stable")
+    order = order[merit[order] > 0.0]
+    used, chosen = [0] * n_edges, list[int]()
+    for k, one, two in zip(order.tolist(), i[order].tolist(), j[order].tolist(), strict=True):
+        if len(chosen) == 2 * most:
             break
-        if max(used[i[k]], used[j[k]]) < MAX_PAIRS_OF_EDGE:
-            used[[i[k], j[k]]] += 1
+        if max(used[one], used[two]) < MAX_PAIRS_OF_EDGE:
+            used[one] += 1
+            used[two] += 1
             chosen.append(k)
     return np.array(chosen, dtype=np.intp)
 
@@ -375,6 +419,7 @@ def _distinct(start: Array, stop: Array, width: Array) -> BoolArray:
     alike &= (middle > 0.0) & (middle < length[:, None])
     alike &= np.abs(width[None, :] - width[:, None]) <= DUPLICATE[1] * width[:, None]
     kept = np.ones(len(start), dtype=np.bool_)
-    for j in range(1, len(start)):
-        kept[j] = not np.any(alike[:j, j] & kept[:j])
+    for i in range(len(start)):
+        if kept[i]:
+            kept[i + 1 :] &= ~alike[i, i + 1 :]
     return kept
