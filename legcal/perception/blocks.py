@@ -37,7 +37,7 @@ BEND = (0, 1, 4)  # functions of the limb model without an edge
 MAX_STEP = 0.8  # largest step of a block [px]
 
 TUKEY = 4.0  # width of the biweight: blocks beyond have no weight [standard deviations]
-N_ROUNDS = 10
+N_ROUNDS, CONVERGED_LINE = 10, 1e-3  # of weights: at most, and until no end moves more [px]
 N_SCALES = 3  # rounds in which the scale of the scatter is estimated
 MIN_SCATTER = 0.01  # added to the standard deviation of a block [px]
 COMMON_BIAS, TILT_BIAS = 0.03, 0.02  # of the outline model: of both ends, of each end [px]
@@ -415,7 +415,7 @@ def fit_lines(
         step = np.abs(after - ends).max(axis=1)
         ends[moving], robust[moving] = after[moving], counted[moving]
         if turn >= N_SCALES:
-            moving &= step >= 1e-4
+            moving &= step >= CONVERGED_LINE
         if not np.any(moving):
             break
     on_line = robust > 0.0

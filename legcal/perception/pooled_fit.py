@@ -13,6 +13,7 @@ import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.blocks import Blocks
+from legcal.perception.light import Samples
 from legcal.perception.limb import N_AMPLITUDES, N_POWERS, powers, profile_functions
 from legcal.perception.pixel_sums import PixelBins, PixelSums, even_weights, medians, noise_ratios
 
@@ -37,10 +38,9 @@ ODD_NOISE = (1.5, 4.0)  # of a typical block, from where on one counts less, and
 MIN_NOISE = 0.05  # variance of grey levels [grey levels^2]
 NOISE_ROUNDS, NOISE_CONVERGED = 3, 0.2  # of its estimate, at most; and of its logarithm
 MIN_LIGHT = 1e-3  # of the mean light of a block
-UNKNOWN_SIGMA = 1e3  # standard deviation of what is not known
 
 COMMON_BLUR_SIGMA = 0.03  # of the logarithm of the blur of an outline, about that of the image
-FIRST_ROUNDS, LAST_ROUNDS = 1, 8  # at most
+ROUNDS = 8  # at most
 
 ONE, OTHER = (0, 1, 2, 1, 2, 2), (0, 0, 0, 1, 1, 2)  # pairs of polynomials
 SHIFT, BLUR, N_UNKNOWNS = N_AMPLITUDES, N_AMPLITUDES + 1, N_AMPLITUDES + 2  # unknowns of a block
@@ -85,17 +85,15 @@ def fit_pooled(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> Po
     at = pool.first_amplitudes(
         _Iterate(np.zeros((n, N_ALONG, N_AMPLITUDES)), np.zeros((n, 2)), np.full(n, prior[0]))
     )
-    for _ in range(FIRST_ROUNDS):
-        pool.look(at)
-        equations = pool.equations(at)
-        inverse = pool.inverse(equations, *prior)
-        at = pool.step(at, equations, inverse, *prior)
+    equations = pool.equations(at)
+    inverse = pool.inverse(equations, *prior)
+    at = pool.step(at, equations, inverse, *prior)
     even, sigma = _common_blur(at.log_blur, inverse[:, BLUR, BLUR], pool.seen)
     at = at._replace(log_blur=np.full(n, even))
     sigma = float(np.hypot(sigma, COMMON_BLUR_SIGMA))
     inverse = _with_blur(inverse, sigma**-2 - prior[1] ** -2)
     prior = even, sigma
-    for _ in range(LAST_ROUNDS):
+    for _ in range(ROUNDS):
         if pool.look(at, MAX_MOVE):
             equations = pool.equations(at)
             inverse = pool.inverse(equations, *prior)
@@ -105,7 +103,7 @@ def fit_pooled(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> Po
     pool.look(at)
     equations = pool.equations(at)
     inverse = pool.inverse(equations, *prior)
-    by_gamma = pool.shifts_by_gamma(equations, inverse, sigma)
+    by_gamma = pool.response(_changed_by_gamma(blocks), equations, inverse, sigma)
     at = pool.step(at, equations, inverse, *prior)
     at_ends = np.array([[1.0, -1.0], [1.0, 1.0]])
     line = [SHIFT, N_UNKNOWNS + SHIFT]
@@ -353,17 +351,15 @@ class _Pool:
         precision[:, 0, BLUR] = sigma**-2
         return precision
 
-    def shifts_by_gamma(self, equations: _Equations, inverse: Array, sigma: float) -> Array:
-        """Return how far the middles (n_edges,) of outlines move inside with ln gamma [px], or NaN.
+    def response(
+        self, change: Samples, equations: _Equations, inverse: Array, sigma: float
+    ) -> Array:
+        """Return how far middles of outlines move inside with a nuisance, (n_edges,) [px] or NaN.
 
-        With the covariance of unknowns (n_edges, k, k), the logarithm of the blur known to sigma.
+        One that changes the light of pixels (n_blocks, m) of all blocks; ``inverse`` is the
+        covariance of unknowns (n_edges, k, k), with the logarithm of the blur known to sigma.
         """
         blocks = self.blocks
-        light = blocks.light + blocks.level.astype(np.float32)[blocks.edge][:, None]
-        weights = np.maximum(blocks.weight.sum(axis=1), np.float32(1e-9))
-        of_block = np.einsum("nm,nm->n", light, blocks.weight) / weights
-        of_block = np.maximum(of_block, np.float32(1e-9))[:, None]
-        change = light * np.log(np.maximum(light / of_block, np.float32(MIN_LIGHT)))
         if self.bins is None:
             first = np.flatnonzero(np.diff(self.joined, prepend=-1))
             own = blocks.bins(self.blur).light(change)[self.usable]
@@ -374,7 +370,6 @@ class _Pool:
         changes = replace(self.sums, light=changed * share[:, None])
         with_light = changes.with_light(*self._powers(), self.bounds)
         target = self._eliminated(equations, with_light).reshape(len(self.half_width), -1)
-
         found = _applied(inverse, target)
         # The blurs of an image change alike: by as much as edges say whose blur is not known.
         known, of_blur = sigma**-2, inverse[:, :, BLUR]
@@ -407,6 +402,15 @@ class _Pool:
         for edge, (first, last) in enumerate(pairwise(self.bounds)):
             np.matmul(weight[first:last].T, flat[first:last], out=sums[edge])
         return sums.reshape(n, k, *values.shape[1:])
+
+
+def _changed_by_gamma(blocks: Blocks) -> Samples:
+    """Return how the light of all pixels changes with ln gamma, (n, m)."""
+    light = blocks.light + blocks.level.astype(np.float32)[blocks.edge][:, None]
+    weights = np.maximum(blocks.weight.sum(axis=1), np.float32(1e-9))
+    of_block = np.einsum("nm,nm->n", light, blocks.weight) / weights
+    of_block = np.maximum(of_block, np.float32(1e-9))[:, None]
+    return np.asarray(light * np.log(np.maximum(light / of_block, np.float32(MIN_LIGHT))))
 
 
 def _joined(counts: IntArray) -> IntArray:
