@@ -405,7 +405,7 @@ def _with_nominal_axes(
 def _check_covariance(
     path: Path, estimated: Sequence[ParameterRow], sigma: Array, document: Result
 ) -> None:
-    """Refuse a covariance that is none of the estimated parameters."""
+    """Refuse a covariance that cannot be that of the estimated parameters."""
     n, found = len(estimated), document.covariance
     needed = f"a covariance of the {n} estimated parameters that fits their sigmas"
     if n == 0 or len(found) != n or any(len(row) != n for row in found):

@@ -61,7 +61,7 @@ class Check:
     Attributes
     ----------
     dataset : Dataset
-        The new images; its ``mechanism`` is the calibrated model of the earlier result.
+        The new images; its ``machine`` is the calibrated model of the earlier result.
     earlier : EarlierResult
         What was tested.
     solution : Solution
@@ -171,7 +171,7 @@ def check(
     Raises
     ------
     UsageError
-        If the significance is none.
+        If the significance is out of range.
     DatasetError, ModelError, OutOfClass
         If images or result are malformed, or of different machines.
     NotVisible, NotIdentifiable, DidNotConverge

@@ -40,7 +40,7 @@ MAX_ANGLE = {"psi": 0.5 * math.pi, "theta": math.pi}  # [rad]
 ANGLE_ROUNDING = 1e-3  # [rad]; as of 3.142
 MAX_DISTANCE = 1000.0  # [m] of M_LS from the camera centre
 SIGMA_RANGE = (1e-9, 1.0)  # [rad] or [m]: no axis is known better, and worse says nothing
-MIN_UPRIGHT = 1e-4  # component along the image y axis: M_LS is known, with less it runs away
+MIN_UPRIGHT = 1e-4  # component along the image y axis: below it M_LS is undetermined
 COLUMNS = (
     *(Column(name, "text") for name in ("view", "image", "leg")),
     *(

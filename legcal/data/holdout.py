@@ -31,7 +31,7 @@ def split_images(dataset: Dataset, fraction: float) -> tuple[IntArray, IntArray]
     wanted = max(1, round(fraction * measurements.n_rows))
     most = np.minimum(np.ceil(fraction * shown.sum(axis=0)), shown.sum(axis=0) - 1)
     held_out = np.zeros(measurements.n_rows, dtype=np.bool_)
-    for pose in _poses_by_chance(dataset):
+    for pose in _shuffled_poses(dataset):
         tried = held_out | (measurements.pose == pose)
         fits = np.all(shown[tried].sum(axis=0) <= np.maximum(most, 0.0))
         if fits and tried.sum() <= wanted:
@@ -59,8 +59,8 @@ def dataset_at(dataset: Dataset, rows: IntArray) -> Dataset:
     )
 
 
-def _poses_by_chance(dataset: Dataset) -> IntArray:
-    """Return all poses in an order of chance that does not depend on the order of the rows."""
+def _shuffled_poses(dataset: Dataset) -> IntArray:
+    """Return all poses in a random order that does not depend on the order of the rows."""
     measurements = dataset.measurements
     rows = canonical_order(measurements, dataset.machine.leg_names).rows
     poses = np.array(list(dict.fromkeys(measurements.pose[rows].tolist())), dtype=np.intp)

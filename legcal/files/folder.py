@@ -130,7 +130,7 @@ RESULT = OutputKind("result", "result.json", "legcal_result")
 
 
 def output_path(output: str | Path, kind: OutputKind = RESULT) -> Path:
-    """Return the path of an output folder; an empty text is none, where a path would be "."."""
+    """Return the path of an output folder; refuse an empty text, which as a path would be "."."""
     if output == "":
         raise UsageError(
             f"The {kind.noun} could not be written: found an empty text, needed the path of a "

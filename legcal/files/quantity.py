@@ -146,5 +146,5 @@ def _prior(value: float, sigma: float, dimension: str = "") -> Quantity:
 
 
 def _is_number(value: object) -> bool:
-    """Say whether something is a real number; true is none."""
+    """Say whether something is a real number; booleans are not."""
     return isinstance(value, Real) and not isinstance(value, bool)

@@ -123,7 +123,7 @@ class Document(BaseModel):
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML: keys are text, repeated keys are refused, 2e-6 is a number and 6:25 is none.
+    """Safe YAML: keys are text, repeated keys are refused, 2e-6 is a number and 6:25 is not.
 
     Values are counted while they are read: merge keys and lists can name more than memory holds.
     """

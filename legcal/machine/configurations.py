@@ -60,7 +60,7 @@ class Configurations(NamedTuple):
     Attributes
     ----------
     configurations : (count, nq) array
-        Of the closed chain.
+        Joint values of the closed chain.
     readings : (count, n_legs) array
         Joint value of every leg [m], passive ones too; zero for legs of constant length.
     poses : list of RigidTransform
@@ -88,7 +88,7 @@ def random_configurations(
     count : int
         How many.
     rng : Generator or int
-        Source of chance, or its seed.
+        Random generator, or its seed.
 
     Returns
     -------
@@ -100,9 +100,9 @@ def random_configurations(
     DidNotConverge
         If too few are reached.
     """
-    chance = np.random.default_rng(rng)
+    generator = np.random.default_rng(rng)
     draw = _drawn if mechanism.is_determined else _wandered
-    found = list(draw(mechanism, count, chance))
+    found = list(draw(mechanism, count, generator))
     _require(mechanism, count, len(found))
     return Configurations(
         np.array(found).reshape(count, mechanism.chain.nq),
@@ -162,14 +162,14 @@ def workspace(machine: Machine) -> tuple[Array, list[RigidTransform]]:
     return readings[:, [names.index(name) for name in machine.leg_names]], poses
 
 
-def _drawn(machine: Machine, count: int, chance: np.random.Generator) -> Iterator[Array]:
+def _drawn(machine: Machine, count: int, generator: np.random.Generator) -> Iterator[Array]:
     """Yield what is reached from home at random readings of the motors."""
     drawn = 0
     for turn in range(count):
         if turn == MAX_FAILED and not drawn:
             return
         for tries, share in enumerate(SHARES):
-            (q,) = _random_readings(machine, chance, [share])
+            (q,) = _random_readings(machine, generator, [share])
             reached = _reached_on_the_chain(machine, q, tries)
             if reached is not None:
                 drawn += 1
@@ -178,7 +178,7 @@ def _drawn(machine: Machine, count: int, chance: np.random.Generator) -> Iterato
 
 
 def _drawn_poses(
-    machine: Machine, count: int, chance: np.random.Generator
+    machine: Machine, count: int, generator: np.random.Generator
 ) -> Iterator[tuple[Array, Array]]:
     """Yield readings (n_legs,) and pose (3, 4) of what :func:`_drawn` yields.
 
@@ -192,9 +192,9 @@ def _drawn_poses(
         for tries, share in enumerate(SHARES):
             if not ahead:
                 ahead += _reached(
-                    machine, _random_readings(machine, deepcopy(chance), np.ones(count - turn))
+                    machine, _random_readings(machine, deepcopy(generator), np.ones(count - turn))
                 )
-            (q,) = _random_readings(machine, chance, [share])
+            (q,) = _random_readings(machine, generator, [share])
             readings, pose, is_reached = ahead.pop(0)
             if share < 1.0 or not is_reached:
                 configuration = _reached_on_the_chain(machine, q, tries)
@@ -208,13 +208,13 @@ def _drawn_poses(
 
 
 def _random_readings(
-    machine: Machine, chance: np.random.Generator, shares: Sequence[float] | Array
+    machine: Machine, generator: np.random.Generator, shares: Sequence[float] | Array
 ) -> Array:
     """Return random readings of the motors, each in a share of the travel about home."""
     motors = list(machine.motors)
     lower, upper = np.array([machine.legs[j].travel for j in motors]).T
     home = machine.home_configuration[slider_columns(machine, motors)[0]]
-    q = chance.uniform(lower, upper, (len(shares), len(motors)))
+    q = generator.uniform(lower, upper, (len(shares), len(motors)))
     share = np.asarray(shares)[:, None]
     return np.where(share < 1.0, np.clip(home + share * (q - home), lower, upper), q)
 
@@ -253,22 +253,22 @@ def _reached(machine: Machine, q: Array) -> Iterator[tuple[Array, Array, bool]]:
     return zip(readings, poses, usable.tolist(), strict=True)
 
 
-def _wandered(machine: Machine, count: int, chance: np.random.Generator) -> Iterator[Array]:
+def _wandered(machine: Machine, count: int, generator: np.random.Generator) -> Iterator[Array]:
     """Yield every few steps of a random walk whose sliders stay inside their travel."""
     here = machine.home_configuration
     for _ in range(count):
         for _ in range(MAX_DRAWS):
-            here = random_walk(machine, here, chance)
+            here = random_walk(machine, here, generator)
             if not beyond_travel(machine, here).any():
                 yield here
                 break
 
 
-def random_walk(machine: Machine, here: Array, chance: np.random.Generator) -> Array:
+def random_walk(machine: Machine, here: Array, generator: np.random.Generator) -> Array:
     """Return a closed configuration a few steps away, no further outside the travel."""
     for _ in range(WALK):
         motions = free_motions(machine, here)
-        weights = chance.normal(size=motions.shape[1]) / np.sqrt(max(motions.shape[1], 1))
+        weights = generator.normal(size=motions.shape[1]) / np.sqrt(max(motions.shape[1], 1))
         there = project(machine, machine.chain.integrate(here, STRIDE * motions @ weights))
         if there is None:
             continue

@@ -46,7 +46,7 @@ class LegType:
 
 
 def leg_type(text: str) -> LegType | None:
-    """Return the leg type of a text such as ``UPS``; None if it is none."""
+    """Return the leg type of a text such as ``UPS``; None for any other text."""
     match = _TYPE.fullmatch(text)
     if match is None or not (match[2] or match[3]):
         return None

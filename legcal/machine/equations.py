@@ -52,7 +52,9 @@ class PoseEquations:
     def by_parameters(self, parametrization: Parametrization) -> Array:
         """Return the derivatives by parameters, (k, m, p)."""
         k, m, _ = self.by_local.shape
-        wide = np.zeros((k, m, len(parametrization) + 1))  # the last one for what is none
+        wide = np.zeros(
+            (k, m, len(parametrization) + 1)
+        )  # the last one for numbers that are no parameters
         wide[:, np.arange(m)[:, None], parametrization.place[self.leg]] = self.by_local
         return wide[..., :-1]
 

@@ -431,7 +431,7 @@ def completed(source: Source) -> Source:
 def closed_near(chain: ClosedChain, start: Array, links: Sequence[str]) -> Array | None:
     """Return a closed configuration near a given one, or None where none was found.
 
-    Of what several starts find, the one is taken where links have turned least.
+    Among those that several starts lead to, the one with the smallest rotations of links.
     """
     if _off(chain, start) <= CLOSED:
         return start

@@ -69,9 +69,9 @@ def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
 def home_at_mid_travel(machine: Machine) -> RigidTransform:
     """Return a pose where every leg is at the middle of its travel.
 
-    Of all that seeded starts find, the one that turns the platform least is taken, and of the
-    mirror images in the plane of the base joints the one on the positive side of the base's z.
-    Legs without a motor take the length that is left to them, inside their travel if possible.
+    Among the poses that seeded starts lead to, the one with the smallest rotation of the platform
+    is taken, and among mirror images in the plane of the base joints the one on the positive side
+    of the base's z. Lengths of legs without a motor follow, inside their travel if possible.
 
     Raises
     ------

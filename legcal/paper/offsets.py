@@ -197,7 +197,7 @@ def _constant_distance() -> ca.Function:
 
 
 def _check_any(found: Sequence[object], missing: str) -> None:
-    """Refuse an empty criterion; *missing* is what there is none of."""
+    """Refuse a criterion without observations; *missing* says which are missing."""
     if not found:
         raise NotIdentifiable(
             f"The offsets could not be identified: no {missing}; needed images at different poses "

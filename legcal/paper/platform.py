@@ -152,7 +152,7 @@ class RigidProblem:
         return cls(machine, unknowns, directions, poses, in_base, of_A, sigma_q)
 
     def index(self, rows: IntArray) -> IntArray:
-        """Return the places of the local unknowns of :mod:`leg_equations`, (k, 15)."""
+        """Return the places of the local unknowns of :mod:`legcal.paper.leg_equations`, (k, 15)."""
         free = np.arange(6) if self.machine.spatial else _IN_PLANE
         first = len(self.unknowns) + (free.max() + 1) * self.poses.pose[rows, None]
         steps = np.where(free >= 0, first + free, -1)

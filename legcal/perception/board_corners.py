@@ -272,7 +272,7 @@ def _search_chessboard(
 ) -> tuple[IntArray, Array]:
     """Return numbers (k,) and rough places (k, 2) [px] of the corners: all of them, or none.
 
-    A part of a larger chessboard is none: nobody can tell which part.
+    A part of a larger chessboard does not count, as nothing shows which part it is.
     """
     grid = _inner_corners(grey, board.grid)
     if grid is None or _continues(grid, grey):
@@ -556,7 +556,7 @@ def _other_squares(board: Board, grey: Grey) -> str | None:
     if _continues(grid, grey):
         return "a part of a chessboard of more squares"
     nx, ny = board.grid
-    sides = (grid.shape[:2], grid.shape[1::-1])  # nobody sees which side the columns are along
+    sides = (grid.shape[:2], grid.shape[1::-1])  # either side may be the one with the columns
     x, y = min(sides, key=lambda side: (abs(side[0] - nx) + abs(side[1] - ny), abs(side[0] - nx)))
     seen = f"a chessboard of {x + 1} x {y + 1} squares"
     return seen + (" or that part of one" if x <= nx and y <= ny else "")

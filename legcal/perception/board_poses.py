@@ -224,8 +224,8 @@ def _require_still(
 ) -> None:
     """Refuse images of a view in which the board stands elsewhere than in most of them.
 
-    By the pose of each image alone, by its row; ``scale`` is by how much residuals exceed the
-    standard deviations of corners, ``names`` what each row is called.
+    ``single`` are the poses of single images, by row; residuals are ``scale`` times the standard
+    deviations of corners; ``names`` are those of the rows.
     """
     rows = list(single)
     if len(rows) < 2:

@@ -3,7 +3,7 @@
 Two pairs taken for two legs suggest a pose; thousands are judged by one picture, the better ones
 refined and scored by more, the best by all. A pose is accepted where enough legs match and no other
 pose comes near it. A pose is found for mirrored images of many machines as well, with fewer legs on
-their pairs: so one at which many legs are missing is held against the best one of the images with
+their pairs: so one at which many legs are missing is compared with the best one of the images with
 left and right exchanged.
 """
 
@@ -381,7 +381,7 @@ def mirrored(pictures: Sequence[Picture]) -> list[Picture]:
 
 
 def may_be_mirrored(own: PoseCandidates) -> bool:
-    """Say whether a placed view needs to be held against its mirror image."""
+    """Say whether a placed view needs to be compared with its mirror image."""
     return not own.is_convincing or own.share < NOT_MIRRORED_SUPPORT
 
 

@@ -85,8 +85,8 @@ def find_wrong_images(
 ) -> tuple[Placement, dict[int, str]]:
     """Return the placement with notes, and why images are left out, by row.
 
-    Of the rows searched, some with defects by themselves. Views all of whose images have one are
-    not placed, with one note.
+    ``rows`` were searched; ``defects`` are what is wrong with single images. A view all of whose
+    images have one is not placed, with one note.
     """
     view = search.measurements.view
     usable = [row for row in rows.tolist() if row not in defects]
@@ -185,7 +185,7 @@ def share_shown(
 ) -> float:
     """Return the share of the legs, by visible length, that an image shows where they should be.
 
-    Of the legs that its view is stated to show, or of others; the view must have been placed.
+    By default of the legs that its view is stated to show; the view must have been placed.
     """
     view = int(search.measurements.view[row])
     picture = _picture(search, search.pairs(row, view), row, view, legs)

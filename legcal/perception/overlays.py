@@ -86,7 +86,7 @@ def marks_of_image(
 ) -> list[PartMarks]:
     """Return what is drawn over an image, one entry for each part of a leg in it.
 
-    By its outlines, and where its legs should be.
+    From its outlines and the predicted legs.
     """
     of_leg = {leg.leg: leg for leg in predicted}
     several = {leg.leg for leg in predicted if len(leg.segments) > 1}

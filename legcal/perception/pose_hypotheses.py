@@ -1,8 +1,8 @@
 """Camera poses that two edge pairs suggest, each taken for a leg.
 
-A pair taken for a leg gives its axis but for how much it leans towards the camera, and by its width
-how far it is; what is left is a turn about that axis, which lays a second leg into the plane of a
-second pair. Many poses per picture come out of it, most of them wrong.
+A pair that is assigned to a leg gives its axis, except for its lean towards the camera, and by its
+width its distance. The turn about that axis follows from a second pair: it lays a second leg into
+the plane of that pair. A picture gives many poses in this way, most of them wrong.
 """
 
 from typing import NamedTuple
@@ -31,7 +31,7 @@ MAX_POSES = 3000  # poses of a picture
 
 
 class _Firsts(NamedTuple):
-    """Pairs taken for legs, each with a lean: all about a start but the turn and the place."""
+    """Pairs assigned to legs, each with a lean; the turn about the leg and the place are open."""
 
     u: Array  # (n, 3) direction in the camera frame, from base to platform
     P: Array  # (n, 3) where the middle of the segment is put [m]

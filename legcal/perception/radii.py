@@ -101,9 +101,8 @@ def estimate_radii(
 ) -> RadiusFactors:
     """Return the radii that differ from the model.
 
-    By views, pictures of them, and T_camera_base where they put the camera; ``different`` is the
-    logarithm of the factor from which on a radius is another one, ``alone`` that all parts cannot
-    differ alike.
+    ``views`` are views, their pictures, and T_camera_base. A radius differs from a factor on whose
+    logarithm is ``different``; with ``alone`` the parts do not share a factor.
     """
     samples: dict[LegRadius, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for view, pictures, placed in views:
@@ -193,7 +192,7 @@ def _logarithms(
 ) -> list[tuple[LegRadius, float]]:
     """Return the logarithms of the widths of a picture's pairs against the model's.
 
-    By the scores (n_segments,) of its segments with pairs at a pose.
+    ``score`` and ``pair`` (n_segments,) are those of its segments at a pose.
     """
     targets = picture.targets
     if len(targets) == 0 or len(picture.pairs) == 0:

@@ -134,11 +134,11 @@ def simulate(
     check_dataset_destination(destination, force=force)
     nominal = model if isinstance(model, Machine) else load_mechanism(model)
     _check_readings(nominal, settings)
-    chance = streams(settings.seed)
+    rngs = streams(settings.seed)
     with dataset_folder(destination, force=force) as folder:
         yaml_path, _ = write_model(nominal, folder)
-        truth = write_true_model(nominal, settings.errors, chance["errors"], folder / TRUTH)
-        session = simulate_session(truth, nominal, settings, chance, progress)
+        truth = write_true_model(nominal, settings.errors, rngs["errors"], folder / TRUTH)
+        session = simulate_session(truth, nominal, settings, rngs, progress)
         m, legs = session.measurements, truth.leg_names
         board = None if session.board is None else session.board.document()
         if board is not None and not settings.board_pose:
@@ -159,7 +159,7 @@ def simulate(
         if session.corners is not None:
             write_corners(folder / CORNERS_NAME, session.corners, m)
         if settings.level is Level.PHOTOGRAPHS:
-            _write_photographs(folder, session, settings, chance, workers, progress)
+            _write_photographs(folder, session, settings, rngs, workers, progress)
         files = [*files_in(folder), TRUTH_NAME]
         write_truth(folder / TRUTH_NAME, session, settings, files)
     seen = [[leg.is_seen for leg in shown] for shown in session.scene.images.shown]
@@ -181,7 +181,7 @@ def _write_photographs(
     folder: Path,
     session: SimulatedSession,
     settings: SimulationSettings,
-    chance: Streams,
+    rngs: Streams,
     workers: int,
     progress: Report,
 ) -> None:
@@ -189,7 +189,7 @@ def _write_photographs(
     names = session.measurements.image
     (folder / "images").mkdir()
     progress("Photographs", 0, len(names))
-    rendered = photographs(session, settings.appearance, chance["photographs"], workers)
+    rendered = photographs(session, settings.appearance, rngs["photographs"], workers)
     with closing(rendered):
         for done, (row, png) in enumerate(rendered, 1):
             (folder / names[row]).write_bytes(png)

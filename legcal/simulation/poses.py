@@ -53,9 +53,9 @@ _REGULAR_NOMINAL = 0.05  # of the nominal model's singularity measure at home
 _MAX_ROUNDS = 20  # of draws for poses that the nominal model does not reach
 
 
-def near_ends(end: IntArray, chance: Array) -> Array:
+def near_ends(end: IntArray, draws: Array) -> Array:
     """Return places in the travel, 0 the shortest and 1 the longest, near given ends of it."""
-    return np.asarray(np.abs(end - JITTER * chance))
+    return np.asarray(np.abs(end - JITTER * draws))
 
 
 def are_extreme(machine: Machine, readings: Array) -> BoolArray:

@@ -58,7 +58,7 @@ _FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # for colours; grey levels are written
 
 
 def streams(seed: int) -> dict[str, np.random.Generator]:
-    """Return a source of chance for every purpose; what one draws leaves the others alone."""
+    """Return a random generator for each purpose: draws for one do not change the others."""
     children = np.random.SeedSequence(seed).spawn(len(_PURPOSES))
     return {
         name: np.random.default_rng(child) for name, child in zip(_PURPOSES, children, strict=True)
@@ -87,7 +87,7 @@ def simulate_session(
     truth: Machine,
     nominal: Machine,
     settings: SimulationSettings,
-    chance: Streams,
+    rngs: Streams,
     progress: Report = no_progress,
 ) -> SimulatedSession:
     """Return a session of a true machine of which the nominal model is known."""
@@ -96,9 +96,7 @@ def simulate_session(
     n_sets = 1 if shared else len(cameras)
     if isinstance(settings.poses, int):
         n_poses = settings.poses * n_sets
-        poses = commanded_poses(
-            truth, nominal, n_poses, chance["poses"], settings.sampling, progress
-        )
+        poses = commanded_poses(truth, nominal, n_poses, rngs["poses"], settings.sampling, progress)
     else:
         poses = given_poses(truth, settings.poses)
     settings.check_images(len(cameras), len(poses.poses) // n_sets)
@@ -110,7 +108,7 @@ def simulate_session(
     groups: tuple[str, ...] = ()
     if board is None:
         views = (
-            given or cameras_around(truth, posed_machines, cameras, chance["cameras"], progress)[0]
+            given or cameras_around(truth, posed_machines, cameras, rngs["cameras"], progress)[0]
         )
     elif given:
         placed, views = board_before(board, truth, posed_machines, given), given
@@ -121,13 +119,11 @@ def simulate_session(
             for p in _poses_of(v, n_sets, posed_machines)
         ]
         bodies = in_turn if settings.hand_held else posed_machines
-        placed, views = board_and_cameras(
-            board, truth, bodies, cameras, chance["cameras"], progress
-        )
+        placed, views = board_and_cameras(board, truth, bodies, cameras, rngs["cameras"], progress)
     if placed is not None:
         posed_machines = tuple(placed.beside(posed) for posed in posed_machines)
     if placed is not None and settings.hand_held:
-        views, groups = _in_hand(truth, posed_machines, n_sets, cameras, placed, chance, progress)
+        views, groups = _in_hand(truth, posed_machines, n_sets, cameras, placed, rngs, progress)
     if settings.level is Level.PHOTOGRAPHS:
         views = _encoding(views, settings.appearance.gamma, settings.tell_gamma)
     poses_of = [
@@ -146,17 +142,17 @@ def simulate_session(
     outlines = axes = corners = None
     if settings.level is Level.OUTLINES:
         noise = OutlineNoise(settings.sigma_px, n_points=None)
-        outlines = outlines_of(scene, noise, chance["observations"])
+        outlines = outlines_of(scene, noise, rngs["observations"])
     elif settings.level is Level.AXES:
-        axes = axes_in_images(scene, settings.table, chance["observations"])
+        axes = axes_in_images(scene, settings.table, rngs["observations"])
     if placed is not None and settings.level is not Level.PHOTOGRAPHS:
         corners = corners_in_images(
-            scene, posed_machines, placed, settings.sigma_px, chance["corners"]
+            scene, posed_machines, placed, settings.sigma_px, rngs["corners"]
         )
     width = max(2, len(str(len(poses.poses))))
     labels = tuple(f"p{k + 1:0{width}d}" for k in range(len(poses.poses)))
     measurements = _recorded(
-        truth, poses, labels, scene, settings, chance, hints=settings.hints and not groups
+        truth, poses, labels, scene, settings, rngs, hints=settings.hints and not groups
     )
     return SimulatedSession(
         measurements, outlines, axes, corners, truth, poses, labels, posed_machines, scene,
@@ -191,7 +187,7 @@ def _in_hand(
     n_sets: int,
     cameras: Mapping[str, Camera],
     placed: PlacedBoard,
-    chance: Streams,
+    rngs: Streams,
     progress: Report,
 ) -> tuple[tuple[Viewpoint, ...], tuple[str, ...]]:
     """Return a place for each image from which it shows board and legs, and the view of each."""
@@ -201,7 +197,7 @@ def _in_hand(
     for v, (name, camera) in enumerate(cameras.items()):
         for k, pose in enumerate(_poses_of(v, n_sets, posed_machines)):
             progress("Camera places", len(views), n_images)
-            T = camera_in_hand(truth, posed_machines[pose], camera, chance["cameras"], placed)
+            T = camera_in_hand(truth, posed_machines[pose], camera, rngs["cameras"], placed)
             if T is None:
                 raise NotVisible(
                     f"view {name}: a camera in the hand could not be placed: found none of "
@@ -243,7 +239,7 @@ def _recorded(
     labels: Sequence[str],
     scene: Scene,
     settings: SimulationSettings,
-    chance: Streams,
+    rngs: Streams,
     *,
     hints: bool,  # whether the dataset says roughly where cameras stand
 ) -> Measurements:
@@ -254,15 +250,15 @@ def _recorded(
     least = _MIN_SEEN if photographs else 0.0
     views = []
     for v, view in enumerate(scene.views):
-        T = rough_pose(view.T_base_camera, chance["hints"])
+        T = rough_pose(view.T_base_camera, rngs["hints"])
         shown = tuple(legs[j] for j in images.seen_in_view(v, least))
         used = shown if 0 < len(shown) < len(legs) else None
         views.append(View(view.name, view.camera, *((T, used) if hints else (None, None))))
     q, size = poses.readings, settings.readings.size
     if settings.readings.distribution is Distribution.UNIFORM:
-        q = q + chance["readings"].uniform(-size, size, q.shape)
+        q = q + rngs["readings"].uniform(-size, size, q.shape)
     else:
-        q = q + size * chance["readings"].normal(size=q.shape)
+        q = q + size * rngs["readings"].normal(size=q.shape)
     names = [""] * len(images)
     if photographs:
         repeated = int(images.repeat.max()) > 0

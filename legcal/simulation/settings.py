@@ -91,17 +91,17 @@ class ParameterErrors:
     Attributes
     ----------
     base_joints, platform_joints : Spread
-        Of every coordinate of the joint centres [m].
+        Errors of each coordinate of the joint centres [m].
     offsets : Spread
-        Of actuated legs [m].
+        Errors of the offsets of actuated legs [m].
     lengths : Spread
-        Of legs of constant length [m].
+        Errors of the lengths of constant legs [m].
     axes : Spread
-        Of both angles of axes at base and platform [rad].
+        Errors of both angles of axes at base and platform [rad].
     twists : Spread
-        Of the angles that legs without an S joint keep [rad].
+        Errors of the twists of legs without an S joint [rad].
     radii : Spread
-        Of the cylinders that legs are seen as [m]; no parameter of the kinematics.
+        Errors of the radii of visible cylinders [m]; no parameters of the kinematics.
     coplanar : bool
         Whether joint centres keep their heights, their z in R_b and R_e: what is coplanar stays so.
     """
@@ -195,7 +195,7 @@ class SimulationSettings:
     hand_held : bool
         Every image is taken from a place of its own, with the board in it.
     seed : int
-        What all chance comes from.
+        Seed of all random numbers.
 
     Raises
     ------

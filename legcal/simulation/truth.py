@@ -55,7 +55,7 @@ def draw_errors(
 ) -> tuple[Leg, ...]:
     """Return the legs of a machine with drawn errors, in R_b and R_e.
 
-    Every parameter of the class takes its chance in the same order, however large its error is:
+    Errors of all parameters are drawn in the same order, however large they are:
     errors of one kind do not depend on those of another. B of a leg that is fixed to the platform
     then slides along the leg to where models put it, the foot of the platform link's origin.
     """

@@ -27,13 +27,14 @@ class ImageResult:
     name : str
         Its file.
     corners : int
-        Of the board, found in it.
+        Number of corners of the board that were found.
     used : int
-        Those that were used.
+        Number of corners that were used.
     rms_px : float or None
-        Of their residuals, both coordinates together [px]; None if the image was left out.
+        Root mean square of their residuals, both coordinates together [px]; None if the image
+        was left out.
     tilt : float or None
-        Of the board out of the image plane [rad].
+        Tilt of the board out of the image plane [rad].
     reason : str
         Why it was left out, "" if it was not.
     """
@@ -55,13 +56,13 @@ class CameraCalibration:
     camera : Camera
         The camera.
     covariance : (k, k) array
-        Of its numbers, in the order of ``names`` [px, and without unit].
+        Covariance of its intrinsics, in the order of ``names`` [px, and without unit].
     board : Board
         The board that it was calibrated with.
     images : tuple of ImageResult
         All images, in their order.
     rms_px : float
-        Of the residuals, both coordinates together [px].
+        Root mean square of the residuals, both coordinates together [px].
     noise_px : float
         Scatter of either coordinate of a corner, one standard deviation [px].
     coverage : float

@@ -388,7 +388,7 @@ def read_views(
 
 
 def _refusal(dataset: Dataset, report: Identifiability) -> str:
-    """Return why a dataset cannot be calibrated from, and what would mend it."""
+    """Return why a dataset cannot be calibrated, and the remedies."""
     remedies = [remedy.remedy for remedy in report.remedies if remedy.enough]
     remedy = remedies[0] if remedies else "add images of other poses, and of more legs at once"
     return (

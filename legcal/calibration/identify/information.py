@@ -84,7 +84,7 @@ def whitened_leg_equations(predicted: PredictedObservations) -> WhitenedEquation
 def image_rows(predicted: PredictedObservations) -> Array:
     """Return the whitened derivatives (n_images, n_legs, 4, f + 6 + p) of what images show.
 
-    By the platform's motion, the motion of the camera of that image, and the parameters.
+    They are derivatives by the motion of the platform, that of the camera, and the parameters.
     """
     base, platform = at_base_joints(predicted), at_platform_joints(predicted)
     turns = pose_unit(predicted)

@@ -140,12 +140,12 @@ class Identifiability:
     steps: tuple[StepRank, ...]  # each step, by legcal's criteria and by the printed ones
     views: tuple[tuple[str, ...], ...]  # the legs that each view shows
     images: tuple[int, ...]  # number of images of each view
-    board: BoardReport  # what a calibration board on the base is needed for, and what it mends
+    board: BoardReport  # what a calibration board on the base is needed for, and what it determines
     # standard deviation of the platform that is to be expected from outlines good to 0.1 px, rms
     # over the poses. None where something that moves the platform is not determined, or the motors
     # do not determine its pose
     platform_sigma: RmsMotion | None
-    remedies: tuple[Remedy, ...]  # what would mend what is missing; each was tried
+    remedies: tuple[Remedy, ...]  # changes that would determine what is missing; each was tried
     # the smallest sets of views, fewest first; None where views were given
     recommendation: tuple[Recommendation, ...] | None
     notes: tuple[str, ...]  # what the reader should know

@@ -60,17 +60,17 @@ class Location:
     has_tool_orientation : bool
         Whether the orientation of the tool in the platform is known.
     covariance : (12, 12) array
-        Of ``NAMES``: displacements [m] and rotation vectors [rad] of the base about world axes and
-        of the tool about platform axes, T_true = (exp r, t + x) applied from the left. What is
-        held, and an orientation that is not known, counts as zero.
+        Covariance of ``NAMES``: displacements [m] and rotation vectors [rad] of the base about
+        world axes and of the tool about platform axes, T_true = (exp r, t + x) applied from the
+        left. What is held, and an orientation that is not known, counts as zero.
     held : tuple of OpenPart
-        What the machine leaves open.
+        The directions that no pose of this machine determines.
     held_at : tuple of float
-        The tool position in the platform whose components are taken where it is open [m].
+        Position of the tool in the platform, used where it is not determined [m].
     held_words : str
         The same for people; "" where everything is determined.
     noise : MeasurementNoise
-        Of the measurement.
+        Standard deviations of the measurement.
     rows : tuple of RowResidual
         In the order of the file.
     chi2, dof, p_value : float, int, float or None
@@ -261,7 +261,7 @@ class _RowEntry(FileSchema):
 
 
 class _ResidualsEntry(FileSchema):
-    """What is left of the measured poses."""
+    """Residuals of the measured poses."""
 
     chi2: _Size
     dof: Annotated[int, Field(ge=0)]
@@ -430,7 +430,7 @@ def load_location(file: str | Path) -> Location:
 
 
 def _matrix(path: Path, found: _Covariance) -> Array:
-    """Return the covariance, refused where it is none."""
+    """Return the covariance; refuse a matrix that is not one."""
     n = len(NAMES)
     is_square = len(found.matrix) == n and all(len(row) == n for row in found.matrix)
     if tuple(found.names) == NAMES and is_square:
