@@ -4,25 +4,27 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
-from legcal.calibration import (
-    Calibration,
-    Check,
-    Evaluation,
-    Explanation,
-    Holdout,
-    PlatformBlock,
-    Result,
-    WorkspaceAccuracy,
-    poses_at_readings,
-    result_of,
-)
+from legcal.calibration import poses_at_readings, result_of
 from legcal.machine import pose_differences
 from legcal.report.render import report, table
+
+if TYPE_CHECKING:
+    from legcal.calibration import (
+        Calibration,
+        Check,
+        Evaluation,
+        Explanation,
+        Holdout,
+        PlatformBlock,
+        Result,
+        WorkspaceAccuracy,
+    )
 
 _SHOWN = {  # what tables show a unit in: its size, its name, and digits
     "m": (1e3, "mm", 4),
