@@ -166,7 +166,7 @@ class ObservedOutlines:
         for v in np.unique(self.view):
             of_view = self.view == v
             feet[of_view] = cameras[v].undistort(self.pixels[of_view])
-            lens = np.linalg.inv(cameras[v].pixels_per_unit(feet[of_view]))
+            lens = _inverses(cameras[v].pixels_per_unit(feet[of_view]))
             constants[of_view, :8] = lens.reshape(-1, 8)
         return replace(self, feet=feet, constants=constants)
 
@@ -176,11 +176,17 @@ class ObservedOutlines:
 
     def rows(self, keys: tuple[str, ...], state: State) -> Residuals:
         """Return these offsets with their derivatives."""
-        r, slope, ends = self._predicted(keys, state)
+        r, slope, ends, _ = self._predicted(keys, state)
         if self.bias_index.shape[1]:
             by_bias = -self.bias_shift.transpose(1, 2, 0)
             slope = np.concatenate([slope[:7], by_bias, slope[7:]])
         return Residuals(self._corrected(r, state), slope.T, ends.chain)
+
+    def by_intrinsics(self, wanted: tuple[str, ...], keys: tuple[str, ...], state: State) -> Array:
+        """Return derivatives (n, 2, n_wanted) of the offsets by intrinsics of the views."""
+        by_xy = self._predicted(keys, state)[3]
+        slopes = _sensor_slopes(state.cameras, wanted, self.view, self.pixels)
+        return np.asarray(np.einsum("nqck,cqn->nqk", slopes, by_xy))
 
     def _corrected(self, r: Array, state: State) -> Array:
         """Return offsets (n, 2) without common-mode biases, from (2, n) with them."""
@@ -189,10 +195,15 @@ class ObservedOutlines:
         biases = state.biases[self.bias_index]
         return np.asarray(r.T - np.einsum("nc,ncq->nq", biases, self.bias_shift))
 
-    def _predicted(self, keys: tuple[str, ...], state: State) -> tuple[Array, Array, _EndsInCamera]:
-        """Return offsets (2, n) with biases, derivatives (7 + n_keys, 2, n), and ends of legs."""
+    def _predicted(
+        self, keys: tuple[str, ...], state: State
+    ) -> tuple[Array, Array, _EndsInCamera, Array]:
+        """Return offsets (2, n) with biases, derivatives (7 + n_keys, 2, n), and ends of legs.
 
-        def predicted() -> tuple[Array, Array, _EndsInCamera]:
+        The last are the derivatives (2, 2, n) by the points on the sensor plane.
+        """
+
+        def predicted() -> tuple[Array, Array, _EndsInCamera, Array]:
             ends = _ends_in_camera(state, self.leg, self.view, self.pose)
             xy, by_key = self._feet, None
             if keys:
@@ -202,11 +213,11 @@ class ObservedOutlines:
             r, slope, by_xy = outline_offsets(ends.A, ends.B, radius, self.epsilon, xy, self._lens)
             if by_key is not None:
                 slope = np.concatenate([slope, np.einsum("kcqn,cqn->kqn", by_key, by_xy)])
-            return r, slope, ends
+            return r, slope, ends, by_xy
 
         own = self.radius, self.feet, self.constants
         poses = state.camera_pose, state.platform_pose
-        found: tuple[Array, Array, _EndsInCamera] = self.memory.of(
+        found: tuple[Array, Array, _EndsInCamera, Array] = self.memory.of(
             predicted, keys, *own, state.legs, state.radii, state.cameras, *poses
         )
         return found
@@ -253,12 +264,12 @@ def observed_outlines(
     index = np.flatnonzero(outlines.used)
     row, leg = outlines.row[index], outlines.leg[index]
     view = measurements.view[row]
-    keys = [(int(j), outlines.part[i]) for i, j in zip(index, leg, strict=True)]
+    keys = [(j, outlines.part[i]) for i, j in zip(index.tolist(), leg.tolist(), strict=True)]
     parts = tuple(sorted(set(keys)))
     covariance = outlines.covariance[index]
     cameras, by_gamma = _cameras_of(measurements), _by_gamma(outlines, measurements)[index]
     problems = [
-        *_mixed_gammas(by_gamma, outlines.gamma[index], [cameras[v] for v in view.tolist()]),
+        *_mixed_gammas(by_gamma, outlines.gamma[index], view, cameras),
         *_bad_covariances(covariance, row, leg, measurements, legs),
         *(
             f"The outlines of {legs.names[j]}.{part} could not be used: the mechanism has no such "
@@ -271,8 +282,9 @@ def observed_outlines(
         raise DatasetError(problems)
     order = np.lexsort((measurements.pose[row], view, leg))  # those of a leg in a view together
     index, row, leg, view = index[order], row[order], leg[order], view[order]
-    covariance, by_gamma, keys = covariance[order], by_gamma[order], [keys[i] for i in order]
+    covariance, by_gamma = covariance[order], by_gamma[order]
     n, numbers = len(index), {part: i for i, part in enumerate(parts)}
+    radius = np.array([numbers[key] for key in keys], dtype=np.intp)[order]
     feet, pixels, constants = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.empty((n, 9))
     constants[:, 8] = EPSILON[outlines.edge[index] - 1]
     for v in np.unique(view):
@@ -281,15 +293,14 @@ def observed_outlines(
         normal, xy = outlines.h[at, None, :2], camera.undistort(outlines.ends[at])
         value = np.sum(normal * xy, axis=-1, keepdims=True) + outlines.h[at, None, 2:]
         feet[of_view] = xy - normal * value / np.sum(normal**2, axis=-1, keepdims=True)
-        lens = np.linalg.inv(camera.pixels_per_unit(feet[of_view]))
-        constants[of_view, :8] = lens.reshape(-1, 8)
+        constants[of_view, :8] = _inverses(camera.pixels_per_unit(feet[of_view])).reshape(-1, 8)
         pixels[of_view] = camera.distort(feet[of_view])
     return ObservedOutlines(
         index,
         leg,
         view,
         measurements.pose[row],
-        np.array([numbers[key] for key in keys], dtype=np.intp),
+        radius,
         feet,
         pixels,
         constants,
@@ -350,12 +361,19 @@ def _by_gamma(outlines: Outlines, measurements: Measurements) -> Array:
     return np.where(unknown, outlines.by_gamma, 0.0)
 
 
-def _mixed_gammas(moved: Array, gamma: Array, camera: Sequence[str]) -> list[str]:
+def _inverses(M: Array) -> Array:
+    """Return the inverses of matrices (..., 2, 2)."""
+    (a, b), (c, d) = np.moveaxis(M, (-2, -1), (0, 1))
+    adjoint = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=-2)
+    return np.asarray(adjoint / (a * d - b * c)[..., None, None])
+
+
+def _mixed_gammas(moved: Array, gamma: Array, view: IntArray, cameras: Sequence[str]) -> list[str]:
     """Return one sentence for each camera whose outlines were measured with several gammas."""
     found: dict[str, set[float]] = {}
-    for by_gamma, one, name in zip(moved.tolist(), gamma.tolist(), camera, strict=True):
-        if by_gamma != 0.0:
-            found.setdefault(name, set()).add(one)
+    some = np.flatnonzero(moved)
+    for one, v in zip(gamma[some].tolist(), view[some].tolist(), strict=True):
+        found.setdefault(cameras[v], set()).add(one)
     return [
         f"The outlines of the camera of view {name} could not be used: found that they were "
         f"measured with the gammas {min(values):g} and {max(values):g}, needed one; search the "
@@ -580,6 +598,11 @@ class ObservedCorners:
 
         return Residuals(r, slope, chain)
 
+    def by_intrinsics(self, wanted: tuple[str, ...], state: State) -> Array:
+        """Return derivatives (n, 2, n_wanted) of these by intrinsics of the views."""
+        lens = np.swapaxes(self.constants.reshape(-1, 2, 2), 1, 2)
+        return np.asarray(-lens @ _sensor_slopes(state.cameras, wanted, self.view, self.pixels))
+
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor of corners; no platform pose moves them."""
         one = np.zeros(len(self), dtype=np.intp)
@@ -728,18 +751,27 @@ def _on_sensor(
 
     The latter is how they move with intrinsics; without any unknown these are at *feet*.
     """
-    if not keys:
-        return feet, np.zeros((*feet.shape, 0))
-    xy, slopes = feet.copy(), np.zeros((*feet.shape, len(keys)))
-    for v in np.unique(view):
+    xy = feet
+    if keys:
+        xy = feet.copy()
+        for v in np.unique(view):
+            xy[view == v] = cameras[v].undistort(pixels[view == v])
+    return xy, _sensor_slopes(cameras, keys, view, pixels)
+
+
+def _sensor_slopes(
+    cameras: Sequence[Camera], keys: tuple[str, ...], view: IntArray, pixels: Array
+) -> Array:
+    """Return how points of images (n, ..., 2) move on the sensor plane, (n, ..., 2, n_keys)."""
+    slopes = np.zeros((*pixels.shape, len(keys)))
+    for v in np.unique(view) if keys else ():
         camera, of_view = cameras[v], view == v
         known = [k for k, key in enumerate(keys) if key in intrinsic_names(camera)]
-        seen = pixels[of_view]
-        xy[of_view] = camera.undistort(seen)
-        some = np.zeros((*seen.shape, len(keys)))
-        some[..., known] = undistort_derivatives(camera, seen, [keys[k] for k in known])
+        some = np.zeros((*pixels[of_view].shape, len(keys)))
+        names = [keys[k] for k in known]
+        some[..., known] = undistort_derivatives(camera, pixels[of_view], names)
         slopes[of_view] = some
-    return xy, slopes
+    return slopes
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,6 +92,11 @@ class NoiseModel:
     bias_px: float = 0.0
     tilt_px: float = 0.0
 
+    @property
+    def variances(self) -> Array:
+        """The squares of these, (3,)."""
+        return np.array([self.scale, self.bias_px, self.tilt_px]) ** 2
+
     def covariance(self, claimed: Array) -> Array:
         """Return the covariances (n, 2, 2) [px^2] of outlines with claimed ones."""
         added = self.bias_px**2 * np.outer(_SUM, _SUM)
@@ -127,15 +132,17 @@ def noise_of_the_median(offsets: Array, claimed: Array) -> NoiseModel:
     -------
     NoiseModel
     """
+    s, d = (offsets @ _SUM) / np.sqrt(2.0), (offsets @ _DIFFERENCE) / np.sqrt(2.0)
+    ss, sd, dd, turned = s * s, s * d, d * d, _turned(claimed)
 
-    def scale_of(mode: Array) -> float:
-        share = (offsets @ mode) ** 2 / np.einsum("i,nij,j->n", mode, claimed, mode)
-        return float(np.sqrt(np.median(share) / _MEDIAN_OF_1))
+    def scale_of(squares: Array, variances: Array) -> float:
+        return float(np.sqrt(np.median(squares / variances) / _MEDIAN_OF_1))
 
     def excess(noise: NoiseModel) -> float:
-        return float(np.median(noise.squared_norms(offsets, claimed)) - MEDIAN_OF_2)
+        (a, b, c), _ = _inverted(_covariance(noise.variances, turned))
+        return float(np.median(a * ss + 2.0 * b * sd + c * dd) - MEDIAN_OF_2)
 
-    return _balanced(scale_of(_SUM), scale_of(_DIFFERENCE), excess, offsets)
+    return _balanced(scale_of(ss, turned[0]), scale_of(dd, turned[2]), excess, offsets)
 
 
 def estimate_noise(offsets: Array, explained: Array, claimed: Array) -> NoiseModel:
@@ -248,8 +255,7 @@ def _product(X: Array, Y: Array) -> float:
 
 def _likelihood(noise: NoiseModel, moments: Array, claimed: Array) -> float:
     """Return the logarithm of the likelihood of second moments (3, n) [px^2]."""
-    variances = np.array([noise.scale, noise.bias_px, noise.tilt_px]) ** 2
-    inverse, determinant = _inverted(_covariance(variances, claimed))
+    inverse, determinant = _inverted(_covariance(noise.variances, claimed))
     return -0.5 * (float(np.sum(np.log(determinant))) + _product(inverse, moments))
 
 

@@ -152,18 +152,6 @@ class FitProblem(Problem[State]):
         other = replace(self, observed=self.observed._replace(outlines=outlines))
         return other.with_parts((_bias_block(biases),), (factor,))
 
-    def with_keys(self, keys: tuple[str, ...]) -> FitProblem:
-        """Return the problem with more intrinsics, fixed, among its variables."""
-        block = self.block("cameras")
-        unknown = fixed_at_start(len(block.unknown), len(keys))
-        unknown[:, [keys.index(key) for key in self.keys]] = block.unknown
-        block = replace(block, unknown=unknown, retract=partial(changed_cameras, keys=keys))
-        factors = [
-            replace(factor, whitening=self.factor(factor.name).whitening)
-            for factor in self.observed.factors(keys)
-        ]
-        return replace(self, keys=keys).with_parts((block,), factors)
-
     def with_corners(
         self, corners: ObservedCorners, rejected: Sequence[tuple[int, int]]
     ) -> FitProblem:

@@ -18,13 +18,12 @@ from legcal.estimation import (
     Linearization,
     NormalEquations,
     PseudoHuber,
-    linearize,
     normal_equations,
     residual_changes,
     response,
     score_test,
 )
-from legcal.geometry import Array
+from legcal.geometry import Array, IntArray
 from legcal.machine import LegColumns
 from legcal.vision import shared_cameras
 
@@ -50,19 +49,25 @@ class Sensitivity:
     steps: Array  # (p, c) steps of all of them [m, rad], for each independent part of the error
 
 
-def with_known_intrinsics(
-    problem: FitProblem, state: State, linear: Linearization
-) -> tuple[FitProblem, Linearization]:
-    """Return problem and rows with derivatives by intrinsics that count as known, too."""
-    wide = problem.with_keys(tuple(dict.fromkeys((*problem.keys, *_KEYS))))
-    without_cameras = {name: linear[name] for name in ("readings", "axes")}
-    return wide, linearize(wide, state, without_cameras)
+def derivatives_by_cameras(problem: FitProblem, state: State) -> dict[str, Array]:
+    """Return derivatives (n, q, 4) of whitened residuals by focal lengths and principal points.
+
+    They are of outlines and corners, by the intrinsics of the view of each, known or not.
+    """
+    outlines = problem.outlines.by_intrinsics(_KEYS, problem.keys, state)
+    corners = problem.corners.by_intrinsics(_KEYS, state)
+    whitening = np.asarray(problem.factor("outlines").whitening)
+    return {
+        "outlines": np.einsum("nij,njk->nik", whitening, outlines),
+        "corners": corners / problem.corners.sigma[:, None, None],
+    }
 
 
 def sensitivities(
-    wide: FitProblem,
+    problem: FitProblem,
     state: State,
     linear: Linearization,
+    by_camera: Mapping[str, Array],
     normal: NormalEquations,
     loss: PseudoHuber,
 ) -> tuple[Sensitivity, ...]:
@@ -73,48 +78,72 @@ def sensitivities(
 
     Parameters
     ----------
-    wide, state, linear
-        Where the fit ended, by :func:`with_known_intrinsics`.
+    problem, state, linear
+        Where the fit ended.
+    by_camera : mapping
+        By :func:`derivatives_by_cameras`.
     normal : NormalEquations
         The information there.
     loss : PseudoHuber
     """
+    radii = np.array([problem.legs.radii[part] for part in problem.outlines.parts])
+    of_cameras = _places_of_cameras(problem)
     errors = {
-        what: ("cameras", _camera_error(wide, state, relative, added))
+        what: (of_cameras, _camera_error(state, relative, added))
         for what, (relative, added) in _CAMERA_ERRORS.items()
     }
-    radii = np.array([wide.legs.radii[part] for part in wide.outlines.parts])
-    errors["radii 1 % larger"] = "radii", _RADIUS_PART * radii[:, None]
+    errors["radii 1 % larger"] = problem.place["radii"], _RADIUS_PART * radii[:, None]
     names, changes, pulls = list[str](), list[dict[str, Array]](), list[Array]()
-    for what, (block, error) in errors.items():
-        place, of_prior = wide.place[block], np.zeros(wide.n_kept + 1)
+    for what, (place, error) in errors.items():
+        of_prior = np.zeros(problem.n_kept + 1)
         of_prior[place] = error
-        pull = of_prior[wide.priors.unknown]
-        fixed = np.where(place == wide.n_kept, error, 0.0)
-        change = residual_changes(wide, linear, block, fixed)
+        pull = of_prior[problem.priors.unknown]
+        fixed = np.where(place == problem.n_kept, error, 0.0)
+        if place is of_cameras:
+            change = _changes_by_cameras(problem, by_camera, fixed)
+        else:
+            change = residual_changes(problem, linear, "radii", fixed)
         if change["outlines"].any() or pull.any():
             names.append(what)
             changes.append(change)
-            pulls.append(pull / wide.priors.sigma)
+            pulls.append(pull / problem.priors.sigma)
     found: list[Sensitivity] = []
     if names:
         moved = {
-            factor.name: _efficiency(wide, loss, factor.name)
+            factor.name: _efficiency(problem, loss, factor.name)
             * np.stack([change[factor.name] for change in changes], axis=-1)
-            for factor in wide.factors
+            for factor in problem.factors
+            if factor.name in changes[0]
         }
-        steps = response(wide, linear, normal, moved)
+        steps = response(problem, linear, normal, moved)
         steps += normal.kept_covariance() @ linear.prior_J.T @ np.column_stack(pulls)
         found = [
-            Sensitivity(what, _of_kinematic(wide, steps[:, [i]])) for i, what in enumerate(names)
+            Sensitivity(what, _of_kinematic(problem, steps[:, [i]])) for i, what in enumerate(names)
         ]
-    place = wide.legs.parametrization.place[:, LegColumns.TWIST]
-    twisted = [j for j, x in enumerate(place) if x >= 0 and not wide.free[x]]
+    place = problem.legs.parametrization.place[:, LegColumns.TWIST]
+    twisted = [j for j, x in enumerate(place) if x >= 0 and not problem.free[x]]
     if twisted:
-        columns = [_of_twist(wide, state, linear, normal, loss, j) for j in twisted]
+        columns = [_of_twist(problem, state, linear, normal, loss, j) for j in twisted]
         what = "twists that are fixed, each 0.1 deg off,"
         found.append(Sensitivity(what, np.column_stack(columns)))
     return tuple(found)
+
+
+def _places_of_cameras(problem: FitProblem) -> IntArray:
+    """Return the positions in x (n_views, 4) of focal lengths and principal points."""
+    place = np.full((len(problem.outlines.views), len(_KEYS)), problem.n_kept, dtype=np.intp)
+    for k, key in enumerate(_KEYS):
+        if key in problem.keys:
+            place[:, k] = problem.place["cameras"][:, problem.keys.index(key)]
+    return place
+
+
+def _changes_by_cameras(
+    problem: FitProblem, by_camera: Mapping[str, Array], error: Array
+) -> dict[str, Array]:
+    """Return how whitened residuals (n, q) change with errors (n_views, 4) of cameras."""
+    views = {"outlines": problem.outlines.view, "corners": problem.corners.view}
+    return {name: np.einsum("nqk,nk->nq", by, error[views[name]]) for name, by in by_camera.items()}
 
 
 def _efficiency(problem: FitProblem, loss: PseudoHuber, name: str) -> float:
@@ -123,16 +152,14 @@ def _efficiency(problem: FitProblem, loss: PseudoHuber, name: str) -> float:
     return loss.efficiency(factor.n_rows) if factor.robust else 1.0
 
 
-def _camera_error(
-    wide: FitProblem, state: State, relative: Mapping[str, float], added: Mapping[str, float]
-) -> Array:
-    """Return errors (n_views, n_keys) of all cameras, as parts of intrinsics and in pixels."""
-    error = np.zeros((len(state.cameras), len(wide.keys)))
+def _camera_error(state: State, relative: Mapping[str, float], added: Mapping[str, float]) -> Array:
+    """Return errors (n_views, 4) of all cameras, as parts of intrinsics and in pixels."""
+    error = np.zeros((len(state.cameras), len(_KEYS)))
     for key, part in relative.items():
         values = [intrinsic_of(camera, key) for camera in state.cameras]
-        error[:, wide.keys.index(key)] = part * np.array(values)
+        error[:, _KEYS.index(key)] = part * np.array(values)
     for key, step in added.items():
-        error[:, wide.keys.index(key)] = step
+        error[:, _KEYS.index(key)] = step
     return error
 
 
@@ -191,34 +218,33 @@ class FocalLength:
         )
 
 
-def focal_lengths(wide: FitProblem, state: State, linear: Linearization) -> tuple[FocalLength, ...]:
+def focal_lengths(
+    problem: FitProblem, state: State, linear: Linearization, by_camera: Mapping[str, Array]
+) -> tuple[FocalLength, ...]:
     """Return what the measurements say of the focal lengths that the fit took as known.
 
     One for each camera of which they say anything; arguments as those of :func:`sensitivities`.
     The common-mode biases of outlines are in the problem, so that these do not pass for a focal
     length.
     """
-    focal = [wide.keys.index(key) for key in _FOCAL]
-    is_known = np.all(wide.place["cameras"][:, focal] == wide.n_kept, axis=1)
-    known = [v for v in np.unique(wide.outlines.view).tolist() if is_known[v]]
-    owners = shared_cameras(wide.outlines.views, state.cameras)
+    focal = [_KEYS.index(key) for key in _FOCAL]
+    is_known = np.all(_places_of_cameras(problem)[:, focal] == problem.n_kept, axis=1)
+    known = [v for v in np.unique(problem.outlines.view).tolist() if is_known[v]]
+    owners = shared_cameras(problem.outlines.views, state.cameras)
     tested = sorted({owners[v] for v in known})
     if not tested:
         return ()
-    error = _camera_error(wide, state, _FOCAL, {})
+    error = _camera_error(state, _FOCAL, {})
     changes = [
-        residual_changes(wide, linear, "cameras", error * of_owner[:, None])
+        _changes_by_cameras(problem, by_camera, error * of_owner[:, None])
         for of_owner in (
             np.array([v in known and owners[v] == owner for v in range(len(owners))])
             for owner in tested
         )
     ]
-    columns = {
-        name: np.stack([change[name] for change in changes], axis=-1)
-        for name in ("outlines", "corners")
-    }
-    normal = normal_equations(wide, state, linear)
-    score, information = score_test(wide, linear, normal, columns)
+    columns = {name: np.stack([change[name] for change in changes], axis=-1) for name in by_camera}
+    normal = normal_equations(problem, state, linear)
+    score, information = score_test(problem, linear, normal, columns)
     whole = sum(np.sum(of_kind**2, axis=(0, 1)) for of_kind in columns.values())
     seen = np.flatnonzero(np.diagonal(information) > _ROUNDING * whole)
     covariance = np.linalg.pinv(information[np.ix_(seen, seen)], rcond=_ROUNDING, hermitian=True)

@@ -22,9 +22,9 @@ from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_reasons
 from legcal.calibration.joint_fit.sensitivity import (
     Sensitivity,
+    derivatives_by_cameras,
     focal_lengths,
     sensitivities,
-    with_known_intrinsics,
 )
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
 from legcal.data import Dataset, Order, Outlines, inverse, reorder_measurements
@@ -145,8 +145,8 @@ def assemble_solution(
     held_values = np.zeros((len(held.basis), len(problem.free)))
     held_values[:, problem.free] = (held.basis * held.unit)[:, : problem.n_kinematic]
     biases = zip(problem.block("biases").labels, state.biases.tolist(), strict=True)
-    wide, wide_linear = with_known_intrinsics(problem, state, linear)
-    focal = focal_lengths(wide, state, wide_linear)
+    by_camera = derivatives_by_cameras(problem, state)
+    focal = focal_lengths(problem, state, linear, by_camera)
     contradicted = [f for f in focal if f.is_contradicted]
     gammas = _gammas(problem, state, kept, outlines)
     return Solution(
@@ -182,7 +182,7 @@ def assemble_solution(
         gammas=gammas,
         biases={n: v for n, v in biases if not n.endswith(GAMMA_SUFFIX)},
         shared_px=fit.edge_biases.sizes,
-        sensitivities=sensitivities(wide, state, wide_linear, normal, loss),
+        sensitivities=sensitivities(problem, state, linear, by_camera, normal, loss),
         outlines=_with_rejections(outlines, problem, state, fit.accepted, offsets),
         start=label,
         iterations=fit.iterations,
