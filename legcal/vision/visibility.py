@@ -141,8 +141,11 @@ def bands_of_legs(
     axis = A_camera[:, None] + s[..., None] * u[:, None]
     inside = in_picture(camera, axis, MIN_DEPTH_SHARE * length[:, None])
     m = moment(u, A_camera)
-    runs = [longest_run(one) if np.count_nonzero(one) > 1 else (0, 0) for one in inside]
-    first, last = np.array(runs, dtype=np.intp).reshape(-1, 2).T
+    first, last = np.zeros((2, len(axis)), dtype=np.intp)
+    n_inside = np.count_nonzero(inside, axis=1)
+    last[n_inside == N_SAMPLES] = N_SAMPLES - 1
+    for leg in np.flatnonzero((n_inside > 1) & (n_inside < N_SAMPLES)).tolist():
+        first[leg], last[leg] = longest_run(inside[leg])
     legs = np.arange(len(axis))
     shown = last > first
     ends = np.stack([axis[legs, first], axis[legs, last]], axis=1)
@@ -152,17 +155,12 @@ def bands_of_legs(
     shown &= (distance > 0.0) & (offset >= 1e-6 * length)  # others are seen end-on
     middle = np.where(shown[:, None], ends.mean(axis=1), 0.0)
     scale = np.sqrt(np.abs(np.linalg.det(camera.pixels_per_unit(middle))))
+    along = along / np.where(shown, distance, 1.0)[:, None]
+    normal = m[:, :2] / np.where(shown, np.linalg.norm(m[:, :2], axis=1), 1.0)[:, None]
+    sizes = zip(scale.tolist(), (distance * scale).tolist(), shown.tolist(), strict=True)
     return [
-        Band(
-            ends[i, 0],
-            along[i] / distance[i],
-            m[i, :2] / np.linalg.norm(m[i, :2]),
-            float(scale[i]),
-            float(distance[i] * scale[i]),
-        )
-        if shown[i]
-        else None
-        for i in legs.tolist()
+        Band(ends[i, 0], along[i], normal[i], *size) if is_shown else None
+        for i, (*size, is_shown) in enumerate(sizes)
     ]
 
 
@@ -227,8 +225,8 @@ def predict_legs(
     row: int,
 ) -> list[PredictedLeg]:
     """Predict every leg that an image should show."""
-    T_camera_base = T_base_camera.inv()
-    A_camera, B_camera = T_camera_base.apply(A_base), T_camera_base.apply(B_base)
+    T = T_base_camera.as_matrix()
+    A_camera, B_camera = ((X - T[:3, 3]) @ T[:3, :3] for X in (A_base, B_base))
     length = np.linalg.norm(B_camera - A_camera, axis=1)
     u = (B_camera - A_camera) / length[:, None]
     segments = [visible_segments(of_leg, of) for of_leg, of in zip(cylinders, length, strict=True)]
@@ -268,11 +266,12 @@ def hidden_by(
     # The points of the legs' axes nearest to the viewing rays, and the rays' nearest points.
     c, to_A = ray @ u.T, ray @ A.T  # (n, n_legs)
     sine2 = np.maximum(1.0 - c**2, 1e-12)
-    along = np.clip((c * to_A - np.sum(u * A, axis=1)) / sine2, 0.0, length)
+    from_foot = np.sum(u * A, axis=1)
+    along = np.clip((c * to_A - from_foot) / sine2, 0.0, length)
     depth = to_A + along * c
-    nearest = A + along[..., None] * u
-    gap = np.linalg.norm(nearest - depth[..., None] * ray[:, None], axis=-1)
-    hides = (gap < radius + margin[:, None] * depth) & (depth < distance[:, None])
+    square = np.sum(A * A, axis=1) + along * (along + 2.0 * from_foot) - depth**2  # of the gap
+    reach = radius + margin[:, None] * depth
+    hides = (reach > 0.0) & (square < reach**2) & (depth < distance[:, None])
     front = np.full(len(P_camera), -1, dtype=np.intp)
     for k, other in enumerate(legs):
         front[hides[:, k] & (own != other.leg)] = other.leg
