@@ -1,6 +1,7 @@
 """Photographs, views, hints and radii that cannot be right: each is named, and the rest is used."""
 
 import re
+import resource
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -334,6 +335,19 @@ def test_blur_is_measured_whatever_the_light() -> None:
         for light in (0.3, 1.0):
             noisy = (light * smooth + rng.standard_normal(picture.shape)).astype(np.float32)
             assert measure_exposure(noisy).blur == pytest.approx(blur, rel=0.35, abs=0.3)
+
+
+def test_what_is_flat_has_no_edges() -> None:
+    picture = np.full((600, 800), 20.0, np.float32)
+    assert measure_exposure(picture).blur == 0.0
+    cv2.rectangle(picture, (200, 150), (420, 400), 180.0, -1)
+    for blur in (1.0, 2.0):
+        smooth = np.rint(cv2.GaussianBlur(picture, (0, 0), blur))
+        assert measure_exposure(smooth).blur == pytest.approx(blur, rel=0.2)
+    stripes = np.tile((40.0 + 150.0 * (np.arange(4000) // 9 % 2)).astype(np.float32), (3000, 1))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert measure_exposure(stripes).blur < 0.6  # all slopes are the greatest
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000
 
 
 def test_blurred_images_are_compared_with_their_camera_where_their_view_has_few() -> None:

@@ -37,7 +37,9 @@ MARGIN = 3  # of the image of half the size, beyond which edges do not count [px
 DIRECTIONS = 4  # of edges: what moves is blurred in one
 WEAK = 70.0  # percentile of the slopes from which on a place may be an edge
 STRONG = 95.0  # percentile of the slopes from which on they count
+FLAT = 1.0  # slope below which nothing is there: a hundredth of a grey level in a pixel
 MIN_EDGES, MIN_EDGES_PART = 40, 0.1  # places of a direction, and of all
+MAX_EDGES = 1000  # places of a direction that are compared
 MAX_BLUR = 8.0  # that the scales can measure [px]
 MAX_BLUR_OF_OTHERS = (2.0, 1.2)  # against others: factor, and more [px]
 USUAL_PERCENTILE = 40.0  # percentile of blurs, for what is usual
@@ -89,6 +91,7 @@ def _blur(grey: Grey, half: Grey) -> float:
     least = max(MIN_EDGES, int(MIN_EDGES_PART * len(coarse)))  # else they are corners of others
     of_directions = [np.flatnonzero(direction == d) for d in range(DIRECTIONS)]
     strong = [own[_strongest(coarse[own])] for own in of_directions if len(own) >= least]
+    strong = [one[:: -(-len(one) // MAX_EDGES)] for one in strong]
     if not strong:
         return 0.0
     every = np.concatenate(strong)
@@ -110,7 +113,7 @@ def _edges(half: Grey) -> tuple[Grey, IntArray, IntArray, Grey]:
     coarse = np.asarray(cv2.magnitude(x, y), dtype=np.float32)
     few = coarse[::STRIDE, ::STRIDE].ravel()
     k = int(0.01 * WEAK * (len(few) - 1))
-    weak = np.partition(few, k)[k]
+    weak = max(np.partition(few, k)[k], np.float32(FLAT))
     # Beside the middle of an edge the ratio of slopes says nothing.
     around = cv2.dilate(coarse, _SQUARE)
     edge = coarse >= np.maximum(around, weak)

@@ -261,10 +261,10 @@ def _joined(parts: Sequence[PairMatches], axis: int) -> PairMatches:
     return PairMatches(*(np.concatenate(x, axis=axis) for x in zip(*parts, strict=True)))
 
 
-def _in_picture(pictures: Pictures, poses: CameraPoses) -> tuple[Array, Array, Array, Array]:
-    """Return ends X (K, n, T, 2, 3) [m], points (K, n, T, 2, 2), widths (K, n, T, 2), and shares.
+def _projected(pictures: Pictures, poses: CameraPoses) -> tuple[Array, Array, Array]:
+    """Return ends X (K, n, T, 2, 3) [m], points (K, n, T, 2, 2) and widths (K, n, T, 2).
 
-    Of K pictures, n poses and T segments; the shares (K, n, T) are those that are shown.
+    Of K pictures, n poses and T segments.
     """
     ends = pictures.ends[:, None]
     if np.any(poses.shift):
@@ -282,9 +282,7 @@ def _in_picture(pictures: Pictures, poses: CameraPoses) -> tuple[Array, Array, A
     level = normal[..., 0] ** 2 + normal[..., 1] ** 2
     flat = np.sqrt(level / (level + normal[..., 2] ** 2 + 1e-24))
     width = (2.0 * pictures.radius[:, None] / np.maximum(flat, 0.1))[..., None] / z
-    front = (X[..., 0, 2] > MIN_DEPTH) & (X[..., 1, 2] > MIN_DEPTH)
-    front &= pictures.share[:, None] > 0.0
-    return X, xy, width, np.where(front, _shown(xy, pictures.corners[:, None, None]), 0.0)
+    return X, xy, width
 
 
 def _shown(xy: Array, corners: Array) -> Array:
@@ -300,7 +298,10 @@ def _shown(xy: Array, corners: Array) -> Array:
 
 def _match_block(pictures: Pictures, poses: CameraPoses, tolerance: float) -> PairMatches:
     """Match a few poses to a few pictures."""
-    X, xy, width, visible = _in_picture(pictures, poses)
+    X, xy, width = _projected(pictures, poses)
+    front = (X[..., 0, 2] > MIN_DEPTH) & (X[..., 1, 2] > MIN_DEPTH)
+    front &= pictures.share[:, None] > 0.0
+    visible = np.where(front, _shown(xy, pictures.corners[:, None, None]), 0.0)
     K, n, T = visible.shape
     n_pairs = pictures.pairs.shape[1]
     if T == 0 or n_pairs == 0:
@@ -428,7 +429,7 @@ def _equations(
     which alone are accurate enough to move joints, by shifts of A and B of the leg; residuals and
     weights (K, n, T, 4).
     """
-    X, xy, width, _ = _in_picture(pictures, poses)
+    X, xy, width = _projected(pictures, poses)
     K, n_pairs = pictures.pairs.shape[:2]
     table = np.concatenate([pictures.pairs, _width_sigmas(pictures)[..., None]], axis=2)
     at = found.pair + (n_pairs * np.arange(K))[:, None, None]
@@ -464,11 +465,15 @@ def _equations(
     X = ((X - pictures.t[:, None, None, None]).reshape(flat) @ pictures.R[:, None]).reshape(X.shape)
     lines = D[..., :2, :, :]
     in_base = (lines.reshape(flat) @ poses.R).reshape(lines.shape)
-    J = np.concatenate([cross(X[..., None, :, :], D).sum(axis=-2), D.sum(axis=-2)], axis=-1)
-    where = pictures.place[:, None, :, None, :, None]
-    J_leg = np.concatenate(
-        [((1.0 - where) * in_base).sum(axis=-2), (where * in_base).sum(axis=-2)], axis=-1
-    )
+    J = np.empty((*at.shape, 4, 6))  # sums over the two ends
+    J[..., :3] = sum(cross(X[..., None, k, :], D[..., k, :]) for k in (0, 1))
+    J[..., 3:] = D[..., 0, :] + D[..., 1, :]
+    one, two = np.moveaxis(pictures.place[:, None, :, None, :, None], -2, 0)
+    first, second = in_base[..., 0, :], in_base[..., 1, :]
+    both = first + second
+    J_leg = np.empty((*at.shape, 2, 6))
+    J_leg[..., 3:] = one * first + two * second
+    J_leg[..., :3] = both - J_leg[..., 3:]
     residual = np.empty((*at.shape, 4))
     residual[..., :2] = (parts @ o[..., None])[..., 0]
     residual[..., 2] = np.log(expected / seen)
@@ -490,14 +495,14 @@ def distances(pictures: Pictures, poses: CameraPoses, found: PairMatches) -> Arr
     Sideways, at the ends of the pairs and at the depth of the segments.
     """
     _, _, residual, _ = _equations(pictures, poses, found, 1.0)
-    X, _, _, _ = _in_picture(pictures, poses)
+    X, _, _ = _projected(pictures, poses)
     return np.asarray(np.abs(residual[..., :2]).max(axis=-1) * X[..., 2].mean(axis=-1))
 
 
 def _moved(poses: CameraPoses, xi: Array, shift: Array, centre: Array) -> CameraPoses:
     """Return poses moved by rotation vectors and translations in their frame, (n, 6), not far."""
     turned = np.linalg.norm(xi[:, :3], axis=1) / MAX_TURN
-    moved = np.linalg.norm(np.cross(xi[:, :3], centre) + xi[:, 3:], axis=1)
+    moved = np.linalg.norm(cross(xi[:, :3], centre) + xi[:, 3:], axis=1)
     distance = np.maximum(np.linalg.norm(centre, axis=1), MIN_DEPTH)
     xi = xi / np.maximum(np.maximum(turned, moved / (MAX_DISPLACEMENT * distance)), 1.0)[:, None]
     turn = rotation_matrices(xi[:, :3])
