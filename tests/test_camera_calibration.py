@@ -1,6 +1,5 @@
 """``legcal camera``: cameras from corners and photographs of a board, and all that it refuses."""
 
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ import pytest
 import yaml
 from camera_sessions import CAMERAS, NOISE_PX, PINHOLE, SIZE, drawings, photographs, seen_corners
 
-from legcal import calibrate_camera, cli
+from legcal import calibrate_camera
 from legcal.calibration import CameraCalibration
 from legcal.calibration.camera_calibration import calibration
 from legcal.calibration.camera_calibration.adjustment import RobustFit, robust_fit
@@ -177,15 +176,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def found(folder: Path) -> CameraCalibration:
     return calibrate_camera(folder, SPEC, output=folder / "camera.yaml")
-
-
-def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
-    command = ["legcal", "camera", *map(str, words), "--workers", "1"]
-    monkeypatch.setattr(sys, "argv", command)
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    assert isinstance(stop.value.code, int)
-    return stop.value.code
 
 
 def test_pictures_give_the_camera_that_took_them(found: CameraCalibration) -> None:

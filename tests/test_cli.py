@@ -6,19 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from command_line import run
 from hexapod_example import Run, copy_of_the_example
 
-from legcal import cli
 from legcal.errors import ModelError, NotVisible
-
-
-def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
-    """Run the command line in this process and return its exit code."""
-    monkeypatch.setattr(sys, "argv", ["legcal", *map(str, words)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    assert isinstance(stop.value.code, int)
-    return stop.value.code
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import csv
 import json
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from command_line import run
 from outline_tables import assert_same
 from rendering import SIZE, RepeatedImages, repeated_images
 from scipy.spatial.transform import RigidTransform
 
-from legcal import cli, detect, load_dataset
+from legcal import detect, load_dataset
 from legcal.calibration.detection import Detection, _caption, _counted_reason
 from legcal.data.image_tables import canonical_order
 from legcal.data.outlines import QUALITY, Outlines, read_observations
@@ -73,16 +73,6 @@ def one_image(rendered: RepeatedImages, tmp_path: Path) -> RepeatedImages:
     return made
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
-    """Run the command in this process and return its exit code."""
-    command = ["legcal", "detect", *map(str, words), "--workers", "1"]
-    monkeypatch.setattr(sys, "argv", command)
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    assert isinstance(stop.value.code, int)
-    return stop.value.code
-
-
 def table(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
@@ -103,7 +93,7 @@ def test_folder_json_and_summary_tell_the_same(
 ) -> None:
     before = sorted(rendered.path.rglob("*"))
     out = tmp_path / "out"
-    assert run(monkeypatch, rendered.path, "-o", out, "--json") == 1  # c2 shows no leg
+    assert run(monkeypatch, "detect", rendered.path, "-o", out, "--json") == 1  # c2 shows no leg
     document = json.loads(capsys.readouterr().out)
     assert sorted(rendered.path.rglob("*")) == before
     rows = table(out / "observations.csv")
@@ -188,7 +178,7 @@ def test_people_read_a_table_of_views(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("COLUMNS", "100")
-    assert run(monkeypatch, one_image.path, "-o", tmp_path / "out") == 0
+    assert run(monkeypatch, "detect", one_image.path, "-o", tmp_path / "out") == 0
     printed = capsys.readouterr()
     assert "outlines used in 2 images" in printed.out
     assert re.search(r"1[12]/12", printed.out)  # of one leg little is seen
@@ -254,7 +244,7 @@ def test_images_of_the_same_name_have_pictures_of_their_own(found: Detection) ->
 def test_a_folder_with_other_files_is_refused_before_any_work(
     rendered: RepeatedImages, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(monkeypatch, rendered.path, "-o", rendered.path, "--json") == 2
+    assert run(monkeypatch, "detect", rendered.path, "-o", rendered.path, "--json") == 2
     error: dict[str, Any] = json.loads(capsys.readouterr().out)["error"]
     assert "found a folder with other files and no detection.json of legcal" in error["message"]
 
@@ -267,7 +257,7 @@ def test_images_that_cannot_be_read_are_refused_and_nothing_is_written(
 ) -> None:
     path = one_image.path / one_image.rows[1]["image"]
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    assert run(monkeypatch, one_image.path, "-o", tmp_path / "out") == 2
+    assert run(monkeypatch, "detect", one_image.path, "-o", tmp_path / "out") == 2
     said = capsys.readouterr().err
     assert "p0_1.png" in said
     assert len(said.strip().splitlines()) <= 2

@@ -16,11 +16,12 @@ from types import FrameType
 
 import numpy as np
 import pytest
+from command_line import run as run_command
 from dataset_folder import HEXAPOD, Folder, folder
 from pool_work import keep_row, row_zero_after_row_five
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal import cli, load_dataset, load_mechanism
+from legcal import load_dataset, load_mechanism
 from legcal.errors import DatasetError, ModelError, OutOfResources, UsageError
 from legcal.files import check_destination, closest, parse_yaml, result_folder, write_atomically
 from legcal.signals import raise_if_stopped, stopped_by_signals
@@ -276,10 +277,7 @@ def test_output_that_cannot_be_printed_is_said_on_stderr(words: str, stdout: str
 def test_a_failure_is_json_where_stdout_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.StringIO()
     monkeypatch.setattr(sys, "stdout", out)
-    monkeypatch.setattr(sys, "argv", ["legcal", "inspect", LONG, "--json"])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    assert stop.value.code == 2
+    assert run_command(monkeypatch, "inspect", LONG, "--json") == 2
     assert json.loads(out.getvalue())["error"]["kind"] == "ModelError"
 
 

@@ -3,7 +3,6 @@
 import io
 import json
 import re
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from command_line import run
 from hexapod_example import HEXAPOD
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -22,7 +22,6 @@ from rich.console import Console
 from thinned import thinned
 
 import legcal
-from legcal import cli
 from legcal.calibration import Identifiability, WeakDirection, legs_in_words, views_in_words
 from legcal.calibration.identify.identifiability import (
     check_identifiable,
@@ -84,15 +83,6 @@ def said(found: Identifiability) -> str:
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(identify_table(found))
     return " ".join(console.export_text().split())
-
-
-def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
-    """Run the command line in this process and return its exit code."""
-    monkeypatch.setattr(sys, "argv", ["legcal", "identify", *map(str, words)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    assert isinstance(stop.value.code, int)
-    return stop.value.code
 
 
 def options(views: Sequence[Sequence[str]]) -> Iterator[str]:
@@ -176,7 +166,9 @@ def test_the_report_in_words_says_what_a_board_is_needed_for() -> None:
 def test_the_document_is_that_of_the_report(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(monkeypatch, "hexapod", *options(VIEWS["halves"]), "--board", "--json") == 0
+    assert (
+        run(monkeypatch, "identify", "hexapod", *options(VIEWS["halves"]), "--board", "--json") == 0
+    )
     document = json.loads(capsys.readouterr().out)
     found = report("halves", board=True)
     assert document == json.loads(json.dumps(found.document()))
@@ -209,7 +201,7 @@ def test_tables_fit_80_columns_and_say_the_verdict(
     monkeypatch.setenv("COLUMNS", "80")
     legs = loaded(name).leg_names
     chosen = [[legs[j] for j in view] for view in views]
-    assert run(monkeypatch, name, *options(chosen), "--images", "6") == 0
+    assert run(monkeypatch, "identify", name, *options(chosen), "--images", "6") == 0
     out = capsys.readouterr().out
     assert max(len(line) for line in out.splitlines()) <= 80
     verdict = legcal.identifiability(loaded(name), chosen, 6)
@@ -232,7 +224,7 @@ def test_refusals_are_one_sentence_in_one_document(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert run(monkeypatch, *words, "--json") == 2
+    assert run(monkeypatch, "identify", *words, "--json") == 2
     error = json.loads(capsys.readouterr().out)["error"]
     assert error["kind"] == kind
     assert [word for word in named if word not in error["message"]] == []
@@ -290,7 +282,7 @@ def test_the_legs_of_a_datasets_views_count(
     (tmp_path / "dataset.yaml").write_text(yaml.safe_dump(entry))
     table = entry["measurements"]
     (tmp_path / table).write_bytes((HEXAPOD / table).read_bytes())
-    assert run(monkeypatch, tmp_path, "--json") == 0
+    assert run(monkeypatch, "identify", tmp_path, "--json") == 0
     document = json.loads(capsys.readouterr().out)
     assert document["views"] == [["leg1", "leg2"]] * 3
     assert not document["paper"]["ok"]

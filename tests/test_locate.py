@@ -1,7 +1,6 @@
 """``legcal locate``: what poses of real machines determine, outliers, the table, the files."""
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -12,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
+from command_line import run
 from located import (
     BASE,
     SIGMA_ANGLE,
@@ -29,7 +29,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal import (
     Location,
     ToolPoses,
-    cli,
     load_location,
     load_mechanism,
     locate,
@@ -376,14 +375,6 @@ def in_part() -> Location:
     return locate(shipped("3-rpr"), unoriented(made("3-rpr", 6).poses))
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
-    monkeypatch.setattr(sys, "argv", ["legcal", "locate", *map(str, words)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    assert isinstance(stop.value.code, int)
-    return stop.value.code
-
-
 def test_the_command_writes_what_it_prints_and_ends_with_1_where_it_doubts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -392,16 +383,19 @@ def test_the_command_writes_what_it_prints_and_ends_with_1_where_it_doubts(
     position[4] += 0.05
     write_poses(tmp_path / "poses.csv", hexapod, replace(hexapod.poses, position=position))
     words: list[str | Path] = ["hexapod", tmp_path / "poses.csv", "-o", tmp_path / "a.yaml"]
-    assert run(monkeypatch, *words, "--urdf", tmp_path / "out", "--json") == 0
+    assert run(monkeypatch, "locate", *words, "--urdf", tmp_path / "out", "--json") == 0
     document = json.loads(capsys.readouterr().out)
     names = [Path(p).relative_to(tmp_path).as_posix() for p in document.pop("written")]
     assert names == ["out/models/hexapod.yaml", "out/urdf/hexapod.urdf", "a.yaml"]
     assert yaml.safe_load((tmp_path / "a.yaml").read_text()) == document
-    assert run(monkeypatch, *words, "--encoder-sigma", "1um", "--tool-position", "0,0,5mm") == 0
+    assert (
+        run(monkeypatch, "locate", *words, "--encoder-sigma", "1um", "--tool-position", "0,0,5mm")
+        == 0
+    )
     shown = " ".join(capsys.readouterr().out.split())
     for words_shown in ("Row 5 was left out: 8", "errors of the readings", "was not needed"):
         assert words_shown in shown
-    assert run(monkeypatch, *words, "--position-sigma", "0.001mm") == 1
+    assert run(monkeypatch, "locate", *words, "--position-sigma", "0.001mm") == 1
     assert "Doubtful" in capsys.readouterr().out
     assert load_location(tmp_path / "a.yaml").status == "doubtful"
 

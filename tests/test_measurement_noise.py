@@ -1,7 +1,6 @@
 """Measurement noise from repeated images (4.2): statistics, axes, Canny, the command."""
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from io import StringIO
@@ -11,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from command_line import run
 from rendering import Bar, Light, RepeatedImages, render, repeated_images
 from rich.console import Console
 from scipy.spatial.transform import RigidTransform
 
-from legcal import cli, measure_noise
+from legcal import measure_noise
 from legcal.calibration import QUANTITIES, DatasetNoise, PooledSpread
 from legcal.calibration.measurement_noise.canny import canny_parts, edge_points
 from legcal.calibration.measurement_noise.comparison import find_repeats, noise_notes
@@ -364,16 +364,6 @@ def spoiled(rendered: RepeatedImages, tmp_path: Path) -> RepeatedImages:
     return RepeatedImages(tmp_path / "set", rendered.machine, entry, rows, dict(rendered.pictures))
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
-    """Run the command in this process, without others, and return its exit code."""
-    monkeypatch.setattr("legcal.cli.options.MAX_IMAGE_WORKERS", 1)
-    monkeypatch.setattr(sys, "argv", ["legcal", "noise", *map(str, words)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    assert isinstance(stop.value.code, int)
-    return stop.value.code
-
-
 def test_json_is_one_document_whatever_the_order_and_the_folder_stays_as_it_was(
     spoiled: RepeatedImages,
     found: DatasetNoise,
@@ -382,7 +372,7 @@ def test_json_is_one_document_whatever_the_order_and_the_folder_stays_as_it_was(
 ) -> None:
     spoiled.rows.reverse()
     before = sorted(spoiled.write().rglob("*"))
-    assert run(monkeypatch, spoiled.path, "--json") == 0
+    assert run(monkeypatch, "noise", spoiled.path, "--json") == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out) == found.document()
     assert sorted(spoiled.path.rglob("*")) == before
@@ -571,4 +561,4 @@ def test_repeats_are_images_of_one_pose_in_one_view(
     apart = replace(measurements, view=np.arange(6, dtype=np.intp))
     with pytest.raises(NotIdentifiable, match="no two images of one pose in any view"):
         find_repeats(apart, every, table)
-    assert run(monkeypatch, tmp_path / "nowhere") == 2
+    assert run(monkeypatch, "noise", tmp_path / "nowhere") == 2
