@@ -513,3 +513,16 @@ def axes_session(
             "truth",
         ),
     )
+
+
+def with_camera(
+    measurements: Measurements, outlines: Outlines, camera: Camera
+) -> tuple[Measurements, Outlines]:
+    """Return the same pixels, taken for those of another camera."""
+    views = tuple(replace(view, camera=camera) for view in measurements.views)
+    xy = camera.undistort(outlines.ends)
+    rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+    h = np.cross(rays[:, 0], rays[:, 1])
+    h /= np.linalg.norm(h, axis=1, keepdims=True)
+    h *= np.sign(np.sum(h * outlines.h, axis=1, keepdims=True))
+    return replace(measurements, views=views), replace(outlines, h=h)

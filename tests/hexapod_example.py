@@ -1,6 +1,5 @@
 """Copies of the example hexapod, as it is or small for tests to spoil; one run of all of it."""
 
-import csv
 import re
 import shutil
 from collections.abc import Callable, Sequence
@@ -11,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
+from csv_rows import read_rows, write_rows
 from numpy.typing import NDArray
 
 from legcal.calibration.verdict import Calibration
@@ -83,10 +83,7 @@ class Spoiled:
     def write(self) -> Path:
         """Write dataset.yaml and the table."""
         (self.path / "dataset.yaml").write_text(yaml.safe_dump(self.entry, sort_keys=False))
-        with (self.path / "measurements.csv").open("w", newline="") as stream:
-            writer = csv.DictWriter(stream, list(self.rows[0]))
-            writer.writeheader()
-            writer.writerows(self.rows)
+        write_rows(self.path / "measurements.csv", self.rows)
         return self.path
 
 
@@ -95,8 +92,7 @@ def spoiled(path: Path, n: int, views: Sequence[str] = ("c1", "c2", "c3")) -> Sp
     shutil.copytree(HEXAPOD / "models", path / "models")
     shutil.copytree(HEXAPOD / "urdf", path / "urdf")
     (path / "images").mkdir()
-    with (HEXAPOD / "measurements.csv").open(newline="") as stream:
-        every = list(csv.DictReader(stream))
+    every = read_rows(HEXAPOD / "measurements.csv")
     rows = [row for v in views for row in [row for row in every if row["view"] == v][:n]]
     for row in rows:
         picture = cv2.imread(str(HEXAPOD / row["image"]), cv2.IMREAD_GRAYSCALE)

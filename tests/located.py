@@ -1,12 +1,12 @@
 """Machines that stand somewhere in the world, and tool poses measured there."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+from csv_rows import write_rows
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import ToolPoses
@@ -142,10 +142,3 @@ def write_poses(
         rows.append({name: repr(float(x)) for name, x in numbers.items()})
     write_rows(path, rows)
     return rows
-
-
-def write_rows(path: Path, rows: Sequence[dict[str, str]]) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)

@@ -1,6 +1,5 @@
 """A small renderer of lit cylinders with exactly known outlines, and repeated images of legs."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
+from csv_rows import write_rows
 from scipy.spatial.transform import RigidTransform
 
 from legcal.files import motion_to_xyz_quat
@@ -174,10 +174,7 @@ class RepeatedImages:
         for name, picture in self.pictures.items():
             pixels = np.clip(np.rint(picture), 0, 255).astype(np.uint8)
             assert cv2.imwrite(str(self.path / name), pixels)
-        with (self.path / "measurements.csv").open("w", newline="") as stream:
-            writer = csv.DictWriter(stream, list(self.rows[0]))
-            writer.writeheader()
-            writer.writerows(self.rows)
+        write_rows(self.path / "measurements.csv", self.rows)
         return self.path
 
 

@@ -3,7 +3,6 @@
 What every command writes for every shipped machine is compared in characterisation/.
 """
 
-import csv
 import json
 import re
 import shutil
@@ -17,6 +16,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import yaml
+from csv_rows import read_rows, write_rows
 from hexapod_example import HEXAPOD, ROOT, TRUTH, Run, copy_of_the_example
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import files_of, settings, simulated
@@ -45,12 +45,8 @@ PLANAR = "3-rpr"
 
 def _change(path: Path, change: Callable[[Rows], Rows]) -> Rows:
     """Change the rows of a table; return them."""
-    with path.open(newline="") as file:
-        rows = change(list(csv.DictReader(file)))
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    rows = change(read_rows(path))
+    write_rows(path, rows)
     return rows
 
 

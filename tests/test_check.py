@@ -1,6 +1,5 @@
 """Change detection: rare false alarms, changes found and named, results read back as written."""
 
-import csv
 import json
 import shutil
 from collections.abc import Callable
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from csv_rows import read_rows, write_rows
 from simulated import files_of, simulated
 
 from legcal import calibrate, check
@@ -67,14 +67,10 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _edited(images: Path, folder: Path, table: str, edit: Callable[[dict[str, str]], Any]) -> Path:
     """Copy images with every row of a table edited in place."""
     shutil.copytree(images, folder)
-    with (folder / table).open(newline="") as file:
-        rows: Rows = list(csv.DictReader(file))
+    rows = read_rows(folder / table)
     for row in rows:
         edit(row)
-    with (folder / table).open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(folder / table, rows)
     return folder
 
 

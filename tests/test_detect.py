@@ -1,6 +1,5 @@
 """``legcal detect``: the folder that people look at, what is drawn, and that nothing is lost."""
 
-import csv
 import json
 import re
 from dataclasses import replace
@@ -11,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from command_line import run
+from csv_rows import read_rows, write_rows
 from outline_tables import assert_same
 from rendering import SIZE, RepeatedImages, repeated_images
 from scipy.spatial.transform import RigidTransform
@@ -73,18 +73,6 @@ def one_image(rendered: RepeatedImages, tmp_path: Path) -> RepeatedImages:
     return made
 
 
-def table(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def write_table(path: Path, rows: list[dict[str, str]]) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def test_folder_json_and_summary_tell_the_same(
     rendered: RepeatedImages,
     tmp_path: Path,
@@ -96,7 +84,7 @@ def test_folder_json_and_summary_tell_the_same(
     assert run(monkeypatch, "detect", rendered.path, "-o", out, "--json") == 1  # c2 shows no leg
     document = json.loads(capsys.readouterr().out)
     assert sorted(rendered.path.rglob("*")) == before
-    rows = table(out / "observations.csv")
+    rows = read_rows(out / "observations.csv")
     assert document["outlines"] == len(rows)
     assert document["used"] == sum(row["verdict"] == "used" for row in rows) > 20
     assert list(document["views"]) == ["c1", "c2"]
@@ -192,9 +180,9 @@ def test_an_edited_table_is_never_written_over_and_wins_in_the_dataset(
     out = tmp_path / "out"
     detect(one_image.path, output=out)
     detect(one_image.path, output=out)  # replaces its own files
-    rows = table(out / "observations.csv")
+    rows = read_rows(out / "observations.csv")
     rows[3] |= {"verdict": "rejected", "reason": "a cable", "source": "edited"}
-    write_table(out / "observations.csv", rows)
+    write_rows(out / "observations.csv", rows)
     edited = (out / "observations.csv").read_bytes()
     with pytest.raises(UsageError, match=r"found a table that was changed since .* copy it into"):
         detect(one_image.path, output=out)
@@ -203,7 +191,7 @@ def test_an_edited_table_is_never_written_over_and_wins_in_the_dataset(
     found = detect(one_image.path, output=out)
     assert found.outlines.reason[3] == "a cable"
     assert found.outlines.source.count("edited") == 1
-    kept = table(out / "observations.csv")[3]
+    kept = read_rows(out / "observations.csv")[3]
     assert (kept["verdict"], kept["source"], kept["contrast"]) == ("rejected", "edited", "")
 
 

@@ -12,6 +12,7 @@ import pinocchio as pin
 import pytest
 import yaml
 from command_line import run
+from csv_rows import write_rows
 from located import (
     BASE,
     SIGMA_ANGLE,
@@ -22,7 +23,6 @@ from located import (
     motion_error,
     shipped,
     write_poses,
-    write_rows,
 )
 from scipy.spatial.transform import RigidTransform, Rotation
 

@@ -1,6 +1,5 @@
 """Errors of measurements: outliers rejected, noise, common-mode biases and gammas estimated."""
 
-import csv
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -8,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from csv_rows import read_rows
 from dense_fit import jacobian, residuals
 from fit_sessions import (
     BOARD,
@@ -574,8 +574,7 @@ def test_photographs_without_a_gamma_are_read_with_the_one_they_show(tmp_path: P
     assert abs(np.log(gamma.gamma / 2.2)) < 3.0 * gamma.sigma
     assert gamma.gamma > 1.4
     assert gamma.measured_with > 1.3
-    with (data / "observations.csv").open(newline="") as file:
-        read = {row["gamma"] for row in csv.DictReader(file)} - {""}
+    read = {row["gamma"] for row in read_rows(data / "observations.csv")} - {""}
     assert {float(cell) for cell in read} == {gamma.measured_with}
     again = legcal.calibrate(data)  # by the table, which knows with what it was measured
     assert again.solution.gammas[0].gamma == pytest.approx(gamma.gamma, rel=1e-6)

@@ -1,7 +1,5 @@
 """Effects of errors in what counts as known are those of fits with them; focal lengths too."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from fit_sessions import (
@@ -14,10 +12,10 @@ from fit_sessions import (
     machine_session,
     noisy_outlines,
     noisy_readings,
+    with_camera,
 )
 
 from legcal.calibration.joint_fit import NO_CHOICES, Choices, Prior, Solution, refine
-from legcal.data import Measurements, Outlines
 from legcal.geometry import Array
 from legcal.machine import moved_legs
 from legcal.vision import Camera, with_intrinsics
@@ -30,19 +28,6 @@ FOCAL = "a focal length 1 % longer"
 @pytest.fixture(scope="module")
 def session() -> HexapodSession:
     return irregular_hexapod(8, camera=LENS)
-
-
-def with_camera(
-    measurements: Measurements, outlines: Outlines, camera: Camera
-) -> tuple[Measurements, Outlines]:
-    """Return the same pixels, taken for those of another camera."""
-    views = tuple(replace(view, camera=camera) for view in measurements.views)
-    xy = camera.undistort(outlines.ends)
-    rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
-    h = np.cross(rays[:, 0], rays[:, 1])
-    h /= np.linalg.norm(h, axis=1, keepdims=True)
-    h *= np.sign(np.sum(h * outlines.h, axis=1, keepdims=True))
-    return replace(measurements, views=views), replace(outlines, h=h)
 
 
 def _fit(

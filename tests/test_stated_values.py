@@ -12,6 +12,7 @@ from fit_sessions import (
     machine_session,
     shifted,
     with_board,
+    with_camera,
 )
 from thinned import thinned
 
@@ -23,7 +24,6 @@ from legcal.calibration.joint_fit import (
     Solution,
     refine,
 )
-from legcal.data import View
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.vision import Board, with_intrinsics
 
@@ -64,14 +64,8 @@ def assert_exact(session: MachineSession, found: Solution, tolerance: float = 1e
 def with_wrong_cameras(session: MachineSession, number: float, key: str) -> MachineSession:
     """Return a session whose camera files have another number; pixels stay as they are."""
     camera = with_intrinsics(LENS, {key: number})
-    views = tuple(View(view.name, camera) for view in session.measurements.views)
-    xy = camera.undistort(session.outlines.ends)
-    rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
-    h = np.cross(rays[:, 0], rays[:, 1])
-    h *= np.sign(np.sum(h * session.outlines.h, axis=1, keepdims=True))
-    h /= np.linalg.norm(h, axis=1, keepdims=True)
-    measurements = replace(session.measurements, views=views)
-    return replace(session, measurements=measurements, outlines=replace(session.outlines, h=h))
+    measurements, outlines = with_camera(session.measurements, session.outlines, camera)
+    return replace(session, measurements=measurements, outlines=outlines)
 
 
 def test_fixed_parameters_stay_at_nominal_or_at_their_values(session: MachineSession) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from csv_rows import read_rows
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from outline_tables import LEG_NAMES, LEGS, assert_same, outlines_of, recorded
@@ -182,8 +183,7 @@ def test_rows_without_image_are_named_by_label_or_else_by_number(tmp_path: Path)
     assert row_names(shared) == ("x", "x", "y", "y")
     clash = recorded(["x", "", "", ""], ["", "y", "x", "z"])
     assert row_names(clash) == ("x", "y", "3", "z")
-    with written(tmp_path, axis_table()).open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(written(tmp_path, axis_table()))
     assert [row["image"] for row in rows[::3]] == ["i/2.png", "i/1.png", "a", "b"]
     assert rows[2]["leg"] == "leg, C"
 
