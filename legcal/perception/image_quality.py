@@ -140,7 +140,8 @@ def _greatest_slopes(grey: Grey, row: IntArray, column: IntArray) -> Grey:
 
 def _blur_of(ratios: Grey) -> float:
     """Return the blur of edges by the ratios of their slopes, fine to coarse."""
-    ratio = float(np.median(ratios))
+    ordered, n = np.sort(ratios), len(ratios)
+    ratio = 0.5 * float(ordered[(n - 1) // 2] + ordered[n // 2])
     one, two = (s**2 for s in SCALES)
     # ratio^2 = (sigma^2 + s2^2) / (sigma^2 + s1^2)
     squared = (two - ratio**2 * one) / max(ratio**2 - 1.0, 1e-3)

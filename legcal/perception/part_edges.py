@@ -27,6 +27,7 @@ MAX_BLOCKS = 80  # of a part
 MARGIN = 6  # columns beyond the search window, to judge what an edge is [px]
 MAX_LINES = 8  # near an edge
 SIZES = 4  # windows are worked on together whose half widths are equal in steps of so much [px]
+MOST_VOTES = 2_000_000  # that are added at once, of a few patches
 SEPARATION = 2  # columns and differences of ends up to which a line is the same as a better one
 WIDTH_TOLERANCE = (1.0, 0.02)  # [px] and share of the width: one standard deviation
 MIN_SCORE = 0.15  # of an edge of a pair: mean sharpness of its blocks
@@ -258,12 +259,16 @@ def _lines(votes: Samples, n_blocks: IntArray, halves: IntArray) -> tuple[Array,
     side, middle = 2 * (most + SEPARATION) + 1, most + SEPARATION
     score = np.zeros((n, side, side), dtype=np.float32)
     sizes = np.minimum(SIZES * -(-halves // SIZES), most)
+    first = np.cumsum(n_blocks) - n_blocks
     for half in np.unique(sizes).tolist():
-        own = np.flatnonzero(sizes == half)
-        rows = np.repeat(sizes == half, n_blocks)
         inner = slice(middle - half, middle + half + 1)
-        of_own = votes[rows, most - half : most + half + 1]
-        score[own, inner, inner] = _added(of_own, n_blocks[own], halves[own], half)
+        alike = np.flatnonzero(sizes == half)
+        n_together = max(1, MOST_VOTES // (int(n_blocks.max()) * (2 * half + 1) ** 2))
+        for k in range(0, len(alike), n_together):
+            own = alike[k : k + n_together]
+            rows = np.concatenate([np.arange(first[e], first[e] + n_blocks[e]) for e in own])
+            of_own = votes[rows, most - half : most + half + 1]
+            score[own, inner, inner] = _added(of_own, n_blocks[own], halves[own], half)
     flat, every = score.reshape(n, -1), np.arange(n)
     around = np.arange(-SEPARATION, SEPARATION + 1)
     around = (around[:, None] * side + around).ravel()
