@@ -122,3 +122,25 @@ def test_without_a_command_the_help_is_shown(
     printed = capsys.readouterr()
     assert "Commands" in printed.out
     assert printed.err == "legcal: Nothing was done: found no command, needed one of those above.\n"
+
+
+@pytest.mark.parametrize("workers", ["0", "-1", "257", "1000000"])
+@pytest.mark.parametrize("words", [("detect", "x", "-o", "y"), ("study", "paper", "-o", "y")])
+def test_impossible_numbers_of_processes_are_refused_before_any_is_started(
+    words: tuple[str, ...],
+    workers: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(monkeypatch, *words, "--workers", workers) == 2
+    said = capsys.readouterr().err
+    assert f"--workers could not be used: found {workers}, needed 1 to 256 processes" in said
+
+
+def test_help_names_the_unit_of_the_tool_position(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "locate", "--help") == 0
+    assert "Tool in the platform, in metres" in " ".join(
+        capsys.readouterr().out.replace("\u2502", " ").split()
+    )

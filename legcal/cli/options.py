@@ -16,7 +16,8 @@ from legcal.errors import OutOfResources, UsageError, printable
 from legcal.processors import processors
 
 INTERRUPTED = 130  # exit code of a command that a signal stopped
-MAX_IMAGE_WORKERS = 4  # processes that search images; each takes about 150 MB
+MAX_IMAGE_WORKERS = 4  # processes that search images by default; each takes about 150 MB
+MAX_WORKERS = 256  # more are a mistake: all of them are started
 
 ModelArgument = Annotated[
     str,
@@ -33,11 +34,11 @@ JsonOption = Annotated[
 ]
 
 
-def _at_least_one(workers: int | None) -> int | None:
-    if workers is not None and workers < 1:
+def _possible_number(workers: int | None) -> int | None:
+    if workers is not None and not 1 <= workers <= MAX_WORKERS:
         raise UsageError(
-            f"--workers could not be used: found {workers}, needed 1 or more processes; give "
-            "another number or leave it out."
+            f"--workers could not be used: found {workers}, needed 1 to {MAX_WORKERS} processes; "
+            "give another number or leave it out."
         )
     return workers
 
@@ -45,7 +46,7 @@ def _at_least_one(workers: int | None) -> int | None:
 WorkersOption = Annotated[
     int | None,
     typer.Option(
-        callback=_at_least_one,
+        callback=_possible_number,
         help="Number of processes; by default one for each core (for images at most "
         f"{MAX_IMAGE_WORKERS}). Results do not depend on it.",
     ),
