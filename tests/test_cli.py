@@ -19,7 +19,10 @@ from legcal.errors import ModelError, NotVisible
         (["inspect", "hexapod"], {"casadi", "cv2", "trimesh", "yourdfpy", "scipy.stats"}, "SPU"),
         (
             ["calibrate", "missing", "-o", "out", "--json"],
-            {"scipy.stats", "scipy.optimize", "scipy.interpolate", "trimesh", "plotly"},
+            {
+                *("scipy.stats", "scipy.optimize", "scipy.interpolate", "scipy.sparse.csgraph"),
+                *("trimesh", "plotly"),
+            },
             "missing",
         ),
     ],

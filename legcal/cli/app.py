@@ -85,6 +85,8 @@ def run(*, as_json: bool) -> int:
     """Run the command line and return 0, 1 (data), 2 (use) or 3 (internal)."""
     # Thousands of small matrices: threads inside a product only get in each other's way.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    # Plugins for models of files are of no use here, and are looked for in all that is installed.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     gc.set_threshold(_ALLOCATIONS)
     usage_error: type[Exception] = typer.BadParameter.__bases__[0]
     try:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from legcal.cli.options import DatasetArgument, JsonOption, image_workers, show
+from legcal.cli.options import DatasetArgument, JsonOption, image_workers, loading, show
 from legcal.errors import UsageError
 from legcal.paper import Criteria, Transformation
 
@@ -117,10 +117,12 @@ def calibrate(
             "The calibration could not be run: found no --output (-o), needed the result folder to "
             "write; name one, or the result to test with --check."
         )
-    from legcal import calibration, report
+    with loading():
+        from legcal import calibration, report
 
+        run, summary = calibration.calibrate, report.summary
     with report.progress_on_stderr() as progress:
-        found = calibration.calibrate(
+        found = run(
             dataset,
             output=output,
             progress=progress,
@@ -136,7 +138,7 @@ def calibrate(
     show(
         as_json,
         lambda: calibration.result_of(found).document(),
-        lambda: report.summary(found, output),
+        lambda: summary(found, output),
     )
     if not found.verdict.trustworthy:
         raise typer.Exit(1)

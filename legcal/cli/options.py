@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import sys
@@ -60,6 +61,17 @@ if TYPE_CHECKING:
 def image_workers(workers: int | None = None) -> int:
     """Return the number of processes that search images, by default few: each takes memory."""
     return workers or min(processors(), MAX_IMAGE_WORKERS)
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """Load libraries without searches for dead cycles: none of what they make is dead."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def show(
