@@ -313,6 +313,10 @@ def test_families_have_the_mobility_of_their_type(name: str, mobility: int, tmp_
         assert singularity(machine, machine.home) > 0.05
 
 
+def test_a_family_has_up_to_as_many_legs_as_are_stated(tmp_path: Path) -> None:
+    assert len(family(tmp_path, "32-SPS").legs) == 32  # 129 joints that move
+
+
 def test_dimensions_of_a_family_are_those_that_were_given(tmp_path: Path) -> None:
     spread: dict[str, Any] = {"base_spread": 20.0, "platform_spread": 40.0}
     lengths: dict[str, Any] = {"offset": 380.0, "travel": (-5.0, 120.0), "leg_radius": 12.5}

@@ -19,7 +19,7 @@ from legcal.machine.files import read_file
 
 MAX_ELEMENTS = 50_000
 MAX_LINKS = 1000
-MAX_MOVING = 100
+MAX_MOVING = 200
 
 
 def parse_robot(path: Path, content: bytes) -> etree._Element:

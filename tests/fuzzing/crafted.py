@@ -119,7 +119,7 @@ def _models() -> Iterator[tuple[str, str, bytes, str]]:
     for n, word in ((9000, "needed"), (900, "move")):
         yield f"{n} revolutes", "formats:loops.urdf", _chain(n, "revolute"), word
     yield "900 fixed joints", "formats:loops.urdf", _chain(900, "fixed"), ""
-    yield "99 revolutes", "formats:loops.urdf", _chain(99, "revolute"), ""
+    yield "199 revolutes", "formats:loops.urdf", _chain(199, "revolute"), ""
     planar = (made_input("formats") / "planar.xml").read_bytes()
     made = planar.replace(b'"b1" axis="0 0 1"', b'"b1" axis="0.1 0 1"')
     yield "an axis in the plane of slider and leg", "formats:planar.xml", made, "b1"
