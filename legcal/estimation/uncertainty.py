@@ -103,20 +103,21 @@ def explained_share(
         with_kept = (following.reshape(-1, len(covariance)) @ covariance).reshape(following.shape)
         with_kept = np.pad(with_kept, ((0, 0), (0, 0), (0, 1)))
         of_elements = with_kept[..., :-1] @ np.swapaxes(following, 1, 2)
-        own_numbers = np.arange(problem.d_element)
         Z = None if normal.tangent is None else normal.tangent.Z
         left = normal.V_inverse
         of_elements += left if Z is None else Z @ left @ np.swapaxes(Z, 1, 2)
     for member, columns in where.members:
         J = np.ascontiguousarray(rows.J[member])
-        found = J @ padded[np.ix_(columns, columns)] @ np.swapaxes(J, 1, 2)
-        if where.element is not None:
-            element, own = where.element[member], np.ascontiguousarray(rows.J_element[member])
-            by_both = with_kept[np.ix_(element, own_numbers, columns)]
-            mixed = own @ by_both @ np.swapaxes(J, 1, 2)
-            found += mixed + np.swapaxes(mixed, 1, 2)
-            found += own @ of_elements[element] @ np.swapaxes(own, 1, 2)
-        share[member] = found
+        k, q, m = J.shape
+        along = (J.reshape(k * q, m) @ padded[np.ix_(columns, columns)]).reshape(k, q, m)
+        if where.element is None:
+            share[member] = along @ np.swapaxes(J, 1, 2)
+            continue
+        element, own = where.element[member], np.ascontiguousarray(rows.J_element[member])
+        mixed = own @ with_kept[:, :, columns][element]
+        crossed = mixed @ np.swapaxes(J, 1, 2)
+        share[member] = (along + mixed) @ np.swapaxes(J, 1, 2) + np.swapaxes(crossed, 1, 2)
+        share[member] += own @ of_elements[element] @ np.swapaxes(own, 1, 2)
     return share
 
 
