@@ -26,7 +26,9 @@ from legcal.simulation import (
 )
 from legcal.simulation.solids import Box, PosedMachine, Solid, solids_of
 from legcal.simulation.visibility import MIN_SHARE, contact_offsets
-from legcal.vision import outlines_of_axis
+from legcal.vision import Camera, outlines_of_axis
+from legcal.vision.distortion import DistortionModel
+from legcal.vision.visibility import in_picture, pixels_inside
 
 SHIPPED = (
     "hexapod", "3-rpr", "3-rps", "3-spr", "3-upu", "3-upu-tilted", "6-sps", "hexapod-rod",
@@ -192,3 +194,28 @@ def test_silhouettes_are_the_tangent_planes_of_eq_3(numbers: tuple[float, ...]) 
     assert np.allclose(np.sum(h * offsets, axis=-1), [-R, R], atol=1e-12)  # epsilon +1, -1
     with pytest.raises(NotVisible, match=r"5\.0 mm from its axis"):
         contact_offsets(np.array([0.0, 1.0, 0.0]), np.array([0.005, 0.0, 0.0]), np.array(0.01))
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion"),
+    [
+        ("plumb_bob", [-0.3, 0.0, 0.0, 0.0, 0.0]),
+        ("plumb_bob", [-0.2, 0.05, 1e-3, 1e-3, 0.0]),
+        ("plumb_bob", [0.2, -0.05, 0.0, 0.0, 0.0]),
+        ("rational_polynomial", [0.3, 0.1, 0.0, 0.0, 0.01, 0.5, 0.2, 0.02]),
+        ("equidistant", [0.1, -0.02, 1e-3, 0.0]),
+    ],
+)
+def test_points_that_a_lens_folds_back_are_not_in_the_picture(
+    model: DistortionModel, distortion: list[float]
+) -> None:
+    K = np.array([[900.0, 0.0, 512.0], [0.0, 920.0, 384.0], [0.0, 0.0, 1.0]])
+    camera = Camera(K, 1024, 768, np.array(distortion), model)
+    xy = np.random.default_rng(0).uniform(-3.0, 3.0, (3000, 2))
+    points = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    pixels = camera.distort(xy)
+    back = np.linalg.norm(camera.undistort(pixels) - xy, axis=1) < 1e-3
+    np.testing.assert_array_equal(
+        in_picture(camera, points, 0.1), pixels_inside(camera, pixels) & back
+    )
+    assert 0.1 < camera.unfolded < 2.0

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -20,6 +21,8 @@ from legcal.geometry import Array
 from legcal.vision.distortion import DistortionModel
 
 _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
+MAX_RADIUS = 10.0  # on the sensor plane, beyond which nothing is looked for
+N_DIRECTIONS, N_RADII = 16, 256  # in which a lens is looked at for folds
 _STEP = 1e-6  # of the central differences of undistortion, in units of the sensor plane
 
 
@@ -109,6 +112,23 @@ class Camera:
     def has_distortion(self) -> bool:
         """Whether any distortion coefficient differs from zero."""
         return bool(np.any(self.distortion != 0.0)) or DISTORTION_MODELS[self.model].is_fisheye
+
+    @cached_property
+    def unfolded(self) -> float:
+        """Radius on the sensor plane up to which points farther from the axis are seen farther out.
+
+        Beyond it the polynomials of a lens may fold points back into the image.
+        """
+        x, y = self.width - 1.0, self.height - 1.0
+        border = np.array([[0.0, 0.0], [x, 0.0], [0.0, y], [x, y]])
+        seen = float(np.linalg.norm(self.undistort(border), axis=1).max())
+        most = 1.1 * (seen if seen < MAX_RADIUS else MAX_RADIUS)
+        turn = np.linspace(0.0, 2.0 * np.pi, N_DIRECTIONS, endpoint=False)
+        radius = np.linspace(0.0, most, N_RADII)
+        rays = radius[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+        out = np.linalg.norm(self.distort(rays) - self.K[:2, 2], axis=-1)
+        folds = np.any(np.diff(out, axis=0) <= 0.0, axis=1)
+        return float(radius[max(int(np.argmax(folds)) - 1, 0)] if folds.any() else most)
 
     def project(
         self,

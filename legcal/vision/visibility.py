@@ -171,8 +171,10 @@ def in_picture(camera: Camera, P_camera: Array, nearest: Array | float) -> BoolA
     xy = P_camera[..., :2] / np.where(front, depth, 1.0)[..., None]
     inside = front & pixels_inside(camera, camera.distort(xy))
     if camera.has_distortion:  # the polynomials fold far points back into the image
-        back = camera.undistort(camera.distort(np.where(inside[..., None], xy, 0.0)))
-        inside &= np.linalg.norm(back - np.where(inside[..., None], xy, 0.0), axis=-1) < 1e-3
+        far = inside & (np.sum(xy**2, axis=-1) > camera.unfolded**2)
+        if far.any():
+            back = camera.undistort(camera.distort(xy[far]))
+            inside[far] = np.linalg.norm(back - xy[far], axis=-1) < 1e-3
     return np.asarray(inside)
 
 
