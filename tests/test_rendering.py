@@ -18,6 +18,8 @@ from legcal.errors import UsageError
 from legcal.geometry import Array
 from legcal.machine import Machine, load_mechanism
 from legcal.simulation import Appearance, Level, Light, prepare_view, simulate
+from legcal.simulation.rendering.pipeline import CAMERAS
+from legcal.simulation.rendering.scene import develop
 from legcal.simulation.solids import (
     Box,
     Material,
@@ -288,9 +290,81 @@ def test_colours_are_the_materials_and_grey_is_their_mean() -> None:
     assert [red, green, blue] == pytest.approx([0.75, 0.5, 0.25], abs=1e-4)
 
 
+# What cameras make of the light.
+
+SIDE, DARK, LIGHT = 160, 0.2, 0.8
+
+
+def slanted_edge(kind: str, **changes: Any) -> tuple[Array, bytes]:
+    """Return the photograph of a slanted edge by a kind of camera in grey, and its file."""
+    x, y = np.meshgrid(np.arange(SIDE), np.arange(SIDE))
+    share = np.clip(edge_place(y) - x + 0.5, 0.0, 1.0)[..., None]
+    radiance = np.repeat(DARK + (LIGHT - DARK) * share, 3, axis=2).astype(np.float32)
+    look: dict[str, Any] = {"blur": 0.7, "electrons": 30_000.0, "bits": 8, "colour": True}
+    appearance = Appearance.clean(camera=kind, **(look | changes))
+    if not appearance.colour:
+        radiance = np.ascontiguousarray(radiance[..., 0])
+    image = develop(radiance, appearance, np.random.default_rng(3))
+    file = appearance.pipeline.file(image)
+    written = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_COLOR)
+    assert written is not None
+    return written.astype(np.float64) @ [0.114, 0.587, 0.299], file
+
+
+def edge_place(y: Any) -> Array:
+    """Return where the edge is in rows of the image [px]."""
+    return np.asarray(0.5 * (SIDE - 1) + 0.1 * (y - 0.5 * (SIDE - 1)))
+
+
+@pytest.mark.parametrize("kind", CAMERAS)
+@pytest.mark.parametrize("colour", [True, False])
+def test_cameras_leave_edges_where_they_are(kind: str, colour: bool) -> None:
+    grey, _ = slanted_edge(kind, colour=colour)
+    rows = np.arange(30, SIDE - 30)
+    places = []
+    for y in rows.tolist():
+        near = slice(int(edge_place(y)) - 8, int(edge_place(y)) + 9)
+        level = grey[y, near]
+        middle = 0.5 * (level[:3].mean() + level[-3:].mean())
+        k = int(np.flatnonzero(level >= middle)[-1])
+        places.append(near.start + k + (level[k] - middle) / (level[k] - level[k + 1]))
+    assert np.mean(places - edge_place(rows)) == pytest.approx(0.0, abs=0.05)
+
+
+def test_sharpening_overshoots_and_an_industrial_camera_does_not() -> None:
+    clean, _ = slanted_edge("industrial", electrons=math.inf)
+    sharp, _ = slanted_edge("action", electrons=math.inf)
+    middle = slice(60, 100)  # free of vignetting
+    overshoot = sharp[middle, 40:].max() / np.median(sharp[middle, 60:66]) - 1.0
+    assert clean.max() <= 255.0 * LIGHT + 1.0
+    assert overshoot > 0.05
+
+
+def test_corners_are_darker_and_softer() -> None:
+    wide = CAMERAS["action"]
+    even = wide.through_lens(np.ones((90, 120, 3), dtype=np.float32), 0.0)
+    assert even[0, 0] == pytest.approx(1.0 - wide.vignetting, abs=1e-6)
+    assert even[45, 60] == pytest.approx(1.0, abs=1e-3)
+    points = np.zeros((200, 200, 3), dtype=np.float32)
+    points[[100, 8], [100, 8]] = 1.0
+    blurred = wide.through_lens(points, 0.5)[..., 1]
+    assert blurred[100, 100] > 2.0 * blurred[8, 8] / (1.0 - wide.vignetting)
+
+
+def test_files_are_of_the_stated_quality() -> None:
+    files = {quality: slanted_edge("webcam", jpeg=quality)[1] for quality in (50, 95)}
+    assert all(file[:2] == b"\xff\xd8" for file in files.values())
+    assert len(files[95]) > 1.5 * len(files[50])
+    assert slanted_edge("industrial")[1][:4] == b"\x89PNG"
+    assert Appearance(camera="industrial", jpeg=75).pipeline.suffix == ".jpg"
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
+        {"camera": "webcm"},
+        {"camera": "phone", "bits": 16},
+        {"jpeg": 101},
         {"read_noise": -1.0},
         {"gamma": 0.0},
         {"blur": math.nan},
@@ -303,7 +377,7 @@ def test_colours_are_the_materials_and_grey_is_their_mean() -> None:
     ],
 )
 def test_looks_that_make_no_sense_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(UsageError, match=r"found .*, needed .*; c"):
+    with pytest.raises(UsageError, match=r"found .*, needed .*;"):
         Appearance(**wrong)
 
 

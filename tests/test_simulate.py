@@ -127,6 +127,21 @@ def test_the_seed_and_nothing_else_decides_what_is_drawn(tmp_path: Path) -> None
     assert "observations.csv" not in axes
 
 
+def test_photographs_are_those_of_the_kind_of_camera_and_its_file(tmp_path: Path) -> None:
+    nominal, lens = load_mechanism("3-rps"), small_camera(tmp_path)
+    asked = Request(camera=["webcam:60", str(lens)], poses="1", views=1)
+    found = requested(asked, nominal)
+    look = found.appearance
+    assert (look.camera, look.jpeg, look.colour, found.camera) == ("webcam", 60, True, lens)
+    made = simulate("3-rps", tmp_path / "made", found)
+    dataset = load_dataset(made.folder)
+    (name,) = dataset.measurements.image
+    assert name.endswith(".jpg")
+    assert dataset.image_reader([0])(0).shape == (150, 200)
+    grey = requested(replace(asked, camera=["phone"], colour=False), nominal).appearance
+    assert (grey.camera, grey.jpeg, grey.colour) == ("phone", None, False)
+
+
 def test_photographs_do_not_depend_on_the_number_of_processes(tmp_path: Path) -> None:
     look = legcal.Appearance(gamma=1.8, clutter=0, samples=13)
     few = settings(
@@ -244,6 +259,10 @@ PASSIVE = "hexapod with a passive leg"
             Request(board="charuco", hand_held=True, cameras=Path("c.yaml")),
             "both --hand-held and --cameras",
         ),
+        ("hexapod", Request(camera=["webcm"]), "'webcm', neither a kind .* webcam, phone"),
+        ("hexapod", Request(camera=["phone:best"]), "--camera .* found 'phone:best'"),
+        ("hexapod", Request(camera=["phone", "webcam"]), "found 0 files and 2 kinds"),
+        ("hexapod", Request(camera=["phone"], level=Level.AXES), "--camera phone .* --level axes"),
     ],
 )
 def test_options_without_effect_on_a_machine_are_refused(

@@ -126,13 +126,15 @@ class Request:
             metavar="FILE",
         ),
     )
-    camera: Path | None = field(
+    camera: list[str] | None = field(
         default=None,
         metadata=_option(
-            "Camera file (ROS, OpenCV, Kalibr).",
+            "Camera file (ROS, OpenCV, Kalibr); or what it does to photographs: machine-jpeg, "
+            "webcam, phone, action or industrial, webcam:60 for another JPEG quality. Once for "
+            "each.",
             _CAMERAS,
-            metavar="FILE",
-            shown="1024 x 768 px, slight distortion",
+            metavar="FILE|KIND",
+            shown="1024 x 768 px, slight distortion; industrial",
         ),
     )
     board: str | None = field(

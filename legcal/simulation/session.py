@@ -10,11 +10,10 @@ from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
-import cv2
 import numpy as np
 
 from legcal.data import Corners, Measurements, Outlines, View
-from legcal.errors import NotVisible, OutOfResources
+from legcal.errors import NotVisible
 from legcal.machine import Configurations, Machine
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard, chosen_board
@@ -54,7 +53,6 @@ _PURPOSES = ("errors", "poses", "cameras", "readings", "hints", "observations", 
              "corners")  # fmt: skip
 _MIN_SIGMA_Q = 1e-9  # [m] that readings without noise claim
 _MIN_SEEN = 0.5  # of the photographs of a view that show a leg which its hint names
-_FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # for colours; grey levels are written faster without
 
 
 def streams(seed: int) -> dict[str, np.random.Generator]:
@@ -261,9 +259,9 @@ def _recorded(
         q = q + size * rngs["readings"].normal(size=q.shape)
     names = [""] * len(images)
     if photographs:
-        repeated = int(images.repeat.max()) > 0
+        repeated, suffix = int(images.repeat.max()) > 0, settings.appearance.pipeline.suffix
         names = [
-            f"images/{views[v].name}_{labels[p]}{f'_{k + 1}' * repeated}.png"
+            f"images/{views[v].name}_{labels[p]}{f'_{k + 1}' * repeated}{suffix}"
             for v, p, k in zip(images.view, images.pose, images.repeat, strict=True)
         ]
     seen, pose = np.unique(images.pose, return_inverse=True)
@@ -285,7 +283,7 @@ def _recorded(
 def photographs(
     session: SimulatedSession, appearance: Appearance, rng: np.random.Generator, workers: int = 1
 ) -> Generator[tuple[int, bytes]]:
-    """Yield row and PNG of all images of a session."""
+    """Yield row and file of all images of a session."""
     views, images = session.scene.views, session.scene.images
     of_views, of_images = rng.spawn(len(views)), rng.spawn(len(images))
     try:
@@ -316,16 +314,9 @@ class _Studio:
     sensor_rngs: Mapping[int, np.random.Generator] = field(compare=False)
 
     def photograph(self, row: int) -> bytes:
-        """Return the PNG of a row."""
+        """Return the file of a row's photograph."""
         image = _rendered_view(self).render(self.machines[row], self.sensor_rngs[row])
-        encoded, content = cv2.imencode(".png", image, _FAST if image.ndim == 3 else ())
-        if not encoded:
-            raise OutOfResources(
-                f"The photograph of row {row + 1} could not be encoded: found an image of "
-                f"{image.shape[1]} x {image.shape[0]} px that PNG does not take, needed a smaller "
-                "one; use another camera."
-            )
-        return content.tobytes()
+        return self.appearance.pipeline.file(image)
 
 
 @lru_cache(maxsize=1)

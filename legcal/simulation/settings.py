@@ -38,6 +38,7 @@ from legcal.machine import Machine, parametrization_of
 from legcal.simulation.board import KINDS as BOARD_KINDS
 from legcal.simulation.observe import TableNoise
 from legcal.simulation.rendering.appearance import Appearance, Light
+from legcal.simulation.rendering.pipeline import CAMERAS
 from legcal.simulation.request import Angles, Level, Request, Sampling
 from legcal.vision import Board
 
@@ -421,7 +422,7 @@ def requested(request: Request, nominal: Machine) -> SimulationSettings:
         shared_poses=bool(request.shared_poses) or isinstance(given, Path),
         images=request.images,
         views=request.cameras or (3 if request.views is None else request.views),
-        camera=request.camera,
+        camera=_camera(request)[0],
         board=_board(request.board),
         board_pose=request.board_pose,
         hand_held=request.hand_held,
@@ -511,7 +512,39 @@ def _appearance(request: Request) -> Appearance:
     """Return how photographs look."""
     base = Appearance() if request.appearance is None else read_appearance(request.appearance)
     given = {name: getattr(request, name) for name in ("blur", "clutter", "bits", "colour")}
+    _, kind, quality = _camera(request)
+    if kind is not None:
+        given |= {"camera": kind, "jpeg": quality}
+        given["colour"] = CAMERAS[kind].colour if request.colour is None else request.colour
     return replace(base, **{name: value for name, value in given.items() if value is not None})
+
+
+def _camera(request: Request) -> tuple[Path | None, str | None, int | None]:
+    """Return the camera file, the kind of camera, and the quality of its JPEG files."""
+    files, kinds = [], []
+    for choice in request.camera or ():
+        kind, colon, quality = choice.partition(":")
+        if kind in CAMERAS and (not colon or quality.isdecimal()):
+            kinds.append((kind, int(quality) if colon else None))
+        elif kind not in CAMERAS and (Path(choice).exists() or re.search(r"[./\\]", choice)):
+            files.append(Path(choice))
+        else:
+            raise UsageError(
+                f"--camera could not be used: found {describe(choice)}, neither a kind of camera "
+                f"nor a file, needed {', '.join(CAMERAS)}, one of them with the quality of its "
+                f"JPEG files such as webcam:60, or the path of a file; {closest(kind, CAMERAS)}"
+            )
+    if max(len(files), len(kinds)) > 1:
+        raise UsageError(
+            f"--camera could not be used: found {len(files)} files and {len(kinds)} kinds, needed "
+            "at most one of each; leave out the others."
+        )
+    if kinds and request.level is not Level.PHOTOGRAPHS:
+        raise UsageError(
+            f"--camera {kinds[0][0]} could not be used: found --level {request.level}, needed "
+            "photographs, which a kind of camera changes; leave it out."
+        )
+    return (files[0] if files else None, *(kinds[0] if kinds else (None, None)))
 
 
 def _poses(text: str) -> int | Path:

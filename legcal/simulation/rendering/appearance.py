@@ -9,15 +9,17 @@ import cv2
 import numpy as np
 
 from legcal.errors import UsageError
+from legcal.files import closest, describe
+from legcal.simulation.rendering.pipeline import CAMERAS, CameraPipeline
 from legcal.simulation.rendering.rays import Single
 
 SAMPLES = (13, 21, 34, 55, 89, 144)  # Fibonacci numbers: the lattices of a pixel's rays
 
-_POSITIVE = ("exposure", "gamma")
+_POSITIVE = ("exposure", "gamma", "jpeg")
 _MIN = {"electrons": 1.0}
 _MAX = {
     "blur": 20.0, "gamma": 10.0, "clutter": 500.0, "cables": 100.0, "limb": 1.0, "texture": 10.0,
-    "electrons": math.inf,
+    "electrons": math.inf, "jpeg": 100.0,
 }  # fmt: skip
 
 _SIZE = 512  # points of the tile along a side
@@ -98,6 +100,12 @@ class Appearance:
         Bits of a pixel.
     colour : bool
         Blue, green, red as OpenCV has them instead of grey.
+    camera : {"industrial", "machine-jpeg", "webcam", "phone", "action"}
+        What the camera does to the light: an industrial one nothing, others process it and write
+        JPEG files of 8 bits. A webcam, phone or action camera has a mosaic of colour filters, which
+        counts where ``colour`` is set.
+    jpeg : int or None
+        Quality of the JPEG, 1 to 100, in place of the camera's own.
     samples : int
         Rays of each pixel that an edge may cross: 13, 21, 34, 55, 89 or 144. An outline is not
         biased by it, but its place scatters from one row of pixels to the next, by 0.030 px
@@ -128,13 +136,26 @@ class Appearance:
     read_noise: float = 12.0
     bits: Literal[8, 16] = 8
     colour: bool = False
+    camera: str = "industrial"
+    jpeg: int | None = None
     samples: int = 34
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if not isinstance(value, bool | tuple):
+            if isinstance(value, int | float) and not isinstance(value, bool):
                 _check_number(field.name, value)
+        if self.camera not in CAMERAS:
+            raise UsageError(
+                f"The appearance could not be used: found the camera {describe(self.camera)}, "
+                f"needed {', '.join(CAMERAS)}; {closest(self.camera, CAMERAS)}"
+            )
+        if self.pipeline.jpeg and self.bits != 8:
+            raise UsageError(
+                f"The appearance could not be used: found {self.bits} bits of a pixel and a camera "
+                "that writes JPEG files, needed 8 bits; leave out the bits, or choose the camera "
+                "industrial."
+            )
         _check_choice("bits", self.bits, (8, 16))
         _check_choice("samples", self.samples, SAMPLES)
         for light in self.lights:
@@ -149,6 +170,12 @@ class Appearance:
                     f"The light could not shine: found strength {light.strength:g} and radius "
                     f"{light.radius:g}, needed numbers of at least 0; correct them."
                 )
+
+    @property
+    def pipeline(self) -> CameraPipeline:
+        """What the camera does to the light."""
+        camera = CAMERAS[self.camera]
+        return camera if self.jpeg is None else replace(camera, jpeg=self.jpeg)
 
     @classmethod
     def clean(cls, **changes: object) -> Self:

@@ -171,21 +171,12 @@ def _tint(rng: np.random.Generator) -> tuple[float, float, float]:
 
 
 def develop(radiance: Single, appearance: Appearance, rng: np.random.Generator) -> Image:
-    """Return the image of a radiance: blur, saturation, noise, gamma, rounding."""
-    level = radiance * np.float32(appearance.exposure)
-    if appearance.blur > 0.0:
-        level = np.asarray(cv2.GaussianBlur(level, (0, 0), appearance.blur))
-    np.minimum(level, 1.0, out=level)
-    electrons = appearance.electrons
-    if np.isfinite(electrons):
-        sigma = np.sqrt(level / electrons + (appearance.read_noise / electrons) ** 2)
-        sigma *= rng.standard_normal(level.shape, dtype=np.float32)
-        level += sigma
-    np.clip(level, 0.0, 1.0, out=level)
-    if appearance.gamma != 1.0:
-        cv2.pow(level, 1.0 / appearance.gamma, level)
-    full = 255.0 if appearance.bits == 8 else 65535.0
-    level *= full
+    """Return the image of a radiance: lens, saturation, noise, processing, rounding."""
+    camera = appearance.pipeline
+    light = camera.through_lens(radiance * np.float32(appearance.exposure), appearance.blur)
+    counts = camera.counted(light, appearance.electrons, appearance.read_noise, rng)
+    level = camera.processed(counts, appearance.gamma)
+    level *= 255.0 if appearance.bits == 8 else 65535.0
     level += 0.5
     return level.astype(np.uint8 if appearance.bits == 8 else np.uint16)
 
