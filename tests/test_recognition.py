@@ -327,6 +327,14 @@ def test_radii_that_pictures_contradict_are_estimated(factor: float, legs: list[
     assert not estimate_radii([(0, pictures, _pose(T))]).factor
 
 
+def test_repeated_images_of_one_pose_speak_of_radii_once() -> None:
+    view, pose = np.array([0, 0, 0, 1, 1, 0]), np.array([4, 4, 2, 4, 4, 2])
+    views = View("c1", CAMERA), View("c2", CAMERA)
+    measurements = Measurements(views, ("",) * 6, view, pose, np.zeros((6, 3)), 1e-6)
+    assert recognition.one_of_each_pose(measurements, range(6)) == [0, 2, 3]
+    assert recognition.one_of_each_pose(measurements, [5, 4, 1]) == [5, 4, 1]
+
+
 # The camera of a view.
 
 

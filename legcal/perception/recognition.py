@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data import Outlines
+from legcal.data import Measurements, Outlines
 from legcal.geometry import Array, IntArray
 from legcal.perception.camera_search import (
     START_PICTURES,
@@ -155,7 +155,7 @@ def _by_other_radii(
         search = replace(search, cylinders=radii.corrected(given))
         pictures = {row: search.retargeted(row, one) for row, one in pictures.items()}
         placed = _placed_again(search, groups, placed, pictures, run)
-        few = _for_radii(groups, placed, pictures)
+        few = _for_radii(search, groups, placed, pictures)
         step = radii.of_the_same(estimate_radii(few, CONVERGED, alone=not radii.common))
         radii = radii.then(step)
     if radii.common and _mean_support(placed) < MIN_RADII_GAIN * _mean_support(as_given[2]):
@@ -182,16 +182,32 @@ def _first_radii(
             placed = _anywhere(of_groups, search.n_legs, START_PICTURES, run)
             if any(one.is_clear for one in placed):
                 break
-    return estimate_radii(_for_radii(groups, placed, pictures))
+    return estimate_radii(_for_radii(search, groups, placed, pictures))
 
 
 def _for_radii(
-    groups: Sequence[Group], placed: Sequence[PoseCandidates], pictures: Pictures
+    search: Search,
+    groups: Sequence[Group],
+    placed: Sequence[PoseCandidates],
+    pictures: Pictures,
 ) -> Iterator[tuple[int, list[Picture], CameraPoses]]:
-    """Return a few pictures of each group that was placed."""
+    """Return a few pictures of each group that was placed, one of each pose."""
     for g, (group, one) in enumerate(zip(groups, placed, strict=True)):
         if one.is_convincing:
-            yield g, group.pictures(pictures, group.some), one.poses
+            rows = one_of_each_pose(search.measurements, group.some)
+            yield g, group.pictures(pictures, rows), one.poses
+
+
+def one_of_each_pose(measurements: Measurements, rows: Sequence[int]) -> list[int]:
+    """Return the first of the rows of each view and pose, in their order.
+
+    Light and shade lie alike on a leg in all images of one pose: they agree on a wrong radius.
+    """
+    same = zip(measurements.view[rows].tolist(), measurements.pose[rows].tolist(), strict=True)
+    first: dict[tuple[int, int], int] = {}
+    for row, key in zip(rows, same, strict=True):
+        first.setdefault(key, row)
+    return list(first.values())
 
 
 def _mean_support(placed: Sequence[PoseCandidates]) -> float:
