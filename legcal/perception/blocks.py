@@ -285,7 +285,7 @@ def fit_blocks(
     right -= level[:, None] * pairs[:, :, 0]
     simple, turned = slice(0, N_SIMPLE), slice(N_SIMPLE, None)
     normal, steep = pairs[:, simple, simple], pairs[:, turned, turned]
-    n_samples = sums.count
+    n_samples = sums.count.sum(axis=1)
     inverse = _regularised_inverse(normal, right[:, simple], power, n_samples)
     amplitude = _applied(inverse, right[:, simple])
     left = right - _applied(pairs[:, :, simple], amplitude)  # products with the residuals

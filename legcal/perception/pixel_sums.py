@@ -42,7 +42,7 @@ class PixelSums:
     weight: Array  # (n, 3, m) of 1, o, and o^2
     light: Array  # (n, 2, m) of the light, and of the light times o
     power: Array  # (n, m) of its square
-    count: Array  # (n,) how many pixels, whatever their weights
+    count: Array  # (n, m) how many pixels, whatever their weights
 
     def of_blocks(self, blocks: BoolArray) -> "PixelSums":
         """Return the sums of some blocks (n,)."""
@@ -106,7 +106,7 @@ class PixelBins:
     square: Samples  # (n_rows, k) squared weights
     moment: Samples  # (n_rows, k) times o
     weight: Array  # (n, 3, m), and
-    count: Array  # (n,) as in PixelSums
+    count: Array  # (n, m) as in PixelSums
 
     @classmethod
     def of(
@@ -130,8 +130,7 @@ class PixelBins:
         square = weight * weight
         moment = square * offset
         sums = _binned(entry, n, size, (square, moment, moment * offset))
-        of_rows = np.count_nonzero(used, axis=1).astype(np.float64)
-        count = np.asarray(np.bincount(block, of_rows, n), dtype=np.float64)
+        count = _binned(entry, n, size, (used,))[:, 0]
         grid = np.arange(first, last + 1) / float(per_px)
         return cls(grid, entry, square, moment, sums, count)
 
@@ -148,7 +147,7 @@ class PixelBins:
         return PixelSums(self.grid, self.weight, sums[:, :2], sums[:, 2], self.count)
 
 
-def _binned(entry: IntArray, n: int, size: int, values: Sequence[Samples]) -> Array:
+def _binned(entry: IntArray, n: int, size: int, values: Sequence[Samples | BoolArray]) -> Array:
     """Return sums (n, n_values, size) over pixels of several values (n, k)."""
     sums = np.empty((n, len(values), size))
     for k, of_pixels in enumerate(values):
@@ -194,16 +193,16 @@ def even_weights(grid: Array, ratio: Array, blur: float) -> Array:
 def _variance(sums: PixelSums, side: slice) -> Array:
     """Return the variance (n,) of pixels in some bins of each block about a parabola, or NaN."""
     x = sums.grid[side]
-    powers = (x - x.mean())[:, None] ** np.arange(2 * N_SMOOTH - 1)
+    powers = (x - 0.5 * (x[:1] + x[-1:]))[:, None] ** np.arange(2 * N_SMOOTH - 1)
     moments = sums.weight[:, 0, side] @ powers
     right = sums.light[:, 0, side] @ powers[:, :N_SMOOTH]
-    count = moments[:, 0]
-    level = right[:, 0] / np.maximum(count, 1e-3)
+    level = right[:, 0] / np.maximum(moments[:, 0], 1e-3)
     power = sums.power[:, side].sum(axis=1) - level * right[:, 0]
     right -= level[:, None] * moments[:, :N_SMOOTH]
     order = np.arange(N_SMOOTH)
     normal = moments[:, order[:, None] + order] + 1e-6 * np.eye(N_SMOOTH)
     explained = np.sum(right * np.linalg.solve(normal, right[..., None])[..., 0], axis=1)
+    count = sums.count[:, side].sum(axis=1)
     free = np.maximum(count - N_SMOOTH, 1.0)
     return np.where(count >= MIN_PIXELS, np.maximum(power - explained, 0.0) / free, np.nan)
 

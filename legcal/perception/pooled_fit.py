@@ -33,7 +33,7 @@ ENOUGH_BLOCKS, MAX_JOINED = 16, 3  # of an outline, to join some blocks, so many
 MAX_STEP = (0.7, 0.4)  # of one round: of the line [blurs], of the logarithm of the blur
 MAX_MOVE_OF_SUMS = (1.0, 0.08)  # of middle and ends [blurs], to which sums over pixels serve
 MAX_MOVE = (0.4, 0.15)  # of a line [blurs] and of the logarithm of the blur, to which equations do
-CONVERGED = 0.02  # step of a line below which its rounds end, before the last one [px]
+CONVERGED = (0.02, 0.02)  # steps of lines [px] and log blurs, below which the last round follows
 ODD_NOISE = (1.5, 4.0)  # of a typical block, from where on one counts less, and not at all
 MIN_NOISE = 0.05  # variance of grey levels [grey levels^2]
 NOISE_ROUNDS, NOISE_CONVERGED = 3, 0.2  # of its estimate, at most; and of its logarithm
@@ -68,7 +68,7 @@ class _Equations(NamedTuple):
 
     design: Array  # (n, N_UNKNOWNS, N_POWERS) functions of the unknowns of blocks
     elimination: Array  # (n, N_UNKNOWNS, N_UNKNOWNS) of what is a block's own, and its weight
-    system: Array  # (n_edges, N_ALONG * N_UNKNOWNS, N_ALONG * N_UNKNOWNS) normal matrices
+    inverse: Array  # (n_edges, k, k) covariance of N_ALONG * N_UNKNOWNS unknowns of each edge
 
 
 def fit_pooled(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> PooledLines:
@@ -81,34 +81,25 @@ def fit_pooled(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> Po
     if n == 0 or not np.any(pool.seen):
         nothing = np.full(n, np.nan)
         return PooledLines(np.zeros((n, 2)), np.tile(np.eye(2), (n, 1, 1)), blur, nothing)
-    prior = np.log(blur), PRIOR_BLUR
     at = pool.first_amplitudes(
-        _Iterate(np.zeros((n, N_ALONG, N_AMPLITUDES)), np.zeros((n, 2)), np.full(n, prior[0]))
+        _Iterate(np.zeros((n, N_ALONG, N_AMPLITUDES)), np.zeros((n, 2)), np.full(n, np.log(blur)))
     )
     equations = pool.equations(at)
-    inverse = pool.inverse(equations, *prior)
-    at = pool.step(at, equations, inverse, *prior)
-    even, sigma = _common_blur(at.log_blur, inverse[:, BLUR, BLUR], pool.seen)
-    at = at._replace(log_blur=np.full(n, even))
-    sigma = float(np.hypot(sigma, COMMON_BLUR_SIGMA))
-    inverse = _with_blur(inverse, sigma**-2 - prior[1] ** -2)
-    prior = even, sigma
     for _ in range(ROUNDS):
+        before, (at, _, _) = at, pool.step(at, equations)
+        moved, widened = (np.abs(x - y).max() for x, y in zip(at[1:], before[1:], strict=True))
+        if moved < CONVERGED[0] and widened < CONVERGED[1]:
+            break
         if pool.look(at, MAX_MOVE):
             equations = pool.equations(at)
-            inverse = pool.inverse(equations, *prior)
-        before, at = at, pool.step(at, equations, inverse, *prior)
-        if np.abs(at.line - before.line).max() < CONVERGED:
-            break
     pool.look(at)
     equations = pool.equations(at)
-    inverse = pool.inverse(equations, *prior)
-    by_gamma = pool.response(_changed_by_gamma(blocks), equations, inverse, sigma)
-    at = pool.step(at, equations, inverse, *prior)
+    at, covariance, even = pool.step(at, equations)
+    by_gamma = pool.response(_changed_by_gamma(blocks), equations, covariance)
     at_ends = np.array([[1.0, -1.0], [1.0, 1.0]])
     line = [SHIFT, N_UNKNOWNS + SHIFT]
-    covariance = at_ends @ inverse[:, line][:, :, line] @ at_ends.T
-    return PooledLines(at.line @ at_ends.T, covariance, float(np.exp(even)), by_gamma)
+    of_lines = at_ends @ covariance[:, line][:, :, line] @ at_ends.T
+    return PooledLines(at.line @ at_ends.T, of_lines, float(np.exp(even)), by_gamma)
 
 
 def _with_blur(covariance: Array, precision: float) -> Array:
@@ -119,14 +110,17 @@ def _with_blur(covariance: Array, precision: float) -> Array:
 
 
 def _common_blur(log_blur: Array, variance: Array, seen: BoolArray) -> tuple[float, float]:
-    """Return the logarithm of the blur that most outlines of an image agree on, and its sigma."""
+    """Return the logarithm of the blur that most outlines of an image agree on.
+
+    And by how much that of one outline may differ from it, a standard deviation.
+    """
     log_blur = log_blur[seen]
     weight = 1.0 / (variance[seen] + BLUR_SCATTER**2)
     even, robust = 0.0, weight
     for _ in range(6):
         even = float(robust @ log_blur / robust.sum())
         robust = weight / (1.0 + 0.25 * weight * (log_blur - even) ** 2)
-    return even, float(robust.sum() ** -0.5)
+    return even, float(np.hypot(robust.sum() ** -0.5, COMMON_BLUR_SIGMA))
 
 
 @dataclass(eq=False)
@@ -182,7 +176,7 @@ class _Pool:
         def total(values: Array) -> Array:
             return np.asarray(np.bincount(edge, values, n_edges), dtype=np.float64)
 
-        weights, count = total(sums.weight[:, 0].sum(axis=1)), total(sums.count)
+        weights, count = total(sums.weight[:, 0].sum(axis=1)), total(sums.count.sum(axis=1))
         lights, power = total(sums.light[:, 0].sum(axis=1)), total(sums.power.sum(axis=1))
         spread = np.maximum(power - lights**2 / np.maximum(weights, 1e-9), 0.0)
         contrast = 2.0 * np.sqrt(spread / np.maximum(count, 1.0)) + 1.0
@@ -307,12 +301,15 @@ class _Pool:
         for k, (i, j) in enumerate(zip(ONE, OTHER, strict=True)):
             system[:, i, :, j] = system[:, j, :, i] = sums[:, k]
         side = N_ALONG * N_UNKNOWNS
-        return _Equations(design, elimination, system.reshape(n, side, side))
+        system = system.reshape(n, side, side) + _diagonal(self.precision().reshape(n, side))
+        return _Equations(design, elimination, np.asarray(np.linalg.inv(system)))
 
-    def step(
-        self, at: _Iterate, equations: _Equations, inverse: Array, log_blur: float, sigma: float
-    ) -> _Iterate:
-        """Take a Gauss-Newton step, by equations near an iterate, with a blur known before."""
+    def step(self, at: _Iterate, equations: _Equations) -> tuple[_Iterate, Array, float]:
+        """Take a Gauss-Newton step, by equations near an iterate.
+
+        Return the covariance of the unknowns as well, with a blur that all outlines nearly share,
+        and the logarithm of that.
+        """
         values, slopes, widenings = self.functions
         widened = (at.log_blur - self.at.log_blur)[:, None, None]
         edge, along = self.edge, self.along[:, None]
@@ -320,44 +317,48 @@ class _Pool:
         steep = (along @ (at.amplitude @ slopes)[edge])[:, 0]
         model -= self._moved(at.line)[:, None] * steep
         left = self.with_light - (self.products @ model[..., None])[..., 0]
-        target = self._eliminated(equations, left)
-        precision = self.precision(log_blur, sigma)
+        target, precision = self._eliminated(equations, left), self.precision()
         target[..., :N_AMPLITUDES] -= precision[..., :N_AMPLITUDES] * at.amplitude
         target[:, :2, SHIFT] -= precision[:, :2, SHIFT] * at.line
-        target[:, 0, BLUR] += precision[:, 0, BLUR] * (log_blur - at.log_blur)
-        step = _applied(inverse, target.reshape(len(inverse), -1)).reshape(target.shape)
+        flat, apart = target.reshape(len(target), -1), equations.inverse
+
+        def solved(covariance: Array, log_blur: float, precision: float) -> Array:
+            pulled = flat.copy()
+            pulled[:, BLUR] += precision * (log_blur - at.log_blur)
+            return _applied(covariance, pulled)
+
+        alone = solved(apart, float(np.log(self.blur)), PRIOR_BLUR**-2)[:, BLUR]
+        alone = at.log_blur + np.clip(alone, -MAX_STEP[1], MAX_STEP[1])
+        even, sigma = _common_blur(alone, apart[:, BLUR, BLUR], self.seen)
+        known = sigma**-2
+        covariance = _with_blur(apart, known - PRIOR_BLUR**-2)
+        step = solved(covariance, even, known).reshape(target.shape)
         largest = MAX_STEP[0] * np.exp(at.log_blur)[:, None]
         move = np.clip(step[:, :2, SHIFT], -largest, largest)
         widen = np.clip(step[:, 0, BLUR], -MAX_STEP[1], MAX_STEP[1])
         least, most = np.log(BLURS).tolist()
         log_blurs = np.asarray(np.clip(at.log_blur + widen, least, most))
-        return _Iterate(at.amplitude + step[..., :N_AMPLITUDES], at.line + move, log_blurs)
+        after = _Iterate(at.amplitude + step[..., :N_AMPLITUDES], at.line + move, log_blurs)
+        return after, covariance, even
 
-    def inverse(self, equations: _Equations, log_blur: float, sigma: float) -> Array:
-        """Return the covariances of the unknowns of edges, with the blur known before."""
-        precision = self.precision(log_blur, sigma).reshape(len(self.half_width), -1)
-        return np.asarray(np.linalg.inv(equations.system + _diagonal(precision)))
-
-    def precision(self, log_blur: float, sigma: float) -> Array:
+    def precision(self) -> Array:
         """Return what is known beforehand of the unknowns of edges, (n_edges, N_ALONG, N_UNKNOWNS).
 
-        Lines are known by where they start, and the blur to ``sigma`` of its logarithm.
+        Lines are known by where they start, and the blur roughly.
         """
         precision = np.full((len(self.half_width), N_ALONG, N_UNKNOWNS), 1e10)
         contrast = self.contrast[:, None]
         precision[:, 0, :N_AMPLITUDES] = (COMMON * contrast) ** -2
         precision[:, 1:, :N_AMPLITUDES] = ((ALONG * contrast) ** -2)[:, None, :]
-        precision[:, :2, SHIFT] = (START_SIGMA[0] + START_SIGMA[1] * np.exp(log_blur)) ** -2
-        precision[:, 0, BLUR] = sigma**-2
+        precision[:, :2, SHIFT] = (START_SIGMA[0] + START_SIGMA[1] * self.blur) ** -2
+        precision[:, 0, BLUR] = PRIOR_BLUR**-2
         return precision
 
-    def response(
-        self, change: Samples, equations: _Equations, inverse: Array, sigma: float
-    ) -> Array:
+    def response(self, change: Samples, equations: _Equations, covariance: Array) -> Array:
         """Return how far middles of outlines move inside with a nuisance, (n_edges,) [px] or NaN.
 
-        One that changes the light of pixels (n_blocks, m) of all blocks; ``inverse`` is the
-        covariance of unknowns (n_edges, k, k), with the logarithm of the blur known to sigma.
+        One that changes the light of pixels (n_blocks, m) of all blocks; with the covariance of
+        unknowns once the blur is shared.
         """
         blocks = self.blocks
         if self.bins is None:
@@ -370,13 +371,13 @@ class _Pool:
         changes = replace(self.sums, light=changed * share[:, None])
         with_light = changes.with_light(*self._powers(), self.bounds)
         target = self._eliminated(equations, with_light).reshape(len(self.half_width), -1)
-        found = _applied(inverse, target)
-        # The blurs of an image change alike: by as much as edges say whose blur is not known.
-        known, of_blur = sigma**-2, inverse[:, :, BLUR]
-        freed = 1.0 + (PRIOR_BLUR**-2 - known) * of_blur[:, BLUR]
-        counts = self.seen / (of_blur[:, BLUR] / freed + BLUR_SCATTER**2)
-        widened = float(counts @ (found[:, BLUR] / freed) / counts.sum())
-        found += widened * known * of_blur
+        # The blurs of an image change alike: by as much as edges say whose blur is not shared.
+        apart = equations.inverse[:, BLUR]
+        counts = self.seen / (apart[:, BLUR] + BLUR_SCATTER**2)
+        widened = float(counts @ np.sum(apart * target, axis=1) / counts.sum())
+        of_blur = covariance[:, :, BLUR]
+        shared = 1.0 / of_blur[:, BLUR] - 1.0 / apart[:, BLUR] + PRIOR_BLUR**-2
+        found = _applied(covariance, target) + widened * shared[:, None] * of_blur
         return np.where(self.seen, found[:, SHIFT], np.nan)
 
     def _eliminated(self, equations: _Equations, left: Array) -> Array:
@@ -386,7 +387,7 @@ class _Pool:
 
     def _noise(self, power: Array) -> tuple[Array, Array]:
         """Return the noise of each edge, and how much blocks (n,) count by their residuals' sum."""
-        of_block = np.maximum(power, 0.0) / np.maximum(self.sums.count - 5.0, 1.0)
+        of_block = np.maximum(power, 0.0) / np.maximum(self.sums.count.sum(axis=1) - 5.0, 1.0)
         of_edge = np.fmax(medians(of_block, self.edge, self.bounds), MIN_NOISE)
         excess = of_block / of_edge[self.edge]
         return of_edge, np.clip((ODD_NOISE[1] - excess) / (ODD_NOISE[1] - ODD_NOISE[0]), 0.0, 1.0)
