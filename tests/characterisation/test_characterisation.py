@@ -107,7 +107,8 @@ def test_the_public_api_has_the_names_and_parameters_that_it_had() -> None:
     expected, found = recorded("api"), public_api()
     assert expected.keys() == found.keys()
     for name, entry in expected.items():
-        assert found[name]["parameters"] == entry["parameters"], name
+        first = found[name]["parameters"][: len(entry["parameters"])]  # more may follow
+        assert first == entry["parameters"], name
         assert set(entry["members"]) <= set(found[name]["members"]), name
 
 
