@@ -40,7 +40,7 @@ NOISE_ROUNDS, NOISE_CONVERGED = 3, 0.2  # of its estimate, at most; and of its l
 MIN_LIGHT = 1e-3  # of the mean light of a block
 
 COMMON_BLUR_SIGMA = 0.03  # of the logarithm of the blur of an outline, about that of the image
-ROUNDS = 8  # at most
+ROUNDS, ALL_ROUNDS = 10, 2  # at most; and before those that have converged are left out
 
 ONE, OTHER = (0, 1, 2, 1, 2, 2), (0, 0, 0, 1, 1, 2)  # pairs of polynomials
 SHIFT, BLUR, N_UNKNOWNS = N_AMPLITUDES, N_AMPLITUDES + 1, N_AMPLITUDES + 2  # unknowns of a block
@@ -84,17 +84,30 @@ def fit_pooled(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> Po
     at = pool.first_amplitudes(
         _Iterate(np.zeros((n, N_ALONG, N_AMPLITUDES)), np.zeros((n, 2)), np.full(n, np.log(blur)))
     )
-    equations = pool.equations(at)
-    for _ in range(ROUNDS):
-        before, (at, _, _) = at, pool.step(at, equations)
-        moved, widened = (np.abs(x - y).max() for x, y in zip(at[1:], before[1:], strict=True))
-        if moved < CONVERGED[0] and widened < CONVERGED[1]:
+    equations, moving = pool.equations(at), np.ones(n, dtype=np.bool_)
+    part, of_part, shared = pool, at, None
+    at = _Iterate(*(values.copy() for values in at))
+    for turn in range(ROUNDS):
+        before, (of_part, _, shared) = of_part, part.step(of_part, equations, shared)
+        for values, new in zip(at, of_part, strict=True):
+            values[moving] = new
+        moved, widened = (np.abs(x - y) for x, y in zip(of_part[1:], before[1:], strict=True))
+        still = (moved.max(axis=1) >= CONVERGED[0]) | (widened >= CONVERGED[1])
+        if not np.any(still):
             break
-        if pool.look(at, MAX_MOVE):
-            equations = pool.equations(at)
+        if turn >= ALL_ROUNDS and not np.all(still):
+            # The blur is known by now; few outlines take longer than the others.
+            part, moving[moving] = part.part(still), still
+            of_part = _Iterate(*(values[still] for values in of_part))
+            part.look(of_part)
+            equations = part.equations(of_part)
+        elif part.look(of_part, MAX_MOVE):
+            equations = part.equations(of_part)
+        if turn < ALL_ROUNDS:
+            shared = None
     pool.look(at)
     equations = pool.equations(at)
-    at, covariance, even = pool.step(at, equations)
+    at, covariance, (even, _) = pool.step(at, equations)
     by_gamma = pool.response(_changed_by_gamma(blocks), equations, covariance)
     at_ends = np.array([[1.0, -1.0], [1.0, 1.0]])
     line = [SHIFT, N_UNKNOWNS + SHIFT]
@@ -130,6 +143,7 @@ class _Pool:
     blocks: Blocks
     usable: BoolArray  # which of the blocks
     joined: IntArray  # (n_usable,) which of the blocks here each is a part of
+    row_edge: IntArray  # (n_usable,) and of which edge
     gain: Array  # (n,)
     edge: IntArray  # (n,)
     bounds: list[int]  # n_edges + 1
@@ -166,7 +180,7 @@ class _Pool:
         means = np.column_stack([blocks.gain[usable], along])
         if len(first):
             means = np.add.reduceat(means, first) / np.diff(first, append=len(edge))[:, None]
-        edge = edge[first]
+        row_edge, edge = edge, edge[first]
         bounds = np.searchsorted(edge, np.arange(n_edges + 1)).tolist()
         of_all = blocks.bins(blur).sums(blocks.light)
         ratio = noise_ratios(of_all, blocks.bounds, kept, blur)
@@ -188,6 +202,7 @@ class _Pool:
             blocks,
             usable,
             joined,
+            row_edge,
             means[:, 0],
             edge,
             bounds,
@@ -231,10 +246,37 @@ class _Pool:
         self.with_light = self.sums.with_light(values, slopes, self.bounds)
         return True
 
+    def part(self, edges: BoolArray) -> "_Pool":
+        """Return the blocks of some edges."""
+        own, rows = edges[self.edge], edges[self.row_edge]
+        usable, number = self.usable.copy(), np.cumsum(edges) - 1
+        usable[usable] = rows
+        edge = number[self.edge[own]]
+        values, slopes, widenings = self.functions
+        return replace(
+            self,
+            usable=usable,
+            joined=(np.cumsum(own) - 1)[self.joined[rows]],
+            row_edge=number[self.row_edge[rows]],
+            edge=edge,
+            bounds=np.searchsorted(edge, np.arange(np.count_nonzero(edges) + 1)).tolist(),
+            sums=self.sums.of_blocks(own),
+            at=_Iterate(*(of_all[edges] for of_all in self.at)),
+            functions=(values[edges], slopes[edges], widenings[edges]),
+            **{
+                name: getattr(self, name)[own]
+                for name in ("gain", "along", "own", "products", "with_light")
+            },
+            **{
+                name: getattr(self, name)[edges]
+                for name in ("half_width", "contrast", "noise", "noise_ratio", "seen", "at_line")
+            },
+        )
+
     def _bins(self) -> PixelBins:
         """Return the bins of the pixels of the usable blocks where lines were looked at."""
         blocks, usable = self.blocks, self.usable
-        line, rise = self.at_line[blocks.edge[usable]], 2.0 * blocks.position[usable] - 1.0
+        line, rise = self.at_line[self.row_edge], 2.0 * blocks.position[usable] - 1.0
         moved = blocks.moved[usable] + blocks.gain[usable] * (line[:, 0] + line[:, 1] * rise)
         d = blocks.d[usable] - moved.astype(np.float32)[:, None]
         return PixelBins.of(d, blocks.weight[usable], self.blur, self.joined)
@@ -304,11 +346,13 @@ class _Pool:
         system = system.reshape(n, side, side) + _diagonal(self.precision().reshape(n, side))
         return _Equations(design, elimination, np.asarray(np.linalg.inv(system)))
 
-    def step(self, at: _Iterate, equations: _Equations) -> tuple[_Iterate, Array, float]:
+    def step(
+        self, at: _Iterate, equations: _Equations, shared: tuple[float, float] | None = None
+    ) -> tuple[_Iterate, Array, tuple[float, float]]:
         """Take a Gauss-Newton step, by equations near an iterate.
 
         Return the covariance of the unknowns as well, with a blur that all outlines nearly share,
-        and the logarithm of that.
+        and that: its logarithm, and by how much the one of an outline may differ; it may be known.
         """
         values, slopes, widenings = self.functions
         widened = (at.log_blur - self.at.log_blur)[:, None, None]
@@ -327,10 +371,11 @@ class _Pool:
             pulled[:, BLUR] += precision * (log_blur - at.log_blur)
             return _applied(covariance, pulled)
 
-        alone = solved(apart, float(np.log(self.blur)), PRIOR_BLUR**-2)[:, BLUR]
-        alone = at.log_blur + np.clip(alone, -MAX_STEP[1], MAX_STEP[1])
-        even, sigma = _common_blur(alone, apart[:, BLUR, BLUR], self.seen)
-        known = sigma**-2
+        if shared is None:
+            alone = solved(apart, float(np.log(self.blur)), PRIOR_BLUR**-2)[:, BLUR]
+            alone = at.log_blur + np.clip(alone, -MAX_STEP[1], MAX_STEP[1])
+            shared = _common_blur(alone, apart[:, BLUR, BLUR], self.seen)
+        even, known = shared[0], shared[1] ** -2
         covariance = _with_blur(apart, known - PRIOR_BLUR**-2)
         step = solved(covariance, even, known).reshape(target.shape)
         largest = MAX_STEP[0] * np.exp(at.log_blur)[:, None]
@@ -339,7 +384,7 @@ class _Pool:
         least, most = np.log(BLURS).tolist()
         log_blurs = np.asarray(np.clip(at.log_blur + widen, least, most))
         after = _Iterate(at.amplitude + step[..., :N_AMPLITUDES], at.line + move, log_blurs)
-        return after, covariance, even
+        return after, covariance, shared
 
     def precision(self) -> Array:
         """Return what is known beforehand of the unknowns of edges, (n_edges, N_ALONG, N_UNKNOWNS).
