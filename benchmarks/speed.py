@@ -6,9 +6,10 @@ The images of the sample dataset (1024 x 768, six legs) are decoded beforehand. 
 the processor, for one image: what is seen of exposure and blur; legs recognised and cameras placed,
 near rough camera poses or without any; the brief measurement of all outlines near there, the fit of
 views to them with the search for missing legs, and the measurement with all care where the legs
-truly are, which a joint fit misses by hundredths of a pixel. Of these images/s, "measured once" is what a first measurement asks, recognition included, and
-"calibrate" is all that a calibration does with an image. Peak memory is that of processes which
-measure N and 3 N images that they read one by one.
+truly are, which a joint fit misses by hundredths of a pixel. Of these images/s, "measured once" is
+what a first measurement asks, recognition included, and "calibrate" is all that a calibration does
+with an image. Peak memory is that of processes which measure N and 3 N images that they read one by
+one.
 """
 
 import argparse
