@@ -134,7 +134,7 @@ def drawn_kills(count: int, seed: int, commands: Sequence[Command] = COMMANDS) -
 def faults_of(kill: Kill) -> Iterator[str]:
     """Stop a command, let it go on, and yield what is wrong."""
     command = kill.command
-    duration, finished, results = _undisturbed(command)
+    duration, finished, results, whole = _undisturbed(command)
     with tempfile.TemporaryDirectory(prefix="legcal-kill-") as top:
         folder, mark = Path(top), uuid.uuid4().hex
         _prepare(command, folder)
@@ -156,11 +156,11 @@ def faults_of(kill: Kill) -> Iterator[str]:
         if left:
             yield f"{left} processes are left"
         now = _contents(folder)
-        yield from _faults_of_output(command, before, results, now, code)
+        yield from _faults_of_output(command, before, results, now, code == whole)
         if kill.number is signal.SIGKILL:
-            allowed = {0, -9}
+            allowed = {whole, -9}
         elif _is_one_of(now, results, command):  # Python was about to end
-            allowed = {0, 130, -kill.number}
+            allowed = {whole, 130, -kill.number}
         else:  # before the handlers stood, Python ended itself, in its own words
             allowed = {130} if answered else {code}
         if code not in allowed:
@@ -169,20 +169,20 @@ def faults_of(kill: Kill) -> Iterator[str]:
             yield f"said {_said(folder)}"
         if kill.number is not signal.SIGKILL and answered:
             yield from (f"said {word}" for word in FALSE_WORDS if word in _said(folder))
-        if now == before or code == 0:
+        if now == before or code == whole:
             return  # nothing to go on from
-        if _start(command, folder, mark).wait() != 0:
+        if _start(command, folder, mark).wait() != whole:
             yield f"cannot be run again: {_said(folder)}"
         elif not _is_one_of(_contents(folder), results, command):
             yield "another result when run again"
 
 
 def _faults_of_output(
-    command: Command, before: Contents, results: Sequence[Contents], now: Contents, code: int
+    command: Command, before: Contents, results: Sequence[Contents], now: Contents, ended: bool
 ) -> Iterator[str]:
     """Yield what is neither as before nor as in a whole result."""
-    if code == 0 and not _is_one_of(now, results, command):
-        yield "exit code 0, and the result is not complete"
+    if ended and not _is_one_of(now, results, command):
+        yield "ended, and the result is not complete"
     elif not _is_one_of(now, [before, *results], command):
         yield f"half a result: {sorted(_result(now, command))}"
     changed = {name for name in before if name.startswith("in/") and name not in command.kept}
@@ -207,22 +207,24 @@ _finished: list[Path] = []
 
 
 @cache
-def _undisturbed(command: Command) -> tuple[float, Path, list[Contents]]:
-    """Return how long a command takes, where its result is, and all results that it may have.
+def _undisturbed(command: Command) -> tuple[float, Path, list[Contents], int]:
+    """Return how long a command takes, where its result is, all it may have, and its exit code.
 
-    With a cache it has two: tables hold rounded numbers.
+    With a cache it has two results: tables hold rounded numbers. The code is 1 where the verdict on
+    a result is that it should not be used.
     """
     folder = Path(tempfile.mkdtemp(prefix="legcal-whole-"))
     _finished.append(folder)
     _prepare(command, folder)
     begin = time.perf_counter()
-    assert _start(command, folder, "first").wait() == 0, _said(folder)
+    code = _start(command, folder, "first").wait()
+    assert code in (0, 1), _said(folder)
     duration = time.perf_counter() - begin
     results = [_contents(folder)]
     if any(name.startswith("in/") for name in command.kept):
-        assert _start(command, folder, "first").wait() == 0, _said(folder)
+        assert _start(command, folder, "first").wait() == code, _said(folder)
         results.append(_contents(folder))
-    return duration, folder, results
+    return duration, folder, results, code
 
 
 def remove_finished() -> None:
