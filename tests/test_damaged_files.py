@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import yaml
 from characterisation.inputs import ROOT, made_input
-from fuzzing.crafted import harmful_files, special_files
+from fuzzing.crafted import harmful_files, outlines_with, special_files
 from fuzzing.mutations import mutate
-from fuzzing.running import count_cases, drawn_cases, run_cases
+from fuzzing.running import Case, count_cases, drawn_cases, run_cases
+from fuzzing.subjects import SUBJECTS
 
 from legcal import LegcalError, load_mechanism
 from legcal.errors import DatasetError
@@ -35,6 +36,23 @@ def test_files_made_to_do_harm_are_refused_in_time_and_memory() -> None:
         if ended.fault or ended.code not in (1, 2) or word not in ended.message
     ]
     assert not found
+
+
+def test_outlines_of_most_unequal_claims_are_used_or_refused() -> None:
+    (subject,) = (subject for subject in SUBJECTS if subject.name.endswith("observations.csv"))
+    n_rows = outlines_with({}).count(b"\n") - 1
+    cases = []
+    for seed in range(6):
+        chance = np.random.default_rng(seed)
+        changes = {}
+        for row in (1 + np.flatnonzero(chance.random(n_rows) < 0.05)).tolist():
+            s00, s11 = (10.0 ** chance.uniform(-8.5, 3.9, 2)).tolist()
+            s01 = chance.uniform(-0.9, 0.9) * (s00 * s11) ** 0.5
+            changes[row] = {"s00": s00, "s01": s01, "s11": s11}
+        cases.append(Case(subject, seed, made=outlines_with(changes)))
+    count = count_cases(cases)
+    assert not count.faults, [(ended.case.name, ended.fault) for ended in count.faults]
+    assert count.codes["0"] + count.codes["1"] > 0
 
 
 def test_pipes_devices_and_folders_are_never_read() -> None:

@@ -280,6 +280,18 @@ def test_legs_that_a_view_leaves_out_are_rejected() -> None:
             {"s00": "1", "s01": "2", "s11": "1"},
             ("columns s00, s01, s11", "(1, 2, 1)"),
         ),
+        (
+            outlines_of(3, rejected=0.0),
+            2,
+            {"s00": "1", "s01": "0", "s11": "18446744073709551616"},
+            ("columns s00, s01, s11", "4.29e+09 px", "1e-05 to 100 px"),
+        ),
+        (
+            outlines_of(3, rejected=0.0),
+            2,
+            {"s00": "1e-20", "s01": "0", "s11": "1"},
+            ("columns s00, s01, s11", "1e-10 and 1 px", "1e-05 to 100 px"),
+        ),
         (outlines_of(3), 1, {"verdict": "rejected", "a": "left"}, ("column a", "'left'")),
         (axis_table(), 5, {"z": "-1e300"}, ("column z", "-1000 to 1000 m")),
         (axis_table(), 5, {"psi": "1.5707963"}, ("columns psi, theta", "(x, 0, z)")),

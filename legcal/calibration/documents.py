@@ -20,7 +20,15 @@ from pydantic import (
 )
 
 from legcal.errors import DatasetError
-from legcal.files import Document, Number, Version, content_of, describe, validate
+from legcal.files import (
+    Document,
+    Number,
+    Version,
+    content_of,
+    describe,
+    refuse_too_large,
+    validate,
+)
 
 Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
 AxesByLeg = dict[str, Triple]  # unit vectors
@@ -262,6 +270,7 @@ class Result(Legs, Heading):
         if not isinstance(found, dict) or "legcal_result" not in found:
             what = "another document" if isinstance(found, dict) else describe(found)
             raise unreadable(path, what, "one with 'legcal_result: 1'")
+        refuse_too_large(found, path)
         return validate(cls, found, path)
 
 

@@ -44,6 +44,8 @@ SOURCES = ("detected", "edited")
 UNIT_EXACT = 1e-12  # |h| as computed; it is kept as it stands
 UNIT_TOLERANCE = 1e-3  # |h| as written with few digits; it is normalised
 LINE_TOLERANCE_PX = 5.0  # ends further from the line contradict it
+MIN_PIECE = 0.1  # [px] between the ends: the direction of a shorter one is only rounding
+SIGMA_RANGE = (1e-5, 100.0)  # [px] of offsets: none is known better, and worse says nothing
 
 VERDICT_COLUMNS = (
     Column("verdict", "text", choices=VERDICTS, remedy="correct it"),
@@ -279,12 +281,26 @@ def _refuse_numbers(table: Table, numbers: Array, used: BoolArray) -> None:
         if abs(norm - 1.0) > UNIT_TOLERANCE:
             needed = "a unit vector; divide the three by their norm"
             table.refuse(i, f"a vector of norm {norm:.6g}", needed, "a", "b", "c")
-        if (u0, v0) == (u1, v1):
+        length = math.hypot(u1 - u0, v1 - v0)
+        if length < MIN_PIECE:
+            found = f"ends {length:.3g} px apart" if length else "both ends at the same pixel"
             needed = "two ends of a piece of the edge; correct them"
-            table.refuse(i, "both ends at the same pixel", needed, "u0", "v0", "u1", "v1")
+            table.refuse(i, found, needed, "u0", "v0", "u1", "v1")
         if not (s00 > 0.0 and s11 > 0.0 and s00 * s11 > s01 * s01):
             found = f"a covariance that is not positive definite ({s00:g}, {s01:g}, {s11:g})"
             needed = "variances of the offsets at both ends [px^2]; correct them"
+            table.refuse(i, found, needed, "s00", "s01", "s11")
+            continue
+        largest = 0.5 * (s00 + s11 + math.hypot(s00 - s11, 2.0 * s01))
+        least = s00 * (s11 / largest) - s01 * (s01 / largest)  # the determinant is their product
+        fewest, most = SIGMA_RANGE[0], min(SIGMA_RANGE[1], max(length, MIN_PIECE))
+        if not (least >= fewest**2 and largest <= most**2):
+            sigmas = math.sqrt(max(least, 0.0)), math.sqrt(largest)
+            found = f"offsets known to between {sigmas[0]:.3g} and {sigmas[1]:.3g} px"
+            needed = (
+                f"standard deviations from {fewest:g} to {most:.3g} px; write px^2, or set the "
+                "verdict to rejected"
+            )
             table.refuse(i, found, needed, "s00", "s01", "s11")
 
 

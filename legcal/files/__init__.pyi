@@ -47,6 +47,7 @@ from .schema import is_plain_name as is_plain_name
 from .schema import parse_yaml as parse_yaml
 from .schema import plain_name as plain_name
 from .schema import read_yaml as read_yaml
+from .schema import refuse_too_large as refuse_too_large
 from .schema import validate as validate
 from .table import Column as Column
 from .table import Table as Table

@@ -28,6 +28,7 @@ from legcal.files.reading import MAX_TEXT, MAX_YAML, NotRegular, TooLarge, read_
 MAX_NODES = 100_000  # aliases let a small file stand for a tree without bound
 MAX_DEPTH = 100
 MAX_PROBLEMS = 1000  # of one file that are looked into
+_MAX_WHOLE = 10**308  # whole numbers of files have any length; floats end here
 _MOST_NAMES = 10  # that a hint lists
 _LONGEST_WORD = 100  # for which one that is like it is looked for
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
@@ -270,6 +271,7 @@ def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:
             f"{path}: the {what} could not be read: found more than {MAX_NODES} values, some "
             "repeated through aliases, needed fewer; write it without aliases."
         )
+    refuse_too_large(found, path)
     return typing.cast("dict[str, Any]", found)
 
 
@@ -310,6 +312,27 @@ def _exceeds(value: object, limit: int) -> bool:
             return True
         pending.extend(children)
     return False
+
+
+def refuse_too_large(found: object, path: Path) -> None:
+    """Refuse whole numbers of YAML or JSON that no float can hold, by their keys."""
+    pending, places = [("", found)], []
+    while pending:
+        place, value = pending.pop()
+        if isinstance(value, dict | list):
+            inside = value.items() if isinstance(value, dict) else enumerate(value)
+            children = [(f"{place}.{key}" if place else str(key), child) for key, child in inside]
+            pending.extend(reversed(children))
+        elif isinstance(value, int) and abs(value) > _MAX_WHOLE:
+            places.append(place)
+    if places:
+        raise DatasetError(
+            [
+                f"{path}: {place} could not be read: found a whole number beyond 1e308, needed a "
+                "smaller one; correct the value."
+                for place in places[:MAX_PROBLEMS]
+            ]
+        )
 
 
 def validate(

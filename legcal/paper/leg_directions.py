@@ -19,6 +19,7 @@ from legcal.paper.nominal import NominalMachine
 
 _OUTLIER = 8.0  # standard deviations or medians
 _VARIANCE_NO_AXIS = 1e6  # [rad^2] of the angle to an axis that a leg does not have
+_ROUNDING = 1e-14  # of a variance, in the difference that is left of it
 _MIN_VARIANCE = 1e-12  # [rad^2] of an axis
 
 
@@ -158,8 +159,18 @@ def _conditioned(
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
     e1 = axes.basis[:, 0] - u * np.sum(u * axes.basis[:, 0], axis=-1, keepdims=True)
     e1 /= np.linalg.norm(e1, axis=-1, keepdims=True)
-    symmetric = 0.5 * (left + np.swapaxes(left, 1, 2))
-    return u, np.stack([e1, cross(u, e1)], axis=1), symmetric
+    before = np.trace(axes.covariance[:, :2, :2], axis1=1, axis2=2)
+    covariance = _positive(0.5 * (left + np.swapaxes(left, 1, 2)), _ROUNDING * before)
+    return u, np.stack([e1, cross(u, e1)], axis=1), covariance
+
+
+def _positive(covariance: Array, least: Array) -> Array:
+    """Return covariances (n, 2, 2) with no variance below *least* (n,), which is rounding."""
+    variances, directions = np.linalg.eigh(covariance)
+    lost = variances[:, 0] < least
+    variances = np.maximum(variances[lost], least[lost, None])
+    covariance[lost] = directions[lost] * variances[:, None] @ np.swapaxes(directions[lost], 1, 2)
+    return covariance
 
 
 def _known_normals(base: JointsInBase, view: IntArray, leg: IntArray) -> tuple[Array, Array]:

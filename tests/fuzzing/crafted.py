@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import cv2
 import numpy as np
@@ -23,7 +24,14 @@ def harmful_files() -> Iterator[tuple[str, Case, str]]:
     for name, text, word in _yaml():
         for file in ("small:dataset.yaml", "small:camera_info.yaml")[: 1 + (len(text) < 10_000)]:
             yield f"{name} as {file}", Case(_NAMED[file], made=text), word
-    for name, file, made, word in (*_names(), *_tables(), *_models(), *_images()):
+    for name, file, made, word in (
+        *_names(),
+        *_tables(),
+        *_outlines(),
+        *_results(),
+        *_models(),
+        *_images(),
+    ):
         yield f"{name} as {file}", Case(_NAMED[file], made=made), word
 
 
@@ -68,6 +76,8 @@ def _yaml() -> Iterator[tuple[str, bytes, str]]:
     yield "more keys", b"".join(b"k%d: 1\n" % k for k in range(350_000)), "bytes"
     yield "unknown keys", b"".join(b"k%d: 1\n" % k for k in range(10_000)), "k"
     yield "a long number", b"a: " + b"1" * 1_900_000, "a"
+    for digits in (b"1" * 400, b"-" + b"1" * 400, b"0x" + b"f" * 10_000, b"0b" + b"1" * 20_000):
+        yield f"{digits[:4]!r} and so on", b"a: {b: [0, " + digits + b"]}", "a.b.1 could not"
     yield "a long word", b"a" * 1_900_000, "text"
     yield "a long key", b"k" * 900 + b": 1", "k"
     yield "escapes", b'"\\e[31m\\u202e": 1\n"\\x9b": &a [*a]', ""
@@ -113,6 +123,39 @@ def _tables() -> Iterator[tuple[str, str, bytes, str]]:
     escape = lines[1].replace(b"images/c1_1.png", b"\x1b[31mred.png")
     yield "an escape sequence", table, b"\n".join([lines[0], escape]), "\\x1b"
     yield "a header of escapes", table, b"\x1b]0;x\x07," + lines[0] + b"\n1\n", "\\x1b"
+
+
+def _outlines() -> Iterator[tuple[str, str, bytes, str]]:
+    outlines = "3-rpr-outlines:observations.csv"
+    changes: tuple[dict[str, float], ...] = (
+        {"s11": 2.0**64},
+        {"s00": 1e8, "s01": 0.0, "s11": 1e8},
+        {"s00": 1e-20, "s01": 0.0, "s11": 1e-20},
+    )
+    for change in changes:
+        yield f"{change}", outlines, outlines_with({48: change}), "row 48 (line 49), columns s00"
+    table = outlines_with({}).decode().splitlines()
+    cells = dict(zip(table[0].split(","), table[48].split(","), strict=True))
+    near = {f"{axis}1": float(cells[f"{axis}0"]) + 1e-7 for axis in "uv"}
+    yield "ends side by side", outlines, outlines_with({48: near}), "row 48 (line 49), columns u0"
+
+
+def outlines_with(changes: Mapping[int, Mapping[str, float]]) -> bytes:
+    """Return a table of outlines in which numbers of some rows are others."""
+    lines = (made_input("3-rpr-outlines") / "observations.csv").read_text().splitlines()
+    names = lines[0].split(",")
+    for row, numbers in changes.items():
+        cells = dict(zip(names, lines[row].split(","), strict=True))
+        cells |= {name: repr(float(number)) for name, number in numbers.items()}
+        lines[row] = ",".join(cells.values())
+    return "\n".join([*lines, ""]).encode()
+
+
+def _results() -> Iterator[tuple[str, str, bytes, str]]:
+    document = json.loads((made_input("result") / "result/result.json").read_text())
+    document["residuals"]["dof"] = 10**400
+    made = json.dumps(document).encode()
+    yield "degrees of freedom", "result:result/result.json", made, "residuals.dof could not"
 
 
 def _models() -> Iterator[tuple[str, str, bytes, str]]:
@@ -173,7 +216,7 @@ def _images() -> Iterator[tuple[str, str, bytes, str]]:
             head + opening * 60_000,
             "lists",
         )
-    for camera in (2**31 - 1, 10**30, 20_000):
+    for camera in (2**31 - 1, 10**30, 10**400, 20_000):
         text = (made_input("small") / "camera_info.yaml").read_bytes()
         text = text.replace(b"width: 64", b"width: %d" % camera)
         text = text.replace(b"height: 48", b"height: %d" % camera)
