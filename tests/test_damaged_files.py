@@ -41,18 +41,16 @@ def test_files_made_to_do_harm_are_refused_in_time_and_memory() -> None:
 def test_outlines_of_most_unequal_claims_are_used_or_refused() -> None:
     (subject,) = (subject for subject in SUBJECTS if subject.name.endswith("observations.csv"))
     n_rows = outlines_with({}).count(b"\n") - 1
-    cases = []
-    for seed in range(6):
+    for seed in range(4):
         chance = np.random.default_rng(seed)
         changes = {}
-        for row in (1 + np.flatnonzero(chance.random(n_rows) < 0.05)).tolist():
+        for row in (1 + np.flatnonzero(chance.random(n_rows) < 0.2)).tolist():
             s00, s11 = (10.0 ** chance.uniform(-8.5, 3.9, 2)).tolist()
             s01 = chance.uniform(-0.9, 0.9) * (s00 * s11) ** 0.5
             changes[row] = {"s00": s00, "s01": s01, "s11": s11}
-        cases.append(Case(subject, seed, made=outlines_with(changes)))
-    count = count_cases(cases)
-    assert not count.faults, [(ended.case.name, ended.fault) for ended in count.faults]
-    assert count.codes["0"] + count.codes["1"] > 0
+        (ended,) = run_cases([Case(subject, seed, made=outlines_with(changes))])
+        assert not ended.fault, (ended.case.name, ended.fault)
+        assert ended.code in (0, 1)
 
 
 def test_pipes_devices_and_folders_are_never_read() -> None:
