@@ -12,7 +12,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from itertools import count, islice
+from itertools import chain, count, islice
 from multiprocessing import connection, get_context, resource_tracker
 from threading import Thread
 from typing import Any, Protocol, TypeVar
@@ -149,8 +149,19 @@ def _in_order(
     pool: ProcessPoolExecutor, workers: int, task: Callable[[S], T], rows: Iterable[S], /
 ) -> Iterable[T]:
     rows = list(rows)
+    size = max(1, len(rows) // (_CHUNKS * workers))
     with _starting():
-        return pool.map(task, rows, chunksize=max(1, len(rows) // (_CHUNKS * workers)))
+        parts = [pool.submit(_each, task, part) for part in _parts(rows, size)]
+    # Not pool.map: what is left of it cancels parts, and a pool whose processes end would stand.
+    return chain.from_iterable(part.result() for part in parts)
+
+
+def _parts(rows: list[S], size: int) -> list[list[S]]:
+    return [rows[k : k + size] for k in range(0, len(rows), size)]
+
+
+def _each(task: Callable[[S], T], rows: list[S]) -> list[T]:
+    return [task(row) for row in rows]
 
 
 def _as_they_come(

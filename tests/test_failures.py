@@ -3,10 +3,12 @@
 import errno
 import io
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -175,6 +177,20 @@ def _runs(pid: int) -> bool:
 def test_a_process_that_is_ended_from_outside_is_said_in_one_sentence() -> None:
     with pytest.raises(OutOfResources, match="ended from outside"), worker_pool(2) as run:
         list(run(os._exit, [1, 1]))
+
+
+def test_a_pool_that_is_left_in_the_middle_of_its_work_ends_at_once() -> None:
+    with suppress(KeyboardInterrupt), worker_pool(2) as run:
+        results = iter(run(time.sleep, 40 * [0.0] + 200 * [1.0]))
+        next(results)
+        del results  # as when the stack of who reads them is gone
+        begin = time.perf_counter()
+        for process in multiprocessing.active_children():
+            process.kill()  # by the signal that has stopped this one as well
+        time.sleep(0.5)
+        raise KeyboardInterrupt
+    assert time.perf_counter() - begin < 5.0
+    assert not [t for t in threading.enumerate() if "Executor" in type(t).__name__]
 
 
 def test_what_goes_to_another_process_and_back_is_the_same_bit_by_bit() -> None:
