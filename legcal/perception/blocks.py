@@ -14,7 +14,7 @@ import numpy as np
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.light import Samples, to_light
 from legcal.perception.limb import N_SIMPLE, powers, simple_functions
-from legcal.perception.pixel_sums import PixelBins, PixelSums
+from legcal.perception.pixel_sums import PixelBins, PixelSums, applied
 from legcal.perception.profiles import Edge, read_profiles
 from legcal.vision import Camera, Grey
 
@@ -151,10 +151,6 @@ class Blocks:
         self.last = blur, self.moved.copy(), bins
         return bins
 
-    def of_edges(self, values: Array) -> list[Array]:
-        """Return values (n,) of blocks, edge by edge."""
-        return np.split(values, self.bounds[1:-1])
-
     def kept(self) -> BoolArray:
         """Return which blocks lie on the lines of their edges, (n,)."""
         nothing = [np.zeros(n, dtype=np.bool_) for n in np.diff(self.bounds)]
@@ -287,13 +283,13 @@ def fit_blocks(
     normal, steep = pairs[:, simple, simple], pairs[:, turned, turned]
     n_samples = sums.count.sum(axis=1)
     inverse = _regularised_inverse(normal, right[:, simple], power, n_samples)
-    amplitude = _applied(inverse, right[:, simple])
-    left = right - _applied(pairs[:, :, simple], amplitude)  # products with the residuals
+    amplitude = applied(inverse, right[:, simple])
+    left = right - applied(pairs[:, :, simple], amplitude)  # products with the residuals
     # The outline at distance s further inside lowers d by s.
-    crossed = _applied(pairs[:, simple, turned], -amplitude)
-    imitated = _applied(inverse, crossed)  # by other amplitudes
-    information = _dot(amplitude, _applied(steep, amplitude)) + _dot(
-        imitated, _applied(normal, imitated) - 2.0 * crossed
+    crossed = applied(pairs[:, simple, turned], -amplitude)
+    imitated = applied(inverse, crossed)  # by other amplitudes
+    information = _dot(amplitude, applied(steep, amplitude)) + _dot(
+        imitated, applied(normal, imitated) - 2.0 * crossed
     )
     gradient = -_dot(amplitude, left[:, turned]) - _dot(imitated, left[:, simple])
     residual = power - _dot(amplitude, right[:, simple] + left[:, simple])
@@ -314,11 +310,6 @@ def fit_blocks(
 def _dot(one: Array, other: Array) -> Array:
     """Return the products (n,) of vectors (n, k)."""
     return np.asarray(np.einsum("nk,nk->n", one, other), dtype=np.float64)
-
-
-def _applied(matrices: Array, vectors: Array) -> Array:
-    """Return the products (n, k) of matrices with vectors."""
-    return np.asarray((matrices @ vectors[..., None])[..., 0], dtype=np.float64)
 
 
 def _regularised_inverse(normal: Array, right: Array, power: Array, n_samples: Array) -> Array:

@@ -216,3 +216,8 @@ def medians(values: Array, edge: IntArray, bounds: Sequence[int]) -> Array:
     found, some = np.full(len(ends) - 1, np.nan), ends[1:] > ends[:-1]
     found[some] = ordered[((ends[:-1] + ends[1:]) // 2)[some]]
     return found
+
+
+def applied(matrices: Array, vectors: Array) -> Array:
+    """Return the products (n, i) of matrices (n, i, k) with vectors (n, k)."""
+    return np.asarray((matrices @ vectors[..., None])[..., 0], dtype=np.float64)

@@ -6,6 +6,7 @@ Gauss-Newton needs no pixel (:mod:`legcal.perception.pixel_sums`) as long as lin
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -15,7 +16,14 @@ from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.blocks import Blocks
 from legcal.perception.light import Samples
 from legcal.perception.limb import N_AMPLITUDES, N_POWERS, powers, profile_functions
-from legcal.perception.pixel_sums import PixelBins, PixelSums, even_weights, medians, noise_ratios
+from legcal.perception.pixel_sums import (
+    PixelBins,
+    PixelSums,
+    applied,
+    even_weights,
+    medians,
+    noise_ratios,
+)
 
 # Standard deviations of amplitudes, in contrasts of the outline, as limb.py orders them: of
 # what an outline has in common, of its changes along the outline, and of single blocks.
@@ -325,8 +333,8 @@ class _Pool:
             free = np.asarray(np.linalg.inv(within + _diagonal(own)), dtype=np.float64)
             pull = right[:, :BLUR].copy()
             pull[:, :N_AMPLITUDES] += own[:, :N_AMPLITUDES] * amplitude
-            fitted = _applied(free, pull)
-            explained = fitted * (2.0 * right[:, :BLUR] - _applied(within, fitted))
+            fitted = applied(free, pull)
+            explained = fitted * (2.0 * right[:, :BLUR] - applied(within, fitted))
             before = self.noise
             self.noise, weight = self._noise(self.sums.power.sum(axis=1) - explained.sum(axis=1))
             if np.all(np.abs(np.log(self.noise / before)) < NOISE_CONVERGED):
@@ -343,7 +351,7 @@ class _Pool:
         for k, (i, j) in enumerate(zip(ONE, OTHER, strict=True)):
             system[:, i, :, j] = system[:, j, :, i] = sums[:, k]
         side = N_ALONG * N_UNKNOWNS
-        system = system.reshape(n, side, side) + _diagonal(self.precision().reshape(n, side))
+        system = system.reshape(n, side, side) + _diagonal(self.precision.reshape(n, side))
         return _Equations(design, elimination, np.asarray(np.linalg.inv(system)))
 
     def step(
@@ -361,7 +369,7 @@ class _Pool:
         steep = (along @ (at.amplitude @ slopes)[edge])[:, 0]
         model -= self._moved(at.line)[:, None] * steep
         left = self.with_light - (self.products @ model[..., None])[..., 0]
-        target, precision = self._eliminated(equations, left), self.precision()
+        target, precision = self._eliminated(equations, left), self.precision
         target[..., :N_AMPLITUDES] -= precision[..., :N_AMPLITUDES] * at.amplitude
         target[:, :2, SHIFT] -= precision[:, :2, SHIFT] * at.line
         flat, apart = target.reshape(len(target), -1), equations.inverse
@@ -369,7 +377,7 @@ class _Pool:
         def solved(covariance: Array, log_blur: float, precision: float) -> Array:
             pulled = flat.copy()
             pulled[:, BLUR] += precision * (log_blur - at.log_blur)
-            return _applied(covariance, pulled)
+            return applied(covariance, pulled)
 
         if shared is None:
             alone = solved(apart, float(np.log(self.blur)), PRIOR_BLUR**-2)[:, BLUR]
@@ -386,6 +394,7 @@ class _Pool:
         after = _Iterate(at.amplitude + step[..., :N_AMPLITUDES], at.line + move, log_blurs)
         return after, covariance, shared
 
+    @cached_property
     def precision(self) -> Array:
         """Return what is known beforehand of the unknowns of edges, (n_edges, N_ALONG, N_UNKNOWNS).
 
@@ -422,12 +431,12 @@ class _Pool:
         widened = float(counts @ np.sum(apart * target, axis=1) / counts.sum())
         of_blur = covariance[:, :, BLUR]
         shared = 1.0 / of_blur[:, BLUR] - 1.0 / apart[:, BLUR] + PRIOR_BLUR**-2
-        found = _applied(covariance, target) + widened * shared[:, None] * of_blur
+        found = applied(covariance, target) + widened * shared[:, None] * of_blur
         return np.where(self.seen, found[:, SHIFT], np.nan)
 
     def _eliminated(self, equations: _Equations, left: Array) -> Array:
         """Return right sides (n_edges, N_ALONG, N_UNKNOWNS) by what is left of light (n, k)."""
-        right = _applied(equations.elimination, _applied(equations.design, left))
+        right = applied(equations.elimination, applied(equations.design, left))
         return self._of_edges(right, self.along)
 
     def _noise(self, power: Array) -> tuple[Array, Array]:
@@ -468,11 +477,6 @@ def _joined(counts: IntArray) -> IntArray:
     return np.asarray(
         (np.cumsum(n) - n)[edge] + (np.arange(len(edge)) - before[edge]) // number[edge]
     )
-
-
-def _applied(matrices: Array, vectors: Array) -> Array:
-    """Return the products (n, i) of matrices (n, i, k) with vectors (n, k)."""
-    return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 
 def _diagonal(values: Array) -> Array:

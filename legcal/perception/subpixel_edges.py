@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from legcal.geometry import Array
-from legcal.perception.blocks import BlockLine, Blocks, depth_for_blur
+from legcal.perception.blocks import BLURS, BlockLine, Blocks, depth_for_blur
 from legcal.perception.pixel_sums import medians
 from legcal.perception.pooled_fit import PooledLines, fit_pooled
 from legcal.perception.profiles import Edge
@@ -21,7 +21,6 @@ from legcal.vision import Camera, Grey
 
 FIRST_BLUR = 1.0  # [px]
 MIN_CHI2_GAIN = 30  # by an edge, from which on a block shows one
-BLURS = (0.3, 2.7)  # that a first one may be [px]
 FIRST_BLOCKS = 16  # of an outline
 ROUNDS, ROUNDS_NEAR = (1, 2), (2,)  # of estimates of the blur, and of one near a rough one
 LAST_ROUNDS = 2  # of lines, at most
@@ -69,7 +68,7 @@ def measure_edges(
     n_rounds = ROUNDS if blur is None else ROUNDS_NEAR
     blur = FIRST_BLUR if blur is None else blur
     if not near_fit:
-        blur = first = float(np.clip(blur, *BLURS))
+        blur = first = float(np.clip(blur, *BLURS[:2]))
         blocks = Blocks.read(grey, camera, edges, v, first, FIRST_BLOCKS)
         if len(blocks.moved) == 0:
             return [None] * len(edges), first

@@ -11,12 +11,11 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from legcal.errors import OutOfResources
 from legcal.geometry import Image
+from legcal.simulation.rendering.rays import Single
 
-Single = NDArray[np.float32]
 Subsampling = Literal["4:4:4", "4:2:2", "4:2:0"]
 
 _FACTORS: dict[Subsampling, int] = {
