@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,12 +16,8 @@ from legcal.calibration import CameraCalibration
 from legcal.calibration.camera_calibration import calibration
 from legcal.calibration.camera_calibration.adjustment import RobustFit, robust_fit
 from legcal.calibration.camera_calibration.diagnostics import refuse_undetermined, warnings
-from legcal.calibration.joint_fit.parameter_choices import Prior, known_parameters, resolve
-from legcal.data.measurements import View
-from legcal.data.overrides import overrides_of_call
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
 from legcal.geometry import Array
-from legcal.machine import load_mechanism
 from legcal.perception import BoardImages
 from legcal.vision import Board, DistortionModel, board_of, intrinsic_values
 from legcal.vision.camera_file import read_camera
@@ -213,12 +210,15 @@ def test_sigmas_follow_residuals_and_not_what_corners_claim(
     np.testing.assert_allclose(stated(4.0), stated(1.0), rtol=0.01)
 
 
-def test_the_file_is_a_camera_info_whose_sigmas_become_priors(
+def test_the_file_is_a_camera_info_with_the_whole_covariance(
     found: CameraCalibration, folder: Path
 ) -> None:
     camera = read_camera(folder / "camera.yaml")
     np.testing.assert_array_equal(intrinsic_values(camera), found.values)
-    np.testing.assert_allclose([camera.sigma[n] for n in found.names], found.sigma, rtol=1e-5)
+    assert camera.covariance is not None
+    scale = np.outer(found.sigma, found.sigma)
+    np.testing.assert_allclose(camera.covariance / scale, found.covariance / scale, atol=1e-12)
+    assert np.linalg.eigvalsh(camera.covariance / scale)[0] > 0.0
     document = yaml.safe_load((folder / "camera.yaml").read_text())
     assert list(document)[:6] == [
         "image_width", "image_height", "camera_name", "camera_matrix", "distortion_model",
@@ -226,28 +226,60 @@ def test_the_file_is_a_camera_info_whose_sigmas_become_priors(
     ]  # fmt: skip
     names = [i["image"] for i in document["legcal_camera"]["images"]]
     assert names == [f"b{k:02d}.png" for k in range(N_IMAGES)]
-    view = View("c1", camera)
-    known = known_parameters(load_mechanism("hexapod"), [view])
-    choices = resolve(overrides_of_call(free=["c1.f?", "c1.cx"], priors=["c1.cx=310+-2"]), known)
-    assert choices.free == frozenset()
-    assert set(choices.priors) == {"c1.fx", "c1.fy", "c1.cx"}
-    assert choices.priors["c1.fx"].mean == found.values[0]
-    assert choices.priors["c1.fx"].sigma == pytest.approx(found.sigma[0], rel=1e-5)
-    assert choices.priors["c1.cx"] == Prior(310.0, 2.0)
-    unknown = replace(view, camera=replace(view.camera, sigma={}))
-    known = known_parameters(load_mechanism("hexapod"), [unknown])
-    assert resolve(overrides_of_call(free=["c1.fx"]), known).free == {"c1.fx"}
+    sigma = document["legcal_camera"]["sigma"]
+    np.testing.assert_allclose([sigma[n] for n in found.names], found.sigma, rtol=1e-5)
 
 
-def test_sigmas_of_other_names_are_refused(
-    found: CameraCalibration, folder: Path, tmp_path: Path
+def _block(**changes: Any) -> dict[str, Any]:
+    """Return a block of a camera file, without what is None."""
+    names, rows = ["fx", "cx"], [[4.0, -0.9], [-0.9, 0.25]]
+    changed = {"version": 1, "sigma": {}, "names": names, "covariance": rows} | changes
+    return {key: value for key, value in changed.items() if value is not None}
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"sigma": {"f": 1.0}}, ("legcal_camera.sigma", "found f,", "fx, fy, cx")),
+        ({"sigma": {"fx": -1.0}}, ("legcal_camera.sigma.fx",)),
+        ({"names": ["fx", "f"]}, ("legcal_camera.names", "found f,")),
+        ({"names": ["fx", "fx"]}, ("legcal_camera.names", "fx twice")),
+        ({"names": None}, ("covariance without names",)),
+        ({"covariance": None}, ("names without covariance",)),
+        ({"covariance": [[4.0, 0.0]]}, ("1 rows", "2 rows of 2 numbers for fx, cx")),
+        ({"covariance": [[4.0], [0.0, 1.0]]}, ("rows of other lengths", "2 rows of 2")),
+        ({"covariance": [[4.0, "x"], [0.0, 1.0]]}, ("covariance", "a number")),
+        ({"covariance": [[4.0, 0.1], [0.2, 1.0]]}, ("not symmetric",)),
+        ({"covariance": [[4.0, 3.0], [3.0, 1.0]]}, ("not positive semidefinite",)),
+        ({"covariance": [[4.0, 0.1], [0.1, 0.0]]}, ("not positive semidefinite",)),
+        ({"covariance": [[4.0, 0.0], [0.0, -1.0]]}, ("the variance -1 of cx",)),
+        ({"covariance": [[4.0, 0.0], [0.0, 1e-30]]}, ("the variance 1e-30 of cx",)),
+        ({"sigma": {"fx": 2.1}}, ("deviation 2 of fx", "needed 2.1 as in sigma")),
+    ],
+)  # fmt: skip
+def test_what_is_no_covariance_is_refused_by_name(
+    folder: Path, tmp_path: Path, changes: dict[str, Any], named: tuple[str, ...]
 ) -> None:
-    text, path = (folder / "camera.yaml").read_text(), tmp_path / "camera.yaml"
-    assert found.names[0] == "fx"
-    for old, new, named in (("fx:", "f:", "sigma"), ("fx: ", "fx: -", "sigma.fx")):
-        path.write_text(text.replace(f"sigma: {{{old}", f"sigma: {{{new}"))
-        with pytest.raises(DatasetError, match=f"legcal_camera.{named}"):
-            read_camera(path)
+    document, path = yaml.safe_load((folder / "camera.yaml").read_text()), tmp_path / "camera.yaml"
+    document["legcal_camera"] = _block(**changes)
+    path.write_text(yaml.safe_dump(document))
+    with pytest.raises(DatasetError) as refused:
+        read_camera(path)
+    assert [word for word in (path.name, *named) if word not in str(refused.value)] == []
+    assert len(refused.value.problems) == 1
+
+
+def test_intrinsics_that_a_covariance_does_not_name_are_exact(folder: Path, tmp_path: Path) -> None:
+    document, path = yaml.safe_load((folder / "camera.yaml").read_text()), tmp_path / "camera.yaml"
+    document["legcal_camera"] = _block()
+    path.write_text(yaml.safe_dump(document))
+    covariance = read_camera(path).covariance
+    assert covariance is not None
+    assert np.argwhere(covariance).tolist() == [[0, 0], [0, 2], [2, 0], [2, 2]]
+    assert (covariance[0, 0], covariance[0, 2], covariance[2, 2]) == (4.0, -0.9, 0.25)
+    document["legcal_camera"] = _block(names=None, covariance=None, sigma={"fx": 2.0})
+    path.write_text(yaml.safe_dump(document))
+    assert read_camera(path).covariance is None  # standard deviations without correlations
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,8 @@ from legcal.estimation import (
     linearize,
     minimise,
     named_covariance,
+    normal_equations,
+    robust_cost,
 )
 from legcal.geometry import Array, IntArray
 
@@ -97,6 +99,46 @@ def test_elimination_gives_the_covariance_of_the_whole_system() -> None:
     normal = information(problem, found.state, found.linear)
     mine = named_covariance(problem, found.state, normal.kept_covariance())
     np.testing.assert_allclose(mine, covariance, rtol=1e-9)
+
+
+def _with_prior(problem: Problem[Waves], prior: GaussianPrior) -> Problem[Waves]:
+    (block,) = problem.variables
+    return replace(problem, variables=(replace(block, prior=prior),))
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_correlated_prior_adds_the_inverse_of_its_covariance(turned: bool) -> None:
+    C, mean = np.array([[0.04, -0.03], [-0.03, 0.09]]), np.array([0.6, 0.1])
+    which = np.array([2, 0], dtype=np.intp)
+    single = GaussianPrior(np.array([1], dtype=np.intp), np.zeros(1), np.array([0.5]))
+    problem = waves(np.random.default_rng(1), all_free(N_SHARED, 1), 0.1)
+    by_x = np.random.default_rng(3).normal(size=(3, 3)) if turned else np.eye(3)
+    (block,) = problem.variables
+    if turned:
+        read = replace(block, jacobian=lambda _: by_x, coordinates=lambda v: by_x @ v[:, 0])
+        problem = replace(problem, variables=(read,))
+    known = _with_prior(problem, single + GaussianPrior.of_covariance(which, mean, C))
+    without = _with_prior(problem, GaussianPrior(which[:0], mean[:0], mean[:0]))
+    K = np.zeros((3, 3))
+    K[np.ix_(which, which)], K[1, 1] = np.linalg.inv(C), 4.0
+    away = by_x @ TRUTH.phase[:, 0] - np.array([0.1, 0.0, 0.6])
+    here, there = (linearize(p, TRUTH) for p in (known, without))
+    a, b = (normal_equations(p, TRUTH, linearize(p, TRUTH)) for p in (known, without))
+    np.testing.assert_allclose(a.U - b.U, by_x.T @ K @ by_x, atol=1e-9)
+    np.testing.assert_allclose(a.g_kept - b.g_kept, by_x.T @ K @ away, atol=1e-9)
+    np.testing.assert_allclose(here.prior_J.T @ here.prior_J, by_x.T @ K @ by_x, atol=1e-9)
+    cost = robust_cost(known, here, LOSS) - robust_cost(without, there, LOSS)
+    assert cost == pytest.approx(0.5 * away @ K @ away)
+
+
+def test_what_a_covariance_says_exactly_stays() -> None:
+    problem = waves(np.random.default_rng(1), all_free(N_SHARED, 1), 0.5)
+    mean, which = np.array([0.3, 0.5]), np.array([0, 2], dtype=np.intp)
+    C = 0.09 * np.array([[1.0, -2.0], [-2.0, 4.0]])  # the second moves by minus two of the first
+    found = minimise(_with_prior(problem, GaussianPrior.of_covariance(which, mean, C)), AWAY)
+    first, second = found.state.phase[which, 0] - mean
+    assert abs(first) > 1e-3
+    assert second == pytest.approx(-2.0 * first, rel=1e-4)
 
 
 def test_elements_add_to_the_information_one_by_one() -> None:

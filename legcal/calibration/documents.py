@@ -64,6 +64,14 @@ class ParameterRow(Document):
     sigma: Positive | None  # None where it was not estimated
     unit: str  # m, rad, px, or nothing for coefficients of distortion
     status: Literal["estimated", "fixed", "weak"]  # weak: part of a direction that is held
+    prior_sigma: Positive | None = None  # of an intrinsic by its camera file; else left out
+
+    @model_serializer(mode="wrap")
+    def _without_none(self, whole: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        row: dict[str, Any] = whole(self)
+        if self.prior_sigma is None:
+            del row["prior_sigma"]
+        return row
 
 
 class Kinematic(Document):

@@ -77,12 +77,14 @@ from legcal.perception import (
     place_and_measure,
 )
 from legcal.progress import Report, no_progress
+from legcal.vision import shared_cameras, stated_covariances
 from legcal.workers import worker_pool
 
 TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal one [rad]
 # Of all outlines that are measured in photographs: light at the limb that no model of shading
 # predicts looks like other radii, so that residuals never show it [px].
 LIMB_BIAS = {"bias of many edges": 0.02}
+_MAX_NAMED = 5  # cameras, before they are only counted
 MIN_FOUND_AGAIN = 0.5  # of the outlines of an image
 
 
@@ -212,6 +214,7 @@ def calibrate(
         *board_notes(dataset, found.solution, found.corners),
         *found.solution.notes,
         *_camera_notes(dataset, found.solution),
+        *_exact_cameras(dataset, choices),
     ]
     calibration = judge(
         dataset_at(dataset, fitted),
@@ -512,10 +515,30 @@ def _compare_held_out(data: OrderedDataset, estimate: Estimate, file_rows: IntAr
 
 
 def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
-    """Return which files hold the focal lengths that the measurements contradict."""
+    """Return which files hold the cameras that the measurements contradict."""
     names = [view.name for view in dataset.measurements.views]
     return [
-        f"The focal length of {view} that does not agree is that of "
+        f"The camera of {view} that does not agree is that of "
         f"{dataset.camera_paths[names.index(view)]}."
         for view in solution.contradicted_cameras
+    ]
+
+
+def _exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
+    """Return a note on cameras that are taken as exact because nothing says how well they are."""
+    if dataset.axes is not None:
+        return []
+    views = dataset.measurements.views
+    names, cameras = [view.name for view in views], [view.camera for view in views]
+    chosen = {name.rsplit(".", 1)[0] for name in (*choices.free, *choices.priors, *choices.fixed)}
+    known = {*chosen, *stated_covariances(names, cameras)}
+    exact = [name for name in dict.fromkeys(shared_cameras(names, cameras)) if name not in known]
+    if not exact:
+        return []
+    shown = ", ".join(exact[:_MAX_NAMED])
+    shown += f" and {len(exact) - _MAX_NAMED} more" if len(exact) > _MAX_NAMED else ""
+    state = "their camera files state" if len(exact) > 1 else "its camera file states"
+    return [
+        f"The intrinsics of {shown} are taken as exact, since {state} no covariance; calibrate "
+        "with legcal camera, or state what is known with a prior."
     ]

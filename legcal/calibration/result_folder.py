@@ -38,7 +38,13 @@ from legcal.calibration.documents import (
     WorkspaceAccuracy,
     unreadable,
 )
-from legcal.calibration.joint_fit import BOARD_SCALE, KINDS, PlatformError, known_parameters
+from legcal.calibration.joint_fit import (
+    BOARD_SCALE,
+    KINDS,
+    KnownIntrinsics,
+    PlatformError,
+    known_parameters,
+)
 from legcal.calibration.verdict import Calibration
 from legcal.data import CORNERS_NAME, OBSERVATIONS_NAME, write_corners, write_observations
 from legcal.errors import DatasetError, DidNotConverge, ModelError, OutOfClass
@@ -61,7 +67,13 @@ from legcal.machine import (
     write_calibrated_yaml,
     write_urdf,
 )
-from legcal.vision import camera_numbers, shared_cameras
+from legcal.vision import (
+    Camera,
+    camera_numbers,
+    intrinsic_names,
+    intrinsic_values,
+    shared_cameras,
+)
 
 RESULT_NAME, MODEL_NAME = "result.json", "calibrated.yaml"
 RELOAD_TOLERANCE = 1e-11  # between reloaded and written parameters [m, rad]
@@ -213,6 +225,7 @@ def _parameters(calibration: Calibration) -> list[ParameterRow]:
             value=values[name],
             nominal=parameter.nominal,
             sigma=sigma.get(name),
+            prior_sigma=solution.prior_sigma.get(name),
             unit=parameter.unit,
             status=solution.status.get(name, "fixed"),
         )
@@ -321,19 +334,24 @@ class EarlierResult:
     held: Array  # (w, n) how they change along the directions that were held, by a metre
     fixed: tuple[str, ...]  # kinematic parameters that were fixed
 
-    @property
-    def intrinsics(self) -> dict[str, tuple[float, float]]:
-        """Value and sigma of the estimated intrinsics, by name."""
-        kinematic = set(self.document.kinematic.names)
-        return {
-            row.name: (row.value, row.sigma)
-            for row in self.document.parameters
-            if row.status == "estimated"
-            and row.sigma is not None
-            and row.name not in kinematic
-            and row.name != BOARD_SCALE
-            and ".radius." not in row.name
-        }
+    def intrinsics(self, given: Camera) -> KnownIntrinsics | None:
+        """Return what was found of the intrinsics of a camera; None if none was estimated."""
+        rows = [row for row in self.document.parameters if row.status == "estimated"]
+        number, names = {row.name: i for i, row in enumerate(rows)}, intrinsic_names(given)
+        for owner, numbers in self.document.cameras.items():
+            found = {
+                k: number[f"{owner}.{name}"]
+                for k, name in enumerate(names)
+                if numbers == camera_numbers(given) and f"{owner}.{name}" in number
+            }
+            if found:
+                covariance, at = np.zeros((len(names), len(names))), list(found.values())
+                known = np.array(self.document.covariance)[np.ix_(at, at)]
+                covariance[np.ix_(list(found), list(found))] = known
+                mean = intrinsic_values(given)
+                mean[list(found)] = [rows[i].value for i in at]
+                return KnownIntrinsics(mean, covariance)
+        return None
 
 
 def read_result(given: str | Path) -> EarlierResult:

@@ -28,7 +28,6 @@ from legcal.calibration.joint_fit import (
     PlatformPair,
     Prior,
     Solution,
-    known_parameters,
 )
 from legcal.calibration.ordered_dataset import Options, order_dataset
 from legcal.calibration.pipeline import estimate_parameters, outline_key
@@ -46,7 +45,7 @@ from legcal.machine import (
     vector_of,
 )
 from legcal.progress import Report, no_progress
-from legcal.vision import camera_numbers, intrinsic_names
+from legcal.vision import shared_cameras
 from legcal.workers import worker_pool
 
 SIGNIFICANCE = 0.01
@@ -265,18 +264,13 @@ def _choices(dataset: Dataset, earlier: EarlierResult, prior: _EarlierEstimate) 
         name: Prior(mean, sigma)
         for name, mean, sigma in zip(prior.names, means, sigmas, strict=True)
     }
-    intrinsics = earlier.intrinsics
-    for view in dataset.measurements.views:
-        for owner, numbers in earlier.document.cameras.items():
-            if numbers != camera_numbers(view.camera):
-                continue
-            for key in intrinsic_names(view.camera):
-                if f"{owner}.{key}" in intrinsics:
-                    priors[f"{view.name}.{key}"] = Prior(*intrinsics[f"{owner}.{key}"])
-    owned = known_parameters(dataset.machine, dataset.measurements.views).by_name
+    views = dataset.measurements.views
+    owners = shared_cameras([view.name for view in views], [view.camera for view in views])
+    found = {owner: earlier.intrinsics(v.camera) for owner, v in zip(owners, views, strict=True)}
     return Choices(
         fixed=frozenset(earlier.fixed),
-        priors={name: prior for name, prior in priors.items() if name in owned},
+        priors=priors,
+        cameras={owner: known for owner, known in found.items() if known is not None},
         least_shared_px=earlier.document.residuals.shared_px,
     )
 

@@ -122,6 +122,7 @@ def _described(dataset: Dataset, settings: Mapping[str, object]) -> list[bytes]:
             [view.camera.model, view.camera.width, view.camera.height],
             [view.camera.gamma, view.camera.gamma_is_given],
             [view.camera.K.tolist(), view.camera.distortion.tolist()],
+            None if view.camera.covariance is None else view.camera.covariance.tolist(),
         ]
         for view in measurements.views
     ]

@@ -9,7 +9,8 @@ images nor robots (:mod:`legcal.calibration.joint_fit` is its largest client):
 the d numbers of each element: -1 is fixed (gauge, or by choice), equal numbers move
 together (views that share a lens). ``retract`` applies changes (a sum, ``Frames.moved``, or
 the client's own). ``labels`` and ``units`` name unknowns that are reported, ``coordinates`` and
-``jacobian`` map x to reported values where these differ, ``prior`` is a Gaussian on them.
+``jacobian`` map x to reported values where these differ, ``prior`` is a Gaussian on them, with
+correlations where these are known.
 
 **Factor** Measurements of one kind: ``rows(state)`` returns residuals of all of them at once with
 their derivatives by the blocks that ``touches`` names, in that order, and by the eliminated

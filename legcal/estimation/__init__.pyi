@@ -1,5 +1,6 @@
 from .loss import Huber as Huber
 from .loss import PseudoHuber as PseudoHuber
+from .problem import NO_PRIOR as NO_PRIOR
 from .problem import Factor as Factor
 from .problem import Frames as Frames
 from .problem import GaussianPrior as GaussianPrior

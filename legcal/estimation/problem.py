@@ -16,6 +16,7 @@ from itertools import pairwise
 from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.sparse import csc_array
 from scipy.spatial.transform import RigidTransform
 
@@ -56,20 +57,44 @@ class Frames(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GaussianPrior:
-    """Gaussian knowledge of single coordinates of a block of variables."""
+    """Gaussian knowledge of coordinates of a block of variables."""
 
     unknown: IntArray  # (n,) which of the block's unknowns
     mean: Array  # (n,)
     sigma: Array  # (n,)
+    # (n, n) T with T C T^T = 1 of their correlations C; None where they are independent
+    whitening: Array | None = None
+
+    @classmethod
+    def of_covariance(cls, unknown: IntArray, mean: Array, covariance: Array) -> GaussianPrior:
+        """Return the prior of a covariance (n, n) of positive variances.
+
+        Combinations without any variance are known to a millionth of their parts.
+        """
+        sigma = np.sqrt(np.diagonal(covariance))
+        value, vector = np.linalg.eigh(covariance / np.outer(sigma, sigma))
+        return cls(unknown, mean, sigma, (vector / np.sqrt(np.maximum(value, _EXACT**2))).T)
+
+    def whitened(self, errors: Array) -> Array:
+        """Return errors (n,) or (n, c) of these coordinates with unit covariance."""
+        over_sigma = (errors.T / self.sigma).T
+        return over_sigma if self.whitening is None else self.whitening @ over_sigma
 
     def __add__(self, other: GaussianPrior) -> GaussianPrior:
+        both, whitening = (self, other), None
+        if self.whitening is not None or other.whitening is not None:
+            whitening = block_diag(
+                *(np.eye(len(p.mean)) if p.whitening is None else p.whitening for p in both)
+            )
         return GaussianPrior(
             np.concatenate([self.unknown, other.unknown]),
             np.concatenate([self.mean, other.mean]),
             np.concatenate([self.sigma, other.sigma]),
+            whitening,
         )
 
 
+_EXACT = 1e-6  # least standard deviation along an eigenvector of correlations
 _MAX_KEY = 2**40  # of numbers of groups: above, they are counted anew
 NO_PRIOR = GaussianPrior(np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0))
 
@@ -625,10 +650,12 @@ def linearize(
         prior, size = block.prior, block.n_unknowns
         if len(prior.mean):
             value = getattr(state, block.name)
-            r = (block.read(value)[prior.unknown] - prior.mean) / prior.sigma
+            r = prior.whitened(block.read(value)[prior.unknown] - prior.mean)
             slope = 1.0 / prior.sigma
             if block.jacobian is not None:
-                slope = block.jacobian(value)[prior.unknown] * slope[:, None]
+                slope = prior.whitened(block.jacobian(value)[prior.unknown])
+            elif prior.whitening is not None:
+                slope = prior.whitened(np.eye(size)[prior.unknown])
             priors.append(PriorRows(r, slope, first + prior.unknown, first))
         first += size
     known = {} if known is None else known

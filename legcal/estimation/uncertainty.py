@@ -215,7 +215,8 @@ def scores_of_block(problem: Problem[S], state: S, name: str) -> tuple[Array, Ar
     Parameters
     ----------
     problem : Problem
-        With the block, whose every unknown has a prior of mean zero and comes last of the named.
+        With the block, whose every unknown has a prior of mean zero and its own, and comes last
+        of the named.
     state : S
         Near a minimum of the problem with some of them or none; Gauss-Newton's step from there is
         taken into account.

@@ -16,7 +16,8 @@ from .camera import intrinsic_names as intrinsic_names
 from .camera import intrinsic_unit as intrinsic_unit
 from .camera import intrinsic_values as intrinsic_values
 from .camera import shared_cameras as shared_cameras
-from .camera import undistort_derivatives as undistort_derivatives
+from .camera import stated_covariances as stated_covariances
+from .camera import undistort_with_derivatives as undistort_with_derivatives
 from .camera import with_intrinsics as with_intrinsics
 from .camera_file import CALIBRATED as CALIBRATED
 from .camera_file import camera_info as camera_info

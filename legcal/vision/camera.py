@@ -106,7 +106,8 @@ class Camera:
     model: DistortionModel = "plumb_bob"  # meaning of the coefficients
     gamma: float = 1.0  # grey levels are light to the power 1 / gamma
     gamma_is_given: bool = True  # false where it is assumed
-    sigma: Mapping[str, float] = field(default_factory=dict)  # of its intrinsics, by name
+    # (n, n) of ``intrinsic_names``, zero for what is exact; None where none is stated
+    covariance: Array | None = None
 
     @property
     def has_distortion(self) -> bool:
@@ -238,22 +239,23 @@ def with_intrinsics(camera: Camera, values: Mapping[str, float]) -> Camera:
     return replace(camera, K=K, distortion=distortion)
 
 
-def undistort_derivatives(
+def undistort_with_derivatives(
     camera: Camera,
     pixels: Array,  # (..., 2) pixels
     names: Sequence[str],
-) -> Array:
-    """Return how the points of the sensor plane seen at pixels move with a camera's intrinsics.
+) -> tuple[Array, Array]:
+    """Return the points of the sensor plane seen at pixels, and how intrinsics move them.
 
-    A pixel stays where it is, so that d(u, v)/d(x, y) d(x, y) + d(u, v)/d(intrinsic) = 0.
+    These are (..., 2) and (..., 2, n_names). A pixel stays where it is, so that
+    d(u, v)/d(x, y) d(x, y) + d(u, v)/d(intrinsic) = 0.
     """
     flat = pixels.reshape(-1, 2)
     if len(flat) == 0:  # OpenCV refuses to project nothing
-        return np.zeros((*pixels.shape, len(names)))
+        return pixels, np.zeros((*pixels.shape, len(names)))
     xy = camera.undistort(flat)
     moved = distort_derivatives(camera, xy, names)
     found = -np.linalg.solve(camera.pixels_per_unit(xy), moved)
-    return np.asarray(found.reshape(*pixels.shape, len(names)))
+    return xy.reshape(pixels.shape), np.asarray(found.reshape(*pixels.shape, len(names)))
 
 
 def shared_cameras(names: Sequence[str], cameras: Sequence[Camera]) -> tuple[str, ...]:
@@ -263,6 +265,19 @@ def shared_cameras(names: Sequence[str], cameras: Sequence[Camera]) -> tuple[str
     for name, key in sorted(zip(names, keys, strict=True), key=lambda pair: pair[0]):
         owner.setdefault(key, name)
     return tuple(owner[key] for key in keys)
+
+
+def stated_covariances(names: Sequence[str], cameras: Sequence[Camera]) -> dict[str, Array]:
+    """Return the stated covariances of intrinsics by the view that stands for each camera.
+
+    Of several files with the same numbers, the first of the views that states one counts.
+    """
+    found: dict[str, Array] = {}
+    owners = shared_cameras(names, cameras)
+    for _, owner, camera in sorted(zip(names, owners, cameras, strict=True), key=lambda v: v[0]):
+        if camera.covariance is not None:
+            found.setdefault(owner, camera.covariance)
+    return found
 
 
 def camera_numbers(camera: Camera) -> dict[str, float | str]:

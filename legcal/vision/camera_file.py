@@ -60,10 +60,12 @@ CameraMatrix = Annotated[MatrixEntry, AfterValidator(_is_3x3)]
 
 
 class CalibratedEntry(_OpenSchema):
-    """What legcal adds to a camera that it calibrated: standard deviations by name."""
+    """What legcal adds to a camera that it calibrated: how well its intrinsics are known."""
 
     version: Literal[1]
     sigma: dict[str, Sigma]
+    names: list[str] | None = None  # of the rows of the covariance
+    covariance: list[list[float]] | None = None
 
 
 class RosEntry(_OpenSchema):
@@ -107,6 +109,9 @@ _OPENCV_KEYS = {
     "distortion_coefficients": ("distortion_coefficients", "Distortion_Coefficients"),
     "fisheye_model": ("fisheye_model",),
 }
+_SIGMAS = (1e-12, 1e6)  # least and greatest standard deviation of an intrinsic [px, or none]
+_ROUNDING = 1e-9  # of correlations
+_SIGMA_DIGITS = 1e-4  # relative, to which standard deviations are written
 _SINGULAR = 1e-9  # smallest focal length, as a part of the image size
 
 
@@ -146,15 +151,70 @@ def _from_ros(found: Mapping[str, Any], path: Path) -> Camera:
     )
     if entry.legcal_camera is None:
         return camera
-    sigma = entry.legcal_camera.sigma
-    unknown = [name for name in sigma if name not in intrinsic_names(camera)]
-    if unknown:
+    return replace(camera, covariance=_covariance(entry.legcal_camera, camera, path))
+
+
+def _covariance(entry: CalibratedEntry, camera: Camera, path: Path) -> Array | None:
+    """Return the covariance of all intrinsics, None where only standard deviations are stated."""
+    known, names, rows = intrinsic_names(camera), entry.names, entry.covariance
+    for key, given in (("sigma", list(entry.sigma)), ("names", names or [])):
+        unknown = [name for name in given if name not in known]
+        twice = sorted({name for name in given if given.count(name) > 1})
+        if unknown or twice:
+            found = ", ".join(unknown) or f"{', '.join(twice)} twice"
+            raise DatasetError(
+                f"{path}: legcal_camera.{key} could not be used: found {found}, needed "
+                f"names of {camera.model}: {', '.join(known)}; calibrate the camera again."
+            )
+    if names is None and rows is None:
+        return None
+    problem = _covariance_problem(names, rows, entry.sigma)
+    if problem:
         raise DatasetError(
-            f"{path}: legcal_camera.sigma could not be used: found {', '.join(unknown)}, needed "
-            f"names of {camera.model}: {', '.join(intrinsic_names(camera))}; calibrate the camera "
-            "again."
+            f"{path}: legcal_camera.covariance could not be used: found {problem}; calibrate the "
+            "camera again."
         )
-    return replace(camera, sigma=sigma)
+    covariance, where = np.zeros((len(known), len(known))), [known.index(n) for n in names or ()]
+    C = np.array(rows).reshape(len(where), len(where))
+    covariance[np.ix_(where, where)] = 0.5 * (C + C.T)
+    return covariance
+
+
+def _covariance_problem(
+    names: Sequence[str] | None, rows: Sequence[Sequence[float]] | None, sigma: Mapping[str, float]
+) -> str:
+    """Return what was found and what was needed of a covariance; "" if it is one."""
+    if names is None or rows is None:
+        missing, given = ("names", "covariance") if names is None else ("covariance", "names")
+        return f"{given} without {missing}, needed both"
+    n = len(names)
+    if len(rows) != n or any(len(row) != n for row in rows):
+        lengths = "rows of other lengths" if len(rows) == n else f"{len(rows)} rows"
+        return f"{lengths}, needed {n} rows of {n} numbers for {', '.join(names)}"
+    C = np.array(rows).reshape(n, n)
+    if not np.all(np.isfinite(C)):
+        return "a number that is not finite, needed variances and covariances"
+    variance = np.diagonal(C)
+    least, most = _SIGMAS
+    possible = (variance == 0.0) | ((variance >= least**2) & (variance <= most**2))
+    if not possible.all():
+        i = int(np.argmin(possible))
+        return (
+            f"the variance {variance[i]:g} of {names[i]}, needed zero or the square of a standard "
+            f"deviation of {least:g} to {most:g}"
+        )
+    root = np.sqrt(np.where(variance > 0.0, variance, 1.0))
+    correlation = C / np.outer(root, root)
+    if np.abs(correlation - correlation.T).max(initial=0.0) > _ROUNDING:
+        return "a matrix that is not symmetric, needed one that is"
+    exact = variance == 0.0
+    least_value = float(np.linalg.eigvalsh(correlation)[0]) if n else 0.0
+    if correlation[exact].any() or least_value < -_ROUNDING:
+        return "a matrix that is not positive semidefinite, needed one that is"
+    for name, s in zip(names, np.sqrt(variance).tolist(), strict=True):
+        if name in sigma and abs(sigma[name] - s) > _SIGMA_DIGITS * s:
+            return f"a standard deviation {s:g} of {name} in it, needed {sigma[name]:g} as in sigma"
+    return ""
 
 
 def _from_opencv(found: Mapping[str, Any], path: Path) -> Camera:

@@ -174,6 +174,8 @@ def write_camera(calibration: CameraCalibration, path: Path) -> None:
         "rms_px": _short(calibration.rms_px),
         "coverage": _short(calibration.coverage),
         "sigma": {name: _short(s) for name, s in zip(names, sigma, strict=True)},
+        "names": list(names),
+        "covariance": calibration.covariance.tolist(),
         "images": [
             {"image": i.name, "corners": i.used, "rms_px": _short(i.rms_px)}
             for i in calibration.images

@@ -17,6 +17,7 @@ from .outline_errors import possible_biases as possible_biases
 from .parameter_choices import BOARD_SCALE as BOARD_SCALE
 from .parameter_choices import NO_CHOICES as NO_CHOICES
 from .parameter_choices import Choices as Choices
+from .parameter_choices import KnownIntrinsics as KnownIntrinsics
 from .parameter_choices import Prior as Prior
 from .parameter_choices import known_parameters as known_parameters
 from .parameter_choices import resolve as resolve

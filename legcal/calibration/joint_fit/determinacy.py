@@ -16,7 +16,7 @@ from scipy.linalg import null_space
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import State, with_values
 from legcal.errors import NotIdentifiable
-from legcal.estimation import NormalEquations, inverse_on_range, named_information
+from legcal.estimation import NormalEquations, inverse_on_range, marginal, named_information
 from legcal.geometry import Array
 from legcal.machine import (
     SHOWN,
@@ -47,15 +47,18 @@ class HeldDirections:
 def open_directions(problem: FitProblem, state: State, normal: NormalEquations) -> HeldDirections:
     """Return the open directions that hardly move the platform.
 
-    *problem* holds nothing yet; *normal* is its information at the state.
+    *problem* holds nothing yet; *normal* is its information at the state. Intrinsics that are known
+    with the covariance of a camera file are none of the parameters that may be open.
 
     Raises
     ------
     NotIdentifiable
         If an open direction moves the platform, or belongs to a camera or a radius.
     """
-    names, unit, length = problem.named, named_units(problem, state), state.mean_length
-    information = named_information(problem, state, normal)
+    every_unit, length = named_units(problem, state), state.mean_length
+    judged = np.setdiff1d(np.arange(problem.n_named), problem.calibrated)
+    names, unit = [problem.named[i] for i in judged], every_unit[judged]
+    information = marginal(named_information(problem, state, normal), judged)
     unseen = [name for name, row in zip(names, information, strict=True) if not np.any(row)]
     scaled = unit[:, None] * information * unit
     value, vector = np.linalg.eigh(0.5 * (scaled + scaled.T))
@@ -64,7 +67,7 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
     )
     basis, poor = vector[:, :n_open].T, vector[:, :n_poor].T
     if len(poor) == 0:
-        return HeldDirections(poor, unit)
+        return HeldDirections(np.zeros((0, problem.n_named)), every_unit)
     others = np.flatnonzero((basis[:, problem.n_kinematic :] ** 2).sum(axis=1) > _MAX_OTHERS**2)
     if len(others):
         basis = basis[others]
@@ -91,7 +94,9 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
         is_weak = _HELD_SIGMA * length * np.linalg.norm(harmless, axis=0) > sigma
         weak = tuple(names[i] for i in np.flatnonzero(is_weak))
     directions = (_in_words(names, row, problem.legs.names) for row in sparse_basis(harmless))
-    return HeldDirections(harmless, unit, tuple(directions), weak)
+    basis = np.zeros((len(harmless), problem.n_named))
+    basis[:, judged] = harmless
+    return HeldDirections(basis, every_unit, tuple(directions), weak)
 
 
 def refuse_undetermined_inliers(
@@ -104,13 +109,11 @@ def refuse_undetermined_inliers(
     NotIdentifiable
         With one of the directions.
     """
-    information, biases = named_information(problem, state, normal), problem.where("biases")
-    kept = np.setdiff1d(np.arange(len(information)), biases)
-    mixed = information[np.ix_(biases, kept)]
-    inverse = np.linalg.inv(information[np.ix_(biases, biases)])
-    information = information[np.ix_(kept, kept)] - mixed.T @ inverse @ mixed
-    scaled = held.unit[:, None] * information * held.unit
-    N = null_space(held.basis) if len(held.basis) else np.eye(len(kept))
+    known = np.concatenate([problem.where("biases"), problem.calibrated])
+    kept = np.setdiff1d(np.arange(problem.n_named), known)
+    unit, basis = held.unit[kept], held.basis[:, kept]
+    scaled = unit[:, None] * marginal(named_information(problem, state, normal), kept) * unit
+    N = null_space(basis) if len(basis) else np.eye(len(kept))
     value, vector = np.linalg.eigh(N.T @ scaled @ N)
     if value[0] * (_MAX_SIGMA * state.mean_length) ** 2 < 1.0:
         names = [problem.named[i] for i in kept]

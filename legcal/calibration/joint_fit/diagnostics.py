@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri, ndtr
 
 from legcal.calibration.joint_fit.determinacy import (
     HeldDirections,
@@ -41,6 +42,7 @@ _WIDE_SIGMA = 0.05  # of the mean leg length, angles at it: the prior of what wa
 _WIDE_RADIUS = 0.2  # of the radius
 _MAX_VARIANCE_SHARE = 0.5  # of the variance of that prior, after the measurements, for a test
 _NOMINAL_SIGMA = 0.01  # of the mean leg length: how far a nominal model is off along what is held
+_MIN_SHARE = 0.01  # of the variance that a camera file states, which measurements must remove
 _MANY_REJECTED = 0.1  # of all outlines
 _MOST_REJECTED = 0.5  # of those of a leg or a view
 _MIN_COUNT = 3  # rejected outlines of a leg or a view, at least, before it is noted
@@ -321,6 +323,59 @@ def _held_information(problem: FitProblem, held: HeldDirections, length: float) 
     rows, known = np.zeros((len(held.basis), n)), _NOMINAL_SIGMA * length * held.unit
     rows[:, np.setdiff1d(np.arange(n), problem.where("biases"))] = held.basis / known
     return rows.T @ rows
+
+
+@dataclass(frozen=True)
+class DoubtedCamera:
+    """A camera whose intrinsics the measurements move too far for what its file states."""
+
+    view: str  # the first one by name if several have the camera
+    key: str  # of the intrinsic that moves farthest for what is known of it
+    given: float  # in the camera file
+    sigma: float  # by the covariance of the file
+    found: float  # by the fit
+    apart: float  # standard deviations of that change
+
+    def __str__(self) -> str:
+        unit = f" {intrinsic_unit(self.key)}".rstrip()
+        return (
+            f"The camera of {self.view} does not agree with its covariance: the measurements move "
+            f"{self.key} from {self.given:.6g} +- {self.sigma:.2g}{unit} to {self.found:.6g}{unit},"
+            f" {self.apart:.0f} standard deviations of such a change; the stated uncertainty knows "
+            "nothing of it; calibrate the camera again at the same focus and zoom."
+        )
+
+
+def doubted_cameras(
+    problem: FitProblem, state: State, covariance: Array
+) -> tuple[DoubtedCamera, ...]:
+    """Return the cameras whose intrinsics the measurements move too far for their covariances.
+
+    In units in which what a file states has unit covariance, a fit that leaves the covariance P of
+    these moves them by a vector of covariance 1 - P. *covariance* is that of the kept unknowns.
+    """
+    block, values = problem.block("cameras"), problem.coordinates(state)
+    prior, first = block.prior, int(problem.where("cameras")[0]) if block.n_unknowns else 0
+    of_file = np.isin(first + prior.unknown, problem.calibrated)
+    views = np.array([block.labels[i].rsplit(".", 1)[0] for i in prior.unknown.tolist()])
+    found = []
+    for view in dict.fromkeys(views[of_file].tolist()):
+        rows = np.flatnonzero(of_file & (views == view))
+        own, sigma = first + prior.unknown[rows], prior.sigma[rows]
+        whitening = np.eye(len(prior.mean)) if prior.whitening is None else prior.whitening
+        T = whitening[np.ix_(rows, rows)] / sigma
+        moved, left = values[own] - prior.mean[rows], covariance[np.ix_(own, own)]
+        share, vector = np.linalg.eigh(np.eye(len(rows)) - T @ left @ T.T)
+        told = share > _MIN_SHARE
+        squared = float(np.sum((vector[:, told].T @ T @ moved) ** 2 / share[told]))
+        if squared <= chdtri(max(int(told.sum()), 1), 2.0 * ndtr(-_SIGNIFICANT)):
+            continue
+        spread = np.sqrt(np.maximum(sigma**2 - np.diagonal(left), _MIN_SHARE * sigma**2))
+        k = int(np.argmax(np.abs(moved) / spread))
+        key = problem.named[own[k]].rsplit(".", 1)[1]
+        numbers = prior.mean[rows[k]], sigma[k], values[own[k]], abs(moved[k]) / spread[k]
+        found.append(DoubtedCamera(view, key, *map(float, numbers)))
+    return tuple(found)
 
 
 def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:

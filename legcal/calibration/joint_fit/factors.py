@@ -30,7 +30,7 @@ from legcal.vision import (
     Camera,
     intrinsic_names,
     shared_cameras,
-    undistort_derivatives,
+    undistort_with_derivatives,
 )
 
 _SAME_GAMMA = 1e-6  # relative difference of gammas that count as one
@@ -185,7 +185,7 @@ class ObservedOutlines:
     def by_intrinsics(self, wanted: tuple[str, ...], keys: tuple[str, ...], state: State) -> Array:
         """Return derivatives (n, 2, n_wanted) of the offsets by intrinsics of the views."""
         by_xy = self._predicted(keys, state)[3]
-        slopes = _sensor_slopes(state.cameras, wanted, self.view, self.pixels)
+        slopes = _on_sensor(state.cameras, wanted, self.view, self.feet, self.pixels)[1]
         return np.asarray(np.einsum("nqck,cqn->nqk", slopes, by_xy))
 
     def _corrected(self, r: Array, state: State) -> Array:
@@ -601,7 +601,8 @@ class ObservedCorners:
     def by_intrinsics(self, wanted: tuple[str, ...], state: State) -> Array:
         """Return derivatives (n, 2, n_wanted) of these by intrinsics of the views."""
         lens = np.swapaxes(self.constants.reshape(-1, 2, 2), 1, 2)
-        return np.asarray(-lens @ _sensor_slopes(state.cameras, wanted, self.view, self.pixels))
+        slopes = _on_sensor(state.cameras, wanted, self.view, self.feet, self.pixels)[1]
+        return np.asarray(-lens @ slopes)
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor of corners; no platform pose moves them."""
@@ -751,27 +752,15 @@ def _on_sensor(
 
     The latter is how they move with intrinsics; without any unknown these are at *feet*.
     """
-    xy = feet
-    if keys:
-        xy = feet.copy()
-        for v in np.unique(view):
-            xy[view == v] = cameras[v].undistort(pixels[view == v])
-    return xy, _sensor_slopes(cameras, keys, view, pixels)
-
-
-def _sensor_slopes(
-    cameras: Sequence[Camera], keys: tuple[str, ...], view: IntArray, pixels: Array
-) -> Array:
-    """Return how points of images (n, ..., 2) move on the sensor plane, (n, ..., 2, n_keys)."""
-    slopes = np.zeros((*pixels.shape, len(keys)))
+    xy, slopes = feet.copy(), np.zeros((*pixels.shape, len(keys)))
     for v in np.unique(view) if keys else ():
         camera, of_view = cameras[v], view == v
         known = [k for k, key in enumerate(keys) if key in intrinsic_names(camera)]
         some = np.zeros((*pixels[of_view].shape, len(keys)))
         names = [keys[k] for k in known]
-        some[..., known] = undistort_derivatives(camera, pixels[of_view], names)
+        xy[of_view], some[..., known] = undistort_with_derivatives(camera, pixels[of_view], names)
         slopes[of_view] = some
-    return slopes
+    return xy, slopes
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ import numpy as np
 from legcal.data import Action, Override, View
 from legcal.errors import DatasetError, UsageError
 from legcal.files import closest
+from legcal.geometry import Array
 from legcal.machine import (
     Leg,
     LegKind,
@@ -33,12 +34,21 @@ class Prior:
     sigma: float
 
 
+@dataclass(frozen=True, eq=False)
+class KnownIntrinsics:
+    """What is known of all intrinsics of a camera, in the order of ``intrinsic_names``."""
+
+    mean: Array  # (n,) [px; distortion without unit]
+    covariance: Array  # (n, n) zero for what is exact
+
+
 @dataclass(frozen=True)
 class Choices:
     """Choices of parameters by their full names.
 
-    Without any the fit estimates all kinematic parameters except twists, and radii with a prior;
-    intrinsics are fixed.
+    Without any the fit estimates all kinematic parameters except twists, radii with a prior, and
+    intrinsics whose camera file states a covariance, which is their prior; others are fixed. What
+    is chosen of an intrinsic takes it out of that covariance, whose others stay as they are.
     """
 
     fixed: frozenset[str] = frozenset()  # at nominal, or at ``values``
@@ -47,6 +57,8 @@ class Choices:
     values: Mapping[str, float] = field(default_factory=dict)  # [m, rad, px], axes as angles
     notes: tuple[str, ...] = ()  # what gave way to what
     least_shared_px: Mapping[str, float] = field(default_factory=dict)  # by edge_biases.KINDS
+    # by the view that stands for a camera, in place of what its file states
+    cameras: Mapping[str, KnownIntrinsics] = field(default_factory=dict)
 
     def holds(self, name: str, *, by_default: bool = False) -> bool:
         """Say whether a parameter is held; ``by_default``: whether it is without a choice."""
@@ -61,6 +73,10 @@ class Choices:
             "fixed_at": dict(sorted(self.values.items())),
             "free": sorted(self.free),
             "priors": {name: [p.mean, p.sigma] for name, p in sorted(self.priors.items())},
+            "cameras": {
+                name: [known.mean.tolist(), known.covariance.tolist()]
+                for name, known in sorted(self.cameras.items())
+            },
             "least_shared_px": dict(sorted(self.least_shared_px.items())),
         }
         return {key: value for key, value in found.items() if value}
@@ -84,8 +100,6 @@ class KnownParameter:
     kind: ParameterKind  # what it belongs to
     least: float  # limits of a stated value [unit]
     most: float  # limits of a stated value [unit]
-    # what its camera file says of its uncertainty, one standard deviation [unit]
-    sigma: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +190,7 @@ def _intrinsics(views: Sequence[View]) -> tuple[dict[str, KnownParameter], dict[
                 "fy": (nominal / _FOCAL_RATIO, nominal * _FOCAL_RATIO),
             }.get(name, (-_COEFFICIENT, _COEFFICIENT))
             unit = intrinsic_unit(name)
-            sigma = camera.sigma.get(name) or None
-            known[f"{owner}.{name}"] = KnownParameter(nominal, unit, "intrinsic", *limits, sigma)
+            known[f"{owner}.{name}"] = KnownParameter(nominal, unit, "intrinsic", *limits)
     return known, synonyms
 
 
@@ -236,10 +249,6 @@ def resolve(overrides: Sequence[Override], known: KnownParameters) -> Choices:
     if its_problems:
         raise DatasetError(its_problems)
     decisions = in_file | of_call
-    for name, decision in decisions.items():
-        parameter = known.by_name[name]
-        if decision.action == "free" and parameter.sigma is not None:  # the camera file knows it
-            decisions[name] = _Decision("prior", parameter.nominal, parameter.sigma)
     given_way = [name for name in in_file if of_call.get(name, in_file[name]) != in_file[name]]
     note = f"What the dataset says of {', '.join(given_way)} gave way to what this run asks for."
     stated = {name: (d.value, d.sigma) for name, d in decisions.items() if d.value is not None}

@@ -9,7 +9,7 @@ besides is a field of :class:`State` and a block in :func:`_built`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -28,7 +28,12 @@ from legcal.calibration.joint_fit.factors import (
     observed_readings,
 )
 from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel
-from legcal.calibration.joint_fit.parameter_choices import BOARD_SCALE, NO_CHOICES, Choices
+from legcal.calibration.joint_fit.parameter_choices import (
+    BOARD_SCALE,
+    NO_CHOICES,
+    Choices,
+    KnownIntrinsics,
+)
 from legcal.calibration.joint_fit.variables import (
     DEFAULT_SETTINGS,
     FittedLegs,
@@ -43,6 +48,7 @@ from legcal.calibration.joint_fit.variables import (
 from legcal.data import LegAxes, Measurements, Outlines
 from legcal.errors import NotIdentifiable
 from legcal.estimation import (
+    NO_PRIOR,
     Frames,
     GaussianPrior,
     Problem,
@@ -50,13 +56,15 @@ from legcal.estimation import (
     all_free,
     fixed_at_start,
 )
-from legcal.geometry import Array, BoolArray
+from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import freedoms, radius_name
 from legcal.vision import (
     Camera,
     intrinsic_names,
     intrinsic_unit,
+    intrinsic_values,
     shared_cameras,
+    stated_covariances,
     with_intrinsics,
 )
 
@@ -105,6 +113,14 @@ class FitProblem(Problem[State]):
     def free(self) -> BoolArray:
         """Which kinematic parameters are unknowns, (p,)."""
         return self.parameters.free
+
+    @property
+    def calibrated(self) -> IntArray:
+        """Positions in x of the intrinsics that enter with the covariance of their camera files."""
+        block = self.block("cameras")
+        names = [block.labels[i] for i in block.prior.unknown.tolist()]
+        is_of_file = np.array([name not in self.choices.priors for name in names], dtype=np.bool_)
+        return self.where("cameras")[block.prior.unknown[is_of_file]]
 
     @property
     def n_kinematic(self) -> int:
@@ -272,7 +288,8 @@ def _built(
         parameters.coordinates,
         parameters.jacobian if parameters.turns else None,
     )
-    intrinsics, keys = _intrinsics(outlines.views, cameras, owners, choices)
+    shown = {owners[v] for v in np.union1d(outlines.view, corners.view).tolist()}
+    intrinsics, keys = _intrinsics(outlines.views, cameras, owners, shown, choices)
     camera_pose = fixed_at_start(len(cameras), 6)
     camera_pose[observed.views] = all_free(len(observed.views), 6)
     no_biases = Variables("biases", np.zeros((0, 1), dtype=np.intp))
@@ -357,17 +374,38 @@ def _stated(block: Variables, choices: Choices) -> Variables:
 
 
 def _intrinsics(
-    views: Sequence[str], cameras: Sequence[Camera], owners: Sequence[str], choices: Choices
+    views: Sequence[str],
+    cameras: Sequence[Camera],
+    owners: Sequence[str],
+    shown: Collection[str],  # owners that measurements depend on
+    choices: Choices,
 ) -> tuple[Variables, tuple[str, ...]]:
-    """Return the block of intrinsics, shared by views of one camera, and what its columns are."""
-    wanted = {*choices.free, *choices.priors}
-    names = [
-        f"{view}.{key}"
-        for view, camera in zip(views, cameras, strict=True)
-        if view in owners
-        for key in intrinsic_names(camera)
-        if f"{view}.{key}" in wanted
-    ]
+    """Return the block of intrinsics, shared by views of one camera, and what its columns are.
+
+    The prior is what camera files state of those of which nothing was chosen.
+    """
+    chosen, stated = {*choices.free, *choices.priors}, dict(choices.cameras)
+    for owner, covariance in stated_covariances(views, cameras).items():
+        mean = intrinsic_values(cameras[views.index(owner)])
+        stated.setdefault(owner, KnownIntrinsics(mean, covariance))
+    names, prior = list[str](), NO_PRIOR
+    for view, camera in zip(views, cameras, strict=True):
+        if view not in owners:
+            continue
+        own = [f"{view}.{key}" for key in intrinsic_names(camera)]
+        known = stated.get(view) if view in shown else None
+        variances = [0.0] * len(own) if known is None else np.diagonal(known.covariance).tolist()
+        is_known = [
+            v > 0.0 and name not in chosen | choices.fixed
+            for name, v in zip(own, variances, strict=True)
+        ]
+        free = [k for k, name in enumerate(own) if is_known[k] or name in chosen]
+        at = [k for k in free if is_known[k]]
+        if known is not None and at:
+            numbers = np.array([len(names) + free.index(k) for k in at], dtype=np.intp)
+            covariance = known.covariance[np.ix_(at, at)]
+            prior += GaussianPrior.of_covariance(numbers, known.mean[at], covariance)
+        names += [own[k] for k in free]
     keys = tuple(dict.fromkeys(name.rsplit(".", 1)[1] for name in names))
     number = {name: i for i, name in enumerate(names)}
     index = [[number.get(f"{owner}.{key}", -1) for key in keys] for owner in owners]
@@ -380,6 +418,7 @@ def _intrinsics(
         tuple(names),
         tuple(intrinsic_unit(key) for _, key in where),
         lambda found: np.array([intrinsic_of(found[view], key) for view, key in where]),
+        prior=prior,
     )
     return block, keys
 

@@ -106,7 +106,7 @@ def sensitivities(
         if change["outlines"].any() or pull.any():
             names.append(what)
             changes.append(change)
-            pulls.append(pull / problem.priors.sigma)
+            pulls.append(problem.priors.whitened(pull))
     found: list[Sensitivity] = []
     if names:
         moved = {
@@ -194,10 +194,10 @@ def _of_twist(
 
 @dataclass(frozen=True)
 class FocalLength:
-    """What the measurements say of the focal length of a camera that was taken as known."""
+    """What the measurements say of the focal length of a camera whose file says what it is."""
 
     view: str  # the first one by name if several have the camera
-    given: float  # fx of the camera [px]
+    given: float  # fx in the camera file [px]
     change: float  # what would have to be added to fx and fy, as a part of them
     sigma: float  # standard deviation of that
 
@@ -213,24 +213,27 @@ class FocalLength:
             f"The focal length of {self.view} does not agree with the measurements: found fx = "
             f"{found:.1f} +- {sigma:.1f} px, given {self.given:.1f} px, {away:.0f} standard "
             f"deviations and {1e2 * self.change:+.2f} % apart; the stated uncertainty knows "
-            "nothing of it; calibrate the camera again, look for pictures that were scaled or "
-            f"focused anew, or let the fit find it (--free {self.view}.fx --free {self.view}.fy)."
+            "nothing of it; calibrate the camera again at the same focus and zoom, look for "
+            "pictures that were scaled or focused anew, or let the fit find it "
+            f"(--free {self.view}.fx --free {self.view}.fy)."
         )
 
 
 def focal_lengths(
     problem: FitProblem, state: State, linear: Linearization, by_camera: Mapping[str, Array]
 ) -> tuple[FocalLength, ...]:
-    """Return what the measurements say of the focal lengths that the fit took as known.
+    """Return what the measurements say of the focal lengths that camera files say.
 
-    One for each camera of which they say anything; arguments as those of :func:`sensitivities`.
-    The common-mode biases of outlines are in the problem, so that these do not pass for a focal
-    length.
+    One for each camera of which they say anything and nothing was chosen; arguments as those of
+    :func:`sensitivities`. The common-mode biases of outlines are in the problem, and so are errors
+    of intrinsics with the covariance that camera files state, so that these do not pass for a
+    focal length.
     """
     focal = [_KEYS.index(key) for key in _FOCAL]
-    is_known = np.all(_places_of_cameras(problem)[:, focal] == problem.n_kept, axis=1)
+    of_files = np.append(problem.calibrated, problem.n_kept)
+    is_known = np.all(np.isin(_places_of_cameras(problem)[:, focal], of_files), axis=1)
     known = [v for v in np.unique(problem.outlines.view).tolist() if is_known[v]]
-    owners = shared_cameras(problem.outlines.views, state.cameras)
+    owners = shared_cameras(problem.outlines.views, problem.first_cameras)
     tested = sorted({owners[v] for v in known})
     if not tested:
         return ()
@@ -252,7 +255,7 @@ def focal_lengths(
     return tuple(
         FocalLength(
             tested[i],
-            intrinsic_of(state.cameras[owners.index(tested[i])], "fx"),
+            intrinsic_of(problem.first_cameras[owners.index(tested[i])], "fx"),
             float(d),
             float(s),
         )

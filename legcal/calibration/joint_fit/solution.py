@@ -10,7 +10,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.joint_fit.determinacy import HeldDirections, held_spread, named_units
-from legcal.calibration.joint_fit.diagnostics import rejected_notes, scale_notes
+from legcal.calibration.joint_fit.diagnostics import (
+    doubted_cameras,
+    rejected_notes,
+    scale_notes,
+)
 from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.outline_errors import (
     GAMMA_SUFFIX,
@@ -70,6 +74,7 @@ class Solution:
     names: tuple[str, ...]  # the estimated parameters, in the order of ``values``
     covariance: Array  # (n, n) of these, with cameras and poses unknown
     sigma: Array  # (n,)
+    prior_sigma: Mapping[str, float]  # of the intrinsics that camera files state one of, by name
     # (p, p) of steps of all kinematic parameters, as moved_legs and pose_sensitivity have them
     # (axes turn about the vectors of where they are); zero where fixed, and along what is held.
     kinematic_covariance: Array
@@ -78,7 +83,8 @@ class Solution:
     held_covariance: Array
     value_covariance: Array  # (p, p) kinematic_covariance of the values
     held_basis: Array  # (w, p) how values change along each held direction, by a metre
-    weak: tuple[WorstDirection, ...]  # the estimated directions known worst, worst first
+    # the estimated directions known worst, worst first, of what no camera file states
+    weak: tuple[WorstDirection, ...]
     held: tuple[str, ...]  # the directions that are held at nominal
     cost: float  # over all observations, rejected ones too, with claimed covariances: comparable
     chi2: float  # of used outlines, axes, readings and priors
@@ -148,6 +154,11 @@ def assemble_solution(
     by_camera = derivatives_by_cameras(problem, state)
     focal = focal_lengths(problem, state, linear, by_camera)
     contradicted = [f for f in focal if f.is_contradicted]
+    of_focal = tuple(f.view for f in contradicted)
+    doubted = [c for c in doubted_cameras(problem, state, kept) if c.view not in of_focal]
+    named = problem.named
+    of_files = {named[i] for i in problem.calibrated.tolist()}
+    shown = [i for i, name in enumerate(names) if name not in of_files]
     gammas = _gammas(problem, state, kept, outlines)
     return Solution(
         legs=state.legs,
@@ -166,7 +177,18 @@ def assemble_solution(
         held_covariance=_of_kinematic(problem, held_spread(problem, state, held)),
         value_covariance=_of_kinematic(problem, covariance),
         held_basis=held_values,
-        weak=worst_directions(estimated, names, named_units(problem, state)[where]),
+        weak=worst_directions(
+            estimated[np.ix_(shown, shown)],
+            tuple(names[i] for i in shown),
+            named_units(problem, state)[where][shown],
+        ),
+        prior_sigma={
+            named[i]: sigma
+            for i, sigma in zip(
+                problem.priors.unknown.tolist(), problem.priors.sigma.tolist(), strict=True
+            )
+            if named[i] in of_files
+        },
         held=held.directions,
         cost=cost,
         chi2=chi2,
@@ -188,7 +210,7 @@ def assemble_solution(
         iterations=fit.iterations,
         posterior=Posterior(problem, state, fit.edge_biases, fit.noise, kept),
         focal_error=max((abs(f.change) for f in contradicted), default=0.0),
-        contradicted_cameras=tuple(f.view for f in contradicted),
+        contradicted_cameras=(*of_focal, *(camera.view for camera in doubted)),
         notes=(
             *fit.notes,
             *rejected_notes(problem, fit.accepted),
@@ -196,7 +218,8 @@ def assemble_solution(
             *map(str, gammas),
             *scale_notes(problem, state, settings),
             *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
-            *(str(f) for f in contradicted),
+            *map(str, contradicted),
+            *map(str, doubted),
         ),
     )
 

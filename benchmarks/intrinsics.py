@@ -1,0 +1,138 @@
+"""What the covariance of a camera file is worth: errors over what the fit states of them.
+
+    OMP_NUM_THREADS=1 python benchmarks/intrinsics.py [--runs 100] [--machine 6-spu-noncoplanar]
+                                                      [--images 12] [--noise 0.05]
+
+A board of 9 x 6 squares before the true camera, in so many images, with so much noise of its
+corners [px], gives the covariance of a calibration. In every run the camera file is drawn from it,
+for all views or for each of them, and the joint fit of an outline session gets the true camera,
+the drawn one as if it were exact, and the drawn one with the covariance. A line each: the squared
+error of all kinematic parameters by the whole covariance that the fit states, over their number
+(``nse``, which is that of the platform); displacement of the platform, rms over runs, true and
+predicted; how often a camera was said to disagree; time of a fit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from bound import ERRORS
+from camera_sessions import seen_corners
+from fit_sessions import with_camera
+from outline_sessions import (
+    MACHINES,
+    Design,
+    Noise,
+    OutlineSession,
+    design_of,
+    draw_session,
+    one_fit,
+    platform_errors,
+)
+
+from legcal.calibration import Solution
+from legcal.calibration.camera_calibration.adjustment import robust_fit
+from legcal.data import View
+from legcal.geometry import Array, components
+from legcal.machine import pose_sensitivity, vector_of
+from legcal.vision import Camera, ImageSize, intrinsic_names, intrinsic_values, with_intrinsics
+
+KINDS = ("true camera", "drawn, exact", "drawn, covariance")
+
+
+def calibrated(camera: Camera, n_images: int, noise_px: float) -> Array:
+    """Return the covariance that a calibration with a board states of the intrinsics."""
+    seen = seen_corners(camera, n_images, 0, noise=noise_px)
+    found = robust_fit(seen, ImageSize(camera.width, camera.height), camera.model)
+    assert found is not None
+    return found.scale * found.adjusted.covariance
+
+
+def drawn(camera: Camera, covariance: Array, rng: np.random.Generator) -> Camera:
+    """Return a camera whose errors have this covariance."""
+    names, values = intrinsic_names(camera), intrinsic_values(camera)
+    values = rng.multivariate_normal(values, covariance)
+    return with_intrinsics(camera, dict(zip(names, values.tolist(), strict=True)))
+
+
+def sessions(
+    session: OutlineSession, covariance: Array, rng: np.random.Generator, *, one_camera: bool
+) -> Iterator[OutlineSession]:
+    """Yield a session with its true camera, with a drawn one, and with the drawn covariance."""
+    yield session
+    m, o = session.measurements, session.outlines
+    views, h, wrong = list[View](), o.h.copy(), drawn(m.views[0].camera, covariance, rng)
+    for v, view in enumerate(m.views):
+        if v and not one_camera:
+            wrong = drawn(view.camera, covariance, rng)
+        h[m.view[o.row] == v] = with_camera(m, o, wrong)[1].h[m.view[o.row] == v]
+        views.append(replace(view, camera=wrong))
+    outlines = replace(o, h=h)
+    yield replace(session, measurements=replace(m, views=tuple(views)), outlines=outlines)
+    views = [replace(v, camera=replace(v.camera, covariance=covariance)) for v in views]
+    yield replace(session, measurements=replace(m, views=tuple(views)), outlines=outlines)
+
+
+def errors(design: Design, session: OutlineSession, found: Solution) -> tuple[float, float, float]:
+    """Return e' C^-1 e of the kinematic parameters, and mean squares of the platform [m^2]."""
+    covariance = found.value_covariance
+    truth = vector_of(found.parametrization, design.legs.nominal, session.legs.nominal)
+    away = np.array([found.values[name] for name in found.parametrization.names]) - truth
+    free = np.flatnonzero(np.diagonal(covariance) > 0.0)
+    sigma = np.sqrt(np.diagonal(covariance)[free])
+    correlation = covariance[np.ix_(free, free)] / np.outer(sigma, sigma)
+    z = away[free] / sigma
+    R, t = components(design.poses)
+    J = pose_sensitivity(found.legs, found.parametrization, design.legs.frame_legs, R, t)[:, 3:]
+    predicted = np.einsum("kia,ab,kib->k", J, found.kinematic_covariance, J, optimize=True)
+    displacement, _ = platform_errors(design, found.legs)
+    squared = float(np.mean(displacement**2)), float(np.mean(predicted))
+    return float(z @ np.linalg.solve(correlation, z)) / len(free), *squared
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--machine", choices=MACHINES, default=MACHINES[0])
+    parser.add_argument("--images", type=int, default=12)
+    parser.add_argument("--noise", type=float, default=0.05)
+    chosen = parser.parse_args()
+    noise = Noise()
+    design = design_of(chosen.machine, 3, 15, noise.sigma_px)
+    covariance = calibrated(design.camera, chosen.images, chosen.noise)
+    sigma = zip(intrinsic_names(design.camera), np.sqrt(np.diagonal(covariance)), strict=True)
+    print(", ".join(f"{name} {s:.2g}" for name, s in sigma))
+    print("cameras  fit                  nse  platform um  predicted um  disagree  ms")
+    for one_camera in (True, False):
+        found: list[list[tuple[float, ...]]] = [[] for _ in KINDS]
+        for seed in range(chosen.runs):
+            rng = np.random.default_rng([2002, seed])
+            session = draw_session(design, noise, ERRORS, rng)
+            several = sessions(session, covariance, rng, one_camera=one_camera)
+            for k, given in enumerate(several):
+                begin = time.perf_counter()
+                solution = one_fit(given, noise.radius_sigma)
+                took = time.perf_counter() - begin
+                doubted = bool(solution.contradicted_cameras)
+                found[k].append((*errors(design, given, solution), doubted, took))
+        for kind, rows in zip(KINDS, found, strict=True):
+            nse, error, predicted, doubted, took = np.mean(rows, axis=0)
+            print(
+                f"{'one' if one_camera else 'three':7s}  {kind:18s} {nse:5.2f} "
+                f"{1e6 * np.sqrt(error):12.1f} {1e6 * np.sqrt(predicted):13.1f} "
+                f"{100.0 * doubted:7.0f} % {1e3 * took:4.0f}"
+            )
+
+
+if __name__ == "__main__":
+    main()

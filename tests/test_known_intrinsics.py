@@ -1,0 +1,165 @@
+"""Intrinsics whose camera file states a covariance are unknowns of the joint fit, known by it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from fit_sessions import LENS, MachineSession, machine_session, with_camera
+
+from legcal.calibration.joint_fit import Choices, Prior, Solution, refine
+from legcal.geometry import Array
+from legcal.vision import Camera, intrinsic_names, intrinsic_values, with_intrinsics
+
+NAMES = intrinsic_names(LENS)
+SIGMA = np.array([3.0, 3.0, 1.5, 1.5, 0.004, 0.02, 3e-4, 3e-4, 0.0])  # k3 is held at zero
+FREE = tuple(f"c1.{name}" for name in NAMES[:-1])
+
+
+def _covariance(sigma: Array = SIGMA) -> Array:
+    """Return a covariance correlated as that of calibrations is: fx to fy, cx to p2, k1 to k2."""
+    C = np.eye(len(NAMES))
+    for a, b, r in (("fx", "fy", 0.98), ("cx", "p2", -0.9), ("cy", "p1", -0.9), ("k1", "k2", -0.9)):
+        i, j = NAMES.index(a), NAMES.index(b)
+        C[i, j] = C[j, i] = r
+    return np.asarray(sigma[:, None] * C * sigma)
+
+
+COVARIANCE = _covariance()
+
+
+@cache
+def session(seed: int | None = 0, n_poses: int = 5) -> MachineSession:
+    exact = machine_session("hexapod", n_poses=n_poses)
+    if seed is None:
+        return exact
+    measurements, outlines = exact.noisy(seed)
+    return replace(exact, measurements=measurements, outlines=outlines)
+
+
+def fitted(
+    given: MachineSession, camera: Camera, choices: Choices | None = None, views: Sequence[int] = ()
+) -> Solution:
+    """Return the fit of the pixels of a session with another camera; some views state nothing."""
+    m, o = with_camera(given.measurements, given.outlines, camera)
+    bare = replace(camera, covariance=None)
+    kept = tuple(replace(v, camera=bare) if i in views else v for i, v in enumerate(m.views))
+    m = replace(m, views=kept)
+    return refine(given.legs, m, o, given.start, choices=choices or Choices())
+
+
+def moved(away: Array, covariance: Array | None = COVARIANCE) -> Camera:
+    """Return the true camera with errors of its intrinsics, and what its file states."""
+    values = (intrinsic_values(LENS) + away).tolist()
+    return replace(
+        with_intrinsics(LENS, dict(zip(NAMES, values, strict=True))), covariance=covariance
+    )
+
+
+def errors(given: MachineSession, found: Solution) -> float:
+    """Return e' C^-1 e of the kinematic parameters over their number."""
+    e = given.legs.vector(found.legs) - given.legs.vector(given.truth.legs)
+    sigma = np.sqrt(np.diagonal(found.value_covariance))
+    z, correlation = e / sigma, found.value_covariance / np.outer(sigma, sigma)
+    return float(z @ np.linalg.solve(correlation, z)) / len(e)
+
+
+def said_of_cameras(found: Solution) -> list[str]:
+    return [note for note in found.notes if "agree" in note]
+
+
+def test_errors_of_a_drawn_camera_are_those_that_the_fit_states() -> None:
+    rng = np.random.default_rng(3)
+    root = np.linalg.cholesky(COVARIANCE[:-1, :-1])
+    honest, exact = [], []
+    for seed in range(4):
+        given = session(seed)
+        away = np.append(root @ rng.standard_normal(len(NAMES) - 1), 0.0)
+        found = fitted(given, moved(away))
+        honest.append(errors(given, found))
+        assert said_of_cameras(found) == []
+        if seed < 2:
+            exact.append(errors(given, fitted(given, moved(away, None))))
+    n = 4 * len(session().legs.parametrization)
+    assert abs(np.mean(honest) - 1.0) < 4.0 * np.sqrt(2.0 / n)
+    assert np.mean(exact) > 2.0
+
+
+def test_intrinsics_of_exact_pictures_are_found() -> None:
+    given = session(None)
+    away = np.array([2.0, -1.0, 1.0, -1.0, 0.003, -0.01, 2e-4, -2e-4, 0.0])
+    found = fitted(given, moved(away, _covariance(1e4 * SIGMA)))
+    assert [name for name in found.names if name in {f"c1.{name}" for name in NAMES}] == [*FREE]
+    assert not any(name.startswith(("c2", "c3")) for name in found.values)  # views of one camera
+    assert found.cameras[2].K is not LENS.K
+    np.testing.assert_allclose(found.cameras[2].K, LENS.K, atol=1e-4)
+    assert np.abs(given.legs.vector(found.legs) - given.legs.vector(given.truth.legs)).max() < 1e-7
+
+
+def test_a_covariance_says_what_lies_between_exact_and_free() -> None:
+    given, sigma, unknown = session(), np.append(SIGMA[:4], np.zeros(5)), FREE[:4]
+    exact, free = fitted(given, LENS), fitted(given, LENS, Choices(free=frozenset(unknown)))
+    tight, stated, wide = (
+        fitted(given, replace(LENS, covariance=_covariance(factor * sigma)))
+        for factor in (1e-4, 1.0, 1e4)
+    )
+    n = len(exact.names)
+    assert exact.names == tight.names[:n]
+    for narrow, broad in ((exact, tight), (wide, free)):
+        np.testing.assert_allclose(narrow.sigma[:n], broad.sigma[:n], rtol=1e-3)
+        np.testing.assert_allclose(
+            given.legs.vector(narrow.legs), given.legs.vector(broad.legs), atol=1e-7
+        )
+    assert np.all(stated.sigma[:n] > tight.sigma[:n])
+    assert np.all(stated.sigma[:n] < wide.sigma[:n])
+    # As many priors as unknowns.
+    assert exact.dof == tight.dof == stated.dof == free.dof + len(unknown)
+    assert [stated.prior_sigma[name] for name in unknown] == pytest.approx(SIGMA[:4].tolist())
+    at = [stated.names.index(name) for name in unknown]
+    assert np.all(stated.sigma[at] < SIGMA[:4])
+    assert not {name for direction in wide.weak for name, _ in direction.parts} & {*unknown}
+
+
+def test_one_file_that_states_a_covariance_speaks_for_the_camera() -> None:
+    camera = replace(LENS, covariance=COVARIANCE)
+    both, one = fitted(session(), camera), fitted(session(), camera, views=(0, 2))
+    assert one.values == both.values
+
+
+def test_what_the_owner_chooses_leaves_the_covariance_of_the_file() -> None:
+    camera = replace(LENS, covariance=COVARIANCE)
+    choices = Choices(
+        fixed=frozenset({"c1.fx"}),
+        free=frozenset({"c1.cx"}),
+        priors={"c1.cy": Prior(380.5, 1e-6)},
+    )
+    stated, chosen = fitted(session(), camera), fitted(session(), camera, choices)
+    assert "c1.fx" not in chosen.values
+    assert "c1.cx" not in chosen.prior_sigma
+    assert chosen.prior_sigma["c1.fy"] == stated.prior_sigma["c1.fy"] == pytest.approx(SIGMA[1])
+    assert chosen.values["c1.cy"] == pytest.approx(380.5, abs=1e-5)
+    sigma = [found.sigma[found.names.index("c1.cx")] for found in (stated, chosen)]
+    assert sigma[1] > sigma[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "said"),
+    [
+        ("f", 0.01, ("focal length of c1", "given 1302.9 px", "same focus and zoom")),
+        ("cx", 25.0, ("camera of c1", "same focus and zoom")),
+    ],
+)
+def test_a_camera_that_contradicts_its_covariance_is_named(
+    name: str, error: float, said: tuple[str, ...]
+) -> None:
+    away = np.zeros(len(NAMES))
+    if name == "f":
+        away[:2] = error * intrinsic_values(LENS)[:2]
+    else:
+        away[NAMES.index(name)] = error
+    found = fitted(session(n_poses=8), moved(away, _covariance(0.3 * SIGMA)))
+    (note,) = said_of_cameras(found)
+    assert [word for word in said if word not in note] == []
+    assert found.contradicted_cameras == ("c1",)
+    assert (found.focal_error > 0.005) == (name == "f")
