@@ -20,7 +20,7 @@ from legcal.data import Measurements, load_dataset
 from legcal.errors import DatasetError, LegcalError, ModelError
 from legcal.geometry import Image
 from legcal.machine import Machine
-from legcal.vision import Camera, image_problem, image_size, read_image
+from legcal.vision import Camera, image_size, inspect_image, read_image
 
 __all__ = ["folder"]
 
@@ -308,7 +308,7 @@ def test_16_bit_images_keep_their_fractions_on_the_same_scale(tmp_path: Path, na
 def test_every_cut_of_a_file_is_found(tmp_path: Path, name: str, options: tuple[int, ...]) -> None:
     noise = np.random.default_rng(1).integers(0, 255, (H, W), dtype=np.uint8)
     path = write(tmp_path / name, noise, *options)
-    assert image_problem(path, CAMERA) is None
+    assert inspect_image(path, CAMERA)[1] is None
     content = path.read_bytes()
     if name == "a.jpg":
         assert image_size(content + b"thumbnails and padding").width == W
@@ -374,7 +374,10 @@ HEADER = (b"IHDR", struct.pack(">IIBBBBB", W, H, 8, 0, 0, 0, 0))
         (_damaged, "chunk has a wrong checksum"),
         (lambda: _png(HEADER, (b"IDAT", b"junk"), (b"IEND", b"")), "data that cannot be decoded"),
         (lambda: _tiff(picture().astype(np.float32)), "32 bit floating-point pixels, needed 8 or"),
-        (lambda: _tiff(picture().T.copy()), "48 x 64 px, needed 64 x 48 px as in its camera"),
+        (
+            lambda: _tiff(picture().T.copy()),
+            "48 x 64 px .turned by a quarter turn., needed 64 x 48 px as in its camera",
+        ),
     ],
 )
 def test_files_that_are_no_pictures_are_refused_quietly(

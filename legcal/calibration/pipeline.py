@@ -52,6 +52,7 @@ from legcal.data import (
     Dataset,
     Outlines,
     Override,
+    compression_note,
     dataset_at,
     fingerprint,
     load_dataset,
@@ -215,6 +216,7 @@ def calibrate(
         *found.solution.notes,
         *_camera_notes(dataset, found.solution),
         *_exact_cameras(dataset, choices),
+        *_compression_note(dataset, found.solution),
     ]
     calibration = judge(
         dataset_at(dataset, fitted),
@@ -542,3 +544,15 @@ def _exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
         f"The intrinsics of {shown} are taken as exact, since {state} no covariance; calibrate "
         "with legcal camera, or state what is known with a prior."
     ]
+
+
+def _compression_note(dataset: Dataset, solution: Solution) -> list[str]:
+    """Return a note where outlines were measured in photographs compressed with much loss."""
+    o, measurements = solution.outlines, dataset.measurements
+    measured = {
+        measurements.image[row]
+        for row, source in zip(o.row.tolist(), o.source, strict=True)
+        if source == "detected"
+    }
+    facts = {image: found for image, found in dataset.facts.items() if image in measured}
+    return compression_note(measurements, facts, solution.noise.scale)

@@ -45,3 +45,4 @@ from .outlines import write_observations as write_observations
 from .overrides import Action as Action
 from .overrides import Override as Override
 from .overrides import overrides_of_call as overrides_of_call
+from .photograph_notes import compression_note as compression_note

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,10 +21,20 @@ from legcal.data.dataset_file import (
 from legcal.data.measurements import Measurements, View, read_measurements
 from legcal.data.outlines import Outlines, read_observations
 from legcal.data.overrides import Override
+from legcal.data.photograph_notes import photograph_notes
 from legcal.errors import DatasetError
 from legcal.files import closest, describe, path_problem
 from legcal.machine import Machine, load_mechanism, shipped_folders, shipped_names
-from legcal.vision import Board, Camera, Grey, decode_image, image_problem, parse_board, read_camera
+from legcal.vision import (
+    Board,
+    Camera,
+    Grey,
+    ImageFacts,
+    decode_image,
+    inspect_image,
+    parse_board,
+    read_camera,
+)
 from legcal.workers import KeptArrays
 
 AXES_NAME = "axes.csv"
@@ -52,6 +62,8 @@ class Dataset:
     board: Board | None = None  # the calibration board that is fixed to the base
     T_base_board: RigidTransform | None = None  # its pose in the base link, where it is known
     corners: Corners | None = None  # the rows of ``corners.csv`` if there is one
+    # What the files of images say of themselves, by the names of those that were looked at
+    facts: Mapping[str, ImageFacts] = field(default_factory=dict)
 
     def image_path(self, row: int) -> Path | None:
         """Return the image file of a row; None where only outlines are given."""
@@ -67,10 +79,12 @@ class Dataset:
             KeptArrays(len(rows), MAX_KEPT),
         )
 
-    def image_problem(self, row: int) -> str | None:
-        """Return what keeps the image of a row from being used, or None; nothing is decoded."""
+    def inspect_image(self, row: int) -> tuple[ImageFacts, str | None]:
+        """Return what the image of a row says of itself, and what keeps it from being used."""
         path = self.image_path(row)
-        return image_problem(path, self._camera(row), self._where(row)) if path else None
+        if path is None:
+            return ImageFacts(), None
+        return inspect_image(path, self._camera(row), self._where(row))
 
     def _camera(self, row: int) -> Camera:
         """Return the camera that took the image of a row."""
@@ -174,10 +188,13 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     )
     held = [view.hand_held for view in entry.views.values()]
     of_hand = [row for row, v in enumerate(rows.view.tolist()) if held[v]]
-    problems = row_problems(dataset, of_hand) if check_images else []
+    if not check_images:
+        return dataset
+    facts, problems = inspect_rows(dataset, of_hand)
     if problems:
         raise DatasetError(problems)
-    return dataset
+    of_files = photograph_notes(measurements, dataset.camera_paths, facts)
+    return replace(dataset, notes=(*dataset.notes, *of_files), facts=facts)
 
 
 def _refuse_two_tables(folder: Path) -> None:
@@ -310,8 +327,13 @@ def rows_without_board(
     ]
 
 
-def row_problems(dataset: Dataset, hand_held: Sequence[int]) -> list[str]:
-    """Return one sentence for each row that neither an image nor tables make usable."""
+def inspect_rows(
+    dataset: Dataset, hand_held: Sequence[int]
+) -> tuple[dict[str, ImageFacts], list[str]]:
+    """Return what images say of themselves, by their names, and what is wrong with rows.
+
+    That is one sentence for each row that neither an image nor tables make usable.
+    """
     table_path, measurements = dataset.table_path, dataset.measurements
     if dataset.corners is None:
         problems = [
@@ -324,7 +346,8 @@ def row_problems(dataset: Dataset, hand_held: Sequence[int]) -> list[str]:
     else:
         problems = rows_without_board(table_path, measurements, dataset.corners, hand_held)
     if dataset.axes is not None:
-        return [*problems, *rows_without_axes(table_path, measurements, dataset.axes)]
+        return {}, [*problems, *rows_without_axes(table_path, measurements, dataset.axes)]
+    facts: dict[str, ImageFacts] = {}
     outlines = dataset.observations
     given = set() if outlines is None else set(outlines.row.tolist())
     for row in range(measurements.n_rows):
@@ -336,9 +359,9 @@ def row_problems(dataset: Dataset, hand_held: Sequence[int]) -> list[str]:
                 "them; name an image or remove the row."
             )
         elif path is not None and (os.path.exists(path) or row not in given):
-            found = dataset.image_problem(row)
+            facts[measurements.image[row]], found = dataset.inspect_image(row)
             problems += [found] if found else []
-    return problems
+    return facts, problems
 
 
 def expand_hand_held(

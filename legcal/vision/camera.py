@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -108,6 +109,8 @@ class Camera:
     gamma_is_given: bool = True  # false where it is assumed
     # (n, n) of ``intrinsic_names``, zero for what is exact; None where none is stated
     covariance: Array | None = None
+    # What the files of the photographs said that it was calibrated from, where that is recorded
+    photographs: Mapping[str, Sequence[Any]] = field(default_factory=dict)
 
     @property
     def has_distortion(self) -> bool:

@@ -59,6 +59,26 @@ def _is_3x3(matrix: MatrixEntry) -> MatrixEntry:
 CameraMatrix = Annotated[MatrixEntry, AfterValidator(_is_3x3)]
 
 
+_Text = Annotated[str, Field(max_length=200)]
+_Positive = Annotated[float, Field(gt=0.0)]
+
+
+class PhotographsEntry(_OpenSchema):
+    """What the files of the photographs of the board said: the distinct values of each fact."""
+
+    device: list[_Text] = Field(default_factory=list)
+    serial: list[_Text] = Field(default_factory=list)
+    lens: list[_Text] = Field(default_factory=list)
+    focal_length_mm: list[_Positive] = Field(default_factory=list)
+    focal_length_35mm: list[_Positive] = Field(default_factory=list)
+    digital_zoom: list[_Positive] = Field(default_factory=list)
+    focus_distance_m: list[_Positive] = Field(default_factory=list)
+    taken_size: list[tuple[_PixelCount, _PixelCount]] = Field(default_factory=list)
+    software: list[_Text] = Field(default_factory=list)
+    lens_corrected: list[bool] = Field(default_factory=list)
+    cropped: list[bool] = Field(default_factory=list)
+
+
 class CalibratedEntry(_OpenSchema):
     """What legcal adds to a camera that it calibrated: how well its intrinsics are known."""
 
@@ -66,6 +86,7 @@ class CalibratedEntry(_OpenSchema):
     sigma: dict[str, Sigma]
     names: list[str] | None = None  # of the rows of the covariance
     covariance: list[list[float]] | None = None
+    photographs: PhotographsEntry = Field(default_factory=PhotographsEntry)
 
 
 class RosEntry(_OpenSchema):
@@ -151,7 +172,10 @@ def _from_ros(found: Mapping[str, Any], path: Path) -> Camera:
     )
     if entry.legcal_camera is None:
         return camera
-    return replace(camera, covariance=_covariance(entry.legcal_camera, camera, path))
+    photographs = entry.legcal_camera.photographs.model_dump()
+    known = {name: values for name, values in photographs.items() if values}
+    covariance = _covariance(entry.legcal_camera, camera, path)
+    return replace(camera, covariance=covariance, photographs=known)
 
 
 def _covariance(entry: CalibratedEntry, camera: Camera, path: Path) -> Array | None:

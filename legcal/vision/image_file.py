@@ -19,6 +19,13 @@ from legcal.errors import DatasetError
 from legcal.files import MAX_IMAGE, read_bytes
 from legcal.geometry import Array
 from legcal.vision.camera import Camera
+from legcal.vision.image_facts import (
+    JPEG_SIGNATURE,
+    PNG_SIGNATURE,
+    TIFF_SIGNATURES,
+    ImageFacts,
+    image_facts,
+)
 
 _Level = TypeVar("_Level", np.uint8, np.float32)
 Grey = NDArray[np.float32]  # (height, width) grey levels, 0 to 255
@@ -46,9 +53,6 @@ def quiet_opencv() -> Iterator[None]:
 
 _FLAGS = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
-_JPEG_SIGNATURE = b"\xff\xd8\xff"
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
 _DEEP, _FULL = 12, 16  # bits that the data in files of 16 bits may have
 _TIFF_INTEGERS = {1: "B", 3: "H", 4: "I"}  # struct's letters by the type numbers of TIFF
 _TIFF_TAGS = (256, 257, 258, 273, 279, 322, 323, 324, 325, 339)  # that are looked at
@@ -124,17 +128,21 @@ def _depth(pixels: NDArray[np.generic]) -> int:
     return _FULL if is_moved or used >= 2**_DEEP else _DEEP
 
 
-def image_problem(path: Path, camera: Camera, where: str = "") -> str | None:
-    """Return what keeps an image file from being used, or None; the pixels are not decoded."""
-    return _complete_content(path, camera, where)[1]
+def inspect_image(path: Path, camera: Camera, where: str = "") -> tuple[ImageFacts, str | None]:
+    """Return what an image file says of itself, and what keeps it from being used, if anything.
+
+    The pixels are not decoded.
+    """
+    content, problem = _complete_content(path, camera, where)
+    return image_facts(content), problem
 
 
 def image_size(content: bytes) -> ImageSize:
     """Return the size of an image from the bytes of its file."""
     if not content:
         raise BadImage("an empty file")
-    readers = {_JPEG_SIGNATURE: _jpeg_size, _PNG_SIGNATURE: _png_size}
-    readers |= dict.fromkeys(_TIFF_SIGNATURES, _tiff_size)
+    readers = {JPEG_SIGNATURE: _jpeg_size, PNG_SIGNATURE: _png_size}
+    readers |= dict.fromkeys(TIFF_SIGNATURES, _tiff_size)
     try:
         for signature, read in readers.items():
             if content.startswith(signature):
@@ -155,6 +163,28 @@ def size_problem(width: int, height: int) -> tuple[str, str] | None:
     return f"{width} x {height} px", needed
 
 
+def likely_cause(size: ImageSize, needed: ImageSize, facts: ImageFacts) -> str:
+    """Return in brackets why an image has another size than its camera, "" if nothing shows."""
+    causes = []
+    if facts.is_screenshot:
+        causes.append("a screenshot, as its file says")
+    elif size == ImageSize(needed.height, needed.width):
+        causes.append("turned by a quarter turn")
+    else:
+        for turned, word in ((size, ""), (ImageSize(size.height, size.width), "turned and ")):
+            factor = turned.width / needed.width
+            if abs(turned.height - factor * needed.height) <= max(1.0, factor):
+                causes.append(f"{word}rescaled by {factor:.4g}")
+                break
+        else:
+            if size.width <= needed.width and size.height <= needed.height:
+                causes.append("cropped, or taken in another mode of the camera")
+    if facts.taken_size not in (None, (size.width, size.height)):
+        width, height = facts.taken_size
+        causes.append(f"taken with {width} x {height} px, as its EXIF data say")
+    return f" ({', '.join(causes)})" if causes else ""
+
+
 def _complete_content(path: Path, camera: Camera, where: str) -> tuple[bytes, str | None]:
     """Return the bytes of an image file, and what is wrong with them if anything."""
     if not os.path.isfile(path):
@@ -167,11 +197,12 @@ def _complete_content(path: Path, camera: Camera, where: str) -> tuple[bytes, st
         return b"", _problem(path, where, f"'{error.strerror}'", "a readable file")
     except BadImage as error:
         return b"", _problem(path, where, str(error), error.needed)
-    if (size.width, size.height) != (camera.width, camera.height):
+    needed = ImageSize(camera.width, camera.height)
+    if size != needed:
         return b"", _problem(
             path,
             where,
-            f"{size.width} x {size.height} px",
+            f"{size.width} x {size.height} px{likely_cause(size, needed, image_facts(content))}",
             f"{camera.width} x {camera.height} px as in its camera file",
             "use the original image, neither scaled, cropped nor rotated, or the calibration of "
             "its size",
@@ -214,7 +245,7 @@ def _jpeg_size(content: bytes) -> ImageSize:
 def _png_size(content: bytes) -> ImageSize:
     """Walk the chunks of a PNG to IEND, checking their checksums."""
     width, height = struct.unpack_from(">II", content, 16)
-    at, kind = len(_PNG_SIGNATURE), b""
+    at, kind = len(PNG_SIGNATURE), b""
     while kind != b"IEND":
         length, kind = struct.unpack_from(">I4s", content, at)
         if at + 12 + length > len(content):

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from characterisation.inputs import MAKERS, made_input
+from photograph_files import exif, jpeg, tiff
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ SUBJECTS = (
     Subject("small", "camera_info.yaml", "detect {in} -o {out}"),
     Subject("small", "images/c1_1.png", "detect {in} -o {out}"),
     Subject("pictures", "images/c1_1.tiff", "detect {in} -o {out}"),
-    Subject("pictures", "images/c2_1.jpg", "detect {in} -o {out}", share=0.15),
+    Subject("pictures", "images/c2_1.jpg", "detect {in} -o {out}", share=0.3),
     Subject("tool-poses", "3-rpr.csv",
             "locate {in}/3-rpr/models/3-rpr.yaml {in}/3-rpr.csv -o {out}", deep=True),
     Subject("3-rpr-axes", "dataset.yaml", "calibrate {in} -o {out}", deep=True),
@@ -87,10 +88,12 @@ def _pictures(folder: Path) -> None:
     """Save the two pictures of a small dataset in other formats."""
     shutil.copytree(made_input("small"), folder, dirs_exist_ok=True)
     text = (folder / "measurements.csv").read_text()
+    said = exif(make="Acme", model="One", focal=4.25, zoom=1.0, width=64, height=48, lens="Back")
     for name, suffix in (("c1_1", "tiff"), ("c2_1", "jpg")):
         picture = cv2.imread(str(folder / f"images/{name}.png"), cv2.IMREAD_UNCHANGED)
         assert picture is not None
-        cv2.imwrite(str(folder / f"images/{name}.{suffix}"), picture)
+        content = tiff(picture) if suffix == "tiff" else jpeg(picture, 80, said, b"crs:HasCrop='1'")
+        (folder / f"images/{name}.{suffix}").write_bytes(content)
         text = text.replace(f"{name}.png", f"{name}.{suffix}")
     (folder / "measurements.csv").write_text(text)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
 
@@ -40,10 +40,15 @@ from legcal.vision import (
     Board,
     Camera,
     DistortionModel,
+    ImageFacts,
     ImageSize,
     board_of,
+    differences,
+    image_facts,
     image_size,
+    likely_cause,
     read_image,
+    recorded,
 )
 from legcal.workers import Run, worker_pool
 
@@ -108,7 +113,7 @@ def calibrate_camera(
         CAMERA_FILE.check_place(Path(output))
     flat_board = board_of(board)
     paths = _listed_images([images] if isinstance(images, str | Path) else images)
-    size = _common_size(paths)
+    size, facts = _common_size(paths)
     with worker_pool(workers) as run:
         found = _search(flat_board, paths, size, run, progress)
     shown = [k for k, (numbers, _, _) in enumerate(found) if len(numbers) >= MIN_CORNERS]
@@ -127,6 +132,13 @@ def calibrate_camera(
     left_out = [f"{paths[shown[k]].name}: {why}" for k, why in fitted.left_out.items()]
     refuse_undetermined(fitted, [paths[shown[k]].name for k in fitted.images], left_out)
     result = _result(flat_board, paths, found, shown, fitted)
+    used = [k for k, image in enumerate(result.images) if image.used]
+    changes = _changes([paths[k] for k in used], [facts[k] for k in used], size)
+    result = replace(
+        result,
+        warnings=(*result.warnings, *changes),
+        photographs=recorded([facts[k] for k in used]),
+    )
     if output is not None:
         write_camera(result, Path(output))
     return result
@@ -264,13 +276,16 @@ def _matching(name: str) -> list[Path]:
     return [hit for hit in hits if hit.suffix.lower() in _SUFFIXES and hit.is_file()]
 
 
-def _common_size(paths: Sequence[Path]) -> ImageSize:
-    """Return the size that all images have."""
+def _common_size(paths: Sequence[Path]) -> tuple[ImageSize, list[ImageFacts]]:
+    """Return the size that all images have, and what the file of each says of itself."""
     sizes: dict[ImageSize, list[Path]] = {}
+    facts: list[ImageFacts] = []
     problems = []
     for path in paths:
         try:
-            sizes.setdefault(image_size(read_bytes(path, MAX_IMAGE)), []).append(path)
+            content = read_bytes(path, MAX_IMAGE)
+            sizes.setdefault(image_size(content), []).append(path)
+            facts.append(image_facts(content))
             continue
         except OSError as error:
             found, needed = f"'{error.strerror}'", "a readable file"
@@ -284,15 +299,34 @@ def _common_size(paths: Sequence[Path]) -> ImageSize:
         raise DatasetError(problems)
     if len(sizes) > 1:
         by_count = sorted(sizes.items(), key=lambda item: -len(item[1]))
+        usual = by_count[0][0]
+        first = {size: facts[paths.index(some[0])] for size, some in by_count}
         sizes_in_words = "; ".join(
-            f"{size.width} x {size.height} px in {_named(some)}" for size, some in by_count
+            f"{size.width} x {size.height} px in {_named(some)}"
+            f"{likely_cause(size, usual, first[size]) if size != usual else ''}"
+            for size, some in by_count
         )
         raise DatasetError(
             f"The camera could not be calibrated: found images of different sizes, "
             f"{sizes_in_words}, needed one size; leave out those that another camera took, or that "
             "were scaled, cropped or turned."
         )
-    return next(iter(sizes))
+    return next(iter(sizes)), facts
+
+
+def _changes(paths: Sequence[Path], facts: Sequence[ImageFacts], size: ImageSize) -> Iterator[str]:
+    """Yield a warning for each fact that photographs of one camera must share and do not."""
+    named = list(zip([path.name for path in paths], facts, strict=True))
+    for found in differences(named, (size.width, size.height), None):
+        groups = " and ".join(
+            f"images {how} ({', '.join(names[:_MAX_NAMED])}{', ...' * (len(names) > _MAX_NAMED)})"
+            for how, names in found.images.items()
+        )
+        yield (
+            f"No one camera may hold for all images: found {groups}, needed one "
+            f"{found.fact.what}; leave out those that differ, and photograph the machine like the "
+            "others."
+        )
 
 
 def _named(paths: Sequence[Path]) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,9 @@ class CameraCalibration:
         Share of the image inside the convex hull of all corners.
     warnings : tuple of str
         What is wrong with it, one sentence each.
+    photographs : mapping
+        What the files of the used images say of how they were made: the distinct values of each
+        fact, by its key in the camera file.
     """
 
     camera: Camera
@@ -79,6 +83,7 @@ class CameraCalibration:
     noise_px: float
     coverage: float
     warnings: tuple[str, ...]
+    photographs: Mapping[str, Sequence[Any]] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -181,6 +186,7 @@ def write_camera(calibration: CameraCalibration, path: Path) -> None:
             for i in calibration.images
             if i.rms_px is not None
         ],
+        "photographs": {key: list(values) for key, values in calibration.photographs.items()},
         "warnings": list(calibration.warnings),
     }
     text = camera_info(calibration.camera, path.stem, {CALIBRATED: block})

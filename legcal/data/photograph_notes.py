@@ -1,0 +1,160 @@
+"""Notes on photographs whose files say that the calibration of their camera does not hold for them.
+
+Views that share a camera file share its calibration. Every note names the images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from legcal.data.measurements import Measurements, few, few_views
+from legcal.vision import Difference, ImageFacts, differences
+
+GOOD_QUALITY = 95  # of a JPEG, from which on its loss is far below the noise of a camera
+_TURNS = {1: "not to be turned", 3: "to be turned by 180 deg", 6: "to be turned by 90 deg",
+          8: "to be turned by 270 deg"}  # fmt: skip
+_MOST = 3  # as many photographs of a view must name their camera for each that does not
+
+
+def photograph_notes(
+    measurements: Measurements, camera_paths: Sequence[Path], facts: Mapping[str, ImageFacts]
+) -> list[str]:
+    """Return one sentence for each thing that files of photographs say against their camera.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        Whose cameras know what was recorded of the photographs that they were calibrated from.
+    camera_paths : sequence of Path
+        The camera file of each view.
+    facts : mapping
+        What the files of images say, by the names of the images.
+    """
+    views_of: dict[Path, list[int]] = {}
+    for v, path in enumerate(camera_paths):
+        views_of.setdefault(path, []).append(v)
+    notes: list[str] = []
+    for path, views in views_of.items():
+        images = {v: _images(measurements, v, facts) for v in views}
+        notes += _against_camera(measurements, path, images)
+        for v in views:
+            notes += _of_view(measurements, v, images[v])
+    return notes
+
+
+def _images(
+    measurements: Measurements, view: int, facts: Mapping[str, ImageFacts]
+) -> list[tuple[str, ImageFacts]]:
+    """Return the photographs of a view with what their files say."""
+    rows = zip(measurements.view.tolist(), measurements.image, strict=True)
+    names = dict.fromkeys(image for v, image in rows if v == view and image in facts)
+    return [(name, facts[name]) for name in names]
+
+
+def _against_camera(
+    measurements: Measurements, path: Path, images: Mapping[int, list[tuple[str, ImageFacts]]]
+) -> Iterator[str]:
+    """Yield what contradicts a camera file, and the photographs of its views each other."""
+    named = [one for of_view in images.values() for one in of_view if not one[1].is_screenshot]
+    camera = measurements.views[next(iter(images))].camera
+    view_of = {name: v for v, of_view in images.items() for name, _ in of_view}
+    for found in differences(named, (camera.width, camera.height), camera.photographs):
+        shown = sorted({view_of[name] for names in found.images.values() for name in names})
+        views = few_views([measurements.views[v].name for v in shown])
+        if len(found.images) > 1 and not found.needed:
+            yield (
+                f"{path} may not hold for all images of {views}: found {_in_words(found)}, needed "
+                f"one {found.fact.what}; leave out those that differ, or give them a view of their "
+                "own with the camera file of a calibration for them."
+            )
+        elif found.needed:
+            yield (
+                f"{path} may not hold for all images of {views}: found {_in_words(found)}, needed "
+                f"images {found.needed}, as those of the board were; calibrate the camera from "
+                "photographs that are taken and processed like these, or take these again."
+            )
+        else:
+            yield (
+                f"{path} may not hold for all images of {views}: found {_in_words(found)}, and no "
+                "record of the photographs of the board, needed the same in these; see that it "
+                "was so, or calibrate the camera with legcal camera, which records it."
+            )
+
+
+def _in_words(found: Difference) -> str:
+    """Return the images of a difference, and how they are."""
+    return " and ".join(f"images {how} ({few(names)})" for how, names in found.images.items())
+
+
+def _of_view(
+    measurements: Measurements, view: int, images: Sequence[tuple[str, ImageFacts]]
+) -> Iterator[str]:
+    """Yield what is odd about single photographs of a view."""
+    name = measurements.views[view].name
+    shown = [image for image, facts in images if facts.is_screenshot]
+    nameless = [image for image, facts in images if not facts.device and image not in shown]
+    devices = [facts.device for _, facts in images if facts.device]
+    remedy = "needed the files that the camera wrote; copy them from the camera."
+    if shown:
+        yield (
+            f"Images {few(shown)} of view {name} may be cropped or rescaled: found screenshots, as "
+            f"their files say, {remedy}"
+        )
+    if nameless and len(devices) >= _MOST * len(nameless):
+        yield (
+            f"Images {few(nameless)} of view {name} may be cropped or rescaled: found no camera "
+            f"named in them, '{devices[0]}' in {len(devices)} others, as after editing, a "
+            f"screenshot or a messenger, {remedy}"
+        )
+    turns: dict[int, list[str]] = {}
+    for image, facts in images:
+        if facts.orientation in _TURNS:
+            turns.setdefault(facts.orientation, []).append(image)
+    if len(turns) > 1 and not measurements.views[view].hand_held:
+        found = " and ".join(
+            f"images marked {_TURNS[turn]} ({few(names)})" for turn, names in turns.items()
+        )
+        yield (
+            f"The camera of view {name} may have been turned between its images: found {found}, "
+            "needed a camera that stands still; leave out those that differ, or give them a view "
+            "of their own."
+        )
+
+
+def compression_note(
+    measurements: Measurements, facts: Mapping[str, ImageFacts], scatter: float
+) -> list[str]:
+    """Return a note on photographs that were compressed with much loss.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        Their rows.
+    facts : mapping
+        What the files of images say, by the names of the images.
+    scatter : float
+        Noise of outlines over what the noise of the pixels around them explains.
+    """
+    by_quality: dict[int, set[int]] = {}
+    for v, image in zip(measurements.view.tolist(), measurements.image, strict=True):
+        found = facts.get(image)
+        if found is not None and (found.jpeg_quality or GOOD_QUALITY) < GOOD_QUALITY:
+            by_quality.setdefault(found.jpeg_quality or 0, set()).add(v)
+    if not by_quality:
+        return []
+    names = [view.name for view in measurements.views]
+    of_views: dict[tuple[int, ...], list[int]] = {}
+    for quality, views in sorted(by_quality.items()):
+        of_views.setdefault(tuple(sorted(views)), []).append(quality)
+    parts = [
+        f"photographs of {few_views([names[v] for v in views])} that are JPEGs of quality "
+        f"{qualities[0] if len(qualities) == 1 else f'{qualities[0]} to {qualities[-1]}'} or so"
+        for views, qualities in of_views.items()
+    ]
+    return [
+        f"Lossy compression moves outlines: found {', '.join(parts)}, and outlines that scatter "
+        f"{scatter:.2f} times as much as the noise of their pixels explains, which the stated "
+        "uncertainty includes; store photographs without loss (PNG, TIFF) or as JPEGs of quality "
+        f"{GOOD_QUALITY} or more."
+    ]
