@@ -16,7 +16,7 @@ from photograph_files import exif, jpeg, png, tiff
 from legcal import calibrate_camera, load_dataset
 from legcal.data import compression_note
 from legcal.errors import DatasetError
-from legcal.vision import ImageFacts, image_facts, read_camera
+from legcal.vision import ImageFacts, read_camera, read_facts
 
 __all__ = ["folder"]
 
@@ -36,17 +36,17 @@ XMP = b'<rdf:Description crs:LensProfileEnable="%d" crs:HasCrop="%s"/>'
 
 def test_the_quality_of_every_jpeg_is_found() -> None:
     for quality in range(1, 101):
-        assert image_facts(jpeg(PICTURE, quality)).jpeg_quality == quality
+        assert read_facts(jpeg(PICTURE, quality)).jpeg_quality == quality
     colours = np.dstack([PICTURE] * 3)
-    assert image_facts(jpeg(colours, 60)).jpeg_quality == 60
-    inside = image_facts(tiff(colours, 7))
+    assert read_facts(jpeg(colours, 60)).jpeg_quality == 60
+    inside = read_facts(tiff(colours, 7))
     assert inside.is_lossy
     assert 1 <= (inside.jpeg_quality or 0) < 100
 
 
 @pytest.mark.parametrize("content", [png(PICTURE), tiff(PICTURE), tiff(PICTURE, 5), b"", b"II*\0"])
 def test_files_that_say_nothing_have_no_facts(content: bytes) -> None:
-    facts = image_facts(content)
+    facts = read_facts(content)
     assert facts == ImageFacts(form=facts.form)
 
 
@@ -59,14 +59,14 @@ def test_facts_are_those_that_were_written(order: str) -> None:
         "digital_zoom": 1.0, "orientation": 1, "taken_size": SIZE,
     }  # fmt: skip
     for content in (jpeg(PICTURE, 90, block), png(PICTURE, block), block):
-        found = image_facts(content)
+        found = read_facts(content)
         assert {name: getattr(found, name) for name in expected} == expected
     other = exif(order, make="Acme", model="Two", zoom=0.0, focal=0.0, orientation=9)
-    found = image_facts(jpeg(PICTURE, 90, other, XMP % (1, b"False")))
+    found = read_facts(jpeg(PICTURE, 90, other, XMP % (1, b"False")))
     assert (found.device, found.digital_zoom) == ("Acme Two", 1.0)
     assert found.focal_length is found.orientation is None
     assert (found.lens_corrected, found.cropped) == (True, False)
-    escape = image_facts(jpeg(PICTURE, 90, exif(order, model="\x1b[31m\u202ered" + "x" * 999)))
+    escape = read_facts(jpeg(PICTURE, 90, exif(order, model="\x1b[31m\u202ered" + "x" * 999)))
     assert escape.device.startswith("[31mred")
     assert len(escape.device) < 100
 
@@ -76,7 +76,7 @@ def test_damaged_files_never_raise_and_say_little() -> None:
     contents = [jpeg(PICTURE, 90, block, XMP % (1, b"True")), png(PICTURE, block, Title="a"), block]
     for content in contents:
         for end in range(0, min(len(content), 900), 3):
-            facts = image_facts(content[:end])
+            facts = read_facts(content[:end])
             assert facts.device in ("", "Acme One")
     for old, new in (  # entries, bytes of a text, numbers, and a directory that points to itself
         (block[8:10], b"\xff\xff"),
@@ -85,10 +85,10 @@ def test_damaged_files_never_raise_and_say_little() -> None:
         (b"\x69\x87\x04\0\x01\0\0\0", b"\x69\x87\x04\0\x01\0\0\0\x08\0\0\0"),
     ):
         assert old in block
-        assert image_facts(block.replace(old, new, 1)[: len(block)]).focal_length is None
+        assert read_facts(block.replace(old, new, 1)[: len(block)]).focal_length is None
     chance = np.random.default_rng(3)
     for k in range(1500):
-        facts = image_facts(mutate(contents[k % 3], "jpg", chance))
+        facts = read_facts(mutate(contents[k % 3], "jpg", chance))
         assert all(c.isprintable() for c in facts.device + facts.lens + facts.software)
         for number in (facts.focal_length, facts.focus_distance, facts.digital_zoom):
             assert number is None or 0.0 < number <= 1e5

@@ -30,7 +30,7 @@ from .cylinder import direction_of_angles as direction_of_angles
 from .cylinder import outlines_of_axis as outlines_of_axis
 from .distortion import DistortionModel as DistortionModel
 from .image_facts import ImageFacts as ImageFacts
-from .image_facts import image_facts as image_facts
+from .image_facts import read_facts as read_facts
 from .image_file import BadImage as BadImage
 from .image_file import Grey as Grey
 from .image_file import ImageSize as ImageSize

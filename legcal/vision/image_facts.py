@@ -94,7 +94,7 @@ class ImageFacts:
     is_screenshot: bool = False
 
 
-def image_facts(content: bytes) -> ImageFacts:
+def read_facts(content: bytes) -> ImageFacts:
     """Return what the bytes of an image file say of how it was made."""
     if content.startswith(JPEG_SIGNATURE):
         quality, exif, xmp = _of_jpeg(content)

@@ -24,7 +24,7 @@ from legcal.vision.image_facts import (
     PNG_SIGNATURE,
     TIFF_SIGNATURES,
     ImageFacts,
-    image_facts,
+    read_facts,
 )
 
 _Level = TypeVar("_Level", np.uint8, np.float32)
@@ -134,7 +134,7 @@ def inspect_image(path: Path, camera: Camera, where: str = "") -> tuple[ImageFac
     The pixels are not decoded.
     """
     content, problem = _complete_content(path, camera, where)
-    return image_facts(content), problem
+    return read_facts(content), problem
 
 
 def image_size(content: bytes) -> ImageSize:
@@ -202,7 +202,7 @@ def _complete_content(path: Path, camera: Camera, where: str) -> tuple[bytes, st
         return b"", _problem(
             path,
             where,
-            f"{size.width} x {size.height} px{likely_cause(size, needed, image_facts(content))}",
+            f"{size.width} x {size.height} px{likely_cause(size, needed, read_facts(content))}",
             f"{camera.width} x {camera.height} px as in its camera file",
             "use the original image, neither scaled, cropped nor rotated, or the calibration of "
             "its size",

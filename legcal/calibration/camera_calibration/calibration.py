@@ -44,9 +44,9 @@ from legcal.vision import (
     ImageSize,
     board_of,
     differences,
-    image_facts,
     image_size,
     likely_cause,
+    read_facts,
     read_image,
     recorded,
 )
@@ -285,7 +285,7 @@ def _common_size(paths: Sequence[Path]) -> tuple[ImageSize, list[ImageFacts]]:
         try:
             content = read_bytes(path, MAX_IMAGE)
             sizes.setdefault(image_size(content), []).append(path)
-            facts.append(image_facts(content))
+            facts.append(read_facts(content))
             continue
         except OSError as error:
             found, needed = f"'{error.strerror}'", "a readable file"
