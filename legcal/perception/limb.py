@@ -19,7 +19,7 @@ rho^2, which is good to a part in a hundred up to rho = 0.8 (:func:`profile_func
 from functools import cache
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import gamma, ndtr, pbdv
 
 from legcal.geometry import Array
 
@@ -32,18 +32,17 @@ _REACH, _PER_BLUR = 24.0, 256  # range of the table on both sides, and entries p
 
 @cache  # where no image is measured nothing is tabulated
 def _tabulate_powers() -> tuple[Array, Array]:
-    """Tabulate the functions and their slopes over the range, (n, N_POWERS) each."""
-    from scipy.interpolate import CubicSpline  # a tenth of a second
+    """Tabulate the functions and their slopes over the range, (n, N_POWERS) each.
 
-    coarse = np.arange(-_REACH, _REACH + 1e-9, 1.0 / 32.0)
-    root = np.linspace(0.0, 7.0, 1401)  # substitute x = root^2: the integrands are smooth
-    kernel = np.exp(-0.5 * (root**2 - coarse[:, None]) ** 2) / np.sqrt(2.0 * np.pi)
-    kernel *= 2.0 * (root[1] - root[0])
-    kernel[:, 0] *= 0.5
+    The mean of max(z + n, 0)^p over unit Gaussian noise n is
+    Gamma(p + 1) exp(-z^2 / 4) D_(-p-1)(-z) / sqrt(2 pi), with parabolic cylinder functions D.
+    """
     z = np.arange(-_REACH, _REACH + 1e-9, 1.0 / _PER_BLUR)
-    minus_half = CubicSpline(coarse, kernel.sum(axis=1))(z)
-    half = CubicSpline(coarse, kernel @ root**2)(z)
     gauss, step = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi), ndtr(z)
+    minus_half, half = (
+        gamma(p + 1.0) * np.exp(-0.25 * z * z) / np.sqrt(2.0 * np.pi) * pbdv(-p - 1.0, -z)[0]
+        for p in (-0.5, 0.5)
+    )
     ramp = z * step + gauss
     three_halves, square = z * half + 0.5 * minus_half, z * ramp + step
     columns = [
