@@ -18,7 +18,7 @@ from legcal.simulation.solids import Material, PlacedSolid, Solid, SolidCylinder
 from legcal.vision import Grey
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
-from legcal.vision.visibility import Band, band_of_leg
+from legcal.vision.visibility import Band, bands_of_legs
 
 PHOTOGRAPHS = 3  # of every scene
 FINE = 3  # times as many pixels are rendered in every row, so that the lens blurs before they count
@@ -121,7 +121,8 @@ def photograph(looks: Looks, rng: np.random.Generator, times: int = PHOTOGRAPHS)
     middle = np.array([0.0, 0.0, distance]) + across * rng.uniform(-0.08, 0.08) * distance
     reach = 0.9 * distance
     A, B = middle - reach * u, middle + reach * u
-    band = band_of_leg(camera, A, B, 0.0, 2.0 * reach)
+    ends = np.array([[0.0], [2.0 * reach]])
+    (band,) = bands_of_legs(camera, A[None], B[None], *ends)
     if band is None:
         raise ValueError("the camera misses the cylinder")
     h = outlines_of_axis(u[None], middle[None], radius)[0]

@@ -18,7 +18,7 @@ from legcal.geometry import Array, IntArray
 from legcal.perception.part_edges import EdgePair, LegPart, block_positions, find_pairs
 from legcal.perception.profiles import Edge
 from legcal.perception.subpixel_edges import MeasuredEdge, measure_edges
-from legcal.vision import EPSILON, Band, Camera, Grey, PredictedLeg, band_of_leg, hidden_by
+from legcal.vision import EPSILON, Band, Camera, Grey, PredictedLeg, Segment, hidden_by
 
 OUTSIDE = "outside the image"  # a reason
 HIDDEN = "hidden by"  # the beginning of one
@@ -105,6 +105,17 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
     return outline_table(search, found), blur
 
 
+class _Predicted(NamedTuple):
+    """A part of a leg where it is predicted."""
+
+    leg: PredictedLeg
+    segment: Segment
+    band: Band
+    h: Array  # (2, 3) its outlines
+    v: Array  # (2, 2) offsets of these at both ends of the band [px]
+    width: float  # [px], in the middle
+
+
 def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
     """Find the edges of all parts in one image to about a pixel.
 
@@ -115,41 +126,34 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
     def reject(leg: PredictedLeg, part: str, why: str) -> None:
         rejected.append(PartLines(leg.leg, part, (why, why)))
 
-    searched: list[tuple[LegPart, Array]] = []  # with the predicted outlines (2, 3)
+    searched: list[_Predicted] = []
     for leg in search.legs:
-        window = float(search.window[leg.leg])
-        if math.isnan(window):
+        if math.isnan(search.window[leg.leg]):
             continue
-        for segment, h in zip(leg.segments, leg.outlines, strict=True):
-            band = leg.band
-            if len(leg.segments) > 1:
-                args = leg.A_camera, leg.B_camera, segment.start, segment.end
-                own = band_of_leg(search.camera, *args)
-                if own is None:
-                    reject(leg, segment.link, OUTSIDE)
-                    continue
-                band = own
-            predicted = band.offsets(h[:, None, :], np.array([0.0, band.length]))
-            width = float(np.mean(predicted[1] - predicted[0]))
+        for segment, band, h in zip(leg.segments, leg.bands, leg.outlines, strict=True):
+            if band is None:
+                reject(leg, segment.link, OUTSIDE)
+                continue
+            v = band.offsets(h[:, None, :], np.array([0.0, band.length]))
+            width = 0.5 * float((v[1] - v[0]).sum())
             if width < MIN_WIDTH:
                 reject(leg, segment.link, f"too narrow, {width:.1f} px wide")
             elif band.length < _min_length(width):
                 reject(leg, segment.link, f"too short, {band.length:.0f} px in the image")
             else:
-                guided = search.guided and window <= MAX_GUIDED_WINDOW * width
-                free = np.zeros(len(block_positions(band)), dtype=np.bool_)
-                part = LegPart(leg, segment, band, predicted, free, window, guided)
-                searched.append((part, h))
+                searched.append(_Predicted(leg, segment, band, h, v, width))
     free_parts: list[LegPart] = []
-    for (part, _), front in zip(searched, _in_front(search.legs, searched), strict=True):
+    for predicted, front in zip(searched, _in_front(search.legs, searched), strict=True):
+        leg, segment, band, _, v, width = predicted
         hidden = np.any(front >= 0, axis=0)
-        width = float(np.mean(part.predicted[1] - part.predicted[0]))
-        if np.mean(~hidden) * part.band.length < _min_length(width):
+        if np.mean(~hidden) * band.length < _min_length(width):
             values, counts = np.unique(front[front >= 0], return_counts=True)
             why = f"{HIDDEN} {search.names[values[np.argmax(counts)]]}"
-            reject(part.leg, part.segment.link, why)
+            reject(leg, segment.link, why)
         else:
-            free_parts.append(replace(part, hidden=hidden))
+            window = float(search.window[leg.leg])
+            guided = search.guided and window <= MAX_GUIDED_WINDOW * width
+            free_parts.append(LegPart(leg, segment, band, v, hidden, window, guided))
     parts: list[LegPart] = []
     pairs = find_pairs(search.grey, search.camera, free_parts)
     for part, pair in zip(free_parts, pairs, strict=True):
@@ -215,21 +219,19 @@ def _min_length(width: float) -> float:
     return max(MIN_LENGTH[0], MIN_LENGTH[1] * width)
 
 
-def _in_front(
-    legs: Sequence[PredictedLeg], searched: Sequence[tuple[LegPart, Array]]
-) -> list[IntArray]:
+def _in_front(legs: Sequence[PredictedLeg], searched: Sequence[_Predicted]) -> list[IntArray]:
     """Return which leg hides the outlines (2, n_blocks) of each part, -1 where they are free."""
     if not searched:
         return []
     points = []
-    for part, h in searched:
-        s = part.leg.distance_along(part.band, block_positions(part.band))
-        axis = part.leg.A_camera + s[:, None] * part.leg.u
-        radius = EPSILON * (h @ part.leg.A_camera)
+    for leg, _, band, h, _, _ in searched:
+        s = leg.distance_along(band, block_positions(band))
+        axis = leg.A_camera + s[:, None] * leg.u
+        radius = EPSILON * (h @ leg.A_camera)
         points.append((axis - (EPSILON * radius)[:, None, None] * h[:, None]).reshape(-1, 3))
     n = [len(of_part) for of_part in points]
-    own = np.repeat([part.leg.leg for part, _ in searched], n)
-    margin = np.repeat([MARGIN / part.band.scale for part, _ in searched], n)
+    own = np.repeat([part.leg.leg for part in searched], n)
+    margin = np.repeat([MARGIN / part.band.scale for part in searched], n)
     front = hidden_by(legs, own, np.concatenate(points), margin)
     return [of_part.reshape(2, -1) for of_part in np.split(front, np.cumsum(n)[:-1])]
 

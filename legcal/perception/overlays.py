@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from legcal.data import Outlines
 from legcal.geometry import Array, Image
 from legcal.perception.outline import OUTSIDE
-from legcal.vision import Camera, PredictedLeg, band_of_leg
+from legcal.vision import Camera, PredictedLeg
 
 MarkKind = Literal["edge 1", "edge 2", "axis", "rejected", "predicted"]
 N_POINTS = 40  # of a curve
@@ -164,8 +164,7 @@ def _curve(camera: Camera, h: Array, ends: Array) -> Array:
 
 def _prediction(camera: Camera, leg: PredictedLeg, i: int) -> list[Mark]:
     """Return both predicted outlines of segment i of a leg; none where it is outside the image."""
-    segment = leg.segments[i]
-    band = band_of_leg(camera, leg.A_camera, leg.B_camera, segment.start, segment.end)
+    band = leg.bands[i]
     if band is None:
         return []
     t = np.linspace(0.0, band.length, N_POINTS)

@@ -158,7 +158,7 @@ def _alone(shift: Array, score: Array, least: Array) -> BoolArray:
 
 def block_positions(band: Band) -> Array:
     """Return the positions t of the blocks of a band [px]."""
-    n = int(np.clip(band.length // BLOCK_LENGTH, 4, MAX_BLOCKS))
+    n = min(max(int(band.length // BLOCK_LENGTH), 4), MAX_BLOCKS)
     return np.asarray((np.arange(n) + 0.5) * (band.length / n))
 
 

@@ -49,7 +49,6 @@ from .photograph_comparison import recorded as recorded
 from .visibility import Band as Band
 from .visibility import PredictedLeg as PredictedLeg
 from .visibility import Segment as Segment
-from .visibility import band_of_leg as band_of_leg
 from .visibility import hidden_by as hidden_by
 from .visibility import look_alike as look_alike
 from .visibility import predict_legs as predict_legs

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -115,26 +116,14 @@ class Band:
         return np.asarray(h * np.sign(h[..., :2] @ self.normal)[..., None])
 
 
-def band_of_leg(
-    camera: Camera,
-    A_camera: Array,  # (3,)
-    B_camera: Array,  # (3,)
-    start: float,
-    end: float,
-) -> Band | None:
-    """Return the band along the visible stretch of a leg, or None if it is outside the image."""
-    ends = np.array([[start], [end]])
-    return bands_of_legs(camera, A_camera[None], B_camera[None], *ends)[0]
-
-
 def bands_of_legs(
     camera: Camera,
     A_camera: Array,  # (n, 3)
     B_camera: Array,  # (n, 3)
-    start: Array,  # (n,)
-    end: Array,  # (n,)
+    start: Array,  # (n,) distance from A [m]
+    end: Array,  # (n,) the same
 ) -> list[Band | None]:
-    """Return the bands along the visible stretches of legs, as :func:`band_of_leg` does for one."""
+    """Return the bands along stretches of legs where they are visible, None outside the image."""
     length = np.linalg.norm(B_camera - A_camera, axis=1)
     u = (B_camera - A_camera) / length[:, None]
     s = start[:, None] + (end - start)[:, None] * np.linspace(0.0, 1.0, N_SAMPLES)
@@ -203,6 +192,7 @@ class PredictedLeg:
     B_camera: Array  # (3,) its platform joint [m]
     segments: tuple[Segment, ...]  # the parts that can be seen, from base to platform
     outlines: Array  # (n_segments, 2, 3) their outlines h1, h2, eq (3)
+    bands: tuple[Band | None, ...]  # the frames along them, None for a part outside the image
     band: Band  # the frame along the visible stretch of the whole leg
 
     @cached_property
@@ -232,13 +222,18 @@ def predict_legs(
     length = np.linalg.norm(B_camera - A_camera, axis=1)
     u = (B_camera - A_camera) / length[:, None]
     segments = [visible_segments(of_leg, of) for of_leg, of in zip(cylinders, length, strict=True)]
-    ends = [(some[0].start, max(p.end for p in some)) if some else (0.0, 0.0) for some in segments]
-    bands = bands_of_legs(camera, A_camera, B_camera, *np.array(ends).reshape(-1, 2).T)
+    whole = [(some[0].start, max(p.end for p in some)) if some else (0.0, 0.0) for some in segments]
+    parts = [(leg, segment) for leg, some in enumerate(segments) for segment in some]
+    of = [*range(len(segments)), *(leg for leg, _ in parts)]
+    ends = np.array([*whole, *((part.start, part.end) for _, part in parts)]).reshape(-1, 2).T
+    bands = bands_of_legs(camera, A_camera[of], B_camera[of], *ends)
+    of_parts = iter(bands[len(segments) :])
+    bands_of_parts = [tuple(islice(of_parts, len(some))) for some in segments]
     radius = np.array([max((segment.radius for segment in some), default=0.0) for some in segments])
     distance = np.linalg.norm(A_camera - u * np.sum(u * A_camera, axis=1, keepdims=True), axis=1)
     seen = {
         leg: band
-        for leg, band in enumerate(bands)
+        for leg, band in enumerate(bands[: len(segments)])
         if band is not None and distance[leg] > 1.01 * radius[leg]
     }
     axes = [leg for leg in seen for _ in segments[leg]]
@@ -246,7 +241,9 @@ def predict_legs(
     outlines = outlines_of_axis(u[axes], A_camera[axes], radii)
     of_leg = np.split(outlines, np.cumsum([len(segments[leg]) for leg in seen])[:-1])
     return [
-        PredictedLeg(row, leg, A_camera[leg], B_camera[leg], segments[leg], own, band)
+        PredictedLeg(
+            row, leg, A_camera[leg], B_camera[leg], segments[leg], own, bands_of_parts[leg], band
+        )
         for (leg, band), own in zip(seen.items(), of_leg, strict=False)
     ]
 
