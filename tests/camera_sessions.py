@@ -1,5 +1,6 @@
 """A board before cameras of all models: its corners with noise, and photographs of it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,7 @@ from rendering import photograph
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
-from legcal.perception import BoardImages
+from legcal.perception import BoardImages, Sheet
 from legcal.simulation import Appearance, PlacedBoard
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera
@@ -35,11 +36,28 @@ CAMERAS = {
 
 
 def seen_corners(
-    camera: Camera, n_images: int, seed: int, *, tilt: float = 0.6, noise: float = NOISE_PX
+    camera: Camera,
+    n_images: int,
+    seed: int,
+    *,
+    tilt: float = 0.6,
+    noise: float = NOISE_PX,
+    sheet: Array | None = None,
+    smooth: float = 0.0,
 ) -> BoardImages:
-    """Return the corners of a board in random places, all over the image."""
+    """Return the corners of a board in random places, all over the image.
+
+    The board is bent and printed as the numbers of a sheet say; errors that neighbouring corners of
+    an image share have a standard deviation *smooth* [px].
+    """
     rng = np.random.default_rng(seed)
     middle = RigidTransform.from_translation(-BOARD.points.mean(axis=0))
+    real = BOARD.points
+    if sheet is not None:
+        real = replace(Sheet.flat(real), numbers=sheet).placed(real)[0]
+    apart = np.linalg.norm(BOARD.points[:, None] - BOARD.points, axis=-1)
+    shared = np.exp(-0.5 * (apart / 0.05) ** 2) + 1e-9 * np.eye(len(apart))
+    root = smooth * np.linalg.cholesky(shared)
     size = np.array([camera.width, camera.height])
     near, far = (0.10, 0.22) if camera.model == "equidistant" else (0.22, 0.5)
     image: list[Array] = []
@@ -48,7 +66,7 @@ def seen_corners(
         xy = camera.undistort(rng.uniform(0.15 * size, 0.85 * size))
         turn = Rotation.from_euler("xyz", [*rng.uniform(-tilt, tilt, 2), rng.uniform(-0.6, 0.6)])
         T = RigidTransform.from_components(rng.uniform(near, far) * np.array([*xy, 1.0]), turn)
-        P = (T * middle).apply(BOARD.points)
+        P = (T * middle).apply(real)
         if P[:, 2].min() < 0.03:
             continue
         at = camera.project(P)
@@ -57,7 +75,8 @@ def seen_corners(
             continue
         image.append(np.full(np.count_nonzero(inside), len(image)))
         points.append(BOARD.points[inside])
-        px.append(at[inside])
+        error = root @ rng.standard_normal(at.shape) if smooth else np.zeros(at.shape)
+        px.append((at + error)[inside])
     exact = np.concatenate(px)
     return BoardImages(
         np.concatenate(image).astype(np.intp),

@@ -33,6 +33,7 @@ of finite differences checks them all), and the blocks. At predicted observation
 eliminated elements, so that candidate images are low-rank updates of it
 (``NormalEquations.contributions``). Where ranks are decided, :func:`information_rows` keeps its
 square root. The response to errors of what is fixed (:func:`response`),
+what eliminated elements that share errors disagree by (:class:`Clusters`),
 score tests of columns that were not fitted (:func:`score_test`, :func:`scores_of_block`), and the
 covariance of predictions (:func:`explained_share`) come from the same matrix. Variances of random
 effects are estimated by restricted maximum likelihood (:class:`Effects`).

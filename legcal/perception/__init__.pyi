@@ -1,5 +1,7 @@
+from .board_adjustment import SHEET as SHEET
 from .board_adjustment import AdjustedBoard as AdjustedBoard
 from .board_adjustment import BoardImages as BoardImages
+from .board_adjustment import Sheet as Sheet
 from .board_adjustment import adjust_board as adjust_board
 from .board_corners import board_in_words as board_in_words
 from .board_corners import describe_image as describe_image

@@ -1,18 +1,20 @@
-"""Bundle adjustment of a flat board: its poses in images, and the camera where that is unknown.
+"""Bundle adjustment of a board: its poses in images, the camera and the sheet where unknown.
 
 The client of :mod:`legcal.estimation` for corners: where a camera stands before a board that is
-known (:mod:`legcal.perception.board_poses`), and ``legcal camera``, which lets intrinsics free.
+known (:mod:`legcal.perception.board_poses`), and ``legcal camera``, which lets intrinsics free,
+and how the board departs from a flat and true print (:class:`Sheet`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.estimation import (
+    Clusters,
     Factor,
     Frames,
     GaussianPrior,
@@ -21,6 +23,7 @@ from legcal.estimation import (
     Residuals,
     Variables,
     all_free,
+    clusters,
     minimise,
     normal_equations,
 )
@@ -37,6 +40,9 @@ from legcal.vision import (
 _MAX_ITERATIONS = 60
 _LOSS = Huber(3.0)  # standard deviations from which a corner counts less and less
 _PRIOR_PX = 10.0  # image widths: prior of focal lengths and principal point
+SHEET = ("warp_x", "warp_y", "twist", "print_ratio")  # numbers of a sheet
+SIGMA_WARP = 0.01  # of its longer side: paper of 200 mm is bent by some millimetres
+SIGMA_PRINT_RATIO = 0.005  # printers scale both directions differently
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,14 +56,50 @@ class BoardImages:
 
 
 @dataclass(frozen=True, eq=False)
+class Sheet:
+    """How a board departs from a flat one whose squares are square.
+
+    With X and Y from -1 to 1 over its corners, a corner lies warp_x (1 - X^2) + warp_y (1 - Y^2) +
+    twist X Y above the plane, and lengths along x are 1 + print_ratio times those along y.
+    """
+
+    middle: Array  # (2,) of its corners [m]
+    half: Array  # (2,) of their extent [m]
+    numbers: Array  # (4,) ``SHEET``: [m, m, m, without unit]
+
+    @classmethod
+    def flat(cls, points: Array) -> Sheet:
+        """Return the flat sheet with these corners (n, 3)."""
+        low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+        return cls(0.5 * (low + high), np.maximum(0.5 * (high - low), 1e-9), np.zeros(len(SHEET)))
+
+    @property
+    def prior_sigma(self) -> Array:
+        """Standard deviations of its numbers before anything is seen, (4,)."""
+        warp = SIGMA_WARP * 2.0 * float(self.half.max())
+        return np.array([warp, warp, warp, SIGMA_PRINT_RATIO])
+
+    def placed(self, points: Array) -> tuple[Array, Array]:
+        """Return where corners (n, 3) of a flat board lie, and the derivative (n, 3, 4)."""
+        from_middle = points[:, :2] - self.middle
+        X, Y = (from_middle / self.half).T
+        by_number = np.zeros((len(points), 3, len(SHEET)))
+        by_number[:, 2, :3] = np.stack([1.0 - X**2, 1.0 - Y**2, X * Y], axis=-1)
+        by_number[:, :2, 3] = from_middle * [0.5, -0.5]
+        return points + by_number @ self.numbers, by_number
+
+
+@dataclass(frozen=True, eq=False)
 class AdjustedBoard:
     """A camera and the board in every image."""
 
     camera: Camera
     T_camera_board: tuple[RigidTransform, ...]  # of every image
+    sheet: Sheet | None  # None where the board was taken as flat
     residual: Array  # (n, 2) corners less where they should be seen [px]
     cost: float  # half the sum of squares, in standard deviations, large ones by Huber's loss
-    covariance: Array  # (k, k) of the free intrinsics, by the standard deviations of corners
+    covariance: Array  # (k, k) of the free intrinsics, then of the sheet, by those of corners
+    clusters: Clusters  # what each image says of these
     # (n_images, 6, 6) of a rotation vector [rad] and a displacement [m] of the board, the camera
     # being known
     information: Array
@@ -67,6 +109,7 @@ class AdjustedBoard:
 class _State:
     camera: Camera
     board_pose: Frames  # T_camera_board of every image
+    sheet: Sheet | None
 
 
 def adjust_board(
@@ -74,13 +117,14 @@ def adjust_board(
     poses: Sequence[RigidTransform],  # T_camera_board of every image
     seen: BoardImages,
     free: Sequence[str] = (),  # intrinsics that are unknown
+    sheet: Sheet | None = None,  # where that is unknown: near it
     *,
     max_iterations: int = _MAX_ITERATIONS,
 ) -> AdjustedBoard | None:
     """Return the board's poses of least cost near a start, and free intrinsics of the camera.
 
-    Priors of these are so wide that they say next to nothing. None if no place near the start has
-    all corners before the camera.
+    Priors of these are so wide that they say next to nothing; those of a sheet are what paper and
+    printers do. None if no place near the start has all corners before the camera.
     """
     names = tuple(free)
     where = np.array([intrinsic_names(camera).index(name) for name in names], dtype=np.intp)
@@ -102,24 +146,36 @@ def adjust_board(
         return with_intrinsics(camera, dict(zip(names, values.tolist(), strict=True)))
 
     n = len(seen.image)
-    problem = Problem[_State](
-        variables=(
+    none = np.zeros(n, dtype=np.intp)
+    kept = [
+        Variables(
+            "camera",
+            all_free(1, len(names)),
+            moved,
+            names,
+            ("",) * len(names),
+            lambda camera: intrinsic_values(camera)[where],
+            prior=known,
+        )
+    ]
+    if sheet is not None:
+        kept.append(
             Variables(
-                "camera",
-                all_free(1, len(names)),
-                moved,
-                names,
-                ("",) * len(names),
-                lambda camera: intrinsic_values(camera)[where],
-                prior=known,
-            ),
-        ),
+                "sheet",
+                all_free(1, len(SHEET)),
+                lambda sheet, change: replace(sheet, numbers=sheet.numbers + change[0]),
+                coordinates=lambda sheet: sheet.numbers,
+                prior=GaussianPrior(np.arange(len(SHEET)), np.zeros(len(SHEET)), sheet.prior_sigma),
+            )
+        )
+    problem = Problem[_State](
+        variables=tuple(kept),
         eliminated=Variables("board_pose", all_free(len(poses), 6), Frames.moved),
         factors=(
             Factor(
                 "corners",
                 lambda state: _corners(state, seen, names),
-                (("camera", np.zeros(n, dtype=np.intp), slice(None)),),
+                tuple((block.name, none, slice(None)) for block in kept),
                 n,
                 2,
                 seen.image,
@@ -129,7 +185,7 @@ def adjust_board(
         ),
         name="calibration of the camera" if names else "pose of the board",
     )
-    state = _State(camera, Frames.of(poses))
+    state = _State(camera, Frames.of(poses), sheet)
     if not np.all(np.isfinite(problem.factor("corners").rows(state).r)):
         return None
     found = minimise(problem, state, _LOSS, max_iterations=max_iterations, must_converge=False)
@@ -137,9 +193,11 @@ def adjust_board(
     return AdjustedBoard(
         found.state.camera,
         found.state.board_pose.motions,
+        found.state.sheet,
         -found.linear["corners"].r * seen.sigma_px[:, None],
         found.cost,
         normal.kept_covariance(),
+        clusters(problem, found.linear, normal, _LOSS),
         normal.V,
     )
 
@@ -147,16 +205,20 @@ def adjust_board(
 def _corners(state: _State, seen: BoardImages, names: Sequence[str]) -> Residuals:
     """Return predicted less measured corners [px]; not finite where one is behind the camera."""
     camera, R = state.camera, state.board_pose.R[seen.image]
-    arm = (R @ seen.points[:, :, None])[:, :, 0]
+    points, by_sheet = seen.points, np.zeros((len(seen.points), 3, 0))
+    if state.sheet is not None:
+        points, by_sheet = state.sheet.placed(points)
+    arm = (R @ points[:, :, None])[:, :, 0]
     P = arm + state.board_pose.t[seen.image]
-    shape = seen.px.shape
+    shape, n_kept = seen.px.shape, len(names) + by_sheet.shape[2]
     if P[:, 2].min() <= 1e-9 or not (camera.K[0, 0] > 1.0 and camera.K[1, 1] > 1.0):
         nothing = np.full(shape, np.nan)
-        return Residuals.of(nothing, np.zeros((*shape, len(names))), np.zeros((*shape, 6)))
+        return Residuals.of(nothing, np.zeros((*shape, n_kept)), np.zeros((*shape, 6)))
     predicted, by_point = camera.project_with_derivative(P)
     by_turn = cross(arm[:, None, :], by_point)  # d(pixel) = by_point . (w x arm)
     by_pose = np.concatenate([by_turn, by_point], axis=-1)
-    by_intrinsics = np.zeros((*shape, 0))
+    by_kept = by_point @ (R @ by_sheet)
     if names:
         by_intrinsics = distort_derivatives(camera, P[:, :2] / P[:, 2:], names)
-    return Residuals.of(predicted - seen.px, by_intrinsics, by_pose)
+        by_kept = np.concatenate([by_intrinsics, by_kept], axis=-1)
+    return Residuals.of(predicted - seen.px, by_kept, by_pose)

@@ -11,7 +11,14 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception import AdjustedBoard, BoardImages, adjust_board, plane_poses
+from legcal.perception import (
+    SHEET,
+    AdjustedBoard,
+    BoardImages,
+    Sheet,
+    adjust_board,
+    plane_poses,
+)
 from legcal.vision import (
     DISTORTION_MODELS,
     Camera,
@@ -42,14 +49,24 @@ def _from_scratch(
     if start is None:
         return None
     rough = adjust_board(*start, seen, _ROUGH, max_iterations=_ROUGH_ITERATIONS)
-    return None if rough is None else _all_adjusted(rough.camera, rough.T_camera_board, seen)
+    if rough is None:
+        return None
+    return _all_adjusted(rough.camera, rough.T_camera_board, Sheet.flat(seen.points), seen)
 
 
 def _all_adjusted(
-    camera: Camera, poses: Sequence[RigidTransform], seen: BoardImages
+    camera: Camera, poses: Sequence[RigidTransform], sheet: Sheet, seen: BoardImages
 ) -> AdjustedBoard | None:
-    """Return the adjustment of poses and all intrinsics from a start."""
-    return adjust_board(camera, poses, seen, intrinsic_names(camera))
+    """Return the adjustment of poses, all intrinsics and the sheet from a start."""
+    return adjust_board(camera, poses, seen, intrinsic_names(camera), sheet)
+
+
+def _again(
+    near: AdjustedBoard, poses: Sequence[RigidTransform], seen: BoardImages
+) -> AdjustedBoard | None:
+    """Return the adjustment of other corners, from one nearby."""
+    sheet = near.sheet or Sheet.flat(seen.points)
+    return _all_adjusted(near.camera, poses, sheet, seen)
 
 
 def _by_straight_lines(
@@ -134,7 +151,19 @@ class RobustFit:
     images: tuple[int, ...]  # the number that each of these images had
     left_out: dict[int, str]  # images that disagree, and how
     n_left_out: int  # single corners that were left out of the other images
-    scale: float  # factor on the covariance, by the residuals
+    ratio: float  # of squared errors to claimed ones, by residuals and by how far images disagree
+    all_covariance: Array  # (k + 4, k + 4) of the intrinsics, then of the sheet
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (k, k) of the intrinsics."""
+        k = len(intrinsic_names(self.adjusted.camera))
+        return self.all_covariance[:k, :k]
+
+    @property
+    def sheet(self) -> Array:
+        """Numbers of the sheet, (4,)."""
+        return np.zeros(len(SHEET)) if self.adjusted.sheet is None else self.adjusted.sheet.numbers
 
 
 def robust_fit(seen: BoardImages, size: ImageSize, model: DistortionModel) -> RobustFit | None:
@@ -145,16 +174,16 @@ def robust_fit(seen: BoardImages, size: ImageSize, model: DistortionModel) -> Ro
     first = _from_scratch(seen, size, model)
     if first is None:
         return None
-    camera, poses = first.camera, list(first.T_camera_board)
+    poses = list(first.T_camera_board)
     kept = np.ones(len(seen.image), dtype=np.bool_)
     left_out: dict[int, str] = {}
     adjusted = first
     for _ in range(_MAX_ROUNDS):
         part, images = _part(seen, kept, n_images)
-        found = _all_adjusted(camera, [poses[k] for k in images], part)
+        found = _again(adjusted, [poses[k] for k in images], part)
         if found is None:
             break
-        adjusted, camera = found, found.camera
+        adjusted = found
         for k, T in zip(images, found.T_camera_board, strict=True):
             poses[k] = T
         sigma = np.hypot(claimed, _extra(found.residual, claimed[kept]))
@@ -177,16 +206,17 @@ def robust_fit(seen: BoardImages, size: ImageSize, model: DistortionModel) -> Ro
         if converged:
             break
     part, images = _part(seen, kept, n_images)
-    last = _all_adjusted(camera, [poses[k] for k in images], part)
-    adjusted = last if last is not None else adjusted
+    adjusted = _again(adjusted, [poses[k] for k in images], part) or adjusted
     others = ~np.isin(seen.image, list(left_out))
+    ratio = max(_scale(adjusted, part, len(images)), adjusted.clusters.ratio())
     return RobustFit(
         adjusted,
         part,
         images,
         left_out,
         int(np.count_nonzero(~kept & others)),
-        _scale(adjusted, part, len(images)),
+        ratio,
+        adjusted.clusters.covariance(ratio),
     )
 
 

@@ -226,7 +226,7 @@ def _result(
     n_dof = max(2 * len(square) - len(adjusted.covariance) - 6 * len(fitted.images), 1)
     return CameraCalibration(
         camera=adjusted.camera,
-        covariance=adjusted.covariance * fitted.scale,
+        covariance=fitted.covariance,
         board=board,
         images=tuple(images),
         rms_px=float(np.sqrt(np.mean(square))),

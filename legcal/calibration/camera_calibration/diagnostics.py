@@ -52,7 +52,7 @@ def refuse_undetermined(
         raise too_few_images(n, names, left_out)
     camera = found.adjusted.camera
     f = float(camera.K[0, 0])
-    sigma = float(np.sqrt(found.adjusted.covariance[0, 0] * found.scale))
+    sigma = float(np.sqrt(found.covariance[0, 0]))
     if not sigma <= _MAX_FOCAL_SIGMA * f:
         raise NotIdentifiable(
             f"The camera could not be calibrated: found boards tilted by at most "
@@ -89,7 +89,7 @@ def too_few_images(n: int, names: Sequence[str], left_out: Sequence[str] = ()) -
 def warnings(found: RobustFit) -> list[str]:
     """Return what is wrong with a camera that can be used, one sentence each."""
     n, camera = len(found.images), found.adjusted.camera
-    sigma = np.sqrt(np.diag(found.adjusted.covariance) * found.scale)
+    sigma = np.sqrt(np.diag(found.covariance))
     sentences = []
     if n < _FEW_IMAGES:
         sentences.append(
@@ -150,7 +150,7 @@ def _overfit(found: RobustFit) -> list[str]:
     zeroed = full.camera.distortion.copy()
     zeroed[5:] = 0.0
     start = Camera(full.camera.K, full.camera.width, full.camera.height, zeroed, full.camera.model)
-    plain = adjust_board(start, full.T_camera_board, found.seen, simple)
+    plain = adjust_board(start, full.T_camera_board, found.seen, simple, full.sheet)
     if plain is None:
         return []
     dof = 2 * len(found.seen.px) - len(full.covariance) - 6 * len(found.images)
