@@ -54,7 +54,7 @@ def calibrated(camera: Camera, n_images: int, noise_px: float) -> Array:
     seen = seen_corners(camera, n_images, 0, noise=noise_px)
     found = robust_fit(seen, ImageSize(camera.width, camera.height), camera.model)
     assert found is not None
-    return found.scale * found.adjusted.covariance
+    return found.covariance
 
 
 def drawn(camera: Camera, covariance: Array, rng: np.random.Generator) -> Camera:
