@@ -1,5 +1,5 @@
 from .clusters import Clusters as Clusters
-from .clusters import clusters as clusters
+from .clusters import clustered as clustered
 from .loss import Huber as Huber
 from .loss import PseudoHuber as PseudoHuber
 from .problem import NO_PRIOR as NO_PRIOR

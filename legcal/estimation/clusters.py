@@ -61,7 +61,7 @@ class Clusters:
         return np.asarray(C @ (ratio * self.information.sum(axis=0) + self.prior) @ C)
 
 
-def clusters(
+def clustered(
     problem: Problem[S],
     linear: Linearization,
     normal: NormalEquations,

@@ -23,7 +23,7 @@ from legcal.estimation import (
     Residuals,
     Variables,
     all_free,
-    clusters,
+    clustered,
     minimise,
     normal_equations,
 )
@@ -197,7 +197,7 @@ def adjust_board(
         -found.linear["corners"].r * seen.sigma_px[:, None],
         found.cost,
         normal.kept_covariance(),
-        clusters(problem, found.linear, normal, _LOSS),
+        clustered(problem, found.linear, normal, _LOSS),
         normal.V,
     )
 

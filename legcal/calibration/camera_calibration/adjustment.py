@@ -37,6 +37,8 @@ _OUTLIER_IMAGE = 4.0  # times the scatter of the median image, from which an ima
 _MIN_OUTLIER_PX = 0.5  # scatter of an image that may be left out [px]
 MIN_CORNERS = 6  # corners of an image that is used
 _MIN_NOISE_PX = 0.015  # of a corner: what neighbours share does not show in residuals
+_TO_SIGMA = 1.4826  # a median of sizes to a standard deviation
+_LEAST_SCATTER_PX = 1e-4  # of exact corners
 _MIN_INLIERS = 0.6  # of the corners of an image that is used
 
 
@@ -186,7 +188,7 @@ def robust_fit(seen: BoardImages, size: ImageSize, model: DistortionModel) -> Ro
         adjusted = found
         for k, T in zip(images, found.T_camera_board, strict=True):
             poses[k] = T
-        sigma = np.hypot(claimed, _extra(found.residual, claimed[kept]))
+        sigma = _scattered(claimed, kept, found.residual)
         judged = kept.copy()
         judged[kept] = np.linalg.norm(found.residual, axis=1) < OUTLIER_SIGMAS * sigma[kept]
         left_out |= _outlier_images(found.residual, part, images)
@@ -229,10 +231,16 @@ def _part(seen: BoardImages, kept: BoolArray, n_images: int) -> tuple[BoardImage
     return part, tuple(images)
 
 
-def _extra(residual: Array, claimed: Array) -> float:
-    """Return how far corners scatter beyond what they claim, robustly [px]."""
-    seen = 1.4826 * float(np.median(np.abs(residual)))
-    return float(np.sqrt(max(seen**2 - float(np.median(claimed)) ** 2, 0.0)))
+def _scattered(claimed: Array, kept: BoolArray, residual: Array) -> Array:
+    """Return standard deviations of corners (n,) that fit how they scatter, robustly [px].
+
+    What they scatter beyond their claims is added to all; claims that are too large are scaled.
+    """
+    share = _TO_SIGMA * float(np.median(np.abs(residual) / claimed[kept, None]))
+    if share < 1.0:
+        return np.maximum(share * claimed, _LEAST_SCATTER_PX)
+    seen, usual = _TO_SIGMA * np.median(np.abs(residual)), np.median(claimed[kept])
+    return np.hypot(claimed, np.sqrt(max(seen**2 - usual**2, 0.0)))
 
 
 def _outlier_images(residual: Array, seen: BoardImages, images: Sequence[int]) -> dict[int, str]:
