@@ -240,7 +240,7 @@ def _scattered(claimed: Array, kept: BoolArray, residual: Array) -> Array:
     if share < 1.0:
         return np.maximum(share * claimed, _LEAST_SCATTER_PX)
     seen, usual = _TO_SIGMA * np.median(np.abs(residual)), np.median(claimed[kept])
-    return np.hypot(claimed, np.sqrt(max(seen**2 - usual**2, 0.0)))
+    return np.asarray(np.hypot(claimed, np.sqrt(max(seen**2 - usual**2, 0.0))))
 
 
 def _outlier_images(residual: Array, seen: BoardImages, images: Sequence[int]) -> dict[int, str]:
