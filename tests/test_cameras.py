@@ -142,7 +142,12 @@ PLAIN, FIVE = Camera(STRAIGHT, *SIZE), Camera(STRAIGHT, *SIZE, np.array(PLUMB_BO
 )
 def test_points_move_with_each_intrinsic_as_the_differences_say(camera: Camera) -> None:
     names, values = intrinsic_names(camera), intrinsic_values(camera)
-    found = undistort_with_derivatives(camera, PIXELS, names)[1]
+    near = camera.undistort(PIXELS) + np.array([3e-3, -2e-3])
+    xy, found = undistort_with_derivatives(camera, PIXELS, names, near)
+    np.testing.assert_allclose(xy, camera.undistort(PIXELS), atol=1e-13)
+    far = undistort_with_derivatives(camera, PIXELS, names, np.full(PIXELS.shape, np.nan))
+    np.testing.assert_allclose(far[0], xy, atol=1e-13)
+    np.testing.assert_allclose(far[1], found, rtol=1e-9, atol=1e-15)
     assert found.shape == (2, 2, 2, len(names))
     for k, (name, value) in enumerate(zip(names, values, strict=True)):
         step = 1e-2 if intrinsic_unit(name) == "px" else 1e-5
@@ -154,10 +159,10 @@ def test_points_move_with_each_intrinsic_as_the_differences_say(camera: Camera) 
         np.testing.assert_allclose(found[..., k], slope, rtol=2e-5, atol=2e-8, err_msg=name)
     same = with_intrinsics(camera, dict(zip(names, values, strict=True)))
     np.testing.assert_array_equal(same.undistort(PIXELS), camera.undistort(PIXELS))
-    both = undistort_with_derivatives(camera, PIXELS, ("cy", "fx"))[1]
-    alone = undistort_with_derivatives(camera, PIXELS, ("fx",))[1]
+    both = undistort_with_derivatives(camera, PIXELS, ("cy", "fx"), near)[1]
+    alone = undistort_with_derivatives(camera, PIXELS, ("fx",), near)[1]
     np.testing.assert_allclose(both[..., 1:], alone, rtol=1e-12)
-    assert undistort_with_derivatives(camera, PIXELS, ())[1].shape == (2, 2, 2, 0)
+    assert undistort_with_derivatives(camera, PIXELS, (), near)[1].shape == (2, 2, 2, 0)
 
 
 def test_intrinsics_are_those_of_the_model() -> None:

@@ -3,12 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
-from fit_sessions import LENS, MachineSession, machine_session, with_camera
+import yaml
+from fit_sessions import LENS, MachineSession, axes_session, machine_session, with_camera
+from simulated import simulated
 
+from legcal import calibrate, check
+from legcal.calibration import Result
 from legcal.calibration.joint_fit import Choices, Prior, Solution, refine
+from legcal.data import load_dataset, no_outlines
 from legcal.geometry import Array
 from legcal.vision import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 
@@ -163,3 +169,47 @@ def test_a_camera_that_contradicts_its_covariance_is_named(
     assert [word for word in said if word not in note] == []
     assert found.contradicted_cameras == ("c1",)
     assert (found.focal_error > 0.005) == (name == "f")
+
+
+def test_axes_do_not_depend_on_cameras() -> None:
+    exact = axes_session()
+    measurements, axes = exact.noisy(0)
+    views = [replace(view, camera=moved(0.0 * SIGMA)) for view in measurements.views]
+    stated = replace(measurements, views=tuple(views))
+    found = refine(exact.legs, stated, no_outlines(), exact.start(), axes=axes)
+    assert not any(name.endswith(".fx") for name in found.values)
+
+
+def state_covariance(folder: Path) -> Path:
+    """Write a covariance of fx, fy and k3 into the camera file of a dataset; return the folder."""
+    (path,) = set(load_dataset(folder).camera_paths)
+    document, names = yaml.safe_load(path.read_text()), ["fy", "fx", "k3"]
+    rows = [[9.0, 8.5, 0.0], [8.5, 9.0, 0.0], [0.0, 0.0, 0.0]]
+    block = {"version": 1, "sigma": {"fx": 3.0}, "names": names, "covariance": rows}
+    path.write_text(yaml.safe_dump(document | {"legcal_camera": block}))
+    return folder
+
+
+def test_a_camera_file_with_a_covariance_is_used_from_calibration_to_check(tmp_path: Path) -> None:
+    folder = simulated(tmp_path / "set", "3-rpr", poses=8).folder
+    found = calibrate(state_covariance(folder), output=tmp_path / "out")
+    assert not any("exact" in note for note in found.notes)
+    document = Result.read(tmp_path / "out/result.json")
+    assert {p.name: p.prior_sigma for p in document.parameters if p.prior_sigma} == {
+        "c1.fx": 3.0,
+        "c1.fy": 3.0,
+    }
+    names = [p.name for p in document.parameters if p.status == "estimated"]
+    at = [names.index("c1.fx"), names.index("c1.fy")]
+    earlier = np.array(document.covariance)[np.ix_(at, at)]
+    new = simulated(tmp_path / "new", "3-rpr", poses=4).folder
+    tested = check(new, tmp_path / "out")  # the camera is known by the earlier result
+    assert not tested.movement.moved
+    prior = tested.solution.posterior.problem.block("cameras").prior
+    assert prior.mean.tolist() == [document.parameters[i].value for i in _rows(document)]
+    whitened = prior.whitened(np.eye(2))
+    np.testing.assert_allclose(np.linalg.inv(whitened.T @ whitened), earlier, rtol=1e-6)
+
+
+def _rows(document: Result) -> list[int]:
+    return [i for i, p in enumerate(document.parameters) if p.prior_sigma]

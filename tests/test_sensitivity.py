@@ -1,5 +1,7 @@
 """Effects of errors in what counts as known are those of fits with them; focal lengths too."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from fit_sessions import (
@@ -88,6 +90,18 @@ def test_a_wrong_prior_of_a_camera_moves_the_fit_as_predicted(session: HexapodSe
         )
 
     found, mistaken = (_fit(session, choices(f)) for f in (0.0, PART))
+    _assert_moved(found, mistaken, FOCAL)
+
+
+def test_a_wrong_file_with_a_covariance_moves_the_fit_as_predicted(
+    session: HexapodSession,
+) -> None:
+    C = np.zeros((9, 9))
+    C[:4, :4] = np.diag([4.0, 4.0, 1.0, 1.0])
+    C[0, 1] = C[1, 0] = 3.9
+    C[0, 2] = C[2, 0] = -1.0
+    wrong = with_intrinsics(LENS, {"fx": 1290.0 + 12.9 * PART, "fy": 1280.0 + 12.8 * PART})
+    found, mistaken = (_fit(session, camera=replace(c, covariance=C)) for c in (LENS, wrong))
     _assert_moved(found, mistaken, FOCAL)
 
 

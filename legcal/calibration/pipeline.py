@@ -162,7 +162,7 @@ def calibrate(
         Names or patterns of parameters left at nominal, or ``NAME=VALUE``.
     free : sequence of str
         Names or patterns of parameters to estimate that are fixed otherwise (intrinsics), and of
-        radii and twists to estimate without a prior.
+        radii, twists and intrinsics with a covariance to estimate without a prior.
     holdout : float, optional
         Hold out this part of the images, and compare them with what the fit of the others predicts.
 

@@ -56,7 +56,8 @@ def calibrate(
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="Estimate what is fixed otherwise (camera), and radii and twists without a prior.",
+            help="Estimate what is fixed otherwise (camera), and what has a prior (radii, twists, "
+            "calibrated cameras) without one.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None,

@@ -69,7 +69,7 @@ class GaussianPrior:
     def of_covariance(cls, unknown: IntArray, mean: Array, covariance: Array) -> GaussianPrior:
         """Return the prior of a covariance (n, n) of positive variances.
 
-        Combinations without any variance are known to a millionth of their parts.
+        Combinations without any variance are known to a hundred-thousandth of their parts.
         """
         sigma = np.sqrt(np.diagonal(covariance))
         value, vector = np.linalg.eigh(covariance / np.outer(sigma, sigma))
@@ -94,7 +94,7 @@ class GaussianPrior:
         )
 
 
-_EXACT = 1e-6  # least standard deviation along an eigenvector of correlations
+_EXACT = 1e-5  # least standard deviation along an eigenvector of correlations
 _MAX_KEY = 2**40  # of numbers of groups: above, they are counted anew
 NO_PRIOR = GaussianPrior(np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0))
 

@@ -24,6 +24,7 @@ from legcal.vision.distortion import DistortionModel
 _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
 MAX_RADIUS = 10.0  # on the sensor plane, beyond which nothing is looked for
 N_DIRECTIONS, N_RADII = 16, 256  # in which a lens is looked at for folds
+_NEWTON_STEPS, _SMALL_STEP = 8, 1e-9  # of undistortion from points nearby, on the sensor plane
 _STEP = 1e-6  # of the central differences of undistortion, in units of the sensor plane
 
 
@@ -39,7 +40,8 @@ class Distortion:
     prior_sigma: float  # of a coefficient of which nothing is known
     distort: Callable[[Array, Array, Array], Array]  # (x, y) of the sensor plane to pixels
     undistort: Callable[[Array, Array, Array], Array]  # pixels to (x, y)
-    derivatives: Callable[[Array, Array, Array], Array]  # of pixels (2 n, 4 + m) by intrinsics
+    # pixels (n, 1, 2), and their derivatives (2 n, 2 + 4 + m) by x and y, then by intrinsics
+    with_derivatives: Callable[[Array, Array, Array], tuple[Array, Array]]
     kalibr: tuple[str, ...] = ()  # its names in a camchain; these list four coefficients
     is_fisheye: bool = False  # distorts with all coefficients zero
 
@@ -57,11 +59,13 @@ def _polynomial_undistort(pixels: Array, K: Array, coefficients: Array) -> Array
     )
 
 
-def _polynomial_derivatives(xy: Array, K: Array, coefficients: Array) -> Array:
+def _polynomial_derivatives(xy: Array, K: Array, coefficients: Array) -> tuple[Array, Array]:
     rays = np.concatenate([xy[:, 0], np.ones((len(xy), 1))], axis=1).reshape(-1, 1, 3)
     zero = np.zeros(3)
-    jacobian = cv2.projectPoints(rays, zero, zero, K, coefficients)[1]
-    return np.asarray(jacobian[:, 6:])  # behind those by rotation and translation
+    pixels, J = cv2.projectPoints(rays, zero, zero, K, coefficients)
+    return np.asarray(pixels), np.concatenate(
+        [J[:, 3:5], J[:, 6:]], axis=1
+    )  # by translation, and the last
 
 
 def _fisheye_distort(xy: Array, K: Array, coefficients: Array) -> Array:
@@ -74,10 +78,13 @@ def _fisheye_undistort(pixels: Array, K: Array, coefficients: Array) -> Array:
     )
 
 
-def _fisheye_derivatives(xy: Array, K: Array, coefficients: Array) -> Array:
+def _fisheye_derivatives(xy: Array, K: Array, coefficients: Array) -> tuple[Array, Array]:
     rays = np.concatenate([xy[:, 0], np.ones((len(xy), 1))], axis=1).reshape(-1, 1, 3)
     zero = np.zeros(3)
-    return np.asarray(cv2.fisheye.projectPoints(rays, zero, zero, K, coefficients)[1])
+    pixels, J = cv2.fisheye.projectPoints(rays, zero, zero, K, coefficients)
+    return np.asarray(pixels), np.concatenate(
+        [J[:, 11:13], J[:, :8]], axis=1
+    )  # by translation, and the first
 
 
 _POLYNOMIAL = _polynomial_distort, _polynomial_undistort, _polynomial_derivatives
@@ -246,6 +253,7 @@ def undistort_with_derivatives(
     camera: Camera,
     pixels: Array,  # (..., 2) pixels
     names: Sequence[str],
+    near: Array,  # (..., 2) points of the sensor plane near those that are seen there
 ) -> tuple[Array, Array]:
     """Return the points of the sensor plane seen at pixels, and how intrinsics move them.
 
@@ -255,10 +263,29 @@ def undistort_with_derivatives(
     flat = pixels.reshape(-1, 2)
     if len(flat) == 0:  # OpenCV refuses to project nothing
         return pixels, np.zeros((*pixels.shape, len(names)))
-    xy = camera.undistort(flat)
-    moved = distort_derivatives(camera, xy, names)
-    found = -np.linalg.solve(camera.pixels_per_unit(xy), moved)
-    return xy.reshape(pixels.shape), np.asarray(found.reshape(*pixels.shape, len(names)))
+    xy = _undistorted(camera, flat, near.reshape(-1, 2))
+    _, by_point, moved = _with_derivatives(camera, xy, names)
+    found = -_solved(by_point, moved)
+    return xy.reshape(pixels.shape), found.reshape(*pixels.shape, len(names))
+
+
+def _undistorted(camera: Camera, pixels: Array, near: Array) -> Array:
+    """Return points (n, 2) seen at pixels, by Newton's method from points nearby if that ends."""
+    xy = near
+    for _ in range(_NEWTON_STEPS if camera.has_distortion else 0):
+        there, by_point, _ = _with_derivatives(camera, xy, ())
+        step = _solved(by_point, (pixels - there)[..., None])[..., 0]
+        xy = xy + step
+        if np.abs(step).max() < _SMALL_STEP:
+            return np.asarray(xy)
+    return camera.undistort(pixels)
+
+
+def _solved(M: Array, right: Array) -> Array:
+    """Return M^-1 right (n, 2, k) of matrices (n, 2, 2)."""
+    (a, b), (c, d) = M.transpose(1, 2, 0)
+    first, second = right.transpose(1, 2, 0) / (a * d - b * c)
+    return np.stack([d * first - b * second, a * second - c * first], axis=1).T
 
 
 def shared_cameras(names: Sequence[str], cameras: Sequence[Camera]) -> tuple[str, ...]:
@@ -300,8 +327,20 @@ def _padded(camera: Camera) -> Array:
 
 def distort_derivatives(camera: Camera, xy: Array, names: Sequence[str]) -> Array:
     """Return the derivative of pixels of points (n, 2) by intrinsics, (n, 2, n_names)."""
+    return _with_derivatives(camera, xy, names)[2]
+
+
+def _with_derivatives(
+    camera: Camera, xy: Array, names: Sequence[str]
+) -> tuple[Array, Array, Array]:
+    """Return pixels (n, 2) of points (n, 2), derivatives by these (n, 2, 2), and by intrinsics.
+
+    Pixels are those of a camera without skew.
+    """
     known = (*_PINHOLE, *_coefficients(camera))
-    derivatives = DISTORTION_MODELS[camera.model].derivatives
-    jacobian = derivatives(xy.reshape(-1, 1, 2), camera.K, _padded(camera))
-    columns = [known.index(name) for name in names]
-    return np.asarray(jacobian[:, columns].reshape(len(xy), 2, len(names)))
+    both = DISTORTION_MODELS[camera.model].with_derivatives
+    pixels, J = both(xy.reshape(-1, 1, 2), camera.K, _padded(camera))
+    J = J.reshape(len(xy), 2, 2 + len(known))
+    by_point = J[:, :, :2] if camera.has_distortion else camera.pixels_per_unit(xy)
+    columns = [2 + known.index(name) for name in names]
+    return pixels.reshape(-1, 2), by_point, np.asarray(J[:, :, columns])

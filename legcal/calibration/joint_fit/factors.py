@@ -758,7 +758,9 @@ def _on_sensor(
         known = [k for k, key in enumerate(keys) if key in intrinsic_names(camera)]
         some = np.zeros((*pixels[of_view].shape, len(keys)))
         names = [keys[k] for k in known]
-        xy[of_view], some[..., known] = undistort_with_derivatives(camera, pixels[of_view], names)
+        xy[of_view], some[..., known] = undistort_with_derivatives(
+            camera, pixels[of_view], names, feet[of_view]
+        )
         slopes[of_view] = some
     return xy, slopes
 
