@@ -388,6 +388,18 @@ def test_a_wrong_pose_of_the_board_is_noted_and_changes_nothing(
     np.testing.assert_allclose(A, right_A, atol=1e-8)
 
 
+def test_corners_of_images_that_are_kept_aside_are_not_written(tmp_path: Path) -> None:
+    folder = _simulated(tmp_path, poses=8, views=1, board="charuco").folder
+    calibrate(folder, output=tmp_path / "out", holdout=0.25)
+    held_out = json.loads((tmp_path / "out/result.json").read_text())["holdout"]["images"]
+    all_images, written = (
+        {row["image"] for row in read_rows(place / "corners.csv")}
+        for place in (folder, tmp_path / "out")
+    )
+    assert written < all_images
+    assert len(written) == len(all_images) - held_out
+
+
 def test_corners_that_are_too_few_are_refused(tmp_path: Path) -> None:
     folder = _simulated(tmp_path, poses=2, views=1, board="charuco").folder
     _change(folder / "corners.csv", lambda rows: rows[:2])

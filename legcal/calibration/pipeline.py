@@ -223,7 +223,7 @@ def calibrate(
         found.solution,
         found.steps,
         notes,
-        corners=found.corners,
+        corners=None if found.corners is None else found.corners.at(fitted),
         held_out=prediction,
     )
     if output is not None:
