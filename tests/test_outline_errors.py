@@ -33,26 +33,32 @@ from legcal.calibration.joint_fit import (
     BOARD_SCALE,
     DEFAULT_SETTINGS,
     KINDS,
-    EstimatedGamma,
     FitProblem,
+    GammaTrials,
     RefinementSettings,
     Solution,
     State,
     build_fit,
     known_gammas,
-    next_gammas,
+    loses_outlines,
     observed_outlines,
     possible_biases,
     refine,
 )
-from legcal.calibration.joint_fit.outline_errors import (
+from legcal.calibration.joint_fit.gammas import (
     GAMMA_RANGE,
+    GAMMA_STEP,
     GAMMA_TOLERANCE,
+    MAX_GAMMA_TRIALS,
+    most_likely,
+    next_trial,
+)
+from legcal.calibration.joint_fit.outline_errors import (
     LIMB_SIGMA,
-    MAX_GAMMA_STEP,
     N_KINDS,
     RECOVERED_SHARE,
     EdgeBiases,
+    EstimatedGamma,
     NoiseModel,
     estimated_biases,
 )
@@ -67,6 +73,8 @@ from legcal.data import Measurements, Outlines, no_outlines
 from legcal.errors import DidNotConverge
 from legcal.estimation import information, linearize, score_test, scores_of_block
 from legcal.geometry import Array, BoolArray
+from legcal.perception import used_as_before
+from legcal.perception.outline import WRONG_WIDTH
 from legcal.simulation import moved_outlines
 from legcal.simulation import simulate as simulate_folder
 from legcal.vision import EPSILON
@@ -519,24 +527,6 @@ def test_each_camera_has_its_own_gamma(session: HexapodSession) -> None:
     assert np.log(gamma.gamma) == pytest.approx(LOG_GAMMA, abs=0.1)
 
 
-@pytest.mark.parametrize("share", [0.35, 0.6, 1.0])
-@pytest.mark.parametrize("true", [1.0, 1.6, 2.2])
-def test_search_of_a_gamma_converges(true: float, share: float) -> None:
-    read, found = 1.0, list[tuple[EstimatedGamma, ...]]()
-    for _ in range(4):
-        seen = share * np.log(true / read)
-        found.append((EstimatedGamma(("c1", "c2"), read * float(np.exp(seen)), 0.05, read),))
-        gammas = next_gammas(found)
-        if not gammas:
-            break
-        assert set(gammas) == {"c1", "c2"}
-        assert GAMMA_RANGE[0] <= gammas["c1"] <= GAMMA_RANGE[1]
-        assert abs(np.log(gammas["c1"] / read)) <= MAX_GAMMA_STEP + 1e-12
-        read = gammas["c1"]
-    assert gammas == {}
-    assert abs(np.log(true / read)) <= GAMMA_TOLERANCE / share + 1e-12
-
-
 def test_note_on_a_gamma_says_how_well_it_is_known_and_names_few_views() -> None:
     clear = str(EstimatedGamma(("c1",), 2.1, 0.05, 2.0))
     assert clear.startswith(
@@ -546,21 +536,99 @@ def test_note_on_a_gamma_says_how_well_it_is_known_and_names_few_views() -> None
     assert "of views c0, c1, c2, c3, c4 and 3 more is not given, and its outlines hardly" in vague
 
 
-@pytest.mark.parametrize(
-    ("gamma", "sigma", "measured_with", "expected"),
-    [
-        (0.6, 0.05, 1.0, {}),  # no camera has these
-        (4.5, 0.05, 2.9, {}),
-        (0.6, 0.05, 1.5, {"c1": 1.0}),
-        (1.3, 0.2, 1.0, {}),  # may be chance
-        (1.3, 0.1, 1.0, {"c1": pytest.approx(1.3**2)}),
-    ],
-)
-def test_next_gamma_is_significant_and_one_that_cameras_have(
-    gamma: float, sigma: float, measured_with: float, expected: dict[str, float]
+def trial(session: HexapodSession, gamma: float, lost: float = np.inf) -> Outlines:
+    """Return outlines of a camera of LOG_GAMMA, measured with a gamma.
+
+    Each knows its response to it to a third. Those that it moves by more than *lost* [px] are not
+    found.
+    """
+    away = LOG_GAMMA - np.log(gamma)
+    outlines = encoded(session, away)
+    wrong = np.random.default_rng(4).normal(1.0, 0.33, len(outlines))
+    return replace(
+        outlines,
+        gamma=np.full(len(outlines), gamma),
+        by_gamma=outlines.by_gamma * wrong,
+        used=outlines.used & (np.abs(outlines.by_gamma * away) <= lost),
+    )
+
+
+@pytest.mark.parametrize("lost", [np.inf, 0.15])
+def test_the_most_likely_gamma_is_that_of_the_same_outlines(
+    session: HexapodSession, lost: float
 ) -> None:
-    found = EstimatedGamma(("c1",), gamma, sigma, measured_with)
-    assert next_gammas([(found,)]) == expected
+    measurements, start = without_gamma(session.measurements), disturbed_start(session)
+
+    def fitted(gamma: float) -> Solution:
+        return refine(session.legs, measurements, trial(session, gamma, lost), start)
+
+    first = fitted(1.0)
+    trials = GammaTrials.begun(first, {})
+    while gammas := trials.next():
+        trials = trials.tried(gammas, fitted(gammas["c1"]))
+    found = trials.found()
+    assert found.keys() == {"c1", "c2", "c3"}
+    assert np.log(found["c1"]) == pytest.approx(LOG_GAMMA, abs=GAMMA_TOLERANCE)
+    assert trials.notes({}) == ()
+    assert GammaTrials.begun(first, {"c2": 1.0}).next() == {}  # by outlines that are kept
+
+
+def test_fewer_outlines_speak_for_no_gamma(session: HexapodSession) -> None:
+    """Those that are left where most are lost fit better, and many of them are needed."""
+    every, few = trial(session, np.exp(LOG_GAMMA)), trial(session, 3.0, lost=0.02)
+    assert few.used.sum() < 0.5 * every.used.sum()
+    assert loses_outlines(every, few)
+    assert not loses_outlines(few, every)
+    one_less = replace(every, used=every.used & (np.arange(len(every)) != 7))
+    assert not loses_outlines(every, one_less)
+
+
+@pytest.mark.parametrize("truth", [-0.3, 0.0, 0.15, 0.4, 0.65, 0.79, 1.05, 1.4])
+def test_trials_end_at_the_gamma_that_is_likely(truth: float) -> None:
+    def merit(log_gamma: Array) -> Array:
+        return -0.5 * ((log_gamma - truth) / 0.05) ** 2
+
+    tried = np.zeros(1)
+    while (there := next_trial(tried, merit(tried))) is not None:
+        tried = np.append(tried, there)
+    assert len(tried) <= 1 + MAX_GAMMA_TRIALS
+    found, (least, most) = most_likely(tried, merit(tried)), np.log(GAMMA_RANGE)
+    # Between the first two the first one stays, if it is the better one.
+    assert found == pytest.approx(np.clip(truth, least, most), abs=0.5 * GAMMA_STEP)
+    if 0.5 * GAMMA_STEP < truth < 2.5 * GAMMA_STEP:
+        assert found == pytest.approx(np.clip(truth, least, most), abs=1e-9)
+
+
+def test_a_likelihood_that_is_flat_leaves_the_gamma_open(session: HexapodSession) -> None:
+    assert most_likely(np.array([0.0, 0.4, 0.8]), np.array([0.0, 1.9, -30.0])) == 0.0
+    measurements, start = without_gamma(session.measurements), disturbed_start(session)
+    outlines = trial(session, 1.0)
+    faint = replace(outlines, by_gamma=np.full(len(outlines), 1e-4))
+    solution = refine(session.legs, measurements, faint, start)
+    trials = GammaTrials.begun(solution, {})
+    other = replace(faint, gamma=np.full(len(faint), np.exp(GAMMA_STEP)))
+    gammas = trials.next()
+    trials = trials.tried(gammas, refine(session.legs, measurements, other, start))
+    assert trials.found() == {}
+    (note,) = trials.notes({})
+    assert "of views c1, c2, c3 stays undecided: its outlines are about as likely with 1.49" in note
+    (note,) = trials.tried(gammas, None).notes({"c1": 2.0})
+    assert "fewer of its outlines can be used with 2.00" in note
+
+
+def test_outlines_of_another_gamma_are_used_as_before_whatever_their_width(
+    session: HexapodSession,
+) -> None:
+    before = session.outlines.choose(np.arange(len(session.outlines)) < 4)
+    before = replace(before, used=np.array([True, True, True, False]), reason=("", "", "", "far"))
+    after = replace(
+        before,
+        used=np.array([False, False, True, True]),
+        reason=(f"{WRONG_WIDTH}, 9.0 px for 8.0 px", "edge too rough", "", ""),
+    )
+    found = used_as_before(after, before)
+    assert found.used.tolist() == [True, False, True, False]
+    assert [bool(reason) for reason in found.reason] == [False, True, False, True]
 
 
 @pytest.mark.slow

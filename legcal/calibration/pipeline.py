@@ -29,9 +29,8 @@ from legcal.calibration.four_steps import Steps, four_steps, starts
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit import (
     DEFAULT_SETTINGS,
-    MAX_GAMMA_ROUNDS,
     Choices,
-    EstimatedGamma,
+    GammaTrials,
     HeldOut,
     Prior,
     Solution,
@@ -39,7 +38,7 @@ from legcal.calibration.joint_fit import (
     in_file_order,
     known_gammas,
     known_parameters,
-    next_gammas,
+    loses_outlines,
     refine_from_best,
     resolve,
 )
@@ -62,7 +61,7 @@ from legcal.data import (
     split_images,
     store_outlines,
 )
-from legcal.errors import NotIdentifiable, NotVisible, UsageError
+from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.files import check_destination, output_path
 from legcal.geometry import IntArray
 from legcal.machine import Machine
@@ -76,6 +75,7 @@ from legcal.perception import (
     measure_photographs,
     nominal_placement,
     place_and_measure,
+    used_as_before,
 )
 from legcal.progress import Report, no_progress
 from legcal.vision import shared_cameras, stated_covariances
@@ -276,7 +276,11 @@ def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimat
     estimate = _measure_again(data, first, seen, board, options)
     return replace(
         estimate,
-        image_notes=(*seen.placement.all_notes, *_not_found_again(first, estimate)),
+        image_notes=(
+            *seen.placement.all_notes,
+            *_not_found_again(first, estimate),
+            *estimate.image_notes,
+        ),
         fit_notes=_notes_on_images(estimate),
         other_radii=other_radii,
     )
@@ -342,19 +346,33 @@ def _measure_again(
     if not rows:
         return estimate
     again = seen.photographs.narrowed(np.array(rows, dtype=np.intp), estimate.outlines)
-    again = replace(again, machine=_with_fitted_radii(again.machine, estimate.solution))
-    given = known_gammas(again.keep, again.measurements)
-    gammas: list[tuple[EstimatedGamma, ...]] = []
-    for _ in range(1 + MAX_GAMMA_ROUNDS):
-        placement = _fitted_placement(data, estimate.solution, seen)
-        outlines = measure_photographs(again, placement, data.progress)
-        estimate = _fit(estimate.fitted, outlines, placement, board, options)
-        gammas.append(estimate.solution.gammas)
-        others = {name: gamma for name, gamma in next_gammas(gammas).items() if name not in given}
-        if not others:
-            break
-        again = again.with_gammas(others)
-    return estimate
+
+    def fitted(near: Estimate, gammas: Mapping[str, float], like: Outlines | None) -> Estimate:
+        machine = _with_fitted_radii(again.machine, near.solution)
+        photographs = replace(again, machine=machine).with_gammas(gammas)
+        placement = _fitted_placement(data, near.solution, seen)
+        outlines = measure_photographs(photographs, placement, data.progress)
+        if like is not None:
+            outlines = used_as_before(outlines, like)
+        return _fit(near.fitted, outlines, placement, board, options)
+
+    first = best = fitted(estimate, {}, None)
+    trials = GammaTrials.begun(first.solution, known_gammas(again.keep, again.measurements))
+    while gammas := trials.next():
+        try:
+            there = fitted(best, gammas, first.outlines)
+        except (DidNotConverge, NotIdentifiable, NotVisible):
+            trials = trials.tried(gammas, None)
+            continue
+        trials = trials.tried(gammas, there.solution)
+        if trials.best == len(trials.solutions) - 1:
+            best = there
+    last, refused = first, trials.found()
+    if refused:
+        found = fitted(best, refused, None)
+        if not loses_outlines(first.outlines, found.outlines):
+            last, refused = found, {}
+    return replace(last, image_notes=trials.notes(refused))
 
 
 def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:

@@ -33,6 +33,7 @@ from .uncertainty import named_covariance as named_covariance
 from .uncertainty import named_information as named_information
 from .uncertainty import residual_changes as residual_changes
 from .uncertainty import response as response
+from .uncertainty import restricted_log_likelihood as restricted_log_likelihood
 from .uncertainty import score_test as score_test
 from .uncertainty import scores_of_block as scores_of_block
 from .uncertainty import worst_directions as worst_directions

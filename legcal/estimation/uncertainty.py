@@ -12,7 +12,12 @@ import numpy as np
 from scipy.linalg import null_space
 
 from legcal.estimation.problem import Linearization, Places, Problem, Residuals, S, linearize
-from legcal.estimation.solver import NormalEquations, inverse_on_range, normal_equations
+from legcal.estimation.solver import (
+    Minimum,
+    NormalEquations,
+    inverse_on_range,
+    normal_equations,
+)
 from legcal.geometry import Array, IntArray
 
 _ROUNDING = 1e-12  # of information, in differences
@@ -177,6 +182,24 @@ def _add_products(
         np.add.at(kept, places, J.reshape(-1, J.shape[-1]).T @ columns[member].reshape(-1, c))
     if where.element is not None:
         np.add.at(elements, where.element, np.swapaxes(rows.J_element, 1, 2) @ columns)
+
+
+def restricted_log_likelihood(problem: Problem[S], minimum: Minimum[S]) -> float:
+    """Return the logarithm of the likelihood of whitened residuals, all unknowns integrated out.
+
+    Of a minimum of plain squares, up to a constant of the numbers of unknowns and residuals and
+    the determinants of the whitening. Priors of random effects count with their variances.
+    """
+    linear = minimum.linear
+    normal = normal_equations(problem, minimum.state, linear)
+    squares = sum(float(np.sum(rows.r**2)) for rows in linear.rows.values())
+    squares += float(np.sum(linear.prior_r**2))
+    R = normal.reduced()
+    if len(normal.held_directions):
+        N = null_space(normal.held_directions)
+        R = N.T @ R @ N
+    widths = np.linalg.slogdet(R)[1] + np.sum(np.linalg.slogdet(normal.V)[1])
+    return -0.5 * (squares + float(widths)) - float(np.log(problem.priors.sigma).sum())
 
 
 def score_test(

@@ -24,6 +24,7 @@ from .outline import PartLines as PartLines
 from .outline import find_parts as find_parts
 from .outline import measure as measure
 from .outline import outline_table as outline_table
+from .outline import used_as_before as used_as_before
 from .overlays import PartMarks as PartMarks
 from .overlays import draw as draw
 from .overlays import marks_of_image as marks_of_image

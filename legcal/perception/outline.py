@@ -116,6 +116,26 @@ class _Predicted(NamedTuple):
     width: float  # [px], in the middle
 
 
+def used_as_before(outlines: Outlines, before: Outlines) -> Outlines:
+    """Return outlines that are used as the same ones were before, if they are seen at all.
+
+    Of the same images, measured with another gamma: it moves both edges of a part inwards or
+    outwards, so that widths differ from those of a fit with the gamma before.
+    """
+    was = {key for key, used in zip(before.row_keys(), before.used.tolist(), strict=True) if used}
+    of_width = [
+        used or why.startswith(WRONG_WIDTH)
+        for used, why in zip(outlines.used.tolist(), outlines.reason, strict=True)
+    ]
+    seen = np.array(of_width, dtype=np.bool_) & np.isfinite(outlines.covariance[:, 0, 0])
+    used = seen & np.array([key in was for key in outlines.row_keys()], dtype=np.bool_)
+    reason = tuple(
+        "" if is_used else why or "not used before"
+        for is_used, why in zip(used.tolist(), outlines.reason, strict=True)
+    )
+    return replace(outlines, used=used, reason=reason)
+
+
 def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
     """Find the edges of all parts in one image to about a pixel.
 

@@ -51,7 +51,7 @@ from legcal.progress import Report
 from legcal.vision import shared_cameras
 from legcal.workers import Run
 
-DETECTOR_VERSION = 3  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 4  # raise it whenever outlines or notes that are kept come out differently
 TOO_SHORT = "px in the image"  # end of the reason for parts that are not looked for
 MAX_USED_SHARE = 0.3  # of the outlines of a part that should be seen
 

@@ -10,6 +10,7 @@ that reject outlines and estimate their noise, checks of the result, its assembl
 ``variables``         state, manifold of the legs, exact constraints of platform poses
 ``factors``           outlines, readings, axes and corners as residuals with derivatives
 ``outline_errors``    noise of outlines, common-mode edge biases, gammas of cameras
+``gammas``            fits to outlines measured with several gammas, compared
 ``problem``           variables and factors of a fit
 ``fit``               the order of all of it
 ``determinacy``       open directions: refused, or held at nominal

@@ -5,14 +5,13 @@ from .factors import observed_outlines as observed_outlines
 from .fit import bound as bound
 from .fit import refine as refine
 from .fit import refine_from_best as refine_from_best
+from .gammas import GammaTrials as GammaTrials
+from .gammas import loses_outlines as loses_outlines
 from .held_out import HeldOut as HeldOut
 from .held_out import PlatformPair as PlatformPair
 from .held_out import compare_held_out as compare_held_out
 from .outline_errors import KINDS as KINDS
-from .outline_errors import MAX_GAMMA_ROUNDS as MAX_GAMMA_ROUNDS
-from .outline_errors import EstimatedGamma as EstimatedGamma
 from .outline_errors import NoiseModel as NoiseModel
-from .outline_errors import next_gammas as next_gammas
 from .outline_errors import possible_biases as possible_biases
 from .parameter_choices import BOARD_SCALE as BOARD_SCALE
 from .parameter_choices import NO_CHOICES as NO_CHOICES

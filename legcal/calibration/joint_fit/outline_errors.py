@@ -17,9 +17,8 @@ darker, and sideways biases count twice (:data:`SIDEWAYS`).
 **Gammas.** Where the gamma of a camera is not given, its outlines move together, each by its own
 amount, with the logarithm of that gamma over the one with which they were measured. A fit recovers
 only a share of a wrong gamma: how far each outline moves is known roughly, and common-mode biases
-take some. Where the gamma is right it finds no change, and that is searched for by secants
-(:func:`next_gammas`). Where outlines depend little on it, it may find no change at a wrong gamma
-too: the stated uncertainty accounts for that.
+take some. Which gamma is right is found with others (:mod:`.gammas`); what the fit finds beside it
+accounts for light at the limb that looks like another one, and the stated uncertainty for both.
 """
 
 from __future__ import annotations
@@ -62,16 +61,10 @@ _MIN_BIAS_GAIN = 25.0  # of white residuals, one set in 20,000 gains that much
 _MODES = (("bias", (1.0, 1.0)), ("tilt", (-1.0, 1.0)))  # shifts of both ends
 
 RECOVERED_SHARE = 0.5  # of the error of a gamma (logarithm) that a fit recovers, about
-RECOVERED_SHARES = (0.25, 1.2)  # limits of that share by secants
 # Systematic errors at the limb that look like another gamma, in rendered photographs of machines
 # with a known one: standard deviation of its logarithm.
 LIMB_SIGMA = 0.17
 _VAGUE_SIGMA = 0.25  # the same from where on a gamma is called hardly known
-MAX_GAMMA_ROUNDS = 2  # of measuring outlines with another gamma
-GAMMA_TOLERANCE = 0.12  # of the logarithm: smaller than LIMB_SIGMA
-GAMMA_SIGNIFICANCE = 2.0  # standard deviations of the fit: less may be chance
-MAX_GAMMA_STEP = 0.7  # of the logarithm
-GAMMA_RANGE = (1.0, 3.0)  # of gammas that are tried: linear, or encoded for screens
 
 
 @dataclass(frozen=True)
@@ -477,29 +470,3 @@ class EstimatedGamma:
             "which the uncertainty of the result takes into account; write gamma of the views in "
             "dataset.yaml if you know it."
         )
-
-
-def next_gammas(found: Sequence[Sequence[EstimatedGamma]]) -> dict[str, float]:
-    """Return the gammas to measure outlines with next, by view; nothing where fits find no change.
-
-    *found* has the estimates of successive fits, to outlines that were measured anew for each.
-    """
-    gammas: dict[str, float] = {}
-    for one in found[-1]:
-        of_camera = [other for fit in found for other in fit if other.views == one.views]
-        read = np.log([other.measured_with for other in of_camera])
-        seen = np.log([other.gamma for other in of_camera]) - read
-        if abs(seen[-1]) > max(GAMMA_TOLERANCE, GAMMA_SIGNIFICANCE * one.fitted_sigma):
-            step = np.clip(seen[-1] / _share(read, seen), -MAX_GAMMA_STEP, MAX_GAMMA_STEP)
-            other = float(np.clip(np.exp(read[-1] + step), *GAMMA_RANGE))
-            if abs(np.log(other) - read[-1]) > GAMMA_TOLERANCE:
-                gammas |= dict.fromkeys(one.views, other)
-    return gammas
-
-
-def _share(read: Array, seen: Array) -> float:
-    """Return which share of the error of a gamma fits recover, by the last two of them."""
-    if len(read) < 2 or abs(read[-1] - read[-2]) < GAMMA_TOLERANCE:
-        return RECOVERED_SHARE
-    share = -(seen[-1] - seen[-2]) / (read[-1] - read[-2])
-    return float(np.clip(share, *RECOVERED_SHARES))
