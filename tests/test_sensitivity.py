@@ -17,7 +17,14 @@ from fit_sessions import (
     with_camera,
 )
 
-from legcal.calibration.joint_fit import NO_CHOICES, Choices, Prior, Solution, refine
+from legcal.calibration.joint_fit import (
+    FOUND_DISTORTION,
+    NO_CHOICES,
+    Choices,
+    Prior,
+    Solution,
+    refine,
+)
 from legcal.geometry import Array
 from legcal.machine import moved_legs
 from legcal.vision import Camera, with_intrinsics
@@ -146,14 +153,18 @@ def test_a_wrong_twist_moves_the_fit_as_predicted(model: str) -> None:
 
 
 def fitted(
-    session: HexapodSession, seed: int, factor: float, free: frozenset[str] = frozenset()
+    session: HexapodSession,
+    seed: int,
+    factor: float,
+    free: frozenset[str] = frozenset(),
+    **others: float,
 ) -> Solution:
-    """Return the fit of noisy data with a wrong focal length."""
+    """Return the fit of noisy data with a wrong focal length, or with other wrong intrinsics."""
     rng = np.random.default_rng(seed)
     measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
     camera = session.measurements.views[0].camera
     scaled = {key: factor * camera.K[i, i] for i, key in enumerate(("fx", "fy"))}
-    camera = with_intrinsics(camera, scaled)
+    camera = with_intrinsics(camera, scaled | others)
     measurements, outlines = with_camera(measurements, outlines, camera)
     choices = Choices(frozenset(), free, {})
     return refine(session.legs, measurements, outlines, disturbed_start(session), choices=choices)
@@ -192,3 +203,25 @@ def test_a_focal_length_that_is_estimated_is_not_tested() -> None:
     sigma = solution.sigma[solution.names.index("c1.fx")]
     assert abs(solution.values["c1.fx"] - 1290.0) < 4.0 * sigma
     assert sigma < 4.0
+
+
+@pytest.mark.parametrize(
+    ("camera", "given", "words"),
+    [(LENS, 0.0, "were not corrected"), (PINHOLE, -0.1, "were corrected")],
+)
+def test_photographs_of_another_distortion_are_noticed(
+    camera: Camera, given: float, words: str
+) -> None:
+    """As where board and machine are corrected for the lens differently."""
+    session = irregular_hexapod(12, camera=camera)
+    solution = fitted(session, 0, 1.0, k1=given)
+    (note,) = (note for note in solution.notes if note.startswith("The distortion of c1"))
+    assert words in note
+    assert solution.contradicted_cameras == ("c1",)
+    (effect,) = (s for s in solution.sensitivities if s.what == FOUND_DISTORTION)
+    right = fitted(session, 0, 1.0)
+    assert not [note for note in right.notes if "distortion" in note]
+    assert right.contradicted_cameras == ()
+    off = np.array([solution.values[n] - right.values[n] for n in right.parametrization.names])
+    moved = effect.steps[:, 0]
+    assert np.linalg.norm(off + moved) < 0.5 * np.linalg.norm(off)  # it says where the truth is

@@ -10,6 +10,7 @@ import numpy as np
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit import (
     FOCAL_PART,
+    FOUND_DISTORTION,
     HeldOut,
     PlatformAccuracy,
     Solution,
@@ -99,7 +100,8 @@ def judge(
 def _verdict_on_platform(platform: PlatformAccuracy, focal_error: float) -> Verdict:
     """Compare the change of the platform with its uncertainty, in displacement.
 
-    A focal length that the measurements contradict counts with what it does to the platform.
+    Focal lengths and distortions that the measurements contradict count with what they do to the
+    platform.
     """
     change, sigma = platform.change, platform.sigma
     found = (
@@ -114,9 +116,14 @@ def _verdict_on_platform(platform: PlatformAccuracy, focal_error: float) -> Verd
         found += (
             f"; a focal length that the measurements contradict may add {1e3 * focal_effect:.3f} mm"
         )
-    return _verdict(
-        change.mean_displacement, float(np.hypot(sigma.mean_displacement, focal_effect)), found
-    )
+    of_lens = [e.error.mean_displacement for e in platform.effects if e.what == FOUND_DISTORTION]
+    lens_effect = max(of_lens, default=0.0)
+    if lens_effect > 0.0:
+        found += (
+            f"; a distortion that the measurements contradict may add {1e3 * lens_effect:.3f} mm"
+        )
+    known_to = float(np.linalg.norm([sigma.mean_displacement, focal_effect, lens_effect]))
+    return _verdict(change.mean_displacement, known_to, found)
 
 
 def _verdict_on_parameters(dataset: Dataset, solution: Solution) -> Verdict:

@@ -27,6 +27,7 @@ from .problem import FitProblem as FitProblem
 from .problem import build_fit as build_fit
 from .rounds import DISAGREES as DISAGREES
 from .sensitivity import FOCAL_PART as FOCAL_PART
+from .sensitivity import FOUND_DISTORTION as FOUND_DISTORTION
 from .solution import Solution as Solution
 from .solution import in_file_order as in_file_order
 from .variables import DEFAULT_SETTINGS as DEFAULT_SETTINGS

@@ -1,4 +1,4 @@
-"""Sensitivity to errors of what counts as known, and score tests of focal lengths.
+"""Sensitivity to errors of what counts as known, and score tests of cameras.
 
 Encoders carry the absolute scale, and a focal length that is wrong makes perspective wrong in a way
 that nothing else in the fit can imitate altogether. What is left in the residuals then has a slope
@@ -7,7 +7,7 @@ by the focal length: Rao's score test, which needs no further fit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,9 +25,10 @@ from legcal.estimation import (
 )
 from legcal.geometry import Array, IntArray
 from legcal.machine import LegColumns
-from legcal.vision import shared_cameras
+from legcal.vision import Camera, shared_cameras
 
 FOCAL_PART = 0.01  # of the focal length: the error whose effect is reported
+FOUND_DISTORTION = "the distortion that the measurements show"
 _RADIUS_PART = 0.01
 _TWIST_ERROR = np.radians(0.1)
 _CAMERA_ERRORS: Mapping[str, tuple[Mapping[str, float], Mapping[str, float]]] = {  # relative, px
@@ -35,7 +36,7 @@ _CAMERA_ERRORS: Mapping[str, tuple[Mapping[str, float], Mapping[str, float]]] = 
     "a principal point 0.1 px further right": ({}, {"cx": 0.1}),
     "a principal point 0.1 px further down": ({}, {"cy": 0.1}),
 }
-_KEYS = ("fx", "fy", "cx", "cy")  # the intrinsics in these
+_KEYS = ("fx", "fy", "cx", "cy", "k1")  # the intrinsics in these, and of tests
 _FOCAL: Mapping[str, float] = {"fx": 1.0, "fy": 1.0}  # relative
 _SIGNIFICANT = 5.0  # standard deviations
 _ROUNDING = 1e-9  # relative, in differences of nearly equal numbers
@@ -50,9 +51,10 @@ class Sensitivity:
 
 
 def derivatives_by_cameras(problem: FitProblem, state: State) -> dict[str, Array]:
-    """Return derivatives (n, q, 4) of whitened residuals by focal lengths and principal points.
+    """Return derivatives (n, q, 5) of whitened residuals by intrinsics, known or not.
 
-    They are of outlines and corners, by the intrinsics of the view of each, known or not.
+    They are of outlines and corners, by focal lengths, principal point and first coefficient of
+    distortion of the view of each.
     """
     outlines = problem.outlines.by_intrinsics(_KEYS, problem.keys, state)
     corners = problem.corners.by_intrinsics(_KEYS, state)
@@ -70,6 +72,7 @@ def sensitivities(
     by_camera: Mapping[str, Array],
     normal: NormalEquations,
     loss: PseudoHuber,
+    distorted: Sequence[LensDistortion] = (),
 ) -> tuple[Sensitivity, ...]:
     """Return how errors of cameras, radii and fixed twists would change the parameters.
 
@@ -85,6 +88,8 @@ def sensitivities(
     normal : NormalEquations
         The information there.
     loss : PseudoHuber
+    distorted : sequence of LensDistortion
+        Those that the measurements contradict: what they have instead is one more error.
     """
     radii = np.array([problem.legs.radii[part] for part in problem.outlines.parts])
     of_cameras = _places_of_cameras(problem)
@@ -92,6 +97,12 @@ def sensitivities(
         what: (of_cameras, _camera_error(state, relative, added))
         for what, (relative, added) in _CAMERA_ERRORS.items()
     }
+    if distorted:
+        owners = shared_cameras(problem.outlines.views, problem.first_cameras)
+        by_owner = {lens.view: lens.change for lens in distorted}
+        error = np.zeros((len(owners), len(_KEYS)))
+        error[:, _KEYS.index("k1")] = [by_owner.get(owner, 0.0) for owner in owners]
+        errors[FOUND_DISTORTION] = of_cameras, error
     errors["radii 1 % larger"] = problem.place["radii"], _RADIUS_PART * radii[:, None]
     names, changes, pulls = list[str](), list[dict[str, Array]](), list[Array]()
     for what, (place, error) in errors.items():
@@ -130,7 +141,7 @@ def sensitivities(
 
 
 def _places_of_cameras(problem: FitProblem) -> IntArray:
-    """Return the positions in x (n_views, 4) of focal lengths and principal points."""
+    """Return the positions in x (n_views, 5) of the intrinsics that are looked at."""
     place = np.full((len(problem.outlines.views), len(_KEYS)), problem.n_kept, dtype=np.intp)
     for k, key in enumerate(_KEYS):
         if key in problem.keys:
@@ -141,7 +152,7 @@ def _places_of_cameras(problem: FitProblem) -> IntArray:
 def _changes_by_cameras(
     problem: FitProblem, by_camera: Mapping[str, Array], error: Array
 ) -> dict[str, Array]:
-    """Return how whitened residuals (n, q) change with errors (n_views, 4) of cameras."""
+    """Return how whitened residuals (n, q) change with errors (n_views, 5) of cameras."""
     views = {"outlines": problem.outlines.view, "corners": problem.corners.view}
     return {name: np.einsum("nqk,nk->nq", by, error[views[name]]) for name, by in by_camera.items()}
 
@@ -153,7 +164,7 @@ def _efficiency(problem: FitProblem, loss: PseudoHuber, name: str) -> float:
 
 
 def _camera_error(state: State, relative: Mapping[str, float], added: Mapping[str, float]) -> Array:
-    """Return errors (n_views, 4) of all cameras, as parts of intrinsics and in pixels."""
+    """Return errors (n_views, 5) of all cameras, as parts of intrinsics and in pixels."""
     error = np.zeros((len(state.cameras), len(_KEYS)))
     for key, part in relative.items():
         values = [intrinsic_of(camera, key) for camera in state.cameras]
@@ -202,20 +213,59 @@ class FocalLength:
     sigma: float  # standard deviation of that
 
     @property
+    def apart(self) -> float:
+        """How many standard deviations lie between what was given and what was found."""
+        return abs(self.change) / self.sigma
+
+    @property
     def is_contradicted(self) -> bool:
         """Whether the measurements disagree with what was given."""
-        return abs(self.change) > _SIGNIFICANT * self.sigma
+        return self.apart > _SIGNIFICANT
 
     def __str__(self) -> str:
         found, sigma = self.given * (1.0 + self.change), self.given * self.sigma
-        away = abs(self.change) / self.sigma
         return (
             f"The focal length of {self.view} does not agree with the measurements: found fx = "
-            f"{found:.1f} +- {sigma:.1f} px, given {self.given:.1f} px, {away:.0f} standard "
+            f"{found:.1f} +- {sigma:.1f} px, given {self.given:.1f} px, {self.apart:.0f} standard "
             f"deviations and {1e2 * self.change:+.2f} % apart; the stated uncertainty knows "
             "nothing of it; calibrate the camera again at the same focus and zoom, look for "
             "pictures that were scaled or focused anew, or let the fit find it "
             f"(--free {self.view}.fx --free {self.view}.fy)."
+        )
+
+
+@dataclass(frozen=True)
+class LensDistortion:
+    """What the measurements say of the distortion of a camera whose file says what it is."""
+
+    view: str  # the first one by name if several have the camera
+    given: float  # k1 in the camera file
+    change: float  # what would have to be added to it
+    sigma: float  # standard deviation of that
+
+    @property
+    def apart(self) -> float:
+        """How many standard deviations lie between what was given and what was found."""
+        return abs(self.change) / self.sigma
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether the measurements disagree with what was given."""
+        return self.apart > _SIGNIFICANT
+
+    def __str__(self) -> str:
+        found = self.given + self.change
+        looks = ""
+        if abs(found) < 0.5 * abs(self.given):
+            looks = "; photographs look so that were corrected for their lens"
+        elif self.given == 0.0:
+            looks = "; photographs look so that were not corrected for their lens"
+        return (
+            f"The distortion of {self.view} does not agree with the measurements: found k1 = "
+            f"{found:.3f} +- {self.sigma:.3f}, given {self.given:.3f}, {self.apart:.0f} standard "
+            f"deviations apart{looks}; the stated uncertainty knows nothing of it; take and "
+            "process the photographs of board and machine alike, with lens correction in all or in "
+            "none, and calibrate the camera again."
         )
 
 
@@ -229,15 +279,47 @@ def focal_lengths(
     of intrinsics with the covariance that camera files state, so that these do not pass for a
     focal length.
     """
-    focal = [_KEYS.index(key) for key in _FOCAL]
+    error = _camera_error(state, _FOCAL, {})
+    return tuple(
+        FocalLength(view, intrinsic_of(camera, "fx"), change, sigma)
+        for view, camera, change, sigma in _tested(problem, state, linear, by_camera, error)
+    )
+
+
+def lens_distortions(
+    problem: FitProblem, state: State, linear: Linearization, by_camera: Mapping[str, Array]
+) -> tuple[LensDistortion, ...]:
+    """Return what the measurements say of the distortion that camera files say.
+
+    It is tested as :func:`focal_lengths` are, by the coefficient that is largest in most lenses.
+    """
+    error = _camera_error(state, {}, {"k1": 1.0})
+    return tuple(
+        LensDistortion(view, intrinsic_of(camera, "k1"), change, sigma)
+        for view, camera, change, sigma in _tested(problem, state, linear, by_camera, error)
+    )
+
+
+def _tested(
+    problem: FitProblem,
+    state: State,
+    linear: Linearization,
+    by_camera: Mapping[str, Array],
+    error: Array,
+) -> list[tuple[str, Camera, float, float]]:
+    """Return how much of an error (n_views, 5) the residuals show, and its standard deviation.
+
+    They come with the view that stands for each camera of which nothing was chosen, and with the
+    camera of its file.
+    """
+    wrong = np.flatnonzero(np.any(error, axis=0))
     of_files = np.append(problem.calibrated, problem.n_kept)
-    is_known = np.all(np.isin(_places_of_cameras(problem)[:, focal], of_files), axis=1)
+    is_known = np.all(np.isin(_places_of_cameras(problem)[:, wrong], of_files), axis=1)
     known = [v for v in np.unique(problem.outlines.view).tolist() if is_known[v]]
     owners = shared_cameras(problem.outlines.views, problem.first_cameras)
     tested = sorted({owners[v] for v in known})
     if not tested:
-        return ()
-    error = _camera_error(state, _FOCAL, {})
+        return []
     changes = [
         _changes_by_cameras(problem, by_camera, error * of_owner[:, None])
         for of_owner in (
@@ -252,12 +334,7 @@ def focal_lengths(
     seen = np.flatnonzero(np.diagonal(information) > _ROUNDING * whole)
     covariance = np.linalg.pinv(information[np.ix_(seen, seen)], rcond=_ROUNDING, hermitian=True)
     change, sigma = -covariance @ score[seen], np.sqrt(np.diagonal(covariance))
-    return tuple(
-        FocalLength(
-            tested[i],
-            intrinsic_of(problem.first_cameras[owners.index(tested[i])], "fx"),
-            float(d),
-            float(s),
-        )
+    return [
+        (tested[i], problem.first_cameras[owners.index(tested[i])], float(d), float(s))
         for i, d, s in zip(seen.tolist(), change, sigma, strict=True)
-    )
+    ]

@@ -25,9 +25,12 @@ from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_reasons
 from legcal.calibration.joint_fit.sensitivity import (
+    FocalLength,
+    LensDistortion,
     Sensitivity,
     derivatives_by_cameras,
     focal_lengths,
+    lens_distortions,
     sensitivities,
 )
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
@@ -152,10 +155,17 @@ def assemble_solution(
     held_values[:, problem.free] = (held.basis * held.unit)[:, : problem.n_kinematic]
     biases = zip(problem.block("biases").labels, state.biases.tolist(), strict=True)
     by_camera = derivatives_by_cameras(problem, state)
-    focal = focal_lengths(problem, state, linear, by_camera)
-    contradicted = [f for f in focal if f.is_contradicted]
-    of_focal = tuple(f.view for f in contradicted)
-    doubted = [c for c in doubted_cameras(problem, state, kept) if c.view not in of_focal]
+    # One mistake in a camera looks like others: of each camera the test that sees most counts.
+    tests: list[FocalLength | LensDistortion] = [
+        *focal_lengths(problem, state, linear, by_camera),
+        *lens_distortions(problem, state, linear, by_camera),
+    ]
+    clearest = {test.view: test for test in sorted(tests, key=lambda test: test.apart)}
+    disagreeing = [test for test in clearest.values() if test.is_contradicted]
+    contradicted = [test for test in disagreeing if isinstance(test, FocalLength)]
+    distorted = [test for test in disagreeing if isinstance(test, LensDistortion)]
+    of_tests = tuple(test.view for test in disagreeing)
+    doubted = [c for c in doubted_cameras(problem, state, kept) if c.view not in of_tests]
     named = problem.named
     of_files = {named[i] for i in problem.calibrated.tolist()}
     shown = [i for i, name in enumerate(names) if name not in of_files]
@@ -204,13 +214,13 @@ def assemble_solution(
         gammas=gammas,
         biases={n: v for n, v in biases if not n.endswith(GAMMA_SUFFIX)},
         shared_px=fit.edge_biases.sizes,
-        sensitivities=sensitivities(problem, state, linear, by_camera, normal, loss),
+        sensitivities=sensitivities(problem, state, linear, by_camera, normal, loss, distorted),
         outlines=_with_rejections(outlines, problem, state, fit.accepted, offsets),
         start=label,
         iterations=fit.iterations,
         posterior=Posterior(problem, state, fit.edge_biases, fit.noise, kept),
         focal_error=max((abs(f.change) for f in contradicted), default=0.0),
-        contradicted_cameras=(*of_focal, *(camera.view for camera in doubted)),
+        contradicted_cameras=(*of_tests, *(camera.view for camera in doubted)),
         notes=(
             *fit.notes,
             *rejected_notes(problem, fit.accepted),
@@ -218,7 +228,7 @@ def assemble_solution(
             *map(str, gammas),
             *scale_notes(problem, state, settings),
             *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
-            *map(str, contradicted),
+            *map(str, disagreeing),
             *map(str, doubted),
         ),
     )
