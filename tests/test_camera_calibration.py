@@ -274,6 +274,7 @@ def _block(**changes: Any) -> dict[str, Any]:
     return {key: value for key, value in changed.items() if value is not None}
 
 
+@pytest.mark.usefixtures("found")
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
@@ -306,6 +307,7 @@ def test_what_is_no_covariance_is_refused_by_name(
     assert len(refused.value.problems) == 1
 
 
+@pytest.mark.usefixtures("found")
 def test_intrinsics_that_a_covariance_does_not_name_are_exact(folder: Path, tmp_path: Path) -> None:
     document, path = yaml.safe_load((folder / "camera.yaml").read_text()), tmp_path / "camera.yaml"
     document["legcal_camera"] = _block()
