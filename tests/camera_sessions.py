@@ -135,3 +135,14 @@ def photographs(
         paths.append(folder / f"b{k:02d}.png")
         assert cv2.imwrite(str(paths[-1]), np.asarray(image))
     return paths
+
+
+def together(*sets: BoardImages) -> BoardImages:
+    """Return the images of several sets as one."""
+    first = np.cumsum([0, *(int(part.image[-1]) + 1 for part in sets)])
+    image = [part.image + start for part, start in zip(sets, first, strict=False)]
+    rest = (
+        np.concatenate([getattr(part, name) for part in sets])
+        for name in ("points", "px", "sigma_px")
+    )
+    return BoardImages(np.concatenate(image), *rest)

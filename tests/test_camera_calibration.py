@@ -9,13 +9,26 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from camera_sessions import CAMERAS, NOISE_PX, PINHOLE, SIZE, drawings, photographs, seen_corners
+from camera_sessions import (
+    CAMERAS,
+    NOISE_PX,
+    PINHOLE,
+    SIZE,
+    drawings,
+    photographs,
+    seen_corners,
+    together,
+)
 
 from legcal import calibrate_camera
 from legcal.calibration import CameraCalibration
 from legcal.calibration.camera_calibration import calibration
 from legcal.calibration.camera_calibration.adjustment import RobustFit, robust_fit
-from legcal.calibration.camera_calibration.diagnostics import refuse_undetermined, warnings
+from legcal.calibration.camera_calibration.diagnostics import (
+    refuse_divided,
+    refuse_undetermined,
+    warnings,
+)
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
 from legcal.geometry import Array
 from legcal.perception import BoardImages
@@ -147,6 +160,47 @@ def test_single_corners_and_images_that_disagree_are_left_out() -> None:
     assert found.left_out[11]
     assert found.n_left_out == len(single)
     assert np.abs(pulls(found)).max() < 3.5
+
+
+TRUTH = CAMERAS["plumb_bob"]
+ZOOMED = replace(
+    TRUTH, K=np.diag([1.04, 1.04, 1.0]) @ TRUTH.K + [[0, 0, -12.5], [0, 0, -9.8], [0] * 3]
+)
+
+
+def rolled(seen: BoardImages) -> BoardImages:
+    """Return corners of a camera that turned while it read out its rows."""
+    moved = 4.0 * (seen.px[:, 1:] / SIZE.height - 0.5) * [1.0, -0.5]
+    return replace(seen, px=seen.px + moved * (1.0 + seen.image[:, None]))
+
+
+@pytest.mark.parametrize(
+    ("others", "why"),
+    [
+        (seen_corners(ZOOMED, 5, 8, sheet=SHEET), "focal length about 4 % longer"),
+        (seen_corners(TRUTH, 5, 8, sheet=SHEET + np.array([4e-3, 0, 0, 0])), "bent otherwise"),
+        (rolled(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "moved while its rows were read out"),
+    ],
+)
+def test_a_third_of_the_images_wrong_alike_is_named_and_moves_nothing(
+    others: BoardImages, why: str
+) -> None:
+    found = fitted(together(others, seen_corners(TRUTH, 10, 2, sheet=SHEET)))
+    assert set(found.left_out) == set(range(5))
+    assert sum(why in reason for reason in found.left_out.values()) >= 3
+    assert np.abs(pulls(found)).max() < 3.0
+    refuse_divided(found, [str(k) for k in range(15)])
+
+
+def test_two_groups_of_one_size_are_refused_and_named() -> None:
+    found = fitted(together(seen_corners(ZOOMED, 5, 8), seen_corners(TRUTH, 5, 2)))
+    with pytest.raises(NotIdentifiable) as refused:
+        refuse_divided(found, [f"{k}.jpg" for k in range(10)])
+    for word in ("two groups", "0.jpg, 1.jpg", "5.jpg, 6.jpg", "focal length about"):
+        assert word in str(refused.value)
+    few = replace(found, rival=(), images=found.images[:5], left_out=dict.fromkeys(range(7), "?"))
+    with pytest.raises(NotIdentifiable, match="only 5 of 12 images agree"):
+        refuse_divided(few, [f"{k}.jpg" for k in range(12)])
 
 
 def test_noise_that_corners_do_not_claim_is_seen_and_counted() -> None:

@@ -16,7 +16,7 @@ f is known with v degrees of freedom: that of Student's distribution.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,8 +24,9 @@ import numpy as np
 from legcal.estimation.loss import LEAST_SQUARES, Loss
 from legcal.estimation.problem import Linearization, Problem, S
 from legcal.estimation.solver import NormalEquations, inverse_on_range
-from legcal.geometry import Array
+from legcal.geometry import Array, BoolArray, IntArray
 
+_RANGE = 1e-9  # of an information: what is smaller is rounding
 _MIN_DOF = 4.0  # of a ratio that is believed
 
 
@@ -36,6 +37,59 @@ class Clusters:
     score: Array  # (n, k) gradient of the cost
     information: Array  # (n, k, k) the element following
     prior: Array  # (k, k)
+    prior_score: Array  # (k,)
+
+    def choose(self, which: IntArray | BoolArray) -> Clusters:
+        """Return some of the elements."""
+        return replace(self, score=self.score[which], information=self.information[which])
+
+    def best(self) -> Array:
+        """Return the step (k,) of the kept unknowns to the minimum of the elements and priors."""
+        return np.asarray(-self.normal_inverse @ (self.score.sum(axis=0) + self.prior_score))
+
+    def moved(self, step: Array) -> Clusters:
+        """Return the same after a step (k,) of the kept unknowns, to first order."""
+        return replace(
+            self,
+            score=self.score + self.information @ step,
+            prior_score=self.prior_score + self.prior @ step,
+        )
+
+    def freed(self, direction: Array) -> tuple[Clusters, Array, Array]:
+        """Return the same with a change along *direction* (k,) free in each element.
+
+        Beside it, at the minimum of what is left, that change and its information, (n,) each.
+        """
+        pull = self.information @ direction
+        own = np.maximum(pull @ direction, 1e-300)
+        left = replace(
+            self,
+            score=self.score - pull * (self.score @ direction / own)[:, None],
+            information=self.information - pull[:, :, None] * pull[:, None, :] / own[:, None, None],
+        )
+        step = left.best()
+        change = -(self.moved(step).score @ direction) / own
+        return left.moved(step), change, own
+
+    def contradiction(
+        self, which: BoolArray, ratio: float, directions: Array | None = None
+    ) -> Array:
+        """Return how far each element contradicts the others of a group, in squared sigmas (n,).
+
+        At the minimum of the group *which*, for errors of a ratio f; along unit changes
+        *directions* (k, c) of the kept unknowns alone where these are given.
+        """
+        A = self.information
+        N = inverse_on_range(A[which].sum(axis=0) + self.prior)
+        V = A + np.where(which, -1.0, 1.0)[:, None, None] * (A @ N @ A)
+        s = self.score
+        if directions is not None:
+            s, V = s @ directions, directions.T @ V @ directions
+        V = V + _RANGE * np.einsum("nii->ni", V)[:, :, None] * np.eye(V.shape[1])
+        V = V + 1e-300 * np.eye(V.shape[1])
+        return (
+            np.asarray(np.einsum("ni,ni->n", s, np.linalg.solve(V, s[..., None])[..., 0])) / ratio
+        )
 
     @cached_property
     def normal_inverse(self) -> Array:
@@ -92,4 +146,9 @@ def clustered(
         where = at[:, None, None], index[:, :, None], index[:, None, :]
         np.add.at(U, where, np.swapaxes(J, 1, 2) @ J)
     prior_J = linear.prior_J
-    return Clusters(score[:, :k], U[:, :k, :k] - normal.contributions(), prior_J.T @ prior_J)
+    return Clusters(
+        score[:, :k],
+        U[:, :k, :k] - normal.contributions(),
+        prior_J.T @ prior_J,
+        prior_J.T @ linear.prior_r,
+    )

@@ -1,3 +1,4 @@
+from .board_adjustment import LOSS as LOSS
 from .board_adjustment import SHEET as SHEET
 from .board_adjustment import AdjustedBoard as AdjustedBoard
 from .board_adjustment import BoardImages as BoardImages

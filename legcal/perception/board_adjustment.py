@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.estimation import (
+    NO_PRIOR,
     Clusters,
     Factor,
     Frames,
@@ -24,6 +25,8 @@ from legcal.estimation import (
     Variables,
     all_free,
     clustered,
+    fixed_at_start,
+    linearize,
     minimise,
     normal_equations,
 )
@@ -38,7 +41,7 @@ from legcal.vision import (
 )
 
 _MAX_ITERATIONS = 60
-_LOSS = Huber(3.0)  # standard deviations from which a corner counts less and less
+LOSS = Huber(3.0)  # standard deviations from which a corner counts less and less
 _PRIOR_PX = 10.0  # image widths: prior of focal lengths and principal point
 SHEET = ("warp_x", "warp_y", "twist", "print_ratio")  # numbers of a sheet
 SIGMA_WARP = 0.01  # of its longer side: paper of 200 mm is bent by some millimetres
@@ -119,6 +122,7 @@ def adjust_board(
     free: Sequence[str] = (),  # intrinsics that are unknown
     sheet: Sheet | None = None,  # where that is unknown: near it
     *,
+    held: bool = False,  # whether camera and sheet stay, and only poses follow
     max_iterations: int = _MAX_ITERATIONS,
 ) -> AdjustedBoard | None:
     """Return the board's poses of least cost near a start, and free intrinsics of the camera.
@@ -188,18 +192,28 @@ def adjust_board(
     state = _State(camera, Frames.of(poses), sheet)
     if not np.all(np.isfinite(problem.factor("corners").rows(state).r)):
         return None
-    found = minimise(problem, state, _LOSS, max_iterations=max_iterations, must_converge=False)
-    normal = normal_equations(problem, found.state, found.linear, _LOSS)
+    moving = problem
+    if held:
+        moving = replace(problem, variables=tuple(map(_held, problem.variables)))
+    found = minimise(moving, state, LOSS, max_iterations=max_iterations, must_converge=False)
+    linear = linearize(problem, found.state) if held else found.linear
+    normal = normal_equations(problem, found.state, linear, LOSS)
     return AdjustedBoard(
         found.state.camera,
         found.state.board_pose.motions,
         found.state.sheet,
-        -found.linear["corners"].r * seen.sigma_px[:, None],
+        -linear["corners"].r * seen.sigma_px[:, None],
         found.cost,
         normal.kept_covariance(),
-        clustered(problem, found.linear, normal, _LOSS),
+        clustered(problem, linear, normal, LOSS),
         normal.V,
     )
+
+
+def _held(block: Variables) -> Variables:
+    """Return a block that does not move."""
+    unknown = fixed_at_start(*block.unknown.shape)
+    return replace(block, unknown=unknown, labels=(), units=(), prior=NO_PRIOR)
 
 
 def _corners(state: _State, seen: BoardImages, names: Sequence[str]) -> Residuals:

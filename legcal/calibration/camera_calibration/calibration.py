@@ -19,6 +19,7 @@ from legcal.calibration.camera_calibration.adjustment import (
 from legcal.calibration.camera_calibration.diagnostics import (
     MIN_IMAGES,
     coverage,
+    refuse_divided,
     refuse_undetermined,
     tilts,
     too_few_images,
@@ -129,6 +130,7 @@ def calibrate_camera(
             f"The camera could not be calibrated: found no {model} camera that explains the "
             "corners, needed one; check the board and the model of the lens."
         )
+    refuse_divided(fitted, [paths[k].name for k in shown])
     left_out = [f"{paths[shown[k]].name}: {why}" for k, why in fitted.left_out.items()]
     refuse_undetermined(fitted, [paths[shown[k]].name for k in fitted.images], left_out)
     result = _result(flat_board, paths, found, shown, fitted)

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from legcal.calibration.camera_calibration.adjustment import RobustFit
+from legcal.data import few
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array
 from legcal.perception import adjust_board
@@ -18,6 +19,7 @@ MIN_IMAGES, _FEW_IMAGES = 3, 10
 _MAX_FOCAL_SIGMA, _WEAK_FOCAL_SIGMA = 0.05, 0.003  # as parts of the focal length
 _MIN_TILT, _MIN_SPREAD = np.radians(15.0), np.radians(20.0)
 _MIN_COVERAGE = 0.5
+_MAX_RIVAL = 2.0 / 3.0  # of the images that agree, those that agree on another camera
 _LARGE_RESIDUAL_PX = 1.0
 _MANY_LEFT_OUT = 0.05  # of all corners
 _OVERFIT = 0.01  # probability from which on the gain of more coefficients may be chance
@@ -67,6 +69,30 @@ def refuse_undetermined(
             f"The camera could not be calibrated: found the principal point at ({centre[0]:.0f}, "
             f"{centre[1]:.0f}) px, outside the image, needed one inside; see that the images are "
             "not cropped, that the model fits the lens, and tilt the board more."
+        )
+
+
+def refuse_divided(found: RobustFit, names: Sequence[str]) -> None:
+    """Raise NotIdentifiable if no group of images is clearly the largest that agrees.
+
+    *names* are those of all images that were fitted.
+    """
+    own, rival = ([names[k] for k in images] for images in (found.images, found.rival))
+    if len(rival) > _MAX_RIVAL * len(own):
+        whys = [found.left_out[k] for k in found.rival]
+        why = max(set(whys), key=whys.count)
+        raise NotIdentifiable(
+            "The camera could not be calibrated: found two groups of images that each agree on "
+            f"another camera, {few(own)} and {few(rival)} (the second: {why}), needed one camera; "
+            "give only the images of one group, with zoom, focus and stabilisation off."
+        )
+    n_others = len(found.left_out)
+    if n_others > len(own):
+        whys = sorted({f"{names[k]}: {why}" for k, why in found.left_out.items()})
+        raise NotIdentifiable(
+            f"The camera could not be calibrated: found that only {len(own)} of "
+            f"{len(own) + n_others} images agree on a camera ({few(own)}; {few(whys)}), needed "
+            "more than half; take them again, the board still, and zoom, focus, stabilisation off."
         )
 
 

@@ -1,0 +1,138 @@
+"""Adjustments of a camera and a board to corners: from scratch, and from one nearby."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.geometry import BoolArray, IntArray
+from legcal.perception import AdjustedBoard, BoardImages, Sheet, adjust_board, plane_poses
+from legcal.vision import (
+    DISTORTION_MODELS,
+    Camera,
+    DistortionModel,
+    ImageSize,
+    intrinsic_names,
+    quiet_opencv,
+)
+
+_FOCAL_LENGTHS = (0.25, 4.0, 13)  # least to greatest, how many: parts of the longer side
+_MAX_ANGLE = 1.45  # [rad] to the axis of a fisheye lens
+_ROUGH, _ROUGH_ITERATIONS = ("fx", "fy", "k1"), 12  # estimated first
+
+
+def from_scratch(
+    seen: BoardImages, size: ImageSize, model: DistortionModel
+) -> AdjustedBoard | None:
+    """Return the adjustment from where a camera is roughly right, None if none succeeds."""
+    start = None if DISTORTION_MODELS[model].is_fisheye else _by_opencv(seen, size, model)
+    start = start or _by_straight_lines(seen, size, model)
+    if start is None:
+        return None
+    rough = adjust_board(*start, seen, _ROUGH, max_iterations=_ROUGH_ITERATIONS)
+    if rough is None:
+        return None
+    return _all_adjusted(rough.camera, rough.T_camera_board, Sheet.flat(seen.points), seen)
+
+
+def _all_adjusted(
+    camera: Camera, poses: Sequence[RigidTransform], sheet: Sheet, seen: BoardImages
+) -> AdjustedBoard | None:
+    """Return the adjustment of poses, all intrinsics and the sheet from a start."""
+    return adjust_board(camera, poses, seen, intrinsic_names(camera), sheet)
+
+
+def again(
+    near: AdjustedBoard, poses: Sequence[RigidTransform], seen: BoardImages
+) -> AdjustedBoard | None:
+    """Return the adjustment of other corners, from one nearby."""
+    sheet = near.sheet or Sheet.flat(seen.points)
+    return _all_adjusted(near.camera, poses, sheet, seen)
+
+
+def _by_straight_lines(
+    seen: BoardImages, size: ImageSize, model: DistortionModel
+) -> tuple[Camera, list[RigidTransform]] | None:
+    """Return the camera without distortion before which boards are flattest, of several."""
+    centre = 0.5 * (size.width - 1.0), 0.5 * (size.height - 1.0)
+    no_distortion = np.zeros(len(DISTORTION_MODELS[model].coefficients))
+    cameras = []
+    for part in np.geomspace(*_FOCAL_LENGTHS).tolist():
+        f = part * max(size.width, size.height)
+        K = np.array([[f, 0.0, centre[0]], [0.0, f, centre[1]], [0.0, 0.0, 1.0]])
+        cameras.append(Camera(K, size.width, size.height, no_distortion, model))
+    best = min(cameras, key=lambda camera: _non_flatness(camera, seen))
+    poses = []
+    for a, b in pairwise(_bounds(seen)):
+        found = plane_poses(best, seen.points[a:b], seen.px[a:b], np.ones(b - a))
+        if not found:
+            return None
+        poses.append(found[0].T_camera_plane)
+    return best, poses
+
+
+def _non_flatness(camera: Camera, seen: BoardImages) -> float:
+    """Return how far the corners of boards are from any plane before a camera (rms) [px]."""
+    angle = np.linalg.norm(seen.px - camera.K[:2, 2], axis=1) / camera.K[0, 0]
+    if DISTORTION_MODELS[camera.model].is_fisheye and angle.max() > _MAX_ANGLE:
+        return np.inf
+    xy = camera.undistort(seen.px)
+    off = []
+    for a, b in pairwise(_bounds(seen)):
+        board = seen.points[a:b, :2]
+        H, _ = cv2.findHomography(board, xy[a:b])
+        if H is None:
+            return np.inf
+        flat = np.column_stack([board, np.ones(b - a)]) @ np.asarray(H, dtype=np.float64).T
+        off.append(camera.distort(flat[:, :2] / flat[:, 2:]) - seen.px[a:b])
+    return float(np.sqrt(np.mean(np.concatenate(off) ** 2)))
+
+
+def _bounds(seen: BoardImages) -> IntArray:
+    """Return where the corners of each image begin, and where those of the last one end."""
+    return np.searchsorted(seen.image, np.arange(seen.image[-1] + 2))
+
+
+def _by_opencv(
+    seen: BoardImages, size: ImageSize, model: DistortionModel
+) -> tuple[Camera, list[RigidTransform]] | None:
+    """Return the camera that OpenCV calibrates, with two coefficients of distortion."""
+    pieces = list(pairwise(_bounds(seen)))
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    try:
+        with quiet_opencv():
+            _, K, distortion, turns, shifts = cv2.calibrateCamera(
+                [seen.points[a:b].astype(np.float32) for a, b in pieces],
+                [seen.px[a:b].astype(np.float32) for a, b in pieces],
+                (size.width, size.height),
+                np.eye(3),
+                np.zeros(5),
+                flags=flags,
+            )
+    except cv2.error:
+        return None
+    numbers = np.concatenate([np.ravel(K), np.ravel(distortion), np.ravel(turns), np.ravel(shifts)])
+    if not np.all(np.isfinite(numbers)) or min(K[0, 0], K[1, 1]) < 1.0:
+        return None
+    coefficients = np.zeros(len(DISTORTION_MODELS[model].coefficients))
+    coefficients[:2] = np.ravel(distortion)[:2]
+    poses = [
+        RigidTransform.from_components(np.ravel(t), Rotation.from_rotvec(np.ravel(w)))
+        for w, t in zip(turns, shifts, strict=True)
+    ]
+    return Camera(np.asarray(K), size.width, size.height, coefficients, model), poses
+
+
+def part_of(
+    seen: BoardImages, kept: BoolArray, n_images: int
+) -> tuple[BoardImages, tuple[int, ...]]:
+    """Return some of the corners, and the numbers that their images had."""
+    images = sorted(set(seen.image[kept].tolist()))
+    new = np.full(n_images, -1, dtype=np.intp)
+    new[images] = np.arange(len(images))
+    part = BoardImages(new[seen.image[kept]], seen.points[kept], seen.px[kept], seen.sigma_px[kept])
+    return part, tuple(images)
