@@ -1,7 +1,7 @@
 """Whether ``legcal camera`` states honest uncertainties from boards as they are printed.
 
     OMP_NUM_THREADS=1 python benchmarks/printed_boards.py [--sets 200] [--images 20] [--wrong zoom]
-    OMP_NUM_THREADS=1 python benchmarks/printed_boards.py --photographs [--kind phone] [--keep FOLDER]
+    OMP_NUM_THREADS=1 python benchmarks/printed_boards.py --photographs [--kind phone]
 
 Each set has a sheet of its own: bent by --warp mm, uneven beyond that, printed --ratio wider than
 high. Corners have errors of their own and errors that neighbours in an image share (sharpening,
