@@ -31,7 +31,7 @@ from legcal.calibration.camera_calibration.diagnostics import (
 )
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
 from legcal.geometry import Array
-from legcal.perception import BoardImages
+from legcal.perception import BoardImages, SeenBoard
 from legcal.vision import Board, DistortionModel, board_of, intrinsic_values
 from legcal.vision.camera_file import read_camera
 
@@ -280,21 +280,31 @@ def test_pictures_give_the_camera_that_took_them(found: CameraCalibration) -> No
     assert [i["sigma"] for i in document["intrinsics"]] == found.sigma.tolist()
 
 
+def test_inner_corners_that_are_stated_for_squares_are_found_out(
+    found: CameraCalibration, folder: Path
+) -> None:
+    again = calibrate_camera(folder, "chessboard:8x5:30mm")
+    assert (again.board.columns, again.board.rows) == (9, 6)
+    assert "write --board chessboard:9x6" in again.warnings[0]
+    np.testing.assert_allclose(again.values, found.values, rtol=1e-9)
+
+
 def test_sigmas_follow_residuals_and_not_what_corners_claim(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = seen_corners(CAMERAS["plumb_bob"], N_IMAGES, 1)
-    number = {tuple(point): k for k, point in enumerate(board_of(SPEC).points)}
+    board = board_of(SPEC)
 
     def stated(claim: float) -> Array:
         images = iter(range(N_IMAGES))
 
-        def corners(*_: object) -> tuple[Array, Array, Array]:
+        def corners(*_: object) -> SeenBoard:
             own = seen.image == next(images)
-            numbers = np.array([number[tuple(point)] for point in seen.points[own]])
-            return numbers, seen.px[own], claim * seen.sigma_px[own]
+            ij = np.rint(seen.points[own, :2] / board.side).astype(np.intp)
+            black = np.where(ij.sum(axis=1) % 2 == 0, 1, -1)
+            return SeenBoard(board.kind, ij, seen.px[own], claim * seen.sigma_px[own], black)
 
-        monkeypatch.setattr(calibration, "find_corners", corners)
+        monkeypatch.setattr(calibration, "search_board", corners)
         paths = [folder / f"b{k:02d}.png" for k in range(N_IMAGES)]
         return calibrate_camera(paths, SPEC, workers=1).sigma
 

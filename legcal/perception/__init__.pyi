@@ -4,11 +4,15 @@ from .board_adjustment import AdjustedBoard as AdjustedBoard
 from .board_adjustment import BoardImages as BoardImages
 from .board_adjustment import Sheet as Sheet
 from .board_adjustment import adjust_board as adjust_board
+from .board_corners import NumberedCorners as NumberedCorners
+from .board_corners import SeenBoard as SeenBoard
 from .board_corners import board_in_words as board_in_words
 from .board_corners import describe_image as describe_image
 from .board_corners import detect_corners as detect_corners
 from .board_corners import find_corners as find_corners
 from .board_corners import require_board as require_board
+from .board_corners import search_board as search_board
+from .board_corners import shown_board as shown_board
 from .board_poses import camera_poses_by_board as camera_poses_by_board
 from .board_poses import plane_poses as plane_poses
 from .diagnostics import BEFORE_FIT as BEFORE_FIT

@@ -121,7 +121,7 @@ def camera_poses_by_board(
                     f"view {view.name}: its camera could not be placed: found {MIN_CORNERS} "
                     f"corners of the board or more in none of its {n} image{'s' * (n != 1)}, "
                     "needed them in one; turn the camera so that it sees the board"
-                    f"{', the whole of it' * (board.kind == 'chessboard')}, or check what the "
+                    f"{', all of its rim' * (board.kind == 'chessboard')}, or check what the "
                     "dataset file says of the board."
                 )
         T_board_camera.append(None if pose is None else pose.T_camera_plane.inv())

@@ -33,8 +33,16 @@ from legcal.calibration.camera_calibration.document import (
 )
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
 from legcal.files import MAX_IMAGE, describe, read_bytes
-from legcal.geometry import Array, IntArray
-from legcal.perception import BoardImages, board_in_words, describe_image, find_corners
+from legcal.geometry import Array
+from legcal.perception import (
+    BoardImages,
+    NumberedCorners,
+    SeenBoard,
+    board_in_words,
+    describe_image,
+    search_board,
+    shown_board,
+)
 from legcal.progress import Report, no_progress
 from legcal.vision import (
     BadImage,
@@ -55,7 +63,6 @@ from legcal.workers import Run, worker_pool
 
 _STAGE = "Searching the board"
 _N_DESCRIBED = 2  # images of which it is said what they show instead
-_Corners = tuple[IntArray, Array, Array]
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 _MAX_NAMED = 5
 
@@ -112,14 +119,18 @@ def calibrate_camera(
         )
     if output is not None:
         CAMERA_FILE.check_place(Path(output))
-    flat_board = board_of(board)
+    stated = board_of(board)
     paths = _listed_images([images] if isinstance(images, str | Path) else images)
     size, facts = _common_size(paths)
     with worker_pool(workers) as run:
-        found = _search(flat_board, paths, size, run, progress)
-    shown = [k for k, (numbers, _, _) in enumerate(found) if len(numbers) >= MIN_CORNERS]
+        seen = _search(stated, paths, size, run, progress)
+    flat_board, note = shown_board(stated, seen)
+    if flat_board is None:
+        raise _not_visible(stated, note)
+    found = [one.numbered(flat_board) for one in seen]
+    shown = [k for k, corners in enumerate(found) if len(corners.number) >= MIN_CORNERS]
     if not shown:
-        raise _not_visible(flat_board, paths, size)
+        raise _not_visible(stated, _shown_instead(stated, paths, size))
     if len(shown) < MIN_IMAGES:
         raise too_few_images(len(shown), [paths[k].name for k in shown])
     progress("Adjusting the camera", 0, 1)
@@ -133,7 +144,7 @@ def calibrate_camera(
     refuse_divided(fitted, [paths[k].name for k in shown])
     left_out = [f"{paths[shown[k]].name}: {why}" for k, why in fitted.left_out.items()]
     refuse_undetermined(fitted, [paths[shown[k]].name for k in fitted.images], left_out)
-    result = _result(flat_board, paths, found, shown, fitted)
+    result = _result(flat_board, paths, found, shown, fitted, note)
     used = [k for k, image in enumerate(result.images) if image.used]
     changes = _changes([paths[k] for k in used], [facts[k] for k in used], size)
     result = replace(
@@ -154,8 +165,8 @@ class _CornerSearch:
     paths: tuple[Path, ...]
     size: ImageSize
 
-    def __call__(self, k: int) -> _Corners:
-        return find_corners(self.board, _read(self.paths[k], self.size))
+    def __call__(self, k: int) -> SeenBoard:
+        return search_board(self.board, _read(self.paths[k], self.size))
 
 
 def _read(path: Path, size: ImageSize) -> Array:
@@ -165,37 +176,41 @@ def _read(path: Path, size: ImageSize) -> Array:
 
 def _search(
     board: Board, paths: Sequence[Path], size: ImageSize, run: Run, progress: Report
-) -> list[_Corners]:
-    """Return the corners in every image."""
+) -> list[SeenBoard]:
+    """Return what every image shows of the board."""
     progress(_STAGE, 0, len(paths))
     found = []
-    for corners in run(_CornerSearch(board, tuple(paths), size), range(len(paths))):
-        found.append(corners)
+    for seen in run(_CornerSearch(board, tuple(paths), size), range(len(paths))):
+        found.append(seen)
         progress(_STAGE, len(found), len(paths))
     return found
 
 
-def _table(board: Board, found: Sequence[_Corners]) -> BoardImages:
+def _table(board: Board, found: Sequence[NumberedCorners]) -> BoardImages:
     """Return the corners of some images in one table."""
-    counts = [len(numbers) for numbers, _, _ in found]
+    counts = [len(corners.number) for corners in found]
     return BoardImages(
         np.repeat(np.arange(len(found)), counts),
-        np.concatenate([board.points[numbers] for numbers, _, _ in found]),
-        np.concatenate([px for _, px, _ in found]),
-        np.concatenate([sigma for _, _, sigma in found]),
+        np.concatenate([board.points[corners.number] for corners in found]),
+        np.concatenate([corners.px for corners in found]),
+        np.concatenate([corners.sigma_px for corners in found]),
     )
 
 
-def _not_visible(board: Board, paths: Sequence[Path], size: ImageSize) -> NotVisible:
-    """Return the refusal of images without the board, and say what they show instead."""
+def _shown_instead(board: Board, paths: Sequence[Path], size: ImageSize) -> str:
+    """Return what images without the board show instead, in words that go after "found"."""
     described = (describe_image(board, _read(path, size)) for path in paths[:_N_DESCRIBED])
-    what = next((words for words in described if words), None)
+    what = next((words for words in described if words), "nothing like the board")
+    return f"{what} in its {len(paths)} image{'s' * (len(paths) != 1)}"
+
+
+def _not_visible(board: Board, instead: str) -> NotVisible:
+    """Return the refusal of images that show something else than the board."""
     hint = ""
-    if what is None and board.kind == "chessboard":
+    if board.kind == "chessboard":
         hint = f" (squares are counted: {board.columns - 1} x {board.rows - 1} inner corners)"
     return NotVisible(
-        f"The camera could not be calibrated: found {what or 'nothing like the board'} in its "
-        f"{len(paths)} image{'s' * (len(paths) != 1)}, needed {board_in_words(board)}"
+        f"The camera could not be calibrated: found {instead}, needed {board_in_words(board)}"
         f"{hint}; correct --board, or take sharper images of the whole board."
     )
 
@@ -203,9 +218,10 @@ def _not_visible(board: Board, paths: Sequence[Path], size: ImageSize) -> NotVis
 def _result(
     board: Board,
     paths: Sequence[Path],
-    found: Sequence[_Corners],
+    found: Sequence[NumberedCorners],
     shown: Sequence[int],
     fitted: RobustFit,
+    note: str,
 ) -> CameraCalibration:
     """Return the camera with what it rests on."""
     adjusted, seen = fitted.adjusted, fitted.seen
@@ -216,7 +232,7 @@ def _result(
     images = []
     for k, path in enumerate(paths):
         i = used.get(k)
-        n = len(found[k][0])
+        n = len(found[k].number)
         why = left_out.get(k, "" if k in shown else "the board was not found")
         if i is None:
             images.append(ImageResult(path.name, n, 0, None, None, why))
@@ -234,7 +250,7 @@ def _result(
         rms_px=float(np.sqrt(np.mean(square))),
         noise_px=float(np.sqrt(square.sum() / n_dof)),
         coverage=coverage(fitted),
-        warnings=(*_left_out(images), *warnings(fitted)),
+        warnings=(*([note] if note else []), *_left_out(images), *warnings(fitted)),
     )
 
 

@@ -1,0 +1,305 @@
+"""Crossings of two edges in grey levels: where they are, by a model fitted to the pixels around.
+
+Around a corner of a board the light is a product of two steps. Lens and pixels blur it, cameras
+sharpen it afterwards: they add a part of its difference from a blurred copy of it, so that it
+overshoots beside the edges. Both are linear, and so grey levels are
+
+    f = c0 + c1 x + c2 y + (k0 + k1 x + k2 y) P(s) + k3 P(s') + b (G0 + G1),    s'^2 = s^2 + r^2,
+
+P(s) the product of both steps under a blur s, P(s') the one of the copy, G0 + G1 what a tone curve
+makes of the edges (a square of P), and linear terms what light and shade do. Each of these is even
+about the crossing, so that none of them moves it. All crossings of an image are fitted at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import erf
+
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.vision import Grey
+
+MIN_CONTRAST = 4.0  # grey levels of 255
+
+_REACH = 9  # pixels of the window to each side, at most
+_N_LINEAR, _N_PLACED = 13, 5  # coefficients; place, two angles, logarithm of the blur
+_SQRT2, _SLOPE = np.sqrt(2.0), np.sqrt(2.0 / np.pi)
+_MIN_PIXELS = 24  # pixels that a fit needs
+_ITERATIONS = 12
+_CONVERGED_PX = 2e-3
+_MAX_STEP = np.array([1.0, 1.0, 0.2, 0.2, 0.4])  # [px, px, rad, rad, 1]
+_START_BLUR = 0.8  # [px]
+_MASK_RADIUS = 1.3  # of the blurred copy: cameras have 1 to 1.5 px [px]
+_RIDGE = 1e-4  # on overshoot and blur, which explain edges almost alike; contrasts are 1
+_MANY_PIXELS = 200  # fewer do not tell overshoot from other shapes of an edge
+_OVERSHOOT = [6, 7, 8, 10, 11, 12]  # functions of it, and of tones
+_BLUR_RIDGE = 1e-3
+_STIFF, _STIFF_STEPS = 100.0, 2  # times that, in the first steps
+_BLUR_SIGMAS = 1.5  # standard deviations of the blur that reach beside an edge
+_MIN_BAND = 0.5  # of what is free beside an edge that is used at least
+_MAX_SHIFT_PX = 2.5  # of the result from the start
+_MAX_TURN = 0.3  # [rad] of an edge from where it should point
+_BLURS = (0.3, 4.0)  # [px]
+_MAX_MISFIT = 0.35  # residual, as a part of the contrast
+_MIN_SIGMA_PX = 0.01  # no corner is known better: print, flatness, pixels that differ
+_LAGS = (
+    2  # pixels over which residuals are correlated: mosaics of colour, JPEG, what is not modelled
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Saddles:
+    """Crossings of two edges in an image."""
+
+    px: Array  # (n, 2) where they are [px]
+    sigma_px: Array  # (n,) standard deviation of either coordinate [px]
+    # (n,) standard deviation of the blur with which edges would be as steep without overshoot [px]
+    blur_px: Array
+    # (n,) half of the step over an edge [grey levels]; positive if it is bright where both sides,
+    # clockwise from the axes as the image shows them, are
+    contrast: Array
+    misfit: Array  # (n,) what the model leaves over (root mean square), as a part of the contrast
+    found: BoolArray  # (n,) whether the picture is a crossing at all; others have no numbers
+
+    def choose(self, rows: IntArray | BoolArray) -> Saddles:
+        """Return some of them."""
+        return Saddles(*(value[rows] for value in vars(self).values()))
+
+    def moved_to(self, px: Array, scale: float) -> Saddles:
+        """Return them where they are in an image, found in one that is scaled by a factor."""
+        return replace(self, px=px, sigma_px=self.sigma_px / scale, blur_px=self.blur_px / scale)
+
+
+def fit_saddles(
+    grey: Grey,  # (height, width) grey levels, 0 to 255
+    start: Array,  # (n, 2) where the crossings should be [px]
+    axes: Array,  # (n, 2, 2) the steps in the image along both edges [px / unit]
+    length: float,  # how far both edges are straight on either side of the crossing [unit]
+    band: float,  # how far from the edges nothing else is printed [unit]
+) -> Saddles:
+    """Return where two edges cross near some pixels."""
+    if not len(start):
+        none = np.zeros(0)
+        return Saddles(np.zeros((0, 2)), none, none, none, none, np.zeros(0, dtype=np.bool_))
+    steps = np.linalg.norm(axes, axis=1)
+    turns = np.arctan2(axes[:, 1], axes[:, 0])
+    window = _Window.around(grey, start, axes, length)
+    free = np.maximum(
+        band - (0.5 + _BLUR_SIGMAS * _START_BLUR) / steps.min(axis=1), _MIN_BAND * band
+    )
+    x = np.column_stack([start, turns, np.full(len(start), np.log(_START_BLUR))])
+    weight = window.weight(length, free)
+    x, _, _, _ = _fit(window, weight, x)
+    # The first fit gives how far blur reaches from what else is printed.
+    wide = np.maximum(
+        band - (0.5 + _BLUR_SIGMAS * np.exp(x[:, 4])) / steps.min(axis=1), _MIN_BAND * band
+    )
+    if np.any(np.abs(wide - free) * steps.min(axis=1) > 0.5):
+        weight = window.weight(length, wide)
+        x, _, _, _ = _fit(window, weight, x)
+    return _judged(window, weight, x, start, turns)
+
+
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """The pixels around places: columns and rows (n, m) less the place, levels (n, m)."""
+
+    side: int  # pixels along a side; m is its square
+    origin: Array  # (n, 2)
+    u: Array
+    v: Array
+    levels: Array  # normalised: by half of their range, about their mean
+    scale: Array  # (n,) that half [grey levels]
+    inside: BoolArray  # (n, m) whether a pixel is in the image
+    on_board: Array  # (n, 2, m) how far along the axes [unit], without sign
+
+    @classmethod
+    def around(cls, grey: Grey, start: Array, axes: Array, length: float) -> _Window:
+        """Return the pixels that are within a length along both axes."""
+        height, width = grey.shape
+        extent = length * float(np.abs(axes).sum(axis=2).max())
+        reach = int(np.clip(np.ceil(extent), 3, _REACH))
+        d = np.arange(-reach, reach + 1)
+        rows, columns = (g.ravel() for g in np.meshgrid(d, d, indexing="ij"))
+        middle = np.rint(start).astype(np.intp)
+        column, row = middle[:, :1] + columns, middle[:, 1:] + rows
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        levels = grey[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)].astype(np.float64)
+        low, high = np.quantile(levels, [0.05, 0.95], axis=1)
+        scale = np.maximum(0.5 * (high - low), 1e-3)
+        levels = (levels - 0.5 * (high + low)[:, None]) / scale[:, None]
+        u, v = column - start[:, :1], row - start[:, 1:]
+        on_board = np.abs(np.linalg.solve(axes, np.stack([u, v], axis=1)))
+        return cls(len(d), start, u, v, levels, scale, inside, on_board)
+
+    def weight(self, length: float, free: Array) -> Array:
+        """Return 1 for pixels (n, m) that are used, else 0."""
+        near = (self.on_board.max(axis=1) <= length) & (self.on_board.min(axis=1) <= free[:, None])
+        return np.asarray(near & self.inside, dtype=np.float64)
+
+    def choose(self, rows: IntArray) -> _Window:
+        """Return the pixels around some of the places."""
+        some = {k: v[rows] for k, v in vars(self).items() if k != "side"}
+        return replace(self, **some)
+
+
+def _fit(window: _Window, weight: Array, x: Array) -> tuple[Array, Array, Array, Array]:
+    """Fit the model by Gauss-Newton.
+
+    Returns place, angles and blur (n, 5); coefficients (n, 8); functions and derivatives
+    (n, 13, m), times the weight; residuals (n, m).
+    """
+    x = x.copy()
+    n = len(x)
+    coefficients = np.zeros((n, _N_LINEAR))
+    open_ = np.flatnonzero(weight.sum(axis=1) >= _MIN_PIXELS)
+    part, w, c = window.choose(open_), weight[open_], coefficients[open_]
+    log_start = float(np.log(_START_BLUR))
+    for iteration in range(_ITERATIONS):
+        if not len(open_):
+            break
+        here, count = x[open_], w.sum(axis=1)
+        if iteration == 0:
+            L = _functions(part, here, None)[:, :_N_LINEAR] * w[:, None]
+            c = _solve(L, part.levels * w, count, np.zeros((len(here), _N_LINEAR)), _STIFF)
+        A = _functions(part, here, c) * w[:, None]
+        expected = np.zeros((len(here), _N_LINEAR + _N_PLACED))
+        expected[:, -1] = log_start - here[:, 4]
+        stiff = _STIFF if iteration < _STIFF_STEPS else 1.0
+        solution = _solve(A, part.levels * w, count, expected, stiff)
+        c, step = solution[:, :_N_LINEAR], solution[:, _N_LINEAR:]
+        step = np.clip(step, -_MAX_STEP, _MAX_STEP)
+        x[open_] = here + step
+        x[open_, 4] = np.clip(x[open_, 4], *np.log(_BLURS))
+        more = (np.abs(step[:, :2]).max(axis=1) >= _CONVERGED_PX) | (stiff > 1.0)
+        more &= np.abs(x[open_, :2] - part.origin).max(axis=1) <= 2.0 * _MAX_SHIFT_PX
+        coefficients[open_] = c
+        if not more.all():
+            open_, part, w, c = open_[more], part.choose(np.flatnonzero(more)), w[more], c[more]
+    return x, coefficients, np.zeros(0), np.zeros(0)
+
+
+def _solve(A: Array, levels: Array, count: Array, expected: Array, stiff: float = 1.0) -> Array:
+    """Return the coefficients (n, k) of functions (n, k, m) by least squares.
+
+    Those of overshoot and tones are near zero where *count* (n,) pixels are few.
+    """
+    n, k, _ = A.shape
+    ridge = np.full((n, k), 1e-9)
+    few = np.maximum(_MANY_PIXELS / np.maximum(count, 1.0), 1.0) ** 4
+    ridge[:, _OVERSHOOT] = (stiff * _RIDGE * few)[:, None]
+    if k > _N_LINEAR:
+        ridge[:, -1] = _BLUR_RIDGE
+    N = A @ np.swapaxes(A, 1, 2)
+    ridge *= np.maximum(np.trace(N, axis1=1, axis2=2) / k, 1e-9)[:, None]
+    N[:, np.arange(k), np.arange(k)] += ridge
+    rhs = (A @ levels[:, :, None])[:, :, 0] + ridge * expected
+    return np.asarray(np.linalg.solve(N, rhs[:, :, None])[:, :, 0])
+
+
+def _functions(window: _Window, x: Array, c: Array | None) -> Array:
+    """Return the linear functions (n, k, m), with coefficients their derivatives after them."""
+    dx = window.u - (x[:, :1] - window.origin[:, :1])
+    dy = window.v - (x[:, 1:2] - window.origin[:, 1:])
+    n, m = dx.shape
+    cos, sin = np.cos(x[:, 2:4]), np.sin(x[:, 2:4])
+    d = cos[:, :, None] * dy[:, None] - sin[:, :, None] * dx[:, None]
+    s = np.exp(x[:, 4])[:, None, None]
+    wide = np.hypot(s, _MASK_RADIUS)
+    t, tw = d / s, d / wide
+    S, T = erf(t / _SQRT2), erf(tw / _SQRT2)
+    G, H = np.exp(-0.5 * t * t), np.exp(-0.5 * tw * tw)
+    # Edges at a slant share their blur, which to first order adds a product of bells.
+    slant = (2.0 / np.pi) * np.cos(x[:, 2] - x[:, 3])[:, None]
+    both = slant * G[:, 0] * G[:, 1]
+    A = np.empty((n, _N_LINEAR + (_N_PLACED if c is not None else 0), m))
+    A[:, 0], A[:, 1], A[:, 2] = 1.0, dx, dy
+    P = S[:, 0] * S[:, 1] + both
+    A[:, 3], A[:, 4], A[:, 5] = P, P * dx, P * dy
+    A[:, 6], A[:, 7], A[:, 8] = T[:, 0] * S[:, 1], S[:, 0] * T[:, 1], T[:, 0] * T[:, 1]
+    A[:, 9], A[:, 10] = G.sum(axis=1), P * P
+    A[:, 11:13] = H
+    if c is None:
+        return A
+    k = (c[:, 3:4] + c[:, 4:5] * dx + c[:, 5:6] * dy)[:, None]
+    over, Q = c[:, 6:8, None], c[:, 8, None, None]
+    slope, slope_w = _SLOPE * G / s, _SLOPE * H / wide
+    other, other_w = S[:, ::-1], T[:, ::-1]
+    # by the distances in functions of the blur, and of the wide one
+    tone = k + (2.0 * c[:, 10:11] * P)[:, None]
+    by_s = tone * (slope * other - both[:, None] * t / s) + over[:, ::-1] * slope * other_w
+    by_s -= c[:, 9, None, None] * t / s * G
+    by_w = over * slope_w * other + Q * slope_w * other_w - c[:, 11:13, None] * tw / wide * H
+    by_d = by_s + by_w
+    along = cos[:, :, None] * dx[:, None] + sin[:, :, None] * dy[:, None]
+    A[:, -5] = (sin[:, :, None] * by_d).sum(axis=1)
+    A[:, -4] = -(cos[:, :, None] * by_d).sum(axis=1)
+    A[:, -3:-1] = -by_d * along
+    A[:, -1] = -(d * by_s).sum(axis=1) - ((s / wide) ** 2 * d * by_w).sum(axis=1)
+    return A
+
+
+def _judged(window: _Window, weight: Array, x: Array, start: Array, turns: Array) -> Saddles:
+    """Return the crossings with what their residuals are worth."""
+    n, k = len(x), _N_LINEAR + _N_PLACED
+    L = _functions(window, x, None) * weight[:, None]
+    count = weight.sum(axis=1)
+    c = _solve(L, window.levels * weight, count, np.zeros((n, _N_LINEAR)))
+    residual = window.levels * weight - (c[:, None] @ L)[:, 0]
+    A = _functions(window, x, c) * weight[:, None]
+    rms = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(count - k, 1.0))
+    P = L[:, 3]
+    contrast = np.sum(P * (window.levels * weight - c[:, :1] * L[:, 0]), axis=1)
+    contrast /= np.maximum(np.sum(P * P, axis=1), 1e-9)
+    size = np.maximum(np.abs(contrast), 1e-9)
+    turn = np.abs(np.angle(np.exp(1j * (x[:, 2:4] - turns)))).max(axis=1)
+    s = np.exp(x[:, 4])
+    narrow = c[:, 3] + 0.5 * (c[:, 6] + c[:, 7])
+    slope = narrow / s + (0.5 * (c[:, 6] + c[:, 7]) + c[:, 8]) / np.hypot(s, _MASK_RADIUS)
+    slope /= np.where(contrast == 0.0, 1.0, contrast)
+    found = count >= _MIN_PIXELS
+    found &= np.linalg.norm(x[:, :2] - start, axis=1) < _MAX_SHIFT_PX
+    found &= (turn < _MAX_TURN) & (size * window.scale > MIN_CONTRAST)
+    found &= (rms < _MAX_MISFIT * size) & (slope > 1.0 / _BLURS[1])
+    variance = np.zeros(n)
+    if found.any():
+        variance[found] = _variance(A[found], residual[found], rms[found], window.side)
+    found &= variance < _MAX_SHIFT_PX**2
+    return Saddles(
+        x[:, :2],
+        np.hypot(np.sqrt(variance), _MIN_SIGMA_PX),
+        1.0 / np.maximum(slope, 1e-3),
+        contrast * window.scale,
+        rms / size,
+        found,
+    )
+
+
+def _variance(A: Array, residual: Array, rms: Array, side: int) -> Array:
+    """Return the variance of either coordinate (n,) [px^2], residuals being correlated.
+
+    Neighbouring residuals are alike where colours are filled in, a JPEG is coarse or the model is
+    not all; the correlation is that of all crossings of the image.
+    """
+    n, k, _ = A.shape
+    N = A @ np.swapaxes(A, 1, 2)
+    N[:, np.arange(k), np.arange(k)] += 1e-9 * np.trace(N, axis1=1, axis2=2)[:, None] / k
+    columns = np.zeros((n, k, 2))
+    columns[:, [_N_LINEAR, _N_LINEAR + 1], [0, 1]] = 1.0
+    pull = np.swapaxes(np.linalg.solve(N, columns), 1, 2) @ A  # (n, 2, m): place by level
+    g = pull.reshape(n, 2, side, side)
+    r = (residual / np.maximum(rms, 1e-12)[:, None]).reshape(n, side, side)
+    used = (np.abs(A[:, 0]) > 0.0).reshape(n, side, side).astype(np.float64)
+    total = np.zeros(n)
+    for i in range(_LAGS + 1):
+        for j in range(-_LAGS if i else 0, _LAGS + 1):
+            a = (slice(0, side - i), slice(max(-j, 0), side - max(j, 0)))
+            b = (slice(i, side), slice(max(j, 0), side + min(j, 0)))
+            pairs = float(np.sum(used[:, *a] * used[:, *b]))
+            alike = float(np.sum(r[:, *a] * r[:, *b])) / max(pairs, 1.0) if i or j else 1.0
+            twice = 2.0 if i or j else 1.0
+            total += twice * alike * np.sum(g[:, :, *a] * g[:, :, *b], axis=(1, 2, 3))
+    alone = np.sum(pull**2, axis=(1, 2))
+    return np.asarray(0.5 * np.maximum(total, alone) * rms**2)
