@@ -158,12 +158,16 @@ def _set(*keys: str | int, by: Any) -> Callable[[Folder], None]:
     return change
 
 
+STATED = {"version": 1, "sigma": {}, "names": ["fx"], "covariance": [[4.0]]}
+
+
 @pytest.mark.parametrize(
     "change",
     [
         _change_image,
         _set("rows", 0, JOINTS[0], by=1e-7),
         _set("camera", "camera_matrix", "data", 2, by=0.01),
+        _set("camera", "legcal_camera", by=STATED),
         _set("entry", "views", "c1", "gamma", by=0.2),
         _set("entry", "views", "c1", "T_base_camera", "xyz", 0, by=0.01),
         _set("entry", "views", "c2", "legs", by=["leg1"]),
