@@ -573,4 +573,4 @@ def _compression_note(dataset: Dataset, solution: Solution) -> list[str]:
         if source == "detected"
     }
     facts = {image: found for image, found in dataset.facts.items() if image in measured}
-    return compression_note(measurements, facts, solution.noise.scale)
+    return compression_note(measurements, facts, solution.rms_px or 0.0, solution.noise.scale)

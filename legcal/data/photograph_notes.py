@@ -123,7 +123,7 @@ def _of_view(
 
 
 def compression_note(
-    measurements: Measurements, facts: Mapping[str, ImageFacts], scatter: float
+    measurements: Measurements, facts: Mapping[str, ImageFacts], rms_px: float, scale: float
 ) -> list[str]:
     """Return a note on photographs that were compressed with much loss.
 
@@ -133,7 +133,9 @@ def compression_note(
         Their rows.
     facts : mapping
         What the files of images say, by the names of the images.
-    scatter : float
+    rms_px : float
+        How far outlines are from the fit, root mean square [px].
+    scale : float
         Noise of outlines over what the noise of the pixels around them explains.
     """
     by_quality: dict[int, set[int]] = {}
@@ -153,8 +155,8 @@ def compression_note(
         for views, qualities in of_views.items()
     ]
     return [
-        f"Lossy compression moves outlines: found {', '.join(parts)}, and outlines that scatter "
-        f"{scatter:.2f} times as much as the noise of their pixels explains, which the stated "
-        "uncertainty includes; store photographs without loss (PNG, TIFF) or as JPEGs of quality "
-        f"{GOOD_QUALITY} or more."
+        f"Lossy compression moves outlines: found {', '.join(parts)}, and outlines that are "
+        f"{rms_px:.2f} px off (rms), with {scale:.2f} times the noise that their pixels explain, "
+        "which the stated uncertainty includes; store photographs without loss (PNG, TIFF) or as "
+        f"JPEGs of quality {GOOD_QUALITY} or more."
     ]
