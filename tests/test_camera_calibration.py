@@ -29,6 +29,7 @@ from legcal.calibration.camera_calibration.diagnostics import (
     refuse_undetermined,
     warnings,
 )
+from legcal.calibration.camera_calibration.lens import chosen_lens, given_lens
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
 from legcal.geometry import Array
 from legcal.perception import BoardImages, SeenBoard
@@ -201,6 +202,34 @@ def test_two_groups_of_one_size_are_refused_and_named() -> None:
     few = replace(found, rival=(), images=found.images[:5], left_out=dict.fromkeys(range(7), "?"))
     with pytest.raises(NotIdentifiable, match="only 5 of 12 images agree"):
         refuse_divided(few, [f"{k}.jpg" for k in range(12)])
+
+
+def test_images_choose_the_lens_model() -> None:
+    """A fisheye, which plumb_bob follows in the middle only."""
+    seen = seen_corners(CAMERAS["equidistant"], 8, 1)
+    chosen = chosen_lens(seen, SIZE)
+    assert chosen is not None
+    assert chosen.fit.adjusted.camera.model == "equidistant"
+    assert "plumb_bob" in chosen.why
+    assert chosen.fit.left_out == {}
+    assert np.abs(pulls(chosen.fit, "equidistant")).max() < 3.0
+    assert chosen.validated_px is not None
+    residual_px = np.sqrt(np.mean(np.sum(chosen.fit.adjusted.residual**2, axis=1)))
+    assert residual_px < chosen.validated_px < 1.5 * residual_px
+
+
+def test_the_simplest_lens_model_stays_where_it_fits_and_a_given_one_is_warned_of() -> None:
+    seen = seen_corners(TRUTH, 8, 1)
+    chosen = chosen_lens(seen, SIZE)
+    assert chosen is not None
+    assert chosen.fit.adjusted.camera.model == "plumb_bob"
+    bulge = seen.px - [320.0, 240.0]
+    far = np.sum((bulge / 400.0) ** 2, axis=1, keepdims=True)
+    ripple = replace(seen, px=seen.px + 0.02 * bulge * np.cos(18.0 * far) * far)
+    given = given_lens(ripple, SIZE, "plumb_bob")
+    assert given is not None
+    assert "as given" in given.why
+    assert "leave out --model" in " ".join(given.warnings)
 
 
 def test_noise_that_corners_do_not_claim_is_seen_and_counted() -> None:

@@ -40,8 +40,9 @@ def camera(
         Path, typer.Option("--output", "-o", metavar="FILE", help="The camera_info YAML to write.")
     ],
     model: Annotated[
-        DistortionModel, typer.Option(help="How the lens distorts; equidistant for a fisheye.")
-    ] = "plumb_bob",
+        DistortionModel | None,
+        typer.Option(help="How the lens distorts; chosen by the images where it is not given."),
+    ] = None,
     workers: WorkersOption = None,
     as_json: JsonOption = False,
 ) -> None:

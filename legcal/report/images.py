@@ -44,7 +44,20 @@ def camera_table(found: CameraCalibration, output: Path) -> RenderableType:
         title,
         table("image", ">corners", ">residual", ">tilt", rows=images),
         table("", ">value", ">sigma", rows=numbers),
+        _model_and_sheet(found),
         [*warnings, f"Written to {output}."],
+    )
+
+
+def _model_and_sheet(found: CameraCalibration) -> str:
+    """Return why the lens model was taken, and what the board is like, in sentences."""
+    unseen = (
+        "" if found.validated_px is None else f", {found.validated_px:.3f} px off in new images"
+    )
+    bend = 1e3 * np.abs(found.sheet[:3]).max()
+    return (
+        f"Lens model {found.lens}{unseen}. The board is bent by up to {bend:.2g} mm, and printed "
+        f"{100.0 * found.sheet[3]:+.2g} +- {100.0 * found.sheet_sigma[3]:.2g} % wider than high."
     )
 
 

@@ -11,11 +11,7 @@ from typing import get_args
 
 import numpy as np
 
-from legcal.calibration.camera_calibration.adjustment import (
-    MIN_CORNERS,
-    RobustFit,
-    robust_fit,
-)
+from legcal.calibration.camera_calibration.adjustment import MIN_CORNERS
 from legcal.calibration.camera_calibration.diagnostics import (
     MIN_IMAGES,
     coverage,
@@ -31,10 +27,12 @@ from legcal.calibration.camera_calibration.document import (
     ImageResult,
     write_camera,
 )
+from legcal.calibration.camera_calibration.lens import ChosenLens, chosen_lens, given_lens
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
 from legcal.files import MAX_IMAGE, describe, read_bytes
 from legcal.geometry import Array
 from legcal.perception import (
+    SHEET,
     BoardImages,
     NumberedCorners,
     SeenBoard,
@@ -71,7 +69,7 @@ def calibrate_camera(
     images: str | Path | Sequence[str | Path],
     board: str | Path | Board,
     *,
-    model: DistortionModel = "plumb_bob",
+    model: DistortionModel | None = None,
     output: str | Path | None = None,
     progress: Report = no_progress,
     workers: int = 1,
@@ -85,8 +83,9 @@ def calibrate_camera(
     board : str, Path or Board
         Such as ``chessboard:9x6:25mm`` (squares), or a YAML file with the block ``board`` of a
         dataset. Its size does not matter here, its proportions do.
-    model : {"plumb_bob", "rational_polynomial", "equidistant"}
-        How the lens distorts.
+    model : {"plumb_bob", "rational_polynomial", "equidistant"}, optional
+        How the lens distorts. Chosen by the images where it is not given: plumb_bob unless its
+        residuals lean over the field and a richer model predicts other images better.
     output : path, optional
         Write a ROS camera_info file there, with the standard deviations of all numbers.
     progress : callable
@@ -112,7 +111,7 @@ def calibrate_camera(
     DidNotConverge
         If no camera explains the corners.
     """
-    if model not in get_args(DistortionModel):
+    if model is not None and model not in get_args(DistortionModel):
         raise UsageError(
             f"The camera could not be calibrated: found the model {model!r}, needed "
             f"{', '.join(get_args(DistortionModel))}; correct it."
@@ -134,17 +133,19 @@ def calibrate_camera(
     if len(shown) < MIN_IMAGES:
         raise too_few_images(len(shown), [paths[k].name for k in shown])
     progress("Adjusting the camera", 0, 1)
-    fitted = robust_fit(_table(flat_board, [found[k] for k in shown]), size, model)
+    table = _table(flat_board, [found[k] for k in shown])
+    lens = chosen_lens(table, size) if model is None else given_lens(table, size, model)
     progress("Adjusting the camera", 1, 1)
-    if fitted is None:
+    if lens is None:
         raise DidNotConverge(
-            f"The camera could not be calibrated: found no {model} camera that explains the "
-            "corners, needed one; check the board and the model of the lens."
+            f"The camera could not be calibrated: found no {model or 'lens model'} that explains "
+            "the corners, needed one; check the board and the model of the lens."
         )
+    fitted = lens.fit
     refuse_divided(fitted, [paths[k].name for k in shown])
     left_out = [f"{paths[shown[k]].name}: {why}" for k, why in fitted.left_out.items()]
     refuse_undetermined(fitted, [paths[shown[k]].name for k in fitted.images], left_out)
-    result = _result(flat_board, paths, found, shown, fitted, note)
+    result = _result(flat_board, paths, found, shown, lens, note)
     used = [k for k, image in enumerate(result.images) if image.used]
     changes = _changes([paths[k] for k in used], [facts[k] for k in used], size)
     result = replace(
@@ -220,10 +221,11 @@ def _result(
     paths: Sequence[Path],
     found: Sequence[NumberedCorners],
     shown: Sequence[int],
-    fitted: RobustFit,
+    lens: ChosenLens,
     note: str,
 ) -> CameraCalibration:
     """Return the camera with what it rests on."""
+    fitted = lens.fit
     adjusted, seen = fitted.adjusted, fitted.seen
     used = {shown[k]: i for i, k in enumerate(fitted.images)}
     left_out = {shown[k]: why for k, why in fitted.left_out.items()}
@@ -250,7 +252,18 @@ def _result(
         rms_px=float(np.sqrt(np.mean(square))),
         noise_px=float(np.sqrt(square.sum() / n_dof)),
         coverage=coverage(fitted),
-        warnings=(*([note] if note else []), *_left_out(images), *warnings(fitted)),
+        sheet=fitted.sheet,
+        sheet_covariance=fitted.all_covariance[-len(SHEET) :, -len(SHEET) :],
+        error_ratio=float(np.sqrt(fitted.ratio)),
+        lens=lens.why,
+        validated_px=lens.validated_px,
+        corners=np.concatenate([seen.px, adjusted.residual], axis=1),
+        warnings=(
+            *([note] if note else []),
+            *_left_out(images),
+            *lens.warnings,
+            *warnings(fitted),
+        ),
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from legcal.files import Document, YamlOutput
 from legcal.geometry import Array
+from legcal.perception import SHEET
 from legcal.vision import CALIBRATED, Board, Camera, camera_info, intrinsic_names, intrinsic_values
 
 CAMERA_FILE = YamlOutput(
@@ -70,6 +71,19 @@ class CameraCalibration:
         Share of the image inside the convex hull of all corners.
     warnings : tuple of str
         What is wrong with it, one sentence each.
+    sheet : (4,) array
+        How the board is bent along x and y, twisted [m], and how much wider it is printed.
+    sheet_covariance : (4, 4) array
+        Covariance of these.
+    error_ratio : float
+        Errors that images disagree by, or residuals, over what corners claim.
+    lens : str
+        The lens model, and why it was taken.
+    validated_px : float or None
+        Root mean square of residuals of images that the camera was not calibrated with [px]; None
+        if there are fewer than four images.
+    corners : (n, 4) array
+        Where corners that were used were seen, and their residuals [px].
     photographs : mapping
         What the files of the used images say of how they were made: the distinct values of each
         fact, by its key in the camera file.
@@ -83,6 +97,12 @@ class CameraCalibration:
     noise_px: float
     coverage: float
     warnings: tuple[str, ...]
+    sheet: Array
+    sheet_covariance: Array
+    error_ratio: float
+    lens: str
+    validated_px: float | None
+    corners: Array
     photographs: Mapping[str, Sequence[Any]] = field(default_factory=dict)
 
     @property
@@ -100,8 +120,14 @@ class CameraCalibration:
         """Their standard deviations, (k,) [px, and without unit]."""
         return np.sqrt(np.diag(self.covariance))
 
+    @property
+    def sheet_sigma(self) -> Array:
+        """Standard deviations of the numbers of the sheet, (4,)."""
+        return np.sqrt(np.diag(self.sheet_covariance))
+
     def document(self) -> dict[str, Any]:
         """Return what ``--json`` prints."""
+        sheet = zip(SHEET, self.sheet.tolist(), self.sheet_sigma.tolist(), strict=True)
         numbers = zip(self.names, self.values.tolist(), self.sigma.tolist(), strict=True)
         return CameraDocument(
             legcal_camera=1,
@@ -125,11 +151,15 @@ class CameraCalibration:
                 for image in self.images
             ],
             warnings=list(self.warnings),
+            lens=self.lens,
+            validated_px=self.validated_px,
+            error_ratio=self.error_ratio,
+            sheet=[Intrinsic(name=name, value=v, sigma=sigma) for name, v, sigma in sheet],
         ).document()
 
 
 class Intrinsic(Document):
-    """A number of the camera [px, or without unit]."""
+    """A number of the camera or of the sheet [px, m, or without unit]."""
 
     name: str
     value: float
@@ -161,6 +191,10 @@ class CameraDocument(Document):
     coverage: float
     images: list[BoardImage]
     warnings: list[str]
+    lens: str
+    validated_px: float | None
+    error_ratio: float
+    sheet: list[Intrinsic]
 
 
 def write_camera(calibration: CameraCalibration, path: Path) -> None:
@@ -178,6 +212,14 @@ def write_camera(calibration: CameraCalibration, path: Path) -> None:
         "version": 1,
         "rms_px": _short(calibration.rms_px),
         "coverage": _short(calibration.coverage),
+        "lens": calibration.lens,
+        "validated_px": calibration.validated_px and _short(calibration.validated_px),
+        "sheet": {
+            name: {"value": _short(v), "sigma": _short(s)}
+            for name, v, s in zip(
+                SHEET, calibration.sheet.tolist(), calibration.sheet_sigma.tolist(), strict=True
+            )
+        },
         "sigma": {name: _short(s) for name, s in zip(names, sigma, strict=True)},
         "names": list(names),
         "covariance": calibration.covariance.tolist(),
