@@ -13,9 +13,9 @@ from dataset_folder import SIZE, Folder, folder
 from fuzzing.mutations import mutate
 from photograph_files import exif, jpeg, png, tiff
 
-from legcal import calibrate_camera, load_dataset
+from legcal import calibrate, calibrate_camera, load_dataset
 from legcal.data import compression_note
-from legcal.errors import DatasetError
+from legcal.errors import DatasetError, NotVisible
 from legcal.vision import ImageFacts, read_camera, read_facts
 
 __all__ = ["folder"]
@@ -144,6 +144,15 @@ def test_an_image_unlike_the_others_is_named_with_the_difference(
         del folder.entry["views"]["c2"]
     (note,) = notes(folder, {1: content})
     assert [word for word in [*ONE, *words] if word not in note] == []
+
+
+def test_a_refusal_names_what_may_be_its_cause(folder: Folder) -> None:
+    del folder.entry["views"]["c2"]["legs"]
+    (note,) = notes(folder, {1: phone(zoom=2.0)})
+    with pytest.raises(NotVisible) as refused:
+        calibrate(folder.path)
+    assert len(refused.value.problems) > 1
+    assert refused.value.problems[-1] == note
 
 
 @pytest.mark.parametrize(

@@ -234,6 +234,8 @@ def calibrate(
 def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Options) -> Estimate:
     """Recognise and measure all images, and fit some of them: phases 2 to 5 of the method.
 
+    A refusal also has what files of photographs say against their camera: it may be the cause.
+
     Raises
     ------
     NotVisible, NotIdentifiable, DidNotConverge
@@ -241,13 +243,18 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
     """
     rows = data.rows_of(file_rows)
     try:
+        try:
+            return _estimate(data, rows, options)
+        except NotIdentifiable:
+            if not data.plan.is_cached:
+                raise
+        # Outlines that an earlier run left do not always determine the cameras; images do.
+        data = replace(data, plan=plan_dataset(data.dataset, ""))
         return _estimate(data, rows, options)
-    except NotIdentifiable:
-        if not data.plan.is_cached:
+    except (NotVisible, NotIdentifiable, DidNotConverge) as error:
+        if not data.dataset.file_notes:
             raise
-    # Outlines that an earlier run left do not always determine the cameras; images do.
-    data = replace(data, plan=plan_dataset(data.dataset, ""))
-    return _estimate(data, rows, options)
+        raise type(error)([*error.problems, *data.dataset.file_notes]) from error
 
 
 def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimate:

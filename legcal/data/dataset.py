@@ -64,6 +64,7 @@ class Dataset:
     corners: Corners | None = None  # the rows of ``corners.csv`` if there is one
     # What the files of images say of themselves, by the names of those that were looked at
     facts: Mapping[str, ImageFacts] = field(default_factory=dict)
+    file_notes: tuple[str, ...] = ()  # those of the notes that come from these
 
     def image_path(self, row: int) -> Path | None:
         """Return the image file of a row; None where only outlines are given."""
@@ -193,8 +194,9 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     facts, problems = inspect_rows(dataset, of_hand)
     if problems:
         raise DatasetError(problems)
-    of_files = photograph_notes(measurements, dataset.camera_paths, facts)
-    return replace(dataset, notes=(*dataset.notes, *of_files), facts=facts)
+    of_files = tuple(photograph_notes(measurements, dataset.camera_paths, facts))
+    notes = (*dataset.notes, *of_files)
+    return replace(dataset, notes=notes, facts=facts, file_notes=of_files)
 
 
 def _refuse_two_tables(folder: Path) -> None:
