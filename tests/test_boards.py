@@ -203,6 +203,23 @@ def test_corners_of_a_blurred_picture_have_larger_sigmas() -> None:
     assert np.sqrt(np.mean((error / sigma[:, None]) ** 2)) < 1.6
 
 
+@pytest.mark.parametrize("board", BOARDS, ids=lambda b: b.kind)
+def test_images_of_anything_else_show_no_board(board: Board) -> None:
+    rng = np.random.default_rng(1)
+    for shape in ((1, 1), (2, 9), (60, 80)):
+        for image in (np.zeros(shape), rng.normal(100.0, 2.0, shape), rng.uniform(0, 255, shape)):
+            assert len(find_corners(board, image)[0]) == 0
+
+
+def test_tags_of_a_blurred_picture_are_read() -> None:
+    """No module of a tag is told from the next by OpenCV before the image is sharpened."""
+    T = before(APRILGRID)
+    number, px, sigma = find_corners(APRILGRID, picture(APRILGRID, T, blur=3.2))
+    error = px - seen_at(APRILGRID, T)[number]
+    assert len(number) >= 0.9 * APRILGRID.n_corners
+    assert np.sqrt(np.mean((error / sigma[:, None]) ** 2)) < 2.0
+
+
 @pytest.mark.parametrize("scale", [2, 1.6, 0.7])
 def test_pixels_of_a_rescaled_image_are_put_back_where_they_were(scale: float) -> None:
     """Corners of small boards are searched in an enlarged image, of large images in a smaller."""

@@ -19,7 +19,7 @@ from legcal.errors import NotVisible
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.corner_lattice import Print, expected, find_lattice, measured
 from legcal.perception.placement import Load
-from legcal.perception.saddles import Saddles
+from legcal.perception.saddles import Saddles, fit_saddles
 from legcal.progress import Report
 from legcal.vision import (
     APRIL_TAGS,
@@ -42,6 +42,7 @@ _FRAME = 0.2  # of the side of a tag that its black frame is wide, as Kalibr pri
 _SEARCHED = (300_000, 1_200_000, 80_000)  # pixels of the images in which lattices are searched
 _MAX_BLUR = 2.2  # [px]: more is measured in a smaller image,
 _MEASURED_BLUR = 1.4  # where it is so much
+_N_ASKED = 9  # corners by which the blur is known
 _SAME = 0.45  # scale of a search from which on corners are found in the image itself
 _MIN_LINE = 0.34  # of the corners of the line inside it, that an outer line of a lattice has
 _MIN_SIDE = 3  # corners along the sides of a chessboard whose extent counts
@@ -177,22 +178,26 @@ def _measured_twice(
     One that is blurred over many pixels is made smaller for that.
     """
     blur = 0.0
-    if scale < _SAME or board.x is not None:
+    if len(ij) and (scale < _SAME or scale > 1.0):
         ij, found = measured(rescaled(grey, scale), board, ij, px, grow=False)
-        px = found.px
-        if len(ij):
-            blur = float(np.median(found.blur_px)) / scale
-    px = reduced(px, scale)
+        px, blur = reduced(found.px, scale), _usual_blur(found) / scale
+    elif len(ij):
+        px = reduced(px, scale)
+        some = np.linspace(0, len(ij) - 1, min(_N_ASKED, len(ij))).astype(np.intp)
+        _, axes = expected(board.xy(ij), px, board.xy(ij[some]), board.pitch)
+        blur = _usual_blur(fit_saddles(grey, px[some], axes, board.length, board.band))
     if blur <= _MAX_BLUR:
-        ij_here, found = measured(grey, board, ij, px)
-        if not len(ij_here) or np.median(found.blur_px) <= _MAX_BLUR:
-            return ij_here, found
-        ij, px, blur = ij_here, found.px, float(np.median(found.blur_px))
+        return measured(grey, board, ij, px)
     scale = _MEASURED_BLUR / blur
     small = rescaled(grey, scale)
     both = np.array(small.shape[::-1]) / grey.shape[::-1]  # of columns and rows, which are whole
     ij, found = measured(small, board, ij, (px + 0.5) * both - 0.5)
     return ij, found.moved_to((found.px + 0.5) / both - 0.5, scale)
+
+
+def _usual_blur(found: Saddles) -> float:
+    """Return the blur of most corners [px]; 0 without any."""
+    return float(np.median(found.blur_px[found.found])) if found.found.any() else 0.0
 
 
 def _without_loose_lines(ij: IntArray) -> BoolArray:
@@ -227,6 +232,7 @@ _MIN_PERIMETER = 0.01  # perimeter of a marker, as a part of the longer side of 
 _BORDERS = (2, 1)  # modules of the black frame of a tag: Kalibr's, and the usual one
 _MARKERS_SEARCHED = 1_200_000  # pixels of the image in which markers are searched first
 _MAX_PIXELS = 24_000_000  # of an image in which OpenCV looks for markers
+_SHARPENED, _SHARPENED_PX = 4.0, 2.5  # unsharp mask by which blurred modules are told apart
 _ENLARGED = 2.0  # modules may be only a few pixels wide
 _ANCHORS_OFF = 0.3  # of a pitch that corners of markers are from where the others put them
 _FIRST_TAG = 0xD5D628584  # of the family 36h11, its modules row by row from the top left
@@ -236,8 +242,8 @@ def _tags_and_corners(board: Board, grey: Grey) -> tuple[IntArray, Saddles]:
     """Return columns and rows of the corners beside markers or tags, and where they are."""
     board_print = _print(board)
     best: tuple[IntArray, Saddles] | None = None
-    for scale in _marker_scales(grey):
-        tags, places = _search_tags(board, grey, scale)
+    for scale, is_blurred in _marker_searches(grey):
+        tags, places = _search_tags(board, grey, scale, is_blurred=is_blurred)
         xy, px = _anchors(board, tags, places)
         if not len(xy):
             continue
@@ -255,11 +261,16 @@ def _tags_and_corners(board: Board, grey: Grey) -> tuple[IntArray, Saddles]:
     )
 
 
-def _marker_scales(grey: Grey) -> list[float]:
-    """Return the scales at which markers are searched, one after the other."""
-    scales = [possible_scale(grey, scale, pixels) for scale, pixels in (
-        (1.0, _MARKERS_SEARCHED), (1.0, _MAX_PIXELS), (_ENLARGED, _MAX_PIXELS))]  # fmt: skip
-    return list(dict.fromkeys(scales))
+def _marker_searches(grey: Grey) -> list[tuple[float, bool]]:
+    """Return how markers are searched, one way after the other: scale, and whether sharpened."""
+    wanted = (
+        (1.0, _MARKERS_SEARCHED, False),
+        (1.0, _MARKERS_SEARCHED, True),
+        (1.0, _MAX_PIXELS, False),
+        (_ENLARGED, _MAX_PIXELS, False),
+    )
+    ways = [(possible_scale(grey, scale, pixels), sharp) for scale, pixels, sharp in wanted]
+    return list(dict.fromkeys(ways))
 
 
 def _anchors(board: Board, tags: IntArray, places: Array) -> tuple[Array, Array]:
@@ -301,14 +312,20 @@ def _near_anchors(board: Print, xy: Array) -> IntArray:
     return np.asarray(ij[gap < 0.75 * board.pitch])
 
 
-def _search_tags(board: Board, grey: Grey, scale: float) -> tuple[IntArray, Array]:
+def _search_tags(
+    board: Board, grey: Grey, scale: float, *, is_blurred: bool = False
+) -> tuple[IntArray, Array]:
     """Return the tags or markers in an image, of whatever board of the same dictionary.
 
-    Returns numbers (n,); places (n, 4, 2) [px] anticlockwise from the lower left of a tag.
+    A blurred image is sharpened for it. Returns numbers (n,); places (n, 4, 2) [px] anticlockwise
+    from the lower left of a tag.
     """
     ids, found = np.zeros(0, dtype=np.intp), np.zeros((0, 4, 2))
     # Where it becomes smaller that is first, as the conversion takes memory.
     image = _eight_bits(rescaled(grey, scale)) if scale < 1 else rescaled(_eight_bits(grey), scale)
+    if is_blurred:
+        soft = cv2.GaussianBlur(image, (0, 0), _SHARPENED_PX)
+        image = np.asarray(cv2.addWeighted(image, 1.0 + _SHARPENED, soft, -_SHARPENED, 0.0))
     for border in _BORDERS if board.kind == "aprilgrid" else (1,):
         detector = cv2.aruco.ArucoDetector(dictionary(board.dictionary), _parameters(border))
         corners, numbers, _ = detector.detectMarkers(image)

@@ -290,7 +290,8 @@ def expected(
     square = np.sum(away**2, axis=2)
     if without_own:
         square[np.arange(len(at)), np.arange(len(at))] = np.inf
-    nearest = np.sort(square, axis=1)[:, : min(8, len(xy))].mean(axis=1, keepdims=True)
+    others = min(8, len(xy) - without_own)
+    nearest = np.sort(square, axis=1)[:, :others].mean(axis=1, keepdims=True)
     reach = np.maximum(nearest, 0.5 * _NEAR**2)
     weight = np.exp(-0.5 * square / reach) + np.where(np.isfinite(square), 1e-6, 0.0)
     x, y = away[..., 0], away[..., 1]

@@ -13,22 +13,28 @@ about the crossing, so that none of them moves it. All crossings of an image are
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import erf
 
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.vision import Grey
 
+_Levels = NDArray[np.floating[Any]]
+
 MIN_CONTRAST = 4.0  # grey levels of 255
 
 _REACH = 9  # pixels of the window to each side, at most
 _N_LINEAR, _N_PLACED = 13, 5  # coefficients; place, two angles, logarithm of the blur
-_SQRT2, _SLOPE = np.sqrt(2.0), np.sqrt(2.0 / np.pi)
+_SQRT2, _SLOPE = math.sqrt(2.0), math.sqrt(2.0 / math.pi)
+_MIN_AREA = 1e-6  # [px^2 / unit^2] between axes that are not one line
 _MIN_PIXELS = 24  # pixels that a fit needs
 _ITERATIONS = 12
-_CONVERGED_PX = 2e-3
+_CONVERGED_PX = 4e-3
 _MAX_STEP = np.array([1.0, 1.0, 0.2, 0.2, 0.4])  # [px, px, rad, rad, 1]
 _START_BLUR = 0.8  # [px]
 _MASK_RADIUS = 1.3  # of the blurred copy: cameras have 1 to 1.5 px [px]
@@ -37,6 +43,7 @@ _MANY_PIXELS = 200  # fewer do not tell overshoot from other shapes of an edge
 _OVERSHOOT = [6, 7, 8, 10, 11, 12]  # functions of it, and of tones
 _BLUR_RIDGE = 1e-3
 _STIFF, _STIFF_STEPS = 100.0, 2  # times that, in the first steps
+_OTHER_PX = 0.3  # by which the strip beside the edges is another that is used again
 _BLUR_SIGMAS = 1.5  # standard deviations of the blur that reach beside an edge
 _MIN_BAND = 0.5  # of what is free beside an edge that is used at least
 _MAX_SHIFT_PX = 2.5  # of the result from the start
@@ -83,22 +90,37 @@ def fit_saddles(
     if not len(start):
         none = np.zeros(0)
         return Saddles(np.zeros((0, 2)), none, none, none, none, np.zeros(0, dtype=np.bool_))
-    steps = np.linalg.norm(axes, axis=1)
+    height, width = grey.shape
+    at = np.where(np.isfinite(start), start, -1.0)
+    there = np.all((at > -0.5) & (at < [width - 0.5, height - 0.5]), axis=1)
+    start = np.where(there[:, None], at, 0.0)
+    axes = np.where((there & np.isfinite(axes).all(axis=(1, 2)))[:, None, None], axes, 0.0)
+    steps = np.maximum(np.linalg.norm(axes, axis=1).min(axis=1), 1e-9)
     turns = np.arctan2(axes[:, 1], axes[:, 0])
-    window = _Window.around(grey, start, axes, length)
-    free = np.maximum(
-        band - (0.5 + _BLUR_SIGMAS * _START_BLUR) / steps.min(axis=1), _MIN_BAND * band
-    )
-    x = np.column_stack([start, turns, np.full(len(start), np.log(_START_BLUR))])
-    weight = window.weight(length, free)
-    x, _, _, _ = _fit(window, weight, x)
-    # The first fit gives how far blur reaches from what else is printed.
-    wide = np.maximum(
-        band - (0.5 + _BLUR_SIGMAS * np.exp(x[:, 4])) / steps.min(axis=1), _MIN_BAND * band
-    )
-    if np.any(np.abs(wide - free) * steps.min(axis=1) > 0.5):
-        weight = window.weight(length, wide)
-        x, _, _, _ = _fit(window, weight, x)
+    reach = int(np.clip(np.ceil(length * np.abs(axes).sum(axis=2).max()), 3, _REACH))
+    window = _Window.around(grey, start, axes, reach)
+
+    def free(blur: Array) -> Array:
+        return np.asarray(np.maximum(band - (0.5 + _BLUR_SIGMAS * blur) / steps, _MIN_BAND * band))
+
+    none = np.zeros((len(start), 2))
+    x = np.column_stack([none, turns, np.full(len(start), np.log(_START_BLUR))])
+    at_first = free(np.full(len(start), _START_BLUR))
+    weight = window.weight(length, at_first)
+    x = _fit(window, weight, x)
+    # The first fit gives how far blur reaches from what else is printed, and where the edges are.
+    now = free(np.exp(x[:, 4]))
+    other = np.abs(now - at_first) * steps > _OTHER_PX
+    other |= (np.linalg.norm(x[:, :2], axis=1) > _OTHER_PX) & (now * steps < reach)
+    other &= np.linalg.norm(x[:, :2], axis=1) < _MAX_SHIFT_PX
+    if other.any():
+        start = start.copy()
+        start[other] += x[other, :2]
+        x[other, :2] = 0.0
+        part = _Window.around(grey, start[other], axes[other], reach)
+        window.put(other, part)
+        weight[other] = part.weight(length, now[other])
+        x[other] = _fit(part, weight[other], x[other])
     return _judged(window, weight, x, start, turns)
 
 
@@ -107,7 +129,6 @@ class _Window:
     """The pixels around places: columns and rows (n, m) less the place, levels (n, m)."""
 
     side: int  # pixels along a side; m is its square
-    origin: Array  # (n, 2)
     u: Array
     v: Array
     levels: Array  # normalised: by half of their range, about their mean
@@ -116,13 +137,11 @@ class _Window:
     on_board: Array  # (n, 2, m) how far along the axes [unit], without sign
 
     @classmethod
-    def around(cls, grey: Grey, start: Array, axes: Array, length: float) -> _Window:
-        """Return the pixels that are within a length along both axes."""
+    def around(cls, grey: Grey, start: Array, axes: Array, reach: int) -> _Window:
+        """Return the pixels that are within a reach [px]."""
         height, width = grey.shape
-        extent = length * float(np.abs(axes).sum(axis=2).max())
-        reach = int(np.clip(np.ceil(extent), 3, _REACH))
-        d = np.arange(-reach, reach + 1)
-        rows, columns = (g.ravel() for g in np.meshgrid(d, d, indexing="ij"))
+        near = np.arange(-reach, reach + 1)
+        rows, columns = (g.ravel() for g in np.meshgrid(near, near, indexing="ij"))
         middle = np.rint(start).astype(np.intp)
         column, row = middle[:, :1] + columns, middle[:, 1:] + rows
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
@@ -131,57 +150,67 @@ class _Window:
         scale = np.maximum(0.5 * (high - low), 1e-3)
         levels = (levels - 0.5 * (high + low)[:, None]) / scale[:, None]
         u, v = column - start[:, :1], row - start[:, 1:]
-        on_board = np.abs(np.linalg.solve(axes, np.stack([u, v], axis=1)))
-        return cls(len(d), start, u, v, levels, scale, inside, on_board)
+        (a, b), (c, d) = (axes[:, k, :, None].swapaxes(0, 1) for k in range(2))
+        area = a * d - b * c
+        on_board = np.abs(np.stack([d * u - b * v, a * v - c * u], axis=1))
+        is_line = np.abs(area) < _MIN_AREA  # nothing is on the board
+        on_board /= np.where(is_line, 1.0, np.abs(area))[:, None]
+        on_board[is_line[:, 0]] = np.inf
+        return cls(len(near), u, v, levels, scale, inside, on_board)
 
     def weight(self, length: float, free: Array) -> Array:
         """Return 1 for pixels (n, m) that are used, else 0."""
         near = (self.on_board.max(axis=1) <= length) & (self.on_board.min(axis=1) <= free[:, None])
         return np.asarray(near & self.inside, dtype=np.float64)
 
-    def choose(self, rows: IntArray) -> _Window:
-        """Return the pixels around some of the places."""
-        some = {k: v[rows] for k, v in vars(self).items() if k != "side"}
-        return replace(self, **some)
+    def put(self, rows: BoolArray, part: _Window) -> None:
+        """Put the pixels around other places in some rows."""
+        for name, value in vars(part).items():
+            if name != "side":
+                getattr(self, name)[rows] = value
 
 
-def _fit(window: _Window, weight: Array, x: Array) -> tuple[Array, Array, Array, Array]:
-    """Fit the model by Gauss-Newton.
-
-    Returns place, angles and blur (n, 5); coefficients (n, 8); functions and derivatives
-    (n, 13, m), times the weight; residuals (n, m).
-    """
+def _fit(window: _Window, weight: Array, x: Array) -> Array:
+    """Fit the model by Gauss-Newton: place less the start, angles and blur (n, 5)."""
     x = x.copy()
-    n = len(x)
-    coefficients = np.zeros((n, _N_LINEAR))
-    open_ = np.flatnonzero(weight.sum(axis=1) >= _MIN_PIXELS)
-    part, w, c = window.choose(open_), weight[open_], coefficients[open_]
-    log_start = float(np.log(_START_BLUR))
+    count = weight.sum(axis=1)
+    open_ = np.flatnonzero(count >= _MIN_PIXELS)
+    if not len(open_):
+        return x
+    # The pixels that are used, first; single precision is enough for steps.
+    used = np.argsort(-weight[open_], axis=1, kind="stable")[:, : int(count.max())]
+    u, v, levels, w = (
+        np.take_along_axis(pixels[open_], used, axis=1).astype(np.float32)
+        for pixels in (window.u, window.v, window.levels, weight)
+    )
+    levels *= w
+    count = count[open_]
+    c = np.zeros((len(open_), _N_LINEAR))
     for iteration in range(_ITERATIONS):
-        if not len(open_):
-            break
-        here, count = x[open_], w.sum(axis=1)
-        if iteration == 0:
-            L = _functions(part, here, None)[:, :_N_LINEAR] * w[:, None]
-            c = _solve(L, part.levels * w, count, np.zeros((len(here), _N_LINEAR)), _STIFF)
-        A = _functions(part, here, c) * w[:, None]
-        expected = np.zeros((len(here), _N_LINEAR + _N_PLACED))
-        expected[:, -1] = log_start - here[:, 4]
+        here = x[open_]
         stiff = _STIFF if iteration < _STIFF_STEPS else 1.0
-        solution = _solve(A, part.levels * w, count, expected, stiff)
+        if iteration == 0:
+            c = _solve(_functions(u, v, here, None) * w[:, None], levels, count, c, stiff)
+        A = _functions(u, v, here, c) * w[:, None]
+        expected = np.zeros((len(here), _N_LINEAR + _N_PLACED))
+        expected[:, -1] = np.log(_START_BLUR) - here[:, 4]
+        solution = _solve(A, levels, count, expected, stiff)
         c, step = solution[:, :_N_LINEAR], solution[:, _N_LINEAR:]
         step = np.clip(step, -_MAX_STEP, _MAX_STEP)
-        x[open_] = here + step
-        x[open_, 4] = np.clip(x[open_, 4], *np.log(_BLURS))
+        here = here + step
+        here[:, 4] = np.clip(here[:, 4], *np.log(_BLURS))
+        x[open_] = here
         more = (np.abs(step[:, :2]).max(axis=1) >= _CONVERGED_PX) | (stiff > 1.0)
-        more &= np.abs(x[open_, :2] - part.origin).max(axis=1) <= 2.0 * _MAX_SHIFT_PX
-        coefficients[open_] = c
+        more &= np.abs(here[:, :2]).max(axis=1) <= 2.0 * _MAX_SHIFT_PX
+        if not more.any():
+            break
         if not more.all():
-            open_, part, w, c = open_[more], part.choose(np.flatnonzero(more)), w[more], c[more]
-    return x, coefficients, np.zeros(0), np.zeros(0)
+            open_, c, count = open_[more], c[more], count[more]
+            u, v, levels, w = u[more], v[more], levels[more], w[more]
+    return x
 
 
-def _solve(A: Array, levels: Array, count: Array, expected: Array, stiff: float = 1.0) -> Array:
+def _solve(A: _Levels, levels: _Levels, count: Array, expected: Array, stiff: float = 1.0) -> Array:
     """Return the coefficients (n, k) of functions (n, k, m) by least squares.
 
     Those of overshoot and tones are near zero where *count* (n,) pixels are few.
@@ -192,17 +221,17 @@ def _solve(A: Array, levels: Array, count: Array, expected: Array, stiff: float 
     ridge[:, _OVERSHOOT] = (stiff * _RIDGE * few)[:, None]
     if k > _N_LINEAR:
         ridge[:, -1] = _BLUR_RIDGE
-    N = A @ np.swapaxes(A, 1, 2)
+    N = (A @ np.swapaxes(A, 1, 2)).astype(np.float64)
     ridge *= np.maximum(np.trace(N, axis1=1, axis2=2) / k, 1e-9)[:, None]
     N[:, np.arange(k), np.arange(k)] += ridge
     rhs = (A @ levels[:, :, None])[:, :, 0] + ridge * expected
     return np.asarray(np.linalg.solve(N, rhs[:, :, None])[:, :, 0])
 
 
-def _functions(window: _Window, x: Array, c: Array | None) -> Array:
+def _functions(u: _Levels, v: _Levels, x: Array, c: Array | None) -> _Levels:
     """Return the linear functions (n, k, m), with coefficients their derivatives after them."""
-    dx = window.u - (x[:, :1] - window.origin[:, :1])
-    dy = window.v - (x[:, 1:2] - window.origin[:, 1:])
+    x = x.astype(u.dtype)
+    dx, dy = u - x[:, :1], v - x[:, 1:2]
     n, m = dx.shape
     cos, sin = np.cos(x[:, 2:4]), np.sin(x[:, 2:4])
     d = cos[:, :, None] * dy[:, None] - sin[:, :, None] * dx[:, None]
@@ -212,9 +241,9 @@ def _functions(window: _Window, x: Array, c: Array | None) -> Array:
     S, T = erf(t / _SQRT2), erf(tw / _SQRT2)
     G, H = np.exp(-0.5 * t * t), np.exp(-0.5 * tw * tw)
     # Edges at a slant share their blur, which to first order adds a product of bells.
-    slant = (2.0 / np.pi) * np.cos(x[:, 2] - x[:, 3])[:, None]
+    slant = (2.0 / math.pi) * np.cos(x[:, 2] - x[:, 3])[:, None]
     both = slant * G[:, 0] * G[:, 1]
-    A = np.empty((n, _N_LINEAR + (_N_PLACED if c is not None else 0), m))
+    A = np.empty((n, _N_LINEAR + (_N_PLACED if c is not None else 0), m), dtype=u.dtype)
     A[:, 0], A[:, 1], A[:, 2] = 1.0, dx, dy
     P = S[:, 0] * S[:, 1] + both
     A[:, 3], A[:, 4], A[:, 5] = P, P * dx, P * dy
@@ -223,6 +252,7 @@ def _functions(window: _Window, x: Array, c: Array | None) -> Array:
     A[:, 11:13] = H
     if c is None:
         return A
+    c = c.astype(u.dtype)
     k = (c[:, 3:4] + c[:, 4:5] * dx + c[:, 5:6] * dy)[:, None]
     over, Q = c[:, 6:8, None], c[:, 8, None, None]
     slope, slope_w = _SLOPE * G / s, _SLOPE * H / wide
@@ -244,11 +274,11 @@ def _functions(window: _Window, x: Array, c: Array | None) -> Array:
 def _judged(window: _Window, weight: Array, x: Array, start: Array, turns: Array) -> Saddles:
     """Return the crossings with what their residuals are worth."""
     n, k = len(x), _N_LINEAR + _N_PLACED
-    L = _functions(window, x, None) * weight[:, None]
+    L = _functions(window.u, window.v, x, None) * weight[:, None]
     count = weight.sum(axis=1)
     c = _solve(L, window.levels * weight, count, np.zeros((n, _N_LINEAR)))
     residual = window.levels * weight - (c[:, None] @ L)[:, 0]
-    A = _functions(window, x, c) * weight[:, None]
+    A = _functions(window.u, window.v, x, c) * weight[:, None]
     rms = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(count - k, 1.0))
     P = L[:, 3]
     contrast = np.sum(P * (window.levels * weight - c[:, :1] * L[:, 0]), axis=1)
@@ -260,7 +290,7 @@ def _judged(window: _Window, weight: Array, x: Array, start: Array, turns: Array
     slope = narrow / s + (0.5 * (c[:, 6] + c[:, 7]) + c[:, 8]) / np.hypot(s, _MASK_RADIUS)
     slope /= np.where(contrast == 0.0, 1.0, contrast)
     found = count >= _MIN_PIXELS
-    found &= np.linalg.norm(x[:, :2] - start, axis=1) < _MAX_SHIFT_PX
+    found &= np.linalg.norm(x[:, :2], axis=1) < _MAX_SHIFT_PX
     found &= (turn < _MAX_TURN) & (size * window.scale > MIN_CONTRAST)
     found &= (rms < _MAX_MISFIT * size) & (slope > 1.0 / _BLURS[1])
     variance = np.zeros(n)
@@ -268,7 +298,7 @@ def _judged(window: _Window, weight: Array, x: Array, start: Array, turns: Array
         variance[found] = _variance(A[found], residual[found], rms[found], window.side)
     found &= variance < _MAX_SHIFT_PX**2
     return Saddles(
-        x[:, :2],
+        start + x[:, :2],
         np.hypot(np.sqrt(variance), _MIN_SIGMA_PX),
         1.0 / np.maximum(slope, 1e-3),
         contrast * window.scale,
