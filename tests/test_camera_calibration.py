@@ -30,7 +30,8 @@ from legcal.calibration.camera_calibration.diagnostics import (
     warnings,
 )
 from legcal.calibration.camera_calibration.lens import chosen_lens, given_lens
-from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
+from legcal.calibration.camera_calibration.picture import write_picture
+from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry import Array
 from legcal.perception import BoardImages, SeenBoard
 from legcal.vision import Board, DistortionModel, board_of, intrinsic_values
@@ -260,6 +261,23 @@ def test_what_images_hardly_determine_is_warned_of_with_figures() -> None:
     assert any("overfits" in sentence for sentence in warnings(plain))
 
 
+def test_a_board_that_is_not_as_stated_is_named_and_what_to_add() -> None:
+    wide = fitted(seen_corners(TRUTH, 12, 2, sheet=np.array([0.0, 0.0, 0.0, 0.025])))
+    assert np.abs(pulls(wide)).max() < 4.0
+    assert "2.5 % wider than high" in " ".join(warnings(wide))
+    bent = fitted(seen_corners(TRUTH, 12, 2, sheet=np.array([9e-3, 0.0, 0.0, 0.0])))
+    assert "bent by 9 mm" in " ".join(warnings(bent))
+    seen = seen_corners(TRUTH, 12, 4)
+    left = (seen.px[:, 0] < 300.0) & (seen.px[:, 1] < 300.0)
+    keep = left & (np.bincount(seen.image[left], minlength=12)[seen.image] >= 12)
+    _, image = np.unique(seen.image[keep], return_inverse=True)
+    part = BoardImages(image, seen.points[keep], seen.px[keep], seen.sigma_px[keep])
+    said = " ".join(warnings(fitted(part)))
+    missing = said.split("bring the board to ")[1].split(" of the image")[0].split(", ")
+    assert {"the right", "the bottom", "the bottom right"} <= set(missing)
+    assert "the top left" not in missing
+
+
 def test_undetermined_cameras_are_refused_with_figures() -> None:
     parallel = fitted(seen_corners(CAMERAS["plumb_bob"], 6, 2, tilt=0.002, noise=0.3))
     few = fitted(seen_corners(CAMERAS["plumb_bob"], 3, 1))
@@ -292,7 +310,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def found(folder: Path) -> CameraCalibration:
-    return calibrate_camera(folder, SPEC, output=folder / "camera.yaml")
+    picture = folder.parent / f"{folder.name}-field.png"
+    return calibrate_camera(folder, SPEC, output=folder / "camera.yaml", picture=picture)
 
 
 def test_pictures_give_the_camera_that_took_them(found: CameraCalibration) -> None:
@@ -412,6 +431,24 @@ def test_intrinsics_that_a_covariance_does_not_name_are_exact(folder: Path, tmp_
     document["legcal_camera"] = _block(names=None, covariance=None, sigma={"fx": 2.0})
     path.write_text(yaml.safe_dump(document))
     assert read_camera(path).covariance is None  # standard deviations without correlations
+
+
+def test_the_picture_shows_where_corners_were_seen_and_replaces_only_itself(
+    found: CameraCalibration, folder: Path
+) -> None:
+    path = folder.parent / f"{folder.name}-field.png"
+    shown = cv2.imread(str(path))
+    assert shown is not None
+    assert shown.shape[1] == 1280
+    red = np.all(np.abs(shown.astype(int) - [60, 60, 140]) < 10, axis=-1)
+    factor = 1280 / PINHOLE.width
+    seen = np.rint((found.corners[:, :2] + 0.5) * factor).astype(int)
+    assert not red[seen[:, 1], seen[:, 0]].any()
+    assert red[5, 5]
+    write_picture(found, path)  # an earlier picture is replaced
+    cv2.imwrite(str(path), np.zeros((4, 4), np.uint8))
+    with pytest.raises(UsageError, match="another file of that name"):
+        write_picture(found, path)
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,10 @@ def camera(
         DistortionModel | None,
         typer.Option(help="How the lens distorts; chosen by the images where it is not given."),
     ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="A PNG to write: corners and residuals over the field."),
+    ] = None,
     workers: WorkersOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -55,6 +59,7 @@ def camera(
             board,
             model=model,
             output=output,
+            picture=picture,
             progress=progress,
             workers=image_workers(workers),
         )

@@ -97,11 +97,12 @@ class YamlOutput:
         except DatasetError:
             return False
 
-    def write(self, path: Path, text: str) -> None:
+    def write(self, path: Path, content: str | bytes) -> None:
         """Write a file; an earlier one of its kind is replaced, any other is not."""
         self.check_place(path)
         try:
-            write_atomically(path, text.encode())
+            data = content.encode() if isinstance(content, str) else content
+            write_atomically(path, data)
         except OSError as error:
             raise OutOfResources(
                 f"{path}: {self.noun} could not be written: found '{error.strerror}', needed a "

@@ -28,6 +28,7 @@ from legcal.calibration.camera_calibration.document import (
     write_camera,
 )
 from legcal.calibration.camera_calibration.lens import ChosenLens, chosen_lens, given_lens
+from legcal.calibration.camera_calibration.picture import PICTURE_FILE, write_picture
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
 from legcal.files import MAX_IMAGE, describe, read_bytes
 from legcal.geometry import Array
@@ -71,6 +72,7 @@ def calibrate_camera(
     *,
     model: DistortionModel | None = None,
     output: str | Path | None = None,
+    picture: str | Path | None = None,
     progress: Report = no_progress,
     workers: int = 1,
 ) -> CameraCalibration:
@@ -88,6 +90,8 @@ def calibrate_camera(
         residuals lean over the field and a richer model predicts other images better.
     output : path, optional
         Write a ROS camera_info file there, with the standard deviations of all numbers.
+    picture : path, optional
+        Write a PNG there of where corners were seen, and how residuals lean over the field.
     progress : callable
         Called as ``progress(stage, done, total)``.
     workers : int
@@ -118,6 +122,8 @@ def calibrate_camera(
         )
     if output is not None:
         CAMERA_FILE.check_place(Path(output))
+    if picture is not None:
+        PICTURE_FILE.check_place(Path(picture))
     stated = board_of(board)
     paths = _listed_images([images] if isinstance(images, str | Path) else images)
     size, facts = _common_size(paths)
@@ -155,6 +161,8 @@ def calibrate_camera(
     )
     if output is not None:
         write_camera(result, Path(output))
+    if picture is not None:
+        write_picture(result, Path(picture))
     return result
 
 

@@ -12,7 +12,7 @@ from legcal.calibration.camera_calibration.adjustment import RobustFit
 from legcal.data import few
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array
-from legcal.perception import adjust_board
+from legcal.perception import SHEET, adjust_board
 from legcal.vision import Camera, intrinsic_names
 
 MIN_IMAGES, _FEW_IMAGES = 3, 10
@@ -24,6 +24,15 @@ _LARGE_RESIDUAL_PX = 1.0
 _MANY_LEFT_OUT = 0.05  # of all corners
 _OVERFIT = 0.01  # probability from which on the gain of more coefficients may be chance
 _FOLDED_PX = 0.1
+_MAX_RATIO = 25.0  # of squared errors to what corners scatter
+_MAX_PRINT_RATIO, _MAX_BEND = 0.015, 0.02  # three and two standard deviations of the priors
+_SIGNIFICANT = 4.0  # standard deviations
+_OPEN_PRIOR = 0.5  # part of the prior of the print ratio that is left where images say little
+_IMAGES_OF_PART = 2  # that show corners in a part of the image
+_PARTS = (
+    "the top left", "the top", "the top right", "the left", "the middle", "the right",
+    "the bottom left", "the bottom", "the bottom right",
+)  # fmt: skip
 
 
 def tilts(found: RobustFit) -> Array:
@@ -61,7 +70,7 @@ def refuse_undetermined(
             f"{np.degrees(tilts(found).max()):.0f} deg out of the image plane and at most "
             f"{np.degrees(spread(found)):.0f} deg to each other, which leave the focal length open "
             f"(fx {f:.0f} px, known to {sigma:.2g} px), needed views from several sides; tilt the "
-            "board by 30 deg and more to the left, the right, up and down."
+            f"board by 30 deg and more{_missing_tilts(found)}."
         )
     centre = camera.K[:2, 2]
     if not np.all((centre > 0.0) & (centre < [camera.width - 1.0, camera.height - 1.0])):
@@ -128,13 +137,21 @@ def warnings(found: RobustFit) -> list[str]:
         sentences.append(
             f"The focal length is weakly determined, to {100.0 * focal:.2g} % ({sigma[0]:.2g} px): "
             f"the boards are tilted by at most {np.degrees(tilt):.0f} deg out of the image plane "
-            f"and {np.degrees(apart):.0f} deg to each other; tilt them by 30 deg and more."
+            f"and {np.degrees(apart):.0f} deg to each other; tilt them by 30 deg and more"
+            f"{_missing_tilts(found)}."
         )
     covered = coverage(found)
     if covered < _MIN_COVERAGE:
         sentences.append(
             f"Corners cover {100.0 * covered:.0f} % of the image: what the lens does outside is "
-            "extrapolated; bring the board near every edge and corner of the image."
+            f"extrapolated; bring the board to {_unseen_parts(found)} of the image."
+        )
+    sentences += _sheet(found)
+    if found.ratio > _MAX_RATIO:
+        sentences.append(
+            f"Images disagree on the camera {np.sqrt(found.ratio):.0f} times as much as corners "
+            "scatter, which the standard deviations count: zoom, focus or stabilisation change, or "
+            "the board moves or bends; switch these off, and lay the board on something flat."
         )
     sentences += _folding(camera)
     sentences += _overfit(found)
@@ -151,6 +168,62 @@ def warnings(found: RobustFit) -> list[str]:
             "see that the board is flat, sharp and evenly lit."
         )
     return sentences
+
+
+def _sheet(found: RobustFit) -> list[str]:
+    """Return warnings of a board that is not what was stated, or of which too little is known."""
+    sheet = found.adjusted.sheet
+    if sheet is None:
+        return []
+    sigma = np.sqrt(np.diag(found.all_covariance)[-len(SHEET) :])
+    side, ratio = 2.0 * float(sheet.half.max()), float(sheet.numbers[3])
+    sentences = []
+    if abs(ratio) > _MAX_PRINT_RATIO and abs(ratio) > _SIGNIFICANT * sigma[3]:
+        sentences.append(
+            f"Squares or tags are {100.0 * abs(ratio):.2g} % wider than high"
+            if ratio > 0.0
+            else f"Squares or tags are {100.0 * abs(ratio):.2g} % higher than wide"
+        )
+        sentences[-1] += ", more than printers do: measure the board, and correct --board."
+    k = int(np.argmax(np.abs(sheet.numbers[:3])))
+    bend = abs(float(sheet.numbers[k]))
+    if bend > _MAX_BEND * side and bend > _SIGNIFICANT * sigma[k]:
+        sentences.append(
+            f"The board is bent by {1e3 * bend:.2g} mm over {1e3 * side:.0f} mm: lay it on "
+            "something flat."
+        )
+    if sigma[3] > _OPEN_PRIOR * sheet.prior_sigma[3]:
+        sentences.append(
+            f"Whether squares are square is open to {100.0 * sigma[3]:.2g} %, and with it fx over "
+            "fy: turn the board by a quarter in some images."
+        )
+    return sentences
+
+
+def _unseen_parts(found: RobustFit) -> str:
+    """Return the parts of the image where few corners were seen."""
+    camera = found.adjusted.camera
+    part = np.floor(3.0 * (found.seen.px + 0.5) / [camera.width, camera.height]).astype(np.intp)
+    number = np.clip(part, 0, 2) @ [1, 3]
+    images = [len(set(found.seen.image[number == k].tolist())) for k in range(9)]
+    unseen = [name for name, n in zip(_PARTS, images, strict=True) if n < _IMAGES_OF_PART]
+    return ", ".join(unseen) or "every edge and corner"
+
+
+def _missing_tilts(found: RobustFit) -> str:
+    """Return to which sides boards were not tilted, as the end of a sentence; "" if to all."""
+    normal = np.array([T.rotation.as_matrix()[:, 2] for T in found.adjusted.T_camera_board])
+    towards = -normal * np.sign(normal[:, 2:])  # the side that is seen
+    slant = np.degrees(np.arctan2(towards[:, :2], -towards[:, 2:]))
+    least = float(np.degrees(_MIN_TILT))
+    farther = {
+        "right": slant[:, 0].max() < least,
+        "left": slant[:, 0].min() > -least,
+        "lower": slant[:, 1].max() < least,
+        "upper": slant[:, 1].min() > -least,
+    }
+    missing = [side for side, lacks in farther.items() if lacks]
+    return f", also with the {' and the '.join(missing)} side farther away" if missing else ""
 
 
 def _folding(camera: Camera) -> list[str]:

@@ -1,0 +1,115 @@
+"""A picture of a calibration: where corners were seen, and how residuals lean over the field."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from legcal.calibration.camera_calibration.document import CameraCalibration
+from legcal.files import YamlOutput
+
+_LONGER = 1280  # side of the picture [px]
+_CELLS = 16  # along it
+_ARROW = 0.45  # of a cell: the longest arrow
+_LEAST_ARROW = 3  # corners of a cell whose mean residual is drawn
+_LETTER = 0.55  # scale of letters
+_DARK, _WHITE, _EMPTY = (32, 32, 32), (255, 255, 255), (60, 60, 140)
+_SEEN, _RESIDUAL, _CENTRE = (90, 120, 60), (0, 225, 255), (255, 170, 40)  # blue, green, red
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_MARK = b"Software\x00legcal camera"
+
+Canvas = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class _Picture(YamlOutput):
+    """A PNG that says which command wrote it."""
+
+    def _is_own(self, path: Path) -> bool:
+        try:
+            with path.open("rb") as file:
+                return _MARK in file.read(len(_SIGNATURE) + 200)
+        except OSError:
+            return False
+
+
+PICTURE_FILE = _Picture(
+    "the picture", "picture", "", "a new file or a picture that this command wrote"
+)
+
+
+def write_picture(calibration: CameraCalibration, path: Path) -> None:
+    """Write the picture as PNG; an earlier one of this command is replaced, any other file is not.
+
+    Raises
+    ------
+    UsageError
+        If another file stands there, or none can be written.
+    OutOfResources
+        If the file cannot be written.
+    """
+    png = np.asarray(cv2.imencode(".png", picture(calibration))[1]).tobytes()
+    header = len(_SIGNATURE) + 25  # the chunk IHDR
+    chunk = b"tEXt" + _MARK
+    marked = (len(_MARK)).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big")
+    PICTURE_FILE.write(path, png[:header] + marked + png[header:])
+
+
+def picture(calibration: CameraCalibration) -> Canvas:
+    """Return the picture: cells by how many corners were seen, arrows of mean residuals, BGR."""
+    camera = calibration.camera
+    factor = _LONGER / max(camera.width, camera.height)
+    side = _LONGER / _CELLS
+    width, height = (round(factor * n) for n in (camera.width, camera.height))
+    shown = np.full((height, width, 3), _DARK, dtype=np.uint8)
+    at = (calibration.corners[:, :2] + 0.5) * factor
+    cell = np.floor(at / side).astype(np.intp)
+    shape = int(np.ceil(height / side)), int(np.ceil(width / side))
+    index = np.clip(cell[:, 1], 0, shape[0] - 1) * shape[1] + np.clip(cell[:, 0], 0, shape[1] - 1)
+    count = np.bincount(index, minlength=shape[0] * shape[1])
+    mean = (
+        np.stack([np.bincount(index, r, len(count)) for r in calibration.corners[:, 2:].T], axis=-1)
+        / np.maximum(count, 1)[:, None]
+    )
+    enough = count >= _LEAST_ARROW
+    longest = float(np.linalg.norm(mean[enough], axis=1).max()) if enough.any() else 0.0
+    scale = _ARROW * side / max(longest, 1e-9)
+    full = max(float(np.quantile(count[count > 0], 0.9)), 1.0) if count.any() else 1.0
+    for k in range(len(count)):
+        y, x = divmod(k, shape[1])
+        low = round(x * side) + 1, round(y * side) + 1
+        high = min(round((x + 1) * side), width) - 1, min(round((y + 1) * side), height) - 1
+        share = 0.25 + 0.75 * min(count[k] / full, 1.0)
+        colour = _EMPTY if not count[k] else tuple(int(share * c) for c in _SEEN)
+        cv2.rectangle(shown, low, high, colour, -1)
+    for point in at:
+        cv2.circle(shown, tuple(np.rint(point).astype(int).tolist()), 1, (150, 180, 130), -1)
+    for drawn in np.flatnonzero(enough).tolist():
+        y, x = divmod(drawn, shape[1])
+        middle = (np.array([x, y]) + 0.5) * side
+        start, end = (
+            tuple(np.rint(p).astype(int).tolist())
+            for p in (middle - scale * mean[drawn], middle + scale * mean[drawn])
+        )
+        cv2.arrowedLine(shown, start, end, _RESIDUAL, 2, cv2.LINE_AA, tipLength=0.3)
+    centre = tuple(np.rint((camera.K[:2, 2] + 0.5) * factor).astype(int).tolist())
+    cv2.drawMarker(shown, centre, _CENTRE, cv2.MARKER_CROSS, 24, 2, cv2.LINE_AA)
+    unseen = calibration.validated_px
+    lines = (
+        f"{camera.model}, {len(at)} corners, {calibration.rms_px:.3f} px off (rms)"
+        + ("" if unseen is None else f", {unseen:.3f} px in images left out"),
+        f"arrows: mean residual of a cell, the longest {longest:.3f} px; red: no corner; cross: "
+        "principal point",
+    )
+    legend = np.full((62, width, 3), _DARK, dtype=np.uint8)
+    for row, line in enumerate(lines):
+        (w, _), _ = cv2.getTextSize(line, cv2.FONT_HERSHEY_SIMPLEX, _LETTER, 1)
+        fit = _LETTER * min(1.0, (width - 20) / w)
+        where = (10, 24 + 26 * row)
+        cv2.putText(legend, line, where, cv2.FONT_HERSHEY_SIMPLEX, fit, _WHITE, 1, cv2.LINE_AA)
+    return np.vstack([shown, legend])
