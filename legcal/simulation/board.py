@@ -206,7 +206,7 @@ class PlacedBoard:
             free[free] = ~posed.hidden(centre, base[free], margin)
         seen = np.all(free.reshape(points.shape[:2]), axis=1)
         if self.board.kind == "chessboard" and not seen.all():
-            seen[:] = False  # it is found as a whole or not at all
+            seen[:] = False  # the numbers of a part are not certain
         return np.asarray(seen)
 
     def is_enough(self, seen: BoolArray) -> bool:
