@@ -60,6 +60,7 @@ def recorded(
 def legs_in_view(rng: np.random.Generator, n: int) -> tuple[Array, Array]:
     """Directions and points of n legs that the camera sees."""
     u = rng.normal(size=(n, 3)) * [1.0, 1.0, 0.3]
+    u[:, :2] /= np.linalg.norm(u[:, :2], axis=-1, keepdims=True)  # none towards the camera
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
     M = rng.uniform([-0.1, -0.1, 0.8], [0.1, 0.1, 1.0], size=(n, 3))
     return u, M

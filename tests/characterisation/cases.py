@@ -301,7 +301,7 @@ def _images() -> Iterable[Case]:
         "camera",
         (
             Step(f"{camera} -o {{here}}/a.yaml --json --workers 1 --model plumb_bob"),
-            Step(f"{camera} --output {{out}} --model equidistant"),
+            Step(f"{camera} --output {{out}} --model equidistant --picture {{here}}/field.png"),
         ),
         input="boards",
     )

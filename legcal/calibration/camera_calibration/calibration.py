@@ -72,9 +72,9 @@ def calibrate_camera(
     *,
     model: DistortionModel | None = None,
     output: str | Path | None = None,
-    picture: str | Path | None = None,
     progress: Report = no_progress,
     workers: int = 1,
+    picture: str | Path | None = None,
 ) -> CameraCalibration:
     """Calibrate a camera from photographs of a flat board.
 
@@ -90,12 +90,12 @@ def calibrate_camera(
         residuals lean over the field and a richer model predicts other images better.
     output : path, optional
         Write a ROS camera_info file there, with the standard deviations of all numbers.
-    picture : path, optional
-        Write a PNG there of where corners were seen, and how residuals lean over the field.
     progress : callable
         Called as ``progress(stage, done, total)``.
     workers : int
         Search the images in that many processes, as :func:`legcal.calibrate` does.
+    picture : path, optional
+        Write a PNG there of where corners were seen, and how residuals lean over the field.
 
     Returns
     -------
