@@ -401,6 +401,7 @@ def _block(**changes: Any) -> dict[str, Any]:
         ({"covariance": [[4.0, "x"], [0.0, 1.0]]}, ("covariance", "a number")),
         ({"covariance": [[4.0, 0.1], [0.2, 1.0]]}, ("not symmetric",)),
         ({"covariance": [[4.0, 3.0], [3.0, 1.0]]}, ("not positive semidefinite",)),
+        ({"covariance": [[1e-20, 1e300], [1e300, 1e-20]]}, ("not positive semidefinite",)),
         ({"covariance": [[4.0, 0.1], [0.1, 0.0]]}, ("not positive semidefinite",)),
         ({"covariance": [[4.0, 0.0], [0.0, -1.0]]}, ("the variance -1 of cx",)),
         ({"covariance": [[4.0, 0.0], [0.0, 1e-30]]}, ("the variance 1e-30 of cx",)),

@@ -28,6 +28,9 @@ PHONE: dict[str, Any] = {
     "serial": "A1", "lens": "Acme back camera",
 }  # fmt: skip
 NAMES = [f"images/{view}_{k}.jpg" for view in ("c1", "c2") for k in (1, 2)]
+PORTRAIT = (
+    b"<rdf:li>com.google.android.apps.camera.gallery.specialtype.SpecialType-PORTRAIT</rdf:li>"
+)
 XMP = b'<rdf:Description crs:LensProfileEnable="%d" crs:HasCrop="%s"/>'
 
 
@@ -131,6 +134,9 @@ DIFFERENT: tuple[tuple[bytes, list[str]], ...] = (
     (jpeg(PICTURE, 95), ["no camera", "'Acme One'", "3 others"]),
     (png(PICTURE, exif(comment=COMMENT + b"Screenshot")), ["screenshots", "copy them"]),
     (png(PICTURE, Software="gnome-screenshot"), ["screenshots"]),
+    (phone(rendered=8), ["portrait mode", "take them again"]),
+    (phone(rendered=6), ["panoramas"]),
+    (jpeg(PICTURE, 95, exif(**PHONE), PORTRAIT), ["portrait mode"]),
 )
 
 
@@ -301,3 +307,8 @@ def test_photographs_of_a_board_by_two_cameras_are_warned_of(boards: Callable[..
     found = calibrate_camera(boards(focal=6.0), "chessboard:9x6:30mm")
     (warning,) = (w for w in found.warnings if "No one camera" in w)
     assert [w for w in ("b2.jpg", "6 mm", "4.25 mm", "b0.jpg") if w not in warning] == []
+
+
+def test_a_photograph_of_a_board_in_portrait_mode_is_warned_of(boards: Callable[..., Path]) -> None:
+    found = calibrate_camera(boards(rendered=7), "chessboard:9x6:30mm")
+    assert [w for w in found.warnings if "b2.jpg" in w and "portrait mode" in w and "b0" not in w]

@@ -53,6 +53,7 @@ from legcal.data import (
     Override,
     compression_note,
     dataset_at,
+    few,
     fingerprint,
     load_dataset,
     overrides_of_call,
@@ -85,7 +86,6 @@ TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal 
 # Of all outlines that are measured in photographs: light at the limb that no model of shading
 # predicts looks like other radii, so that residuals never show it [px].
 LIMB_BIAS = {"bias of many edges": 0.02}
-_MAX_NAMED = 5  # cameras, before they are only counted
 MIN_FOUND_AGAIN = 0.5  # of the outlines of an image
 
 
@@ -562,12 +562,10 @@ def _exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
     exact = [name for name in dict.fromkeys(shared_cameras(names, cameras)) if name not in known]
     if not exact:
         return []
-    shown = ", ".join(exact[:_MAX_NAMED])
-    shown += f" and {len(exact) - _MAX_NAMED} more" if len(exact) > _MAX_NAMED else ""
     state = "their camera files state" if len(exact) > 1 else "its camera file states"
     return [
-        f"The intrinsics of {shown} are taken as exact, since {state} no covariance; calibrate "
-        "with legcal camera, or state what is known with a prior."
+        f"The intrinsics of {few(exact)} are taken as exact, since {state} no covariance; "
+        "calibrate with legcal camera, or state what is known with a prior."
     ]
 
 

@@ -94,12 +94,22 @@ def _of_view(
     name = measurements.views[view].name
     shown = [image for image, facts in images if facts.is_screenshot]
     nameless = [image for image, facts in images if not facts.device and image not in shown]
+    modes: dict[str, list[str]] = {}
+    for image, facts in images:
+        if facts.mode:
+            modes.setdefault(facts.mode, []).append(image)
     devices = [facts.device for _, facts in images if facts.device]
     remedy = "needed the files that the camera wrote; copy them from the camera."
     if shown:
         yield (
             f"Images {few(shown)} of view {name} may be cropped or rescaled: found screenshots, as "
             f"their files say, {remedy}"
+        )
+    for mode, names in modes.items():
+        yield (
+            f"Outlines in images {few(names)} of view {name} may not lie where the lens put them: "
+            f"found {mode}, as their files say, needed photographs in the plain mode of the "
+            "camera; take them again, or leave them out."
         )
     if nameless and len(devices) >= _MOST * len(nameless):
         yield (
@@ -156,7 +166,7 @@ def compression_note(
     ]
     return [
         f"Lossy compression moves outlines: found {', '.join(parts)}, and outlines that are "
-        f"{rms_px:.2f} px off (rms), with {scale:.2f} times the noise that their pixels explain, "
-        "which the stated uncertainty includes; store photographs without loss (PNG, TIFF) or as "
-        f"JPEGs of quality {GOOD_QUALITY} or more."
+        f"{rms_px:.2f} px off (rms), with standard deviations {scale:.2f} times those that the "
+        "noise of their pixels explains, which the stated uncertainty includes; store "
+        f"photographs without loss (PNG, TIFF) or as JPEGs of quality {GOOD_QUALITY} or more."
     ]

@@ -228,6 +228,8 @@ def _covariance_problem(
             f"deviation of {least:g} to {most:g}"
         )
     root = np.sqrt(np.where(variance > 0.0, variance, 1.0))
+    if np.any(np.abs(C) > (1.0 + _ROUNDING) * np.outer(root, root)):
+        return "a matrix that is not positive semidefinite, needed one that is"
     correlation = C / np.outer(root, root)
     if np.abs(correlation - correlation.T).max(initial=0.0) > _ROUNDING:
         return "a matrix that is not symmetric, needed one that is"

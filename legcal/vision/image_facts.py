@@ -19,10 +19,10 @@ TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
 
 _MAKE, _MODEL, _ORIENTATION, _SOFTWARE = 0x010F, 0x0110, 0x0112, 0x0131
 _FOCUS, _FOCAL, _COMMENT, _WIDTH, _HEIGHT = 0x9206, 0x920A, 0x9286, 0xA002, 0xA003
-_ZOOM, _FOCAL_35, _SERIAL, _LENS = 0xA404, 0xA405, 0xA431, 0xA434
+_RENDERED, _ZOOM, _FOCAL_35, _SERIAL, _LENS = 0xA401, 0xA404, 0xA405, 0xA431, 0xA434
 _COMPRESSION, _STRIPS, _STRIP_BYTES, _JPEG_TABLES, _XMP = 259, 273, 279, 347, 700
-_TAGS = (_MAKE, _MODEL, _ORIENTATION, _SOFTWARE, _FOCUS, _FOCAL, _COMMENT, _WIDTH, _HEIGHT, _ZOOM,
-         _FOCAL_35, _SERIAL, _LENS)  # fmt: skip
+_TAGS = (_MAKE, _MODEL, _ORIENTATION, _SOFTWARE, _FOCUS, _FOCAL, _COMMENT, _WIDTH, _HEIGHT,
+         _RENDERED, _ZOOM, _FOCAL_35, _SERIAL, _LENS)  # fmt: skip
 _TIFF_TAGS = (*_TAGS, _COMPRESSION, _STRIPS, _STRIP_BYTES, _JPEG_TABLES, _XMP)
 _TIFF_JPEG = (6, 7)  # compressions of a TIFF
 
@@ -33,6 +33,9 @@ _SCREENSHOT = re.compile(
     re.IGNORECASE,
 )
 _SETTING = rb"crs:%s\s*(?:=\s*[\"']|>\s*)(True|False|[01])"  # of Adobe's raw converters, in XMP
+_PORTRAIT, _PANORAMA = "portrait mode, which draws outlines anew", "panoramas"
+_RENDERINGS = {6.0: _PANORAMA, 7.0: _PORTRAIT, 8.0: _PORTRAIT}  # Apple's, beside those of EXIF
+_MODES = {b"SpecialType-PORTRAIT": _PORTRAIT, b"GPano:ProjectionType": _PANORAMA}  # Google's, XMP
 _MOST_SEGMENTS = 1000
 _MOST_TEXT = 60
 _MOST_BYTES = 262_144  # of a block that is searched
@@ -74,6 +77,8 @@ class ImageFacts:
         Whether a program took distortion out, and whether it cut the image.
     is_screenshot : bool
         Whether it says so.
+    mode : str
+        The mode of the camera, in words, if it does not show what the lens saw.
     """
 
     form: str = ""
@@ -92,6 +97,12 @@ class ImageFacts:
     lens_corrected: bool | None = None
     cropped: bool | None = None
     is_screenshot: bool = False
+    mode: str = ""
+
+    @property
+    def unlike_the_lens(self) -> str:
+        """Why edges may not lie where the lens put them, in words; "" if nothing says so."""
+        return "screenshots" if self.is_screenshot else self.mode
 
 
 def read_facts(content: bytes) -> ImageFacts:
@@ -146,6 +157,10 @@ def _facts(
         lens_corrected=_setting(xmp, b"LensProfileEnable"),
         cropped=_setting(xmp, b"HasCrop"),
         is_screenshot=any(_SCREENSHOT.search(text) for text in (software, comment, *texts)),
+        mode=next(
+            (mode for mark, mode in _MODES.items() if mark in xmp[:_MOST_BYTES]),
+            _RENDERINGS.get(_number(tags, _RENDERED) or 0.0, ""),
+        ),
     )
 
 

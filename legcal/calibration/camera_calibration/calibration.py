@@ -29,6 +29,7 @@ from legcal.calibration.camera_calibration.document import (
 )
 from legcal.calibration.camera_calibration.lens import ChosenLens, chosen_lens, given_lens
 from legcal.calibration.camera_calibration.picture import PICTURE_FILE, write_picture
+from legcal.data import few
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
 from legcal.files import MAX_IMAGE, describe, read_bytes
 from legcal.geometry import Array
@@ -63,7 +64,6 @@ from legcal.workers import Run, worker_pool
 _STAGE = "Searching the board"
 _N_DESCRIBED = 2  # images of which it is said what they show instead
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-_MAX_NAMED = 5
 
 
 def calibrate_camera(
@@ -89,7 +89,8 @@ def calibrate_camera(
         How the lens distorts. Chosen by the images where it is not given: plumb_bob unless its
         residuals lean over the field and a richer model predicts other images better.
     output : path, optional
-        Write a ROS camera_info file there, with the standard deviations of all numbers.
+        Write a ROS camera_info file there, with the covariance of all intrinsics, which
+        :func:`legcal.calibrate` takes as their prior.
     progress : callable
         Called as ``progress(stage, done, total)``.
     workers : int
@@ -111,7 +112,8 @@ def calibrate_camera(
     NotVisible
         If no image shows the board.
     NotIdentifiable
-        If fewer than three images show it, or all from one side.
+        If fewer than three images show it, or all from one side, or if too few of them agree on
+        one camera.
     DidNotConverge
         If no camera explains the corners.
     """
@@ -298,7 +300,9 @@ def _listed_images(named: Sequence[str | Path]) -> list[Path]:
             )
         found |= dict.fromkeys(paths)
     if problems or not found:
-        raise DatasetError(problems or "The images could not be read: found none, needed some.")
+        raise DatasetError(
+            problems or "The images could not be read: found none, needed some; name them."
+        )
     return list(found)
 
 
@@ -341,7 +345,7 @@ def _common_size(paths: Sequence[Path]) -> tuple[ImageSize, list[ImageFacts]]:
         usual = by_count[0][0]
         first = {size: facts[paths.index(some[0])] for size, some in by_count}
         sizes_in_words = "; ".join(
-            f"{size.width} x {size.height} px in {_named(some)}"
+            f"{size.width} x {size.height} px in {few([path.name for path in some])}"
             f"{likely_cause(size, usual, first[size]) if size != usual else ''}"
             for size, some in by_count
         )
@@ -354,22 +358,22 @@ def _common_size(paths: Sequence[Path]) -> tuple[ImageSize, list[ImageFacts]]:
 
 
 def _changes(paths: Sequence[Path], facts: Sequence[ImageFacts], size: ImageSize) -> Iterator[str]:
-    """Yield a warning for each fact that photographs of one camera must share and do not."""
+    """Yield a warning for each fact that photographs of a camera must share, or that is odd."""
     named = list(zip([path.name for path in paths], facts, strict=True))
     for found in differences(named, (size.width, size.height), None):
-        groups = " and ".join(
-            f"images {how} ({', '.join(names[:_MAX_NAMED])}{', ...' * (len(names) > _MAX_NAMED)})"
-            for how, names in found.images.items()
-        )
+        groups = " and ".join(f"images {how} ({few(names)})" for how, names in found.images.items())
         yield (
             f"No one camera may hold for all images: found {groups}, needed one "
             f"{found.fact.what}; leave out those that differ, and photograph the machine like the "
             "others."
         )
-
-
-def _named(paths: Sequence[Path]) -> str:
-    """Return some of the names of files."""
-    if len(paths) <= _MAX_NAMED:
-        return ", ".join(path.name for path in paths)
-    return f"{len(paths)} images ({paths[0].name}, ...)"
+    odd: dict[str, list[str]] = {}
+    for name, one in named:
+        if one.unlike_the_lens:
+            odd.setdefault(one.unlike_the_lens, []).append(name)
+    for what, names in odd.items():
+        yield (
+            f"Corners in images {few(names)} may not lie where the lens put them: found {what}, as "
+            "their files say, needed files as the camera writes them in its plain mode; leave "
+            "these out, or take them again."
+        )

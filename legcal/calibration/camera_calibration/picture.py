@@ -103,8 +103,8 @@ def picture(calibration: CameraCalibration) -> Canvas:
     lines = (
         f"{camera.model}, {len(at)} corners, {calibration.rms_px:.3f} px off (rms)"
         + ("" if unseen is None else f", {unseen:.3f} px in images left out"),
-        f"arrows: mean residual of a cell, the longest {longest:.3f} px; red: no corner; cross: "
-        "principal point",
+        f"arrows: mean residual of a cell, the longest {longest:.3f} px; green: corners, brighter "
+        "where more; red: none; cross: principal point",
     )
     legend = np.full((62, width, 3), _DARK, dtype=np.uint8)
     for row, line in enumerate(lines):
