@@ -207,7 +207,7 @@ def test_a_focal_length_that_is_estimated_is_not_tested() -> None:
 
 @pytest.mark.parametrize(
     ("camera", "given", "words"),
-    [(LENS, 0.0, "were not corrected"), (PINHOLE, -0.1, "were corrected")],
+    [(LENS, 0.0, "had not been corrected"), (PINHOLE, -0.1, "had been corrected")],
 )
 def test_photographs_of_another_distortion_are_noticed(
     camera: Camera, given: float, words: str

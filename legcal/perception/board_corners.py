@@ -234,7 +234,6 @@ _MARKERS_SEARCHED = 1_200_000  # pixels of the image in which markers are search
 _MAX_PIXELS = 24_000_000  # of an image in which OpenCV looks for markers
 _SHARPENED, _SHARPENED_PX = 4.0, 2.5  # unsharp mask by which blurred modules are told apart
 _ENLARGED = 2.0  # modules may be only a few pixels wide
-_ANCHORS_OFF = 0.3  # of a pitch that corners of markers are from where the others put them
 _FIRST_TAG = 0xD5D628584  # of the family 36h11, its modules row by row from the top left
 
 

@@ -51,9 +51,7 @@ _MAX_TURN = 0.3  # [rad] of an edge from where it should point
 _BLURS = (0.3, 4.0)  # [px]
 _MAX_MISFIT = 0.35  # residual, as a part of the contrast
 _MIN_SIGMA_PX = 0.01  # no corner is known better: print, flatness, pixels that differ
-_LAGS = (
-    2  # pixels over which residuals are correlated: mosaics of colour, JPEG, what is not modelled
-)
+_LAGS = 2  # pixels over which residuals are correlated: mosaics of colour, JPEG, other shapes
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,10 +54,12 @@ def _model_and_sheet(found: CameraCalibration) -> str:
     unseen = (
         "" if found.validated_px is None else f", {found.validated_px:.3f} px off in new images"
     )
-    bend = 1e3 * np.abs(found.sheet[:3]).max()
+    k = int(np.argmax(np.abs(found.sheet[:3])))
+    bend, sigma = 1e3 * abs(found.sheet[k]), 1e3 * found.sheet_sigma[k]
+    wider, open_to = 100.0 * found.sheet[3], 100.0 * found.sheet_sigma[3]
     return (
-        f"Lens model {found.lens}{unseen}. The board is bent by up to {bend:.2g} mm, and printed "
-        f"{100.0 * found.sheet[3]:+.2g} +- {100.0 * found.sheet_sigma[3]:.2g} % wider than high."
+        f"Lens model {found.lens}{unseen}. The board is bent by {bend:.2g} +- {sigma:.2g} mm, and "
+        f"printed {wider:+.2g} +- {open_to:.2g} % wider than high."
     )
 
 

@@ -63,9 +63,8 @@ def _polynomial_derivatives(xy: Array, K: Array, coefficients: Array) -> tuple[A
     rays = np.concatenate([xy[:, 0], np.ones((len(xy), 1))], axis=1).reshape(-1, 1, 3)
     zero = np.zeros(3)
     pixels, J = cv2.projectPoints(rays, zero, zero, K, coefficients)
-    return np.asarray(pixels), np.concatenate(
-        [J[:, 3:5], J[:, 6:]], axis=1
-    )  # by translation, and the last
+    by_translation, by_intrinsics = J[:, 3:5], J[:, 6:]
+    return np.asarray(pixels), np.concatenate([by_translation, by_intrinsics], axis=1)
 
 
 def _fisheye_distort(xy: Array, K: Array, coefficients: Array) -> Array:
@@ -82,9 +81,8 @@ def _fisheye_derivatives(xy: Array, K: Array, coefficients: Array) -> tuple[Arra
     rays = np.concatenate([xy[:, 0], np.ones((len(xy), 1))], axis=1).reshape(-1, 1, 3)
     zero = np.zeros(3)
     pixels, J = cv2.fisheye.projectPoints(rays, zero, zero, K, coefficients)
-    return np.asarray(pixels), np.concatenate(
-        [J[:, 11:13], J[:, :8]], axis=1
-    )  # by translation, and the first
+    by_translation, by_intrinsics = J[:, 11:13], J[:, :8]
+    return np.asarray(pixels), np.concatenate([by_translation, by_intrinsics], axis=1)
 
 
 _POLYNOMIAL = _polynomial_distort, _polynomial_undistort, _polynomial_derivatives

@@ -204,42 +204,11 @@ def _of_twist(
 
 
 @dataclass(frozen=True)
-class FocalLength:
-    """What the measurements say of the focal length of a camera whose file says what it is."""
+class _TestedIntrinsic:
+    """What the measurements say of an intrinsic of a camera whose file says what it is."""
 
     view: str  # the first one by name if several have the camera
-    given: float  # fx in the camera file [px]
-    change: float  # what would have to be added to fx and fy, as a part of them
-    sigma: float  # standard deviation of that
-
-    @property
-    def apart(self) -> float:
-        """How many standard deviations lie between what was given and what was found."""
-        return abs(self.change) / self.sigma
-
-    @property
-    def is_contradicted(self) -> bool:
-        """Whether the measurements disagree with what was given."""
-        return self.apart > _SIGNIFICANT
-
-    def __str__(self) -> str:
-        found, sigma = self.given * (1.0 + self.change), self.given * self.sigma
-        return (
-            f"The focal length of {self.view} does not agree with the measurements: found fx = "
-            f"{found:.1f} +- {sigma:.1f} px, given {self.given:.1f} px, {self.apart:.0f} standard "
-            f"deviations and {1e2 * self.change:+.2f} % apart; the stated uncertainty knows "
-            "nothing of it; calibrate the camera again at the same focus and zoom, look for "
-            "pictures that were scaled or focused anew, or let the fit find it "
-            f"(--free {self.view}.fx --free {self.view}.fy)."
-        )
-
-
-@dataclass(frozen=True)
-class LensDistortion:
-    """What the measurements say of the distortion of a camera whose file says what it is."""
-
-    view: str  # the first one by name if several have the camera
-    given: float  # k1 in the camera file
+    given: float  # in the camera file
     change: float  # what would have to be added to it
     sigma: float  # standard deviation of that
 
@@ -253,13 +222,32 @@ class LensDistortion:
         """Whether the measurements disagree with what was given."""
         return self.apart > _SIGNIFICANT
 
+
+class FocalLength(_TestedIntrinsic):
+    """A focal length: ``given`` is fx [px], ``change`` that of fx and fy, as a part of them."""
+
+    def __str__(self) -> str:
+        found, sigma = self.given * (1.0 + self.change), self.given * self.sigma
+        return (
+            f"The focal length of {self.view} does not agree with the measurements: found fx = "
+            f"{found:.1f} +- {sigma:.1f} px, given {self.given:.1f} px, {self.apart:.0f} standard "
+            f"deviations and {1e2 * self.change:+.2f} % apart; the stated uncertainty knows "
+            "nothing of it; calibrate the camera again at the same focus and zoom, look for "
+            "pictures that were scaled or focused anew, or let the fit find it "
+            f"(--free {self.view}.fx --free {self.view}.fy)."
+        )
+
+
+class LensDistortion(_TestedIntrinsic):
+    """A distortion, by its first coefficient k1."""
+
     def __str__(self) -> str:
         found = self.given + self.change
         looks = ""
         if abs(found) < 0.5 * abs(self.given):
-            looks = "; photographs look so that were corrected for their lens"
+            looks = "; the photographs look as if they had been corrected for their lens"
         elif self.given == 0.0:
-            looks = "; photographs look so that were not corrected for their lens"
+            looks = "; the photographs look as if they had not been corrected for their lens"
         return (
             f"The distortion of {self.view} does not agree with the measurements: found k1 = "
             f"{found:.3f} +- {self.sigma:.3f}, given {self.given:.3f}, {self.apart:.0f} standard "
