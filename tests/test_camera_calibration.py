@@ -450,6 +450,9 @@ def test_the_picture_shows_where_corners_were_seen_and_replaces_only_itself(
     cv2.imwrite(str(path), np.zeros((4, 4), np.uint8))
     with pytest.raises(UsageError, match="another file of that name"):
         write_picture(found, path)
+    one = folder.parent / "both"
+    with pytest.raises(UsageError, match="found the file of the camera there"):
+        calibrate_camera(folder, SPEC, output=one, picture=one)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 from .folder import TEMPORARY_SUFFIX as TEMPORARY_SUFFIX
+from .folder import OutputFile as OutputFile
 from .folder import OutputKind as OutputKind
-from .folder import YamlOutput as YamlOutput
 from .folder import check_destination as check_destination
 from .folder import check_path as check_path
 from .folder import existing_parent as existing_parent

@@ -62,7 +62,7 @@ def path_problem(folder: Path, named: str) -> str | None:
 
 
 @dataclass(frozen=True)
-class YamlOutput:
+class OutputFile:
     """A kind of file."""
 
     noun: str  # what is written, with its article, for sentences: "the camera"

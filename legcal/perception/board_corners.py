@@ -396,6 +396,7 @@ def require_board(
     Raises NotVisible with one sentence for each of them.
     """
     shown = set(measurements.view[corners.row].tolist())
+    whole = ", its outer corners in sight" if board.kind == "chessboard" else ""
     problems = []
     for v, view in enumerate(measurements.views):
         rows = [row for row in np.flatnonzero(measurements.view == v).tolist()
@@ -409,8 +410,8 @@ def require_board(
         problems.append(
             f"view {view.name}: the board could not be found in any of its {len(rows)} "
             f"image{'s' * (len(rows) != 1)}: found {found or 'nothing like it'}, needed "
-            f"{board_in_words(board)}; correct the block board of the dataset file, or turn the "
-            "camera."
+            f"{board_in_words(board)}{whole}; correct the block board of the dataset file, or "
+            "turn the camera."
         )
     if problems:
         raise NotVisible(problems)
@@ -419,9 +420,8 @@ def require_board(
 def board_in_words(board: Board) -> str:
     """Return a board in words."""
     what = "tags" if board.kind == "aprilgrid" else "squares"
-    whole = ", its outer corners in sight" if board.kind == "chessboard" else ""
     name = {"chessboard": "a chessboard", "charuco": "a ChArUco board", "aprilgrid": "an AprilGrid"}
-    return f"{name[board.kind]} of {board.columns} x {board.rows} {what}{whole}"
+    return f"{name[board.kind]} of {board.columns} x {board.rows} {what}"
 
 
 def _search(board: Board, load: Load, row: int) -> tuple[IntArray, Array, Array]:

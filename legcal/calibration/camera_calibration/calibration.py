@@ -126,6 +126,11 @@ def calibrate_camera(
         CAMERA_FILE.check_place(Path(output))
     if picture is not None:
         PICTURE_FILE.check_place(Path(picture))
+        if output is not None and Path(output).resolve() == Path(picture).resolve():
+            raise UsageError(
+                f"{picture}: the picture could not be written: found the file of the camera there, "
+                "needed one of its own; give another file."
+            )
     stated = board_of(board)
     paths = _listed_images([images] if isinstance(images, str | Path) else images)
     size, facts = _common_size(paths)

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from legcal.files import Document, YamlOutput
+from legcal.files import Document, OutputFile
 from legcal.geometry import Array
 from legcal.perception import SHEET
 from legcal.vision import CALIBRATED, Board, Camera, camera_info, intrinsic_names, intrinsic_values
 
-CAMERA_FILE = YamlOutput(
+CAMERA_FILE = OutputFile(
     "the camera", "camera file", CALIBRATED, "a new file or one that this command wrote"
 )
 _DIGITS = 6  # of figures that describe the calibration

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legcal.calibration.camera_calibration.document import CameraCalibration
-from legcal.files import YamlOutput
+from legcal.files import OutputFile
 
 _LONGER = 1280  # side of the picture [px]
 _CELLS = 16  # along it
@@ -27,7 +27,7 @@ Canvas = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class _Picture(YamlOutput):
+class _Picture(OutputFile):
     """A PNG that says which command wrote it."""
 
     def _is_own(self, path: Path) -> bool:

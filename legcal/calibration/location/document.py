@@ -16,8 +16,8 @@ from legcal.files import (
     FileSchema,
     MotionEntry,
     Number,
+    OutputFile,
     Version,
-    YamlOutput,
     motion_to_xyz_quat,
     read_yaml,
     validate,
@@ -35,7 +35,7 @@ NAMES = tuple(
 )
 _WHAT = "location file"
 _KEY = "legcal_location"
-LOCATION_FILE = YamlOutput("the location", _WHAT, _KEY, "a new file or an earlier location")
+LOCATION_FILE = OutputFile("the location", _WHAT, _KEY, "a new file or an earlier location")
 _SYMMETRY_TOLERANCE = 1e-9  # relative
 _NEGATIVE_TOLERANCE = 1e-12  # of eigenvalues below zero, relative
 _Vector = Annotated[
