@@ -57,7 +57,7 @@ GAMMA, GAMMA_SUFFIX = len(KINDS), ".gamma"  # one more kind, and the end of the 
 N_KINDS = len(KINDS) + 1
 GAMMA_SIGMA = 0.5  # of the logarithm: photographs are linear, or near 2.2
 SIDEWAYS = np.sqrt(2.0)  # standard deviation of sideways biases, those inwards being one
-_MIN_BIAS_GAIN = 6.0  # of white residuals, one set in twenty gains that much
+_MIN_BIAS_GAIN = 6.0  # one set of white residuals in ten to twenty gains that much
 _MODES = (("bias", (1.0, 1.0)), ("tilt", (-1.0, 1.0)))  # shifts of both ends
 
 RECOVERED_SHARE = 0.5  # of the error of a gamma (logarithm) that a fit recovers, about
