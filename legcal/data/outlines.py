@@ -107,6 +107,11 @@ class Outlines(ImageTable):
         leg, edge = self.leg.tolist(), self.edge.tolist()
         return list(zip(self.row.tolist(), leg, self.part, edge, strict=True))
 
+    def used_keys(self) -> set[tuple[int, int, str, int]]:
+        """Return image row, leg, part and edge of the used outlines."""
+        pairs = zip(self.row_keys(), self.used.tolist(), strict=True)
+        return {key for key, is_used in pairs if is_used}
+
 
 def no_outlines() -> Outlines:
     """Return an empty table."""

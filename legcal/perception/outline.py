@@ -122,7 +122,7 @@ def used_as_before(outlines: Outlines, before: Outlines) -> Outlines:
     Of the same images, measured with another gamma: it moves both edges of a part inwards or
     outwards, so that widths differ from those of a fit with the gamma before.
     """
-    was = {key for key, used in zip(before.row_keys(), before.used.tolist(), strict=True) if used}
+    was = before.used_keys()
     of_width = [
         used or why.startswith(WRONG_WIDTH)
         for used, why in zip(outlines.used.tolist(), outlines.reason, strict=True)

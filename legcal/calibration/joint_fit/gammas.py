@@ -183,15 +183,10 @@ def log_likelihoods(solutions: Sequence[Solution], cameras: Sequence[Views]) -> 
     Of all that are used in all solutions, as noise and biases of each have them. Every camera has
     its outlines, and of what they have in common its part.
     """
-    keys = [solution.outlines.row_keys() for solution in solutions]
-    used = [
-        {key for key, is_used in zip(of, solution.outlines.used.tolist(), strict=True) if is_used}
-        for of, solution in zip(keys, solutions, strict=True)
-    ]
-    same = set.intersection(*used)
+    same = set.intersection(*(solution.outlines.used_keys() for solution in solutions))
     found = np.zeros((len(solutions), len(cameras)))
-    for i, (of, solution) in enumerate(zip(keys, solutions, strict=True)):
-        fit = solution.posterior
+    for i, solution in enumerate(solutions):
+        fit, of = solution.posterior, solution.outlines.row_keys()
         o = fit.problem.outlines
         kept = np.array([of[k] in same for k in o.index.tolist()], dtype=np.bool_)
         problem = fit.problem.weighted(fit.noise, kept)
@@ -209,9 +204,6 @@ def log_likelihoods(solutions: Sequence[Solution], cameras: Sequence[Views]) -> 
 
 def loses_outlines(before: Outlines, after: Outlines) -> bool:
     """Say whether fewer outlines are used than before, by more than chance (McNemar's test)."""
-    used = [
-        {key for key, is_used in zip(o.row_keys(), o.used.tolist(), strict=True) if is_used}
-        for o in (before, after)
-    ]
-    lost, gained = len(used[0] - used[1]), len(used[1] - used[0])
+    used, still = before.used_keys(), after.used_keys()
+    lost, gained = len(used - still), len(still - used)
     return bool(lost - gained > SIGNIFICANCE * np.sqrt(lost + gained))
