@@ -1,8 +1,9 @@
 """Any machine of the class, written as URDF and YAML in any spanning tree, for tests."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -52,7 +53,8 @@ class LegLayout:
     """How one leg is written.
 
     ``cut``: ``far`` (3d where the far joint is an S and ``sphere``), ``mid`` or ``slider``
-    (welded behind or before the slider), ``carry`` (the leg carries the platform, uncut).
+    (welded behind or before the slider), ``carry`` (the leg carries the platform, uncut), ``bear``
+    (the platform is the child of its last joint, see :func:`borne`).
     ``spin``: a revolute along the leg beside its ``S``, or on the side of ``base`` or ``platform``.
     """
 
@@ -128,7 +130,7 @@ def write_machine(
     text = _Text()
     text.link("base")
     text.link("platform")
-    carried = any(layout.of(j).cut == "carry" for j in range(len(description.legs)))
+    carried = any(layout.of(j).cut in ("carry", "bear") for j in range(len(description.legs)))
     virtual = None if carried else layout.virtual
     if virtual is not None:
         T = EYE
@@ -170,6 +172,17 @@ def write_machine(
     path = folder / f"{name}.yaml"
     path.write_text(yaml.safe_dump(document, sort_keys=False))
     return path
+
+
+def borne(description: MachineSpec, j: int, **others: Any) -> tuple[MachineSpec, Layout]:
+    """Return a machine whose platform link is the child of the last joint of leg j, and its layout.
+
+    The frame of the platform is that of the joint then. *others* say how other legs are written.
+    """
+    home = RigidTransform.from_components(description.legs[j].B_home, description.home.rotation)
+    legs = [LegLayout(seed=k, **others) for k in range(len(description.legs))]
+    legs[j] = LegLayout(cut="bear")
+    return replace(description, home=home), Layout(tuple(legs))
 
 
 class _Leg:
@@ -241,6 +254,8 @@ class _Leg:
         if cut_sphere:
             walk = walk[: -self.far_axes]
         tip, pose = self._piece(near, walk)
+        if layout.cut == "bear":
+            return None
         if layout.cut == "carry":
             T = pose.inv() * self.roots["platform"]
             self.text.joint("platform_carried", "fixed", tip, "platform", T)
@@ -270,12 +285,15 @@ class _Leg:
             joint = self.joints[i]
             point = joint.point + self.layout.slid * self.rng.uniform(-1.0, 1.0) * joint.axis
             T = RigidTransform.from_components(point, Rotation.random(rng=self.rng))
+            child = f"{joint.name}_link"
+            if self.layout.cut == "bear" and i == len(self.joints) - 1:
+                child, T = "platform", self.roots["platform"]
             flip = self.layout.flip_slider if joint.type == "prismatic" else self.layout.flip_axes
             axis = joint.axis * (-1.0 if flip else 1.0)
             if joint.type == "prismatic":
                 axis = axis if outward else -axis
-            child = f"{joint.name}_link"
-            self.text.link(child, self._visual(i + 1 if outward else i, T))
+            if child != "platform":
+                self.text.link(child, self._visual(i + 1 if outward else i, T))
             lower, upper = (-6.3, 6.3) if joint.type == "revolute" else (-0.2, 0.5)
             if joint.type == "prismatic" and self.layout.flip_slider:
                 lower, upper = -upper, -lower

@@ -2,16 +2,18 @@
 
 import pickle
 import re
+from dataclasses import replace
 from functools import cache
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from layouts import PASSED, Layout, LegLayout, LegSpec, MachineSpec, write_machine
+from layouts import PASSED, Layout, LegLayout, LegSpec, MachineSpec, borne, write_machine
 from machines import MACHINES, SHIPPED_URDF, SHIPPED_YAML, of_types
 from thinned import thinned
 
@@ -185,6 +187,29 @@ def test_every_layout_of_a_machine_gives_the_same_analysis_and_poses(
     )
     if name != "every leg otherwise":  # whose revolutes do not turn anywhere
         _same_poses(_plain(description, written), machine)
+
+
+BORNE = [("6-UPS", 0, {}), ("3-RPR, tilted plane", 1, {}), ("3-UPU", 2, {"cut": "mid"}),
+         ("Tricept", 3, {"sphere": False}), ("Tricept", 1, {"hung": "platform"})]  # fmt: skip
+
+
+@pytest.mark.parametrize(("description", "leg", "others"), BORNE)
+def test_a_platform_that_is_the_child_of_a_last_joint_changes_nothing(
+    description: str, leg: int, others: dict[str, Any], tmp_path: Path
+) -> None:
+    drawn, layout = borne(MACHINES[description](), leg, **others)
+    path = write_machine(tmp_path, drawn, layout)
+    machine = load_mechanism(path)
+    assert machine.platform_joint is None
+    _check(machine, drawn, layout)
+    assert machine.mobility == MOBILITY[description[0]]
+    _same_poses(load_mechanism(write_machine(tmp_path / "plain", drawn, Layout())), machine)
+    # Its home, where none is given, is as level as that of the machine in our layout.
+    level = [
+        load_mechanism(write_machine(tmp_path / name, drawn, replace(written, home=False))).home
+        for name, written in (("a", layout), ("b", Layout()))
+    ]
+    np.testing.assert_allclose(level[0].as_matrix(), level[1].as_matrix(), atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -4,12 +4,13 @@ import re
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 import yaml
-from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
+from layouts import Layout, LegLayout, LegSpec, MachineSpec, borne, write_machine
 from lxml import etree
 from machines import MACHINES, ROOT, SHIPPED, SHIPPED_URDF, SHIPPED_YAML, of_types, ring
 from scipy.spatial.transform import RigidTransform
@@ -34,6 +35,7 @@ from legcal.machine import (
     vector_of,
     with_platform_foot,
     write_calibrated_yaml,
+    write_model,
     write_urdf,
 )
 from legcal.simulation import (
@@ -176,29 +178,73 @@ def test_origins_and_radii_are_added_and_changed_in_place() -> None:
 
 
 @pytest.mark.parametrize(
-    ("carried", "link", "found"),
+    ("machine", "leg", "others"),
     [
-        (True, "", "leg 'leg1' could not be written: found that joint"),
-        (False, "leg3_seat", "'leg3_seat' on a link that carries other things"),
+        ("6-UPS", 0, {}),
+        ("3-RPR", 1, {"hung": "platform"}),
+        ("3-UPU", 2, {"cut": "mid"}),
+        ("Tricept", 3, {"sphere": False}),
     ],
 )
-def test_a_link_that_carries_other_things_cannot_be_moved(
-    carried: bool, link: str, found: str, tmp_path: Path
+def test_models_are_written_whose_platform_is_the_child_of_a_last_joint(
+    machine: str, leg: int, others: dict[str, Any], tmp_path: Path
 ) -> None:
-    layout = Layout((LegLayout(cut="carry"), *[LegLayout()] * 5)) if carried else Layout()
+    drawn, layout = borne(MACHINES[machine](), leg, **others)
+    nominal = load_mechanism(write_machine(tmp_path / "nominal", drawn, layout))
+    true = _check(nominal, tmp_path)
+    legs = geometries(true)
+    written = write(nominal, legs, tmp_path)
+    assert max(map(apart, geometries(written), legs)) < 1e-10
+    yaml_path, _ = write_model(nominal, tmp_path / "again")
+    assert max(map(apart, geometries(load_mechanism(yaml_path)), geometries(nominal))) < 1e-12
+
+
+@pytest.mark.parametrize("link", ["leg1_b1_link", "leg3_seat", "leg4_end"])
+def test_a_leg_moves_alone_whose_link_carries_other_things(link: str, tmp_path: Path) -> None:
+    layout = Layout((LegLayout(cut="carry"), *[LegLayout(sphere=k < 4) for k in range(1, 6)]))
     path = write_machine(tmp_path, of_types(["US"] * 6), layout)
-    if carried:
-        link = load_mechanism(path).urdf.joints["platform_carried"].parent
+    urdf = path.with_suffix(".urdf")
     extra = (
         f'<link name="camera"/><joint name="camera_mount" type="fixed"><parent link="{link}"/>'
         '<child link="camera"/></joint></robot>'
     )
-    urdf = path.with_suffix(".urdf")
     urdf.write_text(urdf.read_text().replace("</robot>", extra))
     nominal = load_mechanism(path)
-    with pytest.raises(OutOfClass, match=found):
-        write_urdf(nominal, geometries(nominal), tmp_path / "calibrated.urdf")
-    assert not (tmp_path / "calibrated.urdf").exists()
+    legs = other_legs(nominal, 3e-3)
+    written = write(nominal, legs, tmp_path)
+    assert max(map(apart, geometries(written), legs)) < 1e-10
+
+
+def test_a_leg_that_is_welded_to_the_platform_by_another_leg_is_refused(tmp_path: Path) -> None:
+    path = write_machine(tmp_path, of_types(["UU"] * 3), Layout())
+    machine = load_mechanism(path)
+    T = machine.chain.pose(machine.home_configuration, "leg2_end", "leg1_end")
+    patch = UrdfPatch(path.with_suffix(".urdf").read_bytes())
+    patch.add_frame("leg2_end", "other", "other", "other_joint", T)
+    path.with_suffix(".urdf").write_bytes(patch.content())
+    path.write_text(path.read_text().replace("- leg1_seat", "- other"))
+    with pytest.raises(OutOfClass, match="leg 'leg1' is outside the method: found several welds"):
+        load_mechanism(path)
+
+
+def test_closures_may_name_joints_whose_links_carry_other_things(tmp_path: Path) -> None:
+    path = write_machine(tmp_path, of_types(["SS"] * 6), Layout((LegLayout(hung="platform"),)))
+    urdf, text = path.with_suffix(".urdf"), path.read_text()
+    joints = load_mechanism(path).urdf.joints
+    moved = urdf.read_text()
+    for leg in ("leg1", "leg2"):
+        seat = f"{leg}_seat"
+        assert joints[f"{seat}_frame"].parent == "base"
+        extra = (
+            f'<link name="{seat}_in"/><joint name="{seat}_fixed" type="fixed">'
+            f'<parent link="{seat}"/><child link="{seat}_in"/></joint></robot>'
+        )
+        moved = moved.replace("</robot>", extra)
+    urdf.write_text(moved)
+    path.write_text(text.replace("- leg1_seat", "- leg1_seat_frame"))
+    nominal = load_mechanism(path)
+    legs = other_legs(nominal, 3e-3)
+    assert max(map(apart, geometries(write(nominal, legs, tmp_path)), legs)) < 1e-10
 
 
 @pytest.mark.parametrize(

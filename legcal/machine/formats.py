@@ -13,16 +13,18 @@ from pathlib import Path
 
 import numpy as np
 from lxml import etree
+from scipy.linalg import null_space
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass
 from legcal.files import closest
 from legcal.geometry import Array
+from legcal.machine.bodies import rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.files import find_model, find_urdf, read_file, yaml_of_urdf
 from legcal.machine.mjcf import read_mjcf_source
 from legcal.machine.schema import MAX_LOOPS, MechanismFile, read_mechanism_file
-from legcal.machine.solver import solve
+from legcal.machine.solver import Equations, solve
 from legcal.machine.spanning_tree import (
     DRAWING,
     Loop,
@@ -37,6 +39,7 @@ from legcal.machine.spanning_tree import (
     sliders_without_travel,
     travel_note,
 )
+from legcal.machine.topology import find_chains, level_rotation, propose_block
 from legcal.machine.urdf import (
     LOOP_TAGS,
     Problems,
@@ -420,12 +423,61 @@ def completed(source: Source) -> Source:
     found = closed_near(chain, start, source.urdf.links)
     configuration = start if found is None else found
     urdf = source.urdf
-    poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
     sliders = sliders_without_travel(urdf)
+    if sliders and found is not None and _off(chain, start) > CLOSED:
+        configuration = found = _levelled(chain, found, source, closures)
+    poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
     if sliders:
         readings = {name: float(configuration[chain.q_index(name)]) for name in sliders}
         source = _with_travel(source, readings, poses)
     return source if found is None else replace(source, poses=poses)
+
+
+def _levelled(
+    chain: ClosedChain, configuration: Array, source: Source, closures: Sequence[Closure]
+) -> Array:
+    """Return a closed configuration with the platform level, the given one where it cannot be.
+
+    A file that neither draws a closed mechanism nor says how far its sliders go leaves the pose
+    open. Of the level ones it is the one with the sliders nearest to where they are drawn.
+    """
+    urdf = source.urdf
+    try:
+        block = propose_block(urdf, closures, source.file.name_mot, source.path)
+    except OutOfClass:
+        return configuration  # refused later
+    bodies = rigid_bodies(urdf, closures, block.platform_joint)
+    chains = find_chains(bodies, urdf, block.base, block.platform)
+    A, B = (
+        np.array(points) @ bodies.T_body_link[link][:3, :3]
+        for link, points in (
+            (block.base, [leg.A for leg in chains]),
+            (block.platform, [leg.line_in(-1, leg.B)[0] for leg in chains]),
+        )
+    )
+    level = RigidTransform.from_rotation(level_rotation(A, B))
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        residual, jacobian = chain.linearize(points[0])
+        turned, by_joints = chain.welded(block.base, block.platform, level)
+        rows = np.concatenate([residual, turned[3:]]), np.concatenate([jacobian, by_joints[3:]])
+        return rows[0][None], rows[1][None]
+
+    found = _solved(chain, equations, configuration)
+    if found is None:
+        return configuration
+    sliders = [name for name, joint in urdf.joints.items() if joint.type == "prismatic"]
+    values = [chain.q_index(name) for name in sliders]
+    rates = [chain.v_index(name) for name in sliders]
+    for _ in range(STEPS):
+        free = null_space(equations(found[None])[1][0], rcond=1e-9)
+        step = -free @ np.linalg.lstsq(free[rates], found[values], rcond=1e-6)[0]
+        step *= min(1.0, _MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-300))
+        nearer = _solved(chain, equations, chain.integrate(found, step))
+        if nearer is None or np.linalg.norm(nearer[values]) >= np.linalg.norm(found[values]):
+            break
+        found = nearer
+    return found
 
 
 def closed_near(chain: ClosedChain, start: Array, links: Sequence[str]) -> Array | None:
@@ -463,6 +515,12 @@ def _close(chain: ClosedChain, configuration: Array) -> Array | None:
     def equations(points: Array) -> tuple[Array, Array]:
         residual, jacobian = chain.linearize(points[0])
         return residual[None], jacobian[None]
+
+    return _solved(chain, equations, configuration)
+
+
+def _solved(chain: ClosedChain, equations: Equations, configuration: Array) -> Array | None:
+    """Return the configuration near a given one where equations hold, or None."""
 
     def retract(points: Array, step: Array) -> Array:
         step = step[0] * min(1.0, _MAX_STEP / max(float(np.abs(step).max()), 1e-300))

@@ -20,6 +20,7 @@ from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine, platform_pose, readings_at
 from legcal.machine.parameters import legs_in_links
 from legcal.machine.solver import poses_after, solve
+from legcal.machine.topology import level_rotation
 
 TRIALS = 200
 MIN_TRIALS = 20  # trials, where one of them found a pose above the base
@@ -70,8 +71,9 @@ def home_at_mid_travel(machine: Machine) -> RigidTransform:
     """Return a pose where every leg is at the middle of its travel.
 
     Among the poses that seeded starts lead to, the one with the smallest rotation of the platform
-    is taken, and among mirror images in the plane of the base joints the one on the positive side
-    of the base's z. Lengths of legs without a motor follow, inside their travel if possible.
+    is taken, counted from where its joints lie over those of the base, and among mirror images in
+    the plane of the base joints the one on the positive side of
+    the base's z. Lengths of legs without a motor follow, inside their travel if possible.
 
     Raises
     ------
@@ -83,6 +85,7 @@ def home_at_mid_travel(machine: Machine) -> RigidTransform:
     actuated = np.array([leg.kind is LegKind.ACTUATED for leg in machine.legs])
     rng = np.random.default_rng(1965)
     centre = machine.A_base.mean(axis=0)
+    level = level_rotation(machine.A_base, machine.B_platform)
     reach = float(np.abs(wanted + machine.q0).mean())
     best: tuple[float, RigidTransform] | None = None
     for first in range(0, TRIALS, BATCH):
@@ -91,11 +94,12 @@ def home_at_mid_travel(machine: Machine) -> RigidTransform:
             (centre + rng.normal(0.0, reach, 3), rng.normal(0.0, 0.1 + trial / TRIALS, 3))
             for trial in trials
         ]
+        starts = [(t, (level * Rotation.from_rotvec(turn)).as_rotvec()) for t, turn in starts]
         found = _with_lengths(machine, starts, wanted[actuated], reach)
         for trial, T in zip(trials, found, strict=True):
             if T is None:
                 continue
-            rank = _unlikely(machine, T) + float(T.rotation.magnitude())
+            rank = _unlikely(machine, T) + float((level.inv() * T.rotation).magnitude())
             if best is None or rank < best[0] - 1e-6:
                 best = rank, T
             if trial >= MIN_TRIALS and best[0] < 5.0:

@@ -37,6 +37,7 @@ from legcal.machine.leg import (
 )
 from legcal.machine.mobility import CONFIGURATIONS, generic_configurations, mobility
 from legcal.machine.model import Machine, joint_values, vectors_A_to_B
+from legcal.machine.origins import with_own_origins
 from legcal.machine.parameters import n_frame_legs
 from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.spanning_tree import Source
@@ -103,6 +104,9 @@ def _load(source: Source) -> Machine:
         drawn = MotionEntry.model_validate(motion_to_xyz_quat(T))
         block = block.model_copy(update={"home": drawn})
     machine = _assemble(source, block, closures)
+    urdf, own = with_own_origins(source.urdf, closures, machine)
+    if urdf is not source.urdf:
+        machine = _assemble(replace(source, urdf=urdf), block, own)
     # Home: a pose that closes.
     given = machine.home if block.home is not None else None
     if given is None:

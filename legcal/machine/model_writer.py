@@ -161,7 +161,10 @@ def _is_written_down(machine: Machine) -> bool:
     document = yaml.compose(content, Loader=yaml.SafeLoader)
     stand_ins = _entry(document, "joint_name")
     has_stand_ins = isinstance(stand_ins, yaml.SequenceNode) and bool(stand_ins.value)
-    return isinstance(_entry(document, "legcal"), yaml.MappingNode) and not has_stand_ins
+    if not isinstance(_entry(document, "legcal"), yaml.MappingNode) or has_stand_ins:
+        return False
+    named = {tuple(pair) for pair in yaml.safe_load(content)["closed_loop"]}
+    return named == {(c.frame_1, c.frame_2) for c in machine.chain.closures}
 
 
 def _entry(node: yaml.Node | None, key: str) -> yaml.Node | None:

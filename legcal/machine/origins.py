@@ -2,12 +2,14 @@
 
 A number of a leg is carried by the origin of a joint: that of its first joint by A, of its last by
 B, of its slider or of a joint of its rod by the length. Where an origin moves that leg alone it is
-a :class:`Handle`; legs whose origins carry other things too are refused.
+a :class:`Handle`. Trees in which no origin does, because the last joint of a leg carries the
+platform or a frame of a closure lies on a link with other things, get a link of its own there
+(:func:`with_own_origins`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,17 +19,18 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import OutOfClass
 from legcal.geometry import Array, matrix_inverse, matrix_product, rotation_between
 from legcal.machine.bodies import Bodies, frame_link, rigid_bodies
+from legcal.machine.chain import Closure
 from legcal.machine.leg import Leg, LegChain, Step
 from legcal.machine.model import Machine
 from legcal.machine.parameters import legs_in_links, twist_after
-from legcal.machine.urdf import UrdfJoint
+from legcal.machine.urdf import Urdf, UrdfJoint, UrdfPatch, parse_urdf
 
 _ROUNDING = 1e-14  # [rad]: what turns less does not turn
 
 
 def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[RigidTransform, bool]]:
     """Return the new origin of every joint that carries a number of a leg, and if it is turned."""
-    handles = Handles(machine)
+    handles = Handles(machine.urdf, machine.chain.closures, machine.platform_joint)
     found: dict[str, tuple[RigidTransform, bool]] = {}
 
     def move(handle: Handle, motion: Motion, body: str) -> None:
@@ -56,6 +59,73 @@ def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[Rigi
     return found
 
 
+def with_own_origins(
+    urdf: Urdf, closures: Sequence[Closure], machine: Machine
+) -> tuple[Urdf, list[Closure]]:
+    """Return the tree of a machine and its closures with an origin for every number of a leg.
+
+    Links are added where none is: between a joint and the link that it carries, and for frames of
+    closures on links that carry other things. Nothing is added to the layout that we write.
+
+    Raises
+    ------
+    OutOfClass
+        If a leg is welded several times between two of its joints.
+    """
+    changed = list(closures)
+    while True:
+        handles = Handles(urdf, changed, machine.platform_joint)
+        try:
+            for leg in machine.legs:
+                _find_all(handles, leg, machine)
+        except NoOriginError as missing:
+            patch, names = UrdfPatch(urdf.content), {*urdf.links, *urdf.joints}
+            if missing.joint is not None:
+                below = urdf.joints[missing.joint].child
+                link, joint = _unused(f"{missing.joint}_mount", names)
+                patch.add_link_below(missing.joint, link, joint)
+                changed = _renamed(changed, missing.joint, below)
+            else:
+                frame = str(missing.frame)
+                link, joint = _unused(f"{frame}_mount", names)
+                patch.add_frame(
+                    frame_link(urdf, frame), link, link, joint, RigidTransform.identity()
+                )
+                changed = _renamed(changed, frame, link)
+            urdf = parse_urdf(urdf.path, patch.content())
+        else:
+            return urdf, changed
+
+
+def _find_all(handles: Handles, leg: Leg, machine: Machine) -> None:
+    """Find the origins of a leg."""
+    chain = leg.urdf_chain
+    first, last = chain.steps[0], chain.steps[-1]
+    handles.of(first, first.near, machine.base, leg.name)
+    handles.of(last, last.far, machine.platform, leg.name)
+    if chain.slider is None:
+        _in_rod(handles, leg, chain, (0.0, 0.0))
+
+
+def _unused(name: str, taken: Set[str]) -> tuple[str, str]:
+    """Return free names of a link and of the fixed joint above it."""
+    while name in taken or f"{name}_joint" in taken:
+        name += "_"
+    return name, f"{name}_joint"
+
+
+def _renamed(closures: Sequence[Closure], old: str, new: str) -> list[Closure]:
+    """Return closures with another name of a frame."""
+    return [
+        Closure(
+            closure.kind,
+            new if closure.frame_1 == old else closure.frame_1,
+            new if closure.frame_2 == old else closure.frame_2,
+        )
+        for closure in closures
+    ]
+
+
 class Handle(NamedTuple):
     """The joint of the URDF whose origin is moved."""
 
@@ -63,28 +133,35 @@ class Handle(NamedTuple):
     is_inverse: bool  # whether its origin moves the body against the leg's joint
 
 
+class NoOriginError(LookupError):
+    """No origin moves a joint or a frame of a closure alone."""
+
+    def __init__(self, *, joint: str | None = None, frame: str | None = None) -> None:
+        super().__init__(joint, frame)
+        self.joint, self.frame = joint, frame
+
+
 class Handles:
     """Which origins of the URDF move the joints of legs in the bodies of a machine."""
 
-    def __init__(self, machine: Machine) -> None:
-        self._machine = machine
-        self._urdf = machine.urdf
-        self._closures = machine.chain.closures
-        self._fixed = rigid_bodies(self._urdf, (), machine.platform_joint)
-        self.bodies: Bodies = rigid_bodies(self._urdf, self._closures, machine.platform_joint)
-        self._above = {joint.child: joint for joint in self._urdf.joints.values()}
+    def __init__(self, urdf: Urdf, closures: Sequence[Closure], platform_joint: str | None) -> None:
+        self._urdf = urdf
+        self._closures = closures
+        self._fixed = rigid_bodies(urdf, (), platform_joint)
+        self.bodies: Bodies = rigid_bodies(urdf, closures, platform_joint)
+        self._above = {joint.child: joint for joint in urdf.joints.values()}
 
     def of(self, step: Step, side: int, body: str, leg: str) -> Handle:
         """Return what moves a joint in a body."""
         connection = step.connection
         if connection.closure is not None:
             closure = self._closures[connection.closure]
-            return Handle(self._carrier((closure.frame_1, closure.frame_2)[side], leg), False)
+            return Handle(self._carrier((closure.frame_1, closure.frame_2)[side]), False)
         joint = self._urdf.joints[str(connection.joint)]
         if side == 0:
             return Handle(joint, False)
         if self._fixed.body_of[joint.child] == self._fixed.body_of[body]:
-            return Handle(self._onward(joint, body, leg), True)
+            return Handle(self._onward(joint, body), True)
         return self._weld(joint, body, leg)
 
     def link(self, step: Step, side: int) -> str:
@@ -96,7 +173,7 @@ class Handles:
         joint = self._urdf.joints[str(connection.joint)]
         return (joint.parent, joint.child)[side]
 
-    def _onward(self, joint: UrdfJoint, body: str, leg: str) -> UrdfJoint:
+    def _onward(self, joint: UrdfJoint, body: str) -> UrdfJoint:
         """Return the fixed joint that leads from the child of a joint to the rest of its body."""
         link, onward = body, None
         while link != joint.child and link in self._above:
@@ -104,46 +181,38 @@ class Handles:
             link = onward.parent
         if link == joint.child and onward is not None and self._carries_only(link, onward):
             return onward
-        raise OutOfClass(
-            f"{self._machine.urdf_path}: leg '{leg}' could not be written: found that joint "
-            f"'{joint.name}' carries the link '{body}' itself, needed legs that hang from base or "
-            "platform, or are closed on them; let a virtual floating joint carry the platform, or "
-            "put a link on a fixed joint between them."
-        )
+        raise NoOriginError(joint=joint.name)
 
     def _weld(self, joint: UrdfJoint, body: str, leg: str) -> Handle:
         """Return the fixed joint under a frame of the closure that welds a leg to a body."""
         ours, theirs = self._fixed.body_of[body], self._fixed.body_of[joint.child]
-        problem: OutOfClass | None = None
+        problem: NoOriginError | None = None
         for closure in self._closures:
             frames = closure.frame_1, closure.frame_2
             on = [self._fixed.body_of[frame_link(self._urdf, frame)] for frame in frames]
             if closure.kind == "6d" and set(on) == {ours, theirs}:
                 for wanted in (ours, theirs):
                     try:
-                        carrier = self._carrier(frames[on.index(wanted)], leg)
-                    except OutOfClass as error:
+                        carrier = self._carrier(frames[on.index(wanted)])
+                    except NoOriginError as error:
                         problem = problem or error
                         continue
                     return Handle(carrier, wanted == theirs)
         if problem is not None:
             raise problem
         raise OutOfClass(
-            f"{self._machine.urdf_path}: leg '{leg}' could not be written: found several welds "
-            f"between joint '{joint.name}' and the link '{body}', needed one; close the leg once."
+            f"{self._urdf.path}: leg '{leg}' is outside the method: found several welds between "
+            f"joint '{joint.name}' and the link '{body}', needed one, which moves with the "
+            "parameters of the leg; close the leg once."
         )
 
-    def _carrier(self, frame: str, leg: str) -> UrdfJoint:
+    def _carrier(self, frame: str) -> UrdfJoint:
         """Return the fixed joint under a closure's frame, which must carry nothing else."""
         link = frame_link(self._urdf, frame)
         above = self._above.get(link)
         if above is not None and not above.moves and self._carries_only(link, None, closures=1):
             return above
-        raise OutOfClass(
-            f"{self._machine.urdf_path}: leg '{leg}' could not be written: found the closure "
-            f"frame '{frame}' on a link that carries other things too, needed a link of its own on "
-            "a fixed joint; add one at the joint centre."
-        )
+        raise NoOriginError(frame=frame)
 
     def _carries_only(self, link: str, below: UrdfJoint | None, closures: int = 0) -> bool:
         """Say whether a link carries one joint or none, and so many frames of closures."""
@@ -248,7 +317,7 @@ def _in_rod(
     body = chain.bodies[chain.n_lower - 1]
     try:
         handle = handles.of(above, above.near, handles.link(below, below.far), leg.name)
-    except OutOfClass:
+    except NoOriginError:
         handle = handles.of(below, below.far, handles.link(above, above.near), leg.name)
         handle = handle._replace(is_inverse=not handle.is_inverse)
     point, along = chain.line_in(chain.n_lower, chain.A)

@@ -13,6 +13,7 @@ from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from legcal.errors import OutOfClass
 from legcal.files import is_plain_name
@@ -148,6 +149,15 @@ def propose_frame(names: Sequence[str], chains: Sequence[LegChain]) -> list[str]
     spans = np.array([_span(ends[0][list(c)]) * _span(ends[1][list(c)]) for c in chosen])
     first = int(np.argmax(spans >= spans.max() * (1.0 - TIE)))
     return [names[j] for j in chosen[first]]
+
+
+def level_rotation(A: Array, B: Array) -> Rotation:
+    """Return the rotation of a platform whose joints B (n, 3) lie over those of the base A (n, 3).
+
+    It turns the directions of the joints from their mean onto each other as well as possible
+    (Kabsch 1976), whatever frames their links have: the platform is level and not turned.
+    """
+    return Rotation.align_vectors(A - A.mean(axis=0), B - B.mean(axis=0))[0]
 
 
 def in_order(chains: Sequence[LegChain], motors: Sequence[str], urdf: Urdf) -> list[LegChain]:

@@ -459,6 +459,8 @@ def _limits(
             "give the travel of the joint" if kind == "prismatic" else "give its limits",
         )
         return None
+    if not bounds_written:
+        return None  # of a revolute, as onshape-to-robot writes joints that turn freely
     bounds = [number_list(limit.get(key, "0"), 1) for key in ("lower", "upper")]
     if bounds[0] is None or bounds[1] is None:
         return None
@@ -525,6 +527,14 @@ class UrdfPatch:
         if before is not None:
             before.tail = "\n  "
         body.tail, element.tail = "\n  ", "\n"
+
+    def add_link_below(self, joint: str, link: str, fixed: str) -> None:
+        """Add a link between a joint and its child, which a fixed joint carries in its place."""
+        element = next(e for e in self._robot.findall("joint") if e.get("name") == joint)
+        for child in element.findall("child"):
+            carried = str(child.get("link"))
+            child.set("link", link)
+            self.add_frame(link, carried, link, fixed, RigidTransform.identity())
 
     def content(self) -> bytes:
         """Return the file as it is now."""
