@@ -1,10 +1,82 @@
-"""How long-running work says where it is."""
+"""How long-running work says where it is: to a function of the caller, or on stderr."""
 
-from collections.abc import Callable
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 Report = Callable[[str, int, int], None]
 """Called as ``report(stage, done, total)``."""
 
+Progress = Report | bool
+"""What public functions take: True shows bars, in terminals and notebooks; False shows nothing."""
+
+_REFRESH = 0.1  # [s] between two pictures of a bar, at least
+
 
 def no_progress(stage: str, done: int, total: int) -> None:
     """Report nothing."""
+
+
+@contextmanager
+def shown_progress(progress: Progress) -> Iterator[Report]:
+    """Yield what is called with the progress of the work within; see :data:`Progress`."""
+    if callable(progress):
+        yield progress
+    elif progress:
+        with _on_stderr() as report:
+            yield report
+    else:
+        yield no_progress
+
+
+@contextmanager
+def _on_stderr() -> Iterator[Report]:
+    """Show one line a stage: a moving bar on a terminal or in a notebook, else finished stages."""
+    from rich.console import Console
+
+    console = Console(stderr=True, highlight=False)
+    if not (console.is_terminal or (console.is_jupyter and find_spec("ipywidgets"))):
+        yield _finished_stages(console)
+        return
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+    )
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    # Without a thread of its own, beside which no process can be copied.
+    with Progress(*columns, TimeElapsedColumn(), console=console, auto_refresh=False) as bars:
+        tasks = {}
+        refreshed = -_REFRESH
+
+        def report(stage: str, done: int, total: int) -> None:
+            nonlocal refreshed
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+            now = time.monotonic()
+            if done == total or now - refreshed >= _REFRESH:
+                bars.refresh()
+                refreshed = now
+
+        yield report
+        for task in bars.tasks:  # what was left out of a stage is done as well
+            bars.update(task.id, completed=task.total)
+
+
+def _finished_stages(console: Console) -> Report:
+    def report(stage: str, done: int, total: int) -> None:
+        if done == total:
+            console.print(f"{stage}: {done}/{total}")
+
+    return report

@@ -37,7 +37,7 @@ from legcal.perception import (
     hint_notes,
     place_and_measure,
 )
-from legcal.progress import Report, no_progress
+from legcal.progress import Progress, shown_progress
 from legcal.workers import worker_pool
 
 
@@ -45,7 +45,7 @@ def detect(
     source: str | Path | Dataset,
     *,
     output: str | Path | None = None,
-    progress: Report = no_progress,
+    progress: Progress = False,
     workers: int = 1,
 ) -> Detection:
     """Find and measure the outlines of the legs in all images, without a fit.
@@ -58,8 +58,8 @@ def detect(
     output : path, optional
         Write a folder there: ``observations.csv``, ``index.html`` and each image with what was
         found in it.
-    progress : callable
-        Called as ``progress(stage, done, total)``.
+    progress : bool or callable
+        True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
     workers : int
         Search and draw the images in that many processes, as :func:`legcal.calibrate` does.
 
@@ -84,11 +84,11 @@ def detect(
         check_detection_destination(output_path(output, DETECTION), folder)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     images = _rows_with_image(dataset)
-    with worker_pool(workers) as pool:
-        data = order_dataset(dataset, pool, progress)
+    with shown_progress(progress) as report, worker_pool(workers) as pool:
+        data = order_dataset(dataset, pool, report)
         detection = _detected(data, images)
         if output is not None:
-            write_detection(detection, Path(output), pool, progress)
+            write_detection(detection, Path(output), pool, report)
     return detection
 
 

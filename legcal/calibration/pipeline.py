@@ -78,7 +78,7 @@ from legcal.perception import (
     place_and_measure,
     used_as_before,
 )
-from legcal.progress import Report, no_progress
+from legcal.progress import Progress, shown_progress
 from legcal.vision import shared_cameras, stated_covariances
 from legcal.workers import worker_pool
 
@@ -124,7 +124,7 @@ def calibrate(
     source: str | Path | Dataset,
     *,
     output: str | Path | None = None,
-    progress: Report = no_progress,
+    progress: Progress = False,
     criteria: Criteria = "default",
     transformation: Transformation | None = None,
     use_cache: bool = True,
@@ -142,8 +142,8 @@ def calibrate(
         The dataset folder, or what :func:`legcal.load_dataset` returned.
     output : path, optional
         Write the result folder there: calibrated model, parameters, observations.
-    progress : callable
-        Called as ``progress(stage, done, total)``.
+    progress : bool or callable
+        True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
     criteria : {"default", "literal"}
         What the four steps minimise: legcal's criteria, or the paper's as printed.
     transformation : {"points", "cross_product"}, optional
@@ -196,8 +196,8 @@ def calibrate(
 
     # 2 to 5. Recognise, measure, four steps, joint fit, measure again.
     key = outline_key(dataset, choices)
-    with worker_pool(workers) as pool:
-        data = order_dataset(dataset, pool, progress, fingerprint=key if use_cache else "")
+    with shown_progress(progress) as report, worker_pool(workers) as pool:
+        data = order_dataset(dataset, pool, report, fingerprint=key if use_cache else "")
         estimate = estimate_parameters(data, fitted, Options(choices, criteria, transformation))
     cache_notes = _store_outlines(data, estimate, key)
     prediction = _compare_held_out(data, estimate, held_out) if len(held_out) else None

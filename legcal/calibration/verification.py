@@ -44,7 +44,7 @@ from legcal.machine import (
     pose_sensitivity,
     vector_of,
 )
-from legcal.progress import Report, no_progress
+from legcal.progress import Progress, shown_progress
 from legcal.vision import shared_cameras
 from legcal.workers import worker_pool
 
@@ -145,7 +145,7 @@ def check(
     result: str | Path,
     *,
     significance: float = SIGNIFICANCE,
-    progress: Report = no_progress,
+    progress: Progress = False,
     workers: int = 1,
 ) -> Check:
     """Test with a few new images whether an earlier calibration still holds.
@@ -158,8 +158,8 @@ def check(
         The folder that the earlier calibration wrote.
     significance : float
         Probability of a false alarm.
-    progress : callable
-        Called as ``progress(stage, done, total)``.
+    progress : bool or callable
+        True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
     workers : int
         Search the images in that many processes.
 
@@ -187,8 +187,8 @@ def check(
     dataset = _as_calibrated(dataset, earlier)
     prior = _EarlierEstimate.of(dataset.machine, earlier)
     choices = _choices(dataset, earlier, prior)
-    with worker_pool(workers) as pool:
-        data = order_dataset(dataset, pool, progress, fingerprint=outline_key(dataset, choices))
+    with shown_progress(progress) as report, worker_pool(workers) as pool:
+        data = order_dataset(dataset, pool, report, fingerprint=outline_key(dataset, choices))
         every_row = np.arange(dataset.measurements.n_rows)
         found = estimate_parameters(data, every_row, Options(choices, every_leg=False))
     if dataset.axes is None and not found.outlines.used.any():

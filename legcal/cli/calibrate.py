@@ -122,20 +122,19 @@ def calibrate(
         from legcal import calibration, report
 
         run, summary = calibration.calibrate, report.summary
-    with report.progress_on_stderr() as progress:
-        found = run(
-            dataset,
-            output=output,
-            progress=progress,
-            criteria=criteria,
-            transformation=transformation,
-            use_cache=not fresh,
-            workers=image_workers(),
-            priors=prior or (),
-            fixed=fix or (),
-            free=free or (),
-            holdout=holdout,
-        )
+    found = run(
+        dataset,
+        output=output,
+        progress=True,
+        criteria=criteria,
+        transformation=transformation,
+        use_cache=not fresh,
+        workers=image_workers(),
+        priors=prior or (),
+        fixed=fix or (),
+        free=free or (),
+        holdout=holdout,
+    )
     show(
         as_json,
         lambda: calibration.result_of(found).document(),
@@ -149,14 +148,13 @@ def _check(dataset: Path, result: Path, significance: float | None, *, as_json: 
     """Test an earlier result with new images."""
     from legcal import calibration, report
 
-    with report.progress_on_stderr() as progress:
-        found = calibration.check(
-            dataset,
-            result,
-            significance=calibration.SIGNIFICANCE if significance is None else significance,
-            progress=progress,
-            workers=image_workers(),
-        )
+    found = calibration.check(
+        dataset,
+        result,
+        significance=calibration.SIGNIFICANCE if significance is None else significance,
+        progress=True,
+        workers=image_workers(),
+    )
     show(as_json, found.document, lambda: report.check_summary(found))
     if found.movement.moved:
         raise typer.Exit(1)

@@ -53,16 +53,15 @@ def camera(
     """Calibrate a camera from photographs of a chessboard, ChArUco board or AprilGrid."""
     from legcal import calibration, report
 
-    with report.progress_on_stderr() as progress:
-        found = calibration.calibrate_camera(
-            images,
-            board,
-            model=model,
-            output=output,
-            picture=picture,
-            progress=progress,
-            workers=image_workers(workers),
-        )
+    found = calibration.calibrate_camera(
+        images,
+        board,
+        model=model,
+        output=output,
+        picture=picture,
+        progress=True,
+        workers=image_workers(workers),
+    )
     show(as_json, found.document, lambda: report.camera_table(found, output))
 
 
@@ -84,10 +83,9 @@ def detect(
     """Find the outlines of the legs and show them over the images, to see what went wrong."""
     from legcal import calibration, report
 
-    with report.progress_on_stderr() as progress:
-        found = calibration.detect(
-            dataset, output=output, progress=progress, workers=image_workers(workers)
-        )
+    found = calibration.detect(
+        dataset, output=output, progress=True, workers=image_workers(workers)
+    )
     show(as_json, lambda: found.document, lambda: report.detection_table(found, output))
     if found.unplaced or not found.outlines.used.any():
         raise typer.Exit(1)
@@ -372,6 +370,5 @@ def noise(
     """Estimate how precisely images tell where legs are, from repeated images of the same poses."""
     from legcal import calibration, report
 
-    with report.progress_on_stderr() as progress:
-        found = calibration.measure_noise(dataset, progress=progress, workers=image_workers())
+    found = calibration.measure_noise(dataset, progress=True, workers=image_workers())
     show(as_json, found.document, lambda: report.noise_table(found))

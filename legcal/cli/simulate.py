@@ -38,15 +38,14 @@ def simulate(
     The default is 45 photographs: 3 views of 15 extreme poses each.
     """
     from legcal.machine import load_mechanism
-    from legcal.report import progress_on_stderr, simulation_table
+    from legcal.report import simulation_table
     from legcal.simulation import requested, summary_document
     from legcal.simulation import simulate as run
 
     nominal = load_mechanism(model)
     settings = requested(Request(**options), nominal)
     workers = image_workers()
-    with progress_on_stderr() as progress:
-        made = run(nominal, output, settings, force=force, workers=workers, progress=progress)
+    made = run(nominal, output, settings, force=force, workers=workers, progress=True)
     document, repeated = summary_document(made), options["images"] > 1
     show(as_json, lambda: document, lambda: simulation_table(document, repeated=repeated))
 

@@ -54,19 +54,18 @@ def paper(
     as_json: JsonOption = False,
 ) -> None:
     """Repeat section 4.3 of the paper: calibrations of a 6-SPU, before and after."""
-    from legcal.report import progress_on_stderr, study_table
+    from legcal.report import study_table
     from legcal.simulation import PaperStudy, TableNoise, run_study
 
     noise = TableNoise.in_radians() if radians else TableNoise()
-    with progress_on_stderr() as progress:
-        result = run_study(
-            PaperStudy(noise),
-            runs,
-            seed=seed,
-            workers=workers or processors(),
-            output=output,
-            progress=progress,
-        )
+    result = run_study(
+        PaperStudy(noise),
+        runs,
+        seed=seed,
+        workers=workers or processors(),
+        output=output,
+        progress=True,
+    )
     document = result.document()
     show(as_json, lambda: document, lambda: study_table(document))
     if output is not None and not as_json:

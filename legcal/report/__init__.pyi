@@ -8,7 +8,6 @@ from .images import simulation_table as simulation_table
 from .machine import inspect_table as inspect_table
 from .machine import location_table as location_table
 from .noise import noise_table as noise_table
-from .progress_bars import progress_on_stderr as progress_on_stderr
 from .render import report as report
 from .render import table as table
 from .study import study_table as study_table

@@ -22,7 +22,7 @@ from legcal.errors import UsageError
 from legcal.files import output_path
 from legcal.geometry import Array
 from legcal.machine import Machine, load_mechanism, write_model
-from legcal.progress import Report, no_progress
+from legcal.progress import Progress, Report, shown_progress
 from legcal.simulation.folder import (
     SIMULATED,
     TRUTH,
@@ -90,7 +90,7 @@ def simulate(
     *,
     force: bool = False,
     workers: int = 1,
-    progress: Report = no_progress,
+    progress: Progress = False,
 ) -> SimulatedDataset:
     """Write a dataset of a machine that differs from its nominal model by drawn errors.
 
@@ -110,8 +110,8 @@ def simulate(
         Replace an earlier simulated dataset.
     workers : int
         Render photographs in that many processes.
-    progress : callable
-        Called as ``progress(stage, done, total)``.
+    progress : bool or callable
+        True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
 
     Returns
     -------
@@ -135,10 +135,10 @@ def simulate(
     nominal = model if isinstance(model, Machine) else load_mechanism(model)
     _check_readings(nominal, settings)
     rngs = streams(settings.seed)
-    with dataset_folder(destination, force=force) as folder:
+    with shown_progress(progress) as report, dataset_folder(destination, force=force) as folder:
         yaml_path, _ = write_model(nominal, folder)
         truth = write_true_model(nominal, settings.errors, rngs["errors"], folder / TRUTH)
-        session = simulate_session(truth, nominal, settings, rngs, progress)
+        session = simulate_session(truth, nominal, settings, rngs, report)
         m, legs = session.measurements, truth.leg_names
         board = None if session.board is None else session.board.document()
         if board is not None and not settings.board_pose:
@@ -159,7 +159,7 @@ def simulate(
         if session.corners is not None:
             write_corners(folder / CORNERS_NAME, session.corners, m)
         if settings.level is Level.PHOTOGRAPHS:
-            _write_photographs(folder, session, settings, rngs, workers, progress)
+            _write_photographs(folder, session, settings, rngs, workers, report)
         files = [*files_in(folder), TRUTH_NAME]
         write_truth(folder / TRUTH_NAME, session, settings, files)
     seen = [[leg.is_seen for leg in shown] for shown in session.scene.images.shown]

@@ -22,7 +22,7 @@ import numpy as np
 from legcal.errors import DidNotConverge, LegcalError, OutOfResources, UsageError
 from legcal.files import TEMPORARY_SUFFIX, write_atomically
 from legcal.processors import processors
-from legcal.progress import Report, no_progress
+from legcal.progress import Progress, shown_progress
 from legcal.simulation.checkpoint import (
     CHECKPOINT_NAME,
     Checkpoint,
@@ -107,7 +107,7 @@ def run_study(
     seed: int = 0,
     workers: int = 1,
     output: Path | None = None,
-    progress: Report = no_progress,
+    progress: Progress = False,
 ) -> StudyResult:
     """Run a study, or what is missing of it.
 
@@ -125,8 +125,8 @@ def run_study(
     output : Path, optional
         Folder for the checkpoint, the document and the figures. One that holds a checkpoint of
         the same study is continued; more runs than before are added to those that are there.
-    progress : callable
-        Called with the number of runs that are done.
+    progress : bool or callable
+        True shows a bar on stderr; a function is called with the number of runs that are done.
 
     Returns
     -------
@@ -143,19 +143,19 @@ def run_study(
     """
     _check_numbers(n_runs, seed, workers)
     stage = f"Study {study.name}"
-    with _folder(output) as folder:
+    with shown_progress(progress) as report, _folder(output) as folder:
         path = folder / CHECKPOINT_NAME
         first = header(study.name, study.settings, seed)
         kept = output is not None
         with open_checkpoint(path, first, study.is_record, kept=kept) as checkpoint:
             missing = [run for run in range(n_runs) if run not in checkpoint.offsets]
             done = n_runs - len(missing)
-            progress(stage, done, n_runs)
+            report(stage, done, n_runs)
             with closing(lines_of_runs(study, seed, missing, workers)) as chunks:
                 for lines in chunks:
                     checkpoint.append(lines)
                     done += len(lines)
-                    progress(stage, done, n_runs)
+                    report(stage, done, n_runs)
             result = _result(study, seed, n_runs, checkpoint)
         if output is not None:
             _write(result, folder)

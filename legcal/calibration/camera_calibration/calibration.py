@@ -43,7 +43,7 @@ from legcal.perception import (
     search_board,
     shown_board,
 )
-from legcal.progress import Report, no_progress
+from legcal.progress import Progress, Report, shown_progress
 from legcal.vision import (
     BadImage,
     Board,
@@ -72,7 +72,7 @@ def calibrate_camera(
     *,
     model: DistortionModel | None = None,
     output: str | Path | None = None,
-    progress: Report = no_progress,
+    progress: Progress = False,
     workers: int = 1,
     picture: str | Path | None = None,
 ) -> CameraCalibration:
@@ -91,8 +91,8 @@ def calibrate_camera(
     output : path, optional
         Write a ROS camera_info file there, with the covariance of all intrinsics, which
         :func:`legcal.calibrate` takes as their prior.
-    progress : callable
-        Called as ``progress(stage, done, total)``.
+    progress : bool or callable
+        True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
     workers : int
         Search the images in that many processes, as :func:`legcal.calibrate` does.
     picture : path, optional
@@ -134,21 +134,22 @@ def calibrate_camera(
     stated = board_of(board)
     paths = _listed_images([images] if isinstance(images, str | Path) else images)
     size, facts = _common_size(paths)
-    with worker_pool(workers) as run:
-        seen = _search(stated, paths, size, run, progress)
-    flat_board, note = shown_board(stated, seen)
-    if flat_board is None:
-        raise _not_visible(stated, note)
-    found = [one.numbered(flat_board) for one in seen]
-    shown = [k for k, corners in enumerate(found) if len(corners.number) >= MIN_CORNERS]
-    if not shown:
-        raise _not_visible(stated, _shown_instead(stated, paths, size))
-    if len(shown) < MIN_IMAGES:
-        raise too_few_images(len(shown), [paths[k].name for k in shown])
-    progress("Adjusting the camera", 0, 1)
-    table = _table(flat_board, [found[k] for k in shown])
-    lens = chosen_lens(table, size) if model is None else given_lens(table, size, model)
-    progress("Adjusting the camera", 1, 1)
+    with shown_progress(progress) as report:
+        with worker_pool(workers) as run:
+            seen = _search(stated, paths, size, run, report)
+        flat_board, note = shown_board(stated, seen)
+        if flat_board is None:
+            raise _not_visible(stated, note)
+        found = [one.numbered(flat_board) for one in seen]
+        shown = [k for k, corners in enumerate(found) if len(corners.number) >= MIN_CORNERS]
+        if not shown:
+            raise _not_visible(stated, _shown_instead(stated, paths, size))
+        if len(shown) < MIN_IMAGES:
+            raise too_few_images(len(shown), [paths[k].name for k in shown])
+        report("Adjusting the camera", 0, 1)
+        table = _table(flat_board, [found[k] for k in shown])
+        lens = chosen_lens(table, size) if model is None else given_lens(table, size, model)
+        report("Adjusting the camera", 1, 1)
     if lens is None:
         raise DidNotConverge(
             f"The camera could not be calibrated: found no {model or 'lens model'} that explains "

@@ -39,7 +39,7 @@ from legcal.perception import (
     nominal_placement,
     recognise_and_place,
 )
-from legcal.progress import Report, no_progress
+from legcal.progress import Progress, Report, shown_progress
 from legcal.vision import EPSILON
 from legcal.workers import worker_pool
 
@@ -62,7 +62,7 @@ _MAX_NAMED = 4  # places in a note
 
 
 def measure_noise(
-    source: str | Path | Dataset, *, progress: Report = no_progress, workers: int = 1
+    source: str | Path | Dataset, *, progress: Progress = False, workers: int = 1
 ) -> DatasetNoise:
     """Estimate the noise of outlines and leg axes from repeated images of the same poses.
 
@@ -71,8 +71,8 @@ def measure_noise(
     source : path or Dataset
         A dataset whose column ``pose`` says which images repeat each other. Its outlines, if it has
         any, are left alone: the images are searched.
-    progress : callable
-        Called as ``progress(stage, done, total)``.
+    progress : bool or callable
+        True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
     workers : int
         Search the images in that many processes, as :func:`legcal.calibrate` does.
 
@@ -86,8 +86,8 @@ def measure_noise(
         If the images do not show the legs where they should be, or no leg was found twice.
     """
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
-    with worker_pool(workers) as executor:
-        data = order_dataset(dataset, executor, progress)
+    with shown_progress(progress) as report, worker_pool(workers) as executor:
+        data = order_dataset(dataset, executor, report)
         machine, measurements = data.machine, data.measurements
         paths = [dataset.image_path(row) for row in data.order.rows.tolist()]
         has_image = np.array(
@@ -95,7 +95,7 @@ def measure_noise(
         )
         repeats = find_repeats(measurements, has_image, dataset.table_path)
         every = replace(data.photographs, detect=np.flatnonzero(has_image), keep=no_outlines())
-        placement, outlines = _search(every, repeats, progress)
+        placement, outlines = _search(every, repeats, report)
     methods = []
     for name, table in outlines.items():
         found = leg_orientations(table, measurements, machine.legs, repeats)
