@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from legcal import calibrate, load_dataset, load_mechanism
+from legcal.calibration import Calibration
 from legcal.calibration.joint_fit.variables import platform_poses
-from legcal.calibration.verdict import Calibration
 from legcal.data.axes import axes_from_outlines
 from legcal.machine import KinematicParameters, point_like_legs, pose_differences, to_vector
 from legcal.paper.four_steps import run_steps

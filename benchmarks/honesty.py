@@ -21,8 +21,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from legcal import calibrate, load_mechanism
+from legcal.calibration import Calibration
 from legcal.calibration.joint_fit.outline_errors import KINDS
-from legcal.calibration.verdict import Calibration
 from legcal.geometry import components
 from legcal.geometry.types import Array
 from legcal.machine import Machine, geometries, pose_sensitivity, vector_of

@@ -33,7 +33,7 @@ import numpy as np
 from board_photographs import PrintedBoard, photograph_boards
 
 from legcal import LegcalError, calibrate, calibrate_camera, load_mechanism
-from legcal.calibration.verdict import Calibration
+from legcal.calibration import Calibration
 from legcal.geometry import Array, components
 from legcal.machine import geometries, pose_sensitivity, vector_of
 from legcal.simulation import Appearance, SimulationSettings, mild_lens, simulate

@@ -7,6 +7,7 @@ from .calibration import detect as detect
 from .calibration import evaluate as evaluate
 from .calibration import identifiability as identifiability
 from .calibration import load_location as load_location
+from .calibration import load_result as load_result
 from .calibration import locate as locate
 from .calibration import measure_noise as measure_noise
 from .calibration import write_location as write_location

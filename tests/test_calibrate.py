@@ -22,7 +22,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import files_of, settings, simulated
 
 from legcal import calibrate, evaluate, load_dataset, load_mechanism, simulate
-from legcal.calibration import Calibration, poses_at_readings, result_of
+from legcal.calibration import Calibration, poses_at_readings
 from legcal.calibration.board import BoardViews, base_of_board, board_notes
 from legcal.calibration.joint_fit import BOARD_SCALE
 from legcal.calibration.verdict import judge
@@ -120,7 +120,7 @@ def _rotated(folder: Path) -> None:
 
 def _by_name(calibration: Calibration) -> dict[str, Any]:
     """Return what a result says of every name, whatever their order."""
-    found = result_of(calibration)
+    found = calibration.result
     names = [row.name for row in found.parameters if row.status == "estimated"]
     order, legs = np.argsort(names), np.argsort(found.legs)
     kinematic = np.argsort(found.kinematic.names)
@@ -275,7 +275,7 @@ def test_a_view_without_images_is_noted_and_gets_no_pose(
 
     calibration = calibrate(_edited(planar[0], tmp_path / "spare", add))
     assert any("view spare has no row" in note for note in calibration.notes)
-    assert set(result_of(calibration).views) == {"c1", "c2", "c3"}
+    assert set(calibration.result.views) == {"c1", "c2", "c3"}
 
 
 def test_an_interrupted_run_leaves_nothing_behind(
@@ -477,7 +477,7 @@ def test_errors_from_photographs_are_as_large_as_their_sigmas(example_run: Run) 
     pulls = _pulls(example_run.calibration, TRUTH)
     assert len(pulls) == 30
     assert 0.2 < np.mean(np.square(pulls)) < 2.0
-    radii = [row for row in result_of(example_run.calibration).parameters if ".radius." in row.name]
+    radii = [row for row in example_run.calibration.result.parameters if ".radius." in row.name]
     assert len(radii) == 6
     for radius in radii:  # light at the limb allows no smaller sigma
         assert radius.sigma is not None

@@ -15,8 +15,8 @@ from simulated import settings, simulated
 
 import legcal
 from legcal import calibrate, simulate
+from legcal.calibration import Calibration
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
-from legcal.calibration.verdict import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
 from legcal.machine import Machine
 

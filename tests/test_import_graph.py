@@ -21,7 +21,7 @@ ROOMS = (
     "cli",
 )
 BESIDE = "simulation"  # it knows the truth
-OUTSIDE = {"__main__", "errors", "processors", "progress", "signals", "version", "workers"}
+OUTSIDE = {"__main__", "brief", "errors", "processors", "progress", "signals", "version", "workers"}
 
 
 @cache

@@ -3,10 +3,7 @@ from .camera_calibration.document import CameraCalibration as CameraCalibration
 from .change_detection import Explanation as Explanation
 from .detection import DETECTION_PAGE as DETECTION_PAGE
 from .detection import Detection as Detection
-from .documents import Holdout as Holdout
-from .documents import PlatformBlock as PlatformBlock
 from .documents import Result as Result
-from .documents import WorkspaceAccuracy as WorkspaceAccuracy
 from .evaluation import Evaluation as Evaluation
 from .evaluation import evaluate as evaluate
 from .identify.identifiability import answer as answer
@@ -50,8 +47,10 @@ from .measurement_noise.repeatability import QUANTITIES as QUANTITIES
 from .measurement_noise.repeatability import PooledSpread as PooledSpread
 from .outline_detection import detect as detect
 from .pipeline import calibrate as calibrate
-from .result_folder import result_of as result_of
-from .verdict import Calibration as Calibration
+from .result import Calibration as Calibration
+from .result_folder import load_result as load_result
+from .summary import UNITS as UNITS
+from .summary import sentences as sentences
 from .verification import SIGNIFICANCE as SIGNIFICANCE
 from .verification import Check as Check
 from .verification import check as check

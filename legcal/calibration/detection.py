@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.brief import brief
 from legcal.data import (
     OBSERVATIONS_NAME,
     Dataset,
@@ -75,6 +76,7 @@ _HOW_TO_CORRECT = (
 )
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class Detection:
     """The result of :func:`legcal.detect`, in the order of the files.

@@ -105,10 +105,18 @@ class Gamma(Document):
     sigma: Number
 
 
+class Distance(Document):
+    """How far two frames are from each other; over poses, means."""
+
+    dX_m: NotNegative
+    dE_rad: NotNegative
+
+
 class Staged(Legs):
     """What the four steps gave."""
 
     diagnostics: list[str]
+    from_fit: Distance | None = None  # None where the motors do not determine the pose
 
 
 class NoSteps(Document):
@@ -147,6 +155,16 @@ class ResidualsBlock(FitQuality):
     shared_px: dict[str, NotNegative]
 
 
+class Observations(Document):
+    """What the fit was made from."""
+
+    kind: Literal["outlines", "axes"]
+    used: int
+    total: int
+    images: int
+    rejected: dict[str, int]  # outlines, by the reason
+
+
 class BoardPose(Document):
     """The pose of the calibration board, R_b laid on the nominal one."""
 
@@ -154,6 +172,10 @@ class BoardPose(Document):
     given: Pose | None
     scale: Number
     rms_px: Number | None
+    corners: int = 0  # of all images
+    used: int = 0  # of these
+    images: int = 0  # with a corner that is used
+    off: Distance | None = None  # from where the dataset has it, base joints being nominal
 
 
 class PoseAccuracy(Document):
@@ -249,6 +271,7 @@ class Result(Legs, Heading):
     gammas: list[Gamma]
     stages: Stages
     residuals: ResidualsBlock
+    observations: Observations | None = None  # left out by earlier versions
     board: BoardPose | None = None  # left out without a board
     start: str
     platform: PlatformBlock | None
@@ -258,7 +281,7 @@ class Result(Legs, Heading):
     @model_serializer(mode="wrap")
     def _without_absent_blocks(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         found: dict[str, Any] = handler(self)
-        absent = [key for key in ("board", "holdout") if found[key] is None]
+        absent = [key for key in ("observations", "board", "holdout") if found[key] is None]
         return {key: value for key, value in found.items() if key not in absent}
 
     @classmethod

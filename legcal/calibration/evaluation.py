@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.brief import brief
 from legcal.calibration.documents import ComparedParameter, EvaluationDocument
 from legcal.data import Dataset, load_dataset
 from legcal.errors import DidNotConverge, ModelError
@@ -35,6 +36,7 @@ MAX_DRAWS = 20  # of poses in place of those that the reference does not reach
 FIRST_POSES = 10  # of the first draw: if the reference reaches none of them, there is no other
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class Evaluation:
     """The distance of a model from a reference.

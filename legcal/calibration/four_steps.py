@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from scipy.spatial.transform import RigidTransform
 
+from legcal.brief import brief
 from legcal.calibration.board import BoardViews, Poses, in_one_camera
 from legcal.calibration.joint_fit import Start, start_from
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
@@ -16,6 +17,7 @@ from legcal.paper import nominal_machine, run_base_steps, run_platform_steps
 from legcal.perception import Placement
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class Steps:
     """What the four steps give by themselves."""

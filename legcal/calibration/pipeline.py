@@ -44,8 +44,9 @@ from legcal.calibration.joint_fit import (
 )
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.outlier_images import outlier_images
+from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import write_result
-from legcal.calibration.verdict import Calibration, judge
+from legcal.calibration.verdict import judge
 from legcal.data import (
     Corners,
     Dataset,

@@ -12,50 +12,28 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.documents import (
-    BoardPose,
-    Gamma,
-    Holdout,
-    HoldoutPlatform,
-    Kinematic,
-    NoSteps,
     ParameterRow,
-    PlatformBlock,
-    Pose,
-    PoseAccuracy,
-    ResidualsBlock,
     Result,
-    SensitivityRow,
-    Staged,
-    Stages,
-    ViewPose,
-    WeakCombination,
-    WorkspaceAccuracy,
     unreadable,
 )
 from legcal.calibration.joint_fit import (
-    BOARD_SCALE,
     KINDS,
     KnownIntrinsics,
-    PlatformError,
-    known_parameters,
 )
-from legcal.calibration.verdict import Calibration
+from legcal.calibration.result import Calibration
+from legcal.calibration.summary import Summarised, few_lines
 from legcal.data import CORNERS_NAME, OBSERVATIONS_NAME, write_corners, write_observations
 from legcal.errors import DatasetError, DidNotConverge, ModelError, OutOfClass
-from legcal.files import motion_to_xyz_quat, result_folder
+from legcal.files import result_folder
 from legcal.geometry import Array
 from legcal.machine import (
     Leg,
-    LegKind,
     Machine,
     calibrated_axis,
-    describe_direction,
     geometries,
     home_of_legs,
     load_mechanism,
@@ -72,7 +50,6 @@ from legcal.vision import (
     camera_numbers,
     intrinsic_names,
     intrinsic_values,
-    shared_cameras,
 )
 
 RESULT_NAME, MODEL_NAME = "result.json", "calibrated.yaml"
@@ -110,7 +87,7 @@ def write_result(calibration: Calibration, destination: Path) -> None:
             )
         write_calibrated_yaml(machine, yaml, urdf.name, None if home is machine.home else home)
         _check_written(yaml, solution.legs)
-        document = json.dumps(result_of(calibration).document(), indent=1, allow_nan=False)
+        document = json.dumps(calibration.result.document(), indent=1, allow_nan=False)
         (folder / RESULT_NAME).write_text(document + "\n", encoding="utf-8")
         if dataset.axes is None:
             table, measurements = folder / OBSERVATIONS_NAME, dataset.measurements
@@ -133,197 +110,8 @@ def _check_written(yaml: Path, legs: Sequence[Leg]) -> None:
         )
 
 
-def result_of(calibration: Calibration) -> Result:
-    """Return the document of a calibration."""
-    solution, dataset = calibration.solution, calibration.dataset
-    machine, measurements = dataset.machine, dataset.measurements
-    names, views, steps = machine.leg_names, measurements.views, calibration.steps
-    owners = shared_cameras([view.name for view in views], [view.camera for view in views])
-    o, axes = solution.outlines, dataset.axes
-    shown = np.unique(measurements.view[o.row[o.used] if axes is None else axes.row]).tolist()
-    T_base_Rb = machine.T_base_Rb
-    return Result(
-        legcal_result=1,
-        status="converged",
-        verdict=calibration.verdict.sentence,
-        trustworthy=calibration.verdict.trustworthy,
-        legs=list(names),
-        **_legs(names, solution.legs),
-        nominal_axes=nominal_axes(names, geometries(machine)),
-        parameters=_parameters(calibration),
-        covariance=solution.covariance.tolist(),
-        kinematic=Kinematic(
-            names=list(solution.parametrization.names),
-            covariance=solution.value_covariance.tolist(),
-            held=solution.held_basis.tolist(),
-        ),
-        weakest=[
-            WeakCombination(
-                direction=describe_direction([name for name, _ in weak.parts], names),
-                parameters=[name for name, _ in weak.parts],
-                components=[component for _, component in weak.parts],
-                sigma_m=weak.sigma,
-            )
-            for weak in solution.weak
-        ],
-        held=list(solution.held),
-        views={
-            views[v].name: ViewPose(T_base_camera=_pose(T_base_Rb * solution.T_camera_Rb[v].inv()))
-            for v in shown
-        },
-        cameras={v.name: camera_numbers(v.camera) for v in views if v.name in set(owners)},
-        gammas=[
-            Gamma(views=list(one.views), gamma=one.gamma, sigma=one.gamma * one.sigma)
-            for one in solution.gammas
-        ],
-        stages=Stages(
-            staged=NoSteps(failure=steps.failure)
-            if steps.legs is None
-            else Staged(**_legs(names, steps.legs), diagnostics=list(steps.diagnostics))
-        ),
-        residuals=ResidualsBlock.model_validate(solution),
-        board=_board(calibration),
-        start=solution.start,
-        platform=_platform(calibration),
-        holdout=_holdout(calibration),
-        notes=list(calibration.notes),
-    )
-
-
-def _legs(names: Sequence[str], legs: Sequence[Leg]) -> dict[str, Any]:
-    """Return the fields of :class:`Legs`."""
-    named = list(zip(names, legs, strict=True))
-    return {
-        "base_joints": [leg.A.tolist() for leg in legs],
-        "platform_joints": [leg.B.tolist() for leg in legs],
-        "offsets": [None if leg.kind is LegKind.PASSIVE else leg.q0 for leg in legs],
-        "base_axes": {n: leg.base_axis.tolist() for n, leg in named if leg.base_axis is not None},
-        "platform_axes": {
-            n: leg.platform_axis.tolist() for n, leg in named if leg.platform_axis is not None
-        },
-        "twists": {name: leg.twist for name, leg in named if leg.twist is not None},
-    }
-
-
-def _pose(T: RigidTransform) -> Pose:
-    return Pose(**motion_to_xyz_quat(T))
-
-
-def _parameters(calibration: Calibration) -> list[ParameterRow]:
-    """Return all kinematic parameters, the radii that were observed, and estimated intrinsics."""
-    solution, dataset = calibration.solution, calibration.dataset
-    machine = dataset.machine
-    found = parametrization_of(machine, twists=True)
-    numbers = vector_of(found, solution.legs, geometries(machine)).tolist()
-    values = {**solution.values, **dict(zip(found.names, numbers, strict=True))}
-    sigma = dict(zip(solution.names, solution.sigma.tolist(), strict=True))
-    with_board = dataset.board is not None
-    known = known_parameters(machine, dataset.measurements.views, with_board=with_board).by_name
-    return [
-        ParameterRow(
-            name=name,
-            value=values[name],
-            nominal=parameter.nominal,
-            sigma=sigma.get(name),
-            prior_sigma=solution.prior_sigma.get(name),
-            unit=parameter.unit,
-            status=solution.status.get(name, "fixed"),
-        )
-        for name, parameter in known.items()
-        if name in values
-    ]
-
-
-def _board(calibration: Calibration) -> BoardPose | None:
-    """Return where the board stands, which differs from what the dataset says by where R_b is."""
-    solution, dataset = calibration.solution, calibration.dataset
-    if solution.T_Rb_board is None:
-        return None
-    given = dataset.T_base_board
-    return BoardPose(
-        T_base_board=_pose(dataset.machine.T_base_Rb * solution.T_Rb_board),
-        given=None if given is None else _pose(given),
-        scale=solution.values.get(BOARD_SCALE, 1.0),
-        rms_px=solution.rms_corners_px,
-    )
-
-
-def _platform(calibration: Calibration) -> PlatformBlock | None:
-    """Return what all this means at the platform."""
-    platform, measurements = calibration.platform, calibration.dataset.measurements
-    if platform is None:
-        return None
-    labels = measurements.pose_labels or ("",) * measurements.n_poses
-    images: list[list[str]] = [[] for _ in labels]
-    for pose, image in zip(measurements.pose.tolist(), measurements.image, strict=True):
-        if image:
-            images[pose].append(image)
-    change, sigma, workspace = platform.change, platform.sigma, platform.workspace
-    return PlatformBlock(
-        change_dX_m=change.mean_displacement,
-        change_dE_rad=change.mean_rotation,
-        **_predicted(sigma),
-        per_pose=[
-            PoseAccuracy(
-                pose=label or None,
-                images=images[k],
-                change_dX_m=change.displacement[k],
-                change_dE_rad=change.rotation[k],
-                sigma_dX_m=sigma.displacement[k],
-                sigma_dE_rad=sigma.rotation[k],
-            )
-            for k, label in enumerate(labels)
-        ],
-        workspace=None if workspace is None else WorkspaceAccuracy(**_predicted(workspace)),
-        sensitivities=[
-            SensitivityRow(what=effect.what, **_errors(effect.error)) for effect in platform.effects
-        ],
-    )
-
-
-def _errors(error: PlatformError, prefix: str = "") -> dict[str, Any]:
-    """Return means and maxima of an error of the platform, as the document names them."""
-    return {
-        f"{prefix}dX_m": error.mean_displacement,
-        f"{prefix}dE_rad": error.mean_rotation,
-        f"{prefix}dX_max_m": error.max_displacement,
-        f"{prefix}dE_max_rad": error.max_rotation,
-    }
-
-
-def _predicted(error: PlatformError) -> dict[str, Any]:
-    """Return the fields of :class:`WorkspaceAccuracy`."""
-    return {"poses": len(error.displacement), **_errors(error, "sigma_")}
-
-
-def _holdout(calibration: Calibration) -> Holdout | None:
-    """Return what images that were kept aside say."""
-    held_out = calibration.held_out
-    if held_out is None:
-        return None
-    pair = held_out.at_platform
-    return Holdout(
-        images=held_out.n_images,
-        poses=held_out.n_poses,
-        outlines=held_out.outlines,
-        wrong=held_out.wrong,
-        rms_px=held_out.rms_px,
-        expected_px=held_out.expected_px,
-        views=held_out.rms_px_of_view,
-        platform=None
-        if pair is None
-        else HoldoutPlatform(
-            poses=len(held_out.displacement),
-            dX_m=pair.displacement,
-            expected_dX_m=pair.expected_displacement,
-            dE_rad=pair.rotation,
-            expected_dE_rad=pair.expected_rotation,
-        ),
-    )
-
-
 @dataclass(frozen=True, eq=False)
-class EarlierResult:
+class EarlierResult(Summarised):
     """An earlier calibration, whose parts agree with each other."""
 
     folder: Path
@@ -334,11 +122,19 @@ class EarlierResult:
     held: Array  # (w, n) how they change along the directions that were held, by a metre
     fixed: tuple[str, ...]  # kinematic parameters that were fixed
 
+    @property
+    def result(self) -> Result:
+        """The document."""
+        return self.document
+
+    def __repr__(self) -> str:
+        return few_lines(f"Calibration in {self.folder}", self.result)
+
     def intrinsics(self, given: Camera) -> KnownIntrinsics | None:
         """Return what was found of the intrinsics of a camera; None if none was estimated."""
-        rows = [row for row in self.document.parameters if row.status == "estimated"]
+        rows = [row for row in self.result.parameters if row.status == "estimated"]
         number, names = {row.name: i for i, row in enumerate(rows)}, intrinsic_names(given)
-        for owner, numbers in self.document.cameras.items():
+        for owner, numbers in self.result.cameras.items():
             found = {
                 k: number[f"{owner}.{name}"]
                 for k, name in enumerate(names)
@@ -346,7 +142,7 @@ class EarlierResult:
             }
             if found:
                 covariance, at = np.zeros((len(names), len(names))), list(found.values())
-                known = np.array(self.document.covariance)[np.ix_(at, at)]
+                known = np.array(self.result.covariance)[np.ix_(at, at)]
                 covariance[np.ix_(list(found), list(found))] = known
                 mean = intrinsic_values(given)
                 mean[list(found)] = [rows[i].value for i in at]
@@ -354,7 +150,7 @@ class EarlierResult:
         return None
 
 
-def read_result(given: str | Path) -> EarlierResult:
+def load_result(given: str | Path) -> EarlierResult:
     """Return the result in a folder that ``legcal calibrate`` wrote, or in its ``result.json``.
 
     Raises

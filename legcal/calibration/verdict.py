@@ -1,9 +1,8 @@
-"""What a calibration gives: parameters with their uncertainty, and whether to trust them."""
+"""Whether to trust a calibration: what the platform gains, beside how well that is known."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,52 +16,10 @@ from legcal.calibration.joint_fit import (
     known_parameters,
     platform_accuracy,
 )
+from legcal.calibration.result import Calibration, Verdict
 from legcal.data import Corners, Dataset
 
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Whether the calibrated model should replace the nominal one."""
-
-    trustworthy: bool  # the predicted improvement exceeds two of its standard deviations
-    sentence: str  # the same, for people
-
-
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """The result of :func:`legcal.calibrate`, in the order of the files.
-
-    Attributes
-    ----------
-    dataset : Dataset
-        What it was computed from; its ``machine`` is the nominal model.
-    solution : Solution
-        The joint fit: parameters, covariance, cameras, platform poses, radii.
-    steps : Steps
-        What the four steps gave.
-    platform : PlatformAccuracy or None
-        What the platform of the calibrated model does differently, and how well that is known;
-        None where the motors do not determine its pose.
-    verdict : Verdict
-        Whether to use it.
-    notes : tuple of str
-        What else a reader should know.
-    held_out : HeldOut or None
-        How well the fit predicts the held-out images; None without any.
-    corners : Corners or None
-        The corners of the calibration board in all images; None without a board.
-    """
-
-    dataset: Dataset
-    solution: Solution
-    steps: Steps
-    platform: PlatformAccuracy | None
-    verdict: Verdict
-    notes: tuple[str, ...]
-    held_out: HeldOut | None = None
-    corners: Corners | None = None
 
 
 def judge(

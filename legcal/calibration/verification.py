@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from legcal.brief import brief
 from legcal.calibration.change_detection import (
     Movement,
     difference,
@@ -31,7 +32,7 @@ from legcal.calibration.joint_fit import (
 )
 from legcal.calibration.ordered_dataset import Options, order_dataset
 from legcal.calibration.pipeline import estimate_parameters, outline_key
-from legcal.calibration.result_folder import EarlierResult, read_result
+from legcal.calibration.result_folder import EarlierResult, load_result
 from legcal.data import Dataset, load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.estimation import Frames
@@ -53,6 +54,7 @@ MAX_SIGNIFICANCE = 0.5
 PRIOR_SIGMA = 0.009  # [rad], or of the mean leg length: less than what a fit holds at nominal
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class Check:
     """The result of :func:`legcal.check`.
@@ -182,7 +184,7 @@ def check(
             f"needed a probability above 0 and up to {MAX_SIGNIFICANCE:g} (0.01 gives one "
             "false alarm in a hundred checks); correct it."
         )
-    earlier = read_result(result)
+    earlier = load_result(result)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     dataset = _as_calibrated(dataset, earlier)
     prior = _EarlierEstimate.of(dataset.machine, earlier)

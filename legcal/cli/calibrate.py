@@ -137,7 +137,7 @@ def calibrate(
     )
     show(
         as_json,
-        lambda: calibration.result_of(found).document(),
+        lambda: found.result.document(),
         lambda: summary(found, output),
     )
     if not found.verdict.trustworthy:

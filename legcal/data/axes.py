@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.brief import brief
 from legcal.data.image_tables import ImageTable
 from legcal.data.measurements import (
     Measurements,
@@ -78,6 +79,7 @@ COLUMNS = (
 _FLOOR_PX = 1e-3  # no outline is known better: keeps weights finite, whatever a file claims
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class LegAxes(ImageTable):
     """Axes of legs in camera frames, oriented from base to platform: the input of steps 1 to 4.

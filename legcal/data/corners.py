@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.brief import brief
 from legcal.data.image_tables import ImageTable
 from legcal.data.measurements import Measurements, find_rows, places, refuse_unknown_rows
 from legcal.data.outlines import SOURCES, UNLESS_REJECTED, VERDICT_COLUMNS, VERDICTS
@@ -24,6 +25,7 @@ COLUMNS = ("view", "image", "corner", *NUMBERS, *(column.name for column in VERD
 SIGMA_RANGE = (1e-6, 100.0)  # [px]: no corner is known better, and worse says nothing
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class Corners(ImageTable):
     """Corners of the board in images, one row a corner."""

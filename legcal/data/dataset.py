@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.brief import brief
 from legcal.data.axes import LegAxes, read_axes
 from legcal.data.corners import Corners, read_corners
 from legcal.data.dataset_file import (
@@ -45,6 +46,7 @@ MAX_KEPT = 128 * 2**20  # of decoded images [bytes]
 MIN_CORNERS = 4  # in an image that must place its camera
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """Everything that a calibration starts from."""

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.brief import brief
 from legcal.files import Column, Table, closest, describe, path_problem, place_in, read_table
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Leg, LegKind
@@ -38,6 +39,7 @@ class View:
     hand_held: bool = False  # one image of a camera in the hand, which only the board can place
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class Measurements:
     """The rows of ``measurements.csv``: one for each image.

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.brief import brief
 from legcal.data.image_tables import ImageTable
 from legcal.data.measurements import (
     Measurements,
@@ -74,6 +75,7 @@ def _unknown() -> Array:
     return np.zeros(0)
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class Outlines(ImageTable):
     """Outlines of cylinders in images, one row an outline (eqs 2, 3, 5).

@@ -16,6 +16,7 @@ from typing import Literal
 
 import numpy as np
 
+from legcal.brief import brief
 from legcal.geometry import Array, distance_to_line, matrix_inverse
 from legcal.machine.bodies import Connection
 
@@ -240,6 +241,7 @@ class LegChain:
         return matrix[:3, :3] @ point + matrix[:3, 3], matrix[:3, :3] @ self.u
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class Leg:
     """A leg from its base joint centre A to its platform joint centre B.

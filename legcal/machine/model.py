@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.brief import brief
 from legcal.errors import UsageError
 from legcal.geometry import Array, frame_on_points
 from legcal.machine.chain import ClosedChain
@@ -23,6 +24,7 @@ from legcal.machine.leg import (
 from legcal.machine.urdf import Urdf
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class Machine:
     """A platform on legs, read from a YAML and its URDF."""
@@ -65,25 +67,35 @@ class Machine:
         """Whether the platform has as many freedoms as there are motors: readings give its pose."""
         return self.mobility == len(self.motors)
 
-    @cached_property
+    @property
     def A_base(self) -> Array:
         """Base joint centres in the base link, (n_legs, 3) [m]."""
-        return _fixed(np.array([leg.A for leg in self.legs]))
+        return self._arrays[0].copy()
 
-    @cached_property
+    @property
     def B_platform(self) -> Array:
         """Platform joint centres in the platform link, (n_legs, 3) [m]."""
-        return _fixed(np.array([leg.B for leg in self.legs]))
+        return self._arrays[1].copy()
 
-    @cached_property
+    @property
     def q0(self) -> Array:
         """Leg lengths at reading zero, (n_legs,) [m]."""
-        return _fixed(np.array([leg.q0 for leg in self.legs]))
+        return self._arrays[2].copy()
 
-    @cached_property
+    @property
     def sign(self) -> Array:
         """Whether each leg grows (+1) or shrinks (-1) with its reading, (n_legs,)."""
-        return _fixed(np.array([float(leg.sign) for leg in self.legs]))
+        return self._arrays[3].copy()
+
+    @cached_property
+    def _arrays(self) -> tuple[Array, Array, Array, Array]:
+        """Joint centres of base and platform, offsets and signs, of which callers get copies."""
+        return (
+            np.array([leg.A for leg in self.legs]),
+            np.array([leg.B for leg in self.legs]),
+            np.array([leg.q0 for leg in self.legs]),
+            np.array([float(leg.sign) for leg in self.legs]),
+        )
 
     def lengths_at(self, q: Array, legs: Sequence[int] | None = None) -> Array:
         """Return the lengths of some legs, or all, at readings (..., n): :meth:`Leg.length_at`."""
@@ -139,12 +151,6 @@ class Machine:
             legs=tuple(self.legs[j] for j in order),
             frame_legs=tuple(order.index(j) for j in self.frame_legs),
         )
-
-
-def _fixed(array: Array) -> Array:
-    """Return an array that nobody can change."""
-    array.flags.writeable = False
-    return array
 
 
 def vectors_A_to_B(machine: Machine, T_base_platform: RigidTransform) -> Array:

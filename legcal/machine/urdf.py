@@ -12,6 +12,7 @@ import numpy as np
 from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.brief import brief
 from legcal.errors import ModelError
 from legcal.files import NAME_NEEDED, describe, is_name
 from legcal.geometry import Array, matrix_of, roll_pitch_yaw
@@ -283,6 +284,7 @@ class UrdfJoint:
         return self.type != "fixed"
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class Urdf:
     """A URDF whose tree, names and numbers have been checked."""

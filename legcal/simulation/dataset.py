@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from legcal.brief import brief
 from legcal.data import (
     AXES_NAME,
     CORNERS_NAME,
@@ -48,6 +49,7 @@ from legcal.simulation.settings import SimulationSettings, whole_number
 from legcal.simulation.truth import write_true_model
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class SimulatedDataset:
     """What was written.

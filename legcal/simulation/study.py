@@ -19,6 +19,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from legcal.brief import brief
 from legcal.errors import DidNotConverge, LegcalError, OutOfResources, UsageError
 from legcal.files import TEMPORARY_SUFFIX, write_atomically
 from legcal.processors import processors
@@ -77,6 +78,7 @@ class Study(Protocol):
         """Summarise the records of all runs that did not fail, read once and in order."""
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class StudyResult:
     """A finished study."""

@@ -53,6 +53,10 @@ HOW_MANY = ("outlines_found", "samples")
 WORST = re.compile(r"\.(\w+_ax[ei]s|home|change_d\w+|d[EX]_\w+)\b")  # as the worst parameter
 # Which parameters count as weak is a threshold too; where two sessions do not agree on it, these
 # are of different unknowns.
+ADDED = re.compile(  # to documents since they were recorded
+    r"\.(document|result\.json)(\.observations|\.stages\.staged\.from_fit"
+    r"|\.board\.(corners|used|images|off))$"
+)
 OF_UNKNOWNS = {"parameters", "covariance", "kinematic", "held", "base_axes", "platform_axes"}
 
 
@@ -143,7 +147,8 @@ def _of_mappings(
     expected: dict[str, Any], found: dict[str, Any], scale: Scale, path: str
 ) -> list[str]:
     lost, new = sorted(expected.keys() - found.keys()), sorted(found.keys() - expected.keys())
-    told = [f"{path}.{name}: lost" for name in lost] + [f"{path}.{name}: new" for name in new]
+    told = [f"{path}.{name}: lost" for name in lost]
+    told += [f"{path}.{name}: new" for name in new if not ADDED.search(f"{path}.{name}")]
     if "correlation" in expected and "correlation" in found:
         expected, found = _of_variables(expected), _of_variables(found)
     if scale.rough and "reference" in expected:  # parameters of the result, less those of the truth

@@ -105,7 +105,7 @@ def test_every_option_is_in_a_case() -> None:
 
 def test_the_public_api_has_the_names_and_parameters_that_it_had() -> None:
     expected, found = recorded("api"), public_api()
-    assert expected.keys() == found.keys()
+    assert expected.keys() <= found.keys()  # more may be added
     for name, entry in expected.items():
         first = found[name]["parameters"][: len(entry["parameters"])]  # more may follow
         assert first == entry["parameters"], name

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from legcal.brief import brief
 from legcal.files import Document, OutputFile
 from legcal.geometry import Array
 from legcal.perception import SHEET
@@ -49,6 +50,7 @@ class ImageResult:
     reason: str
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
     """The result of :func:`legcal.calibrate_camera`.

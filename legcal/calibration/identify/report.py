@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from legcal.brief import brief
 from legcal.paper import Condition
 
 
@@ -120,6 +121,7 @@ class CameraIntrinsics:
     sigma: dict[str, float | None]
 
 
+@brief
 @dataclass(frozen=True)
 class Identifiability:
     """An identifiability report."""

@@ -9,6 +9,7 @@ from .gammas import GammaTrials as GammaTrials
 from .gammas import loses_outlines as loses_outlines
 from .held_out import HeldOut as HeldOut
 from .held_out import PlatformPair as PlatformPair
+from .held_out import Posterior as Posterior
 from .held_out import compare_held_out as compare_held_out
 from .outline_errors import KINDS as KINDS
 from .outline_errors import NoiseModel as NoiseModel
@@ -23,6 +24,7 @@ from .parameter_choices import resolve as resolve
 from .platform import PlatformAccuracy as PlatformAccuracy
 from .platform import PlatformError as PlatformError
 from .platform import platform_accuracy as platform_accuracy
+from .platform import poses_at_readings as poses_at_readings
 from .problem import FitProblem as FitProblem
 from .problem import build_fit as build_fit
 from .rounds import DISAGREES as DISAGREES

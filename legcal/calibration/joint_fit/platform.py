@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.brief import brief
 from legcal.calibration.joint_fit.sensitivity import Sensitivity
 from legcal.calibration.joint_fit.variables import platform_poses
 from legcal.errors import DidNotConverge
@@ -113,6 +114,7 @@ class Effect:
     error: PlatformError
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class PlatformAccuracy:
     """What a fit means at the platform; angles and distances as in :class:`PlatformError`."""

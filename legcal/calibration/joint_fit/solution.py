@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.brief import brief
 from legcal.calibration.joint_fit.determinacy import HeldDirections, held_spread, named_units
 from legcal.calibration.joint_fit.diagnostics import (
     doubted_cameras,
@@ -60,6 +61,7 @@ _SIGNIFICANT = 5.0  # standard deviations of chi2
 ParameterStatus = Literal["estimated", "fixed", "weak"]
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class Solution:
     """A converged joint fit; axes count as angles from the nominal axis."""

@@ -11,6 +11,7 @@ import yaml
 from pydantic import BeforeValidator, Field
 from scipy.spatial.transform import RigidTransform
 
+from legcal.brief import brief
 from legcal.errors import DatasetError
 from legcal.files import (
     FileSchema,
@@ -44,6 +45,7 @@ _Vector = Annotated[
 _Size = Annotated[Number, Field(ge=0.0)]
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class Location:
     """The result of :func:`legcal.locate`.

@@ -22,8 +22,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.brief import brief
 from legcal.calibration.location.frames import PosePairs, tool_motions
-from legcal.calibration.result_folder import MODEL_NAME, RESULT_NAME, read_result
+from legcal.calibration.result_folder import MODEL_NAME, RESULT_NAME, load_result
 from legcal.data import reading_columns, readings_in
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.files import QUATERNION_TOLERANCE, Column, Table, read_table
@@ -91,6 +92,7 @@ _COLUMNS = (
 _ANGLES = re.compile(r"[rw][xyz]|[abc]|roll|pitch|yaw|phi|theta|psi", re.IGNORECASE)
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class ToolPoses:
     """What a laser tracker, a CMM or a camera measured, one row a pose."""
@@ -396,7 +398,7 @@ def _motions_by_model(machine: Machine, poses: Sequence[RigidTransform]) -> Arra
     if path.name != MODEL_NAME or not os.path.isfile(path.parent / RESULT_NAME):
         return None
     try:
-        result = read_result(path.parent)
+        result = load_result(path.parent)
     except DatasetError as error:
         raise DatasetError(
             [f"The covariance of the model could not be used: {p}" for p in error.problems]

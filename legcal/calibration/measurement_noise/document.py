@@ -8,6 +8,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from legcal.brief import brief
 from legcal.calibration.measurement_noise.repeatability import (
     OUTLINE,
     QUANTITIES,
@@ -75,6 +76,7 @@ class MethodNoise:
         return max(every, key=lambda o: max(s.sd for s in o.samples(quantity)), default=None)
 
 
+@brief
 @dataclass(frozen=True, eq=False)
 class DatasetNoise:
     """The measurement noise of a dataset.

@@ -1,0 +1,79 @@
+"""What an interactive session shows of an object that holds much: a few lines."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Set
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+T = TypeVar("T")
+
+_MAX_FIELDS = 9  # lines
+_MAX_TEXT = 70  # characters of a value
+_MAX_ITEMS = 4  # of a sequence of numbers or names that is shown whole
+_MAX_NUMBERS = 6  # of an array that is shown whole
+_WIDTH = 100  # characters of a line
+
+
+def brief(cls: type[T]) -> type[T]:
+    """Give a dataclass a ``repr`` of at most ten lines, however much it holds.
+
+    Large arrays are shown by their shape, sequences by what is in them, dataclasses by their name.
+    """
+    cls.__repr__ = _repr  # type: ignore[method-assign]
+    return cls
+
+
+def _repr(self: object) -> str:
+    shown = [
+        f"{field.name}={_value(getattr(self, field.name))}"
+        for field in fields(self)  # type: ignore[arg-type]
+        if field.repr
+    ]
+    name = type(self).__name__
+    line = f"{name}({', '.join(shown)})"
+    if len(line) <= _WIDTH:
+        return line
+    if len(shown) > _MAX_FIELDS:
+        shown = [*shown[: _MAX_FIELDS - 1], f"... and {len(shown) - _MAX_FIELDS + 1} more"]
+    return f"{name}(" + ",".join(f"\n    {one}" for one in shown) + ")"
+
+
+def _value(value: object) -> str:
+    """Return a value in a few words."""
+    if isinstance(value, np.ndarray):
+        if value.size <= _MAX_NUMBERS:
+            return np.array2string(value, precision=6, separator=", ").replace("\n", "")
+        return f"array({' x '.join(map(str, value.shape))})"
+    if isinstance(value, RigidTransform | Rotation):
+        return type(value).__name__
+    if isinstance(value, Path):
+        return _short(repr(str(value)))
+    if isinstance(value, Mapping):
+        return _several(list(value), "{}") if value else "{}"
+    if isinstance(value, tuple | list | Set):
+        return _several(list(value), "()" if isinstance(value, tuple) else "[]")
+    if is_dataclass(value):
+        return f"{type(value).__name__}(...)"
+    return _short(repr(value))
+
+
+def _several(items: list[object], brackets: str) -> str:
+    """Return what a sequence holds: its items where these are few and plain, else their types."""
+    if len(items) <= _MAX_ITEMS and all(isinstance(x, str | int | float) for x in items):
+        text = ", ".join(map(repr, items))
+        if len(text) <= _MAX_TEXT:
+            return f"{brackets[0]}{text}{brackets[1]}"
+    counts = Counter(type(x).__name__ for x in items)
+    return f"{brackets[0]}{', '.join(f'{n} {name}' for name, n in counts.items())}{brackets[1]}"
+
+
+def _short(text: str) -> str:
+    """Return the beginning of a text that is long."""
+    text = " ".join(text.split())
+    return text if len(text) <= _MAX_TEXT else f"{text[: _MAX_TEXT - 3]}..."

@@ -1,0 +1,137 @@
+"""Figures of a calibration: residuals over the field of the views, and standard deviations."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from legcal.calibration.documents import ParameterRow, Result
+from legcal.calibration.joint_fit import Posterior
+from legcal.errors import UsageError
+from legcal.geometry import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_ARROW = 0.06  # of the width of an image: the arrow of an outline that is three rms off
+_WIDTH, _HEIGHT = 4.5, 3.8  # of a panel [inch]
+_COLUMNS = 3  # of views, at most
+_LINE = 0.16  # height of a bar [inch]
+
+
+def plot_residuals(posterior: Posterior) -> Figure:
+    """Return a figure of how far used outlines are from the fit, over the field of each view.
+
+    An arrow at each end of an outline points from where the fit predicts it to where it was seen.
+
+    Raises
+    ------
+    UsageError
+        If the fit has no outlines, being made from axes or corners.
+    """
+    from matplotlib import pyplot
+
+    outlines, cameras = posterior.problem.outlines, posterior.state.cameras
+    if not len(outlines):
+        raise UsageError(
+            "The residuals could not be drawn: found a fit without outlines, needed one from "
+            "photographs or outlines; look at .summary() for how well it fits."
+        )
+    off = posterior.problem.offsets(posterior.state)
+    direction = _directions(posterior)
+    rms = float(np.sqrt(np.mean(off**2)))
+    views = np.unique(outlines.view).tolist()
+    columns = min(len(views), _COLUMNS)
+    rows = -(-len(views) // columns)
+    figure, panels = pyplot.subplots(
+        rows, columns, figsize=(_WIDTH * columns, _HEIGHT * rows), squeeze=False
+    )
+    for panel in panels.flat[len(views) :]:
+        panel.set_visible(False)
+    for panel, view in zip(panels.flat, views, strict=False):
+        seen = outlines.view == view
+        camera, here = cameras[view], off[seen]
+        scale = _ARROW * camera.width / max(3.0 * rms, 1e-9)
+        for end in range(2):
+            arrows = scale * here[:, end, None] * direction[seen]
+            panel.quiver(
+                *outlines.pixels[seen, end].T, *arrows.T, outlines.leg[seen],
+                angles="xy", scale_units="xy", scale=1.0, width=0.004, cmap="tab10",
+            )  # fmt: skip
+        panel.set_xlim(-0.5, camera.width - 0.5)
+        panel.set_ylim(camera.height - 0.5, -0.5)
+        panel.set_aspect("equal")
+        panel.set_title(
+            f"{outlines.views[view]}: {np.sqrt(np.mean(here**2)):.3f} px rms", fontsize="medium"
+        )
+    figure.suptitle(f"Outlines less the fit, a colour a leg; arrows {scale:.0f} times as long")
+    figure.tight_layout()
+    return figure
+
+
+def _directions(posterior: Posterior) -> Array:
+    """Return across each outline the direction of positive offsets, unit vectors (n, 2).
+
+    By eq (3), h . M = epsilon R, the axis is on the positive side of edges of epsilon +1.
+    """
+    outlines, state = posterior.problem.outlines, posterior.state
+    along = outlines.pixels[:, 1] - outlines.pixels[:, 0]
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    n_poses, n_legs = len(state.platform_pose.t), len(state.legs)
+    ends = state.ends_at_poses[1].reshape(3, n_poses, n_legs)[:, outlines.pose, outlines.leg].T
+    middle = 0.5 * (state.A[outlines.leg] + ends)
+    R, t = (frames[outlines.view] for frames in state.camera_pose)
+    axis = (R @ middle[..., None])[..., 0] + t
+    pixel = np.array(
+        [
+            state.cameras[view].project(point[None])[0]
+            for view, point in zip(outlines.view.tolist(), axis, strict=True)
+        ]
+    )
+    inward = np.sum((pixel - outlines.pixels[:, 0]) * normal, axis=1)
+    return np.asarray(normal * np.sign(outlines.epsilon * inward)[:, None])
+
+
+def plot_uncertainty(result: Result) -> Figure:
+    """Return a figure of standard deviations: of all parameters, and of the platform at poses."""
+    from matplotlib import pyplot
+
+    groups = [
+        (rows, scale, unit)
+        for of, scale, unit in (("m", 1e3, "mm"), ("rad", float(np.degrees(1.0)), "deg"))
+        if (rows := [row for row in result.parameters if row.unit == of and row.sigma])
+    ]
+    platform = result.platform
+    n = len(groups) + (platform is not None)
+    longest = max((len(rows) for rows, _, _ in groups), default=0)
+    figure, panels = pyplot.subplots(
+        1, max(n, 1), figsize=(_WIDTH * max(n, 1), max(_HEIGHT, _LINE * longest)), squeeze=False
+    )
+    for panel, (rows, scale, unit) in zip(panels.flat, groups, strict=False):
+        _bars(panel, rows, scale)
+        panel.set_xlabel(f"1 sigma [{unit}]")
+    if platform is not None:
+        panel = panels.flat[n - 1]
+        number = np.arange(1, len(platform.per_pose) + 1)
+        for values, label in (
+            ([one.change_dX_m for one in platform.per_pose], "change against the nominal model"),
+            ([one.sigma_dX_m for one in platform.per_pose], "predicted error (1 sigma)"),
+        ):
+            panel.semilogy(number, 1e3 * np.array(values), ".-", label=label)
+        panel.set_xlabel("pose")
+        panel.set_ylabel("platform [mm]")
+        panel.legend(fontsize="small")
+    figure.tight_layout()
+    return figure
+
+
+def _bars(panel: Axes, rows: list[ParameterRow], scale: float) -> None:
+    """Draw a bar for each parameter, the first at the top."""
+    sigma = [scale * (row.sigma or 0.0) for row in rows]
+    panel.barh(range(len(rows)), sigma)
+    panel.set_yticks(range(len(rows)), [row.name for row in rows], fontsize="x-small")
+    panel.invert_yaxis()
+    panel.margins(y=0.01)

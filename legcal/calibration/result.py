@@ -1,0 +1,355 @@
+"""The result of a calibration: what was found, its document, and what people see of it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.calibration.documents import (
+    BoardPose,
+    Distance,
+    Gamma,
+    Holdout,
+    HoldoutPlatform,
+    Kinematic,
+    NoSteps,
+    Observations,
+    ParameterRow,
+    PlatformBlock,
+    Pose,
+    PoseAccuracy,
+    ResidualsBlock,
+    Result,
+    SensitivityRow,
+    Staged,
+    Stages,
+    ViewPose,
+    WeakCombination,
+    WorkspaceAccuracy,
+)
+from legcal.calibration.four_steps import Steps
+from legcal.calibration.joint_fit import (
+    BOARD_SCALE,
+    HeldOut,
+    PlatformAccuracy,
+    PlatformError,
+    Solution,
+    known_parameters,
+    poses_at_readings,
+)
+from legcal.calibration.plots import plot_residuals
+from legcal.calibration.summary import Summarised, few_lines
+from legcal.data import Corners, Dataset
+from legcal.files import motion_to_xyz_quat
+from legcal.machine import (
+    Leg,
+    LegKind,
+    describe_direction,
+    geometries,
+    nominal_axes,
+    parametrization_of,
+    pose_differences,
+    vector_of,
+)
+from legcal.vision import camera_numbers, shared_cameras
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the calibrated model should replace the nominal one."""
+
+    trustworthy: bool  # the predicted improvement exceeds two of its standard deviations
+    sentence: str  # the same, for people
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration(Summarised):
+    """The result of :func:`legcal.calibrate`, in the order of the files.
+
+    Attributes
+    ----------
+    dataset : Dataset
+        What it was computed from; its ``machine`` is the nominal model.
+    solution : Solution
+        The joint fit: parameters, covariance, cameras, platform poses, radii.
+    steps : Steps
+        What the four steps gave.
+    platform : PlatformAccuracy or None
+        What the platform of the calibrated model does differently, and how well that is known;
+        None where the motors do not determine its pose.
+    verdict : Verdict
+        Whether to use it.
+    notes : tuple of str
+        What else a reader should know.
+    held_out : HeldOut or None
+        How well the fit predicts the held-out images; None without any.
+    corners : Corners or None
+        The corners of the calibration board in all images; None without a board.
+    """
+
+    dataset: Dataset
+    solution: Solution
+    steps: Steps
+    platform: PlatformAccuracy | None
+    verdict: Verdict
+    notes: tuple[str, ...]
+    held_out: HeldOut | None = None
+    corners: Corners | None = None
+
+    @cached_property
+    def result(self) -> Result:
+        """The document of ``result.json``."""
+        return _result_of(self)
+
+    def plot_residuals(self) -> Figure:
+        """Return a figure of how far outlines are from the fit, over the field of each view."""
+        return plot_residuals(self.solution.posterior)
+
+    def __repr__(self) -> str:
+        return few_lines(f"Calibration of '{self.dataset.machine.name}'", self.result)
+
+
+def _result_of(calibration: Calibration) -> Result:
+    """Return the document of a calibration."""
+    solution, dataset = calibration.solution, calibration.dataset
+    machine, measurements = dataset.machine, dataset.measurements
+    names, views = machine.leg_names, measurements.views
+    owners = shared_cameras([view.name for view in views], [view.camera for view in views])
+    o, axes = solution.outlines, dataset.axes
+    shown = np.unique(measurements.view[o.row[o.used] if axes is None else axes.row]).tolist()
+    T_base_Rb = machine.T_base_Rb
+    return Result(
+        legcal_result=1,
+        status="converged",
+        verdict=calibration.verdict.sentence,
+        trustworthy=calibration.verdict.trustworthy,
+        legs=list(names),
+        **_legs(names, solution.legs),
+        nominal_axes=nominal_axes(names, geometries(machine)),
+        parameters=_parameters(calibration),
+        covariance=solution.covariance.tolist(),
+        kinematic=Kinematic(
+            names=list(solution.parametrization.names),
+            covariance=solution.value_covariance.tolist(),
+            held=solution.held_basis.tolist(),
+        ),
+        weakest=[
+            WeakCombination(
+                direction=describe_direction([name for name, _ in weak.parts], names),
+                parameters=[name for name, _ in weak.parts],
+                components=[component for _, component in weak.parts],
+                sigma_m=weak.sigma,
+            )
+            for weak in solution.weak
+        ],
+        held=list(solution.held),
+        views={
+            views[v].name: ViewPose(T_base_camera=_pose(T_base_Rb * solution.T_camera_Rb[v].inv()))
+            for v in shown
+        },
+        cameras={v.name: camera_numbers(v.camera) for v in views if v.name in set(owners)},
+        gammas=[
+            Gamma(views=list(one.views), gamma=one.gamma, sigma=one.gamma * one.sigma)
+            for one in solution.gammas
+        ],
+        stages=Stages(staged=_staged(calibration)),
+        residuals=ResidualsBlock.model_validate(solution),
+        observations=_observations(calibration),
+        board=_board(calibration),
+        start=solution.start,
+        platform=_platform(calibration),
+        holdout=_holdout(calibration),
+        notes=list(calibration.notes),
+    )
+
+
+def _legs(names: Sequence[str], legs: Sequence[Leg]) -> dict[str, Any]:
+    """Return the fields of :class:`Legs`."""
+    named = list(zip(names, legs, strict=True))
+    return {
+        "base_joints": [leg.A.tolist() for leg in legs],
+        "platform_joints": [leg.B.tolist() for leg in legs],
+        "offsets": [None if leg.kind is LegKind.PASSIVE else leg.q0 for leg in legs],
+        "base_axes": {n: leg.base_axis.tolist() for n, leg in named if leg.base_axis is not None},
+        "platform_axes": {
+            n: leg.platform_axis.tolist() for n, leg in named if leg.platform_axis is not None
+        },
+        "twists": {name: leg.twist for name, leg in named if leg.twist is not None},
+    }
+
+
+def _pose(T: RigidTransform) -> Pose:
+    return Pose(**motion_to_xyz_quat(T))
+
+
+def _parameters(calibration: Calibration) -> list[ParameterRow]:
+    """Return all kinematic parameters, the radii that were observed, and estimated intrinsics."""
+    solution, dataset = calibration.solution, calibration.dataset
+    machine = dataset.machine
+    found = parametrization_of(machine, twists=True)
+    numbers = vector_of(found, solution.legs, geometries(machine)).tolist()
+    values = {**solution.values, **dict(zip(found.names, numbers, strict=True))}
+    sigma = dict(zip(solution.names, solution.sigma.tolist(), strict=True))
+    with_board = dataset.board is not None
+    known = known_parameters(machine, dataset.measurements.views, with_board=with_board).by_name
+    return [
+        ParameterRow(
+            name=name,
+            value=values[name],
+            nominal=parameter.nominal,
+            sigma=sigma.get(name),
+            prior_sigma=solution.prior_sigma.get(name),
+            unit=parameter.unit,
+            status=solution.status.get(name, "fixed"),
+        )
+        for name, parameter in known.items()
+        if name in values
+    ]
+
+
+def _staged(calibration: Calibration) -> Staged | NoSteps:
+    """Return what the four steps gave, and how far it is from the fit."""
+    steps, machine = calibration.steps, calibration.dataset.machine
+    if steps.legs is None:
+        return NoSteps(failure=steps.failure)
+    from_fit = None
+    if calibration.platform is not None:
+        measurements = calibration.dataset.measurements
+        near, q = calibration.solution.T_Rb_Re, measurements.q[measurements.first_rows]
+        displacement, rotation = pose_differences(
+            poses_at_readings(machine, steps.legs, q, near),
+            poses_at_readings(machine, calibration.solution.legs, q, near),
+        )
+        from_fit = Distance(dX_m=displacement.mean(), dE_rad=rotation.mean())
+    return Staged(
+        **_legs(machine.leg_names, steps.legs),
+        diagnostics=list(steps.diagnostics),
+        from_fit=from_fit,
+    )
+
+
+def _observations(calibration: Calibration) -> Observations:
+    """Return what the fit was made from."""
+    axes, n_images = calibration.dataset.axes, calibration.dataset.measurements.n_rows
+    if axes is not None:
+        n = len(axes)
+        return Observations(kind="axes", used=n, total=n, images=n_images, rejected={})
+    outlines = calibration.solution.outlines
+    reasons = Counter(
+        reason.split(",")[0].split(" by ")[0]
+        for reason, used in zip(outlines.reason, outlines.used, strict=True)
+        if not used
+    )
+    return Observations(
+        kind="outlines",
+        used=int(outlines.used.sum()),
+        total=len(outlines),
+        images=n_images,
+        rejected=dict(reasons.most_common()),
+    )
+
+
+def _board(calibration: Calibration) -> BoardPose | None:
+    """Return where the board stands, which differs from what the dataset says by where R_b is."""
+    solution, dataset, corners = calibration.solution, calibration.dataset, calibration.corners
+    if solution.T_Rb_board is None:
+        return None
+    given, T_base_board = dataset.T_base_board, dataset.machine.T_base_Rb * solution.T_Rb_board
+    off = None
+    if given is not None:
+        apart = given.inv() * T_base_board
+        turn = float(apart.rotation.magnitude())
+        off = Distance(dX_m=float(np.linalg.norm(apart.translation)), dE_rad=turn)
+    return BoardPose(
+        T_base_board=_pose(T_base_board),
+        given=None if given is None else _pose(given),
+        scale=solution.values.get(BOARD_SCALE, 1.0),
+        rms_px=solution.rms_corners_px,
+        corners=0 if corners is None else len(corners),
+        used=0 if corners is None else int(corners.used.sum()),
+        images=0 if corners is None else len(np.unique(corners.row[corners.used])),
+        off=off,
+    )
+
+
+def _platform(calibration: Calibration) -> PlatformBlock | None:
+    """Return what all this means at the platform."""
+    platform, measurements = calibration.platform, calibration.dataset.measurements
+    if platform is None:
+        return None
+    labels = measurements.pose_labels or ("",) * measurements.n_poses
+    images: list[list[str]] = [[] for _ in labels]
+    for pose, image in zip(measurements.pose.tolist(), measurements.image, strict=True):
+        if image:
+            images[pose].append(image)
+    change, sigma, workspace = platform.change, platform.sigma, platform.workspace
+    return PlatformBlock(
+        change_dX_m=change.mean_displacement,
+        change_dE_rad=change.mean_rotation,
+        **_predicted(sigma),
+        per_pose=[
+            PoseAccuracy(
+                pose=label or None,
+                images=images[k],
+                change_dX_m=change.displacement[k],
+                change_dE_rad=change.rotation[k],
+                sigma_dX_m=sigma.displacement[k],
+                sigma_dE_rad=sigma.rotation[k],
+            )
+            for k, label in enumerate(labels)
+        ],
+        workspace=None if workspace is None else WorkspaceAccuracy(**_predicted(workspace)),
+        sensitivities=[
+            SensitivityRow(what=effect.what, **_errors(effect.error)) for effect in platform.effects
+        ],
+    )
+
+
+def _errors(error: PlatformError, prefix: str = "") -> dict[str, Any]:
+    """Return means and maxima of an error of the platform, as the document names them."""
+    return {
+        f"{prefix}dX_m": error.mean_displacement,
+        f"{prefix}dE_rad": error.mean_rotation,
+        f"{prefix}dX_max_m": error.max_displacement,
+        f"{prefix}dE_max_rad": error.max_rotation,
+    }
+
+
+def _predicted(error: PlatformError) -> dict[str, Any]:
+    """Return the fields of :class:`WorkspaceAccuracy`."""
+    return {"poses": len(error.displacement), **_errors(error, "sigma_")}
+
+
+def _holdout(calibration: Calibration) -> Holdout | None:
+    """Return what images that were kept aside say."""
+    held_out = calibration.held_out
+    if held_out is None:
+        return None
+    pair = held_out.at_platform
+    return Holdout(
+        images=held_out.n_images,
+        poses=held_out.n_poses,
+        outlines=held_out.outlines,
+        wrong=held_out.wrong,
+        rms_px=held_out.rms_px,
+        expected_px=held_out.expected_px,
+        views=held_out.rms_px_of_view,
+        platform=None
+        if pair is None
+        else HoldoutPlatform(
+            poses=len(held_out.displacement),
+            dX_m=pair.displacement,
+            expected_dX_m=pair.expected_displacement,
+            dE_rad=pair.rotation,
+            expected_dE_rad=pair.expected_rotation,
+        ),
+    )

@@ -1,0 +1,322 @@
+"""What a calibration says to people: its table of parameters and sentences, from the document."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from legcal.calibration.documents import (
+    Holdout,
+    NoSteps,
+    PlatformBlock,
+    Result,
+    WorkspaceAccuracy,
+)
+from legcal.calibration.plots import plot_uncertainty
+from legcal.errors import OutOfResources
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+UNITS = {  # what people read a unit in: how many there are in it, its name, and digits
+    "m": (1e3, "mm", 4),
+    "rad": (float(np.degrees(1.0)), "deg", 4),
+    "px": (1.0, "px", 3),
+    "": (1.0, "", 6),
+}
+
+
+@dataclass(frozen=True)
+class ParameterTable:
+    """The parameters of a calibration in mm, degrees and pixels; iterating yields rows as dicts.
+
+    ``pandas.DataFrame(table)`` and :meth:`to_pandas` make a data frame of it.
+    """
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]  # None where a parameter was not estimated
+    digits: tuple[int, ...]  # of the numbers of each row
+
+    @classmethod
+    def of(cls, result: Result) -> ParameterTable:
+        """Return the table of a result."""
+        rows, digits = [], []
+        for row in result.parameters:
+            scale, unit, n = UNITS[row.unit]
+            value, nominal = scale * row.value, scale * row.nominal
+            sigma = None if row.sigma is None else scale * row.sigma
+            rows.append((row.name, nominal, value, value - nominal, sigma, unit, row.status))
+            digits.append(n)
+        columns = ("parameter", "nominal", "calibrated", "change", "sigma", "unit", "status")
+        return cls(columns, tuple(rows), tuple(digits))
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return (dict(zip(self.columns, row, strict=True)) for row in self.rows)
+
+    def cells(self) -> list[tuple[str, ...]]:
+        """Return the rows as texts, the status of estimated parameters left out."""
+        return [
+            tuple(_cell(name, x, n) for name, x in zip(self.columns, row, strict=True))
+            for row, n in zip(self.rows, self.digits, strict=True)
+        ]
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a data frame, a row a parameter.
+
+        Raises
+        ------
+        OutOfResources
+            If pandas is not installed, which legcal itself does not need.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise OutOfResources(
+                "The data frame could not be made: found no pandas, which legcal itself does not "
+                "need; install it (pip install pandas), or take the rows as dicts: list(table)."
+            ) from error
+        return pandas.DataFrame(list(self.rows), columns=list(self.columns))
+
+    def __repr__(self) -> str:
+        cells = [self.columns, *self.cells()]
+        width = [max(len(row[k]) for row in cells) for k in range(len(self.columns))]
+        return "\n".join(
+            "  ".join(
+                text.rjust(w) if name in _NUMBERS else text.ljust(w)
+                for name, text, w in zip(self.columns, row, width, strict=True)
+            ).rstrip()
+            for row in cells
+        )
+
+    def _repr_html_(self) -> str:
+        head = "".join(f"<th>{escape(name)}</th>" for name in self.columns)
+        body = "".join(
+            "<tr>"
+            + "".join(
+                f'<td style="text-align:{"right" if name in _NUMBERS else "left"}">'
+                f"{escape(text)}</td>"
+                for name, text in zip(self.columns, row, strict=True)
+            )
+            + "</tr>"
+            for row in self.cells()
+        )
+        return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+_NUMBERS = {"nominal", "calibrated", "change", "sigma"}
+
+
+def _cell(column: str, x: Any, digits: int) -> str:
+    """Return a number or text of the table."""
+    if column == "status":
+        return "" if x == "estimated" else str(x)
+    if x is None:
+        return ""
+    if column not in _NUMBERS:
+        return str(x)
+    return f"{x:{'+' if column == 'change' else ''}{'' if column == 'sigma' else 'z'}.{digits}f}"
+
+
+def sentences(result: Result) -> list[str]:
+    """Return what a result says beside its parameters, but for the verdict: a line each."""
+    return [
+        *(f"Note: {note}" for note in result.notes),
+        *_observation_lines(result),
+        *_board_lines(result),
+        *_steps_lines(result),
+        _fit_line(result),
+        *_direction_lines(result),
+        *([] if result.platform is None else _platform_lines(result.platform)),
+        *([] if result.holdout is None else _holdout_lines(result.holdout)),
+    ]
+
+
+def summary(result: Result) -> str:
+    """Return the table of parameters, what it means, and the verdict as one text."""
+    table = repr(ParameterTable.of(result))
+    return "\n\n".join([table, "\n".join(sentences(result)), result.verdict])
+
+
+def summary_html(result: Result) -> str:
+    """Return the same as HTML."""
+    colour = "green" if result.trustworthy else "firebrick"
+    lines = "".join(f"<li>{escape(line)}</li>" for line in sentences(result))
+    return (
+        f'<p style="color:{colour}"><b>{escape(result.verdict)}</b></p><ul>{lines}</ul>'
+        f"<details><summary>{len(result.parameters)} parameters</summary>"
+        f"{ParameterTable.of(result)._repr_html_()}</details>"
+    )
+
+
+def few_lines(name: str, result: Result) -> str:
+    """Return what an interactive session shows of a result: at most ten lines."""
+    estimated = sum(row.status == "estimated" for row in result.parameters)
+    found = [f"{estimated} of {len(result.parameters)} parameters estimated"]
+    seen = result.observations
+    if seen is not None:
+        found.append(f"{seen.used} of {seen.total} {seen.kind} of {seen.images} images used")
+    found.append(f"{len(result.notes)} note{'s' * (len(result.notes) != 1)}")
+    return "\n".join(
+        [
+            f"{name}: legs {', '.join(result.legs)}" if len(result.legs) < 13 else name,
+            f"  {result.verdict}",
+            f"  {', '.join(found)}",
+            "  more: .summary(), .table(), .plot_uncertainty(), .result",
+        ]
+    )
+
+
+class Summarised:
+    """What every object that has the document of a calibration shows of it."""
+
+    @property
+    def result(self) -> Result:
+        """The document of ``result.json``."""
+        raise NotImplementedError
+
+    def summary(self) -> str:
+        """Return the table of parameters [mm, deg, px], what it means, and the verdict."""
+        return summary(self.result)
+
+    def table(self) -> ParameterTable:
+        """Return the parameters [mm, deg, px]: value, nominal value, change and sigma."""
+        return ParameterTable.of(self.result)
+
+    def plot_uncertainty(self) -> Figure:
+        """Return a figure of the standard deviations of parameters, and of the platform."""
+        return plot_uncertainty(self.result)
+
+    def _repr_html_(self) -> str:
+        return summary_html(self.result)
+
+
+def _mm_deg(dX_m: float, dE_rad: float) -> str:
+    return f"{1e3 * dX_m:.3f} mm / {np.degrees(dE_rad):.4f} deg"
+
+
+def _observation_lines(result: Result) -> list[str]:
+    seen = result.observations
+    if seen is None:
+        return []
+    if seen.kind == "axes":
+        return [
+            f"Axes: {seen.used} in {seen.images} images, taken with the standard deviations that "
+            "their table gives."
+        ]
+    most = sorted(seen.rejected.items(), key=lambda one: -one[1])[:_MAX_REASONS]
+    rejected = ", ".join(f"{count} {reason}" for reason, count in most)
+    return [f"Outlines: {seen.used} of {seen.total} used{f'; rejected: {rejected}' * bool(most)}."]
+
+
+_MAX_REASONS = 4
+_NONE = 5e-4  # [px, mm] and a tenth of it [deg]: would be shown as zero
+
+
+def _board_lines(result: Result) -> list[str]:
+    board = result.board
+    if board is None:
+        return []
+    line = (
+        f"Calibration board: {board.used} of {board.corners} corners used, in {board.images} "
+        f"images, {board.rms_px or 0.0:.3f} px rms."
+    )
+    if board.off is not None:
+        line += (
+            f" It stands {1e3 * board.off.dX_m:.2f} mm and {np.degrees(board.off.dE_rad):.3f} deg "
+            "from where the dataset has it, if the joints of the base stand where the nominal "
+            "model has them."
+        )
+    return [line]
+
+
+def _steps_lines(result: Result) -> list[str]:
+    steps = result.stages.staged
+    if isinstance(steps, NoSteps):
+        return [f"The four steps alone gave no result: {steps.failure}"]
+    left_out = (
+        f" They left out or at nominal {len(steps.diagnostics)} axes, joints or directions."
+        * bool(steps.diagnostics)
+    )
+    if steps.from_fit is None:
+        return [f"The four steps alone gave a result.{left_out}"]
+    return [
+        f"The four steps alone end {1e3 * steps.from_fit.dX_m:.3f} mm / "
+        f"{np.degrees(steps.from_fit.dE_rad):.3f} deg from the fit at the platform.{left_out}"
+    ]
+
+
+def _fit_line(result: Result) -> str:
+    found = result.residuals
+    parts = [f"{found.dof} degrees of freedom"]
+    if found.rms_px is not None:
+        parts.append(f"{found.rms_px:.3f} px rms")
+    if found.rms_axes is not None:
+        parts.append(f"axes off by {found.rms_axes:.3f} of their standard deviations, rms")
+    line = (
+        f"The joint fit started from the {result.start} model: chi2 {found.chi2:.1f} "
+        f"for {', '.join(parts)}."
+    )
+    shared = [f"{what} {sigma:.3f} px" for what, sigma in found.shared_px.items() if sigma > _NONE]
+    return line + (f" Common-mode edge biases: {', '.join(shared)}." if shared else "")
+
+
+def _direction_lines(result: Result) -> list[str]:
+    """Return which combinations of parameters are least certain, and which are held."""
+    worst = [f"{weak.direction} ({1e3 * weak.sigma_m:.3f} mm)" for weak in result.weakest]
+    lines = [f"Least certain combinations (1 sigma): {'; '.join(worst)}."] if worst else []
+    if result.held:
+        lines.append(
+            "Held at nominal, as nothing determines them and they do not move the platform: "
+            f"{'; '.join(result.held)}."
+        )
+    return lines
+
+
+def _platform_lines(found: PlatformBlock) -> list[str]:
+    """Return the predicted error of the platform, and what would add to it."""
+    parts = [f"at the {found.poses} poses {_predicted(found)}"]
+    if found.workspace is not None:
+        parts.append(f"over the workspace {_predicted(found.workspace)}")
+    return [
+        f"Predicted error of the platform (1 sigma): {'; '.join(parts)}.",
+        *(
+            f"{one.what.capitalize()} would move the platform by {_mm_deg(one.dX_m, one.dE_rad)}, "
+            f"at most {_mm_deg(one.dX_max_m, one.dE_max_rad)}."
+            for one in found.sensitivities
+            if 1e3 * one.dX_max_m > _NONE or np.degrees(one.dE_max_rad) > 0.1 * _NONE
+        ),
+    ]
+
+
+def _predicted(at: PlatformBlock | WorkspaceAccuracy) -> str:
+    mean, most = (at.sigma_dX_m, at.sigma_dE_rad), (at.sigma_dX_max_m, at.sigma_dE_max_rad)
+    return f"{_mm_deg(*mean)}, at most {_mm_deg(*most)}"
+
+
+def _holdout_lines(found: Holdout) -> list[str]:
+    of = f"{found.images} image{'s' * (found.images != 1)} kept aside"
+    if found.rms_px is None or found.expected_px is None:
+        return [f"Held out: {of} show no outline that could be compared."]
+    views = ", ".join(f"{name} {rms:.3f}" for name, rms in found.views.items())
+    lines = [
+        f"Held out: {of}: {found.outlines - found.wrong} of {found.outlines} outlines are "
+        f"{found.rms_px:.3f} px (rms) from where the fit of the others predicts them, "
+        f"{found.expected_px:.3f} px were expected ({views})."
+    ]
+    pair = found.platform
+    if pair is None:
+        return [*lines, "They show too few legs at once to determine the platform's pose alone."]
+    return [
+        *lines,
+        f"At the platform, its pose by what {pair.poses} of {found.poses} poses show alone is "
+        f"{_mm_deg(pair.dX_m, pair.dE_rad)} (rms) from that by the readings; "
+        f"{_mm_deg(pair.expected_dX_m, pair.expected_dE_rad)} were expected.",
+    ]

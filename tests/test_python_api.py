@@ -1,0 +1,101 @@
+"""legcal in an interactive session: short to look at; arrays, texts and figures to go on with."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hexapod_example import Run
+from matplotlib import pyplot
+from scipy.spatial.transform import Rotation
+
+import legcal
+from legcal.errors import OutOfResources, UsageError
+from legcal.simulation import Level
+
+
+def test_everything_that_is_returned_is_short_to_look_at(example_run: Run) -> None:
+    calibration = example_run.calibration
+    shown = [
+        calibration,
+        calibration.dataset,
+        calibration.dataset.machine,
+        calibration.dataset.machine.legs[0],
+        calibration.dataset.measurements,
+        calibration.solution,
+        calibration.solution.outlines,
+        calibration.platform,
+        calibration.steps,
+        legcal.load_result(example_run.output),
+        legcal.evaluate("hexapod", "hexapod"),
+        legcal.identifiability(calibration.dataset.machine),
+    ]
+    for one in shown:
+        lines = repr(one).splitlines()
+        assert 1 <= len(lines) <= 10, type(one)
+        assert len(repr(one)) < 1000, type(one)
+
+
+def test_a_result_that_is_loaded_says_what_the_calibration_said(example_run: Run) -> None:
+    calibration, loaded = example_run.calibration, legcal.load_result(example_run.output)
+    assert loaded.summary() == calibration.summary()
+    assert calibration.verdict.sentence in calibration.summary()
+    assert "outlines of 45 images used" in repr(loaded)
+    table = calibration.table()
+    rows = {row["parameter"]: row for row in table}
+    found = calibration.solution.values["leg2.offset"]
+    assert rows["leg2.offset"]["calibrated"] == pytest.approx(1e3 * found, rel=1e-12)
+    assert rows["leg2.offset"]["unit"] == "mm"
+    assert len(table) == len(loaded.result.parameters)
+    assert repr(table).count("\n") == len(table)
+
+
+def test_notebooks_show_names_as_text(example_run: Run) -> None:
+    loaded = legcal.load_result(example_run.output)
+    hostile = loaded.document.model_copy(update={"verdict": "<script>", "notes": ["<b>&"]})
+    html = dataclasses.replace(loaded, document=hostile)._repr_html_()
+    assert "<script>" not in html
+    assert "&lt;b&gt;&amp;" in html
+
+
+def test_pandas_is_asked_for_by_name(example_run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pandas", None)
+    with pytest.raises(OutOfResources, match="pip install pandas"):
+        example_run.calibration.table().to_pandas()
+
+
+def test_figures_show_every_view_and_every_parameter(example_run: Run) -> None:
+    calibration = example_run.calibration
+    residuals, sigma = calibration.plot_residuals(), calibration.plot_uncertainty()
+    titles = [axes.get_title() for axes in residuals.axes]
+    assert [title.split(":")[0] for title in titles] == ["c1", "c2", "c3"]
+    labels = [label.get_text() for label in sigma.axes[0].get_yticklabels()]
+    estimated = [row for row in calibration.result.parameters if row.sigma and row.unit == "m"]
+    assert labels == [row.name for row in estimated]
+    pyplot.close("all")
+
+
+def test_a_fit_without_outlines_has_no_residuals_to_draw(tmp_path: Path) -> None:
+    settings = legcal.SimulationSettings(level=Level.AXES, views=3, poses=12)
+    legcal.simulate("hexapod", tmp_path / "set", settings)
+    with pytest.raises(UsageError, match="found a fit without outlines"):
+        legcal.calibrate(tmp_path / "set").plot_residuals()
+
+
+def test_arrays_of_a_machine_go_into_scipy_and_pinocchio() -> None:
+    machine = legcal.load_mechanism("hexapod")
+    turned = Rotation.from_rotvec([0.0, 0.0, np.pi]).apply(machine.A_base)
+    np.testing.assert_allclose(turned[:, :2], -machine.A_base[:, :2], atol=1e-15)
+    Rotation.from_rotvec(machine.B_platform)
+    pin.SE3(np.eye(3), machine.A_base[0])
+    changed = machine.A_base
+    changed[:] = 0.0  # a copy: the machine stays as it is
+    assert np.abs(machine.A_base).max() > 0.1
+
+
+def test_progress_can_be_switched_on(example_run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    legcal.calibrate(example_run.folder, progress=True)
+    assert "Joint fit: 1/1" in capsys.readouterr().err
+    legcal.calibrate(example_run.folder, progress=False)
+    assert capsys.readouterr().err == ""
