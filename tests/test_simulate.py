@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from outline_tables import LEG_NAMES, outlines_of, recorded
 from rich.console import Console
-from simulated import files_of, settings, small_camera
+from simulated import files_of, settings, simulated, small_camera
 
 import legcal
 from legcal.data import View, load_dataset
@@ -125,6 +125,18 @@ def test_the_seed_and_nothing_else_decides_what_is_drawn(tmp_path: Path) -> None
     for name in ("measurements.csv", "truth/urdf/hexapod.urdf", "truth/outlines.csv"):
         assert one[name] == axes[name]
     assert "observations.csv" not in axes
+
+
+def test_axes_of_any_seed_can_be_read(tmp_path: Path) -> None:
+    for seed in range(2):  # legs of this machine point down in the image, where theta is pi
+        made = simulated(
+            tmp_path / f"{seed}",
+            "3-spr",
+            level=Level.AXES,
+            table=TableNoise.in_radians(),
+            seed=seed,
+        )
+        assert load_dataset(made.folder, check_images=False).axes is not None
 
 
 def test_photographs_are_those_of_the_kind_of_camera_and_its_file(tmp_path: Path) -> None:

@@ -79,6 +79,25 @@ def test_the_noise_of_table_1_has_the_spread_of_its_covariance() -> None:
     )
 
 
+def test_angles_with_noise_are_written_within_their_ranges() -> None:
+    n, noise = 2000, TableNoise.in_radians()
+    turns = np.random.default_rng(3)
+    # Down in the image, where theta is pi, and towards the camera or away, where psi is pi/2.
+    u = 0.05 * turns.normal(size=(n, 3)) + [0.0, 0.1, 1.0]
+    u[1::4, 2] *= -1.0
+    u[::2] = 0.05 * turns.normal(size=(n // 2, 3)) + [0.0, -1.0, 0.0]
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    A = np.tile([0.1, 0.2, 0.9], (n, 1))
+    found = table_of(*_indices(n), u, A, noise, np.random.default_rng(0)).values
+    drawn = table_of_lines(u, A) + np.random.default_rng(0).normal(size=(n, 4)) * noise.sigmas
+    for wanted, most in ((0, 0.5 * np.pi), (1, np.pi)):
+        assert np.abs(drawn[:, wanted]).max() > most + 0.01  # or nothing was to be wrapped
+        assert np.abs(found[:, wanted]).max() <= most
+    assert np.allclose(
+        direction_of_angles(*found.T[:2]), direction_of_angles(*drawn.T[:2]), atol=1e-14
+    )
+
+
 def test_the_angles_of_table_1_are_degrees_unless_radians_are_asked_for() -> None:
     assert np.allclose(np.rad2deg(TableNoise().sigmas[:2]), [0.05, 0.06])
     assert np.allclose(TableNoise.in_radians().sigmas[:2], [0.05, 0.06])

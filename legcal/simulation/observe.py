@@ -245,7 +245,17 @@ def table_of(
     values = table_of_lines(u, A)
     if rng is not None:
         values += rng.normal(size=values.shape) * noise.sigmas
+        values[:, 0], values[:, 1] = _wrapped(values[:, 0], values[:, 1])
     return AxisTable(row, leg, values, np.broadcast_to(noise.sigmas, values.shape))
+
+
+def _wrapped(psi: Array, theta: Array) -> tuple[Array, Array]:
+    """Return psi in [-pi/2, pi/2] and theta in [-pi, pi] of the directions of any angles."""
+    psi = np.remainder(psi + np.pi, 2.0 * np.pi) - np.pi
+    beyond = np.abs(psi) > 0.5 * np.pi  # past the optical axis: the same direction from behind
+    psi = np.where(beyond, np.copysign(np.pi, psi) - psi, psi)
+    theta = np.remainder(theta + np.where(beyond, 2.0, 1.0) * np.pi, 2.0 * np.pi) - np.pi
+    return psi, theta
 
 
 def table_of_lines(u: Array, A: Array) -> Array:
