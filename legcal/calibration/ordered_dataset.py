@@ -6,8 +6,8 @@ never reordered after. A job puts its result back into the order of the files wh
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -72,6 +72,8 @@ class OrderedDataset:
     measurements: Measurements
     axes: LegAxes | None
     rows: IntArray  # the images that are here, among all of them
+    # T_base_platform that images showed, by row among all images, where readings do not give it
+    seen_poses: Mapping[int, RigidTransform] = field(default_factory=dict)
 
     @cached_property
     def photographs(self) -> Photographs:
@@ -92,7 +94,15 @@ class OrderedDataset:
 
     @cached_property
     def _nominal(self) -> tuple[tuple[RigidTransform, ...], Array]:
-        return nominal_poses(self.machine, self.measurements)
+        T, residual = nominal_poses(self.machine, self.measurements)
+        if not self.seen_poses:
+            return T, residual
+        rows = self.rows[self.measurements.first_rows].tolist()
+        seen = [
+            platform_in_base(self.machine, self.seen_poses[row]) if row in self.seen_poses else own
+            for row, own in zip(rows, T, strict=True)
+        ]
+        return tuple(seen), residual
 
     @property
     def T_Rb_Re(self) -> tuple[RigidTransform, ...]:
@@ -127,6 +137,25 @@ class OrderedDataset:
     def rows_of(self, file_rows: IntArray) -> IntArray:
         """Return the rows here of images that are given by their rows in the files."""
         return np.sort(inverse(self.order.rows)[file_rows])
+
+    def with_poses(self, T_base_platform: Mapping[int, RigidTransform]) -> OrderedDataset:
+        """Return the dataset with poses that images show, by pose; as it is without any."""
+        of_rows = {
+            row: T_base_platform[pose]
+            for row, pose in zip(self.rows.tolist(), self.measurements.pose.tolist(), strict=True)
+            if pose in T_base_platform
+        }
+        # A field changes, so that what was cached of the poses is made anew.
+        return replace(self, seen_poses={**self.seen_poses, **of_rows}) if of_rows else self
+
+    def with_fitted_poses(self, T_Rb_Re: Sequence[RigidTransform]) -> OrderedDataset:
+        """Return the dataset with the poses of a fit where readings do not give them."""
+        if self.machine.is_determined:
+            return self
+        back = self.machine.T_platform_Re.inv()
+        return self.with_poses(
+            {k: self.machine.T_base_Rb * T * back for k, T in enumerate(T_Rb_Re)}
+        )
 
     def at(self, rows: IntArray) -> OrderedDataset:
         """Return some of the images, by their rows here, rising."""

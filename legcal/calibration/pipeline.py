@@ -77,6 +77,7 @@ from legcal.perception import (
     measure_photographs,
     nominal_placement,
     place_and_measure,
+    require_rough_cameras,
     used_as_before,
 )
 from legcal.progress import Progress, shown_progress
@@ -275,7 +276,8 @@ def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimat
     other_radii = bool(seen.placement.radii.factor)
     if other_radii:
         data = replace(data, machine=seen.photographs.machine)
-        fitted = data.at(rows)
+    data = data.with_poses(seen.free_poses)
+    fitted = data.at(rows)
     if options.every_leg and (seen.left_out or seen.placement.unplaced):
         _refuse_too_few(data, rows, seen, options.choices)
     # 3 and 4. Four steps and joint fit.
@@ -295,7 +297,22 @@ def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimat
 
 
 def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]:
-    """Return where the nominal model has the legs, with rough cameras, and what shows the board."""
+    """Return where the nominal model has the legs, with rough cameras, and what shows the board.
+
+    Raises
+    ------
+    NotIdentifiable
+        If readings do not give the poses of images that are to be searched, and a view of these has
+        no rough camera pose; nothing is searched then.
+    """
+    dataset = data.dataset
+    if not data.machine.is_determined and (
+        dataset.board is None or dataset.board.T_base_board is None
+    ):
+        hints = [view.T_base_camera for view in data.measurements.views]
+        rows = data.photographs.detect.tolist()
+        if dataset.board is None or not any(hints):
+            require_rough_cameras(data.measurements, rows, hints)
     placement = nominal_placement(data.machine, data.measurements, data.T_base_platform)
     board = observe_board(data)
     if board is not None:
@@ -358,11 +375,13 @@ def _measure_again(
     def fitted(near: Estimate, gammas: Mapping[str, float], like: Outlines | None) -> Estimate:
         machine = _with_fitted_radii(again.machine, near.solution)
         photographs = replace(again, machine=machine).with_gammas(gammas)
-        placement = _fitted_placement(data, near.solution, seen)
+        here = near.fitted.with_fitted_poses(near.solution.T_Rb_Re)
+        every = replace(data, seen_poses=here.seen_poses)
+        placement = _fitted_placement(every, near.solution, seen)
         outlines = measure_photographs(photographs, placement, data.progress)
         if like is not None:
             outlines = used_as_before(outlines, like)
-        return _fit(near.fitted, outlines, placement, board, options)
+        return _fit(here, outlines, placement, board, options)
 
     first = best = fitted(estimate, {}, None)
     trials = GammaTrials.begun(first.solution, known_gammas(again.keep, again.measurements))
@@ -527,6 +546,12 @@ def _split(dataset: Dataset, holdout: float | None) -> tuple[IntArray, IntArray]
             f"{dataset.folder}: no images could be kept aside: found a table of axes, needed "
             "images or outlines, in which a fit is compared with what it did not see; leave out "
             "--holdout."
+        )
+    if not dataset.machine.is_determined:
+        raise UsageError(
+            f"{dataset.folder}: no images could be kept aside: found that "
+            f"{dataset.machine.undetermined}, needed readings that give the poses of images that a "
+            "fit has not seen; leave out --holdout."
         )
     return split_images(dataset, holdout)
 

@@ -96,8 +96,8 @@ def _verdict_on_parameters(dataset: Dataset, solution: Solution) -> Verdict:
     change, sigma = np.sqrt(np.mean(np.square(lengths or [(0.0, 0.0)]), axis=0)).tolist()
     found = (
         f"joints and lengths change by {1e3 * change:.3f} mm against the nominal model, known to "
-        f"{1e3 * sigma:.3f} mm (1 sigma, both rms); the motors do not determine the pose of the "
-        "platform, so that no error of it is stated"
+        f"{1e3 * sigma:.3f} mm (1 sigma, both rms); no platform error can be predicted, because "
+        f"{dataset.machine.undetermined}"
     )
     return _verdict(change, sigma, found)
 

@@ -22,6 +22,7 @@ from .equations import VectorOps as VectorOps
 from .equations import axis_in_leg as axis_in_leg
 from .equations import freedoms as freedoms
 from .equations import leg_equations as leg_equations
+from .equations import machine_equations as machine_equations
 from .equations import pose_equations as pose_equations
 from .equations import pose_sensitivity as pose_sensitivity
 from .equations import twist_residual as twist_residual
@@ -90,6 +91,7 @@ from .parameters import twist_after as twist_after
 from .parameters import vector_of as vector_of
 from .parameters import with_numbers as with_numbers
 from .parameters import with_platform_foot as with_platform_foot
+from .solver import poses_after as poses_after
 from .solver import solve as solve
 from .urdf import Urdf as Urdf
 from .urdf import UrdfPatch as UrdfPatch

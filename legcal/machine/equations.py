@@ -175,8 +175,9 @@ def pose_sensitivity(
     columns = list(freedoms(frame_legs))
     F = equations.by_pose[:, :, columns]
     singular = np.linalg.svd(F, compute_uv=False)
-    few = singular.shape[1] < len(columns)
-    bad = np.flatnonzero((singular[:, -1] < _SINGULAR * singular[:, 0]) | few)
+    bad = np.arange(len(t))
+    if singular.shape[1] == len(columns):
+        bad = np.flatnonzero(singular[:, -1] < _SINGULAR * singular[:, 0])
     if len(bad):
         raise NotIdentifiable(
             f"The platform error could not be predicted: the {int(equations.measured.sum())} "

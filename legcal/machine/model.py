@@ -68,6 +68,15 @@ class Machine:
         return self.mobility == len(self.motors)
 
     @property
+    def undetermined(self) -> str:
+        """Why readings do not give the pose, as a sentence goes on."""
+        n, moves = len(self.motors), f"a platform with mobility {self.mobility}"
+        if n == 0:
+            return f"no motor determines the pose of {moves}"
+        does = "motor does" if n == 1 else "motors do"
+        return f"{n} {does} not determine the pose of {moves}"
+
+    @property
     def A_base(self) -> Array:
         """Base joint centres in the base link, (n_legs, 3) [m]."""
         return self._arrays[0].copy()

@@ -18,6 +18,7 @@ from .board_poses import plane_poses as plane_poses
 from .diagnostics import BEFORE_FIT as BEFORE_FIT
 from .diagnostics import FAR_OFF as FAR_OFF
 from .diagnostics import hint_notes as hint_notes
+from .free_poses import require_rough_cameras as require_rough_cameras
 from .outline import HIDDEN as HIDDEN
 from .outline import MIN_LENGTH as MIN_LENGTH
 from .outline import MIN_LONE_KEPT as MIN_LONE_KEPT

@@ -374,7 +374,7 @@ def gauss_newton_step(
         found = matches.of_pictures(slice(done, done := done + len(some)))
         if found.score.size == 0 or some.pairs.shape[1] == 0:
             continue
-        J, J_leg, residual, weight = _equations(some, poses, found, tolerance)
+        J, J_leg, residual, weight = segment_equations(some, poses, found, tolerance)
         rows = np.concatenate([J, residual[..., None]], axis=-1)  # (K, n, T, 4, 7)
         K, _, T = weight.shape[:3]
         flat = (K, n, 4 * T, 7)
@@ -420,7 +420,7 @@ def _step_prior(centre: Array) -> Array:
     return np.asarray(H)
 
 
-def _equations(
+def segment_equations(
     pictures: Pictures, poses: CameraPoses, found: PairMatches, tolerance: float
 ) -> tuple[Array, Array, Array, Array]:
     """Return residuals of each segment: two of its line, one of its width, one of its place.
@@ -494,7 +494,7 @@ def distances(pictures: Pictures, poses: CameraPoses, found: PairMatches) -> Arr
 
     Sideways, at the ends of the pairs and at the depth of the segments.
     """
-    _, _, residual, _ = _equations(pictures, poses, found, 1.0)
+    _, _, residual, _ = segment_equations(pictures, poses, found, 1.0)
     X, _, _ = _projected(pictures, poses)
     return np.asarray(np.abs(residual[..., :2]).max(axis=-1) * X[..., 2].mean(axis=-1))
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -34,6 +34,7 @@ from legcal.perception.diagnostics import (
     is_visible,
     reject_images,
 )
+from legcal.perception.free_poses import ROUNDS, find_free_poses
 from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
 from legcal.perception.outline import WRONG_WIDTH, Method
 from legcal.perception.placement import (
@@ -140,6 +141,8 @@ class MeasuredImages:
     outlines: Outlines  # of all images; those of images that are left out are rejected
     left_out: dict[int, str]  # why images were left out, by row
     blur: tuple[float, ...]  # usual one of each view [px]; NaN where none was measured
+    # T_base_platform of every pose that images show, where the readings do not give it
+    free_poses: Mapping[int, RigidTransform] = field(default_factory=dict)
 
 
 def given_outlines(photographs: Photographs) -> Outlines:
@@ -172,6 +175,7 @@ def place_and_measure(
     """
     defects, pairs, rough = _inspect_images(photographs, nominal, report, joined)
     usable = np.array([row for row in photographs.detect if row not in defects], dtype=np.intp)
+    nominal, free_poses = _with_free_poses(photographs, nominal, pairs, usable, report)
     search = photographs.search(nominal, pairs, rough)
     hints = nominal.T_base_camera
 
@@ -210,15 +214,42 @@ def place_and_measure(
     view, known = photographs.measurements.view, ~np.isnan(blur)
     of_views = [blur[known & (view == v)] for v in range(len(photographs.measurements.views))]
     usual = tuple(float(np.median(own)) if len(own) else np.nan for own in of_views)
-    return MeasuredImages(photographs, placement, reject_images(outlines, reasons), reasons, usual)
+    outlines = reject_images(outlines, reasons)
+    return MeasuredImages(photographs, placement, outlines, reasons, usual, free_poses)
 
 
 def recognise_and_place(
     photographs: Photographs, nominal: Placement, report: Report, joined: Joined = None
 ) -> Placement:
     """Recognise the legs in the images, and place the cameras by them."""
+    nominal, _ = _with_free_poses(photographs, nominal, {}, photographs.detect, report)
     search, hints = photographs.search(nominal), nominal.T_base_camera
     return _recognised(photographs, search, photographs.detect, hints, report, joined)
+
+
+def _with_free_poses(
+    photographs: Photographs,
+    nominal: Placement,
+    pairs: Mapping[int, CandidatePairs],
+    rows: IntArray,
+    report: Report,
+) -> tuple[Placement, Mapping[int, RigidTransform]]:
+    """Return where a model has the legs, with poses found in images where readings give none."""
+    machine, measurements = photographs.machine, photographs.measurements
+    if machine.is_determined or len(rows) == 0:
+        return nominal, {}
+    found = find_free_poses(
+        photographs.search(nominal, pairs),
+        machine,
+        rows.tolist(),
+        nominal.T_base_camera,
+        photographs.run,
+        _counted(report, "Looking for platform poses", ROUNDS * len(rows)),
+    )
+    B_base = nominal.B_base.copy()
+    for pose, T in found.T_base_platform.items():
+        B_base[measurements.pose == pose] = T.apply(machine.B_platform)
+    return replace(nominal, B_base=B_base, T_base_camera=found.T_base_camera), found.T_base_platform
 
 
 def measure_photographs(
@@ -289,7 +320,8 @@ def _inspect_images(
     rows, measurements = photographs.detect.tolist(), photographs.measurements
     hints = nominal.T_base_camera
     groups = group_views(measurements, photographs.detect, hints, joined)
-    first = {r for g in groups for r in (g.rows if g.hint is None else g.some)}
+    free = not photographs.machine.is_determined
+    first = {r for g in groups for r in (g.rows if g.hint is None or free else g.some)}
     exposures, pairs = dict[int, Exposure](), dict[int, CandidatePairs]()
     count = _counted(report, "Looking at images", len(rows))
     look = partial(_inspect, photographs.search(nominal), first)

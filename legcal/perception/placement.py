@@ -63,6 +63,10 @@ class Search:
         camera = self.measurements.views[view].camera
         return find_candidate_pairs(find_segments(self.load(row), camera))
 
+    def own_pairs(self, row: int) -> CandidatePairs:
+        """Return the edge pairs of an image."""
+        return self.pairs(row, int(self.measurements.view[row]))
+
     def targets(self, row: int, view: int) -> LegSegments:
         """Return the legs at the reading of a row that a view is stated to show."""
         legs = np.flatnonzero(self.wanted[view])

@@ -247,10 +247,7 @@ def _judge(
     if analysis.motion.why_not:
         why = "the machine is singular at poses inside its travel"
         if not machine.is_determined:
-            why = (
-                f"{len(machine.motors)} motors do not determine the pose of a platform with "
-                f"mobility {machine.mobility}"
-            )
+            why = machine.undetermined
         notes.append(f"Platform errors are not predicted: {why}.")
     notes += _machine_notes(machine)
     return Identifiability(
