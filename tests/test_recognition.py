@@ -29,13 +29,13 @@ from legcal.perception.pair_matching import (
     PairMatches,
     Picture,
     Pictures,
-    _equations,
     _moved,
     depth_reversed,
     distances,
     gauss_newton_step,
     leg_segments,
     match_pairs,
+    segment_equations,
 )
 from legcal.perception.placement import Group, Search, group_views
 from legcal.perception.pose_hypotheses import MAX_POSES, pose_hypotheses
@@ -244,11 +244,11 @@ def test_derivatives_of_residuals_are_those_by_differences(joined: bool) -> None
     found = match_pairs(own, poses, 0.02)
     matched = found.score[0, 0] > 0.3
     assert matched.sum() > 5
-    J, J_leg, _, weight = (x[0] for x in _equations(own, poses, found, 0.01))
+    J, J_leg, _, weight = (x[0] for x in segment_equations(own, poses, found, 0.01))
     assert np.all(weight[0, matched] > 0.0)
 
     def residual(at: CameraPoses) -> Array:
-        return np.asarray(_equations(own, at, found, 0.01)[2][0, 0])
+        return np.asarray(segment_equations(own, at, found, 0.01)[2][0, 0])
 
     # Fixed while a segment moves are its place along the pair, which matters by the product of two
     # small residuals, and how obliquely its plane is seen, which matters a little for the width.

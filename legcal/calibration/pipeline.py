@@ -305,14 +305,12 @@ def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]
         If readings do not give the poses of images that are to be searched, and a view of these has
         no rough camera pose; nothing is searched then.
     """
-    dataset = data.dataset
-    if not data.machine.is_determined and (
-        dataset.board is None or dataset.board.T_base_board is None
-    ):
-        hints = [view.T_base_camera for view in data.measurements.views]
-        rows = data.photographs.detect.tolist()
-        if dataset.board is None or not any(hints):
-            require_rough_cameras(data.measurements, rows, hints)
+    hints = [view.T_base_camera for view in data.measurements.views]
+    by_board = data.dataset.board is not None and (
+        data.dataset.T_base_board is not None or any(T is not None for T in hints)
+    )
+    if not data.machine.is_determined and not by_board:
+        require_rough_cameras(data.measurements, data.photographs.detect.tolist(), hints)
     placement = nominal_placement(data.machine, data.measurements, data.T_base_platform)
     board = observe_board(data)
     if board is not None:

@@ -21,6 +21,7 @@ from .equations import PoseEquations as PoseEquations
 from .equations import VectorOps as VectorOps
 from .equations import axis_in_leg as axis_in_leg
 from .equations import freedoms as freedoms
+from .equations import is_constrained as is_constrained
 from .equations import leg_equations as leg_equations
 from .equations import machine_equations as machine_equations
 from .equations import pose_equations as pose_equations

@@ -10,7 +10,7 @@ Readings and the constraints of legs hold as far as the nominal model has them.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -30,10 +30,19 @@ from legcal.estimation import (
     linearize,
 )
 from legcal.geometry import Array, BoolArray, IntArray, cross, motion_of
-from legcal.machine import LegKind, Machine, machine_equations, poses_after, random_poses
+from legcal.machine import (
+    LegKind,
+    Machine,
+    is_constrained,
+    leg_scale,
+    machine_equations,
+    poses_after,
+    solve,
+)
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.pair_matching import (
     CameraPoses,
+    LegSegments,
     Picture,
     Pictures,
     leg_segments,
@@ -43,12 +52,15 @@ from legcal.perception.pair_matching import (
 from legcal.perception.placement import Search, sensor_extent
 from legcal.workers import Run
 
-N_DRAWN, SEED = 400, 1965  # poses that are tried in every image
-KEPT = (40, 8, 3)  # of them, after each of the first tolerances
+N_CHAINS, SEED = 100, 1965  # random walks through the workspace, all at once
+STRIDE, STEPS, SNAPSHOTS = 0.12, 48, (24, 32, 40, 48)  # [rad] and leg lengths; poses that are tried
+KEPT = (100, 30, 8, 3)  # of them, before a step with each of these tolerances
 TOLERANCES = (0.05, 0.035, 0.025, 0.018)  # of an axis beside its pair, cameras being rough [m]
 FITTED = (0.025, 0.018, 0.012, 0.008, 0.006, 0.006)  # of all images together
 EQUATION_SIGMA = 3e-3  # of lengths and constraints by the nominal model [m]
 TRAVEL_SIGMA = 5e-3  # beyond the travel of a slider without a motor [m]
+# Of the score, for squares of what the model says against a pose; larger ones count no more.
+MODEL_COST, MODEL_WIDTH = 0.01, 5.0
 CAMERA_SIGMA = 0.03, 0.03  # of a rough pose: angle, part of the distance
 TURN_SIGMA, PLACE_SIGMA = 0.1, 0.1  # of a pose that its images do not determine [rad], leg lengths
 MAX_STEP = 3.0  # of these, in one step
@@ -80,39 +92,81 @@ class _Scene:
     wanted: BoolArray  # (n_views, n_legs)
     q: Array  # (n_poses, n_legs) readings; of motors alone they have a meaning
     drawn: Array  # (n_drawn, 3, 4) poses of the workspace
+    targets: tuple[LegSegments, ...]  # what is to be seen at them
     images: Mapping[int, Sequence[_Image]]  # by pose
 
-    @property
-    def size(self) -> float:
-        """The mean length of the legs in the workspace [m]."""
-        B = self.drawn[:, :, :3] @ self.machine.B_platform.T + self.drawn[:, :, 3:]
-        return float(np.linalg.norm(B.swapaxes(1, 2) - self.machine.A_base, axis=2).mean())
+    @classmethod
+    def of(
+        cls, machine: Machine, wanted: BoolArray, q: Array, images: Mapping[int, Sequence[_Image]]
+    ) -> _Scene:
+        """Return the scene of a machine and its images."""
+        drawn = _drawn(machine)
+        return cls(machine, wanted, q, drawn, tuple(_targets(machine, drawn)), images)
 
     def pictures(
-        self, poses: Array, of_pose: Sequence[int], cameras: Sequence[RigidTransform | None]
-    ) -> tuple[list[Picture], IntArray, IntArray]:
-        """Return what images show and should show with the platform at poses (n, 3, 4).
+        self,
+        targets: Sequence[LegSegments],
+        of_pose: Sequence[int],
+        cameras: Sequence[RigidTransform | None],
+    ) -> tuple[Pictures, IntArray]:
+        """Return what images show and should show with the legs at poses, and the index of each.
 
-        With the index of the pose, and the view, of each; *of_pose* is the pose of the measurements
-        whose images they are.
+        *of_pose* are the poses of the measurements whose images they are.
         """
-        found, index, views = list[Picture](), list[int](), list[int]()
-        machine = self.machine
-        cylinders = [leg.cylinders for leg in machine.legs]
-        for n, (pose, k) in enumerate(zip(poses, of_pose, strict=True)):
-            B = machine.B_platform @ pose[:, :3].T + pose[:, 3]
+        found, index = list[Picture](), list[int]()
+        placed = [None if T is None else (T.rotation.as_matrix(), T.translation)
+                  for T in (None if T is None else T.inv() for T in cameras)]  # fmt: skip
+        for n, (own, k) in enumerate(zip(targets, of_pose, strict=True)):
             for image in self.images[k]:
-                T_base_camera = cameras[image.view]
-                if T_base_camera is None:
+                camera = placed[image.view]
+                if camera is None:
                     continue
-                legs = np.flatnonzero(self.wanted[image.view])
-                targets = leg_segments(machine.A_base, B, cylinders, legs)
-                T = T_base_camera.inv()
-                R = T.rotation.as_matrix()
-                found.append(Picture(image.pairs, targets, image.corners, R, T.translation))
+                shown = replace(own, share=own.share * self.wanted[image.view, own.leg])
+                found.append(Picture(image.pairs, shown, image.corners, *camera))
                 index.append(n)
-                views.append(image.view)
-        return found, np.array(index, dtype=np.intp), np.array(views, dtype=np.intp)
+        return Pictures.of(found), np.array(index, dtype=np.intp)
+
+
+def _targets(machine: Machine, poses: Array) -> list[LegSegments]:
+    """Return what is to be seen of all legs at poses (n, 3, 4)."""
+    A, every = machine.A_base, np.arange(machine.n_legs)
+    B = machine.B_platform @ poses[:, :, :3].swapaxes(1, 2) + poses[:, None, :, 3]
+    cylinders = [leg.cylinders for leg in machine.legs]
+    return [leg_segments(A, at, cylinders, every) for at in B]
+
+
+def _drawn(machine: Machine) -> Array:
+    """Return poses (n, 3, 4) of the workspace: inside the travel of all sliders, whatever they say.
+
+    Steps of random walks from home that leave the travel are not taken.
+    """
+    rng = np.random.default_rng(SEED)
+    size = leg_scale(machine, machine.home)
+    unit = np.array([1.0] * 3 + [size] * 3)
+    poses = np.repeat(machine.home.as_matrix()[None, :3], N_CHAINS, axis=0)
+    found = []
+    for step in range(1, STEPS + 1):
+        moved = poses_after(poses, STRIDE * unit * rng.normal(size=(N_CHAINS, 6)))
+        moved, is_closed = _constrained(machine, moved, size)
+        inside = is_closed & (np.abs(_beyond_travel(machine, moved)[0]).max(axis=1) == 0.0)
+        poses = np.where(inside[:, None, None], moved, poses)
+        if step in SNAPSHOTS:
+            found.append(poses)
+    return np.concatenate(found)
+
+
+def _constrained(machine: Machine, poses: Array, size: float) -> tuple[Array, BoolArray]:
+    """Return the nearest poses that legs and plane allow, and which of them were found."""
+    if not is_constrained(machine):
+        return poses, np.ones(len(poses), dtype=np.bool_)
+
+    def constraints(poses: Array) -> tuple[Array, Array]:
+        found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
+        return found.values[:, ~found.measured], found.by_pose[:, ~found.measured]
+
+    unit = np.array([1.0 / size] * 3 + [1.0] * 3)
+    found = solve(constraints, poses_after, poses, tolerance=1e-6 * size, unit=unit, steps=10)
+    return found.points, found.worst < 1e-3 * size
 
 
 def find_free_poses(
@@ -137,8 +191,7 @@ def find_free_poses(
         view = int(m.view[row])
         image = _Image(view, pairs, sensor_extent(m.views[view].camera))
         images.setdefault(int(m.pose[row]), []).append(image)
-    drawn = np.array([T.as_matrix()[:3] for T in random_poses(machine, N_DRAWN, SEED)[1]])
-    scene = _Scene(machine, search.wanted, m.q[m.first_rows], drawn, images)
+    scene = _Scene.of(machine, search.wanted, m.q[m.first_rows], images)
     poses, cameras = dict[int, Array](), tuple(hints)
     for _ in range(ROUNDS):
         for k, found in zip(images, run(partial(_searched, scene, cameras), images), strict=True):
@@ -165,13 +218,14 @@ def require_rough_cameras(
 
 def _searched(scene: _Scene, cameras: Sequence[RigidTransform | None], k: int) -> Array:
     """Return the pose (3, 4) at which the images of pose *k* show most legs."""
-    poses = scene.drawn
-    for i, tolerance in enumerate(TOLERANCES):
-        poses = _stepped(scene, cameras, k, poses, tolerance)
-        score = _scores(scene, cameras, k, poses, tolerance)
-        if i < len(KEPT):
-            poses = poses[np.argsort(-score, kind="stable")[: KEPT[i]]]
-    score = _scores(scene, cameras, k, poses, TOLERANCES[-1])
+    poses, targets = scene.drawn, list(scene.targets)
+    for kept, tolerance in zip(KEPT, TOLERANCES, strict=True):
+        score = _scores(scene, cameras, k, poses, targets, tolerance)
+        best = np.argsort(-score, kind="stable")[:kept]
+        poses, targets = poses[best], [targets[i] for i in best]
+        poses = _stepped(scene, cameras, k, poses, targets, tolerance)
+        targets = _targets(scene.machine, poses)
+    score = _scores(scene, cameras, k, poses, targets, TOLERANCES[-1])
     return np.asarray(poses[int(np.argmax(score))])
 
 
@@ -180,16 +234,17 @@ def _scores(
     cameras: Sequence[RigidTransform | None],
     k: int,
     poses: Array,
+    targets: Sequence[LegSegments],
     tolerance: float,
 ) -> Array:
     """Return how many legs agree with each pose (n, 3, 4), less what the model says against it."""
-    pictures, index, _ = scene.pictures(poses, [k] * len(poses), cameras)
-    every = Pictures.of(pictures)
-    found = match_pairs(every, _as_they_are(len(scene.machine.legs)), tolerance)
+    every, index = scene.pictures(targets, [k] * len(poses), cameras)
+    found = match_pairs(every, _as_they_are(scene), tolerance)
     value = (found.exclusive_score[:, 0] * every.share).sum(axis=1)
     score = np.bincount(index, value, minlength=len(poses))
     residual, _ = _model_rows(scene, poses, np.full(len(poses), k))
-    return np.asarray(score - 0.01 * np.sum(residual**2, axis=1))
+    off = np.sum(residual**2 / (1.0 + residual**2 / MODEL_WIDTH**2), axis=1)
+    return np.asarray(score - MODEL_COST * off)
 
 
 def _stepped(
@@ -197,43 +252,49 @@ def _stepped(
     cameras: Sequence[RigidTransform | None],
     k: int,
     poses: Array,
+    targets: Sequence[LegSegments],
     tolerance: float,
 ) -> Array:
     """Return poses (n, 3, 4) after a Gauss-Newton step towards the pairs that they match."""
-    pictures, index, _ = scene.pictures(poses, [k] * len(poses), cameras)
-    rows, _ = _line_rows(scene, pictures, index, poses, tolerance)
+    every, index = scene.pictures(targets, [k] * len(poses), cameras)
+    rows, _ = _line_rows(scene, every, index, poses, tolerance)
     residual, jacobian = _model_rows(scene, poses, np.full(len(poses), k))
     H = jacobian.swapaxes(1, 2) @ jacobian
     b = -(jacobian.swapaxes(1, 2) @ residual[..., None])[..., 0]
     np.add.at(H, index, np.einsum("krx,kry->kxy", rows[..., 1:], rows[..., 1:]))
     np.add.at(b, index, -np.einsum("krx,kr->kx", rows[..., 1:], rows[..., 0]))
-    unit = np.array([TURN_SIGMA] * 3 + [PLACE_SIGMA * scene.size] * 3)
+    unit = _pose_unit(scene)
     step = np.linalg.solve(H + np.diag(unit**-2), b[..., None])[..., 0]
     longest = np.abs(step / unit).max(axis=1, keepdims=True)
     return poses_after(poses, step * np.minimum(1.0, MAX_STEP / longest))
 
 
-def _as_they_are(n_legs: int) -> CameraPoses:
+def _pose_unit(scene: _Scene) -> Array:
+    """Return how far a pose may be from where it is if nothing says so, (6,) [rad, m]."""
+    size = leg_scale(scene.machine, scene.machine.home)
+    return np.array([TURN_SIGMA] * 3 + [PLACE_SIGMA * size] * 3)
+
+
+def _as_they_are(scene: _Scene) -> CameraPoses:
     """Return the pose of the base link in its own frame: pictures know their cameras."""
-    return CameraPoses.rigid(np.eye(3)[None], np.zeros((1, 3)), n_legs)
+    return CameraPoses.rigid(np.eye(3)[None], np.zeros((1, 3)), scene.machine.n_legs)
 
 
 def _line_rows(
-    scene: _Scene, pictures: Sequence[Picture], index: IntArray, poses: Array, tolerance: float
+    scene: _Scene, every: Pictures, index: IntArray, poses: Array, tolerance: float
 ) -> tuple[Array, Array]:
     """Return whitened rows of lines (n_pictures, 2 n_segments, 7): residual, derivatives by pose.
 
     With derivatives (n_pictures, 2 n_segments, 6) by a motion of everything in the base link.
     """
-    every = Pictures.of(pictures)
-    base = _as_they_are(len(scene.machine.legs))
+    base = _as_they_are(scene)
     found = match_pairs(every, base, tolerance)
     J, J_leg, residual, weight = segment_equations(every, base, found, tolerance)
     root = np.sqrt(weight[:, 0, :, :2])  # (n_pictures, n_segments, 2)
     arm = np.einsum("kxy,ksy->ksx", poses[index, :, :3], scene.machine.B_platform[every.leg])
     by_B = J_leg[:, 0, :, :, 3:]
     by_pose = np.concatenate([cross(arm[:, :, None], by_B), by_B], axis=-1)
-    flat = len(pictures), -1
+    flat = len(every), -1
     rows = np.concatenate([residual[:, 0, :, :2, None], by_pose], axis=-1) * root[..., None]
     by_base = J[:, 0, :, :2] * root[..., None]
     return rows.reshape(*flat, 7), by_base.reshape(*flat, 6)
@@ -247,20 +308,28 @@ def _model_rows(scene: _Scene, poses: Array, k: IntArray) -> tuple[Array, Array]
     measured = found.measured
     wanted[:, measured] = (machine.sign * scene.q[k])[:, found.leg[measured]]
     values, jacobian = (found.values - wanted) / EQUATION_SIGMA, found.by_pose / EQUATION_SIGMA
+    beyond, by_travel = _beyond_travel(machine, poses)
+    return (
+        np.concatenate([values, beyond / TRAVEL_SIGMA], axis=1),
+        np.concatenate([jacobian, by_travel / TRAVEL_SIGMA], axis=1),
+    )
+
+
+def _beyond_travel(machine: Machine, poses: Array) -> tuple[Array, Array]:
+    """Return how far sliders are beyond their travel (n, n_legs) [m], and derivatives by pose."""
     arm = machine.B_platform @ poses[:, :, :3].swapaxes(1, 2)
     vector = arm + poses[:, None, :, 3] - machine.A_base
     length = np.linalg.norm(vector, axis=2)
     ends = [
-        sorted(leg.length_at(x) for x in leg.travel)
-        if leg.kind is LegKind.PASSIVE and not leg.is_fixed_to_platform
-        else (0.0, np.inf)
+        (0.0, np.inf)
+        if leg.kind is LegKind.CONSTANT
+        else sorted(leg.length_at(x) for x in leg.travel)
         for leg in machine.legs
     ]
     low, high = np.array(ends).T
-    beyond = (length - np.clip(length, low, high)) / TRAVEL_SIGMA
-    u = vector / length[..., None] * (beyond != 0.0)[..., None] / TRAVEL_SIGMA
-    by_travel = np.concatenate([cross(arm, u), u], axis=2)
-    return np.concatenate([values, beyond], axis=1), np.concatenate([jacobian, by_travel], axis=1)
+    beyond = length - np.clip(length, low, high)
+    u = vector / length[..., None] * (beyond != 0.0)[..., None]
+    return beyond, np.concatenate([cross(arm, u), u], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +358,7 @@ def _fitted(
     at = np.array([poses[k] for k in keys.tolist()])
     state = _State(camera, Frames(at[..., :3], at[..., 3]))
     n_rows = 4 * sum(len(leg.cylinders) for leg in scene.machine.legs)  # at most, of an image
-    unit = np.array([TURN_SIGMA] * 3 + [PLACE_SIGMA * scene.size] * 3)
+    unit = _pose_unit(scene)
 
     def placed(state: _State) -> tuple[RigidTransform | None, ...]:
         found = list(cameras)
@@ -298,8 +367,9 @@ def _fitted(
         return tuple(found)
 
     def lines(state: _State, tolerance: float) -> Residuals:
-        pictures, index, _ = scene.pictures(state.poses, keys.tolist(), placed(state))
-        rows, by_base = _line_rows(scene, pictures, index, state.poses, tolerance)
+        targets = _targets(scene.machine, state.poses)
+        every, index = scene.pictures(targets, keys.tolist(), placed(state))
+        rows, by_base = _line_rows(scene, every, index, state.poses, tolerance)
         R = state.camera.R[view].swapaxes(1, 2)
         by_camera = np.concatenate([by_base[..., :3] @ R, by_base[..., 3:] @ R], axis=-1)
         fill = ((0, 0), (0, n_rows - rows.shape[1]), (0, 0))
@@ -328,7 +398,7 @@ def _fitted(
         coordinates=from_start,
         prior=GaussianPrior(np.arange(len(sigma)), np.zeros(len(sigma)), sigma),
     )
-    every, n_model = np.arange(len(keys)), model(state).r.shape[1]
+    each, n_model = np.arange(len(keys)), model(state).r.shape[1]
     for tolerance in FITTED:
         problem = Problem[_State](
             (of_cameras,),
@@ -342,8 +412,8 @@ def _fitted(
                     n_rows,
                     element,
                 ),
-                Factor("model", model, (), len(keys), n_model, every),
-                Factor("stays", stays, (), len(keys), 6, every),
+                Factor("model", model, (), len(keys), n_model, each),
+                Factor("stays", stays, (), len(keys), 6, each),
             ),
         )
         step, _ = information(problem, state, linearize(problem, state)).step(0.0)

@@ -1,0 +1,259 @@
+"""Platforms that readings do not place: moved by hand, or with fewer motors than freedoms."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dataset_folder import Folder, folder
+from layouts import Layout, LegLayout, MachineSpec, write_machine
+from leg_pictures import clutter, edges, segments
+from machines import SHIPPED_URDF, SHIPPED_YAML, of_types
+from scipy.spatial.transform import RigidTransform, Rotation
+
+import legcal
+from legcal.data import Measurements, View
+from legcal.errors import NotIdentifiable, UsageError
+from legcal.geometry import Array
+from legcal.machine import Machine, load_mechanism
+from legcal.perception.candidate_pairs import find_candidate_pairs
+from legcal.perception.free_poses import find_free_poses
+from legcal.perception.pair_matching import leg_segments
+from legcal.perception.placement import Search
+from legcal.simulation import look_at
+from legcal.vision import Camera, outlines_of_axis
+from legcal.workers import in_turn
+
+__all__ = ["folder"]  # a fixture
+KINDS: dict[str, tuple[list[str], list[str], int]] = {
+    "3-SPS + passive UPS": (["SS"] * 3 + ["US"], ["actuated"] * 3 + ["passive"], 6),
+    "5-SPS": (["SS"] * 5, ["actuated"] * 5, 6),
+    "6-UPS by hand": (["US"] * 6, ["passive"] * 6, 6),
+    "3-RPS, two motors": (["RS"] * 3, ["actuated"] * 2 + ["passive"], 3),
+}
+LAYOUTS = {
+    "hung from the base": Layout(),
+    "hung from the platform": Layout((LegLayout(hung="platform", sphere=False),)),
+    "cut behind the slider": Layout((LegLayout(cut="mid", flip_slider=True),)),
+}
+CAMERA = Camera(np.array([[1000.0, 0.0, 639.5], [0.0, 1000.0, 479.5], [0.0, 0.0, 1.0]]), 1280, 960)
+
+
+def drawn(kind: str) -> MachineSpec:
+    types, kinds, _ = KINDS[kind]
+    return of_types(types, kinds)
+
+
+def without_motors(machine: Path, *left: str) -> Path:
+    """Write a model with some of its motors only."""
+    text = machine.read_text()
+    for line in text.split("name_mot:")[1].split("\njoint_name")[0].splitlines():
+        if line.strip(" -") and line.strip(" -") not in left:
+            text = text.replace(f"{line}\n", "", 1)
+    machine.write_text(text if left else text.replace("name_mot:\n", "name_mot: []\n"))
+    return machine
+
+
+@pytest.mark.parametrize(("kind", "layout"), [(kind, name) for kind in KINDS for name in LAYOUTS])
+def test_what_moves_freely_is_said_of_every_layout(kind: str, layout: str, tmp_path: Path) -> None:
+    types, kinds, mobility = KINDS[kind]
+    machine = load_mechanism(write_machine(tmp_path, drawn(kind), LAYOUTS[layout]))
+    assert [leg.type for leg in machine.legs] == [f"{t[0]}P{t[1]}" for t in types]
+    assert [leg.kind.value for leg in machine.legs] == kinds
+    n_motors = kinds.count("actuated")
+    assert (machine.mobility, len(machine.motors)) == (mobility, n_motors)
+    assert not machine.is_determined
+    assert f"mobility {mobility}" in machine.undetermined
+    said = [note for note in machine.diagnostics if "do not determine the pose" in note]
+    assert len(said) == 1
+
+
+# --- ranks --------------------------------------------------------------------------------------
+
+
+def dense_rank(machine: Machine, n_views: int, n_images: int) -> int:
+    """Return how many directions of joints and offsets outlines and readings determine.
+
+    Written out: both edges of all legs in all images and the readings, by differences in all joint
+    coordinates, offsets, radii, platform poses and cameras, whose freedom of choosing frames is
+    twelve; radii are known to 2 %.
+    """
+    rng = np.random.default_rng(3)
+    n, n_poses = machine.n_legs, n_views * n_images
+    motors = list(machine.motors)
+    T = [
+        machine.home
+        * RigidTransform.from_components(
+            rng.uniform(-0.05, 0.05, 3), Rotation.from_rotvec(rng.uniform(-0.2, 0.2, 3))
+        )
+        for _ in range(n_poses)
+    ]
+    R0, t0 = np.array([x.rotation.as_matrix() for x in T]), np.array([x.translation for x in T])
+    middle = machine.A_base.mean(axis=0) + np.array([0.0, 0.0, 0.3])
+    turns = 2.0 * np.pi * np.arange(n_views) / n_views + 0.3
+    cameras = [
+        look_at(middle + np.array([np.cos(a), np.sin(a), 0.2 + 0.1 * k]), middle)
+        for k, a in enumerate(turns)
+    ]
+    C0 = np.array([c.inv().rotation.as_matrix() for c in cameras])
+    c0 = np.array([c.inv().translation for c in cameras])
+    A0, B0 = machine.A_base, machine.B_platform
+    view = np.repeat(np.arange(n_views), n_images)
+
+    def rows(x: Array) -> Array:
+        dA, dB, dq, dr, pose, camera = np.split(
+            x, np.cumsum([3 * n, 3 * n, len(motors), n, 6 * n_poses])
+        )
+        pose, camera = pose.reshape(-1, 6), camera.reshape(-1, 6)
+        R = Rotation.from_rotvec(pose[:, :3]).as_matrix() @ R0
+        C = Rotation.from_rotvec(camera[:, :3]).as_matrix() @ C0
+        A = A0 + dA.reshape(n, 3)
+        B = (B0 + dB.reshape(n, 3)) @ R.swapaxes(1, 2) + (t0 + pose[:, 3:])[:, None]
+        u = (B - A) / np.linalg.norm(B - A, axis=2, keepdims=True)
+        A_camera = np.einsum("kij,nj->kni", C[view], A) + (c0 + camera[:, 3:])[view][:, None]
+        u_camera = np.einsum("kij,knj->kni", C[view], u)
+        h = outlines_of_axis(u_camera, A_camera, np.broadcast_to(0.01 + dr, u.shape[:2]))
+        lengths = np.linalg.norm(B - A, axis=2)[:, motors] - dq
+        return np.concatenate([1e3 * h.ravel(), 1e6 * lengths.ravel(), dr / 2e-4])
+
+    size = 7 * n + len(motors) + 6 * (n_poses + n_views)
+    step = 1e-6
+    J = np.array([rows(e) - rows(-e) for e in step * np.eye(size)]).T / (2.0 * step)
+    J /= np.linalg.norm(J, axis=0)
+    values = np.linalg.svd(J, compute_uv=False)
+    rank = int(np.sum(values > 1e-8 * values[0]))
+    return rank - n - 6 * (n_poses + n_views)
+
+
+@pytest.mark.parametrize("kind", ["3-SPS + passive UPS", "5-SPS", "6-UPS by hand"])
+@pytest.mark.parametrize(("n_views", "n_images"), [(1, 1), (2, 6)])
+def test_ranks_are_those_of_all_equations_written_out(
+    kind: str, n_views: int, n_images: int, tmp_path: Path
+) -> None:
+    machine = load_mechanism(write_machine(tmp_path, drawn(kind), Layout()))
+    found = legcal.identifiability(machine, [machine.leg_names] * n_views, images=n_images)
+    assert found.full.of == 6 * machine.n_legs - 12 + len(machine.motors)
+    assert found.full.rank == dense_rank(machine, n_views, n_images)
+    assert found.platform_sigma is None
+    assert any(machine.undetermined in note for note in found.notes)
+
+
+# --- recognition --------------------------------------------------------------------------------
+
+
+@cache
+def by_hand(n_motors: int, folder: Path) -> Machine:
+    """The shipped hexapod with some of its motors."""
+    path = folder / "hexapod.yaml"
+    path.write_text(SHIPPED_YAML.read_text().replace("../urdf/hexapod.urdf", str(SHIPPED_URDF)))
+    motors = [f"leg{j}_prismatic" for j in range(1, n_motors + 1)]
+    return load_mechanism(without_motors(path, *motors))
+
+
+@pytest.mark.parametrize("n_motors", [0, 3])
+def test_poses_are_found_near_rough_cameras(n_motors: int, tmp_path: Path) -> None:
+    machine = by_hand(n_motors, tmp_path)
+    rng = np.random.default_rng(n_motors)
+    true = [
+        look_at(1.1 * np.array([np.cos(a), np.sin(a), 0.4]), np.array([0.0, 0.0, 0.2]))
+        for a in (0.4, 2)
+    ]
+    rough = [
+        T
+        * RigidTransform.from_components(
+            rng.normal(0.0, 0.01, 3), Rotation.from_rotvec(rng.normal(0.0, 0.015, 3))
+        )
+        for T in true
+    ]
+    T = [
+        machine.home
+        * RigidTransform.from_components(
+            rng.uniform(-0.06, 0.06, 3), Rotation.from_rotvec(rng.uniform(-0.2, 0.2, 3))
+        )
+        for _ in range(3)
+    ]
+    B = np.array([one.apply(machine.B_platform) for one in T])[[0, 1, 2, 2]]
+    A = np.broadcast_to(machine.A_base, B.shape)
+    view, pose = np.array([0, 1, 0, 1]), np.array([0, 1, 2, 2])
+    q = machine.sign * (np.linalg.norm(B - A, axis=2) - machine.q0)
+    cylinders = [leg.cylinders for leg in machine.legs]
+    every = np.arange(machine.n_legs)
+    pairs = {
+        row: find_candidate_pairs(
+            segments(
+                np.concatenate(
+                    [
+                        edges(leg_segments(A[row], B[row], cylinders, every), true[view[row]]),
+                        clutter(15, rng),
+                    ]
+                )
+            )
+        )
+        for row in range(4)
+    }
+    measurements = Measurements(
+        tuple(View(f"c{v}", CAMERA, rough[v]) for v in range(2)),
+        ("a", "b", "c", "d"),
+        view,
+        pose,
+        np.where(np.isin(every, machine.motors), q, np.nan),
+        2e-6,
+    )
+    search = Search(
+        lambda row: np.zeros((960, 1280), dtype=np.uint8),
+        measurements,
+        A,
+        np.broadcast_to(machine.home.apply(machine.B_platform), B.shape),
+        cylinders,
+        np.ones((2, machine.n_legs), dtype=np.bool_),
+        machine.leg_names,
+        pairs,
+    )
+    found = find_free_poses(search, machine, range(4), rough, in_turn, lambda _: None)
+    off, off_at_home = [], []
+    for row in range(4):
+        X = np.concatenate([A[row], B[row]])
+        camera = found.T_base_camera[view[row]]
+        assert camera is not None
+        B_found = found.T_base_platform[int(pose[row])].apply(machine.B_platform)
+        seen = CAMERA.project(camera.inv().apply(np.concatenate([A[row], B_found])))
+        truth = CAMERA.project(true[view[row]].inv().apply(X))
+        B_home = machine.home.apply(machine.B_platform)
+        at_home = CAMERA.project(rough[view[row]].inv().apply(np.concatenate([A[row], B_home])))
+        off.append(np.linalg.norm(seen - truth, axis=1).max())
+        off_at_home.append(np.linalg.norm(at_home - truth, axis=1).max())
+    assert max(off) < 20.0  # px
+    assert min(off_at_home) > 40.0
+
+
+# --- refusals -----------------------------------------------------------------------------------
+
+
+def free_set(folder: Folder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Return a dataset of a hexapod of three motors, of whose views one has no rough camera."""
+    machine = by_hand(3, tmp_path)
+    monkeypatch.setattr("legcal.data.dataset.load_mechanism", lambda path: machine)
+    folder.columns = folder.columns[:5]
+    folder.entry["views"]["c2"].pop("legs")
+    return folder.write()
+
+
+@pytest.mark.parametrize("command", ["calibrate", "detect"])
+def test_without_a_rough_camera_pose_no_image_is_searched(
+    command: str, folder: Folder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = free_set(folder, monkeypatch, tmp_path)
+    monkeypatch.setattr("legcal.calibration.pipeline.check_identifiable", lambda *_: [])
+    with pytest.raises(NotIdentifiable) as refusal:
+        getattr(legcal, command)(path)
+    (problem,) = refusal.value.problems
+    assert problem.startswith("view c2: the images could not be searched")
+    assert "write T_base_camera" in problem
+
+
+def test_no_images_are_kept_aside_where_readings_give_no_poses(
+    folder: Folder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = free_set(folder, monkeypatch, tmp_path)
+    with pytest.raises(UsageError, match="3 motors do not determine the pose"):
+        legcal.calibrate(path, holdout=0.25)
