@@ -3,18 +3,30 @@
 import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from csv_rows import read_rows, write_rows
 from machines import ROOT, read_family
 from rich.console import Console
+from simulated import simulated
 
 from legcal import evaluate, load_mechanism
-from legcal.machine import create_model, machine_document
+from legcal.calibration import Evaluation
+from legcal.errors import DidNotConverge
+from legcal.machine import (
+    create_model,
+    geometries,
+    machine_document,
+    write_calibrated_yaml,
+    write_urdf,
+)
 from legcal.report import accuracy_table, inspect_table
+from legcal.simulation import Level
 
 
 def _printed(what: object) -> str:
@@ -146,3 +158,48 @@ def test_an_evaluation_leaves_out_what_a_machine_does_not_have(tmp_path: Path) -
     assert len(document["parameters"]) > 30
     text = _printed(accuracy_table(evaluation))
     assert "Parameters only: readings do not give one pose" in text
+
+
+def test_readings_that_one_model_does_not_reach_are_left_out_and_named(tmp_path: Path) -> None:
+    made = simulated(tmp_path / "set", "3-rpr", level=Level.AXES, poses=6, shared_poses=True)
+    truth = load_mechanism(made.truth_path)
+    leg, *others = geometries(truth)  # of a machine that is near a singularity at home
+    write_urdf(truth, [replace(leg, q0=leg.q0 - 0.05), *others], tmp_path / "other.urdf")
+    other = tmp_path / "other.yaml"
+    write_calibrated_yaml(truth, other, "other.urdf")
+
+    (made.folder / "axes.csv").unlink()
+    table = made.folder / "measurements.csv"
+    rows = read_rows(table)
+    for k, row in enumerate(rows):
+        row["image"] = f"{k}.png"
+
+    def compared(kept: list[int], *models: Path) -> Evaluation:
+        write_rows(table, [rows[k] for k in kept])
+        return evaluate(*models, dataset=made.folder)
+
+    everything = list(range(len(rows)))
+    found = compared(everything, other, made.truth_path)
+    document = found.document()
+    n, off = document["left_out"], [row["row"] - 1 for row in document["unreached"]]
+    assert 0 < n < 6
+    assert len(off) == 2 * n  # both views show every pose
+    assert len(found.displacement) == document["poses"] == 6 - n
+    assert [row["image"] for row in document["unreached"]] == [f"{k}.png" for k in off]
+    assert {rows[k]["pose"] for k in everything if k not in off}.isdisjoint(
+        rows[k]["pose"] for k in off
+    )
+    swapped = compared(everything, made.truth_path, other)
+    for one, by in ((found, "model"), (swapped, "reference")):
+        assert {who for row in one.unreached for who in row.by} == {by}
+        assert [row.row - 1 for row in one.unreached] == off
+    shown = _printed(accuracy_table(found))
+    assert f"{n} of 6 poses are left out" in shown
+    assert all(re.search(rf"{k + 1} +c\d +{k}.png +model", shown) for k in off)
+
+    rest = compared([k for k in everything if k not in off], other, made.truth_path)
+    assert rest.document()["left_out"] == 0
+    np.testing.assert_allclose(rest.displacement, found.displacement, atol=1e-9)
+    with pytest.raises(DidNotConverge, match=r"the model does not reach rows 1, 2") as refusal:
+        compared(off, other, made.truth_path)
+    assert refusal.value.exit_code == 1

@@ -363,11 +363,22 @@ class ComparedParameter(Document):
     difference: float
 
 
+class UnreachedRow(Document):
+    """A row of ``measurements.csv`` whose readings a model does not reach."""
+
+    row: int  # counted from 1, without the header
+    view: str
+    image: str
+    by: list[Literal["model", "reference"]]  # who does not reach it
+
+
 class EvaluationDocument(Document):
     """What ``legcal evaluate --json`` prints; null where no pose is compared."""
 
     dX_m: float | None
     dE_rad: float | None
     dX_max_m: float | None
-    poses: int
+    poses: int  # that are compared
+    left_out: int  # poses that are not, since one of the models does not reach them
+    unreached: list[UnreachedRow]  # the rows of these
     parameters: list[ComparedParameter]

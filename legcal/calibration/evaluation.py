@@ -5,24 +5,25 @@ the difference is the displacement of the platform joint of the first frame leg 
 R_e) and the angle of the rotation between the two orientations.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.calibration.documents import ComparedParameter, EvaluationDocument
-from legcal.data import Dataset, load_dataset
+from legcal.calibration.documents import ComparedParameter, EvaluationDocument, UnreachedRow
+from legcal.data import Dataset, few, load_dataset
 from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry import Array
 from legcal.machine import (
     WORKSPACE_POSES,
     WORKSPACE_SEED,
     Machine,
+    followed_poses,
     forward_kinematics,
-    forward_kinematics_many,
     geometries,
     load_mechanism,
     parametrization_of,
@@ -32,6 +33,7 @@ from legcal.machine import (
     vector_of,
 )
 
+WHO: tuple[Literal["model", "reference"], ...] = ("model", "reference")
 MAX_DRAWS = 20  # of poses in place of those that the reference does not reach
 FIRST_POSES = 10  # of the first draw: if the reference reaches none of them, there is no other
 
@@ -52,6 +54,10 @@ class Evaluation:
     values, references : (n_parameters,) array
         The parameters of the model and of the reference. Axes are turns of the reference's axis,
         so that the reference has zero there.
+    n_left_out : int
+        Poses of the dataset that are not compared, since one of the models does not reach them.
+    unreached : tuple of UnreachedRow
+        The rows of the dataset with these poses, and who does not reach them.
     """
 
     displacement: Array
@@ -60,6 +66,8 @@ class Evaluation:
     units: tuple[str, ...]
     values: Array
     references: Array
+    n_left_out: int = 0
+    unreached: tuple[UnreachedRow, ...] = ()
 
     def document(self) -> dict[str, Any]:
         """Return the document that ``legcal evaluate --json`` prints."""
@@ -70,6 +78,8 @@ class Evaluation:
             dE_rad=float(dE.mean()) if len(dX) else None,
             dX_max_m=float(dX.max()) if len(dX) else None,
             poses=len(dX),
+            left_out=self.n_left_out,
+            unreached=list(self.unreached),
             parameters=[
                 ComparedParameter(name=name, value=v, reference=r, difference=v - r)
                 for name, v, r in numbers
@@ -90,8 +100,8 @@ def evaluate(
     model, reference : path, name or Machine
         The two mechanisms; they must have the same legs and frames.
     dataset : path, optional
-        Take the readings of this dataset; else those of 100 poses of the workspace, which are
-        the same at every call.
+        Take the readings of this dataset, without those that one of the models does not reach;
+        else those of 100 poses of the workspace, which are the same at every call.
 
     Returns
     -------
@@ -102,7 +112,7 @@ def evaluate(
     ModelError
         If the two models are not of the same machine.
     DidNotConverge
-        If a model cannot reach a reading.
+        If the models reach no readings together.
 
     Notes
     -----
@@ -114,14 +124,25 @@ def evaluate(
     truth = _in_the_order_of(truth, machine)
     poses: list[RigidTransform] = []
     reference_poses: list[RigidTransform] = []
+    n_left_out = 0
+    unreached: tuple[UnreachedRow, ...] = ()
     if not (machine.is_determined and truth.is_determined):
         pass  # no reading says where the platform is
     elif dataset is None:
         poses, reference_poses = _random_poses(machine, truth)
     else:
-        q = _readings_of(load_dataset(dataset, check_images=False), machine)
-        poses = forward_kinematics_many(machine, q)
-        reference_poses = forward_kinematics_many(truth, q)
+        given = load_dataset(dataset, check_images=False)
+        q = _readings_of(given, machine)
+        both = [list(followed_poses(model, q)) for model in (machine, truth)]
+        missed = [[failure is not None for _, failure in found] for found in both]
+        unreached = _unreached(given, missed)
+        n_left_out = sum(map(max, zip(*missed, strict=True)))
+        if n_left_out == len(q):
+            raise DidNotConverge(_why_none(given, unreached))
+        poses, reference_poses = (
+            [T for (T, _), *off in zip(found, *missed, strict=True) if not any(off)]
+            for found in both
+        )
     displacement, rotation = pose_differences(
         platforms_in_base(machine, poses),
         platforms_in_base(truth, reference_poses),
@@ -135,6 +156,8 @@ def evaluate(
         parametrization.units,
         vector_of(parametrization, geometries(machine), origin),
         vector_of(parametrization, origin, origin),
+        n_left_out,
+        unreached,
     )
 
 
@@ -181,6 +204,30 @@ def _readings_of(dataset: Dataset, machine: Machine) -> Array:
         )
     legs = [names.index(name) for name in machine.leg_names]
     return dataset.measurements.q[dataset.measurements.first_rows][:, legs]
+
+
+def _unreached(dataset: Dataset, missed: Sequence[Sequence[bool]]) -> tuple[UnreachedRow, ...]:
+    """Return the rows whose poses the model or the reference misses, in the order of the file."""
+    m = dataset.measurements
+    return tuple(
+        UnreachedRow(row=row + 1, view=m.views[m.view[row]].name, image=m.image[row], by=by)
+        for row, pose in enumerate(m.pose.tolist())
+        if (by := [who for who, off in zip(WHO, missed, strict=True) if off[pose]])
+    )
+
+
+def _why_none(dataset: Dataset, unreached: Sequence[UnreachedRow]) -> str:
+    """Return why two models could not be compared at any reading of a dataset."""
+    by = [
+        f"the {who} does not reach row{'s' * (len(rows) > 1)} {few(rows)}"
+        for who in WHO
+        if (rows := [str(row.row) for row in unreached if who in row.by])
+    ]
+    return (
+        f"{dataset.table_path}: the models could not be compared: found that {' and '.join(by)}, "
+        "needed a row whose readings both reach; check that readings and models belong to the "
+        "same machine, and legcal.home, or leave out --dataset."
+    )
 
 
 def _random_poses(

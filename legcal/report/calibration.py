@@ -85,4 +85,18 @@ def accuracy_table(evaluation: Evaluation) -> RenderableType:
     ]
     angles = "; axes and twists in deg" * ("rad" in evaluation.units)
     columns = ("parameter", ">model", ">reference", ">difference")
-    return report(headline, table(*columns, rows=rows, title=f"Parameters [mm{angles}]"))
+    return report(
+        headline,
+        *_left_out(evaluation),
+        table(*columns, rows=rows, title=f"Parameters [mm{angles}]"),
+    )
+
+
+def _left_out(evaluation: Evaluation) -> list[RenderableType]:
+    """Return a table of the rows that are left out, if there are any."""
+    n, rows = evaluation.n_left_out, evaluation.unreached
+    if not n:
+        return []
+    title = f"{n} of {n + len(evaluation.displacement)} poses are left out"
+    cells = [(str(row.row), row.view, row.image, " and ".join(row.by)) for row in rows]
+    return [table(">row", "view", "image", "not reached by", rows=cells, title=title)]
