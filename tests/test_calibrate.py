@@ -21,10 +21,12 @@ from hexapod_example import HEXAPOD, ROOT, TRUTH, Run, copy_of_the_example
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import files_of, settings, simulated
 
-from legcal import calibrate, evaluate, load_dataset, load_mechanism, simulate
+from legcal import calibrate, evaluate, load_dataset, load_mechanism, load_result, simulate
 from legcal.calibration import Calibration, poses_at_readings
 from legcal.calibration.board import BoardViews, base_of_board, board_notes
+from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit import BOARD_SCALE
+from legcal.calibration.result_folder import write_result
 from legcal.calibration.verdict import judge
 from legcal.data import found_corners
 from legcal.errors import (
@@ -208,7 +210,8 @@ def test_a_contradicted_focal_length_counts_in_the_verdict(
 )
 def test_fit_and_steps_come_nearer_to_the_truth(model: str, tmp_path: Path) -> None:
     made = simulate(model, tmp_path / "set", settings(poses=8, views=3))
-    found = calibrate(made.folder, transformation="cross_product")
+    out = tmp_path / "out"
+    found = calibrate(made.folder, transformation="cross_product", output=out)
     assert found.verdict.trustworthy
     assert found.steps.failure == ""
     assert found.steps.legs is not None
@@ -231,6 +234,31 @@ def test_fit_and_steps_come_nearer_to_the_truth(model: str, tmp_path: Path) -> N
     twists = {n: s for n, s in found.solution.status.items() if n.endswith(".twist")}
     assert bool(twists) == any(leg.twist is not None for leg in geometries(made.nominal))
     assert "fixed" not in twists.values()
+    assert not [note for note in found.notes if "four steps" in note]
+    apart = evaluate(out / "staged.yaml", out / "calibrated.yaml", dataset=made.folder)
+    from_fit: Any = found.result.stages.staged
+    assert apart.displacement.mean() == pytest.approx(from_fit.from_fit.dX_m, abs=1e-7)
+    assert apart.rotation.mean() == pytest.approx(from_fit.from_fit.dE_rad, abs=1e-6)
+
+
+def test_a_model_of_the_four_steps_that_does_not_load_is_left_out_with_a_note(
+    axes: tuple[SimulatedDataset, Path, Calibration], tmp_path: Path
+) -> None:
+    _, earlier, found = axes
+    assert found.steps.legs is not None
+    on_one_point = tuple(replace(leg, A=np.zeros(3)) for leg in found.steps.legs)
+    for k, (steps, said) in enumerate(
+        [
+            (replace(found.steps, legs=on_one_point), "model of the four steps (staged.yaml)"),
+            (Steps(None, None, "Too few legs."), "no staged.yaml: Too few legs."),
+        ]
+    ):
+        out = shutil.copytree(earlier, tmp_path / f"{k}")
+        written = write_result(replace(found, steps=steps), out)
+        assert said in written.summary()
+        assert k or f"{out / 'staged.yaml'}: " in written.summary()
+        assert sorted(files_of(out)) == ["calibrated.urdf", "calibrated.yaml", "result.json"]
+        assert load_result(out).result.notes == written.result.notes
 
 
 def test_axes_are_fitted_without_images(axes: tuple[SimulatedDataset, Path, Calibration]) -> None:
@@ -241,7 +269,8 @@ def test_axes_are_fitted_without_images(axes: tuple[SimulatedDataset, Path, Cali
     assert solution.chi2 / solution.dof == pytest.approx(1.0, abs=0.35)
     assert solution.rms_axes == pytest.approx(1.0, abs=0.3)
     assert solution.rms_px is None
-    assert sorted(files_of(output)) == ["calibrated.urdf", "calibrated.yaml", "result.json"]
+    models = [f"{name}.{kind}" for name in ("calibrated", "staged") for kind in ("urdf", "yaml")]
+    assert sorted(files_of(output)) == sorted([*models, "result.json"])
     assert not (made.folder / "observations.csv").exists()
     assert not [name for name in solution.values if "radius" in name]
 

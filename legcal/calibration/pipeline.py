@@ -229,7 +229,7 @@ def calibrate(
         held_out=prediction,
     )
     if output is not None:
-        write_result(calibration, Path(output))
+        calibration = write_result(calibration, Path(output))
     return calibration
 
 

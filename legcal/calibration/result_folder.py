@@ -1,8 +1,8 @@
 """The result folder: what a controller and a script read, written, and read back for other jobs.
 
-It is written all of it or nothing: the calibrated model, ``result.json``, and the tables of what
-was observed. A result that is read back must be complete and consistent: its covariance that of its
-parameters, and these the ones of the model beside it.
+It is written all of it or nothing: the calibrated model, that of the four steps, ``result.json``,
+and the tables of what was observed. A result that is read back must be complete and consistent: its
+covariance that of its parameters, and these the ones of the model beside it.
 """
 
 from __future__ import annotations
@@ -52,18 +52,22 @@ from legcal.vision import (
     intrinsic_values,
 )
 
-RESULT_NAME, MODEL_NAME = "result.json", "calibrated.yaml"
+RESULT_NAME, MODEL_NAME, STAGED_NAME = "result.json", "calibrated.yaml", "staged.yaml"
 RELOAD_TOLERANCE = 1e-11  # between reloaded and written parameters [m, rad]
+# The same of the four steps: of a leg that is fixed to the platform they do not say which point of
+# its axis is B, and loading takes another one.
+STAGED_TOLERANCE = 1e-7
 MAX_HOME_RESIDUAL = 0.2  # of a leg length: of calibrated legs at the nominal home
 ROUNDING = 1e-9  # of numbers in files [m]
 SYMMETRY_TOLERANCE = 1e-6  # relative, of covariances
 
 
-def write_result(calibration: Calibration, destination: Path) -> None:
-    """Write the result folder, all of it or nothing.
+def write_result(calibration: Calibration, destination: Path) -> Calibration:
+    """Write the result folder, all of it or nothing, and return what was written.
 
     The calibrated model is loaded again from the files and must have the parameters that were
-    written and close at home, before the folder appears.
+    written and close at home, before the folder appears. So must the model of the four steps, or
+    it is left out, with a note that says why.
 
     Raises
     ------
@@ -72,21 +76,20 @@ def write_result(calibration: Calibration, destination: Path) -> None:
     DidNotConverge
         If the written model does not load as what was computed.
     """
-    dataset, solution = calibration.dataset, calibration.solution
+    dataset, solution, steps = calibration.dataset, calibration.solution, calibration.steps
     machine = dataset.machine
-    stale = [Path(OBSERVATIONS_NAME), Path(CORNERS_NAME)]
-    with result_folder(destination, stale=stale) as folder:
-        urdf, yaml = folder / "calibrated.urdf", folder / MODEL_NAME
-        write_urdf(machine, solution.legs, urdf)
-        home = home_of_legs(machine, solution.legs, MAX_HOME_RESIDUAL)
-        if home is None:
-            raise DidNotConverge(
-                f"{machine.yaml_path}: the calibrated model could not be written: found no "
-                "closed pose of its legs near legcal.home, needed one; check legcal.home and the "
-                "nominal model; nothing was written."
-            )
-        write_calibrated_yaml(machine, yaml, urdf.name, None if home is machine.home else home)
-        _check_written(yaml, solution.legs)
+    stale = [OBSERVATIONS_NAME, CORNERS_NAME, STAGED_NAME, str(_urdf_of(Path(STAGED_NAME)))]
+    with result_folder(destination, stale=map(Path, stale)) as folder:
+        _write_model(machine, solution.legs, folder / MODEL_NAME, RELOAD_TOLERANCE)
+        if steps.legs is not None:
+            try:
+                _write_model(machine, steps.legs, folder / STAGED_NAME, STAGED_TOLERANCE)
+            except (DidNotConverge, ModelError, OutOfClass) as failure:
+                why = " ".join(failure.problems).replace(str(folder), str(destination))
+                note = f"There is no model of the four steps (staged.yaml). {why}"
+                calibration = replace(calibration, notes=(*calibration.notes, note))
+                for path in (folder / STAGED_NAME, _urdf_of(folder / STAGED_NAME)):
+                    path.unlink(missing_ok=True)
         document = json.dumps(calibration.result.document(), indent=1, allow_nan=False)
         (folder / RESULT_NAME).write_text(document + "\n", encoding="utf-8")
         if dataset.axes is None:
@@ -94,19 +97,34 @@ def write_result(calibration: Calibration, destination: Path) -> None:
             write_observations(table, solution.outlines, measurements, machine.leg_names)
         if calibration.corners is not None:
             write_corners(folder / CORNERS_NAME, calibration.corners, dataset.measurements)
+    return calibration
 
 
-def _check_written(yaml: Path, legs: Sequence[Leg]) -> None:
-    """Load what was written; it must be the model that was computed, and close."""
+def _urdf_of(yaml: Path) -> Path:
+    """Return the URDF beside the YAML of a written model."""
+    return yaml.with_suffix(".urdf")
+
+
+def _write_model(machine: Machine, legs: Sequence[Leg], yaml: Path, tolerance: float) -> None:
+    """Write a mechanism with other legs; loaded again it must be what was computed, and close."""
+    start = f"{yaml}: the model could not be written: found"
+    write_urdf(machine, legs, _urdf_of(yaml))
+    home = home_of_legs(machine, legs, MAX_HOME_RESIDUAL)
+    if home is None:
+        raise DidNotConverge(
+            f"{start} no closed pose of its legs near legcal.home, needed one; check legcal.home "
+            f"of {machine.yaml_path}, and the nominal model."
+        )
+    moved = None if home is machine.home else home
+    write_calibrated_yaml(machine, yaml, _urdf_of(yaml).name, moved)
     written = reload_and_check(yaml)
     found = parametrization_of(written, twists=True)
     apart = vector_of(found, geometries(written), legs) - vector_of(found, legs, legs)
     off = float(np.abs(apart).max())
-    if not off <= RELOAD_TOLERANCE:
+    if not off <= tolerance:
         raise DidNotConverge(
-            f"The calibrated model could not be written: loaded again, its parameters differ by "
-            f"{off:.1e} m or rad from the computed ones; at most {RELOAD_TOLERANCE:.0e} is "
-            "allowed; nothing was written; please report this."
+            f"{start} that its parameters, loaded again, differ by {off:.1e} m or rad from the "
+            f"computed ones, needed at most {tolerance:.0e}; please report this."
         )
 
 

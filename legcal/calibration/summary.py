@@ -240,7 +240,7 @@ def _board_lines(result: Result) -> list[str]:
 def _steps_lines(result: Result) -> list[str]:
     steps = result.stages.staged
     if isinstance(steps, NoSteps):
-        return [f"The four steps alone gave no result: {steps.failure}"]
+        return [f"The four steps alone gave no result, and no staged.yaml: {steps.failure}"]
     left_out = (
         f" They left out or at nominal {len(steps.diagnostics)} axes, joints or directions."
         * bool(steps.diagnostics)
