@@ -16,7 +16,7 @@ TAGS = {
     "make": 0x010F, "model": 0x0110, "orientation": 0x0112, "software": 0x0131,
     "exposure": 0x829A, "focus": 0x9206, "focal": 0x920A, "comment": 0x9286, "width": 0xA002,
     "height": 0xA003, "rendered": 0xA401, "zoom": 0xA404, "focal35": 0xA405, "serial": 0xA431,
-    "lens": 0xA434,
+    "lens": 0xA434, "taken": 0x9003,
 }  # fmt: skip
 _OF_CAMERA = ("make", "model", "orientation", "software")  # in the first directory
 

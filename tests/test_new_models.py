@@ -432,7 +432,7 @@ CSV_REFUSED = [
     (f"{HEAD}\n{ROW}\n,1,2,3,4\n", ("types.1",)),
     (f"{HEAD},travel_low\n{ROW},0\n{ROW},0\n", ("travel",)),
     (f"{HEAD}\nRPS,nan,2,3,4\n{ROW}\n", ("line 2", "base_x", "'nan'")),
-    ("type\tbase_x\nRPS\t1\n", ("between columns", "','")),
+    ("type\tbase_x\nRPS\t1,5\n", ("'base_y'",)),
     (f"{HEAD},radius,rod\n{ROW},9,8\n", ("line 2", "radius, tube, rod")),
 ]
 

@@ -17,6 +17,7 @@ import typer
 
 from legcal.cli.calibrate import calibrate
 from legcal.cli.commands import camera, detect, evaluate, identify, inspect, locate, new, noise
+from legcal.cli.init import init
 from legcal.cli.options import INTERRUPTED, print_failure
 from legcal.cli.simulate import simulate
 from legcal.cli.study import study
@@ -64,6 +65,7 @@ for command in (
     evaluate,
     locate,
     new,
+    init,
     noise,
     simulate,
 ):

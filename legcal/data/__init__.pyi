@@ -34,6 +34,9 @@ from .measurements import few_views as few_views
 from .measurements import reading_columns as reading_columns
 from .measurements import readings_in as readings_in
 from .measurements import row_names as row_names
+from .new_dataset import NewDataset as NewDataset
+from .new_dataset import plan_new_dataset as plan_new_dataset
+from .new_dataset import write_new_dataset as write_new_dataset
 from .outlines import OUTLINE_COLUMNS as OUTLINE_COLUMNS
 from .outlines import Outlines as Outlines
 from .outlines import is_edited as is_edited

@@ -1,3 +1,4 @@
+from .folder import RESULT as RESULT
 from .folder import TEMPORARY_SUFFIX as TEMPORARY_SUFFIX
 from .folder import OutputFile as OutputFile
 from .folder import OutputKind as OutputKind
@@ -50,7 +51,9 @@ from .schema import read_yaml as read_yaml
 from .schema import refuse_too_large as refuse_too_large
 from .schema import validate as validate
 from .table import Column as Column
+from .table import Lines as Lines
 from .table import Table as Table
 from .table import format_table as format_table
 from .table import place_in as place_in
 from .table import read_table as read_table
+from .table import split_heading as split_heading

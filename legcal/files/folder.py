@@ -115,7 +115,7 @@ class OutputKind:
     """A kind of output folder."""
 
     noun: str  # what the folder holds
-    marker: str  # the JSON document that legcal leaves in such a folder
+    marker: str  # the JSON document that legcal leaves in such a folder; "" if others may be there
     key: str  # a key of that document
 
     def is_in(self, folder: Path) -> bool:
@@ -144,7 +144,8 @@ def check_destination(destination: Path, kind: OutputKind = RESULT) -> None:
     """Refuse an output folder that holds something else than an earlier output of its kind."""
     check_path(destination, kind)
     start = f"{destination}: the {kind.noun} could not be written: found"
-    if destination.is_dir() and holds_files(destination) and not kind.is_in(destination):
+    is_new = not destination.is_dir() or not holds_files(destination)
+    if kind.marker and not (is_new or kind.is_in(destination)):
         raise UsageError(
             f"{start} a folder with other files and no {kind.marker} of legcal, needed a new or "
             f"empty folder or that of an earlier {kind.noun}; give another output folder."

@@ -9,6 +9,7 @@ the lines.
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import math
@@ -21,6 +22,7 @@ from typing import Literal
 import numpy as np
 
 from legcal.errors import DatasetError
+from legcal.files.quantity import LENGTH
 from legcal.files.schema import MAX_PROBLEMS, NAME_NEEDED, closest, content_of, describe, is_name
 from legcal.geometry import Array, BoolArray
 
@@ -28,6 +30,13 @@ _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 MAX_ROWS = 50_000
 MAX_COLUMNS = 300
 _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
+_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?", re.ASCII)
+_HEADING = re.compile(
+    rf"(.*?)(?:\s*[\[(]\s*({'|'.join(LENGTH)}|µm|μm)\s*[\])]|[\s_/]({'|'.join(LENGTH)}|µm|μm))?"
+)
+_WORKBOOKS = {b"PK\x03\x04": "an XLSX or ODS workbook", b"\xd0\xcf\x11\xe0": "an XLS workbook"}
+
+Lines = list[tuple[int, list[str]]]  # those that are not blank: number from 1, stripped cells
 
 
 @dataclass(frozen=True)
@@ -211,10 +220,16 @@ def read_table(
     needed: str = "",
     remedy: str = "",
     unknown: Callable[[str], str] = lambda name: "",
-    fold: bool = False,
+    reshape: Callable[[Lines], Lines] | None = None,
 ) -> Table:
-    """Return a CSV file as a table, with the problems of its cells still to be raised."""
-    lines = _read_lines(path, what)
+    """Return a CSV file as a table, with the problems of its cells still to be raised.
+
+    ``reshape`` makes what stands in tables of people into the columns that are declared; such
+    tables may be separated by semicolons or tabs and have decimal commas then.
+    """
+    lines = _read_lines(path, what, loose=reshape is not None)
+    if reshape is not None and lines:
+        lines = reshape(lines)
     if needed and len(lines) < 2:
         raise DatasetError(
             f"{path}: the {what} could not be used: found {'a' if lines else 'no'} header and no "
@@ -227,7 +242,6 @@ def read_table(
             f"{path}, header: the columns could not be used: found {other[0]!r} between columns, "
             "needed ',' there and '.' in numbers; save it again with commas (CSV)."
         )
-    header = [name.lower() for name in header] if fold else header
     start = f"{path}, header: the columns could not be used: found"
     known = {column.name: column for column in columns}
     problems = []
@@ -297,19 +311,42 @@ def _too_large(path: Path, what: str) -> DatasetError:
     )
 
 
-def _read_lines(path: Path, what: str) -> list[tuple[int, list[str]]]:
+def split_heading(text: str) -> tuple[str, str]:
+    """Return a heading in small letters and digits alone, and its unit of length or "".
+
+    ``Leg 1 [mm]``, ``leg1_mm`` and ``LEG-1 (mm)`` are all ``leg1`` in ``mm``.
+    """
+    match = _HEADING.fullmatch(text.strip())
+    name, unit = (match[1], match[2] or match[3] or "") if match else (text, "")
+    letters = "".join(letter for letter in name.casefold() if letter.isalnum())
+    return letters, "um" if unit in ("µm", "μm") else unit
+
+
+def _read_lines(path: Path, what: str, *, loose: bool = False) -> Lines:
     """Return the lines that are not blank, numbered from 1, their cells stripped.
 
-    A byte-order mark and either kind of line end are accepted.
+    A byte-order mark and either kind of line end are accepted; if ``loose``, also what programs
+    for tables write in other countries.
     """
+    content = content_of(path, what)
+    workbook = _WORKBOOKS.get(content[:4])
+    if loose and workbook:
+        raise DatasetError(
+            f"{path}: the {what} could not be read: found {workbook}, needed CSV; save the sheet "
+            "as CSV (comma-separated)."
+        )
     try:
-        text = content_of(path, what).decode("utf-8-sig")
-        reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-        lines: list[tuple[int, list[str]]] = []
+        text = _decoded(content, loose=loose)
+        delimiter = _delimiter(text) if loose else ","
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+        lines: Lines = []
         for cells in reader:
             if len(lines) > MAX_ROWS or len(cells) > MAX_COLUMNS:
                 raise _too_large(path, what)
-            lines.append((reader.line_num, [cell.strip() for cell in cells]))
+            cells = [cell.strip() for cell in cells]
+            if delimiter != ",":
+                cells = [_with_point(cell) for cell in cells]
+            lines.append((reader.line_num, cells))
     except (UnicodeDecodeError, csv.Error) as error:
         found = (
             f"the byte 0x{error.object[error.start]:02x} at place {error.start}, which is no text"
@@ -321,3 +358,20 @@ def _read_lines(path: Path, what: str) -> list[tuple[int, list[str]]]:
             "in UTF-8; save it again as CSV."
         ) from error
     return [(number, cells) for number, cells in lines if any(cells)]
+
+
+def _decoded(content: bytes, *, loose: bool) -> str:
+    """Return the text of a file in UTF-8; if ``loose``, also in UTF-16 with its mark."""
+    is_wide = loose and content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return content.decode("utf-16" if is_wide else "utf-8-sig")
+
+
+def _delimiter(text: str) -> str:
+    """Return what separates the cells of the first line that is not blank."""
+    first = next(filter(str.strip, text.splitlines()), "")
+    return next((mark for mark in ";\t" if mark in first), ",")
+
+
+def _with_point(cell: str) -> str:
+    """Return a cell, its decimal comma as a point if it is a number."""
+    return cell.replace(",", ".") if _COMMA.fullmatch(cell) else cell

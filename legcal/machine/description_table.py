@@ -20,6 +20,7 @@ from legcal.errors import DatasetError, ModelError
 from legcal.files import (
     Column,
     FileSchema,
+    Lines,
     PlainName,
     Quaternion,
     Table,
@@ -218,7 +219,7 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
     sentence for each wrong column or cell.
     """
     needed = "one row for each leg; add them"
-    table = read_table(path, WHAT, "leg", COLUMNS, needed=needed, fold=True)
+    table = read_table(path, WHAT, "leg", COLUMNS, needed=needed, reshape=_small_letters)
     filled = [np.array([text != "" for text in table.text(name)], dtype=bool) for name in _RADII]
     for row in np.flatnonzero(filled[0] & (filled[1] | filled[2])).tolist():
         needed = "one of them; empty the others"
@@ -264,6 +265,12 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
     return document | {
         key: column for key, column in optional.items() if any(x is not None for x in column)
     }
+
+
+def _small_letters(lines: Lines) -> Lines:
+    """Return lines with their header in small letters."""
+    number, header = lines[0]
+    return [(number, [name.lower() for name in header]), *lines[1:]]
 
 
 def _unit(table: Table, given: str | None) -> str:

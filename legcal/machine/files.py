@@ -4,12 +4,13 @@ import os
 from pathlib import Path
 
 from legcal.errors import DatasetError, ModelError
-from legcal.files import content_of
+from legcal.files import RESULT, content_of
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 FOLDER_YAML = "robot.yaml"  # as Gepetto names it
 DATASET_YAML = "dataset.yaml"
+RESULT_YAML = "calibrated.yaml"  # of the model in a result folder
 
 
 def shipped_folders() -> tuple[Path, Path]:
@@ -26,18 +27,23 @@ def shipped_names() -> list[str]:
 
 
 def find_model(model: str | Path) -> Path:
-    """Return the file that describes a mechanism, of a path or of the name of a shipped model."""
+    """Return the file that describes a mechanism, of a path or of the name of a shipped model.
+
+    A result folder stands for its calibrated model.
+    """
     path = Path(model)
     names = shipped_names()
     is_shipped = str(model) in names
     if os.path.isdir(path) and not is_shipped:
         if (path / FOLDER_YAML).is_file():
             return path / FOLDER_YAML
+        if (path / RESULT_YAML).is_file() and RESULT.is_in(path):
+            return path / RESULT_YAML
         if (path / DATASET_YAML).is_file():
             raise ModelError(what_a_dataset_is_for(path))
         raise ModelError(
             f"{path}: the mechanism could not be read: found a folder without {FOLDER_YAML}, "
-            "needed a folder with it, or a YAML, URDF or MJCF file; give the file."
+            "needed a folder with it, a result folder, or a YAML, URDF or MJCF file; give the file."
         )
     if os.path.exists(path) and not os.path.isdir(path):
         if path.suffix.lower() == ".csv":

@@ -31,6 +31,8 @@ from .cylinder import outlines_of_axis as outlines_of_axis
 from .distortion import DistortionModel as DistortionModel
 from .image_facts import ImageFacts as ImageFacts
 from .image_facts import read_facts as read_facts
+from .image_file import CONVERT as CONVERT
+from .image_file import FOREIGN_SUFFIXES as FOREIGN_SUFFIXES
 from .image_file import BadImage as BadImage
 from .image_file import Grey as Grey
 from .image_file import ImageSize as ImageSize

@@ -20,9 +20,10 @@ TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
 _MAKE, _MODEL, _ORIENTATION, _SOFTWARE = 0x010F, 0x0110, 0x0112, 0x0131
 _FOCUS, _FOCAL, _COMMENT, _WIDTH, _HEIGHT = 0x9206, 0x920A, 0x9286, 0xA002, 0xA003
 _RENDERED, _ZOOM, _FOCAL_35, _SERIAL, _LENS = 0xA401, 0xA404, 0xA405, 0xA431, 0xA434
+_TAKEN = 0x9003
 _COMPRESSION, _STRIPS, _STRIP_BYTES, _JPEG_TABLES, _XMP = 259, 273, 279, 347, 700
 _TAGS = (_MAKE, _MODEL, _ORIENTATION, _SOFTWARE, _FOCUS, _FOCAL, _COMMENT, _WIDTH, _HEIGHT,
-         _RENDERED, _ZOOM, _FOCAL_35, _SERIAL, _LENS)  # fmt: skip
+         _RENDERED, _ZOOM, _FOCAL_35, _SERIAL, _LENS, _TAKEN)  # fmt: skip
 _TIFF_TAGS = (*_TAGS, _COMPRESSION, _STRIPS, _STRIP_BYTES, _JPEG_TABLES, _XMP)
 _TIFF_JPEG = (6, 7)  # compressions of a TIFF
 
@@ -73,6 +74,8 @@ class ImageFacts:
         How to turn the image for looking at it, 1 to 8; 1 is as it is.
     taken_size : tuple of int or None
         Width and height that the camera wrote [px].
+    taken_at : str
+        When it was taken by the clock of the camera, ``2026:11:23 10:15:00``.
     lens_corrected, cropped : bool or None
         Whether a program took distortion out, and whether it cut the image.
     is_screenshot : bool
@@ -94,6 +97,7 @@ class ImageFacts:
     digital_zoom: float | None = None
     orientation: int | None = None
     taken_size: tuple[int, int] | None = None
+    taken_at: str = ""
     lens_corrected: bool | None = None
     cropped: bool | None = None
     is_screenshot: bool = False
@@ -154,6 +158,7 @@ def _facts(
         digital_zoom=1.0 if zoom == 0.0 else zoom,  # 0 says that there was none
         orientation=None if orientation is None else int(orientation),
         taken_size=None if width is None or height is None else (int(width), int(height)),
+        taken_at=_text(tags, _TAKEN),
         lens_corrected=_setting(xmp, b"LensProfileEnable"),
         cropped=_setting(xmp, b"HasCrop"),
         is_screenshot=any(_SCREENSHOT.search(text) for text in (software, comment, *texts)),

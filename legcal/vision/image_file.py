@@ -63,18 +63,31 @@ _TIFF_BYTES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}  # othe
 MAX_SIDE, MAX_AREA = 30_000, 100_000_000  # [px] of an image or a camera; the largest sensors
 _MOST_SCANS = 200  # of a JPEG: each is another pass over all pixels
 _MOST_TAGS, _MOST_STRIPS = 200, 100_000  # of a TIFF
+_SIDEWAYS = 5  # EXIF orientation, from which on width and height are exchanged for looking
 _STRIP = 256  # rows of an image that become grey levels at once
 
+FOREIGN_SUFFIXES = (".heic", ".heif", ".hif", ".avif", ".webp", ".gif", ".bmp", ".jp2", ".jxl",
+                    ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")  # fmt: skip
+CONVERT = (
+    "write them as JPEG of quality 95 or more, or PNG, without turning or scaling them "
+    "(magick mogrify -format jpg -quality 98 *.HEIC), or set the phone to the most compatible "
+    "format"
+)
+_BRANDS = {b"heic": "HEIC", b"heix": "HEIC", b"hevc": "HEIC", b"hevx": "HEIC", b"mif1": "HEIC",
+           b"msf1": "HEIC", b"avif": "AVIF", b"avis": "AVIF", b"crx ": "CR3"}  # fmt: skip
+
 _COMPLETE = "a complete PNG, JPEG or TIFF file"
+_AGAIN = "copy it again or remove the row"
 _LEVELS = "8 or 16 bit grey levels or colours"
 
 
 class BadImage(ValueError):
     """What is wrong with the bytes of an image file: found and needed, as parts of a sentence."""
 
-    def __init__(self, found: str, needed: str = _COMPLETE) -> None:
+    def __init__(self, found: str, needed: str = _COMPLETE, remedy: str = _AGAIN) -> None:
         super().__init__(found)
         self.needed = needed
+        self.remedy = remedy
 
 
 @dataclass(frozen=True)
@@ -152,6 +165,10 @@ def image_size(content: bytes) -> ImageSize:
                 return size
     except (struct.error, IndexError) as error:
         raise BadImage(f"a file cut off after {len(content)} bytes") from error
+    if content[4:8] == b"ftyp" and content[8:12] in _BRANDS:
+        raise BadImage(
+            f"a {_BRANDS[content[8:12]]} file, which cannot be read here", remedy=CONVERT
+        )
     raise BadImage("a file that is none of these")
 
 
@@ -168,6 +185,11 @@ def likely_cause(size: ImageSize, needed: ImageSize, facts: ImageFacts) -> str:
     causes = []
     if facts.is_screenshot:
         causes.append("a screenshot, as its file says")
+    elif size == ImageSize(needed.height, needed.width) and (facts.orientation or 1) >= _SIDEWAYS:
+        causes.append(
+            f"turned by a quarter turn, as programs show it by its EXIF orientation "
+            f"{facts.orientation}; pixels are taken as they are stored"
+        )
     elif size == ImageSize(needed.height, needed.width):
         causes.append("turned by a quarter turn")
     else:
@@ -196,7 +218,7 @@ def _complete_content(path: Path, camera: Camera, where: str) -> tuple[bytes, st
     except OSError as error:
         return b"", _problem(path, where, f"'{error.strerror}'", "a readable file")
     except BadImage as error:
-        return b"", _problem(path, where, str(error), error.needed)
+        return b"", _problem(path, where, str(error), error.needed, error.remedy)
     needed = ImageSize(camera.width, camera.height)
     if size != needed:
         return b"", _problem(
@@ -210,9 +232,7 @@ def _complete_content(path: Path, camera: Camera, where: str) -> tuple[bytes, st
     return content, None
 
 
-def _problem(
-    path: Path, where: str, found: str, needed: str, remedy: str = "copy it again or remove the row"
-) -> str:
+def _problem(path: Path, where: str, found: str, needed: str, remedy: str = _AGAIN) -> str:
     """Return the sentence for an image that cannot be used."""
     prefix = f"{where}: " if where else ""
     return f"{prefix}image {path} could not be read: found {found}, needed {needed}; {remedy}."

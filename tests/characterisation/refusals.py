@@ -969,7 +969,12 @@ def _new() -> Iterable[Refusal]:
         ("units", f"{head},unit\n{row},mm\n{row},m\n", "", ("m and mm",)),
         ("other-unit", f"{head},unit\n{row},mm\n{row},mm\n", "--unit m", ("--unit m", "'mm'")),
         ("blank", f"{head}\n{row}\nRPS,,2,3,4\n", "--unit mm", ("line 3", "base_x")),
-        ("semicolons", "type;base_x\nRPS;1\n", "--unit mm", ("';'", "','")),
+        (
+            "semicolons",
+            "type;base_x;base_y;platform_x\nRPS;1;2;3\n",
+            "--unit mm",
+            ("'platform_y'",),
+        ),
     ]
     for name, content, words, named in lines:
         yield Refusal(

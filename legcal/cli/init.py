@@ -1,0 +1,102 @@
+"""``legcal init``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from legcal.cli.options import JsonOption, print_json, print_table
+
+
+def init(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER",
+            help="The photographs, in it or in one folder for each camera position. It is not "
+            "changed.",
+        ),
+    ],
+    readings: Annotated[
+        Path,
+        typer.Option(
+            "--readings",
+            metavar="FILE",
+            help="A CSV with a column for each encoder; optional columns image, view, pose, time.",
+        ),
+    ],
+    model: Annotated[
+        str, typer.Option("--model", metavar="MODEL", help="The nominal model, as for inspect.")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="The dataset folder to write.")
+    ],
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[VIEW=]FILE",
+            help="The camera file of all views, or of one (repeat it); by default camera_info.yaml "
+            "beside the photographs.",
+        ),
+    ] = None,
+    unit: Annotated[
+        str | None,
+        typer.Option(
+            help="Unit of the readings: m, cm, mm, um; by default as the headings say, else the "
+            "one in which they lie in the travel."
+        ),
+    ] = None,
+    lengths: Annotated[
+        bool, typer.Option("--lengths", help="The table holds whole lengths of legs.")
+    ] = False,
+    views: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME,NAME,...", help="Use only the photographs in these folders of FOLDER."
+        ),
+    ] = None,
+    match: Annotated[
+        Literal["name", "time", "order"] | None,
+        typer.Option(
+            help="How photographs and rows are matched; by default by names, else by times, else "
+            "in order."
+        ),
+    ] = None,
+    encoder_sigma: Annotated[
+        str | None,
+        typer.Option(help="Sigma of a reading, 2um; by default the last digit of the table."),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show the matching and write nothing.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a dataset from a folder of photographs and a table of readings."""
+    from legcal import data, report
+    from legcal.files import LENGTH, parse_quantity
+
+    sigma = (
+        None if encoder_sigma is None else parse_quantity(encoder_sigma, LENGTH, "--encoder-sigma")
+    )
+    found = data.plan_new_dataset(
+        folder,
+        readings,
+        model,
+        output,
+        cameras=camera or (),
+        unit=unit,
+        lengths=lengths,
+        views=[] if views is None else views.split(","),
+        by=match,
+        encoder_sigma=sigma,
+    )
+    if not as_json:
+        print_table(report.matching_table(found))
+    written = [] if dry_run else data.write_new_dataset(found, force=force)
+    if as_json:
+        print_json(found.document() | {"written": [str(path) for path in written]})
+    elif written:
+        print_table(report.written_lines(found, written))

@@ -1,0 +1,388 @@
+"""A dataset made from a folder of photographs and a table as its owner keeps it.
+
+Columns are found by their headings, the unit by the heading or by the travel of the machine, and
+photographs by :mod:`legcal.data.photograph_matching`. All is checked before anything is written,
+and what is found is a :class:`NewDataset` that can be shown first. Photographs that lie in the
+dataset's folder already are named where they are; others are linked, or copied where the file
+system has no links.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import yaml
+
+from legcal.data.measurements import few, reading_columns
+from legcal.data.photograph_matching import Matching, Photograph, Row, find_photographs, match
+from legcal.data.readings_sheet import Headings, readings_of, unit_of
+from legcal.errors import DatasetError, UsageError
+from legcal.files import (
+    NAME_NEEDED,
+    OutputKind,
+    check_path,
+    describe,
+    format_table,
+    is_name,
+    read_table,
+    result_folder,
+)
+from legcal.geometry import Array
+from legcal.machine import DATASET_YAML, Machine, load_mechanism, shipped_names
+from legcal.vision import Camera, inspect_image, read_camera
+
+KIND = OutputKind("dataset", "", "legcal_dataset")  # other files may stand beside it
+MEASUREMENTS = "measurements.csv"
+ONE_VIEW = "c1"
+MIN_SIGMA = 1e-6  # [m], of readings whose noise nobody stated
+_CAMERA_NAMES = ("camera_info.yaml", "camera_info.yml", "camera.yaml")
+
+
+@dataclass(frozen=True, eq=False)
+class NewDataset:
+    """A dataset that is not written yet.
+
+    Attributes
+    ----------
+    machine : Machine
+        The nominal model.
+    model : str
+        How ``dataset.yaml`` names it.
+    folder, table, destination : Path
+        Photographs, readings, and the dataset's folder.
+    columns : dict
+        What each heading of the table is taken for: a joint, view, image, pose or time.
+    unit : str
+        Unit of the readings in the table.
+    unit_from : str
+        Where the unit was found, in words.
+    are_lengths : bool
+        Whether the table holds whole lengths of legs.
+    matching : Matching
+        Pairs of row and photograph.
+    views : tuple of str
+        The view of each pair.
+    readings : (n_rows, n_motors) array
+        Of the actuated legs, in their order [m].
+    cameras : dict
+        The camera file of each view.
+    encoder_sigma : float
+        One standard deviation of a reading [m].
+    notes : tuple of str
+        What is odd, or was chosen.
+    """
+
+    machine: Machine
+    model: str
+    folder: Path
+    table: Path
+    destination: Path
+    columns: Mapping[str, str]
+    unit: str
+    unit_from: str
+    are_lengths: bool
+    rows: tuple[Row, ...]
+    poses: tuple[str, ...]
+    matching: Matching
+    views: tuple[str, ...]
+    readings: Array
+    cameras: Mapping[str, Path]
+    encoder_sigma: float
+    notes: tuple[str, ...]
+
+    @property
+    def joints(self) -> list[str]:
+        """The columns of the readings."""
+        return [column.name for column in reading_columns(self.machine.legs)]
+
+    def document(self) -> dict[str, Any]:
+        """Return what ``legcal init --json`` prints."""
+        return {
+            "dataset": str(self.destination),
+            "mechanism": self.model,
+            "columns": dict(self.columns),
+            "unit": self.unit,
+            "unit_from": self.unit_from,
+            "lengths": self.are_lengths,
+            "matched": self.matching.how,
+            "encoder_sigma": self.encoder_sigma,
+            "views": {view: {"camera": str(path)} for view, path in self.cameras.items()},
+            "images": [
+                {
+                    "row": k + 1,
+                    "view": view,
+                    "photograph": photograph.name,
+                    "image": self.place(photograph),
+                    "readings": dict(
+                        zip(
+                            self.joints,
+                            self.readings[k].tolist(),
+                            strict=True,
+                        )
+                    ),
+                }
+                for (k, photograph), view in zip(self.matching.pairs, self.views, strict=True)
+            ],
+            "notes": list(self.notes),
+        }
+
+    def place(self, photograph: Photograph) -> str:
+        """Return the path of a photograph relative to the dataset's folder."""
+        real, here = photograph.path.resolve(), self.destination.resolve()
+        if real.is_relative_to(here):
+            return real.relative_to(here).as_posix()
+        return (PurePosixPath("images") / photograph.name).as_posix()
+
+
+def plan_new_dataset(
+    folder: str | Path,
+    readings: str | Path,
+    model: str | Path,
+    destination: str | Path,
+    *,
+    cameras: Sequence[str] = (),
+    unit: str | None = None,
+    lengths: bool = False,
+    views: Sequence[str] = (),
+    by: str | None = None,
+    encoder_sigma: float | None = None,
+) -> NewDataset:
+    """Return a dataset of photographs and readings, checked and not written yet.
+
+    Parameters
+    ----------
+    folder : path
+        The photographs: in it, or in one folder for each view. It is not changed.
+    readings : path
+        A CSV with a column for each actuated leg, and a heading.
+    model : path or str
+        The nominal model, as for :func:`legcal.load_mechanism`.
+    destination : path
+        The folder of the dataset.
+    cameras : sequence of str
+        Camera files: one for all views, or ``VIEW=FILE`` for each.
+    unit : str, optional
+        Of the readings: m, cm, mm, um; by default that of the headings, else found from the travel.
+    lengths : bool
+        Whether the table holds whole lengths of legs in place of readings.
+    views : sequence of str
+        Folders to use, all by default.
+    by : str, optional
+        How to match photographs: ``name``, ``time`` or ``order``.
+    encoder_sigma : float, optional
+        One standard deviation of a reading [m]; by default the last digit of the table.
+
+    Raises
+    ------
+    DatasetError, ModelError, UsageError
+        With one sentence for each thing that is wrong.
+    """
+    folder, path, destination = Path(folder), Path(readings), Path(destination)
+    machine = load_mechanism(model)
+    _check_place(folder, destination)
+    photographs = find_photographs(folder, [view.strip("/") for view in views])
+    headings = Headings(path, [machine.legs[j] for j in machine.motors])
+    table = read_table(
+        path, "table of readings", "row", headings.columns(), needed="one row for each photograph",
+        reshape=headings.reshape,
+    )  # fmt: skip
+    table.check()
+    found_unit, unit_from = unit_of(table, headings, unit, lengths)
+    q, digit = readings_of(table, headings, found_unit, lengths)
+    rows = tuple(
+        Row(where, *texts)
+        for where, *texts in zip(
+            table.where, *(table.text(name) for name in ("image", "view", "time")), strict=True
+        )
+    )
+    matching = match(rows, photographs, str(path), by=by)
+    view_of = tuple(_view(rows[k], photograph) for k, photograph in matching.pairs)
+    bad = sorted({view for view in view_of if not is_name(view)})
+    if bad:
+        raise DatasetError(
+            f"{folder}: the view {describe(bad[0])} could not be used: found a name that tables "
+            f"cannot show, needed {NAME_NEEDED}; rename it."
+        )
+    of_views, problems = _cameras(folder, list(dict.fromkeys(view_of)), matching, view_of, cameras)
+    if problems:
+        raise DatasetError(problems)
+    read = {camera: read_camera(camera) for camera in dict.fromkeys(of_views.values())}
+    _check_photographs(matching, [read[of_views[view]] for view in view_of])
+    sigma, note = _sigma(encoder_sigma, digit)
+    notes = [*headings.notes, *matching.notes, *note]
+    if set(view_of) == {ONE_VIEW} and not any(row.view for row in rows):
+        notes.append(
+            f"All photographs are one view, {ONE_VIEW}: if the camera stood in several places, put "
+            "those of each place in a folder, or add a column view."
+        )
+    return NewDataset(
+        machine=machine,
+        model=_model_name(model, machine, destination),
+        folder=folder,
+        table=path,
+        destination=destination,
+        columns=headings.taken,
+        unit=found_unit,
+        unit_from=unit_from,
+        are_lengths=lengths,
+        rows=rows,
+        poses=table.text("pose") if "pose" in table else (),
+        matching=matching,
+        views=view_of,
+        readings=q,
+        cameras=of_views,
+        encoder_sigma=sigma,
+        notes=tuple(notes),
+    )
+
+
+def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
+    """Write a dataset, complete or not at all; return its files, photographs excepted.
+
+    Raises
+    ------
+    UsageError
+        If a file is there already and *force* is not given.
+    OutOfResources
+        If the folder does not take it.
+    """
+    check_path(new.destination, KIND)
+    cameras = list(dict.fromkeys(new.cameras.values()))
+    names = {camera: f"camera_info{f'_{k + 1}' * bool(k)}.yaml" for k, camera in enumerate(cameras)}
+    own = [DATASET_YAML, MEASUREMENTS, *names.values()]
+    linked = {
+        new.place(photograph): photograph.path.resolve()
+        for _, photograph in new.matching.pairs
+        if not photograph.path.resolve().is_relative_to(new.destination.resolve())
+    }
+    there = [name for name in [*own, *linked] if os.path.lexists(new.destination / name)]
+    contents = {names[camera]: camera.read_bytes() for camera in cameras}
+    if there and not force:
+        raise UsageError(
+            f"{new.destination}: the dataset could not be written: found {few(there)} already "
+            "there, needed new files; give another folder with -o, or --force to replace them."
+        )
+    header = ["view", "image", *(["pose"] if new.poses else []), *new.joints]
+    rows = [
+        [view, new.place(photograph), *(new.poses[k : k + 1]), *new.readings[k].tolist()]
+        for (k, photograph), view in zip(new.matching.pairs, new.views, strict=True)
+    ]
+    document = {
+        "legcal_dataset": 1,
+        "mechanism": new.model,
+        "measurements": MEASUREMENTS,
+        "encoder_sigma": new.encoder_sigma,
+        "views": {view: {"camera": names[camera]} for view, camera in new.cameras.items()},
+    }
+    with result_folder(new.destination, KIND) as folder:
+        for name, content in contents.items():
+            (folder / name).write_bytes(content)
+        for name, path in linked.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            _link(path, folder / name)
+        (folder / MEASUREMENTS).write_text(format_table(header, rows), encoding="utf-8")
+        text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
+        (folder / DATASET_YAML).write_text(text, encoding="utf-8")
+    return [new.destination / name for name in own]
+
+
+def _link(path: Path, place: Path) -> None:
+    """Link a file, or copy it where it cannot be linked."""
+    try:
+        os.link(path, place)
+    except OSError:
+        shutil.copy2(path, place)
+
+
+def _check_place(folder: Path, destination: Path) -> None:
+    """Refuse to write into the folder of the photographs."""
+    check_path(destination, KIND)
+    if destination.resolve().is_relative_to(folder.resolve()):
+        raise UsageError(
+            f"{destination}: the dataset could not be written: found a place in the folder of the "
+            "photographs, which is not changed, needed one beside it; give another folder with -o."
+        )
+
+
+def _sigma(given: float | None, digit: float) -> tuple[float, list[str]]:
+    """Return the standard deviation of a reading [m], and a note where nobody stated it."""
+    if given is not None:
+        return given, []
+    sigma = max(digit, MIN_SIGMA)
+    why = "the last digit of the table" if sigma > MIN_SIGMA else "that of a good encoder"
+    return sigma, [
+        f"encoder_sigma is {1e6 * sigma:g} um, {why}: give --encoder-sigma if "
+        "readings are known better or worse."
+    ]
+
+
+def _view(row: Row, photograph: Photograph) -> str:
+    """Return the view of a pair: as the table says, else its folder."""
+    return row.view or (photograph.folder if photograph.folder != "." else ONE_VIEW)
+
+
+def _cameras(
+    folder: Path,
+    views: Sequence[str],
+    matching: Matching,
+    view_of: Sequence[str],
+    given: Sequence[str],
+) -> tuple[dict[str, Path], list[str]]:
+    """Return the camera file of each view: as given, else beside its photographs or above them."""
+    for_all = [text for text in given if "=" not in text or os.path.isfile(text)]
+    of_one = dict(text.split("=", 1) for text in given if text not in for_all)
+    problems = []
+    if len(for_all) > 1:
+        problems.append(
+            f"The camera files could not be used: found {few(for_all)}, needed one for all views, "
+            "or --camera VIEW=FILE for each; correct them."
+        )
+    problems += [
+        f"--camera {name}={path} could not be used: found no view of that name, needed one of "
+        f"{few(views)}; correct it."
+        for name, path in of_one.items()
+        if name not in views
+    ]
+    found: dict[str, Path] = {}
+    for view in views:
+        beside = [p.path.parent for (_, p), name in zip(matching.pairs, view_of, strict=True)
+                  if name == view]  # fmt: skip
+        near = [
+            path / name for path in (*beside[:1], folder, folder.parent) for name in _CAMERA_NAMES
+        ]
+        text = of_one.get(view, for_all[0] if for_all else None)
+        path = Path(text) if text else next((path for path in near if path.is_file()), None)
+        if path is not None:
+            found[view] = path
+    missing = [view for view in views if view not in found]
+    if missing:
+        problems.append(
+            f"{folder}: the camera of view{'s' * (len(missing) > 1)} {few(missing)} could not be "
+            f"found: found no --camera and no {_CAMERA_NAMES[0]} beside the photographs, needed "
+            "the file of its calibration; make it with: legcal camera BOARDS --board "
+            "chessboard:9x6:25mm -o camera_info.yaml, and give --camera camera_info.yaml."
+        )
+    return found, problems
+
+
+def _check_photographs(matching: Matching, cameras: Sequence[Camera]) -> None:
+    """Refuse photographs that cannot be read or have another size than their camera."""
+    problems = [
+        problem
+        for (_, photograph), camera in zip(matching.pairs, cameras, strict=True)
+        if (problem := inspect_image(photograph.path, camera)[1]) is not None
+    ]
+    if problems:
+        raise DatasetError(problems)
+
+
+def _model_name(model: str | Path, machine: Machine, destination: Path) -> str:
+    """Return how a dataset names its model: a path relative to it, or the name of a shipped one."""
+    if str(model) in shipped_names() and not os.path.isfile(model):
+        return str(model)
+    return Path(os.path.relpath(machine.yaml_path.resolve(), destination.resolve())).as_posix()

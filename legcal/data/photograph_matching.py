@@ -1,0 +1,400 @@
+"""Which photograph belongs to which row of a table, as people name, order or time them.
+
+Names are compared the strictest way that finds every row: the file name, the name without its
+extension, the last number of the name; their case does not count unless it decides, and of files
+named alike those count whose folders are named alike too. Without names the times are compared, or
+the rows are those of the photographs in order (numbers in names count as numbers).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from datetime import date, datetime, time, timedelta
+from itertools import pairwise
+from pathlib import Path, PurePosixPath
+
+from legcal.data.measurements import few
+from legcal.errors import DatasetError
+from legcal.files import MAX_IMAGE, closest, describe, is_name, read_bytes
+from legcal.vision import CONVERT, FOREIGN_SUFFIXES, read_facts
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+MAX_PHOTOGRAPHS = 50_000
+_NUMBERS = re.compile(r"(\d+)", re.ASCII)
+_EXIF_DATE = re.compile(r"(\d{4}):(\d\d):(\d\d)")
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """An image file, and where it stands in the folder that was given."""
+
+    path: Path
+    name: str  # relative to that folder, with "/"
+
+    @property
+    def folder(self) -> str:
+        """The folder that holds it, relative to the given one; "." for that."""
+        return PurePosixPath(self.name).parent.as_posix()
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a row of the table says of its photograph; "" for nothing."""
+
+    where: str  # for messages
+    image: str
+    view: str
+    time: str
+
+
+@dataclass(frozen=True)
+class Matching:
+    """The photographs of rows: a row has one in each view, or one in all."""
+
+    pairs: tuple[tuple[int, Photograph], ...]  # in the order of views and rows
+    how: str  # in words
+    notes: tuple[str, ...] = ()
+
+
+def find_photographs(folder: Path, chosen: Sequence[str] = ()) -> list[Photograph]:
+    """Return the images in a folder and in the folders in it, in the order of their names.
+
+    ``chosen`` are the only folders to look at, all if empty.
+    """
+    if not os.path.isdir(folder):
+        found = "a file" if os.path.exists(folder) else "no such folder"
+        raise DatasetError(
+            f"{folder}: the photographs could not be found: found {found}, needed the folder that "
+            "holds them; check the path."
+        )
+    photographs: list[Photograph] = []
+    foreign: list[str] = []
+    for above, inside, files in os.walk(folder):
+        inside[:] = sorted(name for name in inside if not name.startswith("."))
+        here = Path(above).relative_to(folder)
+        for name in files:
+            suffix = Path(name).suffix.lower()
+            file = Photograph(Path(above) / name, (here / name).as_posix())
+            if name.startswith(".") or (chosen and file.folder not in chosen):
+                continue
+            if suffix in SUFFIXES:
+                photographs.append(file)
+            elif suffix in FOREIGN_SUFFIXES:
+                foreign.append(file.name)
+        if len(photographs) > MAX_PHOTOGRAPHS:
+            raise DatasetError(
+                f"{folder}: the photographs could not be used: found more than {MAX_PHOTOGRAPHS}, "
+                "needed fewer; give the folder of one calibration."
+            )
+    if not photographs:
+        found, remedy = "none", "check the path"
+        if foreign:
+            found, remedy = f"{len(foreign)} of another format ({few(foreign)})", CONVERT
+        elif chosen:
+            found, remedy = f"none in {few(chosen)}", "check --views"
+        raise DatasetError(
+            f"{folder}: the photographs could not be found: found {found}, needed PNG, JPEG or "
+            f"TIFF files there or in folders in it; {remedy}."
+        )
+    return sorted(photographs, key=lambda photograph: in_order(photograph.name))
+
+
+def in_order(name: str) -> tuple[object, ...]:
+    """Return a key by which numbers in names are in order: ``img2`` before ``img10``."""
+    parts = PurePosixPath(name.casefold()).parts
+    split = [_NUMBERS.split(part) for part in parts]
+    keys = [tuple((int(x), "") if x.isdigit() else (-1, x) for x in words) for words in split]
+    return (len(parts), *keys, name)
+
+
+def match(
+    rows: Sequence[Row], photographs: Sequence[Photograph], table: str, *, by: str | None = None
+) -> Matching:
+    """Return which photograph belongs to which row: by name, by time, else in order.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+    photographs : sequence of Photograph
+        In the order of their names.
+    table : str
+        The table, for messages.
+    by : str, optional
+        ``name``, ``order`` or ``time``; by default what the table has.
+
+    Raises
+    ------
+    DatasetError
+        If rows have no photograph, or more than one in a view.
+    """
+    has = {"name": any(row.image for row in rows), "time": any(row.time for row in rows)}
+    how = by or next((kind for kind in ("name", "time") if has[kind]), "order")
+    if how != "order" and not has[how]:
+        column = {"name": "image", "time": "time"}[how]
+        raise DatasetError(
+            f"{table}: the photographs could not be matched by {how}: found no column '{column}', "
+            f"needed one; add it, or give --match order."
+        )
+    found = {"name": _by_name, "time": _by_time, "order": _in_order}[how](rows, photographs, table)
+    used = {photograph.name for _, photograph in found.pairs}
+    bad = [name for name in used if not is_name(name)]
+    if bad:
+        raise DatasetError(
+            f"{table}: the photograph {describe(bad[0])} could not be used: found a name that "
+            "tables cannot show, needed printable characters; rename the file."
+        )
+    spare = [photograph.name for photograph in photographs if photograph.name not in used]
+    notes = found.notes
+    if spare:
+        one = len(spare) == 1
+        notes += (
+            f"{len(spare)} photograph{'' if one else 's'} {'has' if one else 'have'} no row and "
+            f"{'is' if one else 'are'} left out: {few(spare)}.",
+        )
+    return Matching(found.pairs, found.how, notes)
+
+
+def _path(text: str) -> str:
+    return text.replace("\\", "/").removeprefix("./")
+
+
+def _tail(text: str) -> str:
+    return _path(text).rsplit("/", 1)[-1].casefold()
+
+
+def _stem(text: str) -> str:
+    tail = _tail(text)
+    stem, dot, suffix = tail.rpartition(".")
+    return stem if dot and not suffix.isdigit() else tail
+
+
+def _number(text: str) -> str:
+    found = _NUMBERS.findall(_stem(text))
+    return str(int(found[-1])) if found else ""
+
+
+_KEYS: tuple[tuple[str, Callable[[str], str]], ...] = (
+    ("by name", _tail),
+    ("by name, whatever its extension", _stem),
+    ("by the last number of the name", _number),
+)
+
+
+def _alike(photograph: Photograph, text: str) -> tuple[int, bool]:
+    """Return how many folders above the file are named alike, and whether the case is too."""
+    one, two = (_path(name).casefold().split("/")[-2::-1] for name in (photograph.name, text))
+    same = [a == b for a, b in zip(one, two, strict=False)]
+    return [*same, False].index(False), photograph.name.endswith(_path(text))
+
+
+def _candidates(row: Row, photographs: Sequence[Photograph]) -> list[Photograph]:
+    """Return the photographs in the folder of the view of a row, all if there is no such folder."""
+    of_view = [p for p in photographs if row.view and _in_folder(p, row.view)]
+    return of_view or list(photographs)
+
+
+def _in_folder(photograph: Photograph, view: str) -> bool:
+    folder = photograph.folder.casefold()
+    return folder == view.casefold() or folder.endswith("/" + view.casefold())
+
+
+def _by_name(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) -> Matching:
+    """Compare names, the strictest way first."""
+    named = [k for k, row in enumerate(rows) if row.image]
+    best: dict[int, list[Photograph]] = {}
+    for how, key in _KEYS:
+        if key is _number and not all(rows[k].image.isdigit() for k in named):
+            continue
+        by_key: dict[str, list[Photograph]] = {}
+        for photograph in photographs:
+            by_key.setdefault(key(photograph.name), []).append(photograph)
+        found = {}
+        for k in named:
+            same = by_key.get(key(rows[k].image), [])
+            if same and rows[k].view:
+                same = _candidates(rows[k], same)
+            if same and key(rows[k].image):
+                most = max(_alike(photograph, rows[k].image) for photograph in same)
+                found[k] = [p for p in same if _alike(p, rows[k].image) == most]
+        if len(found) == len(named):
+            return _named_once(rows, found, how, table)
+        if len(found) > len(best):
+            best = found
+    problems = []
+    taken = {photograph.name for same in best.values() for photograph in same}
+    for k in named:
+        if k not in best:
+            near = closest(rows[k].image, [p.name for p in photographs if p.name not in taken])
+            problems.append(
+                f"{rows[k].where}, column image: the photograph could not be found: found no "
+                f"{describe(rows[k].image)}, needed one of the {len(photographs)} photographs; "
+                f"{near}"
+            )
+    if len(best) == 0 and len(problems) > 1:
+        problems = [
+            f"{table}: the photographs could not be matched by name: found none that is named like "
+            f"{describe(rows[named[0]].image)}, needed the names of files such as "
+            f"{describe(photographs[0].name)}; correct the column image, or give --match order."
+        ]
+    raise DatasetError(problems)
+
+
+def _named_once(
+    rows: Sequence[Row], found: dict[int, list[Photograph]], how: str, table: str
+) -> Matching:
+    """Return the pairs if every photograph has one row, and every row one photograph a view."""
+    row_of: dict[str, int] = {}
+    problems = []
+    for k, same in found.items():
+        folders = [photograph.folder for photograph in same]
+        if len(set(folders)) < len(folders) or (rows[k].view and len(same) > 1):
+            problems.append(
+                f"{rows[k].where}, column image: the photograph could not be decided: found "
+                f"{describe(rows[k].image)} for {few([p.name for p in same])}, needed one; write "
+                "the name with its folder and extension."
+            )
+        for photograph in same:
+            if row_of.setdefault(photograph.name, k) != k:
+                problems.append(
+                    f"{rows[k].where}, column image: the photograph could not be decided: found "
+                    f"{describe(photograph.name)} also for {rows[row_of[photograph.name]].where}, "
+                    "needed one row a photograph; add a column view, or write names with folders."
+                )
+    if problems:
+        raise DatasetError(problems)
+    blank = [row.where for k, row in enumerate(rows) if k not in found]
+    notes = (
+        f"{len(blank)} row{'s' * (len(blank) > 1)} of {table} without the name of a photograph "
+        f"{'are' if len(blank) > 1 else 'is'} left out.",
+    )
+    return Matching(_sorted(rows, found.items()), how, notes if blank else ())
+
+
+def _sorted(
+    rows: Sequence[Row], found: Iterable[tuple[int, Sequence[Photograph]]]
+) -> tuple[tuple[int, Photograph], ...]:
+    """Return pairs in the order of views and, in each, of rows."""
+    pairs = [(k, photograph) for k, same in found for photograph in same]
+    folders: dict[str, int] = {}
+    for k, photograph in pairs:
+        folders.setdefault(rows[k].view or photograph.folder, len(folders))
+    pairs.sort(key=lambda pair: (folders[rows[pair[0]].view or pair[1].folder], pair[0]))
+    return tuple(pairs)
+
+
+def _in_order(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) -> Matching:
+    """Take rows and photographs one by one: in each view, in all, or all rows in each folder."""
+    folders: dict[str, list[Photograph]] = {}
+    for photograph in photographs:
+        folders.setdefault(photograph.folder, []).append(photograph)
+    views: dict[str, list[int]] = {}
+    for k, row in enumerate(rows):
+        views.setdefault(row.view, []).append(k)
+    if "" not in views and all(any(_in_folder(p, view) for p in photographs) for view in views):
+        groups = [
+            (f"view {view}", members, [p for p in photographs if _in_folder(p, view)])
+            for view, members in views.items()
+        ]
+        how = "in the order of rows and of names, view by view"
+    elif len(photographs) == len(rows):
+        groups = [("all folders", list(range(len(rows))), list(photographs))]
+        how = "in the order of rows and of names"
+    else:
+        groups = [
+            (f"folder {folder}", list(range(len(rows))), inside)
+            for folder, inside in folders.items()
+        ]
+        how = "in the order of rows and of names: every folder shows the poses of all rows"
+    problems = [
+        f"{table}: the photographs of {name} could not be matched in order: found {len(inside)} "
+        f"photographs for {len(members)} rows, needed as many; remove what has no partner, or add "
+        "a column image with their names."
+        for name, members, inside in groups
+        if len(members) != len(inside)
+    ]
+    if problems:
+        raise DatasetError(problems)
+    notes = []
+    pairs: list[tuple[int, Photograph]] = []
+    for name, members, inside in groups:
+        times = [_taken_at(photograph) for photograph in inside]
+        known = [when for when in times if when is not None]
+        if len(known) == len(times) and known != sorted(known):
+            notes.append(
+                f"The photographs of {name} were not taken in the order of their names, as their "
+                "EXIF times say; see that the rows are in the order of the names, or add a column "
+                "image or time."
+            )
+        pairs += zip(members, inside, strict=True)
+    return Matching(tuple(pairs), how, tuple(notes))
+
+
+def _taken_at(photograph: Photograph) -> datetime | None:
+    """Return when a photograph was taken, as its file says."""
+    try:
+        return _moment(read_facts(read_bytes(photograph.path, MAX_IMAGE)).taken_at)
+    except OSError:
+        return None
+
+
+def _moment(text: str, day: date | None = None) -> datetime | None:
+    """Return the time in a text: ISO 8601, as EXIF writes it, or of the day alone."""
+    text = _EXIF_DATE.sub(r"\1-\2-\3", text.strip(), count=1)
+    try:
+        return datetime.fromisoformat(text).replace(tzinfo=None)
+    except ValueError:
+        pass
+    try:
+        return None if day is None else datetime.combine(day, time.fromisoformat(text))
+    except ValueError:
+        return None
+
+
+def _by_time(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) -> Matching:
+    """Give each row the photograph taken nearest to its time.
+
+    Clocks may differ by a constant where there are as many photographs as rows.
+    """
+    taken = {p.name: when for p in photographs if (when := _taken_at(p)) is not None}
+    dated = sorted((p for p in photographs if p.name in taken), key=lambda p: taken[p.name])
+    if len(dated) < len(rows):
+        raise DatasetError(
+            f"{table}: the photographs could not be matched by time: found {len(dated)} "
+            f"photographs with a time in their EXIF data for {len(rows)} rows, needed as many or "
+            "more; copy the files from the camera as they are, or add a column image."
+        )
+    day = taken[dated[0].name].date()
+    times = [_moment(row.time, day) for row in rows]
+    bad = [
+        f"{row.where}, column time: the time could not be read: found {describe(row.time)}, needed "
+        "one such as 2026-11-23 10:15:00; correct the cell."
+        for row, when in zip(rows, times, strict=True)
+        if when is None
+    ]
+    if bad:
+        raise DatasetError(bad)
+    moments = [when for when in times if when is not None]
+    order = sorted(range(len(rows)), key=lambda k: moments[k])
+    gaps = [moments[b] - moments[a] for a, b in pairwise(order)]
+    least = min(gaps, default=timedelta(days=1))
+    shift = timedelta()
+    if len(dated) == len(rows):
+        apart = [taken[p.name] - moments[k] for k, p in zip(order, dated, strict=True)]
+        shift = sorted(apart)[len(apart) // 2]
+        pairs = dict(zip(order, dated, strict=True))
+    else:
+        pairs = {k: min(dated, key=lambda p: abs(taken[p.name] - moments[k])) for k in order}
+    worst = max(abs(taken[p.name] - moments[k] - shift) for k, p in pairs.items())
+    if len({p.name for p in pairs.values()}) < len(rows) or 2 * worst >= least:
+        raise DatasetError(
+            f"{table}: the photographs could not be matched by time: found times up to "
+            f"{worst.total_seconds():.0f} s apart and rows {least.total_seconds():.0f} s apart, "
+            "needed less than half of that; leave out photographs without a row, so that a "
+            "difference of the clocks shows, or add a column image."
+        )
+    about = f", clocks {shift.total_seconds():+.0f} s apart" if shift else ""
+    found = [(k, [p]) for k, p in sorted(pairs.items())]
+    return Matching(_sorted(rows, found), f"by time, within {worst.total_seconds():.0f} s{about}")

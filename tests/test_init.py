@@ -1,0 +1,290 @@
+"""``legcal init``: a dataset from photographs and a table as their owner has them."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from command_line import run
+from csv_rows import read_rows
+from hexapod_example import HEXAPOD
+from photograph_files import exif, jpeg
+
+from legcal import load_dataset
+
+PICTURE = np.zeros((48, 64), np.uint8)
+CAMERA = """image_width: 64
+image_height: 48
+camera_name: c
+camera_matrix: {rows: 3, cols: 3, data: [80, 0, 32, 0, 80, 24, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}
+"""
+LEGS = [f"leg{j}" for j in range(1, 7)]
+
+
+def own_folder(
+    tmp_path: Path, photographs: Sequence[str], taken: Mapping[str, str] | None = None
+) -> Path:
+    """Write photographs and the file of their camera."""
+    for k, name in enumerate(photographs):
+        path = tmp_path / "photos" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        said = {"taken": taken[name]} if taken else {}
+        path.write_bytes(jpeg(PICTURE + np.uint8(k), block=exif(**said)))
+    (tmp_path / "camera_info.yaml").write_text(CAMERA)
+    return tmp_path
+
+
+def readings(k: int) -> list[float]:
+    """Return readings of row k inside the travel of the shipped hexapod [mm]."""
+    return [10.0 + 7.0 * k + j for j in range(6)]
+
+
+def table(
+    folder: Path,
+    columns: Mapping[str, Sequence[str]] | None = None,
+    n: int = 3,
+    *,
+    names: Sequence[str] = LEGS,
+    factor: float = 1.0,
+    add: float = 0.0,
+    separator: str = ",",
+) -> None:
+    """Write a table of readings: some columns, and one for each leg."""
+    columns = columns or {}
+    lines = [[*columns, *names]]
+    for k in range(n):
+        numbers = [f"{factor * (q + add):.6g}" for q in readings(k)]
+        lines.append([*(cells[k] for cells in columns.values()), *numbers])
+    text = "\n".join(separator.join(line) for line in lines) + "\n"
+    if separator != ",":
+        text = text.replace(".", ",")
+    (folder / "own.csv").write_text(text)
+
+
+def init(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str, output: str = "dataset"
+) -> int:
+    return run(
+        monkeypatch, "init", folder / "photos", "--readings", folder / "own.csv",
+        "--model", "hexapod", "-o", folder / output, *words,
+    )  # fmt: skip
+
+
+def pairs(folder: Path) -> list[tuple[str, str, int]]:
+    """Return view, image and number of the readings of each row that was written."""
+    rows = read_rows(folder / "dataset" / "measurements.csv")
+    number = {readings(k)[0]: k for k in range(20)}
+    return [
+        (row["view"], row["image"], number[round(1e3 * float(row["leg1_prismatic"]), 6)])
+        for row in rows
+    ]
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_lengths_in_mm_and_odd_names_give_the_dataset_of_the_example(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = ["Photo;" + ";".join(f"L{j} [mm]" for j in range(1, 7)) + ";Remark"]
+    for row in read_rows(HEXAPOD / "measurements.csv"):
+        k = int(row["image"][-6:-4])
+        path = tmp_path / "photos" / row["view"] / f"IMG_{k:04d}.JPG"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.hardlink_to(HEXAPOD / row["image"])
+        lengths = [1e3 * float(row[f"leg{j}_prismatic"]) + 345.0 for j in range(1, 7)]
+        numbers = ";".join(f"{length:.4f}".replace(".", ",") for length in lengths)
+        lines.append(f"{row['view']}\\img_{k:04d}.heic;{numbers};fine")
+    (tmp_path / "own.csv").write_text("\n".join(lines))
+    before = snapshot(tmp_path / "photos")
+    camera = HEXAPOD / "camera_info.yaml"
+    assert init(monkeypatch, tmp_path, "--camera", str(camera)) == 2
+    said = capsys.readouterr().err
+    assert "look like lengths of legs in mm; add --lengths" in said
+    words = ("--camera", str(camera), "--lengths", "--encoder-sigma", "2um")
+    assert init(monkeypatch, tmp_path, *words) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "45 photographs, 3 views, 6 encoders" in out
+    assert "whatever its extension" in out
+    assert "'Remark'" in out
+    assert snapshot(tmp_path / "photos") == before
+    made, example = load_dataset(tmp_path / "dataset"), load_dataset(HEXAPOD)
+    np.testing.assert_allclose(made.measurements.q, example.measurements.q, atol=1e-9)
+    assert made.measurements.sigma_q == example.measurements.sigma_q
+    for k in range(45):
+        one, two = made.image_path(k), example.image_path(k)
+        assert one is not None
+        assert two is not None
+        assert one.read_bytes() == two.read_bytes()
+
+
+FLAT = ("IMG_2.JPG", "IMG_10.JPG", "IMG_11.JPG")
+TWO = ("a/IMG_2.jpg", "a/IMG_10.jpg", "a/IMG_11.jpg", "b/IMG_3.jpg", "b/IMG_4.jpg", "b/IMG_12.jpg")
+SAME = ("a/1.png", "a/2.png", "a/3.png", "b/1.png", "b/2.png", "b/3.png")
+TIMES = ("2026:11:23 10:00:05", "2026:11:23 10:01:05", "2026:11:23 10:02:06")
+Columns = dict[str, Sequence[str]]
+MATCHED: list[tuple[Sequence[str], Columns, int, list[tuple[str, int]]]] = [
+    # photographs, columns, number of rows, and the photograph of each row
+    (FLAT, {}, 3, list(zip(FLAT, range(3), strict=True))),
+    (FLAT, {"Image": ("img_11.png", "IMG_2", "x/img_10.jpg")}, 3,
+     [("IMG_11.JPG", 0), ("IMG_2.JPG", 1), ("IMG_10.JPG", 2)]),
+    (FLAT, {"photo": ("10", "11", "2")}, 3,
+     [("IMG_10.JPG", 0), ("IMG_11.JPG", 1), ("IMG_2.JPG", 2)]),
+    (TWO, {}, 3, [*zip(TWO[:3], range(3), strict=True), *zip(TWO[3:], range(3), strict=True)]),
+    (TWO, {}, 6, list(zip(TWO, range(6), strict=True))),
+    (TWO, {"view": ("b", "b", "b", "a", "a", "a")}, 6,
+     [*zip(TWO[3:], range(3), strict=True), *zip(TWO[:3], range(3, 6), strict=True)]),
+    (SAME, {"file": ("3.jpg", "1.jpg", "2.jpg")}, 3,
+     [(f"{v}/{i}.png", k) for v in "ab" for k, i in enumerate((3, 1, 2))]),
+    (SAME, {"camera": "abba", "name": "1122"}, 4,
+     [("a/1.png", 0), ("a/2.png", 3), ("b/1.png", 1), ("b/2.png", 2)]),
+    (FLAT, {"time": ("10:02:00", "10:00", "10:01")}, 3,
+     [("IMG_11.JPG", 0), ("IMG_2.JPG", 1), ("IMG_10.JPG", 2)]),
+    # clocks an hour apart
+    (FLAT, {"Time": tuple(f"2026-11-23T11:0{i}:03" for i in (1, 0, 2))}, 3,
+     [("IMG_10.JPG", 0), ("IMG_2.JPG", 1), ("IMG_11.JPG", 2)]),
+    (FLAT, {"time": ("10:02:00", "10:00")}, 2, [("IMG_11.JPG", 0), ("IMG_2.JPG", 1)]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("photographs", "columns", "n", "expected"), MATCHED)
+def test_photographs_are_matched_by_name_order_or_time(
+    photographs: Sequence[str],
+    columns: Columns,
+    n: int,
+    expected: list[tuple[str, int]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    taken = dict(zip(FLAT, TIMES, strict=True)) if photographs is FLAT else None
+    table(own_folder(tmp_path, photographs, taken), columns, n)
+    assert init(monkeypatch, tmp_path) == 0
+    found = pairs(tmp_path)
+    names = [(image.removeprefix("images/"), k) for _, image, k in found]
+    assert names == expected
+    folders = [Path(name).parent.name or "c1" for name, _ in names]
+    assert [view for view, *_ in found] == folders
+    load_dataset(tmp_path / "dataset")
+
+
+@pytest.mark.parametrize(
+    ("names", "factor", "add", "words"),
+    [
+        (LEGS, 1.0, 0.0, ()),  # mm, found from the travel
+        (LEGS, 1e-3, 0.0, ()),
+        ([f"Leg {j} (um)" for j in range(1, 7)], 1e3, 0.0, ()),
+        ([f"q{j}_cm" for j in range(1, 7)], 0.1, 0.0, ()),
+        ([str(j) for j in range(6)], 0.1, 0.0, ("--unit", "cm")),
+        ([f"LEG{j}_prismatic/mm" for j in range(1, 7)], 1.0, 345.0, ("--lengths",)),
+        (LEGS, 1e-3, 345.0, ("--lengths",)),
+    ],
+)
+def test_units_and_columns_are_found(
+    names: Sequence[str],
+    factor: float,
+    add: float,
+    words: Sequence[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    table(own_folder(tmp_path, FLAT), names=names, factor=factor, add=add, separator=";")
+    assert init(monkeypatch, tmp_path, *words) == 0
+    assert [k for *_, k in pairs(tmp_path)] == [0, 1, 2]
+
+
+REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]] = [
+    # photographs, table, words of the command, what must be named
+    (FLAT, {"n": 2}, (), ("3 photographs for 2 rows", "column image")),
+    (FLAT, {"columns": {"image": ("IMG_2", "IMG_10", "IMG_12")}}, (),
+     ("row 3 (line 4)", "'IMG_12'", "'IMG_11.JPG'")),
+    (FLAT, {"columns": {"image": ("a", "b", "c")}}, (), ("'a'", "'IMG_2.JPG'", "--match order")),
+    (FLAT, {"columns": {"image": ("IMG_2", "img_2.jpg", "IMG_10")}}, (), ("row 2", "row 1")),
+    (("1.jpg", "1.png", "2.png"), {"columns": {"image": "112"}}, (), ("row 1", "1.jpg, 1.png")),
+    (SAME, {"n": 6, "columns": {"image": "123123"}}, (), ("a/1.png", "column view")),
+    (FLAT, {"names": LEGS[:5]}, (), ("leg6", "'leg5'")),
+    (FLAT, {"names": ["a", "b", "c", "d", "e", "f"]}, (), ("'a'", "L1, q1, 1")),
+    (FLAT, {"names": [*LEGS[:5], "leg5 mm"]}, (), ("'leg5'", "'leg5 mm'")),
+    (FLAT, {"add": 345.0}, (), ("lengths of legs in mm", "add --lengths")),
+    (FLAT, {}, ("--lengths",), ("readings in mm", "leave out --lengths")),
+    (FLAT, {}, ("--unit", "m"), ("readings in mm", "give the unit mm")),
+    (FLAT, {"add": 5000.0}, (), ("travel of the model", "-4 to 144 mm")),
+    (FLAT, {"names": [f"{leg} [mm]" for leg in LEGS]}, ("--unit", "m"), ("m and mm", "--unit")),
+    (FLAT, {}, ("--unit", "inch"), ("'inch'", "um")),
+    (FLAT, {}, ("--camera", "c7=x.yaml"), ("c7=x.yaml", "c1")),
+    (FLAT, {}, ("--camera", "missing.yaml"), ("missing.yaml",)),
+    (FLAT, {}, ("--camera", str(HEXAPOD / "camera_info.yaml")), ("IMG_2.JPG", "64 x 48", "1024")),
+    (FLAT, {}, ("--match", "time"), ("by time", "column 'time'")),
+    (FLAT, {"columns": {"time": ("10:00", "x", "10:02")}}, (), ("EXIF",)),
+    (FLAT, {}, ("--views", "c9"), ("c9", "--views")),
+    (("IMG_1.HEIC", "IMG_2.HEIC"), {}, (), ("2 of another format", "IMG_1.HEIC", "JPEG")),
+    ((), {}, (), ("no such folder",)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("photographs", "content", "words", "named"), REFUSED)
+def test_what_cannot_become_a_dataset_is_refused_and_nothing_written(
+    photographs: Sequence[str],
+    content: dict[str, Any],
+    words: Sequence[str],
+    named: Sequence[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    table(own_folder(tmp_path, photographs), **content)
+    assert init(monkeypatch, tmp_path, *words) == 2
+    said = capsys.readouterr().err
+    assert said.count("legcal: ") == 1
+    assert all(word in said for word in named), said
+    assert not (tmp_path / "dataset").exists()
+
+
+def test_nothing_is_overwritten_without_force_and_nothing_is_written_into_the_photographs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table(own_folder(tmp_path, FLAT))
+    assert init(monkeypatch, tmp_path, output="photos/dataset") == 2
+    assert "folder of the photographs, which is not changed" in capsys.readouterr().err
+    assert init(monkeypatch, tmp_path, "--dry-run") == 0
+    assert not (tmp_path / "dataset").exists()
+    # beside the photographs: they are named where they are
+    (tmp_path / "camera_info.yaml").rename(tmp_path / "lens.yaml")
+    words = ("--camera", str(tmp_path / "lens.yaml"), "--json")
+    capsys.readouterr()
+    assert init(monkeypatch, tmp_path, *words, output=".") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert [image["image"] for image in document["images"]] == [f"photos/{x}" for x in FLAT]
+    assert not (tmp_path / "images").exists()
+    assert load_dataset(tmp_path).measurements.n_rows == 3
+    before = snapshot(tmp_path)
+    table(tmp_path, add=1.0)
+    assert init(monkeypatch, tmp_path, *words, output=".") == 2
+    assert "dataset.yaml, measurements.csv, camera_info.yaml already" in capsys.readouterr().out
+    assert {path for path, x in snapshot(tmp_path).items() if x != before.get(path)} == {
+        str(tmp_path / "own.csv")
+    }
+    assert init(monkeypatch, tmp_path, *words, "--force", output=".") == 0
+    assert load_dataset(tmp_path).measurements.q[0, 0] == pytest.approx(0.011)
+
+
+def test_hostile_names_do_no_harm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table(own_folder(tmp_path, ("a\x1b[31m.jpg",)), n=1, names=[*LEGS[:5], "leg6"])
+    assert init(monkeypatch, tmp_path) == 2
+    assert "\x1b" not in capsys.readouterr().err
+    (tmp_path / "photos/a\x1b[31m.jpg").rename(tmp_path / "photos/[red]b.jpg")
+    table(tmp_path, {"../x\x1b[2J": ["=1+1"], "image": ["../[red]b.jpg"]}, n=1)
+    assert init(monkeypatch, tmp_path) == 0
+    said = capsys.readouterr().out
+    assert "\x1b" not in said
+    assert "[red]b.jpg" in said
+    entry = yaml.safe_load((tmp_path / "dataset/dataset.yaml").read_text())
+    assert entry["views"] == {"c1": {"camera": "camera_info.yaml"}}
+    assert pairs(tmp_path) == [("c1", "images/[red]b.jpg", 0)]
