@@ -16,10 +16,12 @@ from legcal.errors import DatasetError
 from legcal.files.schema import _PLAIN_TEXT, _Loader, _QuickLoader
 from legcal.vision import read_camera
 
-PARTS = 4
+PARTS = 4  # of 2000 files
 
 
-@pytest.mark.parametrize("part", range(PARTS))
+@pytest.mark.parametrize(
+    "part", [0, *(pytest.param(part, marks=pytest.mark.system) for part in range(1, PARTS))]
+)
 def test_mutated_files_are_used_or_refused_in_time_and_memory(part: int) -> None:
     cases = drawn_cases(2000, seed=0, deep_share=0.0)[part::PARTS]
     count = count_cases(cases)
@@ -28,8 +30,9 @@ def test_mutated_files_are_used_or_refused_in_time_and_memory(part: int) -> None
     assert min(count.codes["0"], count.codes["2"]) > 0
 
 
-def test_files_made_to_do_harm_are_refused_in_time_and_memory() -> None:
-    names, cases, words = zip(*harmful_files(), strict=True)
+@pytest.mark.parametrize("largest", [False, pytest.param(True, marks=pytest.mark.system)])
+def test_files_made_to_do_harm_are_refused_in_time_and_memory(largest: bool) -> None:
+    names, cases, words = zip(*harmful_files(largest=largest), strict=True)
     found = [
         (name, ended.code, ended.fault, ended.message[:200])
         for name, word, ended in zip(names, words, run_cases(cases), strict=True)
@@ -38,19 +41,21 @@ def test_files_made_to_do_harm_are_refused_in_time_and_memory() -> None:
     assert not found
 
 
-def test_outlines_of_most_unequal_claims_are_used_or_refused() -> None:
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.system) for seed in range(1, 4))]
+)
+def test_outlines_of_most_unequal_claims_are_used_or_refused(seed: int) -> None:
     (subject,) = (subject for subject in SUBJECTS if subject.name.endswith("observations.csv"))
     n_rows = outlines_with({}).count(b"\n") - 1
-    for seed in range(4):
-        chance = np.random.default_rng(seed)
-        changes = {}
-        for row in (1 + np.flatnonzero(chance.random(n_rows) < 0.2)).tolist():
-            s00, s11 = (10.0 ** chance.uniform(-8.5, 3.9, 2)).tolist()
-            s01 = chance.uniform(-0.9, 0.9) * (s00 * s11) ** 0.5
-            changes[row] = {"s00": s00, "s01": s01, "s11": s11}
-        (ended,) = run_cases([Case(subject, seed, made=outlines_with(changes))])
-        assert not ended.fault, (ended.case.name, ended.fault)
-        assert ended.code in (0, 1)
+    chance = np.random.default_rng(seed)
+    changes = {}
+    for row in (1 + np.flatnonzero(chance.random(n_rows) < 0.2)).tolist():
+        s00, s11 = (10.0 ** chance.uniform(-8.5, 3.9, 2)).tolist()
+        s01 = chance.uniform(-0.9, 0.9) * (s00 * s11) ** 0.5
+        changes[row] = {"s00": s00, "s01": s01, "s11": s11}
+    (ended,) = run_cases([Case(subject, seed, made=outlines_with(changes))])
+    assert not ended.fault, (ended.case.name, ended.fault)
+    assert ended.code in (0, 1)
 
 
 def test_pipes_devices_and_folders_are_never_read() -> None:

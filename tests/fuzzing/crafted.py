@@ -19,18 +19,21 @@ DETECT = "detect {in} -o {out}"
 CALIBRATE = "calibrate {in} -o {out}"
 
 
-def harmful_files() -> Iterator[tuple[str, Case, str]]:
-    """Yield a name, the file, and a word of the refusal."""
-    for name, text, word in _yaml():
+def harmful_files(*, largest: bool) -> Iterator[tuple[str, Case, str]]:
+    """Yield a name, the file, and a word of the refusal.
+
+    The largest are as large as is read: each takes seconds. Others say the same of smaller ones.
+    """
+    for name, text, word in _yaml(900_000 if largest else 150_000):
         for file in ("small:dataset.yaml", "small:camera_info.yaml")[: 1 + (len(text) < 10_000)]:
             yield f"{name} as {file}", Case(_NAMED[file], made=text), word
     for name, file, made, word in (
         *_names(),
-        *_tables(),
+        *_tables(40_000 if largest else 4_000),
         *_outlines(),
         *_results(),
-        *_models(),
-        *_images(),
+        *_models(199 if largest else 99),
+        *_images(10_000 if largest else 3_000),
     ):
         yield f"{name} as {file}", Case(_NAMED[file], made=made), word
 
@@ -60,7 +63,7 @@ def special_files() -> Iterator[tuple[str, Case]]:
             yield f"{special} as {case.subject.name}", case
 
 
-def _yaml() -> Iterator[tuple[str, bytes, str]]:
+def _yaml(n_numbers: int) -> Iterator[tuple[str, bytes, str]]:
     merged = ["a0: &a0 {x: 1, y: 2}"]
     lists = ["a0: &a0 [1, 2]"]
     for k in range(1, 12):
@@ -70,7 +73,7 @@ def _yaml() -> Iterator[tuple[str, bytes, str]]:
     yield "aliases", "\n".join(lists).encode(), "values"
     yield "deep nesting", b"a: " + b"[" * 100_000, "levels"
     yield "deep mappings", b"a: " + b"{a: " * 30_000, "levels"
-    yield "many numbers", b"a: [" + b"1," * 900_000 + b"]", "values"
+    yield "many numbers", b"a: [" + b"1," * n_numbers + b"]", "values"
     yield "more numbers", b"a: [" + b"1," * 1_900_000 + b"]", "at most 2000000"
     yield "two million numbers", b"a: [" + b"1," * 2_000_000 + b"]", "at most 2000000"
     yield "more keys", b"".join(b"k%d: 1\n" % k for k in range(350_000)), "bytes"
@@ -105,7 +108,7 @@ def _names() -> Iterator[tuple[str, str, bytes, str]]:
     yield "an unknown frame", "formats:gepetto/robot.yaml", made, "leg1_ent"
 
 
-def _tables() -> Iterator[tuple[str, str, bytes, str]]:
+def _tables(n_bad: int) -> Iterator[tuple[str, str, bytes, str]]:
     table = "small:measurements.csv"
     lines = (made_input("small") / "measurements.csv").read_bytes().splitlines()
     for digits in (b"1" * 130_000 + b"x", b"1" * 130_000, b"." + b"1" * 130_000 + b"e"):
@@ -117,7 +120,7 @@ def _tables() -> Iterator[tuple[str, str, bytes, str]]:
     yield "columns", table, b",".join(b"c%d" % k for k in range(350_000)), "columns"
     yield "unknown columns", table, b",".join([*(b"c%d" % k for k in range(299)), b"x\n1"]), "c1"
     yield "one column many times", table, b",".join([b"view"] * 300) + b"\n1", "times"
-    yield "bad cells", table, lines[0] + b"\n" + b"\n".join([b"x" + lines[1]] * 40_000), "view"
+    yield "bad cells", table, lines[0] + b"\n" + b"\n".join([b"x" + lines[1]] * n_bad), "view"
     long_name = lines[1].replace(b"images/c1_1.png", b"=HYPERLINK(%s)" % (b"x" * 90_000))
     yield "a formula", table, b"\n".join([lines[0], *[long_name] * 40]), "= + - @"
     escape = lines[1].replace(b"images/c1_1.png", b"\x1b[31mred.png")
@@ -158,11 +161,11 @@ def _results() -> Iterator[tuple[str, str, bytes, str]]:
     yield "degrees of freedom", "result:result/result.json", made, "residuals.dof could not"
 
 
-def _models() -> Iterator[tuple[str, str, bytes, str]]:
+def _models(n_joints: int) -> Iterator[tuple[str, str, bytes, str]]:
     for n, word in ((9000, "needed"), (900, "move")):
         yield f"{n} revolutes", "formats:loops.urdf", _chain(n, "revolute"), word
     yield "900 fixed joints", "formats:loops.urdf", _chain(900, "fixed"), ""
-    yield "199 revolutes", "formats:loops.urdf", _chain(199, "revolute"), ""
+    yield f"{n_joints} revolutes", "formats:loops.urdf", _chain(n_joints, "revolute"), ""
     planar = (made_input("formats") / "planar.xml").read_bytes()
     made = planar.replace(b'"b1" axis="0 0 1"', b'"b1" axis="0.1 0 1"')
     yield "an axis in the plane of slider and leg", "formats:planar.xml", made, "b1"
@@ -197,11 +200,12 @@ def _chain(n: int, kind: str) -> bytes:
     return b"".join(parts)
 
 
-def _images() -> Iterator[tuple[str, str, bytes, str]]:
+def _images(n_px: int) -> Iterator[tuple[str, str, bytes, str]]:
     for size in (30_000, 2**31 - 1):
         yield f"{size} px", "settings:board.png", _png(size), "at most 30000 px"
         yield f"{size} px", "small:images/c1_1.png", _png(size), "px"
-    yield "10,000 px", "settings:board.png", _png(10_000, rows=bytes(100_010_000)), "nothing like"
+    made = _png(n_px, rows=bytes(n_px * (n_px + 1)))
+    yield f"{n_px} px", "settings:board.png", made, "nothing like"
     named = _png(64, b"\x1b[3m")
     yield "a chunk of escapes", "small:images/c1_1.png", named[:-20] + b"\0" + named[-19:], ""
     heads = (
