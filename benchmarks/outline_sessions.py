@@ -11,8 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration import (
@@ -27,12 +29,15 @@ from legcal.calibration import (
 )
 from legcal.data import Measurements, Outlines, View, axes_from_outlines
 from legcal.errors import DidNotConverge
+from legcal.files import read_yaml
 from legcal.geometry import Array, IntArray
 from legcal.machine import (
     Leg,
     LegKind,
     Machine,
     Parametrization,
+    create_model,
+    description_of,
     geometries,
     load_mechanism,
     moved_legs,
@@ -74,17 +79,21 @@ SHIPPED = (
     "tricept",
     "3-rpr",
 )
-_SIX_LEGS = (NONCOPLANAR, COPLANAR, *SHIPPED[:5])
-_MOST_LEGS = 4  # of six that a view is said to see, as in the paper
+KINDS = Path(__file__).with_name("machine_kinds.yaml")
+_MANY_LEGS, _MOST_LEGS = 6, 4  # of six or more that a view is said to see, as in the paper
 _SEED = 2002  # of what is the same in all runs
 _CLOSED = 1e-13  # [m]
+WAY = (0.25, 0.5, 0.75)  # parts of the way from home to readings
 
 
 # True machines before their cameras
 
 
 def true_machine(name: str) -> Machine:
-    """Return a true machine of the studies: one of ``MACHINES``, or a shipped model."""
+    """Return a true machine of the studies: of ``MACHINES``, of ``kinds()``, or a shipped model."""
+    if name in kinds():
+        with tempfile.TemporaryDirectory(prefix="legcal-study-") as folder:
+            return made(name, Path(folder))
     if name not in (COPLANAR, NONCOPLANAR):
         return load_mechanism(name)
     flat = load_mechanism("hexapod")
@@ -97,6 +106,22 @@ def true_machine(name: str) -> Machine:
     )
     with tempfile.TemporaryDirectory(prefix="legcal-study-") as folder:
         return load_mechanism(write_model_with(flat, legs, flat.home, Path(folder), {}))
+
+
+@lru_cache(maxsize=1)
+def kinds() -> dict[str, dict[str, Any]]:
+    """Return the tables of machines that are not shipped, by name."""
+    return dict(read_yaml(KINDS, "table"))
+
+
+def made(kind: str, folder: Path) -> Machine:
+    """Write a machine that is not shipped as a model and load it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    table = folder / f"{kind}-table.yaml"
+    text = {"legcal_table": 1, "name": kind, "unit": "mm", **kinds()[kind]}
+    table.write_text(yaml.safe_dump(text, sort_keys=False))
+    described = description_of(table, family=None, unit=None, name=None, dimensions={})
+    return create_model(described, folder, force=True).machine
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +185,7 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
     B_base = np.array([machine.T_base_Rb.apply(points) for points in B])
     A_base = np.array([machine.A for machine in machines])
     outlines = outlines_of(Scene(A_base, B_base, views, images), OutlineNoise(sigma_px, None))
-    most = _MOST_LEGS if name in _SIX_LEGS else machine.n_legs
+    most = _MOST_LEGS if machine.n_legs >= _MANY_LEGS else machine.n_legs
     seen = []
     for v in range(n_views):
         rows = np.flatnonzero(images.view == v)
@@ -325,8 +350,14 @@ def nominal_start(session: OutlineSession) -> Start:
     """Return the nominal model, moved from home to the readings, and the rough cameras."""
     measurements, legs = session.measurements, session.legs
     cameras = cameras_from_hints(measurements, RigidTransform.identity())
-    home = (session.home,) * measurements.n_poses
-    return start_from(legs.nominal, measurements, legs, cameras, home, "nominal")
+    poses: Sequence[RigidTransform] = (session.home,) * measurements.n_poses
+    B = session.home.apply([leg.B for leg in legs.nominal])
+    home = np.linalg.norm(B - [leg.A for leg in legs.nominal], axis=1)
+    q0 = np.array([leg.q0 for leg in legs.nominal])
+    wanted = legs.sign * measurements.q[measurements.first_rows] + q0
+    for part in WAY:
+        poses = platform_poses(legs.nominal, home + part * (wanted - home), poses, legs.frame_legs)
+    return start_from(legs.nominal, measurements, legs, cameras, poses, "nominal")
 
 
 def staged_legs(session: OutlineSession, criteria: Criteria) -> tuple[Leg, ...]:

@@ -94,7 +94,7 @@ def test_the_table_shows_signs_kinds_and_notes(tmp_path: Path) -> None:
     ("family", "found", "notes"),
     [
         ("4-RPR", "more than it needs", ["more motors than the pose needs: mobility 3"]),
-        ("8-SPS", "more than it needs", ["mobility 6, motors 8", "is singular at home"]),
+        ("8-SPS", "NOT determined", ["motors 8, which hold only 5", "is singular at home"]),
         ("3-SPS", "NOT determined", ["do not determine the pose: mobility 6"]),
         ("6-SS", "it cannot move", ["the platform cannot move: mobility 0"]),
     ],

@@ -58,7 +58,7 @@ def without_a_motor(name: str) -> Machine:
     machine = machine_of(name)
     legs = list(machine.legs)
     legs[1] = replace(legs[1], kind=LegKind.PASSIVE)
-    return replace(machine, legs=tuple(legs))
+    return replace(machine, legs=tuple(legs), motor_rank=machine.motor_rank - 1)
 
 
 # --- every shipped machine ----------------------------------------------------------------------

@@ -29,10 +29,11 @@ from legcal.data import (
     row_names,
 )
 from legcal.errors import DatasetError
-from legcal.geometry import Array, IntArray, components
+from legcal.geometry import Array, IntArray, components, product
 from legcal.machine import (
     Leg,
     Machine,
+    contradiction,
     followed_poses,
     geometries,
     list_in_words,
@@ -225,16 +226,38 @@ def nominal_poses(
             T[k] = pose
     B = machine.home.apply(machine.B_platform)
     most = MAX_NOMINAL_RESIDUAL * float(np.linalg.norm(B - machine.A_base, axis=1).mean())
-    problems = [
+    contradicting = _contradictions(machine, measurements, T)
+    problems = list(contradicting.values())
+    problems += [
         f"The readings of {_image_of(measurements, k)} could not be used: found that the legs of "
         f"the nominal model miss them by {1e3 * residual[k]:.1f} mm at the nearest pose, needed at "
         f"most {1e3 * most:.1f} mm; check these readings and legcal.home, or take the image out."
         for k in off
-        if not residual[k] <= most
+        if not residual[k] <= most and k not in contradicting
     ]
     if problems:
         raise DatasetError(problems)
     return tuple(T), residual
+
+
+def _contradictions(
+    machine: Machine, measurements: Measurements, T_Rb_Re: Sequence[RigidTransform]
+) -> dict[int, str]:
+    """Return a sentence on each pose at which readings of redundant motors contradict others."""
+    if not machine.is_redundant:
+        return {}
+    q = measurements.q[measurements.first_rows][:, list(machine.motors)]
+    from_Re = machine.T_platform_Re.inv()
+    found = [
+        contradiction(machine, product(machine.T_base_Rb, T, from_Re), row)
+        for T, row in zip(T_Rb_Re, q, strict=True)
+    ]
+    return {
+        k: f"The readings of {_image_of(measurements, k)} could not be used: found {words}; check "
+        "this reading, its encoder and the offset of the leg, or take the image out."
+        for k, words in enumerate(found)
+        if words is not None
+    }
 
 
 def _least_squares(

@@ -35,6 +35,8 @@ from .home import TRAVEL_MARGIN as TRAVEL_MARGIN
 from .home import home_of_legs as home_of_legs
 from .home import legs_outside as legs_outside
 from .kinematics import Follower as Follower
+from .kinematics import consistent_readings as consistent_readings
+from .kinematics import contradiction as contradiction
 from .kinematics import follow as follow
 from .kinematics import followed_poses as followed_poses
 from .kinematics import forward_kinematics as forward_kinematics
@@ -43,6 +45,7 @@ from .kinematics import inverse_kinematics as inverse_kinematics
 from .kinematics import platform_in_base as platform_in_base
 from .kinematics import platforms_in_base as platforms_in_base
 from .kinematics import pose_differences as pose_differences
+from .kinematics import reading_residuals as reading_residuals
 from .kinematics import solve_poses as solve_poses
 from .leg import Cylinder as Cylinder
 from .leg import EquationKind as EquationKind

@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge
 from legcal.geometry import Array, BoolArray, motions_of
 from legcal.machine.equations import PoseEquations, freedoms, pose_equations
-from legcal.machine.kinematics import follow, follow_poses, solve_poses
+from legcal.machine.kinematics import consistent_readings, follow, follow_poses, solve_poses
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.mobility import free_motions, project, singularities, singularity
 from legcal.machine.model import (
@@ -196,7 +196,12 @@ def _drawn_poses(
                 )
             (q,) = _random_readings(machine, generator, [share])
             readings, pose, is_reached = ahead.pop(0)
-            if share < 1.0 or not is_reached:
+            if machine.is_redundant:
+                if share < 1.0:
+                    ((readings, pose, is_reached),) = _reached(machine, q[None])
+                if not is_reached:
+                    continue
+            elif share < 1.0 or not is_reached:
                 configuration = _reached_on_the_chain(machine, q, tries)
                 if configuration is None:
                     continue
@@ -214,7 +219,7 @@ def _random_readings(
     motors = list(machine.motors)
     lower, upper = np.array([machine.legs[j].travel for j in motors]).T
     home = machine.home_configuration[slider_columns(machine, motors)[0]]
-    q = generator.uniform(lower, upper, (len(shares), len(motors)))
+    q = consistent_readings(machine, generator.uniform(lower, upper, (len(shares), len(motors))))
     share = np.asarray(shares)[:, None]
     return np.where(share < 1.0, np.clip(home + share * (q - home), lower, upper), q)
 
@@ -246,7 +251,8 @@ def _reached(machine: Machine, q: Array) -> Iterator[tuple[Array, Array, bool]]:
     lengths = np.linalg.norm(arms + poses[:, None, :, 3] - machine.A_base, axis=2)
     readings = machine.sign * (lengths - machine.q0)
     readings[:, [leg.kind is LegKind.CONSTANT for leg in machine.legs]] = 0.0
-    readings[:, motors] = q
+    if not machine.is_redundant:
+        readings[:, motors] = q
     least = MIN_SINGULARITY * singularity(machine, machine.home)
     usable = (part == 1.0) & ~_outside(machine, readings).any(axis=1)
     usable &= singularities(machine, poses) >= least

@@ -79,14 +79,17 @@ def _motor_notes(machine: Machine) -> list[str]:
     notes = []
     if machine.mobility == 0:
         return ["the platform cannot move: mobility 0; check the joints and axes of the legs."]
+    n_motors, rank = len(machine.motors), machine.motor_rank
     if not machine.is_determined:
-        n_motors = len(machine.motors)
-        found = "the motors do not determine the pose"
-        if n_motors > machine.mobility:
-            found = "there are more motors than the pose needs"
+        holding = "" if rank == n_motors else f", which hold only {rank} of its freedoms"
         notes.append(
-            f"{found}: mobility {machine.mobility}, motors {n_motors}; forward kinematics is "
-            "refused."
+            f"the motors do not determine the pose: mobility {machine.mobility}, motors "
+            f"{n_motors}{holding}; forward kinematics is refused."
+        )
+    elif machine.is_redundant:
+        notes.append(
+            f"there are more motors than the pose needs: mobility {machine.mobility}, motors "
+            f"{n_motors}; the pose at readings is that of least squares."
         )
     singular = singularity_note(machine)
     return notes if singular is None else [*notes, singular]

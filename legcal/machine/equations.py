@@ -123,6 +123,24 @@ def leg_equations(leg: Leg, R: Array, t: Array, *, by_local: bool = True) -> Pos
     )
 
 
+def least_squares_equations(found: PoseEquations) -> tuple[Array, Array]:
+    """Return equations (k, m) and derivatives (k, m, 6) that hold where readings miss least.
+
+    They are the constraints as they are, and of the residuals of readings what no small motion that
+    the constraints leave can undo; steps to their root are those of Gauss-Newton with the
+    constraints exact.
+    """
+    constraints, J = found.by_pose[:, ~found.measured], found.by_pose[:, found.measured]
+    left = J - J @ (np.linalg.pinv(constraints, rcond=_DEPENDENT) @ constraints)
+    U, singular, _ = np.linalg.svd(left, full_matrices=False)
+    U = np.swapaxes(U * (singular > _SINGULAR * singular[:, :1])[:, None], 1, 2)
+    residual = (U @ found.values[:, found.measured, None])[..., 0]
+    return (
+        np.concatenate([found.values[:, ~found.measured], residual], axis=1),
+        np.concatenate([constraints, U @ J], axis=1),
+    )
+
+
 def machine_equations(machine: Machine, R: Array, t: Array) -> PoseEquations:
     """Return all equations of a machine, its plane too, at poses of its links, without by_local."""
     found = pose_equations(machine.legs, R, t, by_local=False)
@@ -152,6 +170,7 @@ def freedoms(frame_legs: Sequence[int]) -> tuple[int, ...]:
 
 
 _SINGULAR = 1e-9  # of the largest singular value
+_DEPENDENT = 1e-7  # the same of constraints, some of which may say what others do
 
 
 def pose_sensitivity(
@@ -163,8 +182,9 @@ def pose_sensitivity(
 ) -> Array:
     """Return how parameters move R_e in R_b at given readings, (k, 6, p): rotation, displacement.
 
-    The equations of all legs hold before and after: F_pose d_pose + F_xi d_xi = 0. Where there are
-    more than freedoms (a 3-UPU that only translates) their squares are least.
+    The equations of all legs hold before and after: F_pose d_pose + F_xi d_xi = 0. Of redundant
+    motors the squares of the lengths are least, with the constraints exact; where constraints alone
+    are more than freedoms (a 3-UPU that only translates) those of all equations.
 
     Raises
     ------
@@ -186,8 +206,28 @@ def pose_sensitivity(
             "pose out."
         )
     moved = np.zeros((len(t), 6, len(parametrization)))
-    moved[:, columns] = -np.linalg.pinv(F) @ equations.by_parameters(parametrization)
+    by_parameters = equations.by_parameters(parametrization)
+    if not is_overdetermined(equations, columns):
+        moved[:, columns] = -np.linalg.pinv(F) @ by_parameters
+        return moved
+    read = equations.measured
+    C, D = F[:, ~read], by_parameters[:, ~read]
+    inverse = np.linalg.pinv(C, rcond=_DEPENDENT)
+    follow = -inverse @ D  # the constraints
+    left = np.eye(len(columns)) - inverse @ C
+    rest = by_parameters[:, read] + F[:, read] @ follow
+    moved[:, columns] = follow - np.linalg.pinv(F[:, read] @ left, rcond=_SINGULAR) @ rest
     return moved
+
+
+def is_overdetermined(equations: PoseEquations, columns: Sequence[int]) -> bool:
+    """Say whether there are more readings than the constraints leave freedoms at the first pose."""
+    n_constraints, n_read = int(np.sum(~equations.measured)), int(equations.measured.sum())
+    if n_read + n_constraints <= len(columns):
+        return False
+    constraints = equations.by_pose[0][~equations.measured][:, columns]
+    rank = np.linalg.matrix_rank(constraints, rtol=_DEPENDENT) if n_constraints else 0
+    return n_read > len(columns) - int(rank)
 
 
 _WORDS = {

@@ -17,10 +17,14 @@ from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry import Array, BoolArray, IntArray, motion_of, motions_of, product
 from legcal.machine.closing import close_at, closure_equations
 from legcal.machine.equations import (
+    PoseEquations,
     constraints_at,
     describe_worst,
+    equations_at,
     freedoms,
     is_constrained,
+    is_overdetermined,
+    least_squares_equations,
     machine_equations,
     pose_equations,
     violated_constraint,
@@ -49,6 +53,11 @@ RANDOM_ANGLES = 6  # other angles of all legs that are tried
 FEW_RESTARTS = 2  # of legs that do not close from there
 DEPENDENT = 1e-7  # of the largest singular value: equations that say the same
 MAX_POSE_ERROR = 0.01  # of a leg length: how far a given pose may be from a closed one
+MAX_CONTRADICTION = 0.03  # of a leg length: errors of a model, not of readings
+UNCHECKED = 1e-3  # redundancy of a reading that no other says anything about
+ALIKE = 0.9  # of the largest test: readings that explain a contradiction as well
+FEW_STEPS = 12  # of Newton's method at most, and
+REDUNDANT_STEPS = 40  # where readings contradict each other: convergence is linear there
 
 
 def forward_kinematics(
@@ -68,14 +77,16 @@ def forward_kinematics(
     Returns
     -------
     RigidTransform
-        T_base_platform, with every loop closed to 1e-12 m.
+        T_base_platform, with every loop closed to 1e-12 m. Where there are more motors than
+        freedoms the squares of what they miss are least: :func:`reading_residuals`.
 
     Raises
     ------
     NotIdentifiable
         If the motors do not determine the pose.
     DidNotConverge
-        If no closed pose is reached from ``start`` without crossing a singularity.
+        If no closed pose is reached from ``start`` without crossing a singularity, or readings of
+        redundant motors contradict each other by more than 3 % of a leg length.
     UsageError
         If the readings are too few or not finite.
     """
@@ -136,13 +147,17 @@ class Follower:
         Raises
         ------
         DidNotConverge
-            If no closed pose is reached without crossing a singularity; the configuration stays
-            where it was.
+            If no closed pose is reached without crossing a singularity, or readings contradict each
+            other; the configuration stays where it was.
         UsageError
             If the readings are too few or not finite.
         """
         readings = _readings(self._machine, np.asarray(q, dtype=np.float64)[None])[0]
-        self.configuration = follow(self._machine, self.configuration, readings)
+        reached = follow(self._machine, self.configuration, readings)
+        failure = _disagreement(self._machine, platform_pose(self._machine, reached), readings)
+        if failure is not None:
+            raise failure
+        self.configuration = reached
         return self.pose
 
 
@@ -180,7 +195,9 @@ def followed_poses(
     if not on_the_chain:
         poses, part = follow_poses(machine, machine.home, known[0], readings, LONG_STEP)
         if np.all(part == 1.0):
-            yield from ((T, None) for T in motions_of(poses[:, :, :3], poses[:, :, 3]))
+            followed = motions_of(poses[:, :, :3], poses[:, :, 3])
+            for i, (T, row) in enumerate(zip(followed, readings, strict=True)):
+                yield T, _disagreement(machine, T, row, f" of row {i + 1}")
             return
     configurations = [machine.home_configuration]
     for i, row in enumerate(readings):
@@ -190,9 +207,12 @@ def followed_poses(
         except DidNotConverge as failure:
             yield platform_pose(machine, nearest), failure
             continue
-        known.append(row)
-        configurations.append(configuration)
-        yield platform_pose(machine, configuration), None
+        T = platform_pose(machine, configuration)
+        contradicted = _disagreement(machine, T, row, f" of row {i + 1}")
+        if contradicted is None:
+            known.append(row)
+            configurations.append(configuration)
+        yield T, contradicted
 
 
 def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> Array:
@@ -230,6 +250,81 @@ def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> A
     return q
 
 
+def reading_residuals(machine: Machine, T_base_platform: RigidTransform, q: Array) -> Array:
+    """Return what readings q (n_legs,) miss at a pose, (n_legs,) [m]; zero for legs without motor.
+
+    They are zero up to rounding at the pose of forward kinematics unless motors are redundant.
+    """
+    motors, found = list(machine.motors), np.zeros(machine.n_legs)
+    found[motors] = np.asarray(q)[motors] - readings_at(machine, T_base_platform)[motors]
+    return found
+
+
+def consistent_readings(machine: Machine, readings: Array) -> Array:
+    """Return the nearest readings (k, n_motors) that motors can have together, linearly from home.
+
+    Readings of motors that are not redundant are returned as they are.
+    """
+    if not machine.is_redundant:
+        return readings
+    motors = list(machine.motors)
+    home = machine.home_configuration[slider_columns(machine, motors)[0]]
+    span = machine.sign[motors][:, None] * _reading_span(machine, machine.home)
+    return np.asarray(home + (readings - home) @ span @ span.T)
+
+
+def _reading_span(machine: Machine, T: RigidTransform) -> Array:
+    """Return a basis (n_motors, mobility) of how lengths change together near a pose."""
+    equations = equations_at(machine, T)
+    J = equations.by_pose[0][equations.measured]
+    C = equations.by_pose[0][~equations.measured]
+    J = J - J @ np.linalg.pinv(C, rcond=DEPENDENT) @ C
+    return np.linalg.svd(J, full_matrices=False)[0][:, : machine.mobility]
+
+
+def contradiction(machine: Machine, T: RigidTransform, readings: Array) -> str | None:
+    """Return in words which readings (n_motors,) of redundant motors contradict the others grossly.
+
+    The pose T_base_platform is that of least squares. Each reading in turn is taken for the wrong
+    one: the largest residual over the root of its redundancy names it. Where there is only one
+    motor too many, all explain the contradiction alike.
+    """
+    if not machine.is_redundant:
+        return None
+    motors = list(machine.motors)
+    span = _reading_span(machine, T)
+    redundancy = np.maximum(1.0 - np.sum(span**2, axis=1), UNCHECKED)
+    q = np.zeros(machine.n_legs)
+    q[motors] = readings
+    residual = np.abs(reading_residuals(machine, T, q)[motors])
+    test = residual / np.sqrt(redundancy)
+    worst, most = int(np.argmax(test)), MAX_CONTRADICTION * leg_scale(machine, T)
+    if test[worst] <= most:
+        return None
+    alike = [machine.leg_names[motors[i]] for i in np.flatnonzero(test > ALIKE * test[worst])]
+    alike.remove(machine.leg_names[motors[worst]])
+    others = f" (or as likely one of {', '.join(alike)})" if alike else ""
+    off = 1e3 * residual[worst] / redundancy[worst]
+    allowed = 1e3 * most / np.sqrt(redundancy[worst])
+    return (
+        f"the reading of leg '{machine.leg_names[motors[worst]]}'{others} {off:.1f} mm from where "
+        f"the other motors put it, needed at most {allowed:.1f} mm"
+    )
+
+
+def _disagreement(
+    machine: Machine, T: RigidTransform, readings: Array, which: str = ""
+) -> DidNotConverge | None:
+    """Return the error of readings (n_motors,) that contradict each other, None if they do not."""
+    found = contradiction(machine, T, readings)
+    if found is None:
+        return None
+    return DidNotConverge(
+        f"{machine.yaml_path}: the pose at the readings{which} could not be computed: found "
+        f"{found}; check this reading, its encoder and the offset of the leg."
+    )
+
+
 def _readings(machine: Machine, q: Array) -> Array:
     """Return the readings of the motors, (n_rows, n_motors), checked."""
     if q.ndim != 2 or q.shape[1] != machine.n_legs:
@@ -257,8 +352,9 @@ def _check_determined(machine: Machine) -> None:
     if not machine.is_determined:
         raise NotIdentifiable(
             f"{machine.yaml_path}: the pose cannot be computed from readings: found mobility "
-            f"{machine.mobility} and {len(machine.motors)} motors, needed as many motors as "
-            "mobility; correct name_mot, or do not ask for poses of this mechanism."
+            f"{machine.mobility} and {len(machine.motors)} motors that hold {machine.motor_rank} "
+            "of these freedoms, needed motors that hold all; correct name_mot, or do not ask for "
+            "poses of this mechanism."
         )
 
 
@@ -317,7 +413,8 @@ def solve_poses(
 
     *lengthening* (k, n_legs) is s q of actuated legs [m], NaN where unknown; without it poses move
     to the nearest at which the constraints hold. Where no pose meets all (parameters far from the
-    truth) the one with least squares is found. After few *steps* poses are only nearer.
+    truth) the one with least squares is found; of redundant motors that with least squares of the
+    lengths, the constraints exact. After few *steps* poses are only nearer.
     """
     fixed = np.ones(6, dtype=np.bool_)
     fixed[list(freedoms(frame_legs))] = False
@@ -337,7 +434,28 @@ def solve_poses(
 
     poses = np.concatenate([R, t[..., None]], axis=2)
     found = solve(equations, poses_after, poses, tolerance=1e-15, rank=DEPENDENT, steps=steps)
-    return SolvedPoses(found.points[:, :, :3], found.points[:, :, 3], found.worst, found.size)
+    poses, missed, size = found.points, found.worst, found.size
+    if lengthening is None or len(poses) == 0:
+        return SolvedPoses(poses[:, :, :3], poses[:, :, 3], missed, size)
+
+    def with_known(poses: Array) -> PoseEquations:
+        found = pose_equations(legs, poses[:, :, :3], poses[:, :, 3], by_local=False)
+        found.values[:, found.measured] -= lengthening[:, found.leg[found.measured]]
+        found.by_pose[:, :, fixed] = 0.0
+        return found.of(~found.measured | np.isfinite(lengthening[0, found.leg]))
+
+    if is_overdetermined(with_known(poses), freedoms(frame_legs)):
+        found = solve(
+            lambda poses: least_squares_equations(with_known(poses)),
+            poses_after,
+            poses,
+            tolerance=1e-15,
+            rank=DEPENDENT,
+            steps=steps,
+        )
+        poses, size = found.points, found.size
+        missed = np.abs(equations(poses)[0]).max(axis=1, initial=0.0)
+    return SolvedPoses(poses[:, :, :3], poses[:, :, 3], missed, size)
 
 
 def project_pose(
@@ -384,7 +502,8 @@ def follow(
 
     It is closed to 1e-12 m, in the same assembly mode, with no leg flipped. Steps are no shorter
     than a part *min_step* of the way. *on_the_chain* stops where the joints of the chain do: soon,
-    but in a place that depends on the spanning tree. *which* names the readings in the message.
+    but in a place that depends on the spanning tree. *which* names the readings in the message. Of
+    redundant motors the pose is followed that misses the readings least, and sliders stand there.
 
     Raises
     ------
@@ -413,16 +532,20 @@ def follow(
         configuration, known = reached, jacobian
         return True
 
-    done = walk_in_steps(attempt, min_step)
+    done = 0.0 if machine.is_redundant else walk_in_steps(attempt, min_step)
     if done == 1.0:
         return configuration
     T = platform_pose(machine, configuration)
     part = 0.0
-    if not on_the_chain:
+    if machine.is_redundant or not on_the_chain:
         now = configuration[q_columns]
         (pose,), (part,) = follow_poses(machine, T, now, readings[None], min_step)
         T = motion_of(pose[:, :3], pose[:, 3])
     if part < 1.0:
+        if machine.is_redundant:
+            failure = _disagreement(machine, _nearest(machine, T, readings), readings, which)
+            if failure is not None:
+                raise failure
         raise DidNotConverge(
             f"{machine.yaml_path}: the pose at the readings{which} could not be reached: at "
             f"{100 * (done + part * (1.0 - done)):.1f} % of the way from the starting pose the "
@@ -439,6 +562,19 @@ def follow(
             "cut spherical joints with 3d."
         )
     return closed
+
+
+def _nearest(machine: Machine, T: RigidTransform, readings: Array) -> RigidTransform:
+    """Return the pose near T_base_platform at which readings (n_motors,) miss least."""
+    lengthening = machine.sign[list(machine.motors)] * readings
+
+    def equations(poses: Array) -> tuple[Array, Array]:
+        found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
+        found.values[:, found.measured] -= lengthening
+        return least_squares_equations(found)
+
+    found = solve(equations, poses_after, T.as_matrix()[None, :3], tolerance=1e-15)
+    return motion_of(found.points[0, :, :3], found.points[0, :, 3])
 
 
 def follow_poses(
@@ -460,10 +596,17 @@ def follow_poses(
             return poses, done
         part = np.minimum(done[rows] + step[rows], 1.0)
         lengthening = machine.sign[motors] * (first + part[:, None] * (last[rows] - first))
+        if machine.is_redundant:  # from where motors are: readings between need not agree
+            here = machine_equations(machine, poses[rows, :, :3], poses[rows, :, 3])
+            now = here.values[:, here.measured]
+            share = ((part - done[rows]) / (1.0 - done[rows]))[:, None]
+            lengthening = now + share * (machine.sign[motors] * last[rows] - now)
 
         def equations(poses: Array, lengthening: Array = lengthening) -> tuple[Array, Array]:
             found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
             found.values[:, found.measured] -= lengthening
+            if machine.is_redundant:
+                return least_squares_equations(found)
             return found.values, found.by_pose
 
         found = newton(
@@ -474,6 +617,7 @@ def follow_poses(
             contraction=CONTRACTION,
             first=scale,
             unit=unit,
+            steps=REDUNDANT_STEPS if machine.is_redundant else FEW_STEPS,
         )
         jacobian = dimensionless(machine, found.points)
         good = found.converged | (found.worst < TOLERANCE * scale)
@@ -518,6 +662,8 @@ def _closed_at(
             trial = close_at(machine, T, there, FEW_RESTARTS, exact=exact)
         except DidNotConverge:
             continue
+        if machine.is_redundant:
+            return trial
         trial[slider_columns(machine, machine.motors)[0]] = readings
         closed, _ = _closed_from(machine, trial, free)
         if closed is not None:

@@ -35,7 +35,12 @@ from legcal.machine.leg import (
     LegChain,
     LegKind,
 )
-from legcal.machine.mobility import CONFIGURATIONS, generic_configurations, mobility
+from legcal.machine.mobility import (
+    CONFIGURATIONS,
+    generic_configurations,
+    mobility,
+    motor_rank,
+)
 from legcal.machine.model import Machine, joint_values, vectors_A_to_B
 from legcal.machine.origins import with_own_origins
 from legcal.machine.parameters import n_frame_legs
@@ -122,6 +127,7 @@ def _load(source: Source) -> Machine:
     _check_across(machine)
     configurations = generic_configurations(machine, CONFIGURATIONS)
     machine = replace(machine, mobility=mobility(machine, configurations))
+    machine = replace(machine, motor_rank=motor_rank(machine, configurations))
     _check_equations(machine, configurations)
     proposed = proposal_notes(file.legcal, machine)
     found = map(

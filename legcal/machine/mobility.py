@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array, cross
 from legcal.machine.equations import is_constrained, machine_equations
-from legcal.machine.model import Machine, vectors_A_to_B
+from legcal.machine.model import Machine, slider_columns, vectors_A_to_B
 from legcal.machine.solver import solve
 
 CLOSED = 1e-12  # [m], and [rad] for frames
@@ -28,7 +28,7 @@ def leg_scale(machine: Machine, T_base_platform: RigidTransform) -> float:
 
 
 def mobility(machine: Machine, configurations: Sequence[Array]) -> int:
-    """Return the freedoms of the platform; the motors determine it where they are as many.
+    """Return the freedoms of the platform.
 
     The rank is taken where the closures have their largest among closed configurations, of which
     some should be near home only, because a symmetric pose may be singular.
@@ -39,10 +39,29 @@ def mobility(machine: Machine, configurations: Sequence[Array]) -> int:
 def freedoms_at(machine: Machine, configuration: Array) -> tuple[int, int]:
     """Return the freedoms of all joints and of the platform alone at a closed configuration."""
     null_space = free_motions(machine, configuration)
-    twist = machine.chain.twist(machine.base, machine.platform) @ null_space
+    return null_space.shape[1], _moved(machine, null_space)
+
+
+def motor_rank(machine: Machine, configurations: Sequence[Array]) -> int:
+    """Return how many freedoms of the platform the motors hold.
+
+    It is the mobility less the freedoms that are left where the motors stand, at that of the
+    configurations of :func:`mobility` where these are fewest.
+    """
+    _, sliders = slider_columns(machine, machine.motors)
+    scale, left = leg_scale(machine, machine.home), []
+    for configuration in configurations:
+        null_space = free_motions(machine, configuration)
+        _, values, right = np.linalg.svd(null_space[sliders] / scale)
+        left.append(_moved(machine, null_space @ right[int(np.sum(values > RANK_TOLERANCE)) :].T))
+    return machine.mobility - min(left)
+
+
+def _moved(machine: Machine, motions: Array) -> int:
+    """Return the rank of the platform's twists by motions (nv, k) of the joints, as linearised."""
+    twist = machine.chain.twist(machine.base, machine.platform) @ motions
     twist[:3] /= leg_scale(machine, machine.home)
-    values = np.linalg.svd(twist, compute_uv=False)
-    return null_space.shape[1], int(np.sum(values > RANK_TOLERANCE))
+    return int(np.sum(np.linalg.svd(twist, compute_uv=False) > RANK_TOLERANCE))
 
 
 def generic_configurations(machine: Machine, count: int) -> list[Array]:

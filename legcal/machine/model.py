@@ -43,6 +43,7 @@ class Machine:
     chain: ClosedChain  # the tree and its closures in Pinocchio
     urdf: Urdf  # the tree as written
     mobility: int = 0  # freedoms of the platform
+    motor_rank: int = 0  # of which the motors hold
     diagnostics: tuple[str, ...] = ()  # what the reader should know, one sentence each
     base_normal: Array | None = None  # (3,) of the plane of motion in the links of base and
     platform_normal: Array | None = None  # platform, the same way up; None in space
@@ -64,8 +65,13 @@ class Machine:
 
     @property
     def is_determined(self) -> bool:
-        """Whether the platform has as many freedoms as there are motors: readings give its pose."""
-        return self.mobility == len(self.motors)
+        """Whether the motors hold all freedoms of the platform: readings give its pose."""
+        return min(self.motor_rank, len(self.motors)) == self.mobility
+
+    @property
+    def is_redundant(self) -> bool:
+        """Whether readings give the pose and can contradict each other: it is of least squares."""
+        return self.is_determined and len(self.motors) > self.mobility
 
     @property
     def undetermined(self) -> str:
@@ -200,7 +206,8 @@ def machine_document(machine: Machine) -> dict[str, Any]:
 
     A is in the base link and B in the platform link [m], twist in [rad]; ``n_d`` is the number of
     legs that define the frames, ``r`` that of R joints on the base, ``n_ac`` that of legs that are
-    actuated or of constant length, ``idle_spins`` the freedoms that only turn a leg about itself.
+    actuated or of constant length, ``motor_rank`` that of the freedoms of the platform that motors
+    hold, ``idle_spins`` that of the freedoms that only turn a leg about itself.
     """
     kinds = [leg.kind for leg in machine.legs]
     return {
@@ -208,6 +215,7 @@ def machine_document(machine: Machine) -> dict[str, Any]:
         "spatial": machine.spatial,
         "mobility": machine.mobility,
         "motors": len(machine.motors),
+        "motor_rank": machine.motor_rank,
         "n": machine.n_legs,
         "n_d": len(machine.frame_legs),
         "r": sum(leg.base_joint is JointType.REVOLUTE for leg in machine.legs),

@@ -21,8 +21,10 @@ _MAX_ROWS = 60  # of residuals; the file has them all
 def inspect_table(description: dict[str, Any]) -> RenderableType:
     """Return the document of ``inspect`` as people read it, lengths in millimetres."""
     motors, mobility, legs = description["motors"], description["mobility"], description["legs"]
-    verdict = "the motors determine the pose" if motors == mobility else "NOT determined by motors"
-    if motors > mobility:
+    verdict = "the motors determine the pose"
+    if description["motor_rank"] < mobility:
+        verdict = "NOT determined by motors"
+    elif motors > mobility:
         verdict = "more than it needs"
     if mobility == 0:
         verdict = "it cannot move"

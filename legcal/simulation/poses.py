@@ -25,6 +25,8 @@ from legcal.machine import (
     Configurations,
     Machine,
     beyond_travel,
+    consistent_readings,
+    contradiction,
     follow,
     forward_kinematics,
     joint_values,
@@ -139,7 +141,10 @@ def given_poses(machine: Machine, path: Path) -> Configurations:
             except DidNotConverge:
                 problem = "legs that cannot have these lengths at the same time"
             else:
-                problem = feasibility.problem(configuration, of_motors=False)
+                T = platform_pose(machine, configuration)
+                problem = contradiction(machine, T, row) or feasibility.problem(
+                    configuration, of_motors=False
+                )
                 known.append(row)
                 reached.append(configuration)
         if problem is not None:
@@ -292,7 +297,7 @@ def _followed(
         part = rng.random(len(home))
         if extreme:
             part = near_ends(rng.integers(0, 2, len(home)), part)
-        q = lower + part * (upper - lower)
+        q = consistent_readings(machine, (lower + part * (upper - lower))[None])[0]
         return np.asarray(q if shrink == 1.0 else np.clip(home + shrink * (q - home), lower, upper))
 
     def reached(readings: Array) -> Array | str:

@@ -102,6 +102,7 @@ def _root_of_sum(squares: Array) -> Array:
 
 
 _REACHED = 1e-8  # [m]
+_REACHED_BY_ALL = 0.03  # of the length of a leg: how far readings of redundant motors may disagree
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +176,8 @@ def _workspace_poses(machine: Machine, legs: Sequence[Leg]) -> Sequence[RigidTra
     for leg, q in zip(legs, readings.T, strict=True):
         if leg.kind is LegKind.ACTUATED:
             length = np.linalg.norm(R @ leg.B + t - leg.A, axis=1)
-            reached &= np.abs(length - (leg.sign * q + leg.q0)) < _REACHED
+            most = _REACHED_BY_ALL * length if machine.is_redundant else _REACHED
+            reached &= np.abs(length - (leg.sign * q + leg.q0)) < most
     return [poses[k] for k in np.flatnonzero(reached)] or None
 
 

@@ -1,0 +1,128 @@
+"""Machines that are not shipped, of every kind of the class: outlines, and calibrations.
+
+    OMP_NUM_THREADS=1 python benchmarks/machine_kinds.py [KIND ...] [--runs 200] [--seed 0]
+                         [--datasets 0] [--level axes|outlines|photographs] [--keep FOLDER]
+
+KIND: a table of ``machine_kinds.yaml`` (all of them without), which is a table of joints without
+version, name and unit (mm). Two things are asked:
+
+- sessions of outlines (``--runs``): the joint fit from a model that is wrong by up to 2 mm and
+  1 deg in everything, and from rough cameras; its errors beside the Cramer-Rao bound and the
+  normalised squared error on all that is determined, as ``classes_study.py`` counts them;
+- datasets (``--datasets``) of ``legcal simulate`` without hints at ``--level``, whose true machine
+  is off by up to 2 mm, calibrated by ``legcal calibrate``: how many are, the platform error of
+  eq (20) at their readings before and after, and how the latter compares with the predicted sigma
+  (mean over seeds).
+"""
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from bound import ERRORS
+from classes_study import errors_of_fit
+from outline_sessions import Noise, design_of, draw_session, kinds, made, one_fit
+from outline_study import failures_of
+
+from legcal import LegcalError, calibrate, evaluate
+from legcal.simulation import Level, SimulationSettings, failure_of, simulate
+
+N_VIEWS, N_POSES = 3, 15
+
+
+def sessions(kind: str, runs: int, seed: int) -> str:
+    """Return a line on the joint fit in many sessions of outlines."""
+    noise, records = Noise(), []
+    design = design_of(kind, N_VIEWS, N_POSES, noise.sigma_px)
+    for child in np.random.SeedSequence(seed).spawn(runs):
+        session = draw_session(design, noise, ERRORS, np.random.default_rng(child))
+        try:
+            solution = one_fit(session, noise.radius_sigma)
+            records.append(errors_of_fit(design, session, solution, noise))
+        except LegcalError as error:
+            records.append({"failure": failure_of(error)})
+            print(f"{kind}: {error}", file=sys.stderr)
+    fits = [record for record in records if "failure" not in record]
+    line = f"{kind:20}{len(fits):6} of {runs}"
+    if fits:
+        rank = np.array([fit["rank"] for fit in fits])
+        ratio, nse = (
+            float(rank @ np.array([fit[key] for fit in fits])) / rank.sum()
+            for key in ("of_bound", "nse")
+        )
+        determined = f"{rank.min()} of {len(design.parametrization)}"
+        line += f"{determined:>12}{math.sqrt(ratio):14.3f}{nse:8.3f}"
+    return f"{line}  {failures_of(records) or ''}"
+
+
+def datasets(kind: str, level: Level, seeds: Sequence[int], scratch: Path) -> str:
+    """Print a line a dataset, and return one on all that were calibrated."""
+    model, found = made(kind, scratch / "nominal").yaml_path, []
+    for seed in seeds:
+        folder = scratch / f"{kind}-{level}-{seed}"
+        result = scratch / f"{folder.name}-result"
+        begin = time.perf_counter()
+        try:
+            if not folder.exists():
+                simulate(model, folder, SimulationSettings(level=level, seed=seed, hints=False))
+            begin = time.perf_counter()
+            calibration = calibrate(folder, output=result, use_cache=False)
+            truth = next((folder / "truth/models").glob("*.yaml"))
+            before, after = (
+                evaluate(path, truth, dataset=folder).displacement.mean()
+                for path in (model, result / "calibrated.yaml")
+            )
+        except LegcalError as error:
+            print(f"{kind:20}{seed:4}  {type(error).__name__}: {error}", flush=True)
+            continue
+        platform = calibration.platform
+        predicted = math.nan if platform is None else platform.sigma.mean_displacement
+        found.append((before, after, predicted))
+        seconds = time.perf_counter() - begin
+        print(f"{kind:20}{seed:4}{numbers(found[-1])}{seconds:6.0f} s", flush=True)
+    line = f"{kind:20}{len(found):4} of {len(seeds)} from {level}"
+    return line + (numbers(np.mean(found, axis=0)) if found else "")
+
+
+def numbers(errors: Sequence[float]) -> str:
+    """Return errors of the platform [mm]: before, after, predicted; and the ratio of these."""
+    before, after, predicted = errors
+    return (
+        f"  nominal {1e3 * before:7.3f} mm, calibrated {1e3 * after:7.4f}, predicted "
+        f"{1e3 * predicted:7.4f}, ratio {after / predicted:5.2f}"
+    )
+
+
+def main() -> None:
+    """Print what was asked of every kind."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("kinds", nargs="*", metavar="KIND", help="tables; all of them")
+    parser.add_argument("--runs", type=int, default=200, help="sessions of outlines; 200")
+    parser.add_argument("--seed", type=int, default=0, help="of sessions, and of the first dataset")
+    parser.add_argument("--datasets", type=int, default=0, help="simulated and calibrated; none")
+    parser.add_argument("--level", type=Level, default=Level.OUTLINES, choices=list(Level))
+    parser.add_argument("--keep", type=Path, help="folder that keeps datasets for the next run")
+    options = parser.parse_args()
+    if unknown := set(options.kinds) - set(kinds()):
+        parser.error(f"found {', '.join(sorted(unknown))}, needed some of {', '.join(kinds())}")
+    chosen = options.kinds or list(kinds())
+    if options.runs:
+        print(f"{'':20}{'converged':>12}{'determined':>12}{'error/bound':>14}{'nse':>8}")
+        for kind in chosen:
+            print(sessions(kind, options.runs, options.seed), flush=True)
+    if options.datasets:
+        seeds = range(options.seed, options.seed + options.datasets)
+        with TemporaryDirectory() as temporary:
+            scratch = options.keep or Path(temporary)
+            scratch.mkdir(parents=True, exist_ok=True)
+            summary = [datasets(kind, options.level, seeds, scratch) for kind in chosen]
+        print(*summary, sep="\n")
+
+
+if __name__ == "__main__":
+    main()

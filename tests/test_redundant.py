@@ -1,0 +1,210 @@
+"""More motors than freedoms: ranks, poses of least squares, errors of parameters, refusals."""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
+
+import numpy as np
+import pytest
+from layouts import Layout, LegSpec, MachineSpec, write_machine
+from machines import displaced, of_types, planar, ring
+from outline_sessions import made
+from parameter_steps import written_with
+from scipy.spatial.transform import RigidTransform
+from simulated import settings
+
+import legcal
+from legcal.calibration.joint_fit.platform import platform_by_parameters
+from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
+from legcal.geometry import Array
+from legcal.machine import (
+    Follower,
+    Machine,
+    forward_kinematics,
+    forward_kinematics_many,
+    geometries,
+    inverse_kinematics,
+    load_mechanism,
+    parametrization_of,
+    platform_in_base,
+    platforms_in_base,
+    random_configurations,
+    reading_residuals,
+    slider_columns,
+    solve_poses,
+)
+from legcal.machine.mobility import generic_configurations
+from legcal.simulation import simulate
+from legcal.simulation.poses import given_poses
+
+
+def _concurrent() -> MachineSpec:
+    """Return a planar platform whose three motors turn about one point; a fourth leg is passive."""
+    B, z = ring([0, 100, 220, 300], 0.12), np.array([0.0, 0.0, 1.0])
+    A = np.array([[-0.4, 0.1, 0.0]] * 3 + [[0.1, -0.5, 0.0]])
+    kinds = ["actuated"] * 3 + ["passive"]
+    legs = [LegSpec("RR", a, b, k, z, z) for a, b, k in zip(A, B, kinds, strict=True)]
+    return MachineSpec(tuple(legs), RigidTransform.identity(), frame_legs=(0, 3), normal=z)
+
+
+REDUNDANT: dict[str, Callable[[], MachineSpec]] = {
+    "7-UPS": lambda: of_types(["US"] * 7),
+    "4-RPR": lambda: planar(kinds=("actuated",) * 4),
+    "3-RPS + SPS": lambda: of_types(["RS"] * 3 + ["SS"]),
+    "5-UPS + RPS": lambda: of_types(["US"] * 5 + ["RS"]),
+    "2-RPS + 2-SPS + rod": lambda: of_types(
+        ["RS", "RS", "SS", "SS", "SS"], ["actuated"] * 4 + ["constant"]
+    ),
+}
+OTHERS: dict[str, Callable[[], MachineSpec]] = {
+    "3-RPS": lambda: of_types(["RS"] * 3),
+    "5-UPS": lambda: of_types(["US"] * 5),
+    "three motors about a point": _concurrent,
+}
+MOBILITY = {"7-UPS": 6, "4-RPR": 3, "3-RPS + SPS": 3, "5-UPS + RPS": 5, "2-RPS + 2-SPS + rod": 3}
+
+
+@cache
+def machine_of(name: str) -> Machine:
+    """Return a machine that is written and loaded once."""
+    spec = (REDUNDANT | OTHERS)[name]()
+    return load_mechanism(write_machine(Path(mkdtemp()), spec, Layout()))
+
+
+def _differences(f: Callable[[Array], Array], n: int) -> Array:
+    """Return the derivative of a function by central differences, (m, n)."""
+    steps = 1e-5 * np.eye(n)
+    return np.stack([(f(step) - f(-step)) / 2e-5 for step in steps], axis=1)
+
+
+@pytest.mark.parametrize("name", [*REDUNDANT, *OTHERS])
+def test_what_motors_hold_is_the_rank_of_closures_by_differences(name: str) -> None:
+    machine = machine_of(name)
+    chain, configuration = machine.chain, generic_configurations(machine, 2)[-1]
+
+    def moved(step: Array) -> Array:
+        """Return closures, then the pose of the platform."""
+        there = chain.integrate(configuration, step)
+        residual = chain.linearize(there)[0].copy()
+        R, t = chain.placement(there, machine.base, machine.platform)
+        return np.concatenate([residual, R.ravel(), t])
+
+    both = _differences(moved, chain.nv)
+    closures, twist = both[:-12], both[-12:]
+    motors = np.eye(chain.nv)[slider_columns(machine, machine.motors)[1]]
+    held = np.concatenate([closures, motors])
+    free, left = (
+        np.linalg.matrix_rank(np.concatenate([rows, twist]), tol=1e-6)
+        - np.linalg.matrix_rank(rows, tol=1e-6)
+        for rows in (closures, held)
+    )
+    assert (machine.mobility, machine.motor_rank) == (free, free - left)
+    assert machine.is_determined == (left == 0)
+    assert machine.is_redundant == (name in REDUNDANT)
+    assert machine.mobility == MOBILITY.get(name, machine.mobility)
+
+
+def test_motors_as_many_as_freedoms_that_hold_fewer_do_not_determine_the_pose() -> None:
+    machine = machine_of("three motors about a point")
+    assert machine.mobility == len(machine.motors) == 3
+    assert any("motors 3, which hold only 2" in note for note in machine.diagnostics)
+    with pytest.raises(NotIdentifiable, match="3 motors that hold 2 of these freedoms"):
+        Follower(machine)
+
+
+@pytest.mark.parametrize("name", ["7-UPS", "4-RPR", "2-RPS + 2-SPS + rod"])
+def test_poses_are_those_of_least_squares(name: str) -> None:
+    machine = machine_of(name)
+    rng, motors = np.random.default_rng(1), list(machine.motors)
+    drawn = random_configurations(machine, 1, rng)
+    lower, upper = np.array([machine.legs[j].travel for j in motors]).T
+    assert np.all((drawn.readings[:, motors] >= lower) & (drawn.readings[:, motors] <= upper))
+    for T, q in zip(drawn.poses, drawn.readings, strict=True):
+        found = forward_kinematics(machine, q)  # all readings agree
+        np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-10)
+        assert np.abs(reading_residuals(machine, found, q)).max() < 1e-11
+        q[motors] += 2e-3 * rng.normal(size=len(motors))
+        follower = Follower(machine)
+        found = follower.move_to(q)
+        inverse_kinematics(machine, found)  # the legs allow it
+        residual = reading_residuals(machine, found, q)
+        assert 1e-5 < np.abs(residual).max() < 0.01
+        assert np.abs(machine.chain.linearize(follower.configuration)[0]).max() < 1e-11
+
+        def cost(step: Array, T: RigidTransform = found, q: Array = q) -> float:
+            """Return the sum of squares where the legs allow a pose near a displaced one."""
+            near = platform_in_base(machine, displaced(T, step))
+            legs, R, t = geometries(machine), near.rotation.as_matrix(), near.translation
+            allowed = solve_poses(legs, machine.frame_legs, R[None], t[None])
+            B = allowed.R[0] @ np.array([leg.B for leg in legs]).T + allowed.t.T
+            A = np.array([leg.A for leg in legs])
+            lengths = np.linalg.norm(B.T - A, axis=1)[motors]
+            missed = machine.lengths_at(q[motors], motors) - lengths
+            return float(missed @ missed)
+
+        steps = 1e-4 * np.eye(6) if machine.spatial else 1e-4 * np.eye(6)[2:5]
+        slope = [cost(step) - cost(-step) for step in steps]
+        change = [cost(step) + cost(-step) - 2.0 * cost(0.0 * step) for step in steps]
+        assert np.abs(slope).max() < 1e-3 * max(change)
+        assert min(change) > -1e-12
+
+
+@pytest.mark.parametrize("name", ["7-UPS", "4-RPR", "2-RPS + 2-SPS + rod"])
+def test_predicted_errors_are_those_of_written_models(name: str, tmp_path: Path) -> None:
+    machine = machine_of(name)
+    parametrization = parametrization_of(machine)
+    rng = np.random.default_rng(3)
+    step = 1e-6 * rng.normal(size=len(parametrization))
+    other = written_with(machine, parametrization, step, tmp_path)
+    drawn = random_configurations(machine, 2, rng)
+    before = platforms_in_base(machine, drawn.poses)
+    after = platforms_in_base(other, forward_kinematics_many(other, drawn.readings))
+    J = platform_by_parameters(geometries(machine), parametrization, machine.frame_legs, before)
+    for T, T_other, by in zip(before, after, J, strict=True):
+        turn = (T_other.rotation * T.rotation.inv()).as_rotvec()
+        moved = np.concatenate([turn, T_other.translation - T.translation])
+        np.testing.assert_allclose(by @ step, moved, atol=2e-3 * np.abs(moved).max())
+
+
+def test_readings_that_contradict_each_other_are_refused_with_the_motor(tmp_path: Path) -> None:
+    machine = machine_of("4-RPR")
+    q = inverse_kinematics(machine, machine.home)
+    wrong = q.copy()
+    wrong[1] += 0.1
+    # one motor too many says by how much, and that any of them may be meant
+    found = r"of leg '(\S+)' \(or as likely one of .*leg\d.*\) (\S+) mm from where the other motors"
+    with pytest.raises(DidNotConverge, match=found):
+        forward_kinematics(machine, wrong)
+    follower = Follower(machine)
+    with pytest.raises(DidNotConverge, match=found):
+        follower.move_to(wrong)
+    np.testing.assert_array_equal(follower.configuration, machine.home_configuration)
+    header = ",".join(str(leg.prismatic) for leg in machine.legs)
+    path = tmp_path / "poses.csv"
+    path.write_text(f"{header}\n{','.join(map(str, q))}\n{','.join(map(str, wrong))}\n")
+    with pytest.raises(DatasetError, match=rf"row 2 \(line 3\).*{found}"):
+        given_poses(machine, path)
+
+
+def test_a_redundant_machine_calibrates_and_a_wrong_reading_is_refused(tmp_path: Path) -> None:
+    machine, folder = made("4-rpr", tmp_path), tmp_path / "dataset"
+    simulate(machine.yaml_path, folder, settings(poses=6))
+    calibration = legcal.calibrate(folder, output=tmp_path / "result")
+    truth = next((folder / "truth/models").glob("*.yaml"))
+    before, after = (
+        legcal.evaluate(path, truth, dataset=folder).displacement
+        for path in (machine.yaml_path, tmp_path / "result/calibrated.yaml")
+    )
+    assert calibration.platform is not None
+    assert calibration.platform.workspace is not None
+    sigma = calibration.platform.sigma.mean_displacement
+    assert after.mean() < 3.0 * sigma < 0.1 * before.mean()
+    table = folder / "measurements.csv"
+    header, first, *rows = table.read_text().splitlines()
+    columns, cells = header.split(","), first.split(",")
+    column = columns.index(str(machine.legs[1].prismatic))
+    cells[column] = "0.12" if float(cells[column]) < 0.06 else "0.0"
+    table.write_text("\n".join([header, ",".join(cells), *rows, ""]))
+    with pytest.raises(DatasetError, match=r"readings of view .* from where the other motors put"):
+        legcal.calibrate(folder, output=tmp_path / "refused")
