@@ -15,7 +15,7 @@ from legcal.machine import (
     geometries,
     load_mechanism,
     moved_legs,
-    with_platform_foot,
+    reframed,
     write_calibrated_yaml,
     write_urdf,
 )
@@ -34,7 +34,9 @@ def written_with(
     """Return a mechanism with changed parameters, as loaded from the files written of it."""
     folder.mkdir(exist_ok=True)
     origin = np.asarray(nominal.T_platform_Re.inv().translation)
-    legs = with_platform_foot(moved_legs(geometries(nominal), parametrization.place, step), origin)
+    legs = reframed(
+        moved_legs(geometries(nominal), parametrization.place, step), nominal.frame_legs, origin
+    )
     write_urdf(nominal, legs, folder / "other.urdf")
     write_calibrated_yaml(nominal, folder / "other.yaml", "other.urdf")
     return load_mechanism(folder / "other.yaml")

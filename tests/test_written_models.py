@@ -31,9 +31,9 @@ from legcal.machine import (
     moved_legs,
     parametrization_of,
     pose_equations,
+    reframed,
     reload_and_check,
     vector_of,
-    with_platform_foot,
     write_calibrated_yaml,
     write_model,
     write_urdf,
@@ -60,7 +60,7 @@ def other_legs(nominal: Machine, size: float) -> tuple[Leg, ...]:
     unit = np.where([unit == "m" for unit in parametrization.units], size, 10.0 * size)
     signs = np.random.default_rng(2).choice([-1.0, 1.0], len(unit))
     legs = moved_legs(geometries(nominal), parametrization.place, unit * signs)
-    return with_platform_foot(legs, np.asarray(nominal.T_platform_Re.inv().translation))
+    return reframed(legs, nominal.frame_legs, np.asarray(nominal.T_platform_Re.inv().translation))
 
 
 def write(nominal: Machine, legs: tuple[Leg, ...], folder: Path) -> Machine:

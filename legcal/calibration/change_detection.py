@@ -18,7 +18,14 @@ from scipy.special import fdtrc
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, frame_on_points, normal_basis, whitener
-from legcal.machine import Leg, LegKind, Parametrization, twist_after, vector_of
+from legcal.machine import (
+    Leg,
+    LegKind,
+    Parametrization,
+    twist_after,
+    vector_of,
+    with_platform_points,
+)
 
 _STEP = 1e-6  # [m or rad]
 
@@ -235,6 +242,7 @@ def _about(axis: Array, k: int, step: float) -> Rotation:
 def _in_frames_of_joints(legs: Sequence[Leg], frame_legs: Sequence[int]) -> tuple[Leg, ...]:
     """Return legs in the frames R_b and R_e that their joint centres define."""
     frames = list(frame_legs)
+    legs = with_platform_points(legs, frame_legs)
     base = frame_on_points(np.array([leg.A for leg in legs])[frames]).inv()
     platform = frame_on_points(np.array([leg.B for leg in legs])[frames]).inv()
 

@@ -12,7 +12,7 @@ from legcal.calibration.joint_fit import Start, start_from
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
 from legcal.data import Order, Outlines, axes_from_outlines, few_views, inverse
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
-from legcal.machine import Leg, geometries
+from legcal.machine import Leg, geometries, reframed
 from legcal.paper import nominal_machine, run_base_steps, run_platform_steps
 from legcal.perception import Placement
 
@@ -73,7 +73,8 @@ def four_steps(
             )
         except (NotIdentifiable, DidNotConverge) as failure:
             return Steps(None, cameras, str(failure))
-        return Steps(found.legs, cameras, "", found.diagnostics)
+        legs = reframed(found.legs, data.machine.frame_legs)
+        return Steps(legs, cameras, "", found.diagnostics)
     except (NotIdentifiable, NotVisible, DidNotConverge) as failure:
         return Steps(None, None, str(failure))
     finally:

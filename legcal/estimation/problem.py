@@ -327,6 +327,9 @@ class Tangent:
 
     Z: Array  # (n_elements, d, f) basis with kept variables fixed, zero columns where fewer
     Q: Array  # (n_kept, n_elements, d) motion with each kept unknown
+    ties: Array = field(  # (w, n_kept) directions of the kept unknowns that constraints forbid
+        default_factory=lambda: np.zeros((0, 0))
+    )
 
 
 class Constraint(Protocol[S]):

@@ -400,6 +400,8 @@ def _of_rows(
         g_elements = np.einsum("kpf,kp->kf", Z, g_elements)
     held = np.zeros((len(problem.held_directions), problem.n_kept))
     held[:, : problem.held_directions.shape[1]] = problem.held_directions
+    if motion is not None and len(motion.ties):
+        held = np.concatenate([held, motion.ties])
     return NormalEquations(U, W, V, g_kept, g_elements, motion, held)
 
 

@@ -30,7 +30,7 @@ def information_rows(problem: Problem[S], state: S) -> Array:
         np.add.at(J, (measurement, row, where.index[:, None, :]), rows.J)
         J = J[..., :-1]
         if where.element is None:
-            free.append(J.reshape(n * q, -1))
+            free.append(J.reshape(n * q, problem.n_kept))
         else:
             both = np.concatenate([rows.J_element, J], axis=2)
             by_element.append(grouped(both, where.element, problem.n_elements))

@@ -20,6 +20,7 @@ from legcal.estimation.solver import (
 )
 from legcal.geometry import Array, IntArray
 
+_STIFF = 1e6  # information on what is tied, over that of measurements
 _ROUNDING = 1e-12  # of information, in differences
 _MIN_COMPONENT = 0.3  # components of a direction that are named, relative to the largest
 
@@ -60,8 +61,15 @@ def named_covariance(problem: Problem[S], state: S, covariance: Array) -> Array:
 
 
 def named_information(problem: Problem[S], state: S, normal: NormalEquations) -> Array:
-    """Return the normal matrix (n_named, n_named) of coordinates, all else unknown."""
+    """Return the normal matrix (n_named, n_named) of coordinates, all else unknown.
+
+    What exact constraints tie counts as known a thousand times better than by measurements.
+    """
     R, n = normal.reduced(), problem.n_named
+    if normal.tangent is not None and len(normal.tangent.ties):
+        size = np.sqrt(np.maximum(np.diagonal(R), np.finfo(np.float64).tiny))
+        along = np.linalg.qr((normal.tangent.ties / size).T)[0].T * size
+        R += _STIFF * along.T @ along
     if n < len(R):
         R = R[:n, :n] - R[:n, n:] @ inverse_on_range(R[n:, n:]) @ R[n:, :n]
     if problem.is_read_directly:

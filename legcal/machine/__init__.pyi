@@ -58,6 +58,7 @@ from .leg import main_cylinders as main_cylinders
 from .leg import parameters_of_legs as parameters_of_legs
 from .leg import point_like_legs as point_like_legs
 from .leg import radius_name as radius_name
+from .leg import with_platform_points as with_platform_points
 from .loader import load_mechanism as load_mechanism
 from .mobility import leg_scale as leg_scale
 from .mobility import singularity as singularity
@@ -87,6 +88,7 @@ from .parameters import nominal_axes as nominal_axes
 from .parameters import numbers_of as numbers_of
 from .parameters import parametrization_of as parametrization_of
 from .parameters import parametrize as parametrize
+from .parameters import reframed as reframed
 from .parameters import tied_twist as tied_twist
 from .parameters import tied_twist_slope as tied_twist_slope
 from .parameters import to_vector as to_vector
@@ -94,9 +96,11 @@ from .parameters import turns_between as turns_between
 from .parameters import twist_after as twist_after
 from .parameters import vector_of as vector_of
 from .parameters import with_numbers as with_numbers
-from .parameters import with_platform_foot as with_platform_foot
 from .solver import poses_after as poses_after
 from .solver import solve as solve
+from .ties import TieRows as TieRows
+from .ties import Ties as Ties
+from .ties import ties_of as ties_of
 from .urdf import Urdf as Urdf
 from .urdf import UrdfPatch as UrdfPatch
 from .urdf import number_list as number_list

@@ -10,7 +10,7 @@ belongs to the platform in a frame of the platform: the links for the legs of a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Literal
 
@@ -248,9 +248,10 @@ class Leg:
 
     Axes are lines, given for joints whose axis is a parameter: R, and the outer axis of U in a leg
     without an S joint; none in planar machines. A leg that is fixed to the platform (the centre
-    leg of a Tricept) has its direction from A to B as platform axis, and B
-    at the foot of the platform link's origin. The twist is the angle about u from the inner axis at
-    the base to the inner one at the platform, which a leg without an S joint keeps.
+    leg of a Tricept) has its direction from A to B as platform axis, and B at the foot of the
+    platform link's origin, in R_e at its :func:`frame_point` where it defines that. The twist is
+    the angle about u from the inner axis at the base to the inner one at the platform, which a leg
+    without an S joint keeps.
     """
 
     base_joint: JointType
@@ -351,6 +352,52 @@ def point_like_legs(parameters: KinematicParameters) -> tuple[Leg, ...]:
         Leg(S, S, LegKind.PASSIVE if j in parameters.passive else LegKind.ACTUATED, A, B, float(q0))
         for j, (A, B, q0) in enumerate(joints)
     )
+
+
+def frame_point(legs: Sequence[Leg], frame_legs: Sequence[int], leg: int) -> Array:
+    """Return the point (3,) of a frame leg that is fixed to the platform which defines R_e [m].
+
+    Nothing depends on where B lies on the line of such a leg. Frames need a point that every model
+    of one machine has in the same place: beyond the foot of the middle of the other two joints, by
+    half the distance of these, so that the three span a plane also where the line meets the
+    middle. Beside another leg of this kind it is the foot of the third joint.
+    """
+    u = legs[leg].platform_axis
+    others = [legs[j].B for j in frame_legs if not legs[j].is_fixed_to_platform]
+    if u is None or not others:
+        return legs[leg].B
+    middle = np.mean(others, axis=0)
+    beyond = 0.5 * float(np.linalg.norm(others[0] - others[-1]))
+    return np.asarray(legs[leg].B + ((middle - legs[leg].B) @ u + beyond) * u)
+
+
+def with_platform_points(
+    legs: Sequence[Leg], frame_legs: Sequence[int], origin: Array | None = None
+) -> tuple[Leg, ...]:
+    """Return legs with B where models put it on those that are fixed to the platform.
+
+    Nothing depends on where B lies on the line of such a leg. A frame leg has it at its
+    :func:`frame_point`, another at the foot of the platform link's origin, *origin* (3,) in the
+    frame of the legs [m], if that is given.
+    """
+    found = []
+    for j, leg in enumerate(legs):
+        point = frame_point(legs, frame_legs, j) if j in frame_legs else origin
+        if leg.is_fixed_to_platform and leg.platform_axis is not None and point is not None:
+            along = float((point - leg.B) @ leg.platform_axis)
+            leg = replace(
+                leg,
+                B=leg.B + along * leg.platform_axis,
+                q0=leg.q0 + along,
+                cylinders=tuple(
+                    replace(c, start=c.start - along, end=c.end - along)
+                    if c.side == "platform"
+                    else c
+                    for c in leg.cylinders
+                ),
+            )
+        found.append(leg)
+    return tuple(found)
 
 
 def radius_name(leg_name: str, part: str) -> str:

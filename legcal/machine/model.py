@@ -20,6 +20,7 @@ from legcal.machine.leg import (
     Leg,
     LegKind,
     parameters_of_legs,
+    with_platform_points,
 )
 from legcal.machine.urdf import Urdf
 
@@ -118,6 +119,11 @@ class Machine:
         return np.asarray(self.sign[chosen] * q + self.q0[chosen])
 
     @cached_property
+    def legs_of_frames(self) -> tuple[Leg, ...]:
+        """The legs, with B at the point that defines R_e on frame legs fixed to the platform."""
+        return with_platform_points(self.legs, self.frame_legs)
+
+    @cached_property
     def T_base_Rb(self) -> RigidTransform:
         """The frame on the base joint centres of the frame legs, in the base link."""
         return frame_on_points(self.A_base[list(self.frame_legs)], self.base_normal)
@@ -125,18 +131,19 @@ class Machine:
     @cached_property
     def T_platform_Re(self) -> RigidTransform:
         """The frame on the platform joint centres of the frame legs, in the platform link."""
-        return frame_on_points(self.B_platform[list(self.frame_legs)], self.platform_normal)
+        points = np.array([self.legs_of_frames[j].B for j in self.frame_legs])
+        return frame_on_points(points, self.platform_normal)
 
     @cached_property
     def parameters(self) -> KinematicParameters:
         """The kinematic parameters xi, in R_b and R_e [m]."""
         base = self.T_base_Rb.inv().apply(self.A_base)
-        platform = self.T_platform_Re.inv().apply(self.B_platform)
+        platform = self.T_platform_Re.inv().apply([leg.B for leg in self.legs_of_frames])
         n_d = len(self.frame_legs)
         for rank, leg in enumerate(self.frame_legs):  # zero by definition, not by rounding
             base[leg, rank:n_d] = 0.0
             platform[leg, rank:n_d] = 0.0
-        found = parameters_of_legs(self.legs)
+        found = parameters_of_legs(self.legs_of_frames)
         return replace(found, base_joints=base, platform_joints=platform)
 
     def with_cylinders(self, cylinders: Sequence[Sequence[Cylinder]]) -> "Machine":

@@ -18,12 +18,19 @@ from legcal.geometry import (
     IntArray,
     axis_angles,
     cross,
+    frame_on_points,
     matrix_applied,
     normal_basis,
     rotation_between,
     turned_axis,
 )
-from legcal.machine.leg import KinematicParameters, Leg, LegColumns, LegKind
+from legcal.machine.leg import (
+    KinematicParameters,
+    Leg,
+    LegColumns,
+    LegKind,
+    with_platform_points,
+)
 from legcal.machine.model import Machine
 
 _STEP = 1e-6  # [m or rad], of numerical derivatives
@@ -67,7 +74,8 @@ def parametrize(
         free[j, columns.BASE_AXIS] = leg.base_axis is not None
         free[j, columns.PLATFORM_AXIS] = leg.platform_axis is not None
         free[j, columns.TWIST] = twists and leg.twist is not None
-        if leg.is_fixed_to_platform and leg.platform_axis is not None:  # B anywhere on the line
+        if j not in frame_legs and leg.is_fixed_to_platform and leg.platform_axis is not None:
+            # B is anywhere on the line
             free[j, columns.B.start + int(np.argmax(np.abs(leg.platform_axis)))] = False
     found: list[tuple[str, str]] = []
     place = np.full(free.shape, -1, dtype=np.intp)
@@ -109,7 +117,7 @@ def free_coordinates(n_legs: int, frame_legs: Sequence[int]) -> BoolArray:
 def geometries(machine: Machine) -> tuple[Leg, ...]:
     """Return the legs of a mechanism in its joint frames: A and axes in R_b, B and axes in R_e."""
     parameters = machine.parameters
-    moved = _in_frames(machine.legs, machine.T_base_Rb.inv(), machine.T_platform_Re.inv())
+    moved = _in_frames(machine.legs_of_frames, machine.T_base_Rb.inv(), machine.T_platform_Re.inv())
     return tuple(
         replace(leg, A=A, B=B)  # zero by definition, not by rounding
         for leg, A, B in zip(moved, parameters.base_joints, parameters.platform_joints, strict=True)
@@ -247,19 +255,23 @@ def moved_legs(legs: Sequence[Leg], place: IntArray, step: Array) -> tuple[Leg, 
     return tuple(moved)
 
 
-def with_platform_foot(legs: Sequence[Leg], origin: Array) -> tuple[Leg, ...]:
-    """Return legs with B where models put it on those that are fixed to the platform.
+def reframed(
+    legs: Sequence[Leg], frame_legs: Sequence[int], origin: Array | None = None
+) -> tuple[Leg, ...]:
+    """Return the same machine with B where models put it, in the frames that these points define.
 
-    Nothing depends on where B lies on the line of such a leg; models take the foot of the platform
-    link's origin, *origin* (3,) in R_e [m].
+    *origin* is that of :func:`with_platform_points`; legs without a frame leg that is fixed to the
+    platform stay where they are.
     """
-    found = []
-    for leg in legs:
-        if leg.is_fixed_to_platform and leg.platform_axis is not None:
-            along = float((origin - leg.B) @ leg.platform_axis)
-            leg = replace(leg, B=leg.B + along * leg.platform_axis, q0=leg.q0 + along)
-        found.append(leg)
-    return tuple(found)
+    legs = with_platform_points(legs, frame_legs, origin)
+    if not any(legs[j].is_fixed_to_platform for j in frame_legs):
+        return legs
+    T = frame_on_points(np.array([legs[j].B for j in frame_legs])).inv()
+    zero = ~free_coordinates(len(legs), frame_legs)
+    moved = _in_frames(legs, RigidTransform.identity(), T)
+    return tuple(
+        replace(leg, B=np.where(own, 0.0, leg.B)) for leg, own in zip(moved, zero, strict=True)
+    )
 
 
 def twist_after(leg: Leg, turn: Rotation) -> float | None:

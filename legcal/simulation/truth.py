@@ -29,7 +29,7 @@ from legcal.machine import (
     model_name,
     moved_legs,
     parametrization_of,
-    with_platform_foot,
+    reframed,
     write_urdf,
 )
 from legcal.simulation.settings import (
@@ -69,7 +69,7 @@ def draw_errors(
         step[i] = spread.size * unit[i]
     moved = moved_legs(legs, found.place, step)
     origin = np.asarray(nominal.T_platform_Re.inv().translation)
-    return with_platform_foot(moved, origin)
+    return reframed(moved, nominal.frame_legs, origin)
 
 
 def _spread(errors: ParameterErrors, name: str) -> Spread:

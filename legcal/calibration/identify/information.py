@@ -135,6 +135,8 @@ def problem_of(
     n_images, n_legs = images.shape[:2]
     n, m, whole = n_images * n_legs, len(equations.leg), slice(None)
     J = np.concatenate([images[..., n_f:], *(by for _, _, by in more)], axis=3).reshape(n, 4, -1)
+    ties = predicted.ties[None] / SIGMA_EXACT
+    tied = Residuals.of(np.zeros(ties.shape[:2]), ties)
     shown = Residuals.of(np.zeros((n, 4)), J, images[..., :n_f].reshape(n, 4, n_f))
     demanded = Residuals.of(np.zeros((n_poses, m)), equations.by_parameters, equations.by_pose)
     parameters = Variables(
@@ -173,6 +175,13 @@ def problem_of(
                 n_poses,
                 m,
                 np.arange(n_poses),
+            ),
+            Factor(
+                "ties",
+                lambda _: tied,
+                (("parameters", np.zeros(1, dtype=np.intp), whole),),
+                1,
+                ties.shape[1],
             ),
         ),
     )

@@ -30,6 +30,7 @@ from legcal.machine import (
     moved_legs,
     parametrization_of,
     random_poses_of_legs,
+    ties_of,
 )
 from legcal.vision import shared_cameras
 
@@ -41,6 +42,7 @@ _DISTANCE = 2.5  # machine sizes
 _TILT = 0.5  # [rad] from the normal of a planar machine
 SIGMA_Q = 2e-6  # [m] of a reading, where no dataset says
 _SEED = 2002
+_DEPENDENT = 1e-7  # of the largest singular value of ties
 _PERTURBATION = 1e-6  # of the mean leg length, and [rad]
 REACHED = 20  # poses, at least, over which errors of the platform are judged
 THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg length
@@ -147,6 +149,14 @@ class PredictedObservations:
         n = LegColumns.COUNT
         scattered = [self.parametrization.scatter(np.eye(n), j) for j in range(self.n_legs)]
         return np.array(scattered).reshape(self.n_legs, n, len(self.unit)) * self.unit
+
+    @cached_property
+    def ties(self) -> Array:
+        """Derivative of what ties the parameters to each other, in metres, (w, p), independent."""
+        found = ties_of(self.legs, self.frame_legs).at(self.legs).by_local
+        rows = np.einsum("wjc,jcp->wp", found, self.local_to_parameters)
+        _, singular, basis = np.linalg.svd(rows, full_matrices=False)
+        return np.asarray(basis[singular > _DEPENDENT * singular.max(initial=0.0)])
 
     @cached_property
     def with_length(self) -> BoolArray:

@@ -139,7 +139,7 @@ class Analysis:
                 step.columns,
             )
         )
-        n_p = len(self.predicted.unit)
+        n_p = len(self.predicted.unit) - len(self.predicted.ties)
         return Ranks(n_p - len(weak), n_p, weak)
 
     @cached_property
@@ -147,7 +147,7 @@ class Analysis:
         """The joint fit."""
         basis = undetermined(self.predicted, self.information)
         weak = weak_directions(self.predicted, self.motion, basis)
-        n_p = len(self.predicted.unit)
+        n_p = len(self.predicted.unit) - len(self.predicted.ties)
         return Ranks(n_p - len(weak), n_p, weak)
 
     @cached_property

@@ -183,7 +183,9 @@ def identify_platform(
     rows = np.concatenate(
         [rows * wanted[..., None], grouped(seen, groups.of_image, len(groups.pose))], axis=1
     )
-    return StepInformation("platform_joints", columns, eliminate(rows[:, :, keep], n_f))
+    ties = predicted.ties[:, columns] / SIGMA_EXACT
+    found = np.concatenate([eliminate(rows[:, :, keep], n_f), ties])
+    return StepInformation("platform_joints", columns, found)
 
 
 def scalar_products(predicted: PredictedObservations, located: Located) -> StepInformation:

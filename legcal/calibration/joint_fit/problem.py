@@ -132,7 +132,8 @@ class FitProblem(Problem[State]):
         """Number of unknowns; a pose counts with the freedoms that its constraints leave."""
         bound = 6 - len(freedoms(self.legs.frame_legs))
         bound += sum(leg.n_constraints for leg in self.legs.nominal)
-        return self.n_kept + max(6 - bound, 0) * self.n_elements
+        n_tied = self.parameters.n_tied
+        return self.n_kept - n_tied + max(6 - bound, 0) * self.n_elements
 
     @property
     def n_equations(self) -> int:
@@ -320,7 +321,7 @@ def _built(
         variables=tuple(_stated(block, choices) for block in blocks),
         eliminated=_poses(n_poses),
         factors=observed.factors(keys),
-        constraint=LegConstraints(legs),
+        constraint=LegConstraints(parameters),
         name="joint fit",
         remedy="start nearer to the truth (joints to 5 mm, cameras to 2 cm and 2 deg) and check "
         "the camera poses, the readings and that outlines or axes are those of the right legs and "

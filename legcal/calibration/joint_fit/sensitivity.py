@@ -190,7 +190,9 @@ def _of_twist(
     leg: int,
 ) -> Array:
     """Return the steps (p,) of kinematic parameters if a fixed twist is off, poses following."""
-    motion = _TWIST_ERROR * LegConstraints(problem.legs).following(state, leg, LegColumns.TWIST)
+    motion = _TWIST_ERROR * LegConstraints(problem.parameters).following(
+        state, leg, LegColumns.TWIST
+    )
     changes = {
         factor.name: _efficiency(problem, loss, factor.name)
         * linear[factor.name].J_element

@@ -53,7 +53,7 @@ from legcal.machine import (
     parameters_of_legs,
     parametrize,
     radius_name,
-    with_platform_foot,
+    with_platform_points,
 )
 from legcal.vision import Camera
 
@@ -340,7 +340,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     machine, measurements = dataset.machine, dataset.measurements
     legs, views = inverse(order.legs).tolist(), inverse(order.views).tolist()
     origin = np.asarray(machine.T_platform_Re.inv().translation)
-    geometry = with_platform_foot([solution.legs[j] for j in legs], origin)
+    geometry = with_platform_points([solution.legs[j] for j in legs], machine.frame_legs, origin)
     by_leg = {leg: j for j, leg in enumerate(legs)}
     radii = {(by_leg[leg], part): value for (leg, part), value in solution.radii.items()}
     with_board = dataset.board is not None

@@ -24,6 +24,7 @@ from legcal.machine import (
     Machine,
     Parametrization,
     PoseEquations,
+    Ties,
     freedoms,
     geometries,
     moved_legs,
@@ -32,12 +33,14 @@ from legcal.machine import (
     solve_poses,
     tied_twist,
     tied_twist_slope,
+    ties_of,
     vector_of,
     with_numbers,
 )
 from legcal.vision import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 
 _RANK = 1e-7  # of the largest singular value
+_TIED, _TIE_STEPS = 1e-15, 20  # [m], and steps towards it
 _STEP_TOLERANCE = 1e-6  # [m, rad], last step where constraints cannot all be met to rounding
 
 
@@ -144,6 +147,11 @@ class FittedLegs:
         """The kinematic parameters, twists among them."""
         return parametrize(self.names, self.nominal, self.frame_legs, twists=True)
 
+    @cached_property
+    def ties(self) -> Ties:
+        """What ties the parameters to each other."""
+        return ties_of(self.nominal, self.frame_legs)
+
     def vector(self, legs: tuple[Leg, ...]) -> Array:
         """Return the kinematic parameters of legs [m, rad]; axes count from the nominal ones."""
         return vector_of(self.parametrization, legs, self.nominal)
@@ -234,6 +242,37 @@ class LegParameters:
             )
         )
 
+    def tie_rows(self, geometry: tuple[Leg, ...]) -> tuple[Array, Array]:
+        """Return what is left of each tie (m,) and its derivative by the unknowns (m, p_free)."""
+        found = self.legs.ties.at(geometry)
+        by_local = found.by_local.copy()
+        for leg, nominal, unknown, rows in zip(
+            geometry, self.legs.nominal, self.unknown, np.moveaxis(by_local, 1, 0), strict=True
+        ):
+            if unknown[LegColumns.TWIST] < 0:
+                slope = tied_twist_slope(leg, nominal)
+                rows[:, LegColumns.PLATFORM_AXIS] += rows[:, [LegColumns.TWIST]] * slope
+        rows = np.zeros((len(found.values), int(self.free.sum())))
+        is_unknown = self.unknown >= 0
+        rows[:, self.unknown[is_unknown]] = by_local[:, is_unknown]
+        return found.values, rows
+
+    @cached_property
+    def n_tied(self) -> int:
+        """Number of independent ties between the unknowns."""
+        rows = self.tie_rows(self.legs.nominal)[1]
+        return int(np.linalg.matrix_rank(rows, _RANK)) if rows.size else 0
+
+    def on_ties(self, geometry: tuple[Leg, ...]) -> tuple[Leg, ...]:
+        """Return legs moved, as little as possible, to where all ties hold."""
+        for _ in range(_TIE_STEPS):
+            values, rows = self.tie_rows(geometry)
+            if np.abs(values).max(initial=0.0) < _TIED:
+                break
+            step = np.append(-np.linalg.pinv(rows, rcond=_RANK) @ values, 0.0)
+            geometry = self.retract(geometry, step[self.unknown])
+        return geometry
+
     def coordinates(self, geometry: tuple[Leg, ...]) -> Array:
         """Return the values of the unknowns [m, rad]; axes as angles from the nominal ones."""
         return np.asarray(self.legs.vector(geometry)[self.free])
@@ -298,7 +337,12 @@ def _binding(legs: Sequence[Leg], poses: Frames) -> PoseEquations:
 class LegConstraints:
     """Exact constraints of platform poses: joints, constant lengths and the plane."""
 
-    legs: FittedLegs
+    parameters: LegParameters
+
+    @property
+    def legs(self) -> FittedLegs:
+        """The legs."""
+        return self.parameters.legs
 
     @cached_property
     def binds(self) -> bool:
@@ -314,6 +358,7 @@ class LegConstraints:
             raise DidNotConverge("The joint fit came to a radius that is not positive.")
         if not self.binds:
             return state
+        state = replace(state, legs=self.parameters.on_ties(state.legs))
         found = solve_poses(state.legs, self.legs.frame_legs, *state.platform_pose)
         size = float(found.size.max(initial=0.0))
         if size < _STEP_TOLERANCE:
@@ -352,7 +397,12 @@ class LegConstraints:
                 slope = tied_twist_slope(state.legs[leg], self.legs.nominal[leg])
                 by_local[:, LegColumns.PLATFORM_AXIS] += by_local[:, [LegColumns.TWIST]] * slope
             Q[place] -= by_local.T[..., None] * inverse[None, :, :, i]
-        return Tangent(Z, Q[:-1])
+        ties = np.zeros((0, n_kept))
+        if self.legs.ties.points:
+            rows_of_ties = self.parameters.tie_rows(state.legs)[1]
+            ties = np.zeros((len(rows_of_ties), n_kept))
+            ties[:, problem.where("legs")] = rows_of_ties
+        return Tangent(Z, Q[:-1], ties)
 
     def following(self, state: State, leg: int, column: int) -> Array:
         """Return how poses (n_poses, 6) follow one of the numbers of a leg, all else at rest."""
