@@ -51,7 +51,7 @@ from legcal.simulation import (
     plain_scene,
 )
 from legcal.simulation.observe import axes_in_images
-from legcal.vision import Board, Camera
+from legcal.vision import Board, Camera, FixedBoard
 
 K = np.array([[1290.0, 0.0, 518.0], [0.0, 1280.0, 380.0], [0.0, 0.0, 1.0]])
 PINHOLE = Camera(K, 1024, 768)
@@ -397,6 +397,7 @@ def _pose(rng: np.random.Generator) -> RigidTransform:
 
 BOARD = Board("chessboard", 7, 6, 0.025)
 SIGMA_PX = 0.05
+BOARD_SCALE = "board.scale"
 
 
 def place_of_board(session: MachineSession) -> RigidTransform:
@@ -428,9 +429,42 @@ def corners_of(
 
 def with_board(session: MachineSession, corners: Corners) -> tuple[BoardCorners, Start]:
     """Return what is seen of the board, and the wrong start with a board that is wrong as well."""
-    wrong = RigidTransform.from_components([0.004, -0.003, 0.005], Rotation.from_rotvec([0.02] * 3))
-    start = replace(session.start, T_Rb_board=place_of_board(session) * wrong)
-    return BoardCorners(BOARD, corners), start
+    start = replace(session.start, T_Rb_board=place_of_board(session) * _WRONG)
+    return BoardCorners((FixedBoard(BOARD, "base"),), corners), start
+
+
+# A calibration board on the platform, beside the one on the base or alone
+
+ON_PLATFORM = Board("charuco", 7, 5, 0.02, marker=0.014, dictionary="DICT_5X5_50")
+T_RE_BOARD = RigidTransform.from_components([0.05, 0.04, 0.03], Rotation.from_rotvec([3.0, 0.4, 0]))
+_WRONG = RigidTransform.from_components([0.004, -0.003, 0.005], Rotation.from_rotvec([0.02] * 3))
+
+
+def with_boards(
+    session: MachineSession, *, seed: int | None = None, base: bool = True
+) -> tuple[BoardCorners, Start]:
+    """Return what is seen of a board on the platform and one on the base, and the wrong start."""
+    first = BOARD.n_corners if base else 0
+    fixed = FixedBoard(ON_PLATFORM, "platform", None, first)
+    m, truth = session.measurements, session.truth
+    places = [truth.T_Rb_Re[p] * T_RE_BOARD for p in m.pose.tolist()]
+    px: Array = np.concatenate(
+        [
+            m.views[v].camera.project((truth.T_camera_Rb[v] * T).apply(ON_PLATFORM.points))
+            for v, T in zip(m.view.tolist(), places, strict=True)
+        ]
+    )
+    if seed is not None:
+        px = px + SIGMA_PX * np.random.default_rng([seed, 1]).standard_normal(px.shape)
+    n = ON_PLATFORM.n_corners
+    row, corner = np.repeat(np.arange(m.n_rows), n), np.tile(first + np.arange(n), m.n_rows)
+    corners = found_corners(row, corner, px, np.full(len(px), SIGMA_PX))
+    start = replace(session.start, T_Re_board=T_RE_BOARD * _WRONG)
+    if not base:
+        return BoardCorners((fixed,), corners), start
+    start = replace(start, T_Rb_board=place_of_board(session) * _WRONG)
+    on_base = corners_of(session, seed=seed)
+    return BoardCorners((FixedBoard(BOARD, "base"), fixed), on_base.join([corners])), start
 
 
 # Axes of the hexapod of section 4.3

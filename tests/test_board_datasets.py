@@ -53,8 +53,9 @@ def test_every_image_of_a_hand_held_view_is_a_view_in_the_order_of_rows(folder: 
     assert m.view.tolist() == [0, 1, 2, 2]
     assert len(dataset.camera_paths) == 3
     assert m.views[0].T_base_camera is None
-    assert dataset.T_base_board is not None
-    assert dataset.T_base_board.translation == pytest.approx([0.1, 0.0, 0.0])
+    T_base_board = dataset.boards[0].T_link_board
+    assert T_base_board is not None
+    assert T_base_board.translation == pytest.approx([0.1, 0.0, 0.0])
     assert dataset.corners is not None
     assert np.bincount(dataset.corners.row).tolist() == [6, 6]
 
@@ -157,7 +158,7 @@ def test_corners_are_read_as_they_were_written_and_put_in_order(corners: Corners
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "corners.csv"
         write_corners(path, corners, MEASUREMENTS)
-        assert _same(read_corners(path, CHARUCO, MEASUREMENTS), corners)
+        assert _same(read_corners(path, CHARUCO.n_corners, MEASUREMENTS), corners)
     order = canonical_order(MEASUREMENTS, ["leg1"])
     back = order.restore(order.reorder(corners))
     assert _same(back, corners.choose(np.lexsort([corners.corner, corners.row])))
@@ -165,7 +166,7 @@ def test_corners_are_read_as_they_were_written_and_put_in_order(corners: Corners
 
 def _read(tmp_path: Path, *lines: str) -> Corners:
     _write(tmp_path / "corners.csv", list(lines))
-    return read_corners(tmp_path / "corners.csv", CHARUCO, MEASUREMENTS)
+    return read_corners(tmp_path / "corners.csv", CHARUCO.n_corners, MEASUREMENTS)
 
 
 def test_an_edited_corner_wins_and_a_rejected_one_needs_no_place(tmp_path: Path) -> None:

@@ -98,12 +98,12 @@ def test_a_board_is_read_as_it_was_written(
         board = Board("charuco", x, y, side, legacy=legacy, **markers)  # type: ignore[arg-type]
     else:
         board = Board("aprilgrid", x, y, side, spacing=part, dictionary="DICT_APRILTAG_36h11")
-    read, T = parse_board(board_document(board), PATH)
-    assert T is None
-    assert vars(read) == vars(board)
-    assert read.points == pytest.approx(board.points, abs=0.0)
+    read = parse_board(board_document(board), PATH)
+    assert read.T_link_board is None
+    assert vars(read.board) == vars(board)
+    assert read.board.points == pytest.approx(board.points, abs=0.0)
     pose = {"xyz": [0.1, 0.2, 0.3], "quat_xyzw": [0.0, 0.0, 0.6, 0.8]}
-    T = parse_board({**board_document(board), "T_base_board": pose}, PATH)[1]
+    T = parse_board({**board_document(board), "T_base_board": pose}, PATH).T_link_board
     assert T is not None
     assert T.translation == pytest.approx([0.1, 0.2, 0.3])
     assert T.rotation.as_quat() == pytest.approx([0.0, 0.0, 0.6, 0.8])

@@ -25,7 +25,6 @@ from legcal import calibrate, evaluate, load_dataset, load_mechanism, load_resul
 from legcal.calibration import Calibration, poses_at_readings
 from legcal.calibration.board import BoardViews, base_of_board, board_notes
 from legcal.calibration.four_steps import Steps
-from legcal.calibration.joint_fit import BOARD_SCALE
 from legcal.calibration.result_folder import write_result
 from legcal.calibration.verdict import judge
 from legcal.data import found_corners
@@ -38,7 +37,7 @@ from legcal.errors import (
 from legcal.geometry import Array
 from legcal.machine import geometries, pose_differences, vector_of
 from legcal.simulation import Level, SimulatedDataset
-from legcal.vision import Board
+from legcal.vision import Board, FixedBoard
 
 Row = dict[str, str]
 Rows = list[Row]
@@ -378,7 +377,7 @@ def test_hand_held_cameras_need_no_poses(in_the_hand: tuple[SimulatedDataset, Ca
     made, calibration = in_the_hand
     assert len(calibration.solution.T_camera_Rb) == 12
     assert np.sqrt(np.mean(_pulls(calibration, made.truth_path) ** 2)) < 1.8
-    assert abs(calibration.solution.values[BOARD_SCALE] - 1.0) < 2e-3
+    assert abs(calibration.solution.values["board.scale"] - 1.0) < 2e-3
     assert not any("calibration board" in note for note in calibration.notes)
     result = json.loads((made.folder.parent / "result/result.json").read_text())
     assert result["board"]["given"] is None
@@ -404,8 +403,8 @@ def test_a_wrong_pose_of_the_board_is_noted_and_changes_nothing(
     in_the_hand: tuple[SimulatedDataset, Calibration], tmp_path: Path
 ) -> None:
     made, right = in_the_hand
-    assert right.solution.T_Rb_board is not None
-    board = right.dataset.machine.T_base_Rb * right.solution.T_Rb_board
+    assert right.solution.T_frame_board["base"] is not None
+    board = right.dataset.machine.T_base_Rb * right.solution.T_frame_board["base"]
     wrong = {
         "xyz": (board.translation + np.array([0.0, 0.0, 0.2])).tolist(),
         "quat_xyzw": board.rotation.as_quat().tolist(),
@@ -440,18 +439,24 @@ def _seen(n_views: int) -> BoardViews:
     none = np.zeros(0)
     corners = found_corners(none.astype(np.intp), none.astype(np.intp), np.zeros((0, 2)), none)
     T_board_camera = RigidTransform.from_translation([0.0, 0.0, -1.0])
-    return BoardViews(Board("chessboard", 7, 6, 0.03), corners, (T_board_camera,) * n_views, ())
+    boards = (FixedBoard(Board("chessboard", 7, 6, 0.03), "base"),)
+    return BoardViews(boards, corners, (T_board_camera,) * n_views, {}, ())
+
+
+def _with_board(T_base_board: RigidTransform | None) -> Any:
+    fixed = FixedBoard(Board("chessboard", 7, 6, 0.03), "base", T_base_board)
+    return SimpleNamespace(board_on=lambda link: fixed, yaml_path="dataset.yaml")
 
 
 def test_a_board_and_cameras_that_contradict_each_other_are_refused() -> None:
     place = RigidTransform.from_translation([0.3, 0.0, 0.0])
-    board: Any = SimpleNamespace(T_base_board=place, yaml_path="dataset.yaml")
+    board = _with_board(place)
     cameras = RigidTransform.from_translation([0.3, 0.04, -1.0])
     assert base_of_board(board, _seen(1), (None,)) is place
     assert base_of_board(board, _seen(1), (cameras,)) is place
     with pytest.raises(DatasetError, match=r"T_base_board and the T_base_camera .* found the boa"):
         base_of_board(board, _seen(1), (cameras * cameras,))
-    board.T_base_board = None
+    board = _with_board(None)
     found = base_of_board(board, _seen(1), (cameras,))
     assert found is not None
     np.testing.assert_allclose(found.translation, [0.3, 0.04, 0.0], atol=1e-12)
@@ -462,20 +467,23 @@ def test_one_wrong_camera_pose_does_not_move_the_board() -> None:
     place, seen = RigidTransform.from_translation([0.3, 0.0, 0.0]), _seen(3)
     turned = RigidTransform.from_rotation(Rotation.from_euler("z", 90.0, degrees=True))
     right = place * RigidTransform.from_translation([0.0, 0.0, -1.0])
-    board: Any = SimpleNamespace(T_base_board=None, yaml_path="dataset.yaml")
+    board = _with_board(None)
     found = base_of_board(board, seen, (turned * right, right, right))
     assert found is not None
     np.testing.assert_allclose(found.as_matrix(), place.as_matrix(), atol=1e-12)
-    board.T_base_board = place
+    board = _with_board(place)
     assert base_of_board(board, seen, (turned * right, None, right)) is place
 
 
 def test_views_without_corners_are_named() -> None:
     views = [SimpleNamespace(name=name) for name in ("c1", "c2", "c3")]
     dataset: Any = SimpleNamespace(
-        measurements=SimpleNamespace(views=views, view=np.array([0, 1, 1])), T_base_board=None
+        measurements=SimpleNamespace(views=views, view=np.array([0, 1, 1])),
+        boards=(fixed := FixedBoard(Board("chessboard", 7, 6, 0.03), "base"),),
+        board_on=lambda link: fixed,
+        machine=SimpleNamespace(T_base_Rb=None, T_platform_Re=None),
     )
-    corner, solution = np.zeros(2, dtype=np.intp), SimpleNamespace(T_Rb_board=None)
+    corner, solution = np.zeros(2, dtype=np.intp), SimpleNamespace(T_frame_board={})
     corners = found_corners(np.array([0, 1]), corner, np.zeros((2, 2)), np.ones(2))
     notes = partial(board_notes, dataset, cast(Any, solution))
     assert notes(corners) == notes(None) == []

@@ -19,6 +19,7 @@ from dense_fit import (
     violations,
 )
 from fit_sessions import (
+    BOARD,
     LENS,
     PINHOLE,
     SIGMA_PX,
@@ -30,6 +31,7 @@ from fit_sessions import (
     machine_session,
     shifted,
     with_board,
+    with_boards,
 )
 from located import BASE, TOOL, frames_of, pairs_at
 from scipy.spatial.transform import RigidTransform
@@ -92,7 +94,7 @@ def _problem(name: str) -> tuple[FitProblem, State]:
         rods = np.array([part.endswith("_rod") for part in session.outlines.part])
         axes = axes_from_outlines(replace(session.outlines, used=rods), session.measurements, radii)
     if name == "hexapod":
-        board, start = with_board(session, corners_of(session, seed=0))
+        board, start = with_boards(session, seed=0)
     problem = build_fit(
         session.legs,
         session.measurements,
@@ -183,9 +185,9 @@ def test_corners_are_where_the_camera_projects_them() -> None:
     session = machine_session("3-rps", n_poses=2)
     seen, start = with_board(session, corners_of(session))
     problem = build_fit(session.legs, session.measurements, session.outlines, board=seen)
-    board = problem.corners
+    board = problem.boards[0]
     r = linearize(problem, problem.begin(start))["corners"].r * board.sigma[:, None]
-    assert len(board) == 3 * seen.board.n_corners  # one for all images of a view
+    assert len(board) == 3 * BOARD.n_corners  # one for all images of a view
     np.testing.assert_allclose(board.sigma, SIGMA_PX / np.sqrt(2))  # of two images
     in_base = start.T_Rb_board.apply(board.point)
     for v, T in enumerate(start.T_camera_Rb):
@@ -206,7 +208,7 @@ def test_corners_are_where_the_camera_projects_them() -> None:
 def test_all_factors_have_the_derivatives_of_finite_differences(name: str) -> None:
     problem, state = _problem(name)
     assert len(problem.axes) > 0 or name != "6-sps"
-    assert len(problem.corners) > 0 or name != "hexapod"
+    assert all(map(len, problem.boards)) or name != "hexapod"
     J = jacobian(problem, linearize(problem, state))
     unit = np.eye(problem.size)
     expected = by_differences(problem, state, lambda s: residuals(problem, s), unit)

@@ -47,7 +47,7 @@ from legcal.machine import (
 )
 from legcal.machine.family import Family, describe_family
 from legcal.report.identify import _hidden, _two_digits, identify_table
-from legcal.vision import Board
+from legcal.vision import Board, FixedBoard
 
 MODELS = sorted(path.stem for path in SHIPPED_YAML.parent.glob("*.yaml"))
 LEGS = tuple(f"leg{j}" for j in range(1, 7))
@@ -259,7 +259,8 @@ def test_a_dataset_is_judged_by_itself() -> None:
 
 def test_a_dataset_with_a_board_is_judged_with_it() -> None:
     """Everywhere until somebody has looked for it, then in the views that show it."""
-    with_board = replace(example(), board=Board("chessboard", 9, 6, 0.03))
+    board = Board("chessboard", 9, 6, 0.03)
+    with_board = replace(example(), boards=(FixedBoard(board, "base"),))
     assert not recorded_observations(example()).board.any()
     assert recorded_observations(with_board).board.all()
     row = np.flatnonzero(example().measurements.view == 1)[:1]

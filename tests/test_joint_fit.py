@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from dense_fit import allowed, by_differences, projected_move, residuals
 from fit_sessions import (
+    BOARD_SCALE,
     LENS,
     SHIPPED,
     AxesSession,
@@ -33,7 +34,6 @@ from thinned import thinned
 from legcal.calibration.identify.predicted_observations import PredictedObservations
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.joint_fit import (
-    BOARD_SCALE,
     DEFAULT_SETTINGS,
     Choices,
     FittedLegs,
@@ -614,8 +614,7 @@ def test_a_fit_with_a_board_is_exact_without_noise(name: str, by_hand: bool) -> 
         measurements, start = in_the_hand(session, start)
     solution = refine(session.legs, measurements, session.outlines, start, board=seen)
     assert max(errors(session, solution).values()) < 1e-8
-    assert solution.T_Rb_board is not None
-    apart = place_of_board(session).inv() * solution.T_Rb_board
+    apart = place_of_board(session).inv() * solution.T_frame_board["base"]
     assert np.linalg.norm(apart.translation) < 1e-8
     assert solution.values[BOARD_SCALE] == pytest.approx(1.0, abs=1e-8)
     assert solution.status[BOARD_SCALE] == "estimated"

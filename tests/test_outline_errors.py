@@ -11,6 +11,7 @@ from csv_rows import read_rows
 from dense_fit import jacobian, residuals
 from fit_sessions import (
     BOARD,
+    BOARD_SCALE,
     PINHOLE,
     HexapodSession,
     MachineSession,
@@ -30,7 +31,6 @@ from thinned import thinned
 
 import legcal
 from legcal.calibration.joint_fit import (
-    BOARD_SCALE,
     DEFAULT_SETTINGS,
     KINDS,
     FitProblem,
@@ -243,7 +243,7 @@ def test_a_few_wrong_corners_do_little() -> None:
         board=replace(seen, corners=replace(corners, px=px)),
     )
     assert np.abs((_errors(session, bent) - _errors(session, right)) / right.sigma[:30]).max() < 1.0
-    assert {corner for _, corner in bent.rejected_corners} == {*range(0, BOARD.n_corners, 9)}
+    assert {corner for _, _, corner in bent.rejected_corners} == {*range(0, BOARD.n_corners, 9)}
     assert any("disagree with the fit and were left out" in note for note in bent.notes)
 
 
@@ -253,7 +253,7 @@ def test_rejected_corners_and_a_board_in_no_image_are_left_out() -> None:
     none = replace(corners, used=np.zeros(len(corners), dtype=np.bool_))
     seen, start = with_board(session, none)
     solution = refine(session.legs, session.measurements, session.outlines, start, board=seen)
-    assert (solution.T_Rb_board, solution.rms_corners_px) == (None, None)
+    assert (solution.T_frame_board, solution.rms_corners_px) == ({}, {})
     assert BOARD_SCALE not in solution.values
 
 

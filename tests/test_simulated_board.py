@@ -51,9 +51,9 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_corners_are_off_by_as_much_as_they_claim(standing: Path) -> None:
     dataset = load_dataset(standing)
-    corners, board, T_base_board = dataset.corners, dataset.board, dataset.T_base_board
+    corners, (fixed,) = dataset.corners, dataset.boards
+    board, T_base_board = fixed.board, fixed.T_link_board
     assert corners is not None
-    assert board is not None
     assert T_base_board is not None
     view = dataset.measurements.views[0]
     truth = _truth(standing)["views"]["c1"]["T_base_camera"]
@@ -66,9 +66,9 @@ def test_corners_are_off_by_as_much_as_they_claim(standing: Path) -> None:
 
 def test_the_truth_says_where_the_board_is(standing: Path, held: Path) -> None:
     for folder in (standing, held):
-        _, T = parse_board(_truth(folder)["board"], folder)
+        T = parse_board(_truth(folder)["board"], folder).T_link_board
         assert T is not None
-        given = load_dataset(folder).T_base_board
+        given = load_dataset(folder).boards[0].T_link_board
         assert (given is None) == (folder == held)
         assert given is None or np.allclose(given.as_matrix(), T.as_matrix())
 
@@ -77,13 +77,12 @@ def test_every_hand_held_image_has_its_own_place_and_the_board_gives_it(held: Pa
     dataset = load_dataset(held)
     m = dataset.measurements
     assert dataset.corners is not None
-    assert dataset.board is not None
     assert [view.name for view in m.views] == [f"c1-{k + 1}" for k in range(m.n_rows)]
     poses, _ = camera_poses_by_board(
-        dataset.corners, dataset.board, m, [view.name for view in m.views]
+        dataset.corners, dataset.boards[0].board, m, [view.name for view in m.views]
     )
     truth = _truth(held)
-    _, T_base_board = parse_board(truth["board"], held)
+    T_base_board = parse_board(truth["board"], held).T_link_board
     assert T_base_board is not None
     places = []
     for view, T_board_camera in zip(m.views, poses, strict=True):
@@ -101,13 +100,13 @@ def test_photographs_show_the_board_where_it_is(tmp_path: Path) -> None:
     simulate(machine(), tmp_path / "seen", settings)
     dataset = load_dataset(tmp_path / "seen")
     assert dataset.corners is None
-    assert dataset.board is not None
-    number, px, sigma = find_corners(dataset.board, dataset.image_reader([0])(0))
+    board = dataset.boards[0].board
+    number, px, sigma = find_corners(board, dataset.image_reader([0])(0))
     truth = _truth(tmp_path / "seen")
-    _, T_base_board = parse_board(truth["board"], tmp_path)
+    T_base_board = parse_board(truth["board"], tmp_path).T_link_board
     assert T_base_board is not None
     T = motion_from_xyz_quat(**truth["views"]["c1"]["T_base_camera"]).inv() * T_base_board
-    exact = dataset.measurements.views[0].camera.project(T.apply(dataset.board.points))
+    exact = dataset.measurements.views[0].camera.project(T.apply(board.points))
     error = px - exact[number]
     assert len(number) >= 20
     assert np.sqrt(np.mean(error**2)) < 0.04

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fit_sessions import (
-    BOARD,
+    BOARD_SCALE,
     LENS,
     MachineSession,
     corners_of,
@@ -17,15 +17,15 @@ from fit_sessions import (
 from thinned import thinned
 
 from legcal.calibration.joint_fit import (
-    BOARD_SCALE,
     NO_CHOICES,
     Choices,
     Prior,
     Solution,
     refine,
 )
+from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.errors import DidNotConverge, NotIdentifiable
-from legcal.vision import Board, with_intrinsics
+from legcal.vision import with_intrinsics
 
 
 @pytest.fixture(scope="module")
@@ -329,12 +329,18 @@ def test_one_wrong_radius_is_no_wrong_scale(noisy: MachineSession) -> None:
     assert found.notes == ()
 
 
+def _sized(seen: BoardCorners, factor: float) -> BoardCorners:
+    (fixed,) = seen.boards
+    other = replace(fixed, board=replace(fixed.board, side=factor * fixed.board.side))
+    return replace(seen, boards=(other,))
+
+
 @pytest.mark.parametrize("factor", thinned([0.5, 1.02], [1.02]))
 def test_a_board_of_other_dimensions_is_refused(factor: float) -> None:
     session = machine_session("hexapod")
     measurements, outlines = session.noisy(7)
     seen, start = with_board(session, corners_of(session, seed=8))
-    wrong = replace(seen, board=Board("chessboard", 7, 6, factor * BOARD.side))
+    wrong = _sized(seen, factor)
     with pytest.raises(DidNotConverge, match=r"board does not fit .* measure the bo") as refusal:
         refine(session.legs, measurements, outlines, start, board=wrong)
     size = float(str(refusal.value).split("found that it is ")[1].split(" times")[0])
@@ -345,7 +351,7 @@ def test_the_size_of_a_board_can_be_left_to_the_fit_or_known_or_fixed() -> None:
     session = machine_session("hexapod")
     measurements, outlines = session.noisy(9)
     seen, start = with_board(session, corners_of(session, seed=10))
-    wrong = replace(seen, board=Board("chessboard", 7, 6, 0.98 * BOARD.side))
+    wrong = _sized(seen, 0.98)
     everything = session.legs, measurements, outlines, start
     found = refine(*everything, board=wrong, choices=Choices(free=frozenset({BOARD_SCALE})))
     assert found.values[BOARD_SCALE] == pytest.approx(1.0 / 0.98, abs=2e-3)
@@ -356,7 +362,7 @@ def test_the_size_of_a_board_can_be_left_to_the_fit_or_known_or_fixed() -> None:
     fixed = Choices(fixed=frozenset({BOARD_SCALE}))
     held = refine(*everything, board=seen, choices=fixed)
     assert BOARD_SCALE not in held.names
-    assert held.T_Rb_board is not None
+    assert "base" in held.T_frame_board
     stated = Choices(priors={BOARD_SCALE: Prior(1.0, 1e-3)})
     with pytest.raises(DidNotConverge, match=rf"prior of {BOARD_SCALE} contradicts"):
         refine(*everything, board=wrong, choices=stated)

@@ -1,19 +1,22 @@
-"""The calibration board of a dataset: how it ties cameras to each other before any fit.
+"""The calibration boards of a dataset: how they tie cameras to each other before any fit.
 
-The board is fixed to the base. Each camera that shows it is placed against it, so that one rough
+A board on the base stands still: each camera that shows it is placed against it, so that one rough
 camera pose, or a rough pose of the board, places all of them, and the four steps may take all views
-that show it for one camera.
+that show it for one camera. A board on the platform goes where nominal kinematics say, from and to
+places that are not known: as a hand-eye calibration, that places cameras without any rough pose.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.joint_fit import BoardCorners, Solution
+from legcal.calibration.location.frames import PosePairs, transforms
+from legcal.calibration.location.search import search
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.data import (
     CORNERS_NAME,
@@ -22,51 +25,60 @@ from legcal.data import (
     Dataset,
     LegAxes,
     Measurements,
+    join_corners,
 )
 from legcal.errors import DatasetError, NotVisible
-from legcal.geometry import IntArray, pose_distance
-from legcal.perception import FAR_OFF, camera_poses_by_board, detect_corners, require_board
-from legcal.vision import Board
+from legcal.geometry import IntArray, components, pose_distance
+from legcal.perception import (
+    FAR_OFF,
+    board_poses_in_images,
+    camera_poses_by_board,
+    detect_corners,
+    require_board,
+)
+from legcal.vision import FixedBoard
 
 Poses = Sequence[RigidTransform | None]  # one a view
 _MAX_DISTANCE, _MAX_ANGLE = FAR_OFF
+_FEWEST = 4  # images of a board on the platform that place a camera
 
 
 @dataclass(frozen=True, eq=False)
 class BoardViews:
-    """The board and how each camera stands to it."""
+    """The boards and how each camera stands to them."""
 
-    board: Board
+    boards: tuple[FixedBoard, ...]
     corners: Corners  # of all images
-    T_board_camera: tuple[RigidTransform | None, ...]  # None where a view does not show it
+    # To the board on the base, None where a view does not show it
+    T_board_camera: tuple[RigidTransform | None, ...]
+    T_camera_board: Mapping[int, RigidTransform]  # of the board on the platform, by image row
     view_of_row: tuple[str, ...]
 
     def at(self, rows: IntArray) -> BoardCorners:
-        """Return the board in some of the images."""
-        return BoardCorners(self.board, self.corners.at(rows))
+        """Return the boards in some of the images."""
+        return BoardCorners(self.boards, self.corners.at(rows))
 
-    def reject_outliers(self, solution: Solution) -> Corners:
-        """Return the corners of all images, those that a fit left out rejected."""
+    def reject_outliers(self, solution: Solution, fitted: OrderedDataset) -> Corners:
+        """Return the corners of all images, those that a fit of some images left out rejected."""
         left_out = set(solution.rejected_corners)
         if not left_out:
             return self.corners
         corners = self.corners
+        poses = fitted.measurements.pose.tolist()
+        pose_of_row = dict(zip(fitted.rows.tolist(), poses, strict=True))
+        places = zip(corners.row.tolist(), corners.corner.tolist(), strict=True)
         wrong = np.array(
             [
-                used and (self.view_of_row[row], corner) in left_out
-                for used, row, corner in zip(
-                    corners.used.tolist(),
-                    corners.row.tolist(),
-                    corners.corner.tolist(),
-                    strict=True,
-                )
+                any((self.view_of_row[row], p, corner) in left_out
+                    for p in (-1, pose_of_row.get(row, -1)))
+                for row, corner in places
             ],
             dtype=np.bool_,
-        )
-        return corners.reject(wrong, "disagrees with the fit")
+        )  # fmt: skip
+        return corners.reject(wrong & corners.used, "disagrees with the fit")
 
     def poses_by_view(self, T_x_camera: Poses) -> dict[int, RigidTransform]:
-        """Return T_x_board by each camera that shows the board, x any frame."""
+        """Return T_x_board of the base's by each camera that shows it, x any frame."""
         return {
             v: camera * T.inv()
             for v, (camera, T) in enumerate(zip(T_x_camera, self.T_board_camera, strict=True))
@@ -74,60 +86,157 @@ class BoardViews:
         }
 
     def pose_by_cameras(self, T_x_camera: Poses) -> RigidTransform | None:
-        """Return T_x_board on which most cameras agree; None if none shows the board.
+        """Return T_x_board of the base's on which most cameras agree; None if none shows it.
 
         Outliers are left out: one wrong camera pose must not turn all others.
         """
-        found = list(self.poses_by_view(T_x_camera).values())
-        if not found:
-            return None
-        agreeing = [[other for other in found if _agree(one, other, reach=2.0)] for one in found]
-        together = RigidTransform.concatenate(max(agreeing, key=len))
-        middle = np.median(together.translation, axis=0)
-        return RigidTransform.from_components(middle, together.rotation.mean())
+        return _agreed(list(self.poses_by_view(T_x_camera).values()))
+
+    def pose_on_platform(
+        self, data: OrderedDataset, T_x_camera: Poses, T_x_platform: Sequence[RigidTransform]
+    ) -> RigidTransform | None:
+        """Return T_platform_board of the platform's on which most of some images agree.
+
+        *T_x_platform* is that of every pose, x any frame; None if no image shows the board.
+        """
+        place = zip(data.rows.tolist(), data.measurements.view.tolist(),
+                    data.measurements.pose.tolist(), strict=True)  # fmt: skip
+        return _agreed(
+            [
+                T_x_platform[pose].inv() * camera * self.T_camera_board[row]
+                for row, view, pose in place
+                if row in self.T_camera_board and (camera := T_x_camera[view]) is not None
+            ]
+        )
 
     def cameras(
         self, T_x_board: RigidTransform, others: Poses
     ) -> tuple[RigidTransform | None, ...]:
-        """Return T_x_camera of every view: by the board, and *others* where it is not shown."""
+        """Return T_x_camera of every view: by the base's board, *others* where it is not shown."""
         return tuple(
             other if T is None else T_x_board * T
             for T, other in zip(self.T_board_camera, others, strict=True)
         )
 
+    def cameras_by_platform(self, data: OrderedDataset, known: Poses) -> Poses:
+        """Return T_base_camera of every view, known ones as they are, others by the platform's.
+
+        The board on the platform goes where the nominal kinematics carry it. Where it is fixed to
+        the platform is found with the cameras; views that show the base's board too stand together.
+        """
+        view, pose = data.measurements.view, data.measurements.pose
+        frames: dict[int, list[int]] = {}  # the rows of views that stand together, by one of these
+        tied = [v for v, T in enumerate(self.T_board_camera) if T is not None]
+        for row in sorted(self.T_camera_board):
+            v = int(view[row])
+            frames.setdefault(tied[0] if v in tied else v, []).append(row)
+        T_base_platform = data.T_base_platform
+        given = next((b.T_link_board for b in self.boards if b.link == "platform"), None)
+        T_platform_board = given
+        if T_platform_board is None:
+            T_platform_board = self.pose_on_platform(data, known, T_base_platform)
+        if T_platform_board is None and frames:
+            most = max(frames.values(), key=len)
+            if len(np.unique(pose[most])) >= _FEWEST:
+                T_platform_board = _hand_eye(
+                    [T_base_platform[pose[row]] for row in most],
+                    [self._in_frame(row, view) for row in most],
+                )
+        if T_platform_board is None:
+            return known
+        T_base_frame = {
+            v: _agreed(
+                [
+                    T_base_platform[pose[row]] * T_platform_board * self._in_frame(row, view).inv()
+                    for row in rows
+                ]
+            )
+            for v, rows in frames.items()
+        }
+        found = list(known)
+        for v, T in enumerate(known):
+            frame = T_base_frame.get(tied[0] if v in tied else v)
+            if T is None and frame is not None:
+                own = self.T_board_camera[v]
+                found[v] = frame if own is None else frame * own
+        return tuple(found)
+
+    def _in_frame(self, row: int, view: IntArray) -> RigidTransform:
+        """Return the pose of the platform's board in the base's board, or else in the camera."""
+        T_board_camera = self.T_board_camera[view[row]]
+        seen = self.T_camera_board[row]
+        return seen if T_board_camera is None else T_board_camera * seen
+
+
+def _hand_eye(
+    T_base_platform: Sequence[RigidTransform], T_frame_board: Sequence[RigidTransform]
+) -> RigidTransform:
+    """Return T_platform_board by which T_frame_base T_base_platform T_platform_board is as seen."""
+    R, t = components(T_base_platform)
+    M, p = components(T_frame_board)
+    length = float(np.linalg.norm(np.ptp(t, axis=0))) + float(np.linalg.norm(p, axis=1).mean())
+    pairs = PosePairs(R, t, M, p, np.ones(len(R), dtype=np.bool_), length)
+    return transforms(search(pairs, _FEWEST).frames[0])[1]
+
+
+def _agreed(found: Sequence[RigidTransform]) -> RigidTransform | None:
+    """Return the middle of those poses that most agree on; None of none."""
+    if not found:
+        return None
+    agreeing = [[other for other in found if _agree(one, other, reach=2.0)] for one in found]
+    together = RigidTransform.concatenate(max(agreeing, key=len))
+    middle = np.median(together.translation, axis=0)
+    return RigidTransform.from_components(middle, together.rotation.mean())
+
 
 def observe_board(data: OrderedDataset) -> BoardViews | None:
-    """Return what the images of a dataset show of its board, None if it has none.
+    """Return what the images of a dataset show of its boards, None if it has none.
 
     Raises
     ------
     NotVisible
-        If no image shows the board, or that of a hand-held view does not.
+        If no image shows a board, or that of a hand-held view does not show the base's.
     DatasetError
         If what is shown cannot be the board that the dataset describes, or it has moved.
     """
     dataset, measurements = data.dataset, data.measurements
-    if dataset.board is None:
+    if not dataset.boards:
         return None
     used = [measurements.views[v] for v in np.unique(measurements.view).tolist()]
-    needed = {view.name for view in used if view.hand_held}
-    if dataset.corners is not None:
-        corners = data.order.reorder(dataset.corners)
-    else:
-        rows = [row for row, image in enumerate(measurements.image) if image]
-        load = data.photographs.load
-        corners = detect_corners(dataset.board, load, rows, data.pool, data.progress)
-        shown = needed if len(corners) else {view.name for view in used}
-        require_board(dataset.board, corners, load, measurements, shown)
-    T_board_camera, corners = camera_poses_by_board(corners, dataset.board, measurements, needed)
-    if all(T is None for T in T_board_camera):
-        raise NotVisible(
-            f"{dataset.yaml_path}: the calibration board could not be used: found no image with "
-            f"{MIN_CORNERS} of its corners or more, needed one; add corners to "
-            f"{CORNERS_NAME}, or remove that table or the block board."
-        )
+    hand_held = {view.name for view in used if view.hand_held}
+    given = None if dataset.corners is None else data.order.reorder(dataset.corners)
+    T_board_camera: tuple[RigidTransform | None, ...] = (None,) * len(measurements.views)
+    T_camera_board: dict[int, RigidTransform] = {}
+    tables = []
+    for fixed in dataset.boards:
+        on_base = fixed.link == "base"
+        needed = hand_held if on_base else set[str]()
+        if given is not None:
+            own = given.choose(fixed.has(given.corner))
+            own = replace(own, corner=own.corner - fixed.first)
+        else:
+            rows = [row for row, image in enumerate(measurements.image) if image]
+            load = data.photographs.load
+            own = detect_corners(fixed.board, load, rows, data.pool, data.progress)
+            shown = needed if len(own) else {view.name for view in used}
+            require_board(fixed.board, own, load, measurements, shown)
+        if on_base:
+            T_board_camera, own = camera_poses_by_board(own, fixed.board, measurements, needed)
+            found = any(T is not None for T in T_board_camera)
+        else:
+            T_camera_board, own = board_poses_in_images(own, fixed.board, measurements)
+            found = bool(T_camera_board)
+        if not found:
+            which = "" if on_base else " on the platform"
+            raise NotVisible(
+                f"{dataset.yaml_path}: the calibration board{which} could not be used: found no "
+                f"image with {MIN_CORNERS} of its corners or more, needed one; add corners to "
+                f"{CORNERS_NAME}, or remove that table or the block board."
+            )
+        tables.append(replace(own, corner=own.corner + fixed.first))
+    corners = join_corners(tables).sort()
     names = tuple(measurements.views[v].name for v in measurements.view.tolist())
-    return BoardViews(dataset.board, corners, T_board_camera, names)
+    return BoardViews(dataset.boards, corners, T_board_camera, T_camera_board, names)
 
 
 def base_of_board(dataset: Dataset, board: BoardViews, hints: Poses) -> RigidTransform | None:
@@ -138,7 +247,8 @@ def base_of_board(dataset: Dataset, board: BoardViews, hints: Poses) -> RigidTra
     DatasetError
         If the dataset has the board where none of these cameras sees it.
     """
-    given, by_cameras = dataset.T_base_board, board.pose_by_cameras(hints)
+    fixed, by_cameras = dataset.board_on("base"), board.pose_by_cameras(hints)
+    given = None if fixed is None else fixed.T_link_board
     if given is None or by_cameras is None:
         return by_cameras if given is None else given
     # Wrong poses beside a right one are named when the images have placed their cameras.
@@ -155,28 +265,43 @@ def base_of_board(dataset: Dataset, board: BoardViews, hints: Poses) -> RigidTra
 
 
 def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -> list[str]:
-    """Return notes on views that do not show the board, and on a wrong T_base_board."""
+    """Return notes on views that do not show the base's board, and on wrong poses of boards."""
     if corners is None:
         return []
     measurements, notes = dataset.measurements, []
-    shown = set(measurements.view[corners.row[corners.used]].tolist())
+    fixed = dataset.board_on("base")
+    if fixed is None:
+        return _misplaced(dataset, solution)
+    own = corners.used & fixed.has(corners.corner)
+    shown = set(measurements.view[corners.row[own]].tolist())
     without = [
         measurements.views[v].name for v in np.unique(measurements.view).tolist() if v not in shown
     ]
     if without:
+        others = "the legs and the board on the platform" if len(dataset.boards) > 1 else "the legs"
         notes.append(
             f"No image of {', '.join(without)} shows the calibration board, or too little of it: "
-            "these cameras are placed by the legs alone."
+            f"these cameras are placed by {others} alone."
         )
-    given, found = dataset.T_base_board, solution.T_Rb_board
-    if given is not None and found is not None:
-        place = dataset.machine.T_base_Rb * found
+    return [*notes, *_misplaced(dataset, solution)]
+
+
+def _misplaced(dataset: Dataset, solution: Solution) -> list[str]:
+    """Return notes on boards that are far from where the dataset has them."""
+    notes, machine = [], dataset.machine
+    frames = {"base": machine.T_base_Rb, "platform": machine.T_platform_Re}
+    for fixed in dataset.boards:
+        given, found = fixed.T_link_board, solution.T_frame_board.get(fixed.link)
+        if given is None or found is None:
+            continue
+        place = frames[fixed.link] * found
         if not _agree(given, place):
             far, turned = pose_distance(given, place)
+            key, which = f"T_{fixed.link}_board", "" if fixed.link == "base" else " on the platform"
             notes.append(
-                f"The calibration board stands {1e3 * far:.0f} mm and {np.degrees(turned):.1f} deg "
-                "from where T_base_board of the dataset has it, far more than base joints can be "
-                "off; the result does not depend on it; correct T_base_board."
+                f"The calibration board{which} stands {1e3 * far:.0f} mm and "
+                f"{np.degrees(turned):.1f} deg from where {key} of the dataset has it, far more "
+                f"than joints can be off; the result does not depend on it; correct {key}."
             )
     return notes
 

@@ -165,17 +165,28 @@ class Observations(Document):
     rejected: dict[str, int]  # outlines, by the reason
 
 
-class BoardPose(Document):
-    """The pose of the calibration board, R_b laid on the nominal one."""
+class BoardBlock(Document):
+    """A calibration board in the fit."""
 
-    T_base_board: Pose
-    given: Pose | None
+    given: Pose | None  # its pose in the link that it is fixed to, as the dataset has it
     scale: Number
     rms_px: Number | None
     corners: int = 0  # of all images
     used: int = 0  # of these
     images: int = 0  # with a corner that is used
-    off: Distance | None = None  # from where the dataset has it, base joints being nominal
+    off: Distance | None = None  # from where the dataset has it, joints of the link being nominal
+
+
+class BoardPose(BoardBlock):
+    """The pose of the calibration board on the base, R_b laid on the nominal one."""
+
+    T_base_board: Pose
+
+
+class PlatformBoardPose(BoardBlock):
+    """The pose of the calibration board on the platform, R_e laid on the nominal one."""
+
+    T_platform_board: Pose
 
 
 class PoseAccuracy(Document):
@@ -273,6 +284,7 @@ class Result(Legs, Heading):
     residuals: ResidualsBlock
     observations: Observations | None = None  # left out by earlier versions
     board: BoardPose | None = None  # left out without a board
+    platform_board: PlatformBoardPose | None = None  # left out without a board on the platform
     start: str
     platform: PlatformBlock | None
     holdout: Holdout | None = None  # left out without held-out images
@@ -281,7 +293,8 @@ class Result(Legs, Heading):
     @model_serializer(mode="wrap")
     def _without_absent_blocks(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         found: dict[str, Any] = handler(self)
-        absent = [key for key in ("observations", "board", "holdout") if found[key] is None]
+        optional = ("observations", "board", "platform_board", "holdout")
+        absent = [key for key in optional if found[key] is None]
         return {key: value for key, value in found.items() if key not in absent}
 
     @classmethod

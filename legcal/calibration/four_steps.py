@@ -53,13 +53,14 @@ def four_steps(
         if axes is None:
             radii = {p: r for leg in data.machine.legs for p, r in leg.radius_of_part.items()}
             axes = axes_from_outlines(outlines, measurements, radii)
-        if board is not None:
+        joined = board is not None and any(T is not None for T in board.T_board_camera)
+        if board is not None and joined:
             axes, measurements, T_first_camera, new_view = in_one_camera(
                 axes, measurements, board.T_board_camera
             )
         base = run_base_steps(nominal, axes, measurements, criteria=options.criteria)
         cameras = tuple(base.T_Rb_camera)
-        if board is not None:
+        if joined:
             moved = zip([cameras[v] for v in new_view.tolist()], T_first_camera, strict=True)
             cameras = tuple(T if T is None or own is None else T * own for T, own in moved)
         try:
@@ -103,22 +104,33 @@ def starts(
         by_label["staged"] = (steps.legs, staged, rough)
     found = []
     for label, (legs, first, second) in by_label.items():
-        cameras = _start_cameras(data, outlines, first, second, steps)
+        cameras = _start_cameras(data, outlines, first, second, steps, board)
         start = start_from(legs, data.measurements, data.fitted_legs, cameras, data.T_Rb_Re, label)
         if board is not None:
-            T_Rb_board = board.pose_by_cameras([T.inv() for T in cameras])
+            T_Rb_camera = [T.inv() for T in cameras]
+            T_Rb_board = board.pose_by_cameras(T_Rb_camera)
             start = start if T_Rb_board is None else replace(start, T_Rb_board=T_Rb_board)
+            T_Re_board = board.pose_on_platform(data, T_Rb_camera, start.T_Rb_Re)
+            start = start if T_Re_board is None else replace(start, T_Re_board=T_Re_board)
         found.append(start)
     return found
 
 
 def _start_cameras(
-    data: OrderedDataset, outlines: Outlines, first: Poses, second: Poses, steps: Steps
+    data: OrderedDataset,
+    outlines: Outlines,
+    first: Poses,
+    second: Poses,
+    steps: Steps,
+    board: BoardViews | None,
 ) -> list[RigidTransform]:
     """Return a camera pose for every view, the first choice where there is one."""
     cameras = [a if a is not None else b for a, b in zip(first, second, strict=True)]
     shown = outlines.row[outlines.used] if data.axes is None else data.axes.row
     needed = set(data.measurements.view[shown].tolist())
+    if board is not None:
+        on_platform = [row in board.T_camera_board for row in data.rows.tolist()]
+        needed |= set(data.measurements.view[on_platform].tolist())
     unknown = [
         view.name
         for v, view in enumerate(data.measurements.views)
@@ -130,6 +142,6 @@ def _start_cameras(
             "T_base_camera, and the four steps do not locate it "
             f"({steps.failure or 'fewer than three base joints are seen'}); needed one of them; "
             "add a rough T_base_camera to dataset.yaml"
-            + (", or T_base_board to its block board." if data.dataset.board else ".")
+            + (", or T_base_board to its block board." if data.dataset.board_on("base") else ".")
         )
     return [T if T is not None else RigidTransform.identity() for T in cameras]

@@ -318,6 +318,8 @@ def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]
         if T_base_board is not None:
             cameras = board.cameras(T_base_board, placement.T_base_camera)
             placement = replace(placement, T_base_camera=cameras)
+        cameras = tuple(board.cameras_by_platform(data, placement.T_base_camera))
+        placement = replace(placement, T_base_camera=cameras)
     return placement, board
 
 
@@ -348,7 +350,7 @@ def _fit(
         choices=choices,
     )
     fitted.progress("Joint fit", 1, 1)
-    corners = None if board is None else board.reject_outliers(solution)
+    corners = None if board is None else board.reject_outliers(solution, fitted)
     return Estimate(fitted, outlines, steps, solution, corners)
 
 
@@ -521,7 +523,7 @@ def _choices(dataset: Dataset, overrides: Sequence[Override]) -> Choices:
         dataset.machine,
         dataset.measurements.views,
         axes_given=dataset.axes is not None,
-        with_board=dataset.board is not None,
+        boards=dataset.boards,
     )
     choices = resolve([*dataset.overrides, *overrides], known)
     twists = {

@@ -22,6 +22,7 @@ from legcal.calibration.documents import (
     Observations,
     ParameterRow,
     PlatformBlock,
+    PlatformBoardPose,
     Pose,
     PoseAccuracy,
     ResidualsBlock,
@@ -35,11 +36,11 @@ from legcal.calibration.documents import (
 )
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit import (
-    BOARD_SCALE,
     HeldOut,
     PlatformAccuracy,
     PlatformError,
     Solution,
+    board_scale,
     known_parameters,
     poses_at_readings,
 )
@@ -57,7 +58,7 @@ from legcal.machine import (
     pose_differences,
     vector_of,
 )
-from legcal.vision import camera_numbers, shared_cameras
+from legcal.vision import LINKS, Link, camera_numbers, shared_cameras
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -127,6 +128,7 @@ def _result_of(calibration: Calibration) -> Result:
     o, axes = solution.outlines, dataset.axes
     shown = np.unique(measurements.view[o.row[o.used] if axes is None else axes.row]).tolist()
     T_base_Rb = machine.T_base_Rb
+    on_base, on_platform = (_board(calibration, link) for link in LINKS)
     return Result(
         legcal_result=1,
         status="converged",
@@ -164,7 +166,10 @@ def _result_of(calibration: Calibration) -> Result:
         stages=Stages(staged=_staged(calibration)),
         residuals=ResidualsBlock.model_validate(solution),
         observations=_observations(calibration),
-        board=_board(calibration),
+        board=None if on_base is None else BoardPose.model_validate(on_base),
+        platform_board=(
+            None if on_platform is None else PlatformBoardPose.model_validate(on_platform)
+        ),
         start=solution.start,
         platform=_platform(calibration),
         holdout=_holdout(calibration),
@@ -199,8 +204,7 @@ def _parameters(calibration: Calibration) -> list[ParameterRow]:
     numbers = vector_of(found, solution.legs, geometries(machine)).tolist()
     values = {**solution.values, **dict(zip(found.names, numbers, strict=True))}
     sigma = dict(zip(solution.names, solution.sigma.tolist(), strict=True))
-    with_board = dataset.board is not None
-    known = known_parameters(machine, dataset.measurements.views, with_board=with_board).by_name
+    known = known_parameters(machine, dataset.measurements.views, boards=dataset.boards).by_name
     return [
         ParameterRow(
             name=name,
@@ -258,27 +262,32 @@ def _observations(calibration: Calibration) -> Observations:
     )
 
 
-def _board(calibration: Calibration) -> BoardPose | None:
-    """Return where the board stands, which differs from what the dataset says by where R_b is."""
+def _board(calibration: Calibration, link: Link) -> dict[str, Any] | None:
+    """Return where the board on a link is, which differs from the dataset by where R_b, R_e are."""
     solution, dataset, corners = calibration.solution, calibration.dataset, calibration.corners
-    if solution.T_Rb_board is None:
+    fixed, T_frame_board = dataset.board_on(link), solution.T_frame_board.get(link)
+    if fixed is None or T_frame_board is None or corners is None:
         return None
-    given, T_base_board = dataset.T_base_board, dataset.machine.T_base_Rb * solution.T_Rb_board
+    machine = dataset.machine
+    T_link_frame = machine.T_base_Rb if link == "base" else machine.T_platform_Re
+    given, T_link_board = fixed.T_link_board, T_link_frame * T_frame_board
     off = None
     if given is not None:
-        apart = given.inv() * T_base_board
+        apart = given.inv() * T_link_board
         turn = float(apart.rotation.magnitude())
         off = Distance(dX_m=float(np.linalg.norm(apart.translation)), dE_rad=turn)
-    return BoardPose(
-        T_base_board=_pose(T_base_board),
-        given=None if given is None else _pose(given),
-        scale=solution.values.get(BOARD_SCALE, 1.0),
-        rms_px=solution.rms_corners_px,
-        corners=0 if corners is None else len(corners),
-        used=0 if corners is None else int(corners.used.sum()),
-        images=0 if corners is None else len(np.unique(corners.row[corners.used])),
-        off=off,
-    )
+    own = corners.choose(fixed.has(corners.corner))
+    numbers: dict[str, Any] = {
+        f"T_{link}_board": _pose(T_link_board),
+        "given": None if given is None else _pose(given),
+        "scale": solution.values.get(board_scale(link), 1.0),
+        "rms_px": solution.rms_corners_px.get(link),
+        "corners": len(own),
+        "used": int(own.used.sum()),
+        "images": len(np.unique(own.row[own.used])),
+        "off": off,
+    }
+    return numbers
 
 
 def _platform(calibration: Calibration) -> PlatformBlock | None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from legcal.calibration.documents import (
+    BoardBlock,
     Holdout,
     NoSteps,
     PlatformBlock,
@@ -18,6 +19,7 @@ from legcal.calibration.documents import (
 )
 from legcal.calibration.plots import plot_uncertainty
 from legcal.errors import OutOfResources
+from legcal.vision import Link
 
 if TYPE_CHECKING:
     import pandas
@@ -221,17 +223,21 @@ _NONE = 5e-4  # [px, mm] and a tenth of it [deg]: would be shown as zero
 
 
 def _board_lines(result: Result) -> list[str]:
-    board = result.board
+    return [*_of_board("base", result.board), *_of_board("platform", result.platform_board)]
+
+
+def _of_board(link: Link, board: BoardBlock | None) -> list[str]:
+    which = "" if link == "base" else " on the platform"
     if board is None:
         return []
     line = (
-        f"Calibration board: {board.used} of {board.corners} corners used, in {board.images} "
-        f"images, {board.rms_px or 0.0:.3f} px rms."
+        f"Calibration board{which}: {board.used} of {board.corners} corners used, in "
+        f"{board.images} images, {board.rms_px or 0.0:.3f} px rms."
     )
     if board.off is not None:
         line += (
             f" It stands {1e3 * board.off.dX_m:.2f} mm and {np.degrees(board.off.dE_rad):.3f} deg "
-            "from where the dataset has it, if the joints of the base stand where the nominal "
+            f"from where the dataset has it, if the joints of the {link} stand where the nominal "
             "model has them."
         )
     return [line]

@@ -86,7 +86,7 @@ def _verdict_on_platform(platform: PlatformAccuracy, focal_error: float) -> Verd
 def _verdict_on_parameters(dataset: Dataset, solution: Solution) -> Verdict:
     """Compare the change of joints and lengths with their uncertainty."""
     known = known_parameters(
-        dataset.machine, dataset.measurements.views, with_board=dataset.board is not None
+        dataset.machine, dataset.measurements.views, boards=dataset.boards
     ).by_name
     lengths = [
         (solution.values[name] - known[name].nominal, sigma)

@@ -128,10 +128,11 @@ def _described(dataset: Dataset, settings: Mapping[str, object]) -> list[bytes]:
     ]
     rows = [measurements.image, measurements.view.tolist(), measurements.pose.tolist()]
     document = [FORMAT, __version__, settings, views, rows, measurements.sigma_q]
-    if dataset.board is not None:  # it places the cameras near which outlines are looked for
-        T = dataset.T_base_board
-        document.append(board_document(dataset.board))
+    for fixed in dataset.boards:  # they place the cameras near which outlines are looked for
+        T = fixed.T_link_board
+        document.append(board_document(fixed.board))
         document.append(None if T is None else T.as_matrix().tolist())
+        document += [] if fixed.link == "base" else [fixed.link]
     return [
         json.dumps(document, sort_keys=True).encode(),
         np.ascontiguousarray(measurements.q, dtype="<f8").tobytes(),

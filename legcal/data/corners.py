@@ -1,7 +1,8 @@
 """The table ``corners.csv``: corners of the calibration board, written and read back.
 
 One row a corner: view and image, named as in ``observations.csv``; the number of the corner on the
-board; where it is seen and the standard deviation of that [px]; verdict, reason and source.
+board (with two, those of the platform's follow on those of the base's); where it is seen and the
+standard deviation of that [px]; verdict, reason and source.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ from legcal.data.measurements import Measurements, find_rows, places, refuse_unk
 from legcal.data.outlines import SOURCES, UNLESS_REJECTED, VERDICT_COLUMNS, VERDICTS
 from legcal.files import Column, format_table, read_table, write_atomically
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.vision import Board
 
 NUMBERS = ("u", "v", "sigma")
 COLUMNS = ("view", "image", "corner", *NUMBERS, *(column.name for column in VERDICT_COLUMNS))
@@ -30,7 +30,7 @@ SIGMA_RANGE = (1e-6, 100.0)  # [px]: no corner is known better, and worse says n
 class Corners(ImageTable):
     """Corners of the board in images, one row a corner."""
 
-    corner: IntArray  # (n,) index into Board.points
+    corner: IntArray  # (n,) index into Board.points, counted on from FixedBoard.first
     px: Array  # (n, 2) where it is seen [px]; (0, 0) is the centre of the top-left pixel
     sigma_px: Array  # (n,) of either coordinate
     used: BoolArray
@@ -81,8 +81,8 @@ def format_corners(corners: Corners, measurements: Measurements) -> str:
     return format_table(COLUMNS, rows)
 
 
-def read_corners(path: Path, board: Board, measurements: Measurements) -> Corners:
-    """Return the table ``corners.csv`` in the order of the file.
+def read_corners(path: Path, n_corners: int, measurements: Measurements) -> Corners:
+    """Return the table ``corners.csv`` in the order of the file; boards have *n_corners*.
 
     An edited row wins over the detected one of the same image and corner. Raises DatasetError with
     one sentence for each thing that is wrong.
@@ -98,8 +98,8 @@ def read_corners(path: Path, board: Board, measurements: Measurements) -> Corner
             Column(
                 "corner",
                 "whole",
-                most=board.n_corners - 1,
-                needed=f"a corner of the board, 0 to {board.n_corners - 1}",
+                most=n_corners - 1,
+                needed=f"a corner of the board, 0 to {n_corners - 1}",
                 remedy="correct it, or the board in the dataset file",
             ),
             *(Column(name, blank=True, remedy=UNLESS_REJECTED) for name in NUMBERS[:2]),

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.data.axes import LegAxes, read_axes
@@ -16,8 +15,8 @@ from legcal.data.corners import Corners, read_corners
 from legcal.data.dataset_file import (
     ViewEntry,
     find_dataset_file,
-    hand_held_problems,
     read_dataset_file,
+    view_problems,
 )
 from legcal.data.measurements import Measurements, View, read_measurements
 from legcal.data.outlines import Outlines, read_observations
@@ -27,13 +26,14 @@ from legcal.errors import DatasetError
 from legcal.files import closest, describe, path_problem
 from legcal.machine import Machine, load_mechanism, shipped_folders, shipped_names
 from legcal.vision import (
-    Board,
     Camera,
+    FixedBoard,
     Grey,
     ImageFacts,
+    Link,
     decode_image,
     inspect_image,
-    parse_board,
+    parse_boards,
     read_camera,
 )
 from legcal.workers import KeptArrays
@@ -61,12 +61,15 @@ class Dataset:
     notes: tuple[str, ...] = ()  # what is odd but allowed
     axes: LegAxes | None = None  # the rows of ``axes.csv`` if there is one
     overrides: tuple[Override, ...] = ()  # what the block ``parameters`` asks of parameters by name
-    board: Board | None = None  # the calibration board that is fixed to the base
-    T_base_board: RigidTransform | None = None  # its pose in the base link, where it is known
+    boards: tuple[FixedBoard, ...] = ()  # the calibration boards, that on the base first
     corners: Corners | None = None  # the rows of ``corners.csv`` if there is one
     # What the files of images say of themselves, by the names of those that were looked at
     facts: Mapping[str, ImageFacts] = field(default_factory=dict)
     file_notes: tuple[str, ...] = ()  # those of the notes that come from these
+
+    def board_on(self, link: Link) -> FixedBoard | None:
+        """Return the calibration board on a link, None if it has none."""
+        return next((board for board in self.boards if board.link == link), None)
 
     def image_path(self, row: int) -> Path | None:
         """Return the image file of a row; None where only outlines are given."""
@@ -148,10 +151,8 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     yaml_path = find_dataset_file(Path(folder))
     folder = yaml_path.parent
     entry = read_dataset_file(yaml_path)
-    board, T_base_board = None, None
-    if entry.board is not None:
-        board, T_base_board = parse_board(entry.board, yaml_path)
-    problems = hand_held_problems(yaml_path, entry.views, has_board=board is not None)
+    boards = () if entry.board is None else parse_boards(entry.board, yaml_path)
+    problems = view_problems(yaml_path, entry.views, [board.link for board in boards])
     if found := path_problem(folder, entry.measurements):
         problems.append(
             f"{yaml_path}: measurements could not be used: found {found} ({entry.measurements}), "
@@ -185,9 +186,8 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         notes=(*notes, *left_out, *_unused_views(yaml_path, rows)),
         axes=axes,
         overrides=entry.parameters.overrides(yaml_path),
-        board=board,
-        T_base_board=T_base_board,
-        corners=read_given_corners(folder / CORNERS_NAME, board, measurements),
+        boards=boards,
+        corners=read_given_corners(folder / CORNERS_NAME, boards, measurements),
     )
     held = [view.hand_held for view in entry.views.values()]
     of_hand = [row for row, v in enumerate(rows.view.tolist()) if held[v]]
@@ -248,7 +248,7 @@ def _view(name: str, entry: ViewEntry, camera: Camera) -> View:
         name=name,
         camera=replace(camera, gamma=entry.gamma or 1.0, gamma_is_given=entry.gamma is not None),
         T_base_camera=entry.T_base_camera.motion() if entry.T_base_camera else None,
-        legs=tuple(entry.legs) if entry.legs else None,
+        legs=None if entry.legs is None else tuple(entry.legs),
     )
 
 
@@ -304,24 +304,24 @@ def rows_without_axes(table_path: Path, measurements: Measurements, axes: LegAxe
 
 
 def read_given_corners(
-    path: Path, board: Board | None, measurements: Measurements
+    path: Path, boards: tuple[FixedBoard, ...], measurements: Measurements
 ) -> Corners | None:
     """Return the corners beside a dataset, if there are any."""
     if not os.path.exists(path):
         return None
-    if board is None:
+    if not boards:
         raise DatasetError(
             f"{path}: the corners could not be used: found no board in the dataset file, needed "
             "the one that they belong to; describe it in the block board, or remove the table."
         )
-    return read_corners(path, board, measurements)
+    return read_corners(path, sum(b.board.n_corners for b in boards), measurements)
 
 
-def rows_without_board(
-    table_path: Path, measurements: Measurements, corners: Corners, hand_held: Sequence[int]
-) -> list[str]:
+def rows_without_board(dataset: Dataset, corners: Corners, hand_held: Sequence[int]) -> list[str]:
     """Return one sentence for each row of a hand-held view in which the board has no pose."""
-    counts = np.bincount(corners.row[corners.used], minlength=measurements.n_rows)
+    table_path, on_base = dataset.table_path, dataset.board_on("base")
+    shown = corners.used if on_base is None else corners.used & on_base.has(corners.corner)
+    counts = np.bincount(corners.row[shown], minlength=dataset.measurements.n_rows)
     return [
         f"{table_path}, row {row + 1}: its camera could not be placed: found "
         f"{counts[row] or 'no'} corners of the board in {CORNERS_NAME}, needed {MIN_CORNERS} in "
@@ -348,12 +348,14 @@ def inspect_rows(
             if not measurements.image[row]
         ]
     else:
-        problems = rows_without_board(table_path, measurements, dataset.corners, hand_held)
+        problems = rows_without_board(dataset, dataset.corners, hand_held)
     if dataset.axes is not None:
         return {}, [*problems, *rows_without_axes(table_path, measurements, dataset.axes)]
     facts: dict[str, ImageFacts] = {}
     outlines = dataset.observations
     given = set() if outlines is None else set(outlines.row.tolist())
+    if dataset.board_on("platform") is not None and dataset.corners is not None:
+        given |= set(dataset.corners.row[dataset.corners.used].tolist())
     for row in range(measurements.n_rows):
         path = dataset.image_path(row)
         if path is None and row not in given:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,6 +24,7 @@ from legcal.files import (
     validate,
 )
 from legcal.machine import DATASET_YAML
+from legcal.vision import Link
 
 ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
 GAMMAS = (0.2, 5.0)  # no camera encodes light more strongly
@@ -36,7 +37,7 @@ class ViewEntry(FileSchema):
     gamma: Annotated[Number, Field(ge=GAMMAS[0], le=GAMMAS[1])] | None = None  # not known
     T_base_camera: MotionEntry | None = None
     hand_held: Annotated[bool, Strict()] = False
-    legs: Annotated[list[str], Field(min_length=1)] | None = None
+    legs: list[str] | None = None  # none of them where a board on the platform is all that counts
 
     @field_validator("legs")
     @classmethod
@@ -90,7 +91,7 @@ class DatasetEntry(FileSchema):
     encoder_sigma: Annotated[Number, Field(gt=0.0)]
     views: Annotated[dict[Name, ViewEntry], Field(min_length=1)]
     parameters: ParametersEntry = Field(default_factory=ParametersEntry)
-    board: dict[str, Any] | None = None  # read by its kind
+    board: dict[str, Any] | list[Any] | None = None  # read by their kinds
 
     @field_validator("encoder_sigma")
     @classmethod
@@ -136,15 +137,27 @@ def read_dataset_file(path: Path) -> DatasetEntry:
     return validate(DatasetEntry, found, path)
 
 
-def hand_held_problems(path: Path, views: Mapping[str, ViewEntry], *, has_board: bool) -> list[str]:
-    """Return what keeps views from being hand-held."""
-    held = {name: view for name, view in views.items() if view.hand_held}
+def view_problems(
+    path: Path, views: Mapping[str, ViewEntry], boards: Collection[Link]
+) -> list[str]:
+    """Return what keeps views from showing no leg, and from being hand-held.
+
+    *boards* are the links that have a board.
+    """
     problems = [
+        f"{path}: views.{name}.legs could not be used: found an empty list and no board on the "
+        "platform, needed a leg or such a board in the images of every view; name legs, or "
+        "describe the board in the block board (on: platform)."
+        for name, view in views.items()
+        if view.legs == [] and "platform" not in boards
+    ]
+    held = {name: view for name, view in views.items() if view.hand_held}
+    problems += [
         f"{path}: views.{name}.hand_held could not be used: found no board, needed a calibration "
         "board on the base in every image of a camera that is held in the hand; describe it in "
         "the block board."
         for name in held
-        if not has_board
+        if "base" not in boards
     ]
     problems += [
         f"{path}: views.{name}.T_base_camera could not be used: found one pose of a camera that is "

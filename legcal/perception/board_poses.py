@@ -17,7 +17,7 @@ from scipy.special import chdtri
 
 from legcal.data import MIN_CORNERS, Corners, Measurements, few, row_names
 from legcal.errors import DatasetError, NotVisible
-from legcal.geometry import Array, BoolArray
+from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.board_adjustment import BoardImages, adjust_board
 from legcal.vision import Board, Camera
 
@@ -110,7 +110,7 @@ def camera_poses_by_board(
         here = np.flatnonzero((measurements.view[corners.row] == v) & corners.used)
         pose = None
         try:
-            pose = _view_pose(view.name, corners.choose(here), board, measurements)
+            pose = _joint_pose(view.name, corners.choose(here), board, measurements)
         except (DatasetError, NotVisible) as error:
             if isinstance(error, DatasetError) or view.name in needed:
                 problems.setdefault(type(error), []).extend(error.problems)
@@ -126,21 +126,59 @@ def camera_poses_by_board(
                 )
         T_board_camera.append(None if pose is None else pose.T_camera_plane.inv())
         if pose is not None:
-            off = np.zeros(len(corners))
-            off[here] = np.linalg.norm(pose.residual_px, axis=1)
-            outlier = np.zeros(len(corners), dtype=np.bool_)
-            outlier[here] = _outliers(pose, corners.choose(here))
-            why = [f"{px:.2g} px from where the other corners put it" for px in off]
-            corners = corners.reject(outlier, why)
+            corners = _without_outliers(corners, here, pose)
     for kind, sentences in problems.items():
         raise kind(sentences)
     return tuple(T_board_camera), corners
 
 
-def _view_pose(
+def board_poses_in_images(
+    corners: Corners, board: Board, measurements: Measurements
+) -> tuple[dict[int, RigidTransform], Corners]:
+    """Return T_camera_board by the rows of images, and corners without outliers.
+
+    The board moves with the platform: images of one view and one pose show one place of it. An
+    image that shows too few corners, or two poses explain, has none; corners of one that no pose of
+    this board explains are rejected. Raises DatasetError if most images are of that kind.
+    """
+    T_camera_board: dict[int, RigidTransform] = {}
+    places = np.stack([measurements.view, measurements.pose], axis=1)[corners.row]
+    wrong: list[str] = []
+    for v, pose_number in np.unique(places[corners.used], axis=0).tolist():
+        of_place = np.all(places == (v, pose_number), axis=1)
+        here = np.flatnonzero(of_place & corners.used)
+        rows = np.unique(corners.row[of_place]).tolist()
+        name = f"{measurements.views[v].name}, {row_names(measurements)[rows[0]]}"
+        try:
+            pose = _joint_pose(name, corners.choose(here), board, measurements)
+        except NotVisible:
+            continue
+        except DatasetError as error:
+            wrong += error.problems
+            corners = corners.reject(of_place, "no pose of the board explains it")
+            continue
+        if pose is not None:
+            T_camera_board |= dict.fromkeys(rows, pose.T_camera_plane)
+            corners = _without_outliers(corners, here, pose)
+    if len(wrong) > len(T_camera_board):
+        raise DatasetError(wrong)
+    return T_camera_board, corners
+
+
+def _without_outliers(corners: Corners, here: IntArray, pose: PlanePose) -> Corners:
+    """Return corners, those among *here* rejected that are far from where a pose puts them."""
+    off = np.zeros(len(corners))
+    off[here] = np.linalg.norm(pose.residual_px, axis=1)
+    outlier = np.zeros(len(corners), dtype=np.bool_)
+    outlier[here] = _outliers(pose, corners.choose(here))
+    why = [f"{px:.2g} px from where the other corners put it" for px in off]
+    return corners.reject(outlier, why)
+
+
+def _joint_pose(
     name: str, corners: Corners, board: Board, measurements: Measurements
 ) -> PlanePose | None:
-    """Return the pose of the board in a view; None if no image shows enough of its corners."""
+    """Return the pose that images share; None if none of them shows enough corners."""
     if not len(corners):
         return None
     camera = measurements.views[measurements.view[corners.row[0]]].camera

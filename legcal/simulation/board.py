@@ -22,6 +22,8 @@ from legcal.vision import (
     Board,
     BoardKind,
     Camera,
+    FixedBoard,
+    Link,
     board_document,
     charuco_board,
     dictionary,
@@ -40,7 +42,8 @@ _MIN_SHARE = 0.5  # of the corners that an image must show to count
 _MIN_CORNERS = 8
 
 KINDS: tuple[BoardKind, ...] = ("chessboard", "charuco", "aprilgrid")
-_WIDTH = 0.42  # of the size of the machine
+_WIDTH, _PLATFORM_WIDTH = 0.42, 0.3  # of the size of the machine
+_MARKERS: dict[Link, str] = {"base": "DICT_4X4_50", "platform": "DICT_5X5_50"}
 _DIGITS = 3  # of a side in metres: whole millimetres
 
 
@@ -129,10 +132,7 @@ class PlacedBoard:
 
     board: Board
     T_base_board: RigidTransform  # its pose in the base link
-
-    def document(self) -> dict[str, Any]:
-        """Return the board as the block of ``dataset.yaml`` has it, with its pose."""
-        return board_document(self.board) | {"T_base_board": motion_to_xyz_quat(self.T_base_board)}
+    first: int = 0  # the number of its first corner
 
     @property
     def towards_viewer(self) -> float:
@@ -166,6 +166,7 @@ class PlacedBoard:
         return replace(
             posed,
             solids=(*posed.solids, self.plate),
+            boards=(*posed.boards, self),
             vertices=np.concatenate([posed.vertices, self.plate.T_base_solid.apply(mesh.vertices)]),
             faces=np.concatenate([posed.faces, mesh.faces + len(posed.vertices)]),
         )
@@ -221,21 +222,46 @@ class PlacedBoard:
         return np.asarray(self.board.points[:, None] + aside)
 
 
+def placed_at(fixed: FixedBoard, T_base_platform: RigidTransform) -> PlacedBoard:
+    """Return a board on a link in its place at a pose of the platform."""
+    T = RigidTransform.identity() if fixed.T_link_board is None else fixed.T_link_board
+    T_base_board = T if fixed.link == "base" else T_base_platform * T
+    return PlacedBoard(fixed.board, T_base_board, fixed.first)
+
+
+def documents(boards: Sequence[FixedBoard], *, poses: bool) -> Any:
+    """Return boards as the block of ``dataset.yaml`` has them; None of none."""
+    found = [
+        board_document(fixed.board)
+        | ({} if fixed.link == "base" else {"on": fixed.link})
+        | (
+            {f"T_{fixed.link}_board": motion_to_xyz_quat(fixed.T_link_board)}
+            if poses and fixed.T_link_board is not None
+            else {}
+        )
+        for fixed in boards
+    ]
+    return found[0] if len(found) == 1 else found or None
+
+
 def chosen_board(
-    choice: Board | str | Path | None, posed_machines: Sequence[PosedMachine]
+    choice: Board | str | Path | None, posed_machines: Sequence[PosedMachine], link: Link = "base"
 ) -> Board | None:
-    """Return the board that settings ask for."""
+    """Return the board on a link that settings ask for; those of two links look different."""
     if choice is None or isinstance(choice, Board):
         return choice
     if choice not in KINDS:
         return read_board_file(Path(choice))
     joints = np.concatenate([part for m in posed_machines for part in (m.A, m.B)])
-    width = _WIDTH * float(np.linalg.norm(np.ptp(joints, axis=0)))
+    on_base = link == "base"
+    part = _WIDTH if on_base else _PLATFORM_WIDTH
+    width = part * float(np.linalg.norm(np.ptp(joints, axis=0)))
     if choice == "aprilgrid":
         side = max(round(width / 5.3, _DIGITS), 0.001)
         return Board(choice, 4, 3, side, spacing=0.3, dictionary=APRIL_TAGS)
     if choice == "charuco":
         side = max(round(width / 7.0, _DIGITS), 0.002)
         marker = round(0.72 * side, _DIGITS)
-        return Board("charuco", 7, 5, side, marker=marker, dictionary="DICT_4X4_50")
-    return Board("chessboard", 9, 6, max(round(width / 9.0, _DIGITS), 0.001))
+        return Board("charuco", 7, 5, side, marker=marker, dictionary=_MARKERS[link])
+    counts = (9, 6) if on_base else (8, 5)
+    return Board("chessboard", *counts, max(round(width / counts[0], _DIGITS), 0.001))

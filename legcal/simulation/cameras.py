@@ -32,7 +32,7 @@ from legcal.simulation.visibility import (
     legs_in_image,
     longest_in_images,
 )
-from legcal.vision import Board, Camera, read_camera
+from legcal.vision import Board, Camera, Link, read_camera
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -61,6 +61,7 @@ _N_BOARD_CANDIDATES = 2  # places of a board with cameras, of which the better i
 _SIDES = 4  # directions beside the machine
 _BOARD_DISTANCE = 1.05  # half diagonals of the board beyond the base joints
 _LEVELS = (0.0, -0.08, 0.25)  # of the size of the machine, above the base joints
+_PLATFORM_LEVELS = (0.02, 0.05, 0.1, 0.2, 0.3)  # the same above the joints of the platform
 _TILTS = (0.0, 0.6, 1.1)  # [rad] from lying flat, towards cameras with given places
 _MIN_LEGS_SHARE = 0.9  # of what is seen of the legs that must stay seen
 
@@ -145,12 +146,11 @@ def cameras_around(
     cameras: Mapping[str, Camera],
     rng: np.random.Generator,  # of the first sector, roll and distance
     progress: Report = no_progress,
-    board: PlacedBoard | None = None,  # that every camera must see, beside the machines
 ) -> tuple[tuple[Viewpoint, ...], float]:
     """Return cameras around a machine, each in a sector of its own, and how much they see.
 
     That is the least mean length of the legs in the images of a view [px], zero if a camera does
-    not see the board.
+    not see a board.
     """
     reached, tried, up = _reached(posed_machines), _some(posed_machines), _upward(machine)
     sector = 2.0 * np.pi / len(cameras)
@@ -167,7 +167,7 @@ def cameras_around(
             for turn in min(sector, 0.5 * np.pi) * np.array(_TURNS)
             for lift in lifts
         ]
-        place, score = _best(machine, tried, camera, candidates, board)
+        place, score = _best(machine, tried, camera, candidates)
         found.append(Viewpoint(name, camera, candidates[place]))
         least = min(least, score)
     progress("Cameras", len(cameras), len(cameras))
@@ -176,12 +176,11 @@ def cameras_around(
 
 def camera_in_hand(
     machine: Machine,
-    posed: PosedMachine,  # in the pose that the image is to show, with the board
+    posed: PosedMachine,  # in the pose that the image is to show, with its boards
     camera: Camera,
     rng: np.random.Generator,
-    board: PlacedBoard,
 ) -> RigidTransform | None:
-    """Return T_base_camera that shows board and legs, the best of a few; None if there is none."""
+    """Return T_base_camera that shows boards and legs, the best of a few; None if there is none."""
     up, reached = _upward(machine), _reached([posed])
     lifts = _LIFTS if machine.spatial else _LIFTS_PLANAR
     good = []
@@ -192,7 +191,7 @@ def camera_in_hand(
             1.0 + _HAND_EXTRA_DISTANCE * rng.random(),
         )
         T = _before(toward, up, roll, further, reached, camera)
-        score = _score(machine, [posed], camera, T, board)
+        score = _score(machine, [posed], camera, T)
         if score > 0.0:
             good.append((score, T))
         if len(good) == _N_HAND_CANDIDATES:
@@ -212,9 +211,7 @@ def board_and_cameras(
     good: list[tuple[float, PlacedBoard, tuple[Viewpoint, ...]]] = []
     for placed in _lying(board, machine, _some(posed_machines)):
         together = [placed.beside(posed) for posed in posed_machines]
-        views, score = cameras_around(
-            machine, together, cameras, copy.deepcopy(rng), progress, placed
-        )
+        views, score = cameras_around(machine, together, cameras, copy.deepcopy(rng), progress)
         if score > 0.0:
             good.append((score, placed, views))
         if len(good) == _N_BOARD_CANDIDATES:
@@ -244,6 +241,51 @@ def board_before(
         raise _nowhere(
             board, "all of the given cameras", "turn or move the cameras, or use another"
         )
+    return best
+
+
+def board_on_platform(
+    board: Board,
+    machine: Machine,
+    posed_machines: Sequence[PosedMachine],
+    T_base_platform: Sequence[RigidTransform],
+    views: Sequence[Viewpoint],  # that have to see it; without any it faces up
+) -> RigidTransform:
+    """Return T_platform_board of a board on top of the platform, free of the machine."""
+    home = machine.home
+    up = home.rotation.inv().apply(_upward(machine))
+    middle = machine.B_platform.mean(axis=0)
+    size = float(np.linalg.norm(np.ptp(_joints(posed_machines), axis=0)))
+    side = normal_basis(up)[0]
+    towards = None
+    if views:
+        centre = np.mean([view.T_base_camera.translation for view in views], axis=0)
+        towards = home.inv().apply(centre)
+    some = np.unique(np.linspace(0, len(posed_machines) - 1, _N_POSES).astype(int)).tolist()
+    most, best = 0.0, None
+    for tilt in _TILTS if views else _TILTS[:1]:
+        for level in _PLATFORM_LEVELS:
+            place = middle + level * size * up
+            T = _facing(board, place, _tilted(up, towards, place, tilt), side)
+            placed = [PlacedBoard(board, T_base_platform[k] * T) for k in some]
+            bodies = [posed_machines[k] for k in some]
+            if any(p.runs_through(body) for p, body in zip(placed, bodies, strict=True)):
+                continue
+            if not views:
+                return T
+            together = [p.beside(body) for p, body in zip(placed, bodies, strict=True)]
+            seen = np.mean(
+                [
+                    p.is_enough(p.seen(body, view.camera, view.T_base_camera))
+                    for view in views
+                    for p, body in zip(placed, together, strict=True)
+                ]
+            )
+            if seen > most:
+                most, best = float(seen), T
+            break  # one level at each tilt
+    if best is None or most < _MIN_BOARD_SHARE:
+        raise _nowhere(board, "the cameras", "use a smaller board, or other cameras", "platform")
     return best
 
 
@@ -328,7 +370,6 @@ def _best(
     posed_machines: Sequence[PosedMachine],
     camera: Camera,
     places: Sequence[RigidTransform],
-    board: PlacedBoard | None,
 ) -> tuple[int, float]:
     """Return the first of the places with the highest score, and that score.
 
@@ -347,7 +388,7 @@ def _best(
     for k in np.argsort(-most, kind="stable").tolist():
         if most[k] < scores.max():
             break
-        scores[k] = _score(machine, posed_machines, camera, places[k], board)
+        scores[k] = _score(machine, posed_machines, camera, places[k])
     return int(np.argmax(scores)), float(scores.max())
 
 
@@ -356,17 +397,19 @@ def _score(
     posed_machines: Sequence[PosedMachine],
     camera: Camera,
     T: RigidTransform,
-    board: PlacedBoard | None,
 ) -> float:
     """Return the mean length in the image [px] of all legs, those hidden counted as nothing.
 
-    It counts by the share of the poses in which the board is seen, which must be most of them.
+    It counts by the share of the poses in which each board is seen, which must be most of them.
     """
     share = 1.0
-    if board is not None:
-        shown = [board.is_enough(board.seen(posed, camera, T)) for posed in posed_machines]
-        share = float(np.mean(shown))
-        if share < _MIN_BOARD_SHARE:
+    for boards in zip(*(posed.boards for posed in posed_machines), strict=True):
+        shown = [
+            board.is_enough(board.seen(posed, camera, T))
+            for board, posed in zip(boards, posed_machines, strict=True)
+        ]
+        share *= float(np.mean(shown))
+        if np.mean(shown) < _MIN_BOARD_SHARE:
             return 0.0
     return share * float(np.mean(_lengths(machine, posed_machines, camera, T)))
 
@@ -441,11 +484,11 @@ def _hides(
     return left < _MIN_LEGS_SHARE * free
 
 
-def _nowhere(board: Board, who: str, remedy: str) -> NotVisible:
+def _nowhere(board: Board, who: str, remedy: str, link: Link = "base") -> NotVisible:
     """Return that a board has no place."""
     width, height = np.ptp(board.extent, axis=0)[:2].tolist()
     return NotVisible(
-        f"The board could not be placed: found no place near the base at which {who} would see a "
+        f"The board could not be placed: found no place near the {link} at which {who} would see a "
         f"{board.kind} of {1000 * width:.0f} x {1000 * height:.0f} mm well enough, needed one in "
         f"all images; {remedy}."
     )

@@ -24,6 +24,7 @@ from legcal.files import output_path
 from legcal.geometry import Array
 from legcal.machine import Machine, load_mechanism, write_model
 from legcal.progress import Progress, Report, shown_progress
+from legcal.simulation.board import documents
 from legcal.simulation.folder import (
     SIMULATED,
     TRUTH,
@@ -142,9 +143,7 @@ def simulate(
         truth = write_true_model(nominal, settings.errors, rngs["errors"], folder / TRUTH)
         session = simulate_session(truth, nominal, settings, rngs, report)
         m, legs = session.measurements, truth.leg_names
-        board = None if session.board is None else session.board.document()
-        if board is not None and not settings.board_pose:
-            del board["T_base_board"]
+        board = documents(session.boards, poses=settings.board_pose)
         model_name = yaml_path.relative_to(folder).as_posix()
         write_session(folder, nominal, model_name, m, groups=session.groups, board=board)
         exact = exact_outlines(session.scene)
@@ -153,10 +152,8 @@ def simulate(
             write_observations(folder / OBSERVATIONS_NAME, session.outlines, m, legs)
         if session.axes is not None:
             write_axis_table(folder / AXES_NAME, *session.axes, m, legs)
-        if session.board is not None:
-            exact_corners = corners_in_images(
-                session.scene, session.posed_machines, session.board, 0.0
-            )
+        if session.boards:
+            exact_corners = corners_in_images(session.scene, session.posed_machines, 0.0)
             write_corners(folder / TRUTH / CORNERS_NAME, exact_corners, m)
         if session.corners is not None:
             write_corners(folder / CORNERS_NAME, session.corners, m)

@@ -40,6 +40,7 @@ from legcal.files import (
     result_folder,
 )
 from legcal.machine import LegKind, Machine, main_cylinders
+from legcal.simulation.board import documents
 from legcal.simulation.session import SimulatedSession
 from legcal.simulation.settings import SimulationSettings
 from legcal.version import __version__
@@ -60,7 +61,7 @@ def write_session(
     m: Measurements,
     *,
     groups: Sequence[str] = (),  # view of the file of each view, where cameras are in the hand
-    board: Mapping[str, Any] | None = None,  # its block
+    board: Any = None,  # the block of one, or of several
 ) -> None:
     """Write ``dataset.yaml``, ``measurements.csv`` and the camera files."""
     cameras: dict[int, str] = {}
@@ -89,7 +90,7 @@ def write_session(
         "views": views,
     }
     if board is not None:
-        document["board"] = dict(board)
+        document["board"] = board
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
     (folder / "dataset.yaml").write_text(text, encoding="utf-8")
     motors = list(machine.motors)
@@ -136,7 +137,7 @@ def write_truth(
             }
             for label, T, readings in zip(session.labels, poses.poses, poses.readings, strict=True)
         },
-        **({} if session.board is None else {"board": session.board.document()}),
+        **({"board": documents(session.boards, poses=True)} if session.boards else {}),
         "files": list(files),
     }
     path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,6 @@ import numpy as np
 from legcal.data import Corners, Outlines, found_corners, join_corners
 from legcal.errors import NotVisible
 from legcal.geometry import Array, IntArray, cross
-from legcal.simulation.board import PlacedBoard
 from legcal.simulation.solids import PosedMachine
 from legcal.simulation.visibility import Images, LegView, Stretch, Viewpoint, silhouette
 from legcal.vision import Camera
@@ -284,25 +284,30 @@ def table_of_lines(u: Array, A: Array) -> Array:
 
 def corners_in_images(
     scene: Scene,
-    posed_machines: Sequence[PosedMachine],  # in every pose, with the board beside them
-    placed: PlacedBoard,
+    posed_machines: Sequence[PosedMachine],  # in every pose, with the boards beside them
     sigma_px: float,
     rng: np.random.Generator | None = None,
 ) -> Corners:
-    """Return the corners of the board that images show, by row and number; exact without *rng*."""
-    P_base = placed.T_base_board.apply(placed.board.points)
+    """Return the corners of boards that images show, by board, row and number.
+
+    They are exact without *rng*.
+    """
     found = []
-    for row, (v, k) in enumerate(zip(scene.images.view, scene.images.pose, strict=True)):
+    for board, row in product(range(len(posed_machines[0].boards)), range(len(scene.images))):
+        v, k = scene.images.view[row], scene.images.pose[row]
         camera, T = scene.views[v].camera, scene.views[v].T_base_camera
+        placed = posed_machines[k].boards[board]
         corner = np.flatnonzero(placed.seen(posed_machines[k], camera, T))
         if not len(corner):
             continue
-        px = camera.project(T.inv().apply(P_base[corner]))
+        P_base = placed.T_base_board.apply(placed.board.points[corner])
+        px = camera.project(T.inv().apply(P_base))
         if rng is not None:
             px = px + sigma_px * rng.normal(size=px.shape)
             size = np.array([camera.width, camera.height]) - 0.5
             inside = np.all((px >= -0.5) & (px <= size), axis=1)
             corner, px = corner[inside], px[inside]
         sigma = np.full(len(corner), max(sigma_px, EXACT_PX))
-        found.append(found_corners(np.full(len(corner), row, dtype=np.intp), corner, px, sigma))
+        of_row = np.full(len(corner), row, dtype=np.intp)
+        found.append(found_corners(of_row, placed.first + corner, px, sigma))
     return join_corners(found)

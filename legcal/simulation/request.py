@@ -147,10 +147,14 @@ class Request:
             shown="none",
         ),
     )
+    platform_board: str | None = field(
+        default=None,
+        metadata=_option("The same on the platform.", _CAMERAS, metavar="KIND|FILE", shown="none"),
+    )
     board_pose: bool = field(
         default=False,
         metadata=_option(
-            "Write the pose of the board in the base link into dataset.yaml.",
+            "Write the poses of boards in their links into dataset.yaml.",
             _CAMERAS,
             flags=("--board-pose",),
         ),

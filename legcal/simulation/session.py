@@ -16,11 +16,12 @@ from legcal.data import Corners, Measurements, Outlines, View
 from legcal.errors import NotVisible
 from legcal.machine import Configurations, Machine
 from legcal.progress import Report, no_progress
-from legcal.simulation.board import PlacedBoard, chosen_board
+from legcal.simulation.board import PlacedBoard, chosen_board, placed_at
 from legcal.simulation.cameras import (
     MAX_HAND_DRAWS,
     board_and_cameras,
     board_before,
+    board_on_platform,
     camera_in_hand,
     cameras_around,
     mild_lens,
@@ -44,7 +45,7 @@ from legcal.simulation.request import Level
 from legcal.simulation.settings import Distribution, SimulationSettings
 from legcal.simulation.solids import PlacedSolid, PosedMachine, dressed, pose_machine
 from legcal.simulation.visibility import Images, Viewpoint, take_images
-from legcal.vision import Camera
+from legcal.vision import Camera, FixedBoard
 from legcal.workers import worker_pool
 
 Streams = Mapping[str, np.random.Generator]
@@ -74,10 +75,10 @@ class SimulatedSession:
     truth: Machine
     poses: Configurations  # all that were drawn; images may show only some
     labels: tuple[str, ...]  # their names
-    posed_machines: tuple[PosedMachine, ...]  # in every pose, with the board
+    posed_machines: tuple[PosedMachine, ...]  # in every pose, with the boards
     scene: Scene
     left_out: int  # images that show no leg, which a table of outlines or axes has no row for
-    board: PlacedBoard | None
+    boards: tuple[FixedBoard, ...]
     groups: tuple[str, ...]  # view of the dataset of each camera in the hand; empty if they stand
 
 
@@ -102,12 +103,28 @@ def simulate_session(
     shown = replace(truth, urdf=replace(truth.urdf, path=nominal.urdf.path))
     posed_machines = pose_machine(truth, dressed(shown), poses)
     board = chosen_board(settings.board, posed_machines)
+    on_platform = chosen_board(settings.platform_board, posed_machines, "platform")
+    boards: tuple[FixedBoard, ...] = ()
+    if on_platform is not None:
+        T = board_on_platform(on_platform, truth, posed_machines, poses.poses, given)
+        first = 0 if board is None else board.n_corners
+        boards = (FixedBoard(on_platform, "platform", T, first),)
+        posed_machines = tuple(
+            placed_at(boards[0], T).beside(posed)
+            for T, posed in zip(poses.poses, posed_machines, strict=True)
+        )
     placed: PlacedBoard | None = None
     groups: tuple[str, ...] = ()
     if board is None:
-        views = (
-            given or cameras_around(truth, posed_machines, cameras, rngs["cameras"], progress)[0]
-        )
+        views = given
+        if not given:
+            views, least = cameras_around(truth, posed_machines, cameras, rngs["cameras"], progress)
+            if boards and least <= 0.0:
+                raise NotVisible(
+                    "The cameras could not be placed: found no place for one of them from which it "
+                    "sees the board on the platform in most poses, needed one for each; use fewer "
+                    "views, or a smaller board."
+                )
     elif given:
         placed, views = board_before(board, truth, posed_machines, given), given
     else:
@@ -120,8 +137,9 @@ def simulate_session(
         placed, views = board_and_cameras(board, truth, bodies, cameras, rngs["cameras"], progress)
     if placed is not None:
         posed_machines = tuple(placed.beside(posed) for posed in posed_machines)
+        boards = (FixedBoard(placed.board, "base", placed.T_base_board), *boards)
     if placed is not None and settings.hand_held:
-        views, groups = _in_hand(truth, posed_machines, n_sets, cameras, placed, rngs, progress)
+        views, groups = _in_hand(truth, posed_machines, n_sets, cameras, rngs, progress)
     if settings.level is Level.PHOTOGRAPHS:
         views = _encoding(views, settings.appearance.gamma, settings.tell_gamma)
     poses_of = [
@@ -143,10 +161,8 @@ def simulate_session(
         outlines = outlines_of(scene, noise, rngs["observations"])
     elif settings.level is Level.AXES:
         axes = axes_in_images(scene, settings.table, rngs["observations"])
-    if placed is not None and settings.level is not Level.PHOTOGRAPHS:
-        corners = corners_in_images(
-            scene, posed_machines, placed, settings.sigma_px, rngs["corners"]
-        )
+    if boards and settings.level is not Level.PHOTOGRAPHS:
+        corners = corners_in_images(scene, posed_machines, settings.sigma_px, rngs["corners"])
     width = max(2, len(str(len(poses.poses))))
     labels = tuple(f"p{k + 1:0{width}d}" for k in range(len(poses.poses)))
     measurements = _recorded(
@@ -154,7 +170,7 @@ def simulate_session(
     )
     return SimulatedSession(
         measurements, outlines, axes, corners, truth, poses, labels, posed_machines, scene,
-        len(images) - len(rows), placed, groups,
+        len(images) - len(rows), boards, groups,
     )  # fmt: skip
 
 
@@ -184,7 +200,6 @@ def _in_hand(
     posed_machines: Sequence[PosedMachine],  # with the board
     n_sets: int,
     cameras: Mapping[str, Camera],
-    placed: PlacedBoard,
     rngs: Streams,
     progress: Report,
 ) -> tuple[tuple[Viewpoint, ...], tuple[str, ...]]:
@@ -195,7 +210,7 @@ def _in_hand(
     for v, (name, camera) in enumerate(cameras.items()):
         for k, pose in enumerate(_poses_of(v, n_sets, posed_machines)):
             progress("Camera places", len(views), n_images)
-            T = camera_in_hand(truth, posed_machines[pose], camera, rngs["cameras"], placed)
+            T = camera_in_hand(truth, posed_machines[pose], camera, rngs["cameras"])
             if T is None:
                 raise NotVisible(
                     f"view {name}: a camera in the hand could not be placed: found none of "

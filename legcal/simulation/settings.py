@@ -192,7 +192,9 @@ class SimulationSettings:
         A calibration board on the base: ``chessboard``, ``charuco`` or ``aprilgrid`` of a size that
         fits the machine, a YAML file with the block ``board`` of a dataset, or a Board.
     board_pose : bool
-        Say in the dataset where the board is in the base link.
+        Say in the dataset where the boards are in their links.
+    platform_board : Board, str, Path or None
+        The same on the platform.
     hand_held : bool
         Every image is taken from a place of its own, with the board in it.
     seed : int
@@ -220,6 +222,7 @@ class SimulationSettings:
     appearance: Appearance = field(default_factory=Appearance)
     board: Board | str | Path | None = None
     board_pose: bool = False
+    platform_board: Board | str | Path | None = None
     hand_held: bool = False
     seed: int = 0
 
@@ -287,14 +290,15 @@ class SimulationSettings:
         """Refuse settings of a board that contradict others."""
         start = "The dataset could not be simulated: found"
         problems = []
-        if self.board is not None and not isinstance(self.board, Board | str | Path):
-            problems.append(f"{start} {self.board!r} as board, needed a Board; correct it.")
+        for board in (self.board, self.platform_board):
+            if board is not None and not isinstance(board, Board | str | Path):
+                problems.append(f"{start} {board!r} as board, needed a Board; correct it.")
         if self.board is None:
             problems += [
                 f"{start} {what} without a board, needed one on the base; choose a board."
                 for what, wanted in (
                     ("a camera in the hand", self.hand_held),
-                    ("the pose of a board", self.board_pose),
+                    ("the pose of a board", self.board_pose and self.platform_board is None),
                 )
                 if wanted
             ]
@@ -423,7 +427,8 @@ def requested(request: Request, nominal: Machine) -> SimulationSettings:
         images=request.images,
         views=request.cameras or (3 if request.views is None else request.views),
         camera=_camera(request)[0],
-        board=_board(request.board),
+        board=_board(request.board, "--board"),
+        platform_board=_board(request.platform_board, "--platform-board"),
         board_pose=request.board_pose,
         hand_held=request.hand_held,
         hints=request.hints,
@@ -464,7 +469,8 @@ def _refuse_contradictions(request: Request, poses: int | Path, nominal: Machine
             "The cameras could not be placed: found both --hand-held and --cameras, needed one of "
             "them; leave out one of the two."
         )
-    for option, given in (("--hand-held", request.hand_held), ("--board-pose", request.board_pose)):
+    pose = request.board_pose and request.platform_board is None
+    for option, given in (("--hand-held", request.hand_held), ("--board-pose", pose)):
         if given and request.board is None:
             problems.append(
                 f"{option} could not be used: found no --board, needed a board on the base; add "
@@ -480,7 +486,8 @@ def _refuse_other_levels(request: Request) -> None:
     for option in fields(request):
         level = option.metadata["only"]
         value = getattr(request, option.name)
-        of_corners = request.level is Level.AXES and request.board is not None
+        with_board = request.board is not None or request.platform_board is not None
+        of_corners = request.level is Level.AXES and with_board
         if level in (None, request.level) or value is None:
             continue
         if not (option.name == "pixel_noise" and of_corners):
@@ -495,13 +502,13 @@ def _refuse_other_levels(request: Request) -> None:
         raise UsageError(problems)
 
 
-def _board(choice: str | None) -> str | Path | None:
+def _board(choice: str | None, option: str) -> str | Path | None:
     """Return a kind of board, or the path of a file."""
     if choice is None or choice in BOARD_KINDS:
         return choice
     if not Path(choice).exists():
         raise UsageError(
-            f"--board could not be used: found {describe(choice)}, neither a kind of board nor a "
+            f"{option} could not be used: found {describe(choice)}, neither a kind of board nor a "
             f"file, needed {', '.join(BOARD_KINDS)} or the path of a YAML file; "
             f"{closest(choice, BOARD_KINDS)}"
         )

@@ -1,12 +1,17 @@
 from .board import APRIL_TAGS as APRIL_TAGS
 from .board import DICTIONARIES as DICTIONARIES
+from .board import LINKS as LINKS
 from .board import Board as Board
 from .board import BoardKind as BoardKind
+from .board import FixedBoard as FixedBoard
+from .board import Link as Link
+from .board import board_name as board_name
 from .board import charuco_board as charuco_board
 from .board import dictionary as dictionary
 from .board_file import board_document as board_document
 from .board_file import board_of as board_of
 from .board_file import parse_board as parse_board
+from .board_file import parse_boards as parse_boards
 from .board_file import read_board_file as read_board_file
 from .camera import DISTORTION_MODELS as DISTORTION_MODELS
 from .camera import Camera as Camera

@@ -8,8 +8,9 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array
+from legcal.geometry import Array, BoolArray, IntArray
 
 BoardKind = Literal["chessboard", "charuco", "aprilgrid"]
 
@@ -71,6 +72,38 @@ class Board:
         if self.kind == "aprilgrid":
             return np.asarray(self.side * ((1.0 + self.spacing) * (k // 2) + k % 2))
         return np.asarray(self.side * (k + (self.kind == "charuco")))
+
+
+Link = Literal["base", "platform"]
+LINKS: tuple[Link, ...] = ("base", "platform")
+
+
+@dataclass(frozen=True, eq=False)
+class FixedBoard:
+    """A board that is fixed to a link of a machine.
+
+    Numbers of corners go on from board to board, so that one number says which corner of which
+    board: those of the platform's follow on those of the base's.
+    """
+
+    board: Board
+    link: Link  # what it is fixed to
+    T_link_board: RigidTransform | None = None  # its pose in that link, where it is known
+    first: int = 0  # the number of its first corner
+
+    @property
+    def name(self) -> str:
+        """What parameters and messages call it."""
+        return board_name(self.link)
+
+    def has(self, corner: IntArray) -> BoolArray:
+        """Say which of some numbers of corners are its own, (n,)."""
+        return (corner >= self.first) & (corner < self.first + self.board.n_corners)
+
+
+def board_name(link: Link) -> str:
+    """Return what the board on a link is called."""
+    return "board" if link == "base" else f"{link}_board"
 
 
 DICTIONARIES = tuple(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, Strict, field_validator, model_validator
-from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DatasetError, UsageError
 from legcal.files import (
@@ -23,7 +23,14 @@ from legcal.files import (
     read_yaml,
     validate,
 )
-from legcal.vision.board import APRIL_TAGS, DICTIONARIES, Board, dictionary_size
+from legcal.vision.board import (
+    APRIL_TAGS,
+    DICTIONARIES,
+    LINKS,
+    Board,
+    FixedBoard,
+    dictionary_size,
+)
 
 SIDES = (0.0005, 1.0)  # [m] of a square, a marker or a tag
 MAX_COUNT = 100  # squares or tags along a side
@@ -54,7 +61,19 @@ class _BoardEntry(FileSchema):
     """What every board has."""
 
     kind: str
+    on: Literal["base", "platform"] = "base"
     T_base_board: MotionEntry | None = None
+    T_platform_board: MotionEntry | None = None
+
+    @model_validator(mode="after")
+    def _has_the_pose_in_its_link(self) -> Self:
+        other = "platform" if self.on == "base" else "base"
+        if getattr(self, f"T_{other}_board") is not None:
+            raise ValueError(
+                f"found T_{other}_board of a board on the {self.on}, needed its pose in the link "
+                f"that it is fixed to; write T_{self.on}_board, or on: {other}."
+            )
+        return self
 
 
 class ChessboardEntry(_BoardEntry):
@@ -187,8 +206,67 @@ _KINDS: Mapping[str, type[ChessboardEntry | CharucoEntry | AprilgridEntry]] = {
 }
 
 
-def parse_board(found: Mapping[str, Any], path: Path) -> tuple[Board, RigidTransform | None]:
-    """Return the board that a block describes, and its pose in the base link where it is given."""
+def parse_boards(found: Any, path: Path) -> tuple[FixedBoard, ...]:
+    """Return the boards of a block, one mapping or a list of them, that on the base first.
+
+    Raises DatasetError if a link has two, or images cannot tell them apart.
+    """
+    blocks = found if isinstance(found, list) else [found]
+    boards = [parse_board(block, path) for block in blocks]
+    boards.sort(key=lambda board: LINKS.index(board.link))
+    if not boards:
+        raise DatasetError(
+            f"{path}: board could not be used: found an empty list, needed a board; describe one, "
+            "or remove the block."
+        )
+    placed: list[FixedBoard] = []
+    for one in boards:
+        for other in placed:
+            if other.link == one.link:
+                raise DatasetError(
+                    f"{path}: board could not be used: found two boards on the {one.link}, needed "
+                    "at most one on the base and one on the platform; remove one, or correct on."
+                )
+            if same := _looks_like(one.board, other.board):
+                raise DatasetError(
+                    f"{path}: board could not be used: found {same} on base and platform, which "
+                    "images cannot tell apart, needed two boards with other markers or numbers of "
+                    "squares, or of two kinds; print one of them anew, such as ChArUco with "
+                    "another dictionary."
+                )
+        placed.append(replace(one, first=sum(b.board.n_corners for b in placed)))
+    return tuple(placed)
+
+
+def _looks_like(one: Board, other: Board) -> str:
+    """Return what two boards have in common that an image cannot tell apart; "" for nothing."""
+    if one.kind == other.kind == "chessboard":
+        counts = {one.columns, one.rows}, {other.columns, other.rows}
+        return "chessboards of the same numbers of squares" if counts[0] == counts[1] else ""
+    markers = _markers(one)
+    return f"markers of {markers}" if markers and markers == _markers(other) else ""
+
+
+def _markers(board: Board) -> str:
+    """Return the family of the markers of a board: sizes of one family have markers in common."""
+    name = board.dictionary
+    return name.rsplit("_", 1)[0] if name[5:6].isdigit() else name
+
+
+def parse_board(found: Any, path: Path) -> FixedBoard:
+    """Return the board that one mapping describes."""
+    if not isinstance(found, Mapping):
+        raise DatasetError(
+            f"{path}: board could not be read: found {describe(found)}, needed a mapping with its "
+            "kind, or a list of such mappings; describe the board."
+        )
+    link = found.get("on", LINKS[0])
+    if link not in LINKS:
+        raise DatasetError(
+            f"{path}: board.on could not be used: found a board on {describe(link)}, needed base "
+            "or platform, the only links whose motion the joint fit follows; fix the board to one "
+            "of these and correct on."
+        )
     kind = found.get("kind")
     if not isinstance(kind, str) or kind not in _KINDS:
         what = "no such key" if "kind" not in found else describe(kind)
@@ -197,8 +275,8 @@ def parse_board(found: Mapping[str, Any], path: Path) -> tuple[Board, RigidTrans
             "name the kind of the board."
         )
     entry = validate(_KINDS[kind], found, path, "board")
-    T = None if entry.T_base_board is None else entry.T_base_board.motion()
-    return entry.board(), T
+    pose = entry.T_base_board if entry.on == "base" else entry.T_platform_board
+    return FixedBoard(entry.board(), entry.on, None if pose is None else pose.motion())
 
 
 def board_document(board: Board) -> dict[str, Any]:
@@ -254,7 +332,7 @@ def board_of(spec: str | Path | Board) -> Board:
                 raise _refused(str(spec), describe(words[4]), "legacy, or nothing, at the end")
             found["legacy_pattern"] = True
     try:
-        return parse_board({"kind": kind, **found}, Path(_OPTION))[0]
+        return parse_board({"kind": kind, **found}, Path(_OPTION)).board
     except DatasetError as error:
         raise UsageError(error.problems) from error
 
@@ -282,7 +360,7 @@ def read_board_file(path: Path) -> Board:
             f"{path}: the board could not be read: found no block board, needed one as in "
             "dataset.yaml; add it."
         )
-    return parse_board(found, path)[0]
+    return parse_board(found, path).board
 
 
 def _refused(spec: str, found: str, needed: str) -> UsageError:

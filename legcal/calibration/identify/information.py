@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from legcal.calibration.identify.predicted_observations import (
+    SIGMA_PX,
     Across,
     PredictedObservations,
     at_base_joints,
@@ -32,12 +33,13 @@ from legcal.estimation import (
     information_rows,
     marginal_rows,
 )
-from legcal.geometry import Array, IntArray, cross
+from legcal.geometry import Array, IntArray, cross, normal_basis
 from legcal.machine import EquationKind, freedoms, pose_equations
 
 SIGMA_EXACT = 1e-7  # [m]: of what the mechanism itself demands
 INTRINSICS = ("fx", "fy", "cx", "cy")
 _MAX_INTRINSICS_SIGMA = 0.1  # of a focal length: what is known to no better is not determined
+_BOARD = 0.5  # half the side of a board on the platform, of how far its joints are apart
 _OPEN = 0.05  # component of an open direction from which on an intrinsic is part of it
 
 
@@ -48,6 +50,7 @@ class _Nominal:
     parameters: Array
     camera: Array
     pose: Array
+    platform_board: Array
     radius: Array = field(default_factory=lambda: np.zeros(0))
     intrinsics: Array = field(default_factory=lambda: np.zeros(0))
 
@@ -127,9 +130,10 @@ def problem_of(
 ) -> tuple[Problem[_Nominal], _Nominal]:
     """Return the problem of a session and the state that it is linearised at.
 
-    Views that show a board share one camera: that of the board. *more* has variables that images
-    depend on too: the element that each leg in each image depends on (n_images, n_legs), and the
-    derivatives (n_images, n_legs, 4, d) of what it shows.
+    Views that show a board on the base share one camera: that of the board. One on the platform is
+    a factor of its own. *more* has variables that images depend on too: the element that each leg
+    in each image depends on (n_images, n_legs), and the derivatives (n_images, n_legs, 4, d) of
+    what it shows.
     """
     n_f, n_p, n_poses = len(freedoms(predicted.frame_legs)), len(predicted.unit), len(predicted.t)
     n_images, n_legs = images.shape[:2]
@@ -138,6 +142,7 @@ def problem_of(
     ties = predicted.ties[None] / SIGMA_EXACT
     tied = Residuals.of(np.zeros(ties.shape[:2]), ties)
     shown = Residuals.of(np.zeros((n, 4)), J, images[..., :n_f].reshape(n, 4, n_f))
+    on_platform = _platform_board(predicted)
     demanded = Residuals.of(np.zeros((n_poses, m)), equations.by_parameters, equations.by_pose)
     parameters = Variables(
         "parameters",
@@ -152,6 +157,7 @@ def problem_of(
         variables=(
             parameters,
             Variables("camera", all_free(predicted.n_frames, 6)),
+            Variables("platform_board", all_free(int(bool(on_platform)), 6)),
             *(variables for variables, _, _ in more),
         ),
         eliminated=Variables("pose", all_free(n_poses, n_f)),
@@ -183,10 +189,52 @@ def problem_of(
                 1,
                 ties.shape[1],
             ),
+            *on_platform,
         ),
     )
     zeros = {b.name: np.zeros(b.n_unknowns) for b in problem.variables}
     return problem, _Nominal(pose=np.zeros((n_poses, n_f)), **zeros)
+
+
+def _platform_board(predicted: PredictedObservations) -> tuple[Factor[_Nominal], ...]:
+    """Return the factor of the outer corners of a board on the platform; none if there is none.
+
+    It lies among the joints of the platform, where it is fixed is unknown, and corners are seen as
+    well as an outline.
+    """
+    image = np.flatnonzero(predicted.platform_board)
+    if not len(image):
+        return ()
+    B = np.array([leg.B for leg in predicted.legs])
+    middle = B.mean(axis=0)
+    _, spread, axes = np.linalg.svd(B - middle)
+    half = _BOARD * float(spread[0]) / np.sqrt(len(B))
+    corners = middle + half * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) @ axes[:2]
+    view, pose = (np.repeat(x[image], len(corners)) for x in (predicted.view, predicted.pose))
+    R, y = predicted.R[pose], np.tile(corners, (len(image), 1))
+    arm = np.einsum("nij,nj->ni", R, y)
+    place = arm + predicted.t[pose]
+    ray = place - predicted.camera[view]
+    depth = np.linalg.norm(ray, axis=1)
+    across = np.array([normal_basis(u) for u in ray / depth[:, None]])  # (n, 2, 3)
+    by_place = across * (predicted.focal[view] / (SIGMA_PX * depth))[:, None, None]
+    turns, by_y = pose_unit(predicted), by_place @ R
+
+    def moved(at: Array, by: Array) -> Array:
+        """Return derivatives by a turn about the origin and a displacement."""
+        return np.concatenate([cross(at[:, None], by), by], axis=2) * turns
+
+    columns, one = list(freedoms(predicted.frame_legs)), np.zeros(len(place), dtype=np.intp)
+    shown = Residuals.of(
+        np.zeros(by_place.shape[:2]),
+        np.concatenate([moved(place, by_place), moved(y, by_y)], axis=2),
+        moved(arm, by_place)[..., columns],
+    )
+    touches = (
+        ("camera", predicted.frame[view], slice(None)),
+        ("platform_board", one, slice(None)),
+    )
+    return (Factor("platform_board", lambda _: shown, touches, len(place), 2, pose),)
 
 
 def expected_intrinsics(

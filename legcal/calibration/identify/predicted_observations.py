@@ -7,7 +7,7 @@ across each leg is given with the standard deviation of an outline.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -32,7 +32,7 @@ from legcal.machine import (
     random_poses_of_legs,
     ties_of,
 )
-from legcal.vision import shared_cameras
+from legcal.vision import Link, shared_cameras
 
 _TIMES = {2: "two", 3: "three", 4: "four"}
 SIGMA_PX = 0.1  # of an outline across a leg, in the image
@@ -72,6 +72,8 @@ class PredictedObservations:
     # (n_views,): the views whose images show a calibration board on the base: how these cameras
     # stand to each other is known
     board: BoolArray
+    # (n_images,): those that show a calibration board on the platform; none if it is empty
+    platform_board: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
     @property
     def n_legs(self) -> int:
@@ -163,8 +165,10 @@ class PredictedObservations:
         """Which legs have a length that is measured or constant, (n_legs,)."""
         return np.array([leg.kind is not LegKind.PASSIVE for leg in self.legs], dtype=np.bool_)
 
-    def with_board(self, *, board: bool = True) -> PredictedObservations:
-        """Return the same with a calibration board in all images, or in none."""
+    def with_board(self, *, board: bool = True, link: Link = "base") -> PredictedObservations:
+        """Return the same with a calibration board on a link in all images, or in none."""
+        if link == "platform":
+            return replace(self, platform_board=np.full(len(self.view), board, dtype=np.bool_))
         return replace(self, board=np.full(self.n_views, board, dtype=np.bool_))
 
     def columns(self, *kinds: int | slice, legs: BoolArray | None = None) -> IntArray:
@@ -224,6 +228,7 @@ def planned_observations(
     images: int = 15,  # and poses, a view
     *,
     board: bool = False,  # every image shows a calibration board on the base
+    platform_board: bool = False,  # and one on the platform
 ) -> PredictedObservations:
     """Return a session with cameras in default places and random poses inside the travel.
 
@@ -257,6 +262,7 @@ def planned_observations(
         focal=np.full(len(views), FOCAL_PX),
         sigma_q=SIGMA_Q,
         board=np.full(len(views), board, dtype=np.bool_),
+        platform_board=np.full(n_poses, platform_board, dtype=np.bool_),
     )
 
 
@@ -320,7 +326,8 @@ def recorded_observations(
         camera=camera,
         focal=np.array([_focal(view.camera.K) for view in views]),
         sigma_q=m.sigma_q,
-        board=_with_board(dataset)[used],
+        board=np.isin(used, m.view[_showing(dataset, "base")]),
+        platform_board=_showing(dataset, "platform"),
     )
 
 
@@ -378,7 +385,7 @@ def default_cameras(
     axis = _axis(A, B) if spatial else np.array([0.0, 0.0, 1.0])
     places = []
     for seen in views:
-        outward = (middle[list(seen)] - centre).mean(axis=0)
+        outward = (middle[list(seen) or slice(None)] - centre).mean(axis=0)
         outward -= axis * (outward @ axis)
         if np.linalg.norm(outward) < 0.02 * size:  # legs all around: any side will do
             outward = cross(axis, rng.normal(size=3))
@@ -457,15 +464,16 @@ def travel_of(machine: Machine) -> Array:
     return np.array(lengths)
 
 
-def _with_board(dataset: Dataset) -> BoolArray:
-    """Return which views show the board, (n_views,): all of them where nobody has looked yet."""
-    m = dataset.measurements
-    shown = np.full(len(m.views), dataset.board is not None, dtype=np.bool_)
-    if dataset.board is not None and dataset.corners is not None:
-        corners = dataset.corners
-        shown[:] = False
-        shown[m.view[corners.row[corners.used]]] = True
-    return shown
+def _showing(dataset: Dataset, link: Link) -> BoolArray:
+    """Return which images show the board on a link: all of them where nobody has looked yet."""
+    rows, fixed, corners = (
+        range(dataset.measurements.n_rows),
+        dataset.board_on(link),
+        dataset.corners,
+    )
+    if fixed is None or corners is None:
+        return np.full(len(rows), fixed is not None, dtype=np.bool_)
+    return np.isin(rows, corners.row[corners.used & fixed.has(corners.corner)])
 
 
 def _focal(K: Array) -> float:

@@ -40,6 +40,7 @@ from legcal.machine import (
     sparse_basis,
     split_by_motion,
 )
+from legcal.vision import Link
 
 _ERROR = 1e-3  # [m], the largest component of a direction whose effect is reported
 _HARMLESS = 1e-3  # of that: the platform does not move
@@ -58,9 +59,9 @@ class Analysis:
         other.__dict__.update(motion=self.motion, equations=self.equations.at(poses))
         return other
 
-    def with_board(self, *, board: bool = True) -> Analysis:
-        """Return the analysis of the same images with a calibration board in all or in none."""
-        predicted = self.predicted.with_board(board=board)
+    def with_board(self, *, board: bool = True, link: Link = "base") -> Analysis:
+        """Return the analysis of the same images with a board on a link in all or in none."""
+        predicted = self.predicted.with_board(board=board, link=link)
         other = self.elsewhere(predicted, np.arange(len(predicted.t)))
         other.__dict__.update(images=self.images)
         return other

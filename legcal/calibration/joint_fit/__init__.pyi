@@ -14,11 +14,11 @@ from .held_out import compare_held_out as compare_held_out
 from .outline_errors import KINDS as KINDS
 from .outline_errors import NoiseModel as NoiseModel
 from .outline_errors import possible_biases as possible_biases
-from .parameter_choices import BOARD_SCALE as BOARD_SCALE
 from .parameter_choices import NO_CHOICES as NO_CHOICES
 from .parameter_choices import Choices as Choices
 from .parameter_choices import KnownIntrinsics as KnownIntrinsics
 from .parameter_choices import Prior as Prior
+from .parameter_choices import board_scale as board_scale
 from .parameter_choices import known_parameters as known_parameters
 from .parameter_choices import resolve as resolve
 from .platform import PlatformAccuracy as PlatformAccuracy

@@ -17,7 +17,7 @@ from legcal.calibration.joint_fit.determinacy import (
     held_at_nominal,
     open_directions,
 )
-from legcal.calibration.joint_fit.parameter_choices import BOARD_SCALE, Prior
+from legcal.calibration.joint_fit.parameter_choices import Prior, board_scale
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.variables import RefinementSettings, Start, State, intrinsic_of
@@ -32,7 +32,7 @@ from legcal.estimation import (
 )
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import radius_name
-from legcal.vision import intrinsic_names, intrinsic_unit
+from legcal.vision import LINKS, Link, intrinsic_names, intrinsic_unit
 
 _SIGNIFICANT = 5.0  # standard deviations between a prior and the measurements
 _MIN_INFORMATION = 1e-9  # of a prior's information: what measurements must have for a test
@@ -88,25 +88,39 @@ def refuse_other_board(
     Encoders and radii carry the scale too; a board that was taken for larger than it is puts
     cameras further away. *normal* is the information at *state*, a first minimum.
     """
-    if BOARD_SCALE not in problem.named or BOARD_SCALE in problem.choices.priors:
-        return
-    place, priors = problem.named.index(BOARD_SCALE), problem.priors
+    for link in LINKS:
+        name = board_scale(link)
+        if name in problem.named and name not in problem.choices.priors:
+            _refuse_other_size(problem, state, normal, settings, link)
+
+
+def _refuse_other_size(
+    problem: FitProblem,
+    state: State,
+    normal: NormalEquations,
+    settings: RefinementSettings,
+    link: Link,
+) -> None:
+    """Refuse the calibration board on a link if it has other dimensions than the dataset says."""
+    name = board_scale(link)
+    place, priors = problem.named.index(name), problem.priors
     for i in np.flatnonzero(priors.unknown == place).tolist():
         mean, sigma = float(priors.mean[i]), float(priors.sigma[i])
         found = estimate_without_prior(problem, state, normal, place, mean, sigma)
         if found is None or found.sigma > _MAX_SCALE_SIGMA or found.apart <= _SIGNIFICANT:
             continue
-        choices = replace(problem.choices, free=problem.choices.free | {BOARD_SCALE})
+        choices = replace(problem.choices, free=problem.choices.free | {name})
         try:
             free = first_minimum(problem.with_choices(choices, settings), state, settings=settings)
-            size = f"{free.state.board_scale[0]:.4g} times as large as"
+            size = f"{free.state.board_scale[LINKS.index(link)]:.4g} times as large as"
         except (DidNotConverge, NotIdentifiable):
             size = "of another size than"
+        which = "" if link == "base" else f" on the {link}"
         raise DidNotConverge(
-            "The calibration board does not fit the readings and the legs: found that it is "
-            f"{size} the dataset says ({found.apart:.0f} standard deviations away), needed its "
+            f"The calibration board{which} does not fit the readings and the legs: found that it "
+            f"is {size} the dataset says ({found.apart:.0f} standard deviations away), needed its "
             f"dimensions to {1e2 * sigma:.2g} %; measure the board and correct its dimensions in "
-            f"dataset.yaml, or let the fit find them (--free {BOARD_SCALE})."
+            f"dataset.yaml, or let the fit find them (--free {name})."
         )
 
 

@@ -1,4 +1,4 @@
-"""Measurements and their factors: outlines, readings, axes, and corners of a calibration board.
+"""Measurements and their factors: outlines, readings, axes, and corners of calibration boards.
 
 Each kind is a class of arrays, one row a measurement, with the :class:`legcal.estimation.Factor`
 that it is in the fit; :class:`Observed` registers the kinds. A measurement in an image depends on
@@ -26,8 +26,10 @@ from legcal.geometry import Array, BoolArray, IntArray, cross, whitener
 from legcal.machine import LegKind
 from legcal.vision import (
     EPSILON,
-    Board,
+    LINKS,
     Camera,
+    FixedBoard,
+    Link,
     intrinsic_names,
     shared_cameras,
     undistort_with_derivatives,
@@ -43,7 +45,8 @@ class Observed(NamedTuple):
     outlines: ObservedOutlines
     readings: Readings
     axes: ObservedAxes
-    corners: ObservedCorners
+    corners: ObservedCorners  # of the board on the base
+    platform_corners: ObservedCorners
 
     def factors(self, keys: tuple[str, ...]) -> tuple[Factor[State], ...]:
         """Return the factor of each kind; *keys* are the intrinsics that may be unknown."""
@@ -52,7 +55,19 @@ class Observed(NamedTuple):
     @property
     def views(self) -> IntArray:
         """The views that show anything."""
-        return np.unique(np.concatenate([self.outlines.view, self.axes.view, self.corners.view]))
+        seen = (self.outlines, self.axes, self.corners, self.platform_corners)
+        return np.unique(np.concatenate([kind.view for kind in seen]))
+
+    @property
+    def boards(self) -> tuple[ObservedCorners, ...]:
+        """The corners of each board, in the order of the links."""
+        return self.corners, self.platform_corners
+
+    def with_corners(self, corners: ObservedCorners) -> Observed:
+        """Return the same with other corners of the board on their link."""
+        if corners.link == "base":
+            return self._replace(corners=corners)
+        return self._replace(platform_corners=corners)
 
 
 def observed_arrays(
@@ -78,7 +93,7 @@ def observed_arrays(
         found,
         observed_readings(measurements, legs),
         observed_axes(axes, measurements, legs),
-        observed_corners(board, measurements, given if cameras is None else cameras),
+        *observed_corners(board, measurements, given if cameras is None else cameras),
     )
 
 
@@ -540,9 +555,9 @@ def average_images(axes: LegAxes, measurements: Measurements) -> LegAxes:
 
 @dataclass(frozen=True, eq=False)
 class BoardCorners:
-    """A calibration board that stands still on the base, and its corners in images."""
+    """Calibration boards that are fixed to base and platform, and their corners in images."""
 
-    board: Board  # where its corners are, in its own frame
+    boards: tuple[FixedBoard, ...]  # where corners are, in the frames of their boards
     corners: Corners  # where images show them; only the used ones count
 
 
@@ -550,8 +565,10 @@ class BoardCorners:
 class ObservedCorners:
     """The corners of a board that enter the fit, n of them."""
 
+    link: Link  # what the board is fixed to
     view: IntArray  # (n,) index of the view
-    corner: IntArray  # (n,) number of the corner
+    pose: IntArray  # (n,) index of the platform pose; -1 on the base, which no pose moves
+    corner: IntArray  # (n,) number of the corner, as the boards count them
     point: Array  # (n, 3) the corners in the frame of the board [m]
     feet: Array  # (n, 2) where they were measured, on the sensor plane
     pixels: Array  # (n, 2) the same in the image [px]
@@ -564,15 +581,32 @@ class ObservedCorners:
 
     def chosen(self, which: BoolArray, scale: float = 1.0) -> ObservedCorners:
         """Return some of the corners, with standard deviations larger by a factor."""
-        chosen = ObservedCorners(*(getattr(self, f.name)[which] for f in fields(self)))
+        shown = [f.name for f in fields(self) if f.name != "link"]
+        chosen = replace(self, **{name: getattr(self, name)[which] for name in shown})
         return replace(chosen, sigma=scale * chosen.sigma)
+
+    @property
+    def name(self) -> str:
+        """The name of its factor."""
+        return "corners" if self.link == "base" else f"{self.link}_corners"
+
+    def keys(self, which: BoolArray) -> list[tuple[int, int, int]]:
+        """Return view, pose and number of some corners."""
+        columns = (column[which].tolist() for column in (self.view, self.pose, self.corner))
+        return list(zip(*columns, strict=True))
 
     def rows(self, keys: tuple[str, ...], state: State) -> Residuals:
         """Return predicted minus measured corners (n, 2) [px] with their derivatives."""
-        R_camera = state.camera_pose.R[self.view]
-        arm = self.point @ state.board_pose.R[0].T
-        grown = state.board_scale[0] * arm
-        turned = _times(R_camera, grown + state.board_pose.t)
+        R_camera, board = state.camera_pose.R[self.view], LINKS.index(self.link)
+        moves = self.link == "platform"
+        arm = self.point @ state.board_pose.R[board].T
+        grown = state.board_scale[board] * arm
+        on_link = in_base_frame = grown + state.board_pose.t[board]
+        if moves:
+            R_link = state.platform_pose.R[self.pose]
+            carried = _times(R_link, on_link)
+            in_base_frame = carried + state.platform_pose.t[self.pose]
+        turned = _times(R_camera, in_base_frame)
         xy, by_intrinsics = _on_sensor(state.cameras, keys, self.view, self.feet, self.pixels)
         in_camera = turned + state.camera_pose.t[self.view]
         depth = in_camera[:, 2:]
@@ -586,15 +620,20 @@ class ObservedCorners:
         def chain(slope: Array) -> tuple[Array, Array]:
             in_camera = slope[..., :3]
             in_base = in_camera @ R_camera
+            in_link, by_pose = in_base, np.zeros((*slope.shape[:2], 0))
+            if moves:
+                in_link = in_base @ R_link
+                turn = cross(carried[:, None], in_base)
+                by_pose = np.concatenate([turn, in_base], axis=-1)
             J = [
                 cross(turned[:, None], in_camera),
                 in_camera,
-                cross(grown[:, None], in_base),
-                in_base,
-                in_base @ arm[..., None],
+                cross(grown[:, None], in_link),
+                in_link,
+                in_link @ arm[..., None],
                 slope[..., 3:] @ by_intrinsics,
             ]
-            return np.concatenate(J, axis=-1), np.zeros((*slope.shape[:2], 0))
+            return np.concatenate(J, axis=-1), by_pose
 
         return Residuals(r, slope, chain)
 
@@ -605,8 +644,9 @@ class ObservedCorners:
         return np.asarray(-lens @ slopes)
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
-        """Return the factor of corners; no platform pose moves them."""
-        one = np.zeros(len(self), dtype=np.intp)
+        """Return the factor of corners; platform poses move those of a board on the platform."""
+        one = np.full(len(self), LINKS.index(self.link), dtype=np.intp)
+        element = self.pose if self.link == "platform" else None
         touches = (
             ("camera_pose", self.view, _ALL),
             ("board_pose", one, _ALL),
@@ -618,22 +658,40 @@ class ObservedCorners:
         def rows(state: State) -> Residuals:
             return self.rows(keys, state)
 
-        return Factor("corners", rows, touches, len(self), 2, None, whitening, robust=True)
+        return Factor(self.name, rows, touches, len(self), 2, element, whitening, robust=True)
 
 
 def observed_corners(
     seen: BoardCorners | None, measurements: Measurements, cameras: Sequence[Camera]
+) -> tuple[ObservedCorners, ...]:
+    """Return the used corners of the board on each link.
+
+    Those of all images of a view, or on the platform of all images of a view and a pose, are one
+    weighted mean.
+    """
+    boards = {} if seen is None else {fixed.link: fixed for fixed in seen.boards}
+    return tuple(_corners_on(link, boards.get(link), seen, measurements, cameras) for link in LINKS)
+
+
+def _corners_on(
+    link: Link,
+    fixed: FixedBoard | None,
+    seen: BoardCorners | None,
+    measurements: Measurements,
+    cameras: Sequence[Camera],
 ) -> ObservedCorners:
-    """Return the used corners, those of all images of a view as one weighted mean."""
-    corners = None if seen is None else seen.corners
-    if seen is None or corners is None or not corners.used.any():
+    """Return the used corners of the board on a link."""
+    if seen is None or fixed is None:
         none, index = np.zeros(0), np.zeros(0, dtype=np.intp)
         pair = none.reshape(0, 2)
         return ObservedCorners(
-            index, index, none.reshape(0, 3), pair, pair, none.reshape(0, 4), none
+            link, index, index, index, none.reshape(0, 3), pair, pair, none.reshape(0, 4), none
         )
-    used = np.flatnonzero(corners.used)
-    key = np.stack([measurements.view[corners.row[used]], corners.corner[used]], axis=1)
+    corners = seen.corners
+    used = np.flatnonzero(corners.used & fixed.has(corners.corner))
+    row = corners.row[used]
+    moving = measurements.pose[row] if link == "platform" else np.full(len(row), -1)
+    key = np.stack([measurements.view[row], moving, corners.corner[used]], axis=1)
     distinct, which = np.unique(key, axis=0, return_inverse=True)
     which = which.ravel()
     weight = corners.sigma_px[used] ** -2.0
@@ -641,15 +699,15 @@ def observed_corners(
     pixels = np.stack(
         [np.bincount(which, weights=weight * corners.px[used, i]) / total for i in range(2)], axis=1
     )
-    view, corner = distinct.T
+    view, pose, corner = distinct.T.astype(np.intp)
     feet, constants = np.zeros((len(view), 2)), np.zeros((len(view), 4))
     for v in np.unique(view).tolist():
         of_view = view == v
         feet[of_view] = cameras[v].undistort(pixels[of_view])
         lens = cameras[v].pixels_per_unit(feet[of_view])
         constants[of_view] = np.swapaxes(lens, -1, -2).reshape(-1, 4)
-    sigma = 1.0 / np.sqrt(total)
-    return ObservedCorners(view, corner, seen.board.points[corner], feet, pixels, constants, sigma)
+    point, sigma = fixed.board.points[corner - fixed.first], 1.0 / np.sqrt(total)
+    return ObservedCorners(link, view, pose, corner, point, feet, pixels, constants, sigma)
 
 
 # ------------------------------------------------------------------------------------ residuals

@@ -23,7 +23,15 @@ from legcal.machine import (
     radius_name,
     vector_of,
 )
-from legcal.vision import intrinsic_names, intrinsic_unit, intrinsic_values, shared_cameras
+from legcal.vision import (
+    FixedBoard,
+    Link,
+    board_name,
+    intrinsic_names,
+    intrinsic_unit,
+    intrinsic_values,
+    shared_cameras,
+)
 
 
 @dataclass(frozen=True)
@@ -85,7 +93,6 @@ class Choices:
 NO_CHOICES = Choices()
 
 ParameterKind = Literal["kinematic", "radius", "intrinsic", "board"]
-BOARD_SCALE = "board.scale"  # the factor on the dimensions of a calibration board
 _RATIO = 10.0  # between a radius or length and its nominal value: more is a mistake of the unit
 _FOCAL_RATIO = 2.0
 _COEFFICIENT = 1e3  # of distortion; far more than any lens has
@@ -124,21 +131,27 @@ class KnownParameters:
         return self.synonyms.get(name, name)
 
 
+def board_scale(link: Link) -> str:
+    """Return the name of the factor on the dimensions of the calibration board on a link."""
+    return f"{board_name(link)}.scale"
+
+
 def known_parameters(
     machine: Machine,
     views: Sequence[View],
     *,
     axes_given: bool = False,
-    with_board: bool = False,
+    boards: Sequence[FixedBoard] = (),
 ) -> KnownParameters:
     """Return the parameters of a machine and of the cameras of its views."""
     by_name, others = _kinematic(machine), _no_parameters(machine)
     seen: dict[str, KnownParameter] = dict(_radii(machine))
     intrinsics, synonyms = _intrinsics(views)
     seen |= intrinsics
-    board = (
-        {BOARD_SCALE: KnownParameter(1.0, "", "board", 1.0 / _RATIO, _RATIO)} if with_board else {}
-    )
+    board = {
+        board_scale(fixed.link): KnownParameter(1.0, "", "board", 1.0 / _RATIO, _RATIO)
+        for fixed in boards
+    }
     if axes_given:
         reason = "measured axes, in which cameras and radii are contained already"
         others |= dict.fromkeys((*seen, *synonyms), reason)

@@ -1,10 +1,11 @@
 """The problem of the joint fit: its variables, its factors, and the exact constraints of poses.
 
 The blocks, in the order of x: kinematic parameters (``legs``), ``radii``, intrinsics (``cameras``),
-``board_scale``, common-mode edge ``biases``, all of which have names; ``camera_pose`` and
-``board_pose``; and the eliminated ``platform_pose``. Another kind of measurement is a class with a
-factor, registered in :class:`legcal.calibration.joint_fit.factors.Observed`; what it depends on
-besides is a field of :class:`State` and a block in :func:`_built`.
+``board_scale`` of the board on each link, common-mode edge ``biases``, all of which have names;
+``camera_pose`` and ``board_pose``; and the eliminated ``platform_pose``. Another kind of
+measurement is a class with a factor, registered in
+:class:`legcal.calibration.joint_fit.factors.Observed`; what it depends on besides is a field of
+:class:`State` and a block in :func:`_built`.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ from legcal.calibration.joint_fit.factors import (
 )
 from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel
 from legcal.calibration.joint_fit.parameter_choices import (
-    BOARD_SCALE,
     NO_CHOICES,
     Choices,
     KnownIntrinsics,
+    board_scale,
 )
 from legcal.calibration.joint_fit.variables import (
     DEFAULT_SETTINGS,
@@ -59,6 +60,7 @@ from legcal.estimation import (
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import freedoms, radius_name
 from legcal.vision import (
+    LINKS,
     Camera,
     intrinsic_names,
     intrinsic_unit,
@@ -80,9 +82,9 @@ class FitProblem(Problem[State]):
     observed: Observed
     first_radii: Array  # (n_radii,) where radii, intrinsics and the board's size begin
     first_cameras: tuple[Camera, ...]
-    first_board_scale: float
+    first_board_scale: Array  # (2,)
     keys: tuple[str, ...]  # what the unknown intrinsics are
-    rejected_corners: tuple[tuple[int, int], ...] = ()  # view and number of each
+    rejected_corners: tuple[tuple[int, int, int], ...] = ()  # view, pose (-1: all), number
 
     @property
     def legs(self) -> FittedLegs:
@@ -105,9 +107,9 @@ class FitProblem(Problem[State]):
         return self.observed.axes
 
     @property
-    def corners(self) -> ObservedCorners:
-        """The corners of the calibration board."""
-        return self.observed.corners
+    def boards(self) -> tuple[ObservedCorners, ...]:
+        """The corners of the calibration board on each link; none where it has no board."""
+        return self.observed.boards
 
     @property
     def free(self) -> BoolArray:
@@ -146,10 +148,10 @@ class FitProblem(Problem[State]):
             self.parameters.at_fixed(start.legs),
             self.first_radii,
             self.first_cameras,
-            np.array([self.first_board_scale]),
+            self.first_board_scale,
             np.zeros(self.block("biases").n_unknowns),
             Frames.of(start.T_camera_Rb),
-            Frames.of([start.T_Rb_board]),
+            Frames.of([start.T_Rb_board, start.T_Re_board]),
             Frames.of(start.T_Rb_Re),
         )
 
@@ -170,12 +172,12 @@ class FitProblem(Problem[State]):
         return other.with_parts((_bias_block(biases),), (factor,))
 
     def with_corners(
-        self, corners: ObservedCorners, rejected: Sequence[tuple[int, int]]
+        self, corners: ObservedCorners, rejected: Sequence[tuple[int, int, int]]
     ) -> FitProblem:
-        """Return the problem with other corners of the calibration board."""
+        """Return the problem with other corners of the calibration board on their link."""
         other = replace(
             self,
-            observed=self.observed._replace(corners=corners),
+            observed=self.observed.with_corners(corners),
             rejected_corners=(*self.rejected_corners, *rejected),
         )
         return other.with_factors(corners.factor(self.keys))
@@ -191,7 +193,7 @@ class FitProblem(Problem[State]):
             replace(outlines, bias_index=biases.index, bias_shift=biases.shift),
             observed_readings(measurements, self.legs),
             observed_axes(None, measurements, self.legs),
-            observed_corners(None, measurements, ()),
+            *observed_corners(None, measurements, ()),
         )
         radii = self.block("radii")
         more = np.full((len(outlines.parts) - len(radii.unknown), 1), -1)
@@ -273,7 +275,7 @@ def _built(
     settings: RefinementSettings,
 ) -> FitProblem:
     """Return the problem of measurements, with the unknowns and the priors of choices."""
-    outlines, corners = observed.outlines, observed.corners
+    outlines, boards = observed.outlines, observed.boards
     parametrization = legs.parametrization
     names, units = parametrization.names, parametrization.units
     free = np.array(
@@ -289,10 +291,14 @@ def _built(
         parameters.coordinates,
         parameters.jacobian if parameters.turns else None,
     )
-    shown = {owners[v] for v in np.union1d(outlines.view, corners.view).tolist()}
+    seen = np.concatenate([outlines.view, *(corners.view for corners in boards)])
+    shown = {owners[v] for v in np.unique(seen).tolist()}
     intrinsics, keys = _intrinsics(outlines.views, cameras, owners, shown, choices)
     camera_pose = fixed_at_start(len(cameras), 6)
     camera_pose[observed.views] = all_free(len(observed.views), 6)
+    board_pose = fixed_at_start(len(boards), 6)
+    has_board = np.array([len(corners) > 0 for corners in boards])
+    board_pose[has_board] = all_free(int(has_board.sum()), 6)
     no_biases = Variables("biases", np.zeros((0, 1), dtype=np.intp))
     nominal = np.array([legs.radii[part] for part in outlines.parts])
     radii = [radius_name(legs.names[leg], part) for leg, part in outlines.parts]
@@ -300,22 +306,10 @@ def _built(
         kinematic,
         _scalars("radii", radii, "m", nominal, settings.radius_sigma * nominal, choices),
         intrinsics,
-        _scalars(
-            "board_scale",
-            [BOARD_SCALE] if len(corners) else [],
-            "",
-            np.ones(1),
-            np.array([settings.board_scale_sigma]),
-            choices,
-        ),
+        _board_scales(boards, settings, choices),
         no_biases,
         Variables("camera_pose", camera_pose, Frames.moved, max_step=_MAX_STEP),
-        Variables(
-            "board_pose",
-            all_free(1, 6) if len(corners) else fixed_at_start(1, 6),
-            Frames.moved,
-            max_step=_MAX_STEP,
-        ),
+        Variables("board_pose", board_pose, Frames.moved, max_step=_MAX_STEP),
     )
     return FitProblem(
         variables=tuple(_stated(block, choices) for block in blocks),
@@ -333,7 +327,7 @@ def _built(
             [choices.values.get(n, r) for n, r in zip(radii, nominal.tolist(), strict=True)]
         ),
         first_cameras=cameras,
-        first_board_scale=choices.values.get(BOARD_SCALE, 1.0),
+        first_board_scale=np.array([choices.values.get(board_scale(k), 1.0) for k in LINKS]),
         keys=keys,
     )
 
@@ -348,8 +342,6 @@ def _scalars(
     """Return the block of numbers, with priors where they are not freed; some may be fixed."""
     is_free = np.array([not choices.holds(label) for label in labels], dtype=np.bool_)
     unknown = np.where(is_free, np.cumsum(is_free) - 1, -1).astype(np.intp)
-    if not labels:  # one that does not move
-        unknown = np.full(1 if name == "board_scale" else 0, -1, dtype=np.intp)
     known = [
         i
         for i, label in enumerate(labels)
@@ -358,6 +350,19 @@ def _scalars(
     prior = GaussianPrior(unknown[known], mean[known], sigma[known])
     free = tuple(label for label, one in zip(labels, is_free, strict=True) if one)
     return Variables(name, unknown[:, None], labels=free, units=(unit,) * len(free), prior=prior)
+
+
+def _board_scales(
+    boards: Sequence[ObservedCorners], settings: RefinementSettings, choices: Choices
+) -> Variables:
+    """Return the block of the sizes of boards; that of a link without one does not move."""
+    seen = [len(corners) > 0 for corners in boards]
+    names = [board_scale(c.link) for c in boards if len(c)]
+    sigma = np.full(len(names), settings.board_scale_sigma)
+    found = _scalars("board_scale", names, "", np.ones(len(names)), sigma, choices)
+    unknown = np.full((len(boards), 1), -1, dtype=np.intp)
+    unknown[seen] = found.unknown
+    return replace(found, unknown=unknown)
 
 
 def _stated(block: Variables, choices: Choices) -> Variables:

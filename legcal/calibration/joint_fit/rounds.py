@@ -138,7 +138,7 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
         minimum = _passed(problem, minimum, settings, _REJECTION_TOLERANCE)
     _refuse_disagreement(problem.offsets(minimum.state), accepted, settings)
     problem = problem.weighted(noise, accepted)
-    for _ in range(_BOARD_ROUNDS if len(problem.corners) else 0):
+    for _ in range(_BOARD_ROUNDS if any(map(len, problem.boards)) else 0):
         problem = _with_judged_corners(problem, minimum.state, settings)
         minimum = _passed(problem, minimum, settings, _REJECTION_TOLERANCE)
     with_possible, changes, are_white = problem.with_biases(possible), NO_CHANGES, False
@@ -282,23 +282,29 @@ def _with_judged_corners(
     problem: FitProblem, state: State, settings: RefinementSettings
 ) -> FitProblem:
     """Return a problem whose corners have errors by their residuals, outliers left out."""
-    board, linear = problem.corners, linearize(problem, state)
+    linear = linearize(problem, state)
     normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
-    left = 1.0 - 0.5 * np.einsum("nqq->n", explained_share(problem, linear, normal, "corners"))
-    norms = linear["corners"].squared_norms
-    variance = float(np.median(norms)) / MEDIAN_OF_2 / max(float(np.mean(left)), _MIN_REDUNDANCY)
-    scale = max(float(np.sqrt(variance)), _MIN_SCALE)
-    agrees = norms <= (scale * settings.rejection) ** 2
-    wrong = zip(board.view[~agrees].tolist(), board.corner[~agrees].tolist(), strict=True)
-    judged = problem.with_corners(board.chosen(agrees, scale), tuple(wrong))
-    rms = float(np.sqrt(np.mean((linear["corners"].r * board.sigma[:, None]) ** 2)))
-    too_far = np.median(norms * board.sigma**2) > settings.largest_rms_px**2
-    if len(judged.rejected_corners) > len(judged.corners) or too_far:
-        raise DidNotConverge(
-            f"The joint fit ended where the corners of the calibration board are {rms:.1f} px off "
-            f"(rms), needed {settings.largest_rms_px:g} px for most; check that the board stood "
-            "still, its dimensions, and the camera files."
-        )
+    judged = problem
+    for board in problem.boards:
+        if not len(board):
+            continue
+        rows, share = linear[board.name], explained_share(problem, linear, normal, board.name)
+        left = 1.0 - 0.5 * np.einsum("nqq->n", share)
+        norms = rows.squared_norms
+        redundancy = max(float(np.mean(left)), _MIN_REDUNDANCY)
+        variance = float(np.median(norms)) / MEDIAN_OF_2 / redundancy
+        scale = max(float(np.sqrt(variance)), _MIN_SCALE)
+        agrees = norms <= (scale * settings.rejection) ** 2
+        judged = judged.with_corners(board.chosen(agrees, scale), board.keys(~agrees))
+        rms = float(np.sqrt(np.mean((rows.r * board.sigma[:, None]) ** 2)))
+        too_far = np.median(norms * board.sigma**2) > settings.largest_rms_px**2
+        if len(judged.rejected_corners) > sum(map(len, judged.boards)) or too_far:
+            which = "" if board.link == "base" else f" on the {board.link}"
+            raise DidNotConverge(
+                f"The joint fit ended where the corners of the calibration board{which} are "
+                f"{rms:.1f} px off (rms), needed {settings.largest_rms_px:g} px for most; check "
+                "that the board stood still on its link, its dimensions, and the camera files."
+            )
     return judged
 
 
@@ -308,9 +314,9 @@ def corner_notes(problem: FitProblem) -> tuple[str, ...]:
     if not rejected:
         return ()
     views = problem.outlines.views
-    named = [f"{corner} in {views[view]}" for view, corner in sorted(rejected)[:_MAX_NAMED]]
+    named = [f"{corner} in {views[view]}" for view, _, corner in sorted(rejected)[:_MAX_NAMED]]
     more = f" and {len(rejected) - _MAX_NAMED} more" if len(rejected) > _MAX_NAMED else ""
-    n = len(rejected) + len(problem.corners)
+    n = len(rejected) + sum(map(len, problem.boards))
     return (
         f"Of {n} corners of the calibration board {len(rejected)} disagree with the fit and were "
         f"left out: {', '.join(named)}{more}.",

@@ -57,11 +57,12 @@ def derivatives_by_cameras(problem: FitProblem, state: State) -> dict[str, Array
     distortion of the view of each.
     """
     outlines = problem.outlines.by_intrinsics(_KEYS, problem.keys, state)
-    corners = problem.corners.by_intrinsics(_KEYS, state)
     whitening = np.asarray(problem.factor("outlines").whitening)
     return {
         "outlines": np.einsum("nij,njk->nik", whitening, outlines),
-        "corners": corners / problem.corners.sigma[:, None, None],
+    } | {
+        corners.name: corners.by_intrinsics(_KEYS, state) / corners.sigma[:, None, None]
+        for corners in problem.boards
     }
 
 
@@ -153,7 +154,8 @@ def _changes_by_cameras(
     problem: FitProblem, by_camera: Mapping[str, Array], error: Array
 ) -> dict[str, Array]:
     """Return how whitened residuals (n, q) change with errors (n_views, 5) of cameras."""
-    views = {"outlines": problem.outlines.view, "corners": problem.corners.view}
+    views = {corners.name: corners.view for corners in problem.boards}
+    views["outlines"] = problem.outlines.view
     return {name: np.einsum("nqk,nk->nq", by, error[views[name]]) for name, by in by_camera.items()}
 
 
@@ -198,7 +200,7 @@ def _of_twist(
         * linear[factor.name].J_element
         @ motion[factor.element][..., None]
         for factor in problem.factors
-        if factor.element is not None  # corners do not depend on poses
+        if factor.element is not None  # corners on the base do not depend on poses
     }
     steps = _of_kinematic(problem, response(problem, linear, normal, changes))[:, 0]
     steps[problem.legs.parametrization.place[leg, LegColumns.TWIST]] = _TWIST_ERROR

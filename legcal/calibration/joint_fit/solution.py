@@ -55,7 +55,7 @@ from legcal.machine import (
     radius_name,
     with_platform_points,
 )
-from legcal.vision import Camera
+from legcal.vision import Camera, Link
 
 _SIGNIFICANT = 5.0  # standard deviations of chi2
 ParameterStatus = Literal["estimated", "fixed", "weak"]
@@ -96,9 +96,12 @@ class Solution:
     dof: int
     rms_px: float | None  # of the offsets of used outlines [px]
     rms_axes: float | None  # of measured axes, over their claimed standard deviations
-    rms_corners_px: float | None  # of corners of the calibration board [px]
-    rejected_corners: tuple[tuple[str, int], ...]  # view and number, in all images of the view
-    T_Rb_board: RigidTransform | None  # None if no image shows one
+    rms_corners_px: dict[Link, float]  # of corners of the calibration board on each link [px]
+    # View, pose (-1 on the base: in all images of the view) and number; poses as the fit counts
+    # them
+    rejected_corners: tuple[tuple[str, int, int], ...]
+    # T_Rb_board and T_Re_board, by the link that the board is fixed to, where images show one
+    T_frame_board: dict[Link, RigidTransform]
     noise: NoiseModel  # errors of single outlines
     gammas: tuple[EstimatedGamma, ...]  # of cameras without a given gamma
     biases: Mapping[str, float]  # common-mode edge biases by name [px]
@@ -208,10 +211,19 @@ def assemble_solution(
         rms_px=_rms(used),
         rms_axes=_rms(linear["axes"].r),
         rejected_corners=tuple(
-            (problem.outlines.views[view], corner) for view, corner in problem.rejected_corners
+            (problem.outlines.views[view], pose, corner)
+            for view, pose, corner in problem.rejected_corners
         ),
-        T_Rb_board=state.board_pose.motions[0] if len(problem.corners) else None,
-        rms_corners_px=_rms(linear["corners"].r * problem.corners.sigma[:, None]),
+        T_frame_board={
+            corners.link: T
+            for corners, T in zip(problem.boards, state.board_pose.motions, strict=True)
+            if len(corners)
+        },
+        rms_corners_px={
+            corners.link: rms
+            for corners in problem.boards
+            if (rms := _rms(linear[corners.name].r * corners.sigma[:, None])) is not None
+        },
         noise=fit.noise,
         gammas=gammas,
         biases={n: v for n, v in biases if not n.endswith(GAMMA_SUFFIX)},
@@ -343,8 +355,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     geometry = with_platform_points([solution.legs[j] for j in legs], machine.frame_legs, origin)
     by_leg = {leg: j for j, leg in enumerate(legs)}
     radii = {(by_leg[leg], part): value for (leg, part), value in solution.radii.items()}
-    with_board = dataset.board is not None
-    known = known_parameters(machine, measurements.views, with_board=with_board).by_name
+    known = known_parameters(machine, measurements.views, boards=dataset.boards).by_name
     ordered = [name for name in known if name in solution.values]
     names = tuple(name for name in ordered if name in solution.names)
     names_of_legs, frame_legs = machine.leg_names, machine.frame_legs

@@ -71,7 +71,9 @@ class Start:
     T_camera_Rb: tuple[RigidTransform, ...]  # one a view
     T_Rb_Re: tuple[RigidTransform, ...]  # one a pose
     label: str  # where it comes from: ``nominal`` or ``staged``
+    # Of the calibration boards on base and platform
     T_Rb_board: RigidTransform = field(default_factory=RigidTransform.identity)
+    T_Re_board: RigidTransform = field(default_factory=RigidTransform.identity)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +83,10 @@ class State:
     legs: tuple[Leg, ...]  # in R_b and R_e
     radii: Array  # (n_radii,) of the parts of legs [m]
     cameras: tuple[Camera, ...]  # with the intrinsics of each view
-    board_scale: Array  # (1,) factor on the dimensions of the calibration board
+    board_scale: Array  # (2,) factors on the dimensions of the boards on base and platform
     biases: Array  # (n_biases,) common-mode edge biases [px] and logarithms of gammas
     camera_pose: Frames  # T_camera_Rb, one a view
-    board_pose: Frames  # T_Rb_board, one; of no meaning where no image shows one
+    board_pose: Frames  # T_Rb_board and T_Re_board; of no meaning where no image shows one
     platform_pose: Frames  # T_Rb_Re, one a pose
 
     @cached_property
