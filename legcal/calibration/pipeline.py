@@ -306,8 +306,9 @@ def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]
         no rough camera pose; nothing is searched then.
     """
     hints = [view.T_base_camera for view in data.measurements.views]
-    by_board = data.dataset.board is not None and (
-        data.dataset.T_base_board is not None or any(T is not None for T in hints)
+    on_base = data.dataset.board_on("base")
+    by_board = on_base is not None and (
+        on_base.T_link_board is not None or any(T is not None for T in hints)
     )
     if not data.machine.is_determined and not by_board:
         require_rough_cameras(data.measurements, data.photographs.detect.tolist(), hints)
@@ -318,8 +319,9 @@ def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]
         if T_base_board is not None:
             cameras = board.cameras(T_base_board, placement.T_base_camera)
             placement = replace(placement, T_base_camera=cameras)
-        cameras = tuple(board.cameras_by_platform(data, placement.T_base_camera))
-        placement = replace(placement, T_base_camera=cameras)
+        if data.machine.is_determined:
+            cameras = tuple(board.cameras_by_platform(data, placement.T_base_camera))
+            placement = replace(placement, T_base_camera=cameras)
     return placement, board
 
 
