@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from lxml import etree
@@ -34,9 +34,6 @@ from legcal.machine import (
     origins_of,
     parse_robot,
 )
-
-if TYPE_CHECKING:
-    from legcal.simulation.board import PlacedBoard
 
 _SIZES = {"cylinder": ("radius", "length"), "sphere": ("radius",), "box": ("size",)}
 
@@ -440,7 +437,7 @@ class PosedMachine:
     solids: tuple[PlacedSolid, ...]  # what is seen of it, in the base link
     vertices: Array  # vertices, faces: (n, 3) the same as triangles, in the base link [m]
     faces: IntArray
-    boards: tuple[PlacedBoard, ...] = ()  # the calibration boards among the solids
+    boards: tuple[Any, ...] = ()  # the ``PlacedBoard`` of each calibration board among the solids
 
     def hidden(self, centre: Array, points: Array, margin: Array) -> BoolArray:
         """Return which points something stands before, seen from a centre."""
