@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -322,11 +323,34 @@ def new(
     travel: Annotated[
         tuple[float, float] | None, typer.Option(help="Lowest and highest reading.")
     ] = None,
+    min_length: Annotated[
+        float | None,
+        typer.Option(help="Shortest length of a leg, where readings are zero; without --offset."),
+    ] = None,
+    max_length: Annotated[
+        float | None, typer.Option(help="Longest length of a leg, in place of --travel.")
+    ] = None,
     leg_radius: Annotated[float | None, typer.Option(help="Radius of tube and rod.")] = None,
+    type_of_legs: Annotated[
+        str | None, typer.Option("--type", help="Type of the legs of a table that has none: UPS.")
+    ] = None,
+    platform_in: Annotated[
+        Literal["base", "platform"] | None,
+        typer.Option(
+            help="What the platform joints of a table are coordinates of: the platform, or the "
+            "base with the machine at home."
+        ),
+    ] = None,
     tilt: Annotated[
         float | None,
         typer.Option(help="Tilt of R and U axes from their default, in degrees; default 0."),
     ] = None,
+    template: Annotated[
+        bool,
+        typer.Option(
+            "--template", help="Write a commented table to start from, as YAML and CSV in mm."
+        ),
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -344,14 +368,33 @@ def new(
         "turn": turn,
         "offset": offset,
         "travel": travel,
+        "min_length": min_length,
+        "max_length": max_length,
         "leg_radius": leg_radius,
+        "type": type_of_legs,
+        "platform_in": platform_in,
         "tilt": tilt,
     }
+    if template:
+        if table is not None or family is not None or unit is not None or any(dimensions.values()):
+            raise UsageError(
+                "The template could not be written: found other options beside --template, needed "
+                "--output and --name only; leave them out, and write your numbers in the table."
+            )
+        yaml, csv = machine.write_template(output, name, force=force)
+        lines = f"written: {yaml} {csv}", f"Next: legcal new {shlex.quote(str(yaml))} -o ."
+        show(
+            as_json,
+            lambda: {"paths": {"yaml": str(yaml), "csv": str(csv)}},
+            lambda: report.report([Text(line, overflow="ignore") for line in lines]),
+        )
+        return
     model = machine.description_of(
         table, family=family, unit=unit, name=name, dimensions=dimensions
     )
     created = machine.create_model(model, output, force=force)
     description = machine.machine_document(created.machine)
+    description["diagnostics"] = [*model.notes, *description["diagnostics"]]
     paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
     written = f"written: {paths['yaml']} {paths['urdf']}"
     show(

@@ -98,6 +98,7 @@ from .parameters import vector_of as vector_of
 from .parameters import with_numbers as with_numbers
 from .solver import poses_after as poses_after
 from .solver import solve as solve
+from .table_template import write_template as write_template
 from .ties import TieRows as TieRows
 from .ties import Ties as Ties
 from .ties import ties_of as ties_of

@@ -1,7 +1,8 @@
 """A machine as a table or a family describes it, and what cannot be in one."""
 
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -80,6 +81,7 @@ class Description:
     legs: tuple[LegEntry, ...]  # the legs in order
     home: "Home | None"  # T_base_platform of a pose in which it closes
     base_frame: tuple[str, ...] | None  # the legs whose joints define R_b and R_e
+    notes: tuple[str, ...] = ()  # what was assumed
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +101,91 @@ class Home:
         return motion_from_xyz_quat(self.xyz, self.quat_xyzw)
 
 
+def legs_in_words(names: Sequence[str]) -> str:
+    """Return legs as a sentence begins with them."""
+    quoted = [f"'{name}'" for name in names]
+    return f"leg {quoted[0]}" if len(quoted) == 1 else f"legs {', '.join(quoted)}"
+
+
+def home_at_height(described: Description, height: float, turn: Rotation | None) -> Description:
+    """Return a machine whose platform is level at home, over the middle of the base.
+
+    *height* is that of the platform link over the base link [m]. Without a turn its joints lie over
+    those of the base as well as a turn about z, in whole degrees, allows; their middles stand over
+    each other to a whole millimetre.
+    """
+    A, B = _joints(described)
+    if turn is None:
+        one, two = ((p - p.mean(axis=0))[:, :2] @ [1.0, 1.0j] for p in (A, B))
+        angle = round(float(np.degrees(np.angle(np.sum(one * two.conj())))))
+        turn = Rotation.from_euler("z", angle, degrees=True)
+    middle = A.mean(axis=0) - turn.apply(B.mean(axis=0))
+    x, y = (round(float(value), 3) + 0.0 for value in middle[:2])
+    return replace(described, home=Home.of((x, y, height), turn))
+
+
+def joints_from_base(described: Description) -> Description:
+    """Return a machine whose platform joints were given in the base link, at home.
+
+    The platform link gets the axes of the base link and stands in the middle of the joints.
+    """
+    origin = np.round(_joints(described)[1].mean(axis=0), 6) + 0.0
+    legs = tuple(
+        replace(leg, B_platform=np.round(leg.B_platform - origin, 12) + 0.0)
+        for leg in described.legs
+    )
+    home = Home.of(tuple(origin.tolist()), Rotation.identity())
+    note = (
+        "Platform joints are in coordinates of the base at home: the platform link stands in their "
+        f"middle, ({', '.join(f'{1e3 * x:.6g}' for x in origin)}) mm in the base link."
+    )
+    return replace(described, legs=legs, home=home, notes=(*described.notes, note))
+
+
+def look_like_base(described: Description) -> list[str]:
+    """Return that platform joints look as if they were given in the base link.
+
+    That is so if all motors are inside their travel with both links in one place, the platform
+    joints lie away from those of the base, and the machine is not said to stand so.
+    """
+    known = [leg for leg in described.legs if leg.offset is not None and leg.travel is not None]
+    if len(known) < _MANY or (described.home is not None and _closes(described, described.home)):
+        return []
+    origin = Home.of((0.0, 0.0, 0.0), Rotation.identity())
+    A, B = _joints(described)
+    apart = float(np.linalg.norm(B.mean(axis=0) - A.mean(axis=0)))
+    lengths = np.linalg.norm(B - A, axis=1)
+    if 2.0 * apart < lengths.mean() or not _closes(described, origin):
+        return []
+    middle = 1e3 * B.mean(axis=0)
+    return [
+        f"{described.source}: platform_joints could not be used: found joints around "
+        f"({', '.join(f'{x:.4g}' for x in middle)}) mm that fit the lengths of all legs where they "
+        "are, which look like coordinates of the base at home, needed coordinates of the platform; "
+        "say which they are with --platform-in base (or platform_in: base), or with --platform-in "
+        "platform if they are right."
+    ]
+
+
+def _joints(described: Description) -> tuple[Array, Array]:
+    """Return the joints of base and platform, each in its link, (n, 3) [m]."""
+    A = np.array([leg.A_base for leg in described.legs])
+    return A, np.array([leg.B_platform for leg in described.legs])
+
+
+def _closes(described: Description, home: Home) -> bool:
+    """Say whether all motors are inside their travel at a pose."""
+    A, B = _joints(described)
+    lengths = np.linalg.norm(np.asarray(home.motion().apply(B)) - A, axis=1)
+    return all(
+        leg.offset + leg.travel[0] - _SLACK <= length <= leg.offset + leg.travel[1] + _SLACK
+        for leg, length in zip(described.legs, lengths.tolist(), strict=True)
+        if leg.offset is not None and leg.travel is not None
+    )
+
+
+_SLACK = 1e-9  # [m]
+_MANY = 3  # legs that can hardly all fit by chance
 ALONG = 1.0  # [deg]; a U joint is singular where its outer axis lies along the leg
 
 
@@ -130,6 +217,7 @@ def wrong_sizes(described: Description) -> list[str]:
 def wrong_lengths(described: Description, lengths: Array) -> list[str]:
     """Return what is wrong with the lengths of the legs at home."""
     problems = list[str]()
+    outside = list[tuple[str, float, float, float]]()
     for leg, length in zip(described.legs, lengths, strict=True):
         found = _out_of_proportion(described, leg.name, float(length))
         if found:
@@ -145,13 +233,17 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
             continue
         q0 = leg.offset or 0.0
         low, high = q0 + leg.travel[0], q0 + leg.travel[1]
-        slack = 1e-9
-        if not low - slack <= length <= high + slack:
-            problems.append(
-                f"{described.source}: leg '{leg.name}' cannot close at home: found the length "
-                f"{1e3 * length:.6g} mm there, needed {1e3 * low:.6g} to {1e3 * high:.6g} mm "
-                "(offset plus travel); correct home, offsets or travel."
-            )
+        if not low - _SLACK <= length <= high + _SLACK:
+            outside.append((leg.name, 1e3 * float(length), 1e3 * low, 1e3 * high))
+    if outside:
+        shortest, longest = (f(x[1] for x in outside) for f in (min, max))
+        there = f"{shortest:.6g} mm" + f" to {longest:.6g} mm" * (longest - shortest > 1e-6)
+        least, most = min(x[2] for x in outside), max(x[3] for x in outside)
+        problems.append(
+            f"{described.source}: {legs_in_words([name for name, *_ in outside])} cannot close at "
+            f"home: found the length {there} there, needed {least:.6g} to {most:.6g} mm (offset "
+            "plus travel); correct home, offsets or travel."
+        )
     return problems
 
 

@@ -7,7 +7,7 @@ one value for all legs, or a list with one (or null) for each leg.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,7 +20,7 @@ from legcal.errors import DatasetError, ModelError
 from legcal.files import (
     Column,
     FileSchema,
-    Lines,
+    Number,
     PlainName,
     Quaternion,
     Table,
@@ -34,8 +34,20 @@ from legcal.files import (
     validate,
 )
 from legcal.geometry import Array
-from legcal.machine.description import NEEDED_TYPE, Description, Home, LegEntry, LegType, leg_type
+from legcal.machine.description import (
+    NEEDED_TYPE,
+    Description,
+    Home,
+    LegEntry,
+    LegType,
+    home_at_height,
+    joints_from_base,
+    leg_type,
+    legs_in_words,
+    look_like_base,
+)
 from legcal.machine.leg import MAX_LEGS, LegKind
+from legcal.machine.table_headings import UNITS, one_row_a_leg
 
 MAX_NUMBER = 1e9  # of any number, whatever its unit
 
@@ -158,9 +170,10 @@ Radius = Annotated[
 
 
 class HomeEntry(FileSchema):
-    """The block ``home``: a pose of the platform in the base."""
+    """The block ``home``: a pose of the platform in the base, or its height alone."""
 
-    xyz: Vector
+    xyz: Vector | None = None
+    height: Number | None = None
     quat_xyzw: Quaternion | None = None
     rpy_deg: Vector | None = None
 
@@ -178,25 +191,39 @@ class TableFile(FileSchema):
     platform_joints: Points
     offsets: Lengths = None
     lengths: Lengths = None
+    min_length: Lengths = None
+    max_length: Lengths = None
     travel: Travel = None
     radius: Radius = None
     kinds: Annotated[Any, BeforeValidator(_kinds)] = None
     base_axes: Directions | None = None
     platform_axes: Directions | None = None
     home: HomeEntry | None = None
+    platform_in: Literal["base", "platform"] | None = None
     base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
 
 
 WHAT = "table"
+OPTIONS = {
+    "type": "--type",
+    "offsets": "--offset",
+    "travel": "--travel",
+    "min_length": "--min-length",
+    "max_length": "--max-length",
+    "radius": "--leg-radius",
+    "home": "--height",
+    "platform_in": "--platform-in",
+}
 _XYZ = ("x", "y", "z")
 _RADII = ("radius", "tube", "rod")
 _POINTS = tuple(f"{side}_{i}" for side in ("base", "platform") for i in _XYZ)
 _NUMBERS = (
-    *("offset", "length", "travel_low", "travel_high", "radius", "tube", "rod"),
+    *("offset", "length", "min_length", "max_length", "travel_low", "travel_high"),
+    *_RADII,
     *(f"{side}_axis_{i}" for side in ("base", "platform") for i in _XYZ),
 )
 COLUMNS = (
-    *(Column(name, "text", required=name == "type") for name in ("leg", "type", "kind", "unit")),
+    *(Column(name, "text", required=False) for name in ("leg", "type", "kind", "unit")),
     *(
         Column(
             name,
@@ -219,7 +246,15 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
     sentence for each wrong column or cell.
     """
     needed = "one row for each leg; add them"
-    table = read_table(path, WHAT, "leg", COLUMNS, needed=needed, reshape=_small_letters)
+    names = [column.name for column in COLUMNS]
+    table = read_table(
+        path,
+        WHAT,
+        "leg",
+        COLUMNS,
+        needed=needed,
+        reshape=lambda lines: one_row_a_leg(lines, names, path),
+    )
     filled = [np.array([text != "" for text in table.text(name)], dtype=bool) for name in _RADII]
     for row in np.flatnonzero(filled[0] & (filled[1] | filled[2])).tolist():
         needed = "one of them; empty the others"
@@ -245,7 +280,7 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         "legcal_table": 1,
         "name": path.stem,
         "unit": _unit(table, unit),
-        "types": texts("type"),
+        "types": texts("type") if "type" in table else None,
         "base_joints": points("base"),
         "platform_joints": points("platform"),
         "travel": [None if pair == (None, None) else list(pair) for pair in travel],
@@ -259,18 +294,14 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         "kinds": texts("kind"),
         "offsets": numbers("offset"),
         "lengths": numbers("length"),
+        "min_length": numbers("min_length"),
+        "max_length": numbers("max_length"),
         "base_axes": directions("base"),
         "platform_axes": directions("platform"),
     }
     return document | {
         key: column for key, column in optional.items() if any(x is not None for x in column)
     }
-
-
-def _small_letters(lines: Lines) -> Lines:
-    """Return lines with their header in small letters."""
-    number, header = lines[0]
-    return [(number, [name.lower() for name in header]), *lines[1:]]
 
 
 def _unit(table: Table, given: str | None) -> str:
@@ -289,11 +320,17 @@ def _unit(table: Table, given: str | None) -> str:
     return stated[0] if stated else str(given)
 
 
-UNITS = {"m": 0, "mm": -3}
+def read_description(
+    path: Path,
+    unit: str | None = None,
+    name: str | None = None,
+    given: Mapping[str, Any] | None = None,
+) -> Description:
+    """Return the machine that a table describes.
 
-
-def read_description(path: Path, unit: str | None = None, name: str | None = None) -> Description:
-    """Return the machine that a table describes."""
+    ``given`` are entries beside the table, in its unit, which it must not have itself.
+    """
+    given = {} if given is None else given
     try:
         if path.suffix.lower() == ".csv":
             found = read_columns(path, unit)
@@ -311,7 +348,8 @@ def read_description(path: Path, unit: str | None = None, name: str | None = Non
                 found["name"] = name
             if unit is not None:
                 found.setdefault("unit", unit)
-        file = validate(TableFile, found, path)
+        _refuse_twice(path, found, given)
+        file = validate(TableFile, {**found, **given}, path)
     except DatasetError as error:
         raise ModelError(error.problems) from error
     if unit is not None and unit != file.unit:
@@ -324,9 +362,31 @@ def read_description(path: Path, unit: str | None = None, name: str | None = Non
         raise ModelError(problems)
     description = _description(file, str(path))
     problems = _impossible_legs(description)
+    if not problems and file.platform_in is None:
+        problems = look_like_base(description)
     if problems:
         raise ModelError(problems)
     return description
+
+
+def _refuse_twice(path: Path, found: Mapping[str, Any], given: Mapping[str, Any]) -> None:
+    """Refuse entries that the table has and the command too."""
+    twice = [
+        f"{OPTIONS[key]} beside {key if key in found else other}"
+        for key in given
+        for other in (key, *("types" for _ in [0] if key == "type"))
+        if _says_something(found.get(other))
+    ]
+    if twice:
+        raise ModelError(
+            f"{path}: the model could not be read: found {' and '.join(twice)} of the table, "
+            "needed one of them; leave out the option."
+        )
+
+
+def _says_something(value: Any) -> bool:
+    """Say whether an entry of a table, or of one of its legs, is there."""
+    return any(x is not None for x in value) if isinstance(value, list) else value is not None
 
 
 def in_metres(value: float, unit: str) -> float:
@@ -346,13 +406,13 @@ def _conflicting_entries(file: TableFile, source: str) -> list[str]:
         found = "both" if file.type else "neither"
         return [
             f"{source}: the legs could not be read: found {found} of type and types, needed "
-            "one: 'type: 6-UPS', or 'types' with one entry for each leg."
+            "one: 'type: 6-UPS', or 'types' with one entry for each leg, or --type UPS."
         ]
     n = len(file.base_joints)
     problems = []
     for key in (
-        "platform_joints", "types", "legs", "offsets", "lengths", "travel", "radius", "kinds",
-        "base_axes", "platform_axes",
+        "platform_joints", "types", "legs", "offsets", "lengths", "min_length", "max_length",
+        "travel", "radius", "kinds", "base_axes", "platform_axes",
     ):  # fmt: skip
         value = getattr(file, key)
         if (
@@ -394,19 +454,83 @@ def _conflicting_entries(file: TableFile, source: str) -> list[str]:
             f"{source}: base_frame could not be used: found a leg twice, needed different legs; "
             "correct it."
         )
-    if file.home and (file.home.quat_xyzw is None) == (file.home.rpy_deg is None):
+    problems += _wrong_home(file, source)
+    problems += _wrong_lengths(file, source, names)
+    return problems
+
+
+def _wrong_home(file: TableFile, source: str) -> list[str]:
+    """Return what does not fit together in the block ``home``."""
+    problems = []
+    home = file.home
+    if home is None:
+        return []
+    if (home.xyz is None) == (home.height is None):
+        problems.append(
+            f"{source}: home.xyz could not be used: found "
+            f"{'neither' if home.xyz is None else 'both'} of xyz and height, needed one; write one "
+            "of them."
+        )
+    turns = [home.quat_xyzw is not None, home.rpy_deg is not None]
+    if sum(turns) > 1 or (home.xyz is not None and sum(turns) < 1):
         problems.append(
             f"{source}: home could not be used: needed its turn once, as quat_xyzw or as rpy_deg; "
             "write one of them."
         )
+    if file.platform_in == "base":
+        problems.append(
+            f"{source}: home could not be used: found it beside platform joints in coordinates of "
+            "the base (platform_in: base), which are those at home, needed one of them; leave out "
+            "home."
+        )
     return problems
+
+
+def _wrong_lengths(file: TableFile, source: str, names: list[str]) -> list[str]:
+    """Return lengths of legs of which one is missing, too much or wrong."""
+    problems = []
+    n = len(file.base_joints)
+    for name, low, high, _, travel in zip(
+        names, *(_of_each(value, n) for value in _laws(file)), strict=False
+    ):
+        if low is None and high is None:
+            continue
+        found = ""
+        if low is None or high is None:
+            found = f"{'max' if low is None else 'min'}_length alone"
+        elif not low < high:
+            found = f"min_length {low:g} and max_length {high:g}"
+        elif travel is not None:
+            found = "travel beside min_length and max_length"
+        if found:
+            problems.append(
+                f"{source}: min_length and max_length could not be used: found {found} of leg "
+                f"'{name}', needed the shortest and the longest length, in place of travel; "
+                "correct them."
+            )
+            break
+    return problems
+
+
+def _laws(file: TableFile) -> tuple[Any, ...]:
+    """Return what a table says of lengths: shortest, longest, at reading zero, travel."""
+    travel = [file.travel] * len(file.base_joints) if _is_pair(file.travel) else file.travel
+    return file.min_length, file.max_length, file.offsets, travel
+
+
+def _of_each(value: Any, n: int) -> list[Any]:
+    """Return an entry for each leg."""
+    return value if isinstance(value, list) else [value] * n
 
 
 def _useless_entries(file: TableFile, source: str, names: list[str]) -> list[str]:
     """Return which entries are for legs that have no use for them."""
     has_slider = [leg.has_slider for leg in _types(file, len(names))]
     problems = []
-    for key, of_sliders in (("lengths", False), ("offsets", True), ("travel", True)):
+    for key, of_sliders in (
+        ("lengths", False), ("offsets", True), ("travel", True),
+        ("min_length", True), ("max_length", True),
+    ):  # fmt: skip
         value = getattr(file, key)
         shared = not isinstance(value, list) or _is_pair(value)
         entries = [value] * len(names) if shared else value
@@ -435,10 +559,11 @@ def _description(file: TableFile, source: str) -> Description:
         return None if value is None else in_metres(value, file.unit)
 
     def per_leg(value: Any) -> list[Any]:
-        return value if isinstance(value, list) else [value] * n
+        return _of_each(value, n)
 
     names = file.legs or [f"leg{j + 1}" for j in range(n)]
-    travel = [file.travel] * n if _is_pair(file.travel) else per_leg(file.travel)
+    laws = [_of_each(value, n) for value in _laws(file)]
+    notes = list[str]()
     legs = []
     for j, (name, kind_of_leg, kind, radius) in enumerate(
         zip(names, _types(file, n), per_leg(file.kinds), per_leg(file.radius), strict=True)
@@ -447,9 +572,19 @@ def _description(file: TableFile, source: str) -> Description:
         constant = not kind_of_leg.has_slider
         default = LegKind.CONSTANT if constant else LegKind.ACTUATED
         kind = default if kind is None or constant else LegKind(kind)
-        offset = per_leg(file.lengths if constant else file.offsets)[j]
+        low, high, offset, limits = (law[j] for law in laws)
+        if constant:
+            offset = per_leg(file.lengths)[j]
+        elif low is not None:
+            if offset is None and kind is LegKind.ACTUATED:
+                offset = low
+                notes = [
+                    "Readings are taken to be zero at the shortest length of a leg (min_length): "
+                    "give offsets, the length at reading zero, if the encoders count otherwise."
+                ]
+            limits = [_less(low, offset or 0.0), _less(high, offset or 0.0)]
         reads_length = kind is LegKind.PASSIVE and offset is None  # a pair for all means readings
-        limits = metres(travel[j])
+        limits = metres(limits)
         if constant or (reads_length and _is_pair(file.travel)):
             limits = None
         legs.append(
@@ -461,7 +596,21 @@ def _description(file: TableFile, source: str) -> Description:
             )
         )  # fmt: skip
     frame = None if file.base_frame is None else tuple(file.base_frame)
-    return Description(file.name, source, file.unit, tuple(legs), _home(file), frame)
+    described = Description(
+        file.name, source, file.unit, tuple(legs), _home(file), frame, tuple(notes)
+    )
+    if file.home is not None and file.home.height is not None:
+        has_turn = file.home.quat_xyzw is not None or file.home.rpy_deg is not None
+        turn = _turn(file.home) if has_turn else None
+        return home_at_height(described, in_metres(file.home.height, file.unit), turn)
+    if file.platform_in == "base":
+        return joints_from_base(described)
+    return described
+
+
+def _less(one: float, other: float) -> float:
+    """Return a difference by its decimal digits."""
+    return float(Decimal(repr(float(one))) - Decimal(repr(float(other))))
 
 
 def _radii(radius: Any, unit: str) -> tuple[float | None, float | None]:
@@ -483,45 +632,58 @@ def _unit_axis(axes: list[Any] | None, j: int) -> Array | None:
 
 def _home(file: TableFile) -> Home | None:
     """Return the home of a table."""
-    if file.home is None:
+    if file.home is None or file.home.xyz is None:
         return None
     xyz = tuple(in_metres(x, file.unit) for x in file.home.xyz)
     if file.home.quat_xyzw is not None:
         return Home(xyz, file.home.quat_xyzw)
-    turn = Rotation.from_euler("xyz", file.home.rpy_deg or (0.0, 0.0, 0.0), degrees=True)
-    return Home.of(xyz, turn)
+    return Home.of(xyz, _turn(file.home))
+
+
+def _turn(home: HomeEntry) -> Rotation:
+    """Return the rotation of a home."""
+    if home.quat_xyzw is not None:
+        return Rotation.from_quat(home.quat_xyzw)
+    return Rotation.from_euler("xyz", home.rpy_deg or (0.0, 0.0, 0.0), degrees=True)
 
 
 def _impossible_legs(described: Description) -> list[str]:
     """Return what legs lack or cannot have by their types, and which legs coincide."""
-    problems = []
+    lacking: dict[str, list[str]] = {}  # names of the legs for each thing that is wrong
     for leg in described.legs:
-        where = f"{described.source}: leg '{leg.name}' could not be used: found "
         if leg.kind is LegKind.ACTUATED and leg.offset is None:
-            problems.append(
-                f"{where}an actuated slider without an offset, needed its length at reading zero; "
-                "add it to offsets."
-            )
+            lacking.setdefault(
+                "actuated sliders without an offset, needed the length at reading zero; add "
+                "offsets, or min_length and max_length.",
+                [],
+            ).append(leg.name)
         if leg.kind is LegKind.ACTUATED and leg.travel is None:
-            problems.append(
-                f"{where}an actuated slider without travel, needed the lowest and the highest "
-                "reading of its encoder; add them to travel."
-            )
+            lacking.setdefault(
+                "actuated sliders without travel, needed the lowest and the highest reading of "
+                "their encoders; add travel, or min_length and max_length.",
+                [],
+            ).append(leg.name)
         if leg.kind is LegKind.CONSTANT and leg.type.has_slider:
-            problems.append(
-                f"{where}the kind constant with a P in its type, needed a type without P for a leg "
-                "of constant length; correct kinds or types."
-            )
+            lacking.setdefault(
+                "the kind constant with a P in the type, needed a type without P for legs of "
+                "constant length; correct kinds or types.",
+                [],
+            ).append(leg.name)
         for side, type_, axis in (
             ("base", leg.type.base, leg.base_axis),
             ("platform", leg.type.platform, leg.platform_axis),
         ):
             if axis is not None and not type_.has_axis:
                 joint = f"an {type_} joint" if type_ else "a leg that is fixed"
-                problems.append(
-                    f"{where}an axis for {joint} at the {side}, needed axes of R and U joints "
-                    f"only; write null in {side}_axes."
-                )
+                lacking.setdefault(
+                    f"an axis for {joint} at the {side}, needed axes of R and U joints only; write "
+                    f"null in {side}_axes.",
+                    [],
+                ).append(leg.name)
+    problems = [
+        f"{described.source}: {legs_in_words(names)} could not be used: found {what}"
+        for what, names in lacking.items()
+    ]
     # Legs that begin and end in the same two points, and joints all in one point.
     legs = described.legs
     for j, one in enumerate(legs):

@@ -215,6 +215,32 @@ def _default(length: float) -> float:
     return max(round(length, 4), 1e-4)
 
 
+def _lengths_of_family(family: str, given: dict[str, Any]) -> None:
+    """Replace shortest and longest length by the offset and the travel that they make."""
+    low, high = given.pop("min_length", None), given.pop("max_length", None)
+    if low is None and high is None:
+        return
+    if low is None or high is None or not low < high or {"offset", "travel"} & given.keys():
+        raise UsageError(
+            f"The family {family} could not be built: found --min-length {low} and --max-length "
+            f"{high}, needed both, the shorter first, in place of --offset and --travel; correct "
+            "them."
+        )
+    given |= {"offset": low, "travel": (0.0, round(high - low, 9))}
+
+
+_BESIDE = {  # entries of a table for options that may stand beside it
+    "type": "type",
+    "offset": "offsets",
+    "travel": "travel",
+    "min_length": "min_length",
+    "max_length": "max_length",
+    "leg_radius": "radius",
+    "height": "home",
+    "platform_in": "platform_in",
+}
+
+
 def description_of(
     table: Path | None,
     *,
@@ -225,6 +251,7 @@ def description_of(
 ) -> Description:
     """Return the machine that a table or a family describes."""
     given = {key: value for key, value in dimensions.items() if value is not None}
+    options = {key: given.pop(key) for key in list(given) if key in _BESIDE and table is not None}
     if (table is None) == (family is None):
         found = "neither" if table is None else "both"
         raise UsageError(
@@ -236,11 +263,23 @@ def description_of(
             f"The unit could not be used: found '{unit}', needed mm or m; correct --unit."
         )
     if table is None:
+        beside = [f"--{key.replace('_', '-')}" for key in ("type", "platform_in") if key in given]
+        if beside:
+            raise UsageError(
+                f"The family {family} could not be built: found {' and '.join(beside)}, needed it "
+                "beside a table only; leave it out."
+            )
+        _lengths_of_family(str(family), given)
         return describe_family(Family(family=str(family), unit=unit, name=name, **given))
     if given:
-        options = ", ".join(f"--{key.replace('_', '-')}" for key in given)
+        named = ", ".join(f"--{key.replace('_', '-')}" for key in given)
         raise UsageError(
-            f"The model could not be written: found {options} beside a table, needed them with "
+            f"The model could not be written: found {named} beside a table, needed them with "
             "--family only; write them in the table."
         )
-    return read_description(table, unit, name)
+    entries: dict[str, Any] = {_BESIDE[key]: value for key, value in options.items()}
+    if "home" in entries:
+        entries["home"] = {"height": entries["home"]}
+    if "travel" in entries:
+        entries["travel"] = list(entries["travel"])
+    return read_description(table, unit, name, entries)

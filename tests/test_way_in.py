@@ -1,0 +1,211 @@
+"""The first hour: tables of joints as people write them, and from files to a calibration."""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import run
+from csv_rows import read_rows
+from hexapod_example import HEXAPOD, TRUTH
+
+from legcal import evaluate, load_mechanism
+from legcal.machine import Machine, readings_at
+
+BASE = [(289.8, 77.6), (-77.6, 289.8), (-212.1, 212.1), (-212.1, -212.1), (-77.6, -289.8),
+        (289.8, -77.6)]  # fmt: skip
+PLATFORM = [(106.1, 106.1), (38.8, 144.9), (-144.9, 38.8), (-144.9, -38.8), (38.8, -144.9),
+            (106.1, -106.1)]  # fmt: skip
+ENDS = ("--min-length", "380", "--max-length", "500")
+OPTIONS = ("--type", "UPS", *ENDS, "--leg-radius", "10", "--height", "400")
+
+
+def wide(header: str, at: float = 0.0, separator: str = ",") -> str:
+    """Return a row for each leg under a header of six coordinates, the platform at a height."""
+    rows = [
+        separator.join(f"{x:g}" for x in (*A, 0.0, *B, at))
+        for A, B in zip(BASE, PLATFORM, strict=True)
+    ]
+    return "\n".join([header, *rows]) + "\n"
+
+
+def one_row(base: str, platform: str) -> str:
+    points = {f"{base}{j + 1}": A for j, A in enumerate(BASE)}
+    points |= {f"{platform}{j + 1}": B for j, B in enumerate(PLATFORM)}
+    header = ",".join(f"{name}{axis}" for name in points for axis in "xyz")
+    return header + "\n" + ",".join(f"{x:g},{y:g},0" for x, y in points.values()) + "\n"
+
+
+def twelve_points(base: str, platform: str) -> str:
+    rows = [f"{platform}{j + 1},{x:g},{y:g},0" for j, (x, y) in enumerate(PLATFORM)]
+    rows += [f"{base}{j + 1},{x:g},{y:g},0" for j, (x, y) in enumerate(BASE)]
+    return "\n".join(["Point,X [mm],Y [mm],Z [mm]", *rows]) + "\n"
+
+
+def new(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, text: str, *words: str, name: str = "own.csv"
+) -> int:
+    (folder / name).write_text(text)
+    return run(monkeypatch, "new", folder / name, "-o", folder / "made", *words)
+
+
+def made(folder: Path) -> Machine:
+    return load_mechanism(folder / "made/models/own.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (wide("bx,by,bz,px,py,pz"), ("--unit", "mm")),
+        (wide("Base_X [mm];Base_Y [mm];Base_Z [mm];Plat_X [mm];Plat_Y [mm];Plat_Z [mm]",
+              separator=";"), ()),
+        (wide("xa,ya,za,xb,yb,zb"), ("--unit", "mm")),
+        (wide("base_x_mm,base_y_mm,base_z_mm,top_x_mm,top_y_mm,top_z_mm"), ()),
+        (one_row("B", "P"), ("--unit", "mm")),
+        (one_row("A", "B"), ("--unit", "mm")),
+        (twelve_points("B", "P"), ()),
+        (twelve_points("A", "B"), ()),
+        (twelve_points("Base joint ", "Platform joint "), ()),
+    ],
+)  # fmt: skip
+def test_headings_as_people_write_them_give_one_machine(
+    text: str, words: Sequence[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert new(monkeypatch, tmp_path, text, *words, *OPTIONS) == 0
+    machine = made(tmp_path)
+    np.testing.assert_allclose(machine.A_base[:, :2], 1e-3 * np.array(BASE), atol=1e-12)
+    np.testing.assert_allclose(machine.B_platform[:, :2], 1e-3 * np.array(PLATFORM), atol=1e-12)
+    np.testing.assert_allclose(machine.q0, 0.38, atol=1e-12)
+    assert {leg.travel for leg in machine.legs} == {(0.0, 0.12)}
+    np.testing.assert_allclose(machine.home.as_matrix()[:3, 3], [0, 0, 0.4], atol=1e-12)
+    assert machine.home.rotation.magnitude() < 1e-12
+
+
+def test_the_template_is_a_table_and_replaces_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("new", "--template", "-o", tmp_path, "--name", "mine")
+    assert run(monkeypatch, *words) == 0
+    machines = []
+    for suffix in ("yaml", "csv"):
+        assert run(monkeypatch, "new", tmp_path / f"mine.{suffix}", "-o", tmp_path / suffix) == 0
+        machines.append(load_mechanism(tmp_path / suffix / "models/mine.yaml"))
+    found = evaluate(*machines)
+    assert np.abs(found.values).max() < 1.0
+    np.testing.assert_allclose(found.values, found.references, atol=1e-12)
+    (tmp_path / "mine.csv").write_text("mine")
+    capsys.readouterr()
+    assert run(monkeypatch, *words) == 2
+    assert "mine.csv already there" in capsys.readouterr().err
+    assert (tmp_path / "mine.csv").read_text() == "mine"
+    assert run(monkeypatch, *words, "--force") == 0
+    assert run(monkeypatch, *words, "--force", "--unit", "mm") == 2
+
+
+def test_platform_joints_in_the_base_are_asked_about_and_taken_as_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = wide("bx,by,bz,px,py,pz", at=395.5)
+    words = ("--unit", "mm", "--type", "UPS", *ENDS)
+    for more in ((), ("--height", "400")):
+        assert new(monkeypatch, tmp_path, text, *words, *more) == 2
+        said = capsys.readouterr().err
+        assert said.count("legcal: ") == said.count("\n") == 1
+        assert "look like coordinates of the base" in said
+        assert "--platform-in base" in said
+    assert new(monkeypatch, tmp_path, text, *words, "--platform-in", "base") == 0
+    machine = made(tmp_path)
+    np.testing.assert_allclose(machine.home.translation, [0, 0, 0.3955], atol=1e-12)
+    np.testing.assert_allclose(machine.B_platform[0], [0.1061, 0.1061, 0], atol=1e-12)
+    assert "coordinates of the base at home" in " ".join(capsys.readouterr().out.split())
+    assert new(monkeypatch, tmp_path, text, *words, "--platform-in", "platform", "--force") == 0
+    np.testing.assert_allclose(made(tmp_path).B_platform[0], [0.1061, 0.1061, 0.3955], atol=1e-12)
+
+
+def test_a_platform_that_is_turned_in_its_link_is_level_and_turned_back_at_its_height(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines = wide("bx,by,bz,px,py,pz").splitlines()
+    turned = [lines[0]]
+    for line in lines[1:]:
+        *base, x, y, z = line.split(",")
+        turned.append(",".join([*base, y, str(-float(x)), z]))  # by -90 deg
+    assert new(monkeypatch, tmp_path, "\n".join(turned), "--unit", "mm", *OPTIONS) == 0
+    machine = made(tmp_path)
+    assert machine.home.rotation.as_euler("xyz", degrees=True)[2] == pytest.approx(90.0)
+    q = readings_at(machine, machine.home)
+    assert np.ptp(q) < 1e-3
+
+
+REFUSED: list[tuple[str, Sequence[str], Sequence[str]]] = [
+    (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", "--type", "UPS"),
+     ("'leg1', 'leg2', 'leg3', 'leg4', 'leg5', 'leg6'", "min_length")),
+    (wide("bx,by,bz,px,py,pz"), OPTIONS, ("--unit mm",)),
+    (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS[2:]), ("type", "--type UPS")),
+    (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS, "--travel", "0", "9"), ("travel",)),
+    (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS[:-2], "--height", "700"),
+     ("'leg1', 'leg2'", "close at home", "380 to 500 mm")),
+    (wide("bx,by,bz,px,py,pz [cm]"), OPTIONS, ("cm", "m or mm")),
+    (wide("bx,by,bz,px,py,pz [mm]"), ("--unit", "m", *OPTIONS), ("--unit m",)),
+    (wide("bx,by,bz,qx,qy,qz"), ("--unit", "mm", *OPTIONS), ("'qx'", "'platform_x'")),
+    (twelve_points("B", "P").replace("P3", "P2"), OPTIONS, ("'P2' twice",)),
+    (twelve_points("B", "P").replace("P3", "sun"), OPTIONS, ("'sun'", "B1 and P1")),
+    (twelve_points("B", "P").replace("P3,-144.9,38.8,0\n", ""), OPTIONS, ("platform_x",)),
+    (one_row("B", "P") * 2, ("--unit", "mm", *OPTIONS), ("3 rows", "one complete row")),
+    (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", "--max-length", "500", "--type", "UPS"),
+     ("max_length alone",)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "words", "named"), REFUSED)
+def test_what_tables_lack_is_said_once(
+    text: str,
+    words: Sequence[str],
+    named: Sequence[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert new(monkeypatch, tmp_path, text, *words) == 2
+    said = capsys.readouterr().err
+    assert all(word in said for word in named), said
+    assert "leg2'" not in said or "'leg1'" in said.split("leg2'")[0]
+    assert not (tmp_path / "made").exists()
+
+
+@pytest.mark.slow
+def test_three_commands_lead_from_files_to_a_calibration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shipped = load_mechanism(HEXAPOD / "models/hexapod.yaml")
+    joints = [("A", shipped.A_base), ("B", shipped.B_platform)]
+    points = [
+        ",".join([f"{side}{j + 1}", *(f"{1e3 * x:.3f}" for x in p)])
+        for side, all_points in joints
+        for j, p in enumerate(all_points)
+    ]
+    Path("joints.csv").write_text("\n".join(["point,x,y,z", *points]))
+    lines = ["photo," + ",".join(f"L{j} [mm]" for j in range(1, 7))]
+    for row in read_rows(HEXAPOD / "measurements.csv"):
+        name = row["image"].removeprefix("images/").upper()
+        (path := Path("photos") / row["view"] / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(HEXAPOD / row["image"], path)
+        lengths = [1e3 * float(row[f"leg{j}_prismatic"]) + 345.0 for j in range(1, 7)]
+        lines.append(",".join([row["image"], *(f"{x:.4f}" for x in lengths)]))
+    Path("readings.csv").write_text("\n".join(lines))
+    shutil.copy(HEXAPOD / "camera_info.yaml", "camera_info.yaml")
+    commands = [
+        "new joints.csv --unit mm --type SPU --min-length 345 --max-length 489 --leg-radius 10 "
+        "--height 383 -o .",
+        "init photos --readings readings.csv --lengths --model models/joints.yaml -o dataset",
+        "calibrate dataset -o calibrated",
+    ]
+    assert [run(monkeypatch, *words.split()) for words in commands] == [0, 0, 0]
+    nominal, found = (
+        evaluate(model, TRUTH, dataset=HEXAPOD).displacement.mean()
+        for model in ("models/joints.yaml", "calibrated")
+    )
+    assert found < 0.2 * nominal
+    assert found < 2e-4
