@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import one_thread  # noqa: F401
@@ -9,9 +10,31 @@ import pytest
 from hexapod_example import Run, copy_of_the_example
 
 from legcal import calibrate
+from legcal.machine import Machine, loader
+from legcal.machine.files import find_model
+from legcal.machine.spanning_tree import Source
 
 LEFT = ("observations.csv", ".legcal-cache.json")  # beside a dataset, for the next run
 STAGES = "stages.txt"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _shipped_models_are_loaded_once() -> Iterator[None]:
+    """Load each shipped model once a process: hundreds of tests start with one."""
+    folder, load = find_model("hexapod").parent, loader._load
+    machines: dict[tuple[Path, str, str], Machine] = {}
+
+    def loaded(source: Source) -> Machine:
+        if source.path.parent != folder:
+            return load(source)
+        key = (source.path, source.file.model_dump_json(), source.urdf.text)
+        if key not in machines:
+            machines[key] = load(source)
+        return machines[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loader, "_load", loaded)
+        yield
 
 
 @pytest.fixture(scope="session")

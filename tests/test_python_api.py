@@ -77,8 +77,8 @@ def test_figures_show_every_view_and_every_parameter(example_run: Run) -> None:
 
 
 def test_a_fit_without_outlines_has_no_residuals_to_draw(tmp_path: Path) -> None:
-    settings = legcal.SimulationSettings(level=Level.AXES, views=3, poses=12)
-    legcal.simulate("hexapod", tmp_path / "set", settings)
+    settings = legcal.SimulationSettings(level=Level.AXES, views=3, poses=6)
+    legcal.simulate("3-rpr", tmp_path / "set", settings)
     with pytest.raises(UsageError, match="found a fit without outlines"):
         legcal.calibrate(tmp_path / "set").plot_residuals()
 

@@ -29,10 +29,10 @@ def _lines(folder: Path) -> list[bytes]:
 
 
 def test_results_depend_neither_on_the_number_of_processes_nor_on_their_order() -> None:
-    study = Draws(seconds=0.002)
-    results = [run_study(study, 40, seed=3, workers=n).document() for n in (1, 3)]
+    study = Draws(seconds=0.002, fails_above=0.5)
+    results = [run_study(study, 40, seed=3, workers=n).document() for n in (1, 2)]
     assert results[0] == results[1]
-    assert results[0]["n"] == 40
+    assert 0 < results[0]["n"] < 40
 
 
 def test_more_runs_are_added_to_those_that_are_there_and_missing_ones_made_up_for(
@@ -55,7 +55,7 @@ def test_more_runs_are_added_to_those_that_are_there_and_missing_ones_made_up_fo
 
 def test_failed_runs_are_recorded_and_counted(tmp_path: Path) -> None:
     study = Draws(fails_above=0.5)
-    result = run_study(study, 40, workers=2, output=tmp_path / "out")
+    result = run_study(study, 40, output=tmp_path / "out")
     document = result.document()
     assert document["failures"] == {"DidNotConverge": 40 - document["n"]}
     assert 0 < document["n"] < 40
@@ -248,7 +248,7 @@ def test_numbers_that_make_no_sense_are_refused() -> None:
     ):
         with pytest.raises(UsageError, match=message):
             run_study(Draws(), n_runs, seed=seed, workers=workers)
-    run_study(Draws(), 2, workers=10**11)  # more than are of use are not started
+    run_study(Draws(), 1, workers=10**11)  # more than are of use are not started
 
 
 def test_a_full_disk_without_a_folder_promises_nothing_and_warns_of_nothing(
