@@ -43,7 +43,7 @@ from legcal.machine.model import (
     readings_at,
     slider_columns,
 )
-from legcal.machine.solver import newton, poses_after, solve, walk_in_steps
+from legcal.machine.solver import Equations, newton, poses_after, solve, walk_in_steps
 
 CONTRACTION = 0.5  # of the step before; of 1 rad or a leg length for the first
 TOLERANCE = 1e-13  # of a leg length
@@ -566,15 +566,22 @@ def follow(
 
 def _nearest(machine: Machine, T: RigidTransform, readings: Array) -> RigidTransform:
     """Return the pose near T_base_platform at which readings (n_motors,) miss least."""
-    lengthening = machine.sign[list(machine.motors)] * readings
+    equations = _equations_at(machine, machine.sign[list(machine.motors)] * readings)
+    found = solve(equations, poses_after, T.as_matrix()[None, :3], tolerance=1e-15)
+    return motion_of(found.points[0, :, :3], found.points[0, :, 3])
+
+
+def _equations_at(machine: Machine, lengthening: Array) -> Equations:
+    """Return what poses must satisfy at s q of the motors (k, n_motors) [m]."""
 
     def equations(poses: Array) -> tuple[Array, Array]:
         found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
         found.values[:, found.measured] -= lengthening
-        return least_squares_equations(found)
+        if machine.is_redundant:
+            return least_squares_equations(found)
+        return found.values, found.by_pose
 
-    found = solve(equations, poses_after, T.as_matrix()[None, :3], tolerance=1e-15)
-    return motion_of(found.points[0, :, :3], found.points[0, :, 3])
+    return equations
 
 
 def follow_poses(
@@ -601,16 +608,8 @@ def follow_poses(
             now = here.values[:, here.measured]
             share = ((part - done[rows]) / (1.0 - done[rows]))[:, None]
             lengthening = now + share * (machine.sign[motors] * last[rows] - now)
-
-        def equations(poses: Array, lengthening: Array = lengthening) -> tuple[Array, Array]:
-            found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
-            found.values[:, found.measured] -= lengthening
-            if machine.is_redundant:
-                return least_squares_equations(found)
-            return found.values, found.by_pose
-
         found = newton(
-            equations,
+            _equations_at(machine, lengthening),
             poses_after,
             poses[rows],
             tolerance=TOLERANCE * scale,

@@ -81,7 +81,8 @@ class Machine:
         if n == 0:
             return f"no motor determines the pose of {moves}"
         does = "motor does" if n == 1 else "motors do"
-        return f"{n} {does} not determine the pose of {moves}"
+        held = f", of which they hold {self.motor_rank}" if self.motor_rank < n else ""
+        return f"{n} {does} not determine the pose of {moves}{held}"
 
     @property
     def A_base(self) -> Array:

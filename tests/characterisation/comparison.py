@@ -55,7 +55,7 @@ WORST = re.compile(r"\.(\w+_ax[ei]s|home|change_d\w+|d[EX]_\w+)\b")  # as the wo
 # are of different unknowns.
 ADDED = re.compile(  # to documents since they were recorded
     r"\.(document|result\.json)(\.observations|\.stages\.staged\.from_fit"
-    r"|\.board\.(corners|used|images|off)|\.left_out|\.unreached)$"
+    r"|\.board\.(corners|used|images|off)|\.left_out|\.unreached|\.motor_rank)$"
 )
 OF_UNKNOWNS = {"parameters", "covariance", "kinematic", "held", "base_axes", "platform_axes"}
 
