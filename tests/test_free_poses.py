@@ -1,17 +1,20 @@
 """Platforms that readings do not place: moved by hand, or with fewer motors than freedoms."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 from dataset_folder import Folder, folder
+from fit_sessions import machine_session
 from layouts import Layout, LegLayout, MachineSpec, write_machine
 from leg_pictures import clutter, edges, segments
 from machines import SHIPPED_URDF, SHIPPED_YAML, of_types
 from scipy.spatial.transform import RigidTransform, Rotation
 
 import legcal
+from legcal.calibration import refine
 from legcal.data import Measurements, View
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.geometry import Array
@@ -224,6 +227,27 @@ def test_poses_are_found_near_rough_cameras(n_motors: int, tmp_path: Path) -> No
         off_at_home.append(np.linalg.norm(at_home - truth, axis=1).max())
     assert max(off) < 20.0  # px
     assert min(off_at_home) > 40.0
+
+
+def test_poses_between_which_few_lines_leave_a_choice_are_found_by_the_fit(tmp_path: Path) -> None:
+    """Four legs and three readings an image allow several poses."""
+    path = write_machine(tmp_path, drawn("3-SPS + passive UPS"), Layout())
+    session = machine_session(str(path), n_views=2, seed=5)
+    rng = np.random.default_rng(1)
+    far = tuple(
+        RigidTransform.from_components(
+            T.translation + rng.uniform(-0.25, 0.25, 3),
+            Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3)) * T.rotation,
+        )
+        for T in session.start.T_Rb_Re
+    )
+    start = replace(session.start, T_Rb_Re=far)
+    found = refine(session.legs, session.measurements, session.outlines, start)
+    away = [
+        np.linalg.norm(one.translation - other.translation)
+        for one, other in zip(found.T_Rb_Re, session.truth.T_Rb_Re, strict=True)
+    ]
+    assert max(away) < 1e-6
 
 
 # --- refusals -----------------------------------------------------------------------------------

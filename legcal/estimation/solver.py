@@ -325,9 +325,14 @@ class NormalEquations:
         )
         return self._whole(kept, y), 0.5 * (extra - linear)
 
-    def element_step(self) -> Array:
-        """Return the step (size,) of the eliminated elements alone."""
-        y = -(self.V_inverse @ self.g_elements[..., None])[..., 0]
+    def element_step(self, damping: Array | None = None) -> Array:
+        """Return the step (size,) of the eliminated elements alone, each damped by its own part."""
+        if damping is None:
+            inverse = self.V_inverse
+        else:
+            damped = _damped(self.V, damping[:, None])
+            inverse = np.asarray(np.linalg.inv(damped), dtype=np.float64)
+        y = -(inverse @ self.g_elements[..., None])[..., 0]
         return self._whole(np.zeros(len(self.U)), y)
 
     def _whole(self, kept: Array, y: Array) -> Array:
@@ -517,7 +522,7 @@ def _by_element(W: Array, blocks: Array) -> Array:
     return found
 
 
-def _damped(M: Array, damping: float) -> Array:
+def _damped(M: Array, damping: float | Array) -> Array:
     """Return matrices with a part of their diagonal added to it; one where it is zero."""
     damped = M.copy()
     diagonal = np.einsum("...ii->...i", damped)

@@ -22,6 +22,12 @@ from legcal.calibration.joint_fit.diagnostics import (
     rejected_notes,
 )
 from legcal.calibration.joint_fit.factors import BoardCorners
+from legcal.calibration.joint_fit.free_poses import (
+    are_free,
+    have_outliers,
+    with_better_poses,
+    with_free_poses,
+)
 from legcal.calibration.joint_fit.outline_errors import NoiseModel, noise_of_the_median
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
@@ -48,6 +54,8 @@ from legcal.geometry import Array
 
 _MAX_RADIUS_CHANGE = 0.5
 _COST_TOLERANCE = 1e-6  # relative: the same minimum
+_POSE_ROUNDS = 8  # in which other poses are looked for, where readings leave them open
+_PART_OF_MODEL = 0.1  # of the errors of a nominal model, which are left then
 
 
 def refine(
@@ -162,11 +170,38 @@ def _first(problem: FitProblem, start: Start, settings: RefinementSettings) -> M
     """Return the first minimum that a start leads to."""
     begin = problem.begin(start)
     try:
+        if are_free(problem, begin):
+            return _first_of_free_poses(problem, begin, settings)
         return first_minimum(*_held_at_start(problem, begin), settings=settings)
     except DidNotConverge as failure:
         refuse_contradicted_values(problem, start, begin, settings, with_priors=True)
         _refuse_undetermined(problem, begin)
         raise naming_stated_values(problem, failure) from None
+
+
+def _first_of_free_poses(
+    problem: FitProblem, begin: State, settings: RefinementSettings
+) -> Minimum[State]:
+    """Return the first minimum, with other poses where some suit their images badly."""
+
+    def minimum(state: State) -> Minimum[State]:
+        return first_minimum(*_held_at_start(problem, state), settings=settings)
+
+    try:
+        found = minimum(begin)
+        if not have_outliers(problem, found.state):
+            return found
+    except DidNotConverge:
+        found = minimum(with_free_poses(problem, problem.projected(begin)))
+    else:
+        again = minimum(with_free_poses(problem, problem.projected(begin)))
+        found = again if again.cost < found.cost else found
+    for k in range(_POSE_ROUNDS):
+        if not have_outliers(problem, found.state):
+            break
+        again = minimum(with_better_poses(problem, found.state, _PART_OF_MODEL, seed=k))
+        found = again if again.cost < found.cost else found
+    return found
 
 
 def _held_at_start(
