@@ -229,6 +229,7 @@ def test_what_few_calibrations_hold_for_is_asked_about(
     ("shape", "block", "words"),
     [
         ((64, 48), b"", ["48 x 64 px", "turned by a quarter turn"]),
+        ((64, 48), exif(orientation=6), ["quarter turn", "EXIF orientation 6"]),
         ((24, 32), b"", ["32 x 24 px", "rescaled by 0.5"]),
         ((96, 128), b"", ["128 x 96 px", "rescaled by 2"]),
         ((128, 96), b"", ["96 x 128 px", "turned and rescaled by 2"]),
@@ -244,6 +245,12 @@ def test_another_size_is_refused_with_its_likeliest_cause(
     with pytest.raises(DatasetError) as refused:
         notes(folder, {1: other})
     assert [word for word in [*ONE, *words] if word not in str(refused.value)] == []
+
+
+def test_a_photograph_of_another_format_is_named_with_how_to_convert_it(folder: Folder) -> None:
+    with pytest.raises(DatasetError) as refused:
+        notes(folder, {1: b"\0\0\0\x18ftypheic" + bytes(200)})
+    assert [w for w in (*ONE, "HEIC", "magick", "JPEG") if w not in str(refused.value)] == []
 
 
 def test_lossy_compression_is_noted_once_with_views_and_qualities(folder: Folder) -> None:

@@ -2,16 +2,19 @@
 
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import run
 from csv_rows import read_rows
-from hexapod_example import HEXAPOD, TRUTH
+from hexapod_example import HEXAPOD, TRUTH, Run
+from lxml import etree
 
 from legcal import evaluate, load_mechanism
 from legcal.machine import Machine, readings_at
+from legcal.report import machine_picture
 
 BASE = [(289.8, 77.6), (-77.6, 289.8), (-212.1, 212.1), (-212.1, -212.1), (-77.6, -289.8),
         (289.8, -77.6)]  # fmt: skip
@@ -172,6 +175,51 @@ def test_what_tables_lack_is_said_once(
     assert all(word in said for word in named), said
     assert "leg2'" not in said or "'leg1'" in said.split("leg2'")[0]
     assert not (tmp_path / "made").exists()
+
+
+def test_inspect_tells_travel_home_and_lengths_and_draws_the_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    svg = tmp_path / "machine.svg"
+    assert new(monkeypatch, tmp_path, wide("bx,by,bz,px,py,pz"), "--unit", "mm", *OPTIONS) == 0
+    urdf, model = tmp_path / "made/urdf/own.urdf", tmp_path / "made/models/own.yaml"
+    urdf.write_text(urdf.read_text().replace('radius="0.01"', 'radius="0.0123456"'))
+    capsys.readouterr()
+    assert run(monkeypatch, "inspect", model, "--picture", svg) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    machine = made(tmp_path)
+    q = 1e3 * readings_at(machine, machine.home)[1]
+    assert f"leg2 0.00 to 120.00 380.00 to 500.00 {q:.2f} {q + 380.0:.2f}" in said
+    assert "platform at (0.00, 0.00, 400.00) mm in the base" in said
+    assert "12.35" in said
+    root = etree.fromstring(svg.read_bytes())
+    texts = [found.text for found in root.iter("{http://www.w3.org/2000/svg}text")]
+    for name in [f"{letter}{j}" for letter in "AB" for j in range(1, 7)]:
+        assert texts.count(name) == 2
+    assert {"own at home", "R_b x", "R_e x", "100 mm"} <= set(texts)
+    rings = [x for x in root.iter("{http://www.w3.org/2000/svg}circle") if x.get("fill") == "none"]
+    assert len(rings) == 2 * 2 * 3  # views, ends, legs of the frame
+    hostile = machine_picture(replace(machine, name="<script>\x1b[2J&"))
+    assert "&lt;script&gt;" in hostile
+    assert "\x1b" not in hostile
+    assert run(monkeypatch, "inspect", model, "--picture", svg) == 0
+    svg.write_text("mine")
+    for place, word in ((svg, "another file"), (tmp_path / "machine.png", ".svg")):
+        capsys.readouterr()
+        assert run(monkeypatch, "inspect", model, "--picture", place) == 2
+        assert word in capsys.readouterr().err
+    assert svg.read_text() == "mine"
+
+
+def test_a_result_folder_is_a_model(
+    example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    apart = evaluate(example_run.output, example_run.output / "calibrated.yaml")
+    assert apart.displacement.max() < 1e-12
+    assert run(monkeypatch, "inspect", example_run.output) == 0
+    assert run(monkeypatch, "evaluate", example_run.output, TRUTH) == 0
+    shutil.copy(example_run.output / "calibrated.yaml", tmp_path)
+    assert run(monkeypatch, "inspect", tmp_path) == 2  # a folder that legcal did not write
 
 
 @pytest.mark.slow

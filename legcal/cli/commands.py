@@ -170,13 +170,29 @@ def inspect(
             help="Write the model down as DIR/models/NAME.yaml and DIR/urdf/NAME.urdf.",
         ),
     ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.svg", help="Draw the machine at home, its joints numbered, as SVG."
+        ),
+    ] = None,
 ) -> None:
     """Show a mechanism as legcal understands it: legs, joints, frames, mobility."""
     from legcal import report
     from legcal.machine import load_mechanism, machine_document, write_model
 
+    if picture is not None:
+        if picture.suffix.lower() != ".svg":
+            raise UsageError(
+                f"{picture}: the picture could not be written: found another ending, needed .svg; "
+                "give the name of an SVG file."
+            )
+        report.MACHINE_PICTURE.check_place(picture)
     machine = load_mechanism(model)
     description = machine_document(machine)
+    if picture is not None:
+        report.MACHINE_PICTURE.write(picture, report.machine_picture(machine))
+        typer.echo(f"Wrote {picture}.", err=True)
     if write is not None:
         for path in write_model(machine, write):
             typer.echo(f"Wrote {path}.", err=True)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.errors import UsageError
+from legcal.files import motion_to_xyz_quat
 from legcal.geometry import Array, frame_on_points
 from legcal.machine.chain import ClosedChain
 from legcal.machine.leg import (
@@ -212,10 +213,11 @@ def joint_values(machine: Machine, configuration: Array) -> Array:
 def machine_document(machine: Machine) -> dict[str, Any]:
     """Return the document of ``legcal inspect --json``: legs with types, frames, mobility.
 
-    A is in the base link and B in the platform link [m], twist in [rad]; ``n_d`` is the number of
-    legs that define the frames, ``r`` that of R joints on the base, ``n_ac`` that of legs that are
-    actuated or of constant length, ``motor_rank`` that of the freedoms of the platform that motors
-    hold, ``idle_spins`` that of the freedoms that only turn a leg about itself.
+    A is in the base link and B in the platform link [m], twist in [rad]; ``travel`` [m] is null for
+    legs of constant length, ``q_home`` the reading at ``home`` (T_base_platform) [m]; ``n_d`` is
+    the number of legs that define the frames, ``r`` that of R joints on the base, ``n_ac`` that of
+    legs that are actuated or of constant length, ``motor_rank`` that of the freedoms of the
+    platform that motors hold, ``idle_spins`` that of those that only turn a leg about itself.
     """
     kinds = [leg.kind for leg in machine.legs]
     return {
@@ -229,13 +231,19 @@ def machine_document(machine: Machine) -> dict[str, Any]:
         "r": sum(leg.base_joint is JointType.REVOLUTE for leg in machine.legs),
         "n_ac": len(kinds) - kinds.count(LegKind.PASSIVE),
         "idle_spins": sum(leg.idle_spins for leg in machine.legs),
-        "legs": [_leg(leg) for leg in machine.legs],
+        "base_frame": [machine.leg_names[j] for j in machine.frame_legs],
+        "home": motion_to_xyz_quat(machine.home),
+        "legs": [
+            _leg(leg, float(q))
+            for leg, q in zip(machine.legs, readings_at(machine, machine.home), strict=True)
+        ],
         "diagnostics": list(machine.diagnostics),
     }
 
 
-def _leg(leg: Leg) -> dict[str, Any]:
+def _leg(leg: Leg, q_home: float) -> dict[str, Any]:
     """Return one leg of the document."""
+    has_travel = leg.kind is not LegKind.CONSTANT and bool(np.isfinite(leg.travel).all())
     return {
         "name": leg.name,
         "type": leg.type,
@@ -245,6 +253,8 @@ def _leg(leg: Leg) -> dict[str, Any]:
         "B": [float(x) for x in leg.B],
         "q0": float(leg.q0),
         "sign": leg.sign,
+        "travel": [float(x) for x in leg.travel] if has_travel else None,
+        "q_home": q_home,
         "base_axis": None if leg.base_axis is None else [float(x) for x in leg.base_axis],
         "platform_axis": (
             None if leg.platform_axis is None else [float(x) for x in leg.platform_axis]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
+from scipy.spatial.transform import Rotation
 
 from legcal.calibration import Location
 from legcal.geometry import roll_pitch_yaw
@@ -47,6 +48,17 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
     ]
     kinds = max(4, *(0 if leg["actuated"] else len(leg["kind"]) for leg in legs))
     columns = ("leg", "type", ">A in base [mm]", ">B in platform [mm]", ">length [mm]", ">R [mm]")
+    laws = [
+        (
+            leg["name"],
+            _span(leg["travel"]),
+            _span([_at(leg, q) for q in leg["travel"] or ()]),
+            "" if leg["travel"] is None else f"{1e3 * leg['q_home']:z.2f}",
+            f"{1e3 * _at(leg, leg['q_home']):.2f}",
+        )
+        for leg in legs
+    ]
+    of_laws = ("leg", ">travel [mm]", ">length [mm]", ">reading at home", ">length at home")
     axes = [
         (
             leg["name"],
@@ -58,12 +70,18 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
         if leg["base_axis"] or leg["platform_axis"]
     ]
     of_axes = ("leg", ">axis at base", ">axis at platform", ">twist [deg]")
-    legend = f"R_b and R_e stand on the joints of {description['n_d']} legs; q is the reading."
+    frame = ", ".join(description["base_frame"])
+    legend = f"R_b and R_e stand on the joints of {frame}; q is the reading."
     return report(
         title,
         table(*columns, rows=rows, least={1: kinds}),
+        table(*of_laws, rows=laws),
         table(*of_axes, rows=axes) if axes else None,
-        [Text(legend, style="dim"), *(f"note: {note}" for note in description["diagnostics"])],
+        [
+            _home(description["home"]),
+            Text(legend, style="dim"),
+            *(f"note: {note}" for note in description["diagnostics"]),
+        ],
     )
 
 
@@ -81,7 +99,26 @@ def _points(points: Sequence[Sequence[float]]) -> list[str]:
 
 def _radii(leg: dict[str, Any]) -> str:
     """Return the different radii of a leg in millimetres."""
-    return ", ".join(dict.fromkeys(f"{1e3 * c['radius']:.4g}" for c in leg["cylinders"]))
+    rounded = [round(1e3 * cylinder["radius"], 2) for cylinder in leg["cylinders"]]
+    return ", ".join(dict.fromkeys(f"{radius:g}" for radius in rounded))
+
+
+def _at(leg: dict[str, Any], q: float) -> float:
+    """Return the length of a leg at a reading [m]."""
+    return float(leg["q0"] if leg["kind"] == "constant" else leg["sign"] * q + leg["q0"])
+
+
+def _span(values: Sequence[float] | None) -> str:
+    """Return the least and the greatest of lengths in millimetres, or nothing without any."""
+    return f"{1e3 * min(values):z.2f} to {1e3 * max(values):z.2f}" if values else ""
+
+
+def _home(home: dict[str, Sequence[float]]) -> str:
+    """Return home in millimetres and degrees."""
+    xyz = ", ".join(f"{1e3 * x:z.2f}" for x in home["xyz"])
+    turn = Rotation.from_quat(home["quat_xyzw"])
+    angles = ", ".join(f"{degrees(x):z.3f}" for x in roll_pitch_yaw(turn.as_matrix()))
+    return f"Home: platform at ({xyz}) mm in the base, roll pitch yaw ({angles}) deg."
 
 
 def _length(leg: dict[str, Any]) -> str:

@@ -55,7 +55,8 @@ WORST = re.compile(r"\.(\w+_ax[ei]s|home|change_d\w+|d[EX]_\w+)\b")  # as the wo
 # are of different unknowns.
 ADDED = re.compile(  # to documents since they were recorded
     r"\.(document|result\.json)(\.observations|\.stages\.staged\.from_fit"
-    r"|\.board\.(corners|used|images|off)|\.left_out|\.unreached|\.motor_rank)$"
+    r"|\.board\.(corners|used|images|off)|\.left_out|\.unreached|\.motor_rank"
+    r"|\.base_frame|\.home|\.legs\[\d+\]\.(travel|q_home))$"
 )
 OF_UNKNOWNS = {"parameters", "covariance", "kinematic", "held", "base_axes", "platform_axes"}
 

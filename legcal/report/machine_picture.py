@@ -1,0 +1,178 @@
+"""A drawing of a machine at home as SVG: from above and from the side, with numbers of joints.
+
+A joint of the base is a disc ``A1``, one of the platform a disc ``B1``; those that define R_b and
+R_e, the gauge of a calibration, have a ring. Legs are as thick as what is seen of them, axes of
+the frames red (x), green (y) and blue (z).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from legcal.errors import printable
+from legcal.files import OutputFile
+from legcal.geometry import Array
+from legcal.machine import Machine
+
+_SIDE, _EDGE, _HEAD, _LINE = 420.0, 46.0, 44.0, 15.0  # of a panel, its margin, title, text [px]
+_ARM = 34.0  # of the axis of a frame [px]
+_BASE, _PLATFORM, _LEG = "#333333", "#1f66b0", "#b9b9b9"
+_AXES = ("#c62828", "#2e7d32", "#1565c0")
+_MARK = b"<!-- legcal inspect -->"
+
+
+@dataclass(frozen=True)
+class _Drawing(OutputFile):
+    """An SVG that says which command wrote it."""
+
+    def _is_own(self, path: Path) -> bool:
+        try:
+            with path.open("rb") as file:
+                return _MARK in file.read(200)
+        except OSError:
+            return False
+
+
+MACHINE_PICTURE = _Drawing(
+    "the picture", "picture", "", "a new file or a picture that this command wrote"
+)
+
+
+def machine_picture(machine: Machine) -> str:
+    """Return a machine as SVG: from above (x to the right, y up) and from the side (z up)."""
+    A = machine.A_base
+    B = np.asarray(machine.home.apply(machine.B_platform))
+    frames = [("R_b", machine.T_base_Rb), ("R_e", machine.home * machine.T_platform_Re)]
+    views = [("from above", (0, 1))] + [("from the side", (0, 2))] * machine.spatial
+    points = np.concatenate([A, B])
+    low, high = points.min(axis=0), points.max(axis=0)
+    scale = (_SIDE - 2 * _EDGE) / max(float((high - low).max()), 1e-6)
+    width, height = _SIDE * len(views), _HEAD + _SIDE + _LINE * (2 + (machine.n_legs + 3) // 4)
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:g}" height="{height:g}" '
+        f'viewBox="0 0 {width:g} {height:g}" font-family="sans-serif" font-size="12">',
+        _MARK.decode(),
+        '<rect width="100%" height="100%" fill="white"/>',
+        _text((12, 20), f"{machine.name} at home", size=15),
+    ]
+    for k, (name, axes) in enumerate(views):
+        chosen = list(axes)
+        middle = 0.5 * (low + high)[chosen]
+        corner = np.array([_SIDE * (k + 0.5), _HEAD + 0.5 * _SIDE])
+
+        def on_paper(
+            points: Array, chosen: list[int] = chosen, middle: Array = middle, at: Array = corner
+        ) -> Array:
+            return np.asarray(at + scale * (points[..., chosen] - middle) * [1.0, -1.0])
+
+        lines.append(_text((_SIDE * k + 12, _HEAD), f"{name}: x to the right, {'xyz'[axes[1]]} up"))
+        is_plan = axes == (0, 1)
+        if is_plan:
+            lines += [*_outline(on_paper(A), _BASE), *_outline(on_paper(B), _PLATFORM)]
+        for leg, a, b in zip(machine.legs, on_paper(A), on_paper(B), strict=True):
+            thick = 2.0 * scale * max([c.radius for c in leg.cylinders], default=0.0)
+            lines.append(_line(a, b, _LEG, max(thick, 1.5), opacity=0.7))
+        for letter, joints, colour in (("A", A, _BASE), ("B", B, _PLATFORM)):
+            lines += _joints(machine, letter, on_paper(joints), colour, is_plan=is_plan)
+        for frame, T in frames:
+            arms = _ARM / scale * T.rotation.as_matrix().T
+            lines += _frame(frame, on_paper(np.vstack([T.translation, T.translation + arms])))
+    lines += _legend(machine, scale)
+    return "\n".join([*lines, "</svg>"]) + "\n"
+
+
+def _outline(joints: Array, colour: str) -> Iterator[str]:
+    """Yield the polygon of joints, in the order of their angles about their middle."""
+    away = joints - joints.mean(axis=0)
+    order = np.argsort(np.arctan2(away[:, 1], away[:, 0]))
+    corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in joints[order])
+    yield (
+        f'<polygon points="{corners}" fill="{colour}" fill-opacity="0.06" stroke="{colour}" '
+        'stroke-opacity="0.5" stroke-dasharray="4 3"/>'
+    )
+
+
+def _joints(
+    machine: Machine, letter: str, joints: Array, colour: str, *, is_plan: bool
+) -> Iterator[str]:
+    """Yield discs with numbers, a ring around those that define the frames."""
+    middle = joints.mean(axis=0)
+    sign = 1.0 if letter == "A" else -1.0  # numbers of the base outside or below
+    for j, (x, y) in enumerate(joints):
+        yield f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"/>'
+        if j in machine.frame_legs:
+            yield (
+                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="8" fill="none" stroke="{colour}" '
+                'stroke-width="1.5"/>'
+            )
+        away = np.array([x, y]) - middle if is_plan else np.array([0.0, 1.0])
+        away = away / max(float(np.linalg.norm(away)), 1e-9) * sign
+        at = (x + 17.0 * away[0], y + 17.0 * away[1] + 4.0)
+        yield _text(at, f"{letter}{j + 1}", colour=colour, anchor="middle")
+
+
+def _frame(name: str, points: Array) -> Iterator[str]:
+    """Yield the axes of a frame: its origin and the ends of x, y and z."""
+    for axis, (end, colour) in enumerate(zip(points[1:], _AXES, strict=True)):
+        if np.linalg.norm(end - points[0]) < 3.0:  # towards the eye
+            continue
+        yield _line(points[0], end, colour, 2.0)
+        at = points[0] + 1.2 * (end - points[0])
+        letter = f"{name} {'xyz'[axis]}" if axis == 0 else "xyz"[axis]
+        yield _text((at[0], at[1] - 2.0), letter, colour=colour, anchor="middle", size=11)
+
+
+def _legend(machine: Machine, scale: float) -> Iterator[str]:
+    """Yield a length to compare with, and which leg has which number."""
+    y = _HEAD + _SIDE
+    step = _round_length(100.0 / scale)
+    yield _line((12, y), (12 + step * scale, y), _BASE, 2.0)
+    yield _text((18 + step * scale, y + 4), f"{1e3 * step:g} mm")
+    frame = ", ".join(str(j + 1) for j in machine.frame_legs)
+    y += _LINE
+    yield _text(
+        (12, y + 6), f"Rings: the joints of legs {frame} define R_b (base) and R_e (platform)."
+    )
+    for k in range(0, machine.n_legs, 4):
+        y += _LINE
+        names = [f"{j + 1} {machine.leg_names[j]}" for j in range(k, min(k + 4, machine.n_legs))]
+        yield _text((12, y + 8), ",  ".join(names))
+
+
+def _round_length(length: float) -> float:
+    """Return the greatest 1, 2 or 5 times a power of ten that is not longer."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= length * (1 + 1e-9)))
+
+
+def _line(
+    one: Sequence[float] | Array,
+    two: Sequence[float] | Array,
+    colour: str,
+    thick: float,
+    opacity: float = 1.0,
+) -> str:
+    return (
+        f'<line x1="{one[0]:.1f}" y1="{one[1]:.1f}" x2="{two[0]:.1f}" y2="{two[1]:.1f}" '
+        f'stroke="{colour}" stroke-width="{thick:.1f}" stroke-opacity="{opacity:g}" '
+        'stroke-linecap="butt"/>'
+    )
+
+
+def _text(
+    at: Sequence[float],
+    text: str,
+    *,
+    colour: str = "#222222",
+    anchor: str = "start",
+    size: int = 12,
+) -> str:
+    return (
+        f'<text x="{at[0]:.1f}" y="{at[1]:.1f}" fill="{colour}" font-size="{size}" '
+        f'text-anchor="{anchor}">{escape(printable(text))}</text>'
+    )
