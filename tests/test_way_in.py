@@ -14,7 +14,7 @@ from lxml import etree
 
 from legcal import evaluate, load_mechanism
 from legcal.machine import Machine, readings_at
-from legcal.report import machine_picture
+from legcal.report import draw_machine
 
 BASE = [(289.8, 77.6), (-77.6, 289.8), (-212.1, 212.1), (-212.1, -212.1), (-77.6, -289.8),
         (289.8, -77.6)]  # fmt: skip
@@ -199,7 +199,7 @@ def test_inspect_tells_travel_home_and_lengths_and_draws_the_machine(
     assert {"own at home", "R_b x", "R_e x", "100 mm"} <= set(texts)
     rings = [x for x in root.iter("{http://www.w3.org/2000/svg}circle") if x.get("fill") == "none"]
     assert len(rings) == 2 * 2 * 3  # views, ends, legs of the frame
-    hostile = machine_picture(replace(machine, name="<script>\x1b[2J&"))
+    hostile = draw_machine(replace(machine, name="<script>\x1b[2J&"))
     assert "&lt;script&gt;" in hostile
     assert "\x1b" not in hostile
     assert run(monkeypatch, "inspect", model, "--picture", svg) == 0

@@ -191,7 +191,7 @@ def inspect(
     machine = load_mechanism(model)
     description = machine_document(machine)
     if picture is not None:
-        report.MACHINE_PICTURE.write(picture, report.machine_picture(machine))
+        report.MACHINE_PICTURE.write(picture, report.draw_machine(machine))
         typer.echo(f"Wrote {picture}.", err=True)
     if write is not None:
         for path in write_model(machine, write):

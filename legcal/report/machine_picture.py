@@ -43,7 +43,7 @@ MACHINE_PICTURE = _Drawing(
 )
 
 
-def machine_picture(machine: Machine) -> str:
+def draw_machine(machine: Machine) -> str:
     """Return a machine as SVG: from above (x to the right, y up) and from the side (z up)."""
     A = machine.A_base
     B = np.asarray(machine.home.apply(machine.B_platform))
