@@ -153,3 +153,43 @@ def read_family(family: str, unit: str | None = "mm", **dimensions: Any) -> Any:
 def made(folder: Path, **changes: Any) -> Machine:
     """Return the machine of a table with some keys changed, written as a model and loaded."""
     return create_model(read_table(write_table(folder, **changes)), folder).machine
+
+
+def exechon() -> MachineSpec:
+    """Return a 2-UPR + SPR: legs 1 and 2 lie in a plane that turns about the line of their bases.
+
+    Six freedoms less five constraints of joints would be one; two constraints follow from others.
+    """
+    A = np.array([[-0.21, 0.0, 0.0], [0.21, 0.0, 0.0], [0.0, 0.27, 0.0]])
+    B = np.array([[-0.072, 0.0, 0.42], [0.084, 0.0, 0.42], [0.006, 0.09, 0.42]])
+    tilt = Rotation.from_euler("x", -0.1)
+    B[:2] = tilt.apply(B[:2])
+    normal, u = tilt.apply([0.0, 1.0, 0.0]), B[2] - A[2]
+    across = np.cross(normal, u) / np.linalg.norm(np.cross(normal, u))
+    line = np.array([1.0, 0.0, 0.0])
+    legs = (
+        LegSpec("UR", A[0], B[0], "actuated", line, normal),
+        LegSpec("UR", A[1], B[1], "actuated", line, normal),
+        LegSpec("SR", A[2], B[2], "actuated", None, across),
+    )
+    return MachineSpec(legs, RigidTransform.from_components([0.0, 0.03, 0.4], tilt))
+
+
+def two_upr_two_sps() -> MachineSpec:
+    """Return the legs 1 and 2 of an :func:`exechon` with two SPS legs: four freedoms."""
+    machine = exechon()
+    one = LegSpec("SS", np.array([0.06, 0.27, 0.0]), np.array([0.03, 0.09, 0.41]))
+    two = LegSpec("SS", np.array([-0.06, -0.24, 0.0]), np.array([-0.03, -0.09, 0.43]))
+    return MachineSpec((*machine.legs[:2], one, two), machine.home)
+
+
+def four_upu() -> MachineSpec:
+    """Return four UPU legs, one of them passive, whose platform only translates."""
+    A, B = ring([10, 100, 190, 290], 0.3), ring([20, 95, 185, 300], 0.15, 0.4)
+    axes = np.array([[2.0, 0.3, 0.5], [-0.4, 2.0, 0.2], [2.0, -0.6, -0.3], [0.5, 1.8, -0.4]])
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    legs = tuple(
+        LegSpec("UU", a, b, kind, axis, axis)
+        for a, b, axis, kind in zip(A, B, axes, ["actuated"] * 3 + ["passive"], strict=True)
+    )
+    return MachineSpec(legs, RigidTransform.from_translation([0.0, 0.0, 0.4]))

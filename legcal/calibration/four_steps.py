@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
@@ -12,7 +13,7 @@ from legcal.calibration.joint_fit import Start, start_from
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
 from legcal.data import Order, Outlines, axes_from_outlines, few_views, inverse
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
-from legcal.machine import Leg, geometries, reframed
+from legcal.machine import Leg, geometries, machine_ties, on_ties, parametrization_of, reframed
 from legcal.paper import nominal_machine, run_base_steps, run_platform_steps
 from legcal.perception import Placement
 
@@ -75,6 +76,9 @@ def four_steps(
         except (NotIdentifiable, DidNotConverge) as failure:
             return Steps(None, cameras, str(failure))
         legs = reframed(found.legs, data.machine.frame_legs)
+        known = parametrization_of(data.machine)
+        ties, unit = machine_ties(data.machine), np.ones(len(known))
+        legs = on_ties(legs, nominal.legs, ties, known.place, unit)
         return Steps(legs, cameras, "", found.diagnostics)
     except (NotIdentifiable, NotVisible, DidNotConverge) as failure:
         return Steps(None, None, str(failure))

@@ -101,7 +101,13 @@ from .solver import solve as solve
 from .table_template import write_template as write_template
 from .ties import TieRows as TieRows
 from .ties import Ties as Ties
+from .ties import by_step as by_step
+from .ties import independent as independent
+from .ties import machine_ties as machine_ties
+from .ties import on_ties as on_ties
+from .ties import ties_in_words as ties_in_words
 from .ties import ties_of as ties_of
+from .ties import wholly_tied as wholly_tied
 from .urdf import Urdf as Urdf
 from .urdf import UrdfPatch as UrdfPatch
 from .urdf import number_list as number_list

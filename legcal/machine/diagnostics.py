@@ -4,6 +4,7 @@ from legcal.machine.home import legs_outside
 from legcal.machine.mobility import singularity
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.schema import LegcalBlock
+from legcal.machine.ties import ties_in_words
 
 _MIN_SINGULARITY = 1e-4  # singularity measure: less than that is the rounding of a file
 
@@ -27,6 +28,8 @@ def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]
                 f"leg '{leg.name}' is at {1e3 * q[j]:.2f} mm at home, outside its travel of "
                 f"{1e3 * lower:.2f} to {1e3 * upper:.2f} mm; check legcal.home or the limits."
             )
+    tied = ties_in_words(machine)
+    notes += [] if tied is None else [tied]
     return (*notes, *_unseen_notes(machine), *_motor_notes(machine), *_spin_notes(machine))
 
 

@@ -43,9 +43,10 @@ from legcal.machine.mobility import (
 )
 from legcal.machine.model import Machine, joint_values, vectors_A_to_B
 from legcal.machine.origins import with_own_origins
-from legcal.machine.parameters import n_frame_legs
+from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
 from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.spanning_tree import Source
+from legcal.machine.ties import is_tied, machine_ties
 from legcal.machine.topology import (
     any_joint,
     check_bodies,
@@ -129,6 +130,7 @@ def _load(source: Source) -> Machine:
     machine = replace(machine, mobility=mobility(machine, configurations))
     machine = replace(machine, motor_rank=motor_rank(machine, configurations))
     _check_equations(machine, configurations)
+    _check_ties(machine)
     proposed = proposal_notes(file.legcal, machine)
     found = map(
         source.in_format_terms, mechanism_notes(machine, home_is_given=block.home is not None)
@@ -464,6 +466,26 @@ def _check_unit(machine: Machine) -> None:
                     f"leg '{leg.name}', which is {1e3 * length:.4g} mm long at home, needed "
                     f"{MIN_RADIUS:g} to {MAX_RADIUS:g} of the length; correct radius and its unit."
                 )
+
+
+def _check_ties(machine: Machine) -> None:
+    """Check that an overconstrained machine with small errors can have its mobility.
+
+    Raises
+    ------
+    OutOfClass
+        If errors that its constraints allow one by one destroy it together.
+    """
+    ties = machine_ties(machine)
+    if not is_tied(geometries(machine), ties, parametrization_of(machine, twists=True)):
+        n = sum(leg.n_constraints for leg in machine.legs)
+        raise OutOfClass(
+            f"{machine.yaml_path}: the mechanism '{machine.name}' is outside the method: found it "
+            f"overconstrained ({ties.n_dependent} of the {n} constraints of its joints follow from "
+            "the others) and no errors of its parameters near the model with which it keeps its "
+            f"mobility {machine.mobility}, needed parameters that can be tied so; give a leg "
+            "another joint, or leave out a leg without a motor."
+        )
 
 
 def _check_across(machine: Machine) -> None:

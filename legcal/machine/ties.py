@@ -1,20 +1,47 @@
 """Ties: equations between the parameters of legs that hold exactly, whatever is measured.
 
 A leg that is fixed to the platform and defines R_e has B at its
-:func:`~legcal.machine.leg.frame_point`: sliding B along the leg together with its offset
-shows nowhere. Parameters move on the manifold where all ties hold.
+:func:`~legcal.machine.leg.frame_point`: sliding B along the leg together with its offset shows
+nowhere.
+
+An overconstrained machine has more constraints of joints than they take freedoms away (an Exechon,
+whose axes are parallel in pairs). Errors of its parameters keep the mobility if the constraints
+stay dependent: at every pose where they hold the machine has self-stresses, forces w of its joints
+in equilibrium, w . F_pose = 0, and a step of the parameters must do no work on any of them,
+w . F_xi step = 0. Over several poses these are the ties; parameters move on the manifold where all
+of them hold.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from legcal.geometry import Array, cross, normal_basis
+from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
+from legcal.machine.directions import SHOWN, describe_direction, sparse_basis
+from legcal.machine.equations import PoseEquations, pose_equations
 from legcal.machine.leg import Leg, LegColumns, frame_point
+from legcal.machine.mobility import leg_scale
+from legcal.machine.model import Machine
+from legcal.machine.parameters import (
+    Parametrization,
+    geometries,
+    moved_legs,
+    parametrization_of,
+)
+from legcal.machine.solver import poses_after
+
+_POSES, _TEST_POSES = (8, 16, 32, 64), 4  # where ties are taken, and where it is seen that
+# they suffice
+_REACH = 0.15  # of these from home [rad], and of the mean leg length
+_RANK = 1e-7  # of the largest singular value
+_AT_REST, _STEPS = 1e-13, 30  # [m, rad], the last of so many Gauss-Newton steps
+_TRIAL = 1e-3  # of the mean leg length, and [rad]: errors that a machine must be able to have
+_WHOLLY = 1e-9
+_CLOSED = 1e-10  # of the mean leg length
 
 
 class TieRows(NamedTuple):
@@ -24,22 +51,36 @@ class TieRows(NamedTuple):
     by_local: Array  # (m, n_legs, 12) derivative by the numbers of legs (LegColumns)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Ties:
-    """What ties the parameters of the legs of a machine."""
+    """What ties the parameters of the legs of a machine, in R_b and R_e."""
 
     frame_legs: tuple[int, ...]
-    points: tuple[int, ...]  # the frame legs that are fixed to the platform
+    points: tuple[int, ...] = ()  # the frame legs that are fixed to the platform
+    n_dependent: int = 0  # constraints at a pose that follow from the others
+    # Poses where constraints are looked at, (k, 3, 3) and (k, 3) [m]
+    R: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    t: Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def __bool__(self) -> bool:
+        return bool(self.points) or self.n_dependent > 0
 
     def at(self, legs: Sequence[Leg]) -> TieRows:
-        """Return the ties at legs in R_b and R_e."""
-        values, rows = np.zeros(len(self.points)), []
-        for i, j in enumerate(self.points):
+        """Return the ties at legs; those of constraints are not independent of each other."""
+        shape = len(legs), LegColumns.COUNT
+        parts = [(np.zeros(0), np.zeros((0, *shape)))]
+        for j in self.points:
             value, row = self._point(legs, j)
-            values[i] = value
-            rows.append(row)
-        by_local = np.array(rows).reshape(len(rows), len(legs), LegColumns.COUNT)
-        return TieRows(values, by_local)
+            parts.append((np.array([value]), row[None]))
+        if self.n_dependent:
+            found, _, _, stress = _closed(legs, self.n_dependent, self.R, self.t)
+            wide = np.zeros((*found.values.shape, *shape))
+            wide[:, np.arange(len(found.leg)), found.leg] = found.by_local
+            rows = np.einsum("kms,kmjc->ksjc", stress, wide)
+            values = np.einsum("kms,km->ks", stress, found.values)
+            parts.append((values.ravel(), rows.reshape(-1, *shape)))
+        values, rows = zip(*parts, strict=True)
+        return TieRows(np.concatenate(values), np.concatenate(rows))
 
     def _point(self, legs: Sequence[Leg], leg: int) -> tuple[float, Array]:
         """Return how far B of a leg is past its frame point, and the derivative (n_legs, 12)."""
@@ -59,8 +100,185 @@ class Ties:
         return float((B - frame_point(legs, self.frame_legs, leg)) @ u), row
 
 
-def ties_of(legs: Sequence[Leg], frame_legs: Sequence[int]) -> Ties:
+def ties_of(
+    legs: Sequence[Leg],
+    frame_legs: Sequence[int],
+    # (3, 4) R_e in R_b at home, where the constraints hold; without it these tie nothing
+    home: Array | None = None,
+) -> Ties:
     """Return the ties of a machine from its nominal legs in R_b and R_e."""
     fixed = [j for j in frame_legs if legs[j].is_fixed_to_platform]
     defined = any(not legs[j].is_fixed_to_platform for j in frame_legs)
-    return Ties(tuple(frame_legs), tuple(fixed) if defined else ())
+    ties = Ties(tuple(frame_legs), tuple(fixed) if defined else ())
+    n_dependent = 0 if home is None or len(frame_legs) < 3 else _n_dependent(legs, home)
+    if home is None or n_dependent == 0:
+        return ties
+    for n in _POSES:
+        R, t = _poses_near(legs, n_dependent, home, n, 0)
+        ties = replace(ties, n_dependent=n_dependent, R=R, t=t)
+        rows = replace(ties, points=()).at(legs).by_local.reshape(-1, len(legs) * LegColumns.COUNT)
+        if np.linalg.matrix_rank(rows, _RANK) < len(rows):  # more poses say no more
+            break
+    return ties
+
+
+def machine_ties(machine: Machine) -> Ties:
+    """Return the ties of a mechanism; see :func:`ties_of`."""
+    home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
+    return ties_of(geometries(machine), machine.frame_legs, home.as_matrix()[:3])
+
+
+def independent(rows: TieRows, by_unknowns: Array, n: int | None = None) -> tuple[Array, Array]:
+    """Return ties (w,) and orthonormal derivatives (w, p) that say the same as rows (m, p).
+
+    Without *n* the machine must be where all ties hold: elsewhere more seem independent.
+    """
+    left, singular, right = np.linalg.svd(by_unknowns, full_matrices=False)
+    if n is None:
+        n = int(np.sum(singular > _RANK * singular.max(initial=0.0)))
+    return (left.T @ rows.values)[:n] / singular[:n], right[:n]
+
+
+def by_step(rows: TieRows, place: IntArray) -> Array:
+    """Return derivatives (m, p) by steps of parameters that stand at *place* (n_legs, 12)."""
+    found = np.zeros((len(rows.values), int(place.max(initial=-1)) + 1))
+    found[:, place[place >= 0]] = rows.by_local[:, place >= 0]
+    return found
+
+
+def on_ties(
+    legs: Sequence[Leg], nominal: Sequence[Leg], ties: Ties, place: IntArray, scale: Array
+) -> tuple[Leg, ...]:
+    """Return legs moved to where all ties hold, where the nominal ones are.
+
+    Numbers move as little as possible over their *scale* (p,), not at all where that is zero; they
+    stand at *place* (n_legs, 12).
+    """
+    if not ties:
+        return tuple(legs)
+    at_nominal = ties.at(nominal)
+    n = len(independent(at_nominal, by_step(at_nominal, place) * scale)[1])
+    for _ in range(_STEPS):
+        found = ties.at(legs)
+        left, along = independent(found, by_step(found, place) * scale, n)
+        step = -scale * (along.T @ left)
+        legs = moved_legs(legs, place, step)
+        if np.abs(step).max(initial=0.0) < _AT_REST:
+            break
+    return tuple(legs)
+
+
+def wholly_tied(rows: Array) -> BoolArray:
+    """Return which parameters (p,) do not move at all, by orthonormal ties (w, p)."""
+    return np.asarray(np.sum(rows**2, axis=0) > 1.0 - _WHOLLY)
+
+
+def is_tied(legs: Sequence[Leg], ties: Ties, parametrization: Parametrization) -> bool:
+    """Say whether a machine with small errors can be moved to where it has its mobility again.
+
+    Then its constraints hold with as many of them dependent at poses where no tie was taken.
+    """
+    if ties.n_dependent == 0:
+        return True
+    length = _length(legs, ties.R[0], ties.t[0])
+    unit = np.where([name == "m" for name in parametrization.units], length, 1.0)
+    step = _TRIAL * unit * np.random.default_rng(1).uniform(-1.0, 1.0, len(unit))
+    place = parametrization.place
+    moved = on_ties(moved_legs(legs, place, step), legs, ties, place, unit)
+    home = np.concatenate([ties.R[0], ties.t[0][:, None]], axis=1)
+    R, t = _poses_near(moved, ties.n_dependent, home, _TEST_POSES, 1)
+    missed = np.abs(_constraints(moved, R, t).values).max()
+    return bool(missed < _CLOSED * length)
+
+
+def ties_in_words(machine: Machine) -> str | None:
+    """Return what the joints of an overconstrained machine tie, None where they tie nothing."""
+    ties, found = machine_ties(machine), parametrization_of(machine, twists=True)
+    if ties.n_dependent == 0:
+        return None
+    rows = ties.at(geometries(machine))
+    scale = np.where([name == "m" for name in found.units], leg_scale(machine, machine.home), 1.0)
+    tied = sparse_basis(independent(rows, by_step(rows, found.place) * scale)[1])
+    is_alone = np.sum(np.abs(tied) > SHOWN, axis=1) == 1
+    alone = [found.names[i] for i in np.argmax(np.abs(tied[is_alone]), axis=1)]
+    words = [describe_direction(alone, machine.leg_names)] if alone else []
+    together = np.flatnonzero(np.any(np.abs(tied[~is_alone]) > SHOWN, axis=0))
+    names = [found.names[i] for i in together]
+    if names:
+        words.append(f"{describe_direction(names, machine.leg_names)}, to each other")
+    n = sum(leg.n_constraints for leg in machine.legs)
+    return (
+        f"The machine is overconstrained: {ties.n_dependent} of the {n} constraints of its joints "
+        f"follow from the others only while {len(tied)} combinations of its parameters stay as "
+        f"they are, which are tied: {'; '.join(words)}."
+    )
+
+
+def _constraints(legs: Sequence[Leg], R: Array, t: Array) -> PoseEquations:
+    """Return what holds without a reading."""
+    found = pose_equations(legs, R, t)
+    return found.of(~found.measured)
+
+
+def _length(legs: Sequence[Leg], R: Array, t: Array) -> float:
+    """Return the mean length of legs at a pose [m]."""
+    return float(np.mean([np.linalg.norm(R @ leg.B + t - leg.A) for leg in legs]))
+
+
+def _n_dependent(legs: Sequence[Leg], home: Array) -> int:
+    """Return how many constraints follow from the others at home and at poses around it."""
+    n = sum(leg.n_constraints for leg in legs)
+    if n < 2:
+        return 0
+    here = _constraints(legs, home[None, :, :3], home[None, :, 3]).by_pose[0]
+    here = here / _unit(legs, home)
+    found = np.linalg.svd(here, compute_uv=False)
+    dependent = n - int(np.sum(found > _RANK * found[0]))
+    if dependent == 0:
+        return 0
+    # Where home alone is special, the constraints are independent a little way off.
+    R, t = _poses_near(legs, dependent, home, _TEST_POSES, 2)
+    around = _constraints(legs, R, t)
+    singular = np.linalg.svd(around.by_pose / _unit(legs, home), compute_uv=False)
+    rank = np.sum(singular > _RANK * singular[:, :1], axis=1)
+    return n - int(rank.max())
+
+
+def _unit(legs: Sequence[Leg], home: Array) -> Array:
+    """Return what makes rotations and displacements of a pose comparable, (6,)."""
+    return np.repeat([_length(legs, home[:, :3], home[:, 3]), 1.0], 3)
+
+
+def _poses_near(
+    legs: Sequence[Leg], n_dependent: int, home: Array, n: int, seed: int
+) -> tuple[Array, Array]:
+    """Return n poses around home, home first, where the independent constraints hold."""
+    unit = _unit(legs, home)
+    step = np.random.default_rng(seed).uniform(-_REACH, _REACH, (n, 6))
+    step[:, 3:] *= unit[0]
+    step[0] = 0.0
+    poses = poses_after(np.repeat(home[None, :3], n, axis=0), step)
+    _, R, t, _ = _closed(legs, n_dependent, poses[:, :, :3], poses[:, :, 3])
+    return R, t
+
+
+def _closed(
+    legs: Sequence[Leg], n_dependent: int, R: Array, t: Array
+) -> tuple[PoseEquations, Array, Array, Array]:
+    """Return constraints, poses nearby and self-stresses (k, m, n_dependent) there.
+
+    What the self-stresses see is left, whatever the pose: with errors that are not tied the
+    constraints contradict each other there.
+    """
+    poses = np.concatenate([R, t[..., None]], axis=2)
+    unit = _unit(legs, poses[0])
+    for _ in range(_STEPS):
+        found = _constraints(legs, poses[:, :, :3], poses[:, :, 3])
+        left, singular, right = np.linalg.svd(found.by_pose / unit)
+        rank = left.shape[1] - n_dependent
+        along = np.einsum("kmr,km->kr", left[:, :, :rank], found.values) / singular[:, :rank]
+        step = -np.einsum("kr,krc->kc", along, right[:, :rank]) / unit
+        if np.abs(step).max(initial=0.0) < _AT_REST:
+            break
+        poses = poses_after(poses, step)
+    return found, poses[:, :, :3], poses[:, :, 3], left[:, :, rank:]

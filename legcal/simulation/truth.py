@@ -25,9 +25,11 @@ from legcal.machine import (
     geometries,
     home_of_legs,
     load_mechanism,
+    machine_ties,
     mechanism_text,
     model_name,
     moved_legs,
+    on_ties,
     parametrization_of,
     reframed,
     write_urdf,
@@ -68,6 +70,8 @@ def draw_errors(
         unit = normal if spread.distribution is Distribution.NORMAL else uniform
         step[i] = spread.size * unit[i]
     moved = moved_legs(legs, found.place, step)
+    scale = np.array([_spread(errors, name).size for name in found.names])
+    moved = on_ties(moved, legs, machine_ties(nominal), found.place, scale)
     origin = np.asarray(nominal.T_platform_Re.inv().translation)
     return reframed(moved, nominal.frame_legs, origin)
 

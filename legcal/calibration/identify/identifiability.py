@@ -38,6 +38,7 @@ from legcal.machine import (
     legs_outside,
     load_mechanism,
     singularity_note,
+    ties_in_words,
 )
 from legcal.paper import Condition, count_conditions, three_legs_at_once, two_directions
 
@@ -198,7 +199,8 @@ def check_identifiable(
     staged, full = analysis.staged, analysis.full
     if not full.complete:
         raise NotIdentifiable(_refusal(dataset, identifiability_of_dataset(dataset, choices)))
-    notes = []
+    tied = ties_in_words(dataset.machine)
+    notes = [] if tied is None else [tied]
     if any(not weak.harmless for weak in staged.weak):
         notes.append(
             f"The four steps alone leave open {_directions(staged, harmless=False)}; the "
@@ -291,6 +293,8 @@ def _machine_notes(machine: Machine) -> list[str]:
             "poses between home and travel were judged too, which the machine may not reach; "
             "correct legcal.home or the limits."
         )
+    tied = ties_in_words(machine)
+    notes += [] if tied is None else [tied]
     singular = singularity_note(machine)
     return notes if singular is None else [*notes, singular[0].upper() + singular[1:]]
 

@@ -23,11 +23,16 @@ from legcal.machine import (
     LegKind,
     Machine,
     Parametrization,
+    Ties,
+    by_step,
     geometries,
+    independent,
     leg_labels,
     list_in_words,
+    machine_ties,
     main_cylinders,
     moved_legs,
+    on_ties,
     parametrization_of,
     random_poses_of_legs,
     ties_of,
@@ -42,7 +47,6 @@ _DISTANCE = 2.5  # machine sizes
 _TILT = 0.5  # [rad] from the normal of a planar machine
 SIGMA_Q = 2e-6  # [m] of a reading, where no dataset says
 _SEED = 2002
-_DEPENDENT = 1e-7  # of the largest singular value of ties
 _PERTURBATION = 1e-6  # of the mean leg length, and [rad]
 REACHED = 20  # poses, at least, over which errors of the platform are judged
 THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg length
@@ -74,6 +78,7 @@ class PredictedObservations:
     board: BoolArray
     # (n_images,): those that show a calibration board on the platform; none if it is empty
     platform_board: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    tied_by: Ties | None = None  # what ties these parameters; frames alone without it
 
     @property
     def n_legs(self) -> int:
@@ -155,10 +160,9 @@ class PredictedObservations:
     @cached_property
     def ties(self) -> Array:
         """Derivative of what ties the parameters to each other, in metres, (w, p), independent."""
-        found = ties_of(self.legs, self.frame_legs).at(self.legs).by_local
-        rows = np.einsum("wjc,jcp->wp", found, self.local_to_parameters)
-        _, singular, basis = np.linalg.svd(rows, full_matrices=False)
-        return np.asarray(basis[singular > _DEPENDENT * singular.max(initial=0.0)])
+        tied_by = self.tied_by or ties_of(self.legs, self.frame_legs)
+        found = tied_by.at(self.legs)
+        return independent(found, by_step(found, self.parametrization.place) * self.unit)[1]
 
     @cached_property
     def with_length(self) -> BoolArray:
@@ -250,6 +254,7 @@ def planned_observations(
         legs=legs,
         frame_legs=machine.frame_legs,
         parametrization=parametrization_of(machine),
+        tied_by=machine_ties(machine),
         radius=radii(machine.legs, length),
         R=R[:n_poses],
         t=t[:n_poses],
@@ -315,6 +320,7 @@ def recorded_observations(
         legs=legs,
         frame_legs=machine.frame_legs,
         parametrization=parametrization,
+        tied_by=machine_ties(machine),
         radius=radii(machine.legs, length),
         R=R,
         t=t,
@@ -424,7 +430,10 @@ def machine_near(
     nominal = geometries(machine)
     A, B = joints_at(nominal, home)
     length = float(np.linalg.norm(B - A, axis=1).mean())
-    return perturbed(nominal, parametrization_of(machine), length, rng), length, rng
+    found = parametrization_of(machine)
+    scale = np.where([unit == "m" for unit in found.units], length, 1.0)
+    legs = perturbed(nominal, found, length, rng)
+    return on_ties(legs, nominal, machine_ties(machine), found.place, scale), length, rng
 
 
 def perturbed(

@@ -58,7 +58,7 @@ from legcal.estimation import (
     fixed_at_start,
 )
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import freedoms, radius_name
+from legcal.machine import freedoms, radius_name, wholly_tied
 from legcal.vision import (
     LINKS,
     Camera,
@@ -134,6 +134,7 @@ class FitProblem(Problem[State]):
         """Number of unknowns; a pose counts with the freedoms that its constraints leave."""
         bound = 6 - len(freedoms(self.legs.frame_legs))
         bound += sum(leg.n_constraints for leg in self.legs.nominal)
+        bound -= self.legs.ties.n_dependent
         n_tied = self.parameters.n_tied
         return self.n_kept - n_tied + max(6 - bound, 0) * self.n_elements
 
@@ -282,6 +283,9 @@ def _built(
         [not choices.holds(n, by_default=n.endswith(".twist")) for n in names], dtype=np.bool_
     )
     parameters = LegParameters(legs, free, choices.values)
+    if parameters.n_tied:
+        free[free] &= ~wholly_tied(parameters.tie_rows(legs.nominal)[1])
+        parameters = LegParameters(legs, free, choices.values)
     kinematic = Variables(
         "legs",
         parameters.unknown,

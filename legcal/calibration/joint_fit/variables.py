@@ -27,6 +27,7 @@ from legcal.machine import (
     Ties,
     freedoms,
     geometries,
+    independent,
     moved_legs,
     parametrize,
     pose_equations,
@@ -40,7 +41,7 @@ from legcal.machine import (
 from legcal.vision import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 
 _RANK = 1e-7  # of the largest singular value
-_TIED, _TIE_STEPS = 1e-15, 20  # [m], and steps towards it
+_TIED, _TIE_STEPS = 1e-13, 20  # [m], and steps towards it
 _STEP_TOLERANCE = 1e-6  # [m, rad], last step where constraints cannot all be met to rounding
 
 
@@ -133,6 +134,7 @@ class FittedLegs:
     sign: IntArray  # (n_legs,) L = sign q + q0
     frame_legs: tuple[int, ...]  # whose joint centres define R_b and R_e: three, two in a plane
     radii: dict[tuple[int, str], float]  # of the model [m], for each (leg index, part)
+    home: RigidTransform | None = None  # T_Rb_Re; without it constraints tie no parameters
 
     @property
     def n_legs(self) -> int:
@@ -152,7 +154,8 @@ class FittedLegs:
     @cached_property
     def ties(self) -> Ties:
         """What ties the parameters to each other."""
-        return ties_of(self.nominal, self.frame_legs)
+        home = None if self.home is None else self.home.as_matrix()[:3]
+        return ties_of(self.nominal, self.frame_legs, home)
 
     def vector(self, legs: tuple[Leg, ...]) -> Array:
         """Return the kinematic parameters of legs [m, rad]; axes count from the nominal ones."""
@@ -171,6 +174,7 @@ def fitted_legs(machine: Machine) -> FittedLegs:
             for i, leg in enumerate(machine.legs)
             for part, r in leg.radius_of_part.items()
         },
+        machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re,
     )
 
 
@@ -181,6 +185,7 @@ class LegParameters:
     legs: FittedLegs
     free: BoolArray  # (p,) which kinematic parameters are unknowns
     values: Mapping[str, float]  # of fixed ones that are not at nominal
+    _last: tuple[tuple[Leg, ...], tuple[Array, Array]] | None = field(default=None, repr=False)
 
     @cached_property
     def unknown(self) -> IntArray:
@@ -244,8 +249,8 @@ class LegParameters:
             )
         )
 
-    def tie_rows(self, geometry: tuple[Leg, ...]) -> tuple[Array, Array]:
-        """Return what is left of each tie (m,) and its derivative by the unknowns (m, p_free)."""
+    def _ties_at(self, geometry: tuple[Leg, ...], n: int | None) -> tuple[Array, Array]:
+        """Return *n* ties (w,) and their derivatives by the unknowns (w, p_free)."""
         found = self.legs.ties.at(geometry)
         by_local = found.by_local.copy()
         for leg, nominal, unknown, rows in zip(
@@ -257,21 +262,28 @@ class LegParameters:
         rows = np.zeros((len(found.values), int(self.free.sum())))
         is_unknown = self.unknown >= 0
         rows[:, self.unknown[is_unknown]] = by_local[:, is_unknown]
-        return found.values, rows
+        return independent(found, rows, n)
 
     @cached_property
     def n_tied(self) -> int:
         """Number of independent ties between the unknowns."""
-        rows = self.tie_rows(self.legs.nominal)[1]
-        return int(np.linalg.matrix_rank(rows, _RANK)) if rows.size else 0
+        return len(self._ties_at(self.legs.nominal, None)[1]) if self.legs.ties else 0
+
+    def tie_rows(self, geometry: tuple[Leg, ...]) -> tuple[Array, Array]:
+        """Return what is left of each tie (w,) and its derivative by the unknowns (w, p_free)."""
+        if self._last is None or self._last[0] is not geometry:
+            found = geometry, self._ties_at(geometry, self.n_tied)
+            object.__setattr__(self, "_last", found)
+            return found[1]
+        return self._last[1]
 
     def on_ties(self, geometry: tuple[Leg, ...]) -> tuple[Leg, ...]:
         """Return legs moved, as little as possible, to where all ties hold."""
-        for _ in range(_TIE_STEPS):
-            values, rows = self.tie_rows(geometry)
-            if np.abs(values).max(initial=0.0) < _TIED:
+        for _ in range(_TIE_STEPS if self.n_tied else 0):
+            left, rows = self.tie_rows(geometry)
+            if np.abs(left).max() < _TIED:
                 break
-            step = np.append(-np.linalg.pinv(rows, rcond=_RANK) @ values, 0.0)
+            step = np.append(-rows.T @ left, 0.0)
             geometry = self.retract(geometry, step[self.unknown])
         return geometry
 
@@ -400,7 +412,7 @@ class LegConstraints:
                 by_local[:, LegColumns.PLATFORM_AXIS] += by_local[:, [LegColumns.TWIST]] * slope
             Q[place] -= by_local.T[..., None] * inverse[None, :, :, i]
         ties = np.zeros((0, n_kept))
-        if self.legs.ties.points:
+        if self.parameters.n_tied:
             rows_of_ties = self.parameters.tie_rows(state.legs)[1]
             ties = np.zeros((len(rows_of_ties), n_kept))
             ties[:, problem.where("legs")] = rows_of_ties

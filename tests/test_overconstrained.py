@@ -1,0 +1,144 @@
+"""Overconstrained machines: which parameters are tied, and that errors and fits keep the mobility.
+
+Ties are counted by hand: in an Exechon and wherever two UPR legs share a plane, the outer axes at
+the base lie along the line of the bases (four angles), the axes at the platform are parallel and
+across the line of the platform joints (three) and across the outer ones (two twists).
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fit_sessions import MachineSession, machine_session
+from layouts import Layout, LegLayout, MachineSpec, write_machine
+from machines import exechon, four_upu, two_upr_two_sps
+from scipy.spatial.transform import Rotation
+
+from legcal import identifiability
+from legcal.calibration.joint_fit import refine
+from legcal.calibration.joint_fit.variables import start_from
+from legcal.errors import OutOfClass
+from legcal.estimation import Frames
+from legcal.geometry import Array, cross
+from legcal.machine import (
+    Leg,
+    Machine,
+    geometries,
+    load_mechanism,
+    loader,
+    machine_ties,
+    moved_legs,
+    on_ties,
+    parametrization_of,
+    platform_in_base,
+    solve_poses,
+)
+from legcal.simulation import ParameterErrors, Spread, write_true_model
+
+KINDS: dict[str, tuple[Callable[[], MachineSpec], int, int]] = {  # mobility, parameters less ties
+    "exechon": (exechon, 3, 19 - 7),
+    "2-UPR + 2-SPS": (two_upr_two_sps, 4, 24 - 7),
+}
+ENDS = "base", "platform"
+LAYOUTS = (
+    Layout(),
+    Layout((LegLayout(cut="mid"),)),
+    Layout((LegLayout(hung="platform", slid=0.05, seed=3),)),
+)
+
+
+def written(kind: str, layout: Layout, folder: Path) -> Machine:
+    return load_mechanism(write_machine(folder, KINDS[kind][0](), layout))
+
+
+def keeps_its_plane(legs: tuple[Leg, ...]) -> float:
+    """Return how far two UPR legs are from sharing a plane that turns about the line of A [rad]."""
+    one, two = legs[:2]
+
+    def off(axis: Array | None, b: Array, *, parallel: bool) -> float:
+        a, b = np.asarray(axis), b / np.linalg.norm(b)
+        return float(np.linalg.norm(cross(a, b)) if parallel else abs(a @ b))
+
+    line, across = two.A - one.A, two.B - one.B
+    return max(
+        off(one.base_axis, line, parallel=True),
+        off(two.base_axis, line, parallel=True),
+        off(one.platform_axis, np.asarray(two.platform_axis), parallel=True),
+        off(one.platform_axis, across, parallel=False),
+        abs(one.twist or 0.0),
+        abs(two.twist or 0.0),
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_what_is_tied_is_what_keeps_the_mobility(kind: str, layout: Layout, tmp_path: Path) -> None:
+    machine = written(kind, layout, tmp_path)
+    _, mobility, n_free = KINDS[kind]
+    assert machine.mobility == mobility
+    assert any("overconstrained: 2 of the" in note for note in machine.diagnostics)
+    report = identifiability(machine, (machine.leg_names,) * 3)
+    assert (report.full.rank, report.full.of, report.identifiable) == (n_free, n_free, True)
+    found, legs = parametrization_of(machine, twists=True), geometries(machine)
+    step = 3e-3 * np.random.default_rng(1).uniform(-1.0, 1.0, len(found))
+    moved = moved_legs(legs, found.place, step)
+    assert keeps_its_plane(moved) > 1e-3
+    tied = on_ties(moved, legs, machine_ties(machine), found.place, np.ones(len(found)))
+    assert keeps_its_plane(tied) < 1e-11
+    apart = np.linalg.norm([a.B - b.B for a, b in zip(tied, legs, strict=True)])
+    assert apart > 1e-3  # what is not tied keeps its errors
+
+
+def wrong_but_tied(session: MachineSession, true: Machine) -> MachineSession:
+    """Return a session whose wrong nominal legs have the mobility, as those of any model."""
+    legs, start, place = session.legs, session.start, session.legs.parametrization.place
+    unit = np.ones(len(legs.parametrization))
+    away = on_ties(legs.nominal, session.truth.legs, machine_ties(true), place, unit)
+    home = Frames.of([platform_in_base(true, true.home)])
+    there = solve_poses(away, legs.frame_legs, home.R, home.t)
+    nominal = replace(legs, nominal=away, home=Frames(there.R, there.t).motions[0])
+    poses = session.truth.T_Rb_Re
+    begin = start_from(away, session.measurements, nominal, start.T_camera_Rb, poses, "nominal")
+    assert (
+        max(np.abs(a.A - b.A).max() for a, b in zip(away, session.truth.legs, strict=True)) > 2e-3
+    )
+    return replace(session, legs=nominal, start=begin)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_true_machines_close_and_fits_find_them(kind: str, tmp_path: Path) -> None:
+    machine = written(kind, LAYOUTS[0], tmp_path)
+    two, turn = Spread(2e-3), Spread(float(np.deg2rad(1.0)))
+    errors = ParameterErrors(two, two, two, two, axes=turn, twists=turn)
+    true = write_true_model(machine, errors, np.random.default_rng(2), tmp_path / "true")
+    assert true.mobility == machine.mobility
+    assert keeps_its_plane(geometries(true)) < 1e-9
+    session = wrong_but_tied(machine_session(str(true.yaml_path)), true)
+    found = refine(session.legs, session.measurements, session.outlines, session.start)
+    assert keeps_its_plane(found.legs) < 1e-9
+    for leg, exact in zip(found.legs, session.truth.legs, strict=True):
+        assert np.abs(np.concatenate([leg.A - exact.A, leg.B - exact.B])).max() < 1e-7
+
+
+def test_axes_that_must_stay_parallel_turn_together(tmp_path: Path) -> None:
+    machine = load_mechanism(write_machine(tmp_path, four_upu(), LAYOUTS[0]))
+    legs, found = geometries(machine), parametrization_of(machine, twists=True)
+    step = 3e-3 * np.random.default_rng(1).uniform(-1.0, 1.0, len(found))
+    moved = moved_legs(legs, found.place, step)
+    tied = on_ties(moved, legs, machine_ties(machine), found.place, np.ones(len(found)))
+    # The platform keeps one direction: a rotation takes all its axes to those of the base.
+    base, platform = (np.array([getattr(leg, f"{end}_axis") for leg in tied]) for end in ENDS)
+    sign = np.sign(np.einsum("ji,ji->j", base, platform))[:, None]
+    assert Rotation.align_vectors(base, sign * platform)[1] < 1e-9
+    assert max(abs(leg.twist or 0.0) for leg in tied) < 1e-11
+
+
+def test_a_machine_that_cannot_be_tied_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_machine(tmp_path, exechon(), LAYOUTS[0])
+    monkeypatch.setattr(loader, "is_tied", lambda *_: False)
+    with pytest.raises(OutOfClass, match=r"'machine' .* overconstrained .* mobility 3"):
+        load_mechanism(path)
