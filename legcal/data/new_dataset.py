@@ -18,6 +18,7 @@ from typing import Any
 
 import yaml
 
+from legcal.data.dataset_file import ENCODER_SIGMAS
 from legcal.data.measurements import few, reading_columns
 from legcal.data.photograph_matching import Matching, Photograph, Row, find_photographs, match
 from legcal.data.readings_sheet import Headings, readings_of, unit_of
@@ -312,6 +313,12 @@ def _check_place(folder: Path, destination: Path) -> None:
 def _sigma(given: float | None, digit: float) -> tuple[float, list[str]]:
     """Return the standard deviation of a reading [m], and a note where nobody stated it."""
     if given is not None:
+        least, most = ENCODER_SIGMAS
+        if not least <= given <= most:
+            raise UsageError(
+                f"The standard deviation of a reading could not be used: found {given:g} m, needed "
+                f"{least:g} to {most:g} m; correct --encoder-sigma."
+            )
         return given, []
     sigma = max(digit, MIN_SIGMA)
     why = "the last digit of the table" if sigma > MIN_SIGMA else "that of a good encoder"
