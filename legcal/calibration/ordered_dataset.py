@@ -78,13 +78,15 @@ class OrderedDataset:
 
     @cached_property
     def photographs(self) -> Photographs:
-        """All images, what to search in them and what to keep."""
+        """All images, what to search in them and what to keep; none of views that name no leg."""
+        detect, m = inverse(self.order.rows)[self.plan.detect], self.measurements
+        shows = np.array([m.views[v].legs != () for v in m.view[detect].tolist()], dtype=np.bool_)
         return Photographs(
             machine=self.machine,
             measurements=self.measurements,
             load=self.dataset.image_reader(self.order.rows.tolist()),
             run=self.pool,
-            detect=np.sort(inverse(self.order.rows)[self.plan.detect]),
+            detect=np.sort(detect[shows]),
             keep=self.order.reorder(self.plan.keep),
         )
 

@@ -142,6 +142,13 @@ def identify(
             "each other.",
         ),
     ] = False,
+    platform_board: Annotated[
+        bool,
+        typer.Option(
+            "--platform-board",
+            help="A calibration board on the platform is seen in every image.",
+        ),
+    ] = False,
     hand_held: Annotated[
         bool,
         typer.Option(
@@ -155,7 +162,9 @@ def identify(
     from legcal import calibration, report
 
     views = [text.split(",") for text in view or []]
-    found = calibration.answer(model, views, images, board=board, hand_held=hand_held)
+    found = calibration.answer(
+        model, views, images, board=board, platform_board=platform_board, hand_held=hand_held
+    )
     show(as_json, found.document, lambda: report.identify_table(found))
 
 

@@ -21,6 +21,7 @@ from legcal.calibration import (
 from legcal.machine import leg_labels, list_in_words
 from legcal.report.render import report as blocks
 from legcal.report.render import table
+from legcal.vision import Link
 
 _CONDITIONS = {
     "eq12": "base joints and axes (12)",
@@ -58,7 +59,7 @@ def identify_table(report: Identifiability) -> RenderableType:
         [_ranks(report), Text(_LEGEND, style="dim")],
         *(_weak(title, ranks) if ranks.weak else None for title, ranks in weak),
         _remedies(report) if report.remedies else None,
-        [_board(report.board, report.full.of), *(_intrinsics(one) for one in report.intrinsics)],
+        [*_boards(report), *(_intrinsics(one) for one in report.intrinsics)],
         _verdict(report),
     )
 
@@ -75,11 +76,13 @@ def _heading(report: Identifiability) -> list[str]:
         between = " and " if last == first + 2 else " to "
         which = f"view {last}" if last == first + 1 else f"views {first + 1}{between}{last}"
         each = "" if last == first + 1 else " each"
-        legs = ", ".join(labels[name] for name in view)
-        lines.append(f"{which}: legs {legs} in {images} image{'s' * (images != 1)}{each}")
+        legs = f"legs {', '.join(labels[name] for name in view)}" if view else "no leg"
+        lines.append(f"{which}: {legs} in {images} image{'s' * (images != 1)}{each}")
         first = last
     if report.board.present:
         lines.append("a calibration board on the base in every view")
+    if report.platform_board.present:
+        lines.append("a calibration board on the platform in every view")
     return lines
 
 
@@ -155,19 +158,27 @@ def _two_digits(value: float) -> str:
     return f"{float(f'{value:.2g}'):.12g}"
 
 
-def _board(board: BoardReport, of: int) -> str:
-    """Return what a calibration board does, in a few sentences."""
-    subject = "The calibration board on the base" if board.present else "A calibration board"
+def _boards(report: Identifiability) -> list[str]:
+    """Return what boards do; of one on the platform only where there is one, or it would help."""
+    of, moving = report.full.of, report.platform_board
+    helps = moving.needed_for or moving.without != moving.with_board
+    on_platform = [_board(moving, of, "platform")] if moving.present or helps else []
+    return [_board(report.board, of, "base"), *on_platform]
+
+
+def _board(board: BoardReport, of: int, link: Link) -> str:
+    """Return what a calibration board on a link does, in a few sentences."""
+    subject = f"The calibration board on the {link}" if board.present else "A calibration board"
     before, after = board.without, board.with_board
     if not board.needed_for and before == after:
         return f"{subject} is not needed: the ranks are the same without it."
-    verb = "raises" if board.present else "on the base would raise"
+    verb = "raises" if board.present else f"on the {link} would raise"
     text = f"{subject} {verb}"
     if board.needed_for:
         needed = list_in_words(
             [_NEEDS.get(name, _CONDITIONS.get(name, name)) for name in board.needed_for]
         )
-        where = "" if board.present else " on the base"
+        where = "" if board.present else f" on the {link}"
         text = f"{subject}{where} is needed for {needed}; it raises"
     text += (
         f" the ranks from {before.staged_rank} to {after.staged_rank} of {of} step by step, and "

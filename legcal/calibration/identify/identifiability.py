@@ -54,9 +54,10 @@ def answer(
     views: Sequence[Sequence[str]],  # legs of each view; none for a dataset
     images: int | None,  # images a view; None for 15, and for a dataset
     *,
-    # board, hand_held: whether there is a calibration board, and whether every image has a place of
-    # its own
+    # board, platform_board, hand_held: whether there is a calibration board on the base, one on the
+    # platform, and whether every image has a place of its own
     board: bool = False,
+    platform_board: bool = False,
     hand_held: bool = False,
 ) -> Identifiability:
     """Return the report on a model with views, or on a dataset.
@@ -70,12 +71,14 @@ def answer(
             views,
             _IMAGES if images is None else images,
             board=board,
+            platform_board=platform_board,
             hand_held=hand_held,
         )
     given = {
         "--view": bool(views),
         "--images": images is not None,
         "--board": board,
+        "--platform-board": platform_board,
         "--hand-held": hand_held,
     }
     for option in (name for name, is_given in given.items() if is_given):
@@ -95,6 +98,7 @@ def identifiability(
     images: int = 15,
     *,
     board: bool = False,
+    platform_board: bool = False,
     hand_held: bool = False,
 ) -> Identifiability:
     """Judge what images of some views determine of a mechanism's parameters.
@@ -110,6 +114,8 @@ def identifiability(
         Images a view, each of another pose.
     board : bool
         A calibration board on the base is seen in every image and ties the cameras to each other.
+    platform_board : bool
+        A calibration board on the platform is seen in every image; where it is fixed is unknown.
     hand_held : bool
         Every image of a view is taken from a place of its own.
 
@@ -135,15 +141,16 @@ def identifiability(
     """
     legs = read_views(views, mechanism.leg_names, images)
     if hand_held:
-        return _judge_hand_held(mechanism, legs, images, board=board)
+        return _judge_hand_held(mechanism, legs, images, board=board, platform_board=platform_board)
     recommendation = None
     if not legs:
         recommendation = recommend(mechanism, images, board=board)
         names = recommendation[0].views if recommendation else (mechanism.leg_names,)
         legs = read_views(names, mechanism.leg_names, images)
-    predicted = planned_observations(mechanism, legs, images, board=board)
+    boards = {"board": board, "platform_board": platform_board}
+    predicted = planned_observations(mechanism, legs, images, **boards)
     replanning = Replanning(
-        lambda more: planned_observations(mechanism, legs, more, board=board),
+        lambda more: planned_observations(mechanism, legs, more, **boards),
         lambda: recommend(mechanism, max(images, ENOUGH_IMAGES), board=board),
     )
     return _judge(mechanism, Analysis(predicted), recommendation, replanning)
@@ -215,7 +222,12 @@ def check_identifiable(
 
 
 def _judge_hand_held(
-    machine: Machine, legs: tuple[tuple[int, ...], ...], images: int, *, board: bool
+    machine: Machine,
+    legs: tuple[tuple[int, ...], ...],
+    images: int,
+    *,
+    board: bool,
+    platform_board: bool,
 ) -> Identifiability:
     """Return the report on images each of which has a place of its own."""
     if not board or not legs:
@@ -226,7 +238,7 @@ def _judge_hand_held(
             "that the images show; give --board and --view."
         )
     each = tuple(view for view in legs for _ in range(images))
-    predicted = planned_observations(machine, each, 1, board=True)
+    predicted = planned_observations(machine, each, 1, board=True, platform_board=platform_board)
     return _judge(machine, Analysis(predicted), None, None)
 
 
@@ -243,6 +255,7 @@ def _judge(
         analysis,
         *(conditions_of(machine, predicted.with_board(board=b)) for b in (False, True)),
     )
+    platform_board = judge_board(analysis, (), (), link="platform")
     staged, full = analysis.staged, analysis.full
     enough = staged.complete and full.complete
     notes = []
@@ -267,6 +280,7 @@ def _judge(
         views=tuple(tuple(predicted.leg_names[j] for j in view) for view in predicted.views),
         images=tuple(int((predicted.view == v).sum()) for v in range(predicted.n_views)),
         board=board,
+        platform_board=platform_board,
         platform_sigma=analysis.motion.sigma(analysis.information) if full.complete else None,
         remedies=() if enough else find_remedies(analysis, replanning),
         recommendation=recommendation,

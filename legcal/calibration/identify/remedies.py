@@ -41,6 +41,7 @@ from legcal.estimation import compress, eliminate, marginal_rows
 from legcal.geometry import Array, IntArray
 from legcal.machine import JointType, Machine, list_in_words
 from legcal.paper import Condition, count_conditions, three_legs_at_once
+from legcal.vision import Link
 
 _CAMERA = 6  # unknowns of its pose
 _MOST_VIEWS = 4
@@ -187,11 +188,15 @@ def judge_board(
     # without, with_board: the paper's conditions without a board and with one in every view
     without: Sequence[Condition],
     with_board: Sequence[Condition],
+    *,
+    link: Link = "base",
 ) -> BoardReport:
-    """Return what a board does for a session, whether it has one or not."""
-    shown = analysis.predicted.board
-    none = analysis.with_board(board=False) if shown.any() else analysis
-    every = analysis if shown.all() else analysis.with_board()
+    """Return what a board on a link does for a session, whether it has one or not."""
+    predicted = analysis.predicted
+    shown = predicted.board if link == "base" else predicted.platform_board
+    none = analysis.with_board(board=False, link=link) if shown.any() else analysis
+    is_present = bool(len(shown) and shown.all())
+    every = analysis if is_present else analysis.with_board(link=link)
     needed = [
         before.name
         for before, after in zip(without, with_board, strict=True)
@@ -201,9 +206,7 @@ def judge_board(
         needed.append("staged")
     if every.full.complete and not none.full.complete:
         needed.append("full")
-    return BoardReport(
-        bool(shown.all()), tuple(needed), _ranks(none), _ranks(every), _mended(none, every)
-    )
+    return BoardReport(is_present, tuple(needed), _ranks(none), _ranks(every), _mended(none, every))
 
 
 def _ranks(analysis: Analysis) -> BoardRanks:
@@ -363,10 +366,13 @@ def _further_cameras(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Sc
 
 
 def _board(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
-    """Yield a calibration board that ties the cameras to each other."""
+    """Yield a calibration board that ties the cameras to each other, and one on the platform."""
     if analysis.predicted.n_frames > 1:
         text = "put a calibration board on the base that every camera sees"
         yield text, lambda: _score(analysis.with_board())
+    if not analysis.predicted.platform_board.any():
+        text = "put a calibration board on the platform that every camera sees"
+        yield text, lambda: _score(analysis.with_board(link="platform"))
 
 
 def _known_parameters(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
@@ -438,4 +444,8 @@ def _extended(predicted: PredictedObservations, legs: Sequence[int]) -> Predicte
         camera=np.concatenate([predicted.camera, cameras_for(predicted, [legs])]),
         focal=np.append(predicted.focal, FOCAL_PX),
         board=np.append(predicted.board, predicted.board.all()),
+        platform_board=np.append(
+            predicted.platform_board,
+            np.full(len(images), predicted.platform_board.all())[: len(predicted.platform_board)],
+        ),
     )

@@ -143,6 +143,7 @@ class Identifiability:
     views: tuple[tuple[str, ...], ...]  # the legs that each view shows
     images: tuple[int, ...]  # number of images of each view
     board: BoardReport  # what a calibration board on the base is needed for, and what it determines
+    platform_board: BoardReport  # the same of one on the platform
     # standard deviation of the platform that is to be expected from outlines good to 0.1 px, rms
     # over the poses. None where something that moves the platform is not determined, or the motors
     # do not determine its pose
@@ -164,7 +165,8 @@ class Identifiability:
         document = asdict(self)
         document["paper"] = {"ok": self.conditions_hold}
         document["conditions"] = [_condition(c, self.legs) for c in self.conditions]
-        document["board"]["with"] = document["board"].pop("with_board")
+        for board in ("board", "platform_board"):
+            document[board]["with"] = document[board].pop("with_board")
         return {key: _plain(value) for key, value in document.items()}
 
 
