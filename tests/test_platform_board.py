@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from fit_sessions import (
     T_RE_BOARD,
     MachineSession,
@@ -15,10 +18,15 @@ from fit_sessions import (
     place_of_board,
     with_boards,
 )
+from simulated import settings
 
+from legcal import calibrate, evaluate, identifiability, load_dataset, simulate
+from legcal.calibration.identify.identifiability import identifiability_of_dataset
 from legcal.calibration.joint_fit import refine
 from legcal.data.outlines import no_outlines
 from legcal.errors import DatasetError
+from legcal.simulation import SimulatedDataset
+from legcal.simulation.request import Level
 from legcal.vision.board_file import parse_boards
 
 PATH = Path("dataset.yaml")
@@ -105,3 +113,70 @@ def test_boards_of_both_links_are_numbered_one_after_the_other_in_any_order() ->
         assert (base.link, platform.link) == ("base", "platform")
         assert (base.first, platform.first) == (0, 24)
         assert platform.has(np.array([23, 24, 47, 48])).tolist() == [False, True, True, False]
+
+
+# Datasets
+
+
+@pytest.fixture(scope="module")
+def of_boards(tmp_path_factory: pytest.TempPathFactory) -> SimulatedDataset:
+    """A dataset with corners of both boards, whose views name no leg and have no rough pose."""
+    folder = tmp_path_factory.mktemp("boards") / "d"
+    chosen = settings(
+        level=Level.OUTLINES, poses=15, views=1, board="charuco", platform_board="charuco",
+        sigma_px=0.02, hints=False, seed=1,
+    )  # fmt: skip
+    made = simulate("hexapod", folder, chosen)
+    (folder / "observations.csv").unlink()
+    entry = yaml.safe_load((folder / "dataset.yaml").read_text())
+    for view in entry["views"].values():
+        view["legs"] = []
+    (folder / "dataset.yaml").write_text(yaml.safe_dump(entry))
+    return made
+
+
+def test_corners_of_two_boards_calibrate_a_machine_without_a_leg_or_a_rough_pose(
+    of_boards: SimulatedDataset, tmp_path: Path
+) -> None:
+    calibrate(of_boards.folder, output=tmp_path / "r")
+    result = json.loads((tmp_path / "r/result.json").read_text())
+    truth = json.loads((of_boards.folder / "truth/truth.json").read_text())
+    error, nominal = (
+        evaluate(model, of_boards.truth_path, dataset=of_boards.folder).displacement.mean()
+        for model in (tmp_path / "r/calibrated.yaml", of_boards.nominal)
+    )
+    assert error < 3.0 * result["platform"]["sigma_dX_m"]
+    assert error < 0.3 * nominal
+    found, true = (
+        np.array(place["xyz"])
+        for place in (
+            result["platform_board"]["T_platform_board"],
+            truth["board"][1]["T_platform_board"],
+        )
+    )
+    assert np.linalg.norm(found - true) < 0.01
+    assert not [row for row in result["parameters"] if ".radius." in row["name"]]
+
+
+def test_identify_says_what_a_board_on_the_platform_determines(of_boards: SimulatedDataset) -> None:
+    found = identifiability_of_dataset(load_dataset(of_boards.folder))
+    assert found.identifiable
+    assert found.platform_board.present
+    assert not found.platform_board.without.identifiable
+    alone = identifiability(of_boards.nominal, [["leg1"]], 8)
+    assert not alone.identifiable
+    assert "full" in alone.platform_board.needed_for
+    assert alone.platform_board.with_board.full_rank == 30
+    assert any("board on the platform" in remedy.remedy for remedy in alone.remedies)
+    assert identifiability(of_boards.nominal, [["leg1"]], 8, platform_board=True).identifiable
+
+
+def test_views_without_legs_need_a_board_on_the_platform(
+    of_boards: SimulatedDataset, tmp_path: Path
+) -> None:
+    shutil.copytree(of_boards.folder, tmp_path / "d")
+    entry = yaml.safe_load((tmp_path / "d/dataset.yaml").read_text())
+    entry["board"] = entry["board"][0]
+    (tmp_path / "d/dataset.yaml").write_text(yaml.safe_dump(entry))
+    with pytest.raises(DatasetError, match=r"views.c1.legs .* no board on the platform, needed"):
+        load_dataset(tmp_path / "d")

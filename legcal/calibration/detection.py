@@ -25,12 +25,15 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.data import (
+    CORNERS_NAME,
     OBSERVATIONS_NAME,
+    Corners,
     Dataset,
     ImageReader,
     Outlines,
     is_edited,
     row_names,
+    write_corners,
     write_observations,
 )
 from legcal.errors import OutOfResources, UsageError
@@ -100,6 +103,8 @@ class Detection:
         they were expected, and no outline of theirs is here but those that were given.
     notes : tuple of str
         What else a reader should know.
+    corners : Corners or None
+        The corners of calibration boards in all images; None without a board.
     """
 
     dataset: Dataset
@@ -111,6 +116,7 @@ class Detection:
     rows: IntArray
     unplaced: dict[str, str]
     notes: tuple[str, ...]
+    corners: Corners | None = None
 
     def view_of(self, row: int) -> str:
         """Return the name of the view of a row."""
@@ -381,6 +387,8 @@ def write_detection(detection: Detection, destination: Path, run: Run, progress:
         table = folder / OBSERVATIONS_NAME
         names = dataset.machine.leg_names
         write_observations(table, detection.outlines, dataset.measurements, names)
+        if detection.corners is not None:
+            write_corners(folder / CORNERS_NAME, detection.corners, dataset.measurements)
         _draw_all(detection, folder, run, progress)
         (folder / DETECTION_PAGE).write_text(_page(detection), encoding="utf-8", newline="\n")
         files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
@@ -479,5 +487,10 @@ def _is_place(name: Path) -> bool:
     """Say whether a path is one where a detection is written."""
     if ".." in name.parts:
         return False
-    own = {Path(OBSERVATIONS_NAME), Path(DETECTION_PAGE), Path(DETECTION.marker)}
+    own = {
+        Path(OBSERVATIONS_NAME),
+        Path(CORNERS_NAME),
+        Path(DETECTION_PAGE),
+        Path(DETECTION.marker),
+    }
     return name in own or (name.parts[0] == OVERLAYS and name.suffix == ".jpg")

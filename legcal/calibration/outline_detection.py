@@ -143,6 +143,7 @@ def _detected(data: OrderedDataset, images: IntArray) -> Detection:
         rows=images,
         unplaced=unplaced,
         notes=(*dataset.notes, *notes, *data.unreached_notes()),
+        corners=None if board is None else order.restore(board.corners),
     )
 
 

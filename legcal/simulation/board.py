@@ -192,6 +192,13 @@ class PlacedBoard:
                     return True
         return False
 
+    def is_covered(self, posed: PosedMachine) -> bool:
+        """Say whether something of a machine lies over the print, as seen from straight above."""
+        x, y, _ = self.board.extent.mean(axis=0).tolist()
+        eye = self.T_base_board.apply([x, y, self.towards_viewer * 3.0 * max(self.plate_size)])
+        points = self.T_base_board.apply(self.board.points)
+        return bool(posed.hidden(eye, points, np.zeros(len(points))).any())
+
     def seen(self, posed: PosedMachine, camera: Camera, T_base_camera: RigidTransform) -> BoolArray:
         """Return which corners an image shows, (n_corners,)."""
         points = self._watched

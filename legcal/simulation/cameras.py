@@ -269,7 +269,10 @@ def board_on_platform(
             T = _facing(board, place, _tilted(up, towards, place, tilt), side)
             placed = [PlacedBoard(board, T_base_platform[k] * T) for k in some]
             bodies = [posed_machines[k] for k in some]
-            if any(p.runs_through(body) for p, body in zip(placed, bodies, strict=True)):
+            if any(
+                p.runs_through(body) or p.is_covered(body)
+                for p, body in zip(placed, bodies, strict=True)
+            ):
                 continue
             if not views:
                 return T

@@ -64,6 +64,8 @@ class Analysis:
         predicted = self.predicted.with_board(board=board, link=link)
         other = self.elsewhere(predicted, np.arange(len(predicted.t)))
         other.__dict__.update(images=self.images)
+        if link == "platform":  # the steps do without it
+            other.__dict__.update(default_steps=self.default_steps, staged=self.staged)
         return other
 
     @cached_property

@@ -195,8 +195,9 @@ def judge_board(
     predicted = analysis.predicted
     shown = predicted.board if link == "base" else predicted.platform_board
     none = analysis.with_board(board=False, link=link) if shown.any() else analysis
-    is_present = bool(len(shown) and shown.all())
-    every = analysis if is_present else analysis.with_board(link=link)
+    every = analysis if len(shown) and shown.all() else analysis.with_board(link=link)
+    views = np.flatnonzero(shown) if link == "base" else predicted.view[np.flatnonzero(shown)]
+    is_present = len(np.unique(views)) == predicted.n_views
     needed = [
         before.name
         for before, after in zip(without, with_board, strict=True)
