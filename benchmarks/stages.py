@@ -1,27 +1,38 @@
-"""What the four steps give on simulated hexapods, default and literal, printed as measured.
+"""What the four steps give on simulated machines, default and literal, printed as measured.
 
     python benchmarks/stages.py [--machines 5] [--only times|errors]
+    python benchmarks/stages.py --photographs 3-rps tricept [--seed 0]
 
 Every row is the mean over machines of the platform error of eq (20) over ten extreme poses:
 nominal models are uniformly +-2 mm wrong in every parameter; three cameras at 0.9 m see four
 legs each in 15 extreme poses. A criterion that fails on a machine is counted, not hidden.
 Times are medians of a few runs of the default steps on 45 and on 450 images.
+
+With ``--photographs`` the machines are calibrated from 45 rendered photographs each, 15 poses
+before three cameras, as ``legcal simulate`` draws them by default; all models that come of that are
+compared with the truth at these poses, as ``legcal evaluate OUT/staged.yaml TRUTH --dataset`` does;
+poses that a model does not reach are left out and counted.
 """
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
+from tempfile import TemporaryDirectory
 from time import perf_counter
 
 import numpy as np
 
-from legcal.errors import LegcalError
+from legcal import calibrate, evaluate
+from legcal.errors import DidNotConverge, LegcalError
 from legcal.machine import KinematicParameters
 from legcal.paper import Criteria
 from legcal.paper.four_steps import run_steps
 from legcal.simulation import (
     OutlineNoise,
     PaperHexapod,
+    SimulatedDataset,
+    SimulationSettings,
     TableNoise,
     extreme_poses,
     hexapod_cameras,
@@ -30,6 +41,7 @@ from legcal.simulation import (
     paper_hexapod,
     perturb,
     platform_errors,
+    simulate,
 )
 
 NOISES: dict[str, OutlineNoise | TableNoise] = {
@@ -47,11 +59,49 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--machines", type=int, default=5)
     parser.add_argument("--only", choices=["times", "errors"])
+    parser.add_argument("--photographs", nargs="+", metavar="MACHINE")
+    parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
+    if arguments.photographs:
+        _print_photographs(arguments.photographs, arguments.seed)
+        return
     if arguments.only != "errors":
         _print_times()
     if arguments.only != "times":
         _print_errors(arguments.machines)
+
+
+def _print_photographs(names: Sequence[str], seed: int) -> None:
+    """Print the platform errors of models that photographs give, against the simulated truth."""
+    columns = ("nominal", *CRITERIA, "joint fit")
+    print("platform error from photographs, mean over poses [mm / deg]")
+    print(f"{'machine':14}" + " ".join(f"{column:>24}" for column in columns))
+    for name in names:
+        with TemporaryDirectory() as temporary:
+            folder = Path(temporary)
+            made = simulate(name, folder / "set", SimulationSettings(seed=seed))
+            models = {"nominal": Path(name)}
+            for criteria in CRITERIA:
+                calibrate(made.folder, output=folder / criteria, criteria=criteria)
+                models[criteria] = folder / criteria / "staged.yaml"
+            models["joint fit"] = folder / "default/calibrated.yaml"
+            cells = [_against_truth(model, made) for model in models.values()]
+        print(f"{name:14}" + " ".join(f"{cell:>24}" for cell in cells), flush=True)
+
+
+def _against_truth(model: Path, made: SimulatedDataset) -> str:
+    """Return a cell: the mean error at the poses of a dataset, and at how many there is none."""
+    if model.suffix and not model.exists():
+        return "no model"
+    try:
+        found = evaluate(str(model), made.truth_path, dataset=made.folder)
+    except DidNotConverge:
+        return "reaches no pose"
+    if not len(found.displacement):
+        return "no pose by readings"
+    dX, dE = 1e3 * found.displacement.mean(), np.rad2deg(found.rotation.mean())
+    n = found.n_left_out
+    return f"{dX:.3f} / {dE:.3f}" + f" (not at {n})" * (n > 0)
 
 
 def _print_times() -> None:

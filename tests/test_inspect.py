@@ -203,3 +203,7 @@ def test_readings_that_one_model_does_not_reach_are_left_out_and_named(tmp_path:
     with pytest.raises(DidNotConverge, match=r"the model does not reach rows 1, 2") as refusal:
         compared(off, other, made.truth_path)
     assert refusal.value.exit_code == 1
+    (short, *legs) = truth.legs
+    shorter_than_nothing = replace(truth, legs=(replace(short, q0=-1.0), *legs))
+    with pytest.raises(DidNotConverge, match="the model does not reach row"):
+        evaluate(shorter_than_nothing, truth, dataset=made.folder)

@@ -610,6 +610,8 @@ def test_a_likelihood_that_is_flat_leaves_the_gamma_open(session: HexapodSession
     trials = GammaTrials.begun(solution, {})
     other = replace(faint, gamma=np.full(len(faint), np.exp(GAMMA_STEP)))
     gammas = trials.next()
+    (note,) = trials.tried(gammas, None).notes({})
+    assert "stays undecided: no other one could be fitted" in note
     trials = trials.tried(gammas, refine(session.legs, measurements, other, start))
     assert trials.found() == {}
     (note,) = trials.notes({})

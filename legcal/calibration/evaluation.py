@@ -133,14 +133,14 @@ def evaluate(
     else:
         given = load_dataset(dataset, check_images=False)
         q = _readings_of(given, machine)
-        both = [list(followed_poses(model, q)) for model in (machine, truth)]
-        missed = [[failure is not None for _, failure in found] for found in both]
+        both = [_poses_at(model, q) for model in (machine, truth)]
+        missed = [[T is None for T in found] for found in both]
         unreached = _unreached(given, missed)
         n_left_out = sum(map(max, zip(*missed, strict=True)))
         if n_left_out == len(q):
             raise DidNotConverge(_why_none(given, unreached))
         poses, reference_poses = (
-            [T for (T, _), *off in zip(found, *missed, strict=True) if not any(off)]
+            [T for T, *off in zip(found, *missed, strict=True) if T is not None and not any(off)]
             for found in both
         )
     displacement, rotation = pose_differences(
@@ -204,6 +204,16 @@ def _readings_of(dataset: Dataset, machine: Machine) -> Array:
         )
     legs = [names.index(name) for name in machine.leg_names]
     return dataset.measurements.q[dataset.measurements.first_rows][:, legs]
+
+
+def _poses_at(machine: Machine, q: Array) -> list[RigidTransform | None]:
+    """Return T_base_platform at rows of readings, None where the machine does not reach them."""
+    lengths = machine.lengths_at(q[:, list(machine.motors)], machine.motors)
+    possible = np.flatnonzero(np.all(lengths > 0.0, axis=1)).tolist()
+    poses: list[RigidTransform | None] = [None] * len(q)
+    for k, (T, failure) in zip(possible, followed_poses(machine, q[possible]), strict=True):
+        poses[k] = T if failure is None else None
+    return poses
 
 
 def _unreached(dataset: Dataset, missed: Sequence[Sequence[bool]]) -> tuple[UnreachedRow, ...]:

@@ -22,6 +22,7 @@ from legcal.data import (
     Order,
     canonical_order,
     dataset_at,
+    few,
     inverse,
     measurements_at,
     plan_dataset,
@@ -36,7 +37,6 @@ from legcal.machine import (
     contradiction,
     followed_poses,
     geometries,
-    list_in_words,
     platform_in_base,
     platforms_in_base,
     solve_poses,
@@ -47,7 +47,6 @@ from legcal.progress import Report
 from legcal.workers import Run
 
 MAX_NOMINAL_RESIDUAL = 0.03  # of the mean leg length: errors of a nominal model, not of readings
-_MAX_NAMED = 3  # images in a note
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,11 +123,9 @@ class OrderedDataset:
         off = np.flatnonzero(residual > 0.0).tolist()
         if not off:
             return []
-        names = [_image_of(self.measurements, pose) for pose in off[:_MAX_NAMED]]
-        if len(off) > _MAX_NAMED:
-            names.append(f"{len(off) - _MAX_NAMED} more")
+        names = few([_image_of(self.measurements, pose) for pose in off])
         return [
-            f"The nominal model does not reach the readings of {list_in_words(names)}: its legs "
+            f"The nominal model does not reach the readings of {names}: its legs "
             f"miss them by up to {1e3 * float(residual.max()):.2f} mm at the nearest pose, from "
             "which the fit started."
         ]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from legcal.calibration.joint_fit import DISAGREES, Solution
-from legcal.data import Measurements
+from legcal.data import Measurements, few
 from legcal.errors import DidNotConverge
 from legcal.estimation import (
     Factor,
@@ -42,7 +42,6 @@ READING_NOISE = 6e-5  # of readings beside the legs of a fit [m]
 SIGNIFICANT_SIGMAS = 5.0
 MIN_READING_ERROR = 3e-4  # [m]
 SAME_READING = 1e-3  # tolerance for the reading of another image [m]
-MAX_NAMED_LEGS = 4
 BEYOND_TRAVEL = 0.05  # of the travel: what joint limits of a model leave out
 
 
@@ -240,9 +239,8 @@ def _explanation(
     travel = [machine.legs[motors[k]].travel for k in wrong]
     possible = np.clip(shown[wrong], *np.transpose(travel)) - given[wrong]
     worst = 1e3 * float(np.abs(possible).max())
-    more = f" and {len(names) - MAX_NAMED_LEGS} more" if len(names) > MAX_NAMED_LEGS else ""
     return (
         "it shows another pose than its reading says, with readings of "
-        f"{', '.join(names[:MAX_NAMED_LEGS])}{more} off by up to "
+        f"{few(names)} off by up to "
         f"{worst:.1f} mm; check that it was taken there"
     )

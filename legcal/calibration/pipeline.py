@@ -380,7 +380,10 @@ def _measure_again(
         here = near.fitted.with_fitted_poses(near.solution.T_Rb_Re)
         every = replace(data, seen_poses=here.seen_poses)
         placement = _fitted_placement(every, near.solution, seen)
-        outlines = measure_photographs(photographs, placement, data.progress)
+        stage = "Measuring outlines near the fit"
+        if gammas:
+            stage += f", gamma {few(sorted({f'{gamma:.2f}' for gamma in gammas.values()}))}"
+        outlines = measure_photographs(photographs, placement, data.progress, stage=stage)
         if like is not None:
             outlines = used_as_before(outlines, like)
         return _fit(here, outlines, placement, board, options)

@@ -27,8 +27,8 @@ measurement touches one of them at most, and the Schur complement removes them),
     normal = information(problem, found.state, found.linear)
     covariance = named_covariance(problem, found.state, normal.kept_covariance())
 
-A client writes a state, a function of rows for each kind of measurement (CasADi or NumPy; one test
-of finite differences checks them all), and the blocks. At predicted observations the same
+A client writes a state, a function of rows for each kind of measurement (derivatives written out;
+one test of finite differences checks them all), and the blocks. At predicted observations the same
 :func:`information` is the Cramer-Rao bound and says what is identifiable; it is additive over
 eliminated elements, so that candidate images are low-rank updates of it
 (``NormalEquations.contributions``). Where ranks are decided, :func:`information_rows` keeps its

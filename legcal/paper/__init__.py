@@ -12,9 +12,9 @@ In go a :class:`NominalMachine` (where the steps start), the leg axes that the i
 ``four_steps``         3        the steps in a row
 =====================  =======  ==================================================================
 
-Each step has the criterion as printed (``literal``) and a weighted one. All are problems of
-``least_squares``, built with CasADi and solved with IPOPT. Errors of the platform (20) are those of
-the machine room's ``pose_differences``.
+Each step has the criterion as printed (``literal``) and a weighted one. Step 1 is linear, and
+reweighted by default; the others are problems of ``least_squares``, built with CasADi and solved
+with IPOPT. Errors of the platform (20) are those of the machine room's ``pose_differences``.
 """
 
 import lazy_loader

@@ -30,7 +30,7 @@ from legcal.estimation import (
     minimise,
     normal_equations,
 )
-from legcal.geometry import Array, IntArray, cross
+from legcal.geometry import Array, BoolArray, IntArray, cross
 from legcal.vision import (
     DISTORTION_MODELS,
     Camera,
@@ -106,6 +106,11 @@ class AdjustedBoard:
     # (n_images, 6, 6) of a rotation vector [rad] and a displacement [m] of the board, the camera
     # being known
     information: Array
+
+    def rms_px(self, which: BoolArray | None = None) -> float:
+        """How far corners (of all (n,) or some) are from where they should be seen (rms) [px]."""
+        residual = self.residual if which is None else self.residual[which]
+        return float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
 
 
 @dataclass(frozen=True, eq=False)

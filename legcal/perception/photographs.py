@@ -53,6 +53,7 @@ from legcal.vision import shared_cameras
 from legcal.workers import Run
 
 DETECTOR_VERSION = 4  # raise it whenever outlines or notes that are kept come out differently
+MEASURING = "Measuring outlines"  # a stage of progress
 TOO_SHORT = "px in the image"  # end of the reason for parts that are not looked for
 MAX_USED_SHARE = 0.3  # of the outlines of a part that should be seen
 
@@ -191,7 +192,14 @@ def place_and_measure(
             machine = photographs.machine.with_cylinders(other.radii.corrected(search.cylinders))
             corrected = replace(photographs, machine=machine)
             by_other = corrected.search(nominal, pairs, rough)
-            again, also = _measured(corrected, by_other, other, report, together=together)
+            again, also = _measured(
+                corrected,
+                by_other,
+                other,
+                report,
+                together=together,
+                stage=f"{MEASURING} with other radii",
+            )
             blur = np.where(np.isnan(also), blur, also)
             if again.used.sum() > outlines.used.sum():
                 photographs, search, placement, outlines = corrected, by_other, other, again
@@ -259,7 +267,7 @@ def measure_photographs(
     *,
     together: bool = True,
     method: Method | None = None,
-    stage: str = "Measuring outlines",
+    stage: str = MEASURING,
 ) -> Outlines:
     """Return all outlines: those measured near a placement, and those kept.
 
@@ -296,11 +304,10 @@ def _measured(
     *,
     together: bool,
     method: Method | None = None,
-    stage: str = "Measuring outlines",
+    stage: str = MEASURING,
 ) -> tuple[Outlines, Array]:
     """Return all outlines, measured and kept, and the blur of each row [px]."""
     rows = [r for r in photographs.detect.tolist() if photographs.measurements.image[r]]
-    stage += " again" * bool(placement.blur)
     found, blur = measure_outlines(
         search,
         placement,

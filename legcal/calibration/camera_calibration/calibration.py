@@ -256,16 +256,15 @@ def _result(
             images.append(ImageResult(path.name, n, 0, None, None, why))
             continue
         here = seen.image == i
-        rms = float(np.sqrt(np.mean(square[here])))
         n_used = int(np.count_nonzero(here))
-        images.append(ImageResult(path.name, n, n_used, rms, float(tilt[i]), ""))
+        images.append(ImageResult(path.name, n, n_used, adjusted.rms_px(here), float(tilt[i]), ""))
     n_dof = max(2 * len(square) - len(adjusted.covariance) - 6 * len(fitted.images), 1)
     return CameraCalibration(
         camera=adjusted.camera,
         covariance=fitted.covariance,
         board=board,
         images=tuple(images),
-        rms_px=float(np.sqrt(np.mean(square))),
+        rms_px=adjusted.rms_px(),
         noise_px=float(np.sqrt(square.sum() / n_dof)),
         coverage=coverage(fitted),
         sheet=fitted.sheet,

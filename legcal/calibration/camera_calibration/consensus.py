@@ -255,10 +255,7 @@ def _reasons(adjusted: AdjustedBoard, seen: BoardImages, group: BoolArray) -> di
                 "camera or board moved while its rows were read out, or stabilisation bent it"
             )
         else:
-            rms = [
-                float(np.sqrt(np.mean(np.sum(adjusted.residual[which] ** 2, axis=1))))
-                for which in (own, group[seen.image])
-            ]
+            rms = [adjusted.rms_px(which) for which in (own, group[seen.image])]
             reasons[i] = (
                 f"its corners are {rms[0]:.2f} px off (rms) before the camera of the others, whose "
                 f"own are {rms[1]:.2f} px off"

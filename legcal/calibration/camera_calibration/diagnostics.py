@@ -155,7 +155,7 @@ def warnings(found: RobustFit) -> list[str]:
         )
     sentences += _folding(camera)
     sentences += _overfit(found)
-    rms = float(np.sqrt(np.mean(np.sum(found.adjusted.residual**2, axis=1))))
+    rms = found.adjusted.rms_px()
     if rms > _LARGE_RESIDUAL_PX:
         sentences.append(
             f"The residuals are large, {rms:.2f} px (rms): the board is bent, its dimensions are "
@@ -256,7 +256,7 @@ def _overfit(found: RobustFit) -> list[str]:
     gain = (plain.cost - full.cost) / 3.0 / max(full.cost / max(dof, 1), 1e-30)
     if gain > 0.0 and fdtrc(3, max(dof, 1), gain) < _OVERFIT:
         return []
-    rms = [float(np.sqrt(np.mean(np.sum(a.residual**2, axis=1)))) for a in (full, plain)]
+    rms = [adjusted.rms_px() for adjusted in (full, plain)]
     return [
         f"The model overfits: with rational_polynomial corners are {rms[0]:.4f} px off (rms), "
         f"with plumb_bob {rms[1]:.4f} px, which is no better than chance; take --model plumb_bob."

@@ -111,6 +111,12 @@ def refine(
     return _refined(problem, outlines, start, minimum, settings)
 
 
+def _called(start: Start) -> str:
+    """Return where a start comes from, for sentences."""
+    known = {"nominal": "the nominal model", "staged": "the four steps"}
+    return known.get(start.label, f"the start '{start.label}'")
+
+
 def refine_from_best(
     legs: FittedLegs,
     measurements: Measurements,
@@ -139,14 +145,16 @@ def refine_from_best(
     notes: list[str] = []
     failures: list[LegcalError] = []
     for start in starts:
+        begun = _called(start)
         try:
             minimum = _first(problem, start, settings)
         except (DidNotConverge, NotIdentifiable) as failure:
             failures.append(failure)
-            notes.append(f"The start {start.label} was skipped. {failure}")
+            notes.append(f"The joint fit could not start from {begun}. {failure}")
             continue
         if len(starts) > 1:
-            notes.append(f"The start {start.label} led to a cost of {minimum.cost:.6g}.")
+            cost = f"{minimum.cost:.6g}"
+            notes.append(f"Started from {begun}, the joint fit came to a cost of {cost}.")
         least = (1.0 + _COST_TOLERANCE) * minimum.cost
         place = sum(other.cost <= least for _, other in candidates)
         candidates.insert(place, (start, minimum))
@@ -155,7 +163,7 @@ def refine_from_best(
             found = _refined(problem, outlines, start, minimum, settings)
         except (DidNotConverge, NotIdentifiable) as failure:
             failures.append(failure)
-            notes.append(f"The start {start.label} was given up. {failure}")
+            notes.append(f"The joint fit started from {_called(start)} was given up. {failure}")
             continue
         return dataclasses.replace(found, notes=(*found.notes, *notes))
     if failures and all(isinstance(failure, NotIdentifiable) for failure in failures):

@@ -114,6 +114,8 @@ class GammaTrials:
         ):
             if views[0] in refused:
                 why = f"fewer of its outlines can be used with {refused[views[0]]:.2f}"
+            elif np.isfinite(merit).sum() == 1 < len(merit):
+                why = "no other one could be fitted"
             elif (rival := _rival(tried, merit)) is not None:
                 why = f"its outlines are about as likely with {np.exp(rival):.2f}"
             else:
@@ -150,9 +152,7 @@ def most_likely(log_gamma: Array, merit: Array) -> float:
 
     That of the first trial where no other one is clearly better.
     """
-    place = _places(log_gamma, merit)
-    x, y = log_gamma[place], merit[place]
-    i = int(np.argmax(y))
+    x, y, i = _in_order(log_gamma, merit)
     if y[i] - merit[0] <= 0.5 * SIGNIFICANCE**2:
         return float(log_gamma[0])
     if not 0 < i < len(x) - 1 or not np.all(np.isfinite(y[i - 1 : i + 2])):
@@ -164,17 +164,16 @@ def most_likely(log_gamma: Array, merit: Array) -> float:
 
 def _rival(log_gamma: Array, merit: Array) -> float | None:
     """Return the logarithm of another gamma that is nearly as likely as the best one, if any."""
-    place = _places(log_gamma, merit)
-    x, y = log_gamma[place], merit[place]
-    i = int(np.argmax(y))
+    x, y, i = _in_order(log_gamma, merit)
     near = [k for k in range(len(x)) if k != i and y[i] - y[k] <= 0.5 * SIGNIFICANCE**2]
     return float(x[near[0]]) if near else None
 
 
-def _places(log_gamma: Array, merit: Array) -> list[int]:
-    """Return trials of different gammas, rising, the most likely one of each."""
+def _in_order(log_gamma: Array, merit: Array) -> tuple[Array, Array, int]:
+    """Return trials of different gammas, rising, the most likely of each, and which is the best."""
     order = sorted(range(len(merit)), key=lambda k: (log_gamma[k], -merit[k]))
-    return [k for n, k in enumerate(order) if n == 0 or log_gamma[k] > log_gamma[order[n - 1]]]
+    place = [k for n, k in enumerate(order) if n == 0 or log_gamma[k] > log_gamma[order[n - 1]]]
+    return log_gamma[place], merit[place], int(np.argmax(merit[place]))
 
 
 def log_likelihoods(solutions: Sequence[Solution], cameras: Sequence[Views]) -> Array:

@@ -27,6 +27,7 @@ from legcal.calibration.joint_fit.outline_errors import (
 )
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
+from legcal.data import few
 from legcal.errors import DidNotConverge
 from legcal.estimation import (
     GaussianPrior,
@@ -53,7 +54,6 @@ _MIN_SCALE = 0.1
 _MIN_ERROR_PX = 1e-3  # absolute tolerance of standard deviations of errors
 _MAX_ERROR_CHANGE = 0.5  # of the largest error of outlines, in the last round
 _MAX_CHANGED = 0.05  # of the accepted outlines
-_MAX_NAMED = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,12 +314,11 @@ def corner_notes(problem: FitProblem) -> tuple[str, ...]:
     if not rejected:
         return ()
     views = problem.outlines.views
-    named = [f"{corner} in {views[view]}" for view, _, corner in sorted(rejected)[:_MAX_NAMED]]
-    more = f" and {len(rejected) - _MAX_NAMED} more" if len(rejected) > _MAX_NAMED else ""
+    named = few([f"{corner} in {views[view]}" for view, _, corner in sorted(rejected)])
     n = len(rejected) + sum(map(len, problem.boards))
     return (
         f"Of {n} corners of the calibration board {len(rejected)} disagree with the fit and were "
-        f"left out: {', '.join(named)}{more}.",
+        f"left out: {named}.",
     )
 
 

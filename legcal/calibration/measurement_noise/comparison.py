@@ -24,7 +24,7 @@ from legcal.calibration.measurement_noise.repeatability import (
     leg_orientations,
 )
 from legcal.calibration.ordered_dataset import order_dataset
-from legcal.data import Dataset, Measurements, Outlines, load_dataset, no_outlines
+from legcal.data import Dataset, Measurements, Outlines, few, load_dataset, no_outlines
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible
 from legcal.geometry import Array, BoolArray
 from legcal.machine import forward_kinematics_many
@@ -58,7 +58,6 @@ _RANGE = (
 )
 _MIN_JUMP = 3.0  # ratio of spread to claim of an edge that jumps, and the same in the median ratio:
 # not all edges of a method that claims too little jump
-_MAX_NAMED = 4  # places in a note
 
 
 def measure_noise(
@@ -248,11 +247,10 @@ def _jumps(measurements: Measurements, method: MethodNoise) -> list[str]:
     if not found:
         return []
     found.sort(key=lambda jump: -jump[0])
-    places = ", ".join(f"{where} ({sd:.3f} px)" for sd, where in found[:_MAX_NAMED])
-    more = f" and {len(found) - _MAX_NAMED} more" if len(found) > _MAX_NAMED else ""
+    places = few([f"{where} ({sd:.3f} px)" for sd, where in found])
     return [
         f"{CALLED[method.name]}: single outlines spread over {least:.2g} times as far as is "
-        f"claimed of them: {places}{more}. Such an edge jumps between images; pooled "
+        f"claimed of them: {places}. Such an edge jumps between images; pooled "
         "standard deviations and upper bounds are of the jumps, medians are not."
     ]
 
