@@ -472,7 +472,7 @@ def _datasets() -> Iterable[Refusal]:
         ("hand-held", entry(views__c1__hand_held=True), ("c1", "board")),
         (
             "all-at-once",
-            entry(encoder_sigma=-1, views__c1__legs=[], views__c2={}, measurements=GONE),
+            entry(encoder_sigma=-1, views__c1__legs=3, views__c2={}, measurements=GONE),
             ("encoder_sigma", "views.c1.legs", "views.c2.camera", "measurements"),
         ),
         ("yaml", text("dataset.yaml", "legcal_dataset: 1\nviews: {c1: [}\n"), ("line 2",)),
