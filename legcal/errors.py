@@ -32,17 +32,20 @@ class LegcalError(Exception):
     exit_code : int
         The process exit code of the command line: 1 for a reason in the data, 2 for
         malformed input or wrong use.
+    diagnosis : tuple of dict
+        What looks wrong with the session, as ``--json`` has it; empty where nothing was found.
     """
 
     exit_code = 1
+    diagnosis: tuple[dict[str, object], ...] = ()
 
     def __init__(self, problems: str | Sequence[str]) -> None:
         found = (problems,) if isinstance(problems, str) else problems
         self.problems = tuple(printable(problem) for problem in found)
         super().__init__("\n".join(_shortened(self.problems)))
 
-    def __reduce__(self) -> tuple[type, tuple[tuple[str, ...]]]:
-        return type(self), (self.problems,)
+    def __reduce__(self) -> tuple[type, tuple[tuple[str, ...]], dict[str, object]]:
+        return type(self), (self.problems,), {"diagnosis": self.diagnosis}
 
 
 def printable(text: str) -> str:

@@ -258,6 +258,18 @@ class Holdout(Document):
     platform: HoldoutPlatform | None
 
 
+class DiagnosisBlock(Document):
+    """What looks wrong with a session."""
+
+    kind: str
+    what: str
+    same_as: list[str]
+    images_before: int
+    images_after: int
+    score: Number
+    remedy: str
+
+
 class Heading(Document):
     """What a result is worth, and the order of its legs."""
 
@@ -289,11 +301,12 @@ class Result(Legs, Heading):
     platform: PlatformBlock | None
     holdout: Holdout | None = None  # left out without held-out images
     notes: list[str]
+    diagnosis: list[DiagnosisBlock] | None = None  # left out where nothing looks wrong
 
     @model_serializer(mode="wrap")
     def _without_absent_blocks(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         found: dict[str, Any] = handler(self)
-        optional = ("observations", "board", "platform_board", "holdout")
+        optional = ("observations", "board", "platform_board", "holdout", "diagnosis")
         absent = [key for key in optional if found[key] is None]
         return {key: value for key, value in found.items() if key not in absent}
 

@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from legcal.calibration.board import BoardViews, base_of_board, board_notes, observe_board
+from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose
 from legcal.calibration.four_steps import Steps, four_steps, starts
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit import (
@@ -63,7 +64,7 @@ from legcal.data import (
     split_images,
     store_outlines,
 )
-from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible, UsageError
+from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.files import check_destination, output_path
 from legcal.geometry import IntArray
 from legcal.machine import Machine
@@ -74,6 +75,7 @@ from legcal.perception import (
     detection_settings,
     given_outlines,
     hint_notes,
+    is_visible,
     measure_photographs,
     nominal_placement,
     place_and_measure,
@@ -88,6 +90,7 @@ TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal 
 # Of all outlines that are measured in photographs: light at the limb that no model of shading
 # predicts looks like other radii, so that residuals never show it [px].
 LIMB_BIAS = {"bias of many edges": 0.02}
+MAX_LEFT_OUT = 0.25  # of the images, or of the outlines, beyond which common mistakes are tried
 MIN_FOUND_AGAIN = 0.5  # of the outlines of an image
 
 
@@ -103,6 +106,7 @@ class Estimate:
     image_notes: tuple[str, ...] = ()  # on the images by themselves
     fit_notes: tuple[str, ...] = ()  # on the images by the fit
     other_radii: bool = False  # whether the images show other radii than the model has
+    diagnosis: tuple[Diagnosis, ...] = ()  # what looks wrong where many images were left out
 
     @cached_property
     def outliers(self) -> dict[int, str]:
@@ -207,6 +211,7 @@ def calibrate(
     # 6. Judge and write.
     found = estimate.in_file_order()
     notes = [
+        *(one.sentence for one in found.diagnosis),
         *dataset.notes,
         *found.image_notes,
         *found.fit_notes,
@@ -227,6 +232,7 @@ def calibrate(
         notes,
         corners=None if found.corners is None else found.corners.at(fitted),
         held_out=prediction,
+        diagnosis=found.diagnosis,
     )
     if output is not None:
         calibration = write_result(calibration, Path(output))
@@ -236,7 +242,8 @@ def calibrate(
 def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Options) -> Estimate:
     """Recognise and measure all images, and fit some of them: phases 2 to 5 of the method.
 
-    A refusal also has what files of photographs say against their camera: it may be the cause.
+    A refusal also has what looks wrong with the session, and what files of photographs say against
+    their camera: they may be the cause.
 
     Raises
     ------
@@ -253,10 +260,14 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         # Outlines that an earlier run left do not always determine the cameras; images do.
         data = replace(data, plan=plan_dataset(data.dataset, ""))
         return _estimate(data, rows, options)
-    except (NotVisible, NotIdentifiable, DidNotConverge) as error:
-        if not data.dataset.file_notes:
+    except (NotVisible, NotIdentifiable, DidNotConverge, DatasetError) as error:
+        diagnosis, notes = diagnose(data), data.dataset.file_notes
+        if not (diagnosis or notes):
             raise
-        raise type(error)([*error.problems, *data.dataset.file_notes]) from error
+        likeliest = [one.sentence for one in diagnosis]
+        refusal = type(error)([*likeliest, *error.problems, *notes])
+        refusal.diagnosis = tuple(one.document().document() for one in diagnosis)
+        raise refusal from error
 
 
 def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimate:
@@ -293,7 +304,19 @@ def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimat
         ),
         fit_notes=_notes_on_images(estimate),
         other_radii=other_radii,
+        diagnosis=diagnose(data) if _is_doubtful(data, rows, seen, estimate) else (),
     )
+
+
+def _is_doubtful(
+    data: OrderedDataset, rows: IntArray, seen: MeasuredImages, estimate: Estimate
+) -> bool:
+    """Say whether so much was left out that the session itself may be wrong."""
+    cameras, view = seen.placement.T_base_camera, data.measurements.view
+    left_out = [r for r in rows.tolist() if r in seen.left_out or cameras[view[r]] is None]
+    shown = estimate.solution.outlines.choose(is_visible(estimate.solution.outlines))
+    unused = 1.0 - float(shown.used.mean()) if len(shown) else 1.0
+    return max(len(left_out) / len(rows), unused) > MAX_LEFT_OUT
 
 
 def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.documents import (
     BoardPose,
     Distance,
@@ -95,6 +96,8 @@ class Calibration(Summarised):
         How well the fit predicts the held-out images; None without any.
     corners : Corners or None
         The corners of the calibration board in all images; None without a board.
+    diagnosis : tuple of Diagnosis
+        What looks wrong with the session, the likeliest first; empty where nothing does.
     """
 
     dataset: Dataset
@@ -105,6 +108,7 @@ class Calibration(Summarised):
     notes: tuple[str, ...]
     held_out: HeldOut | None = None
     corners: Corners | None = None
+    diagnosis: tuple[Diagnosis, ...] = ()
 
     @cached_property
     def result(self) -> Result:
@@ -174,6 +178,7 @@ def _result_of(calibration: Calibration) -> Result:
         platform=_platform(calibration),
         holdout=_holdout(calibration),
         notes=list(calibration.notes),
+        diagnosis=[one.document() for one in calibration.diagnosis] or None,
     )
 
 

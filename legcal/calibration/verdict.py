@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit import (
     FOCAL_PART,
@@ -30,12 +31,14 @@ def judge(
     *,
     corners: Corners | None = None,
     held_out: HeldOut | None = None,
+    diagnosis: Sequence[Diagnosis] = (),
 ) -> Calibration:
     """Return the calibration with its verdict.
 
     The improvement that the fit predicts is the distance between the nominal and the
     calibrated platform at the readings of the dataset; it counts where it exceeds two of its
     standard deviations. Where readings do not determine a pose, it is that of the parameters.
+    Nothing is trusted that a diagnosis of the session speaks against.
     """
     machine, measurements = dataset.machine, dataset.measurements
     platform = platform_accuracy(
@@ -51,7 +54,19 @@ def judge(
         verdict = _verdict_on_parameters(dataset, solution)
     else:
         verdict = _verdict_on_platform(platform, solution.focal_error)
-    return Calibration(dataset, solution, steps, platform, verdict, tuple(notes), held_out, corners)
+    if diagnosis:
+        verdict = Verdict(False, f"Do not load this into the controller: {diagnosis[0].sentence}")
+    return Calibration(
+        dataset,
+        solution,
+        steps,
+        platform,
+        verdict,
+        tuple(notes),
+        held_out,
+        corners,
+        tuple(diagnosis),
+    )
 
 
 def _verdict_on_platform(platform: PlatformAccuracy, focal_error: float) -> Verdict:

@@ -99,7 +99,8 @@ def run(*, as_json: bool) -> int:
     except Exception as error:  # the one place that may: the boundary to the shell
         raise_if_stopped()  # libraries turn interrupts into errors of their own
         if isinstance(error, LegcalError):
-            print_failure(type(error).__name__, str(error), as_json=as_json)
+            kind, diagnosis = type(error).__name__, error.diagnosis
+            print_failure(kind, str(error), as_json=as_json, diagnosis=diagnosis)
             return error.exit_code
         if isinstance(error, usage_error):
             message = getattr(error, "format_message", error.__str__)()

@@ -6,7 +6,7 @@ import gc
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -125,12 +125,15 @@ def _leave_stdout() -> None:
     sys.stdout = None
 
 
-def print_failure(kind: str, message: str, *, as_json: bool) -> None:
+def print_failure(
+    kind: str, message: str, *, as_json: bool, diagnosis: Sequence[dict[str, object]] = ()
+) -> None:
     """Say on stderr, or in JSON on stdout, why a command failed."""
     message = "\n".join(map(printable, message.split("\n")))
     if as_json:
         with suppress(OutOfResources):
-            print_json({"error": {"kind": kind, "message": message}})
+            found = {"diagnosis": list(diagnosis)} if diagnosis else {}
+            print_json({"error": {"kind": kind, "message": message}, **found})
             return
     if sys.stderr is not None:
         sys.stderr.write(f"legcal: {message}\n")

@@ -170,12 +170,9 @@ def readings_in(table: Table, legs: Sequence[Leg]) -> tuple[Array, tuple[str, ..
         start = f"{table.path}, column {leg.prismatic}"
         travel = f"{lower:g} to {upper:g} m (the joint limits of the model)"
         if np.any(far):
-            remedy = (
-                "these look like millimetres: divide the column by 1000"
-                if 2 * np.sum(far) >= len(column)
-                and _look_like_millimetres(column[far], lower, upper)
-                else "correct the readings or the limits"
-            )
+            remedy = "correct the readings or the limits"
+            if 2 * np.sum(far) >= len(column):
+                remedy = _likely_cause(readings, actuated) or remedy
             table.refuse_file(
                 f"{start}: readings are outside the travel: found {_some(table, column, far)}, "
                 f"needed {travel} with a margin of {TRAVEL_MARGIN:.0%}; {remedy}."
@@ -186,12 +183,33 @@ def readings_in(table: Table, legs: Sequence[Leg]) -> tuple[Array, tuple[str, ..
     return readings, tuple(notes)
 
 
-def _look_like_millimetres(readings: Array, lower: float, upper: float) -> bool:
-    """Say whether readings lie far outside a travel [m], and in it when divided by 1000."""
-    metres, margin = 1e-3 * readings, TRAVEL_MARGIN * (upper - lower)
-    fit = (metres >= lower - margin) & (metres <= upper + margin)
-    far = (readings > 2.0 * upper - lower) | (readings < 2.0 * lower - upper)
-    return bool(np.all(fit & far))
+def _likely_cause(readings: Array, legs: Sequence[Leg]) -> str:
+    """Return what readings (n_rows, n_legs) look like, and the remedy; "" where it is not clear.
+
+    Of what would bring all of them into their travel, that with which they move in it most.
+    """
+    lower, upper = np.array([leg.travel for leg in legs]).T
+    sign, q0 = np.array([(leg.sign, leg.q0) for leg in legs]).T
+    whole = "subtract the leg lengths at reading zero (legcal inspect tells them)"
+    tried = (
+        (1e-3 * readings, "millimetres: divide the column by 1000"),
+        (sign * (readings - q0), f"whole leg lengths: {whole}"),
+        (
+            sign * (1e-3 * readings - q0),
+            f"whole leg lengths in millimetres: divide the column by 1000, and {whole}",
+        ),
+        (1e-2 * readings, "centimetres: divide the column by 100"),
+        (0.0254 * readings, "inches: multiply the column by 0.0254"),
+        (-readings, "readings with the opposite sign: reverse it"),
+    )
+    width = upper - lower
+    found, most = "", 0.0
+    for meant, what in tried:
+        beyond = np.maximum(lower - meant, meant - upper).max(axis=0)
+        moved = float(np.mean(np.ptp(meant, axis=0) / width))
+        if np.all(beyond <= TRAVEL_MARGIN * width) and moved > most:
+            found, most = f"these look like {what}", moved
+    return found
 
 
 def _some(table: Table, column: Array, chosen: BoolArray) -> str:

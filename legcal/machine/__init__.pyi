@@ -38,6 +38,7 @@ from .kinematics import Follower as Follower
 from .kinematics import consistent_readings as consistent_readings
 from .kinematics import contradiction as contradiction
 from .kinematics import follow as follow
+from .kinematics import follow_poses as follow_poses
 from .kinematics import followed_poses as followed_poses
 from .kinematics import forward_kinematics as forward_kinematics
 from .kinematics import forward_kinematics_many as forward_kinematics_many

@@ -1,3 +1,6 @@
+from .agreement import Agreement as Agreement
+from .agreement import compare_assumptions as compare_assumptions
+from .agreement import pairs_of_images as pairs_of_images
 from .board_adjustment import LOSS as LOSS
 from .board_adjustment import SHEET as SHEET
 from .board_adjustment import AdjustedBoard as AdjustedBoard
@@ -16,9 +19,12 @@ from .board_corners import shown_board as shown_board
 from .board_poses import board_poses_in_images as board_poses_in_images
 from .board_poses import camera_poses_by_board as camera_poses_by_board
 from .board_poses import plane_poses as plane_poses
+from .camera_search import LEFT_RIGHT as LEFT_RIGHT
+from .camera_search import UPSIDE_DOWN as UPSIDE_DOWN
 from .diagnostics import BEFORE_FIT as BEFORE_FIT
 from .diagnostics import FAR_OFF as FAR_OFF
 from .diagnostics import hint_notes as hint_notes
+from .diagnostics import is_visible as is_visible
 from .free_poses import require_rough_cameras as require_rough_cameras
 from .outline import HIDDEN as HIDDEN
 from .outline import MIN_LENGTH as MIN_LENGTH
@@ -45,4 +51,8 @@ from .photographs import measure_photographs as measure_photographs
 from .photographs import nominal_placement as nominal_placement
 from .photographs import place_and_measure as place_and_measure
 from .photographs import recognise_and_place as recognise_and_place
+from .placement import Group as Group
+from .placement import Joined as Joined
 from .placement import Placement as Placement
+from .placement import Search as Search
+from .placement import group_views as group_views
