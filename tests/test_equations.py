@@ -251,8 +251,10 @@ def test_the_platform_goes_where_the_equations_are_met_again(
     readings = [float(np.linalg.norm(R @ leg.B + t - leg.A)) - leg.q0 for leg in legs]
     T, p = R, t
     for _ in range(5):
-        by_pose = pose_equations(moved, T[None], p[None]).by_pose[0]
-        change = -np.linalg.pinv(by_pose) @ _residual(moved, readings, T, p)
+        found_there = pose_equations(moved, T[None], p[None])
+        weight = np.where(found_there.measured, 1.0, 1e5)  # constraints are met exactly
+        weighted = weight[:, None] * found_there.by_pose[0]
+        change = -np.linalg.pinv(weighted) @ (weight * _residual(moved, readings, T, p))
         T = Rotation.from_rotvec(change[:3]).as_matrix() @ T
         p = p + change[3:]
     turn = Rotation.from_matrix(T @ R.T).as_rotvec()

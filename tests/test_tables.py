@@ -117,12 +117,8 @@ def test_outlines_are_read_exactly_as_they_were_written(tmp_path: Path, seed: in
     assert_same(read(written(tmp_path, turned)), outlines)
 
 
-@pytest.mark.parametrize("beyond_a_half_turn", [False, True])
-def test_axes_are_read_as_they_were_written(tmp_path: Path, beyond_a_half_turn: bool) -> None:
-    row, leg, values, sigmas = axis_table()
-    if beyond_a_half_turn:  # the same directions by other angles
-        values[:, :2] = np.pi + values[:, :2] * [-1.0, 1.0]
-    found, expected = read_again(written(tmp_path, (row, leg, values, sigmas))), axes_of()
+def test_axes_are_read_as_they_were_written(tmp_path: Path) -> None:
+    found, expected = read_again(written(tmp_path, axis_table())), axes_of()
     assert isinstance(found, LegAxes)
     assert np.array_equal(found.row, expected.row)
     assert np.array_equal(found.leg, expected.leg)
@@ -300,7 +296,6 @@ def test_legs_that_a_view_leaves_out_are_rejected() -> None:
         (axis_table(), 5, {"z": "-1e300"}, ("column z", "-1000 to 1000 m")),
         (axis_table(), 5, {"psi": "1.5707963"}, ("columns psi, theta", "(x, 0, z)")),
         (axis_table(), 5, {"sigma_theta": "3"}, ("column sigma_theta", "1e-09 to 1 rad")),
-        (axis_table(), 5, {"theta": "45"}, ("column theta", "'45'", "one turn", "degrees")),
         (axis_table(), 5, {"theta": "-inf"}, ("column theta", "'-inf'", "finite")),
     ],
 )

@@ -37,7 +37,8 @@ from legcal.vision import (
 
 VALUES = ("psi", "theta", "x", "z")
 SIGMAS = tuple(f"sigma_{name}" for name in VALUES)
-MAX_ANGLE = 2.001 * math.pi  # [rad]; a turn, from any beginning and rounded: no degrees
+MAX_ANGLE = {"psi": 0.5 * math.pi, "theta": math.pi}  # [rad]
+ANGLE_ROUNDING = 1e-3  # [rad]; as of 3.142
 MAX_DISTANCE = 1000.0  # [m] of M_LS from the camera centre
 SIGMA_RANGE = (1e-9, 1.0)  # [rad] or [m]: no axis is known better, and worse says nothing
 MIN_UPRIGHT = 1e-4  # component along the image y axis: below it M_LS is undetermined
@@ -46,12 +47,12 @@ COLUMNS = (
     *(
         Column(
             name,
-            least=-MAX_ANGLE,
-            most=MAX_ANGLE,
-            needed="an angle of at most one turn, 2 pi, either way",
+            least=-most - ANGLE_ROUNDING,
+            most=most + ANGLE_ROUNDING,
+            needed=f"an angle from {-most:.4f} to {most:.4f} rad",
             remedy="write radians, not degrees, or remove the row",
         )
-        for name in ("psi", "theta")
+        for name, most in MAX_ANGLE.items()
     ),
     *(
         Column(

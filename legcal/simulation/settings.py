@@ -193,12 +193,12 @@ class SimulationSettings:
         fits the machine, a YAML file with the block ``board`` of a dataset, or a Board.
     board_pose : bool
         Say in the dataset where the boards are in their links.
-    platform_board : Board, str, Path or None
-        The same on the platform.
     hand_held : bool
         Every image is taken from a place of its own, with the board in it.
     seed : int
         Seed of all random numbers.
+    platform_board : Board, str, Path or None
+        As ``board``, on the platform.
 
     Raises
     ------
@@ -222,9 +222,9 @@ class SimulationSettings:
     appearance: Appearance = field(default_factory=Appearance)
     board: Board | str | Path | None = None
     board_pose: bool = False
-    platform_board: Board | str | Path | None = None
     hand_held: bool = False
     seed: int = 0
+    platform_board: Board | str | Path | None = None
 
     def __post_init__(self) -> None:
         for name, choices in (("level", Level), ("sampling", Sampling)):

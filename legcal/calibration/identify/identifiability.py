@@ -98,8 +98,8 @@ def identifiability(
     images: int = 15,
     *,
     board: bool = False,
-    platform_board: bool = False,
     hand_held: bool = False,
+    platform_board: bool = False,
 ) -> Identifiability:
     """Judge what images of some views determine of a mechanism's parameters.
 
