@@ -106,7 +106,7 @@ def in_order(name: str) -> tuple[object, ...]:
     """Return a key by which numbers in names are in order: ``img2`` before ``img10``."""
     parts = PurePosixPath(name.casefold()).parts
     split = [_NUMBERS.split(part) for part in parts]
-    keys = [tuple((int(x), "") if x.isdigit() else (-1, x) for x in words) for words in split]
+    keys = [tuple((int(x), "") if x.isdecimal() else (-1, x) for x in words) for words in split]
     return (len(parts), *keys, name)
 
 
