@@ -298,7 +298,9 @@ def _with_judged_corners(
         judged = judged.with_corners(board.chosen(agrees, scale), board.keys(~agrees))
         rms = float(np.sqrt(np.mean((rows.r * board.sigma[:, None]) ** 2)))
         too_far = np.median(norms * board.sigma**2) > settings.largest_rms_px**2
-        if len(judged.rejected_corners) > sum(map(len, judged.boards)) or too_far:
+        on_base = board.link == "base"
+        own = [pose for _, pose, _ in judged.rejected_corners if (pose < 0) == on_base]
+        if len(own) > int(agrees.sum()) or too_far:
             which = "" if board.link == "base" else f" on the {board.link}"
             raise DidNotConverge(
                 f"The joint fit ended where the corners of the calibration board{which} are "
