@@ -147,6 +147,7 @@ def test_corners_of_two_boards_calibrate_a_machine_without_a_leg_or_a_rough_pose
     )
     assert error < 3.0 * result["platform"]["sigma_dX_m"]
     assert error < 0.3 * nominal
+    assert list(result["views"]) == ["c1"]
     found, true = (
         np.array(place["xyz"])
         for place in (

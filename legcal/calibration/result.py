@@ -130,7 +130,10 @@ def _result_of(calibration: Calibration) -> Result:
     names, views = machine.leg_names, measurements.views
     owners = shared_cameras([view.name for view in views], [view.camera for view in views])
     o, axes = solution.outlines, dataset.axes
-    shown = np.unique(measurements.view[o.row[o.used] if axes is None else axes.row]).tolist()
+    rows, corners = o.row[o.used] if axes is None else axes.row, calibration.corners
+    if corners is not None:
+        rows = np.concatenate([rows, corners.row[corners.used]])
+    shown = np.unique(measurements.view[rows]).tolist()
     T_base_Rb = machine.T_base_Rb
     on_base, on_platform = (_board(calibration, link) for link in LINKS)
     return Result(
