@@ -137,9 +137,14 @@ def diagnose(data: OrderedDataset, joined: Joined = None) -> tuple[Diagnosis, ..
 
 
 def _rows_with_image(data: OrderedDataset) -> IntArray:
-    """Return the rows whose photographs can be read."""
+    """Return the rows whose photographs are there, without those of views that name no leg."""
     paths = [data.dataset.image_path(row) for row in data.order.rows.tolist()]
-    shown = [k for k, path in enumerate(paths) if path is not None and path.exists()]
+    views = [data.measurements.views[v] for v in data.measurements.view.tolist()]
+    shown = [
+        k
+        for k, (path, view) in enumerate(zip(paths, views, strict=True))
+        if path is not None and path.exists() and view.legs != ()
+    ]
     return np.array(shown, dtype=np.intp)
 
 

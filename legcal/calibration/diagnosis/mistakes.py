@@ -292,7 +292,8 @@ def _of_radii(given: Assumed) -> Iterator[Mistake]:
 
         def other(radius: float) -> float:
             return next(
-                (new for old, new in exchanged.items() if abs(old - radius) <= 1e-3 * old), radius
+                (new for old, new in exchanged.items() if abs(old - radius) <= _SAME_RADIUS * old),
+                radius,
             )
 
         yield Mistake(
