@@ -43,6 +43,7 @@ def test_a_fit_with_exchanged_columns_is_not_trusted_and_they_are_named(tmp_path
     assert found.after == found.images == 10
     assert not calibration.verdict.trustworthy
     assert found.sentence in calibration.verdict.sentence
+    assert "known to" in calibration.verdict.sentence
     assert calibration.notes[0] == found.sentence
     block = calibration.result.document()["diagnosis"]
     assert [one["kind"] for one in block] == ["columns exchanged"]

@@ -51,11 +51,14 @@ def judge(
         solution.sensitivities,
     )
     if platform is None:
-        verdict = _verdict_on_parameters(dataset, solution)
+        change, sigma, found = _change_of_parameters(dataset, solution)
     else:
-        verdict = _verdict_on_platform(platform, solution.focal_error)
+        change, sigma, found = _change_of_platform(platform, solution.focal_error)
     if diagnosis:
-        verdict = Verdict(False, f"Do not load this into the controller: {diagnosis[0].sentence}")
+        why = f"{diagnosis[0].sentence} As it is, {found}."
+        verdict = Verdict(False, f"Do not load this into the controller: {why}")
+    else:
+        verdict = _verdict(change, sigma, found)
     return Calibration(
         dataset,
         solution,
@@ -69,8 +72,8 @@ def judge(
     )
 
 
-def _verdict_on_platform(platform: PlatformAccuracy, focal_error: float) -> Verdict:
-    """Compare the change of the platform with its uncertainty, in displacement.
+def _change_of_platform(platform: PlatformAccuracy, focal_error: float) -> tuple[float, float, str]:
+    """Return the change of the platform, its uncertainty, both displacements [m], and a clause.
 
     Focal lengths and distortions that the measurements contradict count with what they do to the
     platform.
@@ -95,11 +98,11 @@ def _verdict_on_platform(platform: PlatformAccuracy, focal_error: float) -> Verd
             f"; a distortion that the measurements contradict may add {1e3 * lens_effect:.3f} mm"
         )
     known_to = float(np.linalg.norm([sigma.mean_displacement, focal_effect, lens_effect]))
-    return _verdict(change.mean_displacement, known_to, found)
+    return change.mean_displacement, known_to, found
 
 
-def _verdict_on_parameters(dataset: Dataset, solution: Solution) -> Verdict:
-    """Compare the change of joints and lengths with their uncertainty."""
+def _change_of_parameters(dataset: Dataset, solution: Solution) -> tuple[float, float, str]:
+    """Return the change of joints and lengths, its uncertainty, rms [m], and a clause of both."""
     known = known_parameters(
         dataset.machine, dataset.measurements.views, boards=dataset.boards
     ).by_name
@@ -114,7 +117,7 @@ def _verdict_on_parameters(dataset: Dataset, solution: Solution) -> Verdict:
         f"{1e3 * sigma:.3f} mm (1 sigma, both rms); no platform error can be predicted, because "
         f"{dataset.machine.undetermined}"
     )
-    return _verdict(change, sigma, found)
+    return change, sigma, found
 
 
 def _verdict(improvement: float, sigma: float, found: str) -> Verdict:
