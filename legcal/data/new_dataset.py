@@ -64,6 +64,10 @@ class NewDataset:
         Where the unit was found, in words.
     are_lengths : bool
         Whether the table holds whole lengths of legs.
+    rows : tuple of Row
+        What each row of the table says of its photograph.
+    poses : tuple of str
+        The pose of each row; empty where the table does not name them.
     matching : Matching
         Pairs of row and photograph.
     views : tuple of str
