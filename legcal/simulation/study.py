@@ -128,7 +128,7 @@ def run_study(
         Folder for the checkpoint, the document and the figures. One that holds a checkpoint of
         the same study is continued; more runs than before are added to those that are there.
     progress : bool or callable
-        True shows a bar on stderr; a function is called with the number of runs that are done.
+        True shows a bar on stderr; a function is called as ``progress(stage, done, total)``.
 
     Returns
     -------
