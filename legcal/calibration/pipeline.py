@@ -261,7 +261,8 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         data = replace(data, plan=plan_dataset(data.dataset, ""))
         return _estimate(data, rows, options)
     except (NotVisible, NotIdentifiable, DidNotConverge, DatasetError) as error:
-        diagnosis, notes = diagnose(data), data.dataset.file_notes
+        is_told = isinstance(error, DatasetError) and data.machine.is_redundant  # by the readings
+        diagnosis, notes = () if is_told else diagnose(data), data.dataset.file_notes
         if not (diagnosis or notes):
             raise
         likeliest = [one.sentence for one in diagnosis]

@@ -201,7 +201,8 @@ def check(
         raise NotVisible([refusal, *found.image_notes])
     solution = found.in_file_order().solution
     tested = _compare(dataset, earlier, solution, prior, significance)
-    notes = (*dataset.notes, *found.image_notes, *found.fit_notes, *solution.notes)
+    wrong = (one.sentence for one in found.diagnosis)
+    notes = (*wrong, *dataset.notes, *found.image_notes, *found.fit_notes, *solution.notes)
     return replace(tested, notes=tuple(dict.fromkeys(notes)))
 
 

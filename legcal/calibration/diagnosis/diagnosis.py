@@ -19,7 +19,6 @@ from legcal.geometry import Array, IntArray
 from legcal.perception import (
     Agreement,
     Group,
-    Joined,
     Placement,
     Search,
     compare_assumptions,
@@ -30,6 +29,7 @@ from legcal.perception import (
 STAGE = "Trying common mistakes"
 
 _AGREE_ALREADY = 0.9  # of the images: then nothing common is wrong
+_MIN_IMAGES = 3  # of a view
 _N_GROUPS = 2  # of views, a few of whose images say which mistakes are worth a closer look
 _FINALISTS = 5  # that all images judge
 _NEAR_BEST = 0.7  # of the support of the best, which few images gave, that all images judge as well
@@ -75,7 +75,8 @@ class Diagnosis:
     def sentence(self) -> str:
         """The diagnosis for people."""
         others = "".join(f", or {other}" for other in self.same_as)
-        tell = "; look which leg is the first in a picture to tell these apart" * bool(self.same_as)
+        is_of_legs = self.kind.startswith("columns") and bool(self.same_as)
+        tell = "; look which leg is the first in a picture to tell these apart" * is_of_legs
         what = self.what[0].upper() + self.what[1:]
         return (
             f"{what}{others}: {self.mended} {self.after} of {self.images} images agree, as it is "
@@ -95,17 +96,21 @@ class Diagnosis:
         )
 
 
-def diagnose(data: OrderedDataset, joined: Joined = None) -> tuple[Diagnosis, ...]:
+def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     """Return what looks wrong with a session, the likeliest first; nothing where nothing does.
 
-    ``joined`` are T_board_camera of views that show a calibration board.
+    Views of one or two images say nothing: some camera pose fits them whatever is assumed.
     """
     machine, photographs = data.machine, data.photographs
     rows = _rows_with_image(data)
     if not (machine.is_determined and len(machine.motors) and len(rows)):
         return ()
     n_views = len(data.measurements.views)
-    groups = group_views(data.measurements, rows, [None] * n_views, joined)
+    every = group_views(data.measurements, rows, [None] * n_views, None)
+    groups = [group for group in every if len(group.rows) >= _MIN_IMAGES]
+    if not groups:
+        return ()
+    rows = np.sort(np.concatenate([group.rows for group in groups]))
     nowhere = np.full((data.measurements.n_rows, machine.n_legs, 3), np.nan)
     search = photographs.search(Placement(nowhere, nowhere, (None,) * n_views))
     search = replace(search, edge_pairs=pairs_of_images(search, rows.tolist(), data.pool))
