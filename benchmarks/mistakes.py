@@ -233,7 +233,9 @@ def main() -> None:
         for number in range(args.seeds):
             for model in args.models.split(","):
                 dataset = session(model, number, 1e-3 * args.wrong_joints, keep)
-                kinds = [args.only] if args.only else list(MISTAKES)
+                alike = len({leg.type for leg in dataset.machine.legs}) == 1
+                every = [name for name in MISTAKES if alike or name != "platform joints"]
+                kinds = [args.only] if args.only else every
                 kind = kinds[int(rng.integers(len(kinds)))]
                 found, sentence, spent = named(dataset, args.workers)
                 clean, accused = clean + 1, accused + bool(found)

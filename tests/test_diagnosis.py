@@ -7,11 +7,13 @@ from pathlib import Path
 import pytest
 from hexapod_example import Spoiled, spoiled
 
-from legcal import calibrate, load_dataset
+from legcal import SimulationSettings, calibrate, load_dataset, simulate
 from legcal.calibration.diagnosis.diagnosis import diagnose
+from legcal.calibration.diagnosis.mistakes import mistakes
 from legcal.calibration.ordered_dataset import order_dataset
 from legcal.errors import DatasetError, NotVisible
 from legcal.progress import no_progress
+from legcal.simulation import Level
 from legcal.workers import in_turn
 
 COLUMNS = [f"leg{k}_prismatic" for k in range(1, 7)]
@@ -60,6 +62,19 @@ def test_nothing_is_wrong_with_a_session_that_is_right(tmp_path: Path) -> None:
     session = spoiled(tmp_path / "set", 4, ("c1", "c2"))
     data = order_dataset(load_dataset(session.write()), in_turn, no_progress)
     assert diagnose(data) == ()
+
+
+@pytest.mark.parametrize("model", ["3-rpr", "3-upu-tilted", "tricept", "hexapod-strut"])
+def test_every_mistake_can_be_tried_on_every_kind_of_machine(model: str, tmp_path: Path) -> None:
+    """Legs of other types, constant and passive ones, a plane: joints are known or left out."""
+    settings = SimulationSettings(level=Level.OUTLINES, views=2, poses=3)
+    simulate(model, tmp_path / "set", settings)
+    data = order_dataset(load_dataset(tmp_path / "set"), in_turn, no_progress)
+    tried = mistakes(data)
+    assert {"columns exchanged", "readings shifted", "handedness"} <= {one.kind for one in tried}
+    for one in tried:
+        A, B = one.true.joints()
+        assert A.shape == B.shape == (6, data.machine.n_legs, 3)
 
 
 @pytest.mark.parametrize(
