@@ -31,6 +31,7 @@ from legcal.errors import DatasetError, DidNotConverge, ModelError, OutOfClass
 from legcal.files import result_folder
 from legcal.geometry import Array
 from legcal.machine import (
+    RESULT_YAML,
     Leg,
     Machine,
     calibrated_axis,
@@ -52,7 +53,7 @@ from legcal.vision import (
     intrinsic_values,
 )
 
-RESULT_NAME, MODEL_NAME, STAGED_NAME = "result.json", "calibrated.yaml", "staged.yaml"
+RESULT_NAME, STAGED_NAME = "result.json", "staged.yaml"
 RELOAD_TOLERANCE = 1e-11  # between reloaded and written parameters [m, rad]
 # The same of the four steps: of a leg that is fixed to the platform they do not say which point of
 # its axis is B, and loading takes another one.
@@ -80,7 +81,7 @@ def write_result(calibration: Calibration, destination: Path) -> Calibration:
     machine = dataset.machine
     stale = [OBSERVATIONS_NAME, CORNERS_NAME, STAGED_NAME, str(_urdf_of(Path(STAGED_NAME)))]
     with result_folder(destination, stale=map(Path, stale)) as folder:
-        _write_model(machine, solution.legs, folder / MODEL_NAME, RELOAD_TOLERANCE)
+        _write_model(machine, solution.legs, folder / RESULT_YAML, RELOAD_TOLERANCE)
         if steps.legs is not None:
             try:
                 _write_model(machine, steps.legs, folder / STAGED_NAME, STAGED_TOLERANCE)
@@ -180,12 +181,12 @@ def load_result(given: str | Path) -> EarlierResult:
     path = path if path.name == RESULT_NAME and not os.path.isdir(path) else path / RESULT_NAME
     document = Result.read(path)
     try:
-        machine = load_mechanism(path.parent / MODEL_NAME)
+        machine = load_mechanism(path.parent / RESULT_YAML)
     except (ModelError, OutOfClass) as error:
         raise DatasetError(error.problems) from error
     if sorted(document.legs) != sorted(machine.leg_names):
         found = f"the legs {', '.join(document.legs)} in {RESULT_NAME}"
-        needed = f"{', '.join(machine.leg_names)} as in {MODEL_NAME} beside it"
+        needed = f"{', '.join(machine.leg_names)} as in {RESULT_YAML} beside it"
         raise unreadable(path, found, needed)
     machine = machine.with_leg_order(document.legs)
     legs, known = geometries(machine), parametrization_of(machine, twists=True)
@@ -303,4 +304,4 @@ def _check_same_model(
                 other.append(f"the {side} axis of {leg}")
     if other:
         found_words = f"other values of {', '.join(other[:3])}" + " and more" * (len(other) > 3)
-        raise unreadable(path, found_words, f"those of {MODEL_NAME} beside it")
+        raise unreadable(path, found_words, f"those of {RESULT_YAML} beside it")

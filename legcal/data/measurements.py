@@ -19,11 +19,10 @@ from scipy.spatial.transform import RigidTransform
 from legcal.brief import brief
 from legcal.files import Column, Table, closest, describe, path_problem, place_in, read_table
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Leg, LegKind
+from legcal.machine import TRAVEL_MARGIN, Leg, LegKind
 from legcal.vision import Camera
 
 MAX_NAMED = 5  # views or other things, in one sentence
-TRAVEL_MARGIN = 0.05  # of the travel: a reading further outside is an error
 MAX_READING_SPREAD = 10.0  # sigma by which rows of one pose may differ
 _MAX_SHOWN = 3  # readings quoted in a sentence about many
 

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.data.measurements import TRAVEL_MARGIN, few, reading_columns
+from legcal.data.measurements import few, reading_columns
 from legcal.errors import DatasetError, UsageError
 from legcal.files import LENGTH, Column, Lines, Table, describe, split_heading
 from legcal.geometry import Array, BoolArray
-from legcal.machine import Leg
+from legcal.machine import TRAVEL_MARGIN, Leg
 
 LEAST_USED = 0.01  # of the travel: less is the use that is made of it in a larger unit
 GUESSED = ("m", "mm")  # units that are tried where none is stated

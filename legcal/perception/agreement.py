@@ -6,6 +6,7 @@ many legs they show there. Nothing is measured, so that many assumptions can be 
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -37,19 +38,12 @@ class Agreement:
 
 def pairs_of_images(search: Search, rows: Sequence[int], run: Run) -> dict[int, CandidatePairs]:
     """Return the edge pairs of images by row, which hold whatever is assumed."""
-    views = search.measurements.view[list(rows)].tolist()
-    found = run(_PairsOf(search), list(zip(rows, views, strict=True)))
-    return dict(zip(rows, found, strict=True))
+    return dict(zip(rows, run(partial(_pairs_of_image, search), rows), strict=True))
 
 
-@dataclass(frozen=True, eq=False)
-class _PairsOf:
-    """The search of an image, for any process."""
-
-    search: Search
-
-    def __call__(self, row_and_view: tuple[int, int]) -> CandidatePairs:
-        return self.search.pairs(*row_and_view)
+def _pairs_of_image(search: Search, row: int) -> CandidatePairs:
+    """Return the edge pairs of the image of a row."""
+    return search.pairs(row, int(search.measurements.view[row]))
 
 
 def as_if(pairs: CandidatePairs, corners: Array, flip: Array, focal: float) -> CandidatePairs:
@@ -131,9 +125,10 @@ def _agreement(task: _Task) -> Agreement:
 def _together(parts: Sequence[Agreement], groups: Sequence[Group], quick: bool) -> Agreement:
     """Return the agreement of all groups; images that were not compared agree with nothing."""
     row = np.concatenate([g.some if quick else g.rows for g in groups]).astype(np.intp)
-    share = np.zeros(len(row))
     of_row = {r: s for part in parts for r, s in zip(part.row.tolist(), part.share, strict=True)}
-    share[:] = [of_row.get(r, 0.0) for r in row.tolist()]
     return Agreement(
-        row, share, sum(part.support for part in parts), sum(part.expected for part in parts)
+        row,
+        np.array([of_row.get(r, 0.0) for r in row.tolist()]),
+        sum(part.support for part in parts),
+        sum(part.expected for part in parts),
     )

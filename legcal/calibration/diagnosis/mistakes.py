@@ -12,10 +12,9 @@ import numpy as np
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.data import inverse
 from legcal.geometry import Array
-from legcal.machine import Leg, LegKind, Machine, follow_poses, readings_at
+from legcal.machine import TRAVEL_MARGIN, Leg, LegKind, Machine, follow_poses, readings_at
 from legcal.perception import LEFT_RIGHT, UPSIDE_DOWN
 
-_TRAVEL_MARGIN = 0.05  # of the travel: readings further outside are not what was meant
 _STEP = 1.0 / 16.0  # of the way from home to readings, at least
 _MIRROR = np.diag([1.0, -1.0, 1.0])
 _FOCAL_LENGTHS = (2.0, 0.5, 1.5, 2.0 / 3.0, 1.25, 0.8)  # of scaled and cropped images
@@ -333,6 +332,6 @@ def _is_inside(leg: Leg, q: Array) -> bool:
     width = upper - lower
     if not (np.isfinite(width) and width > 0.0):
         return True
-    margin = _TRAVEL_MARGIN * width
+    margin = TRAVEL_MARGIN * width
     inside = (q >= lower - margin) & (q <= upper + margin)
     return bool(np.all(inside | np.isnan(q)))

@@ -24,12 +24,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.brief import brief
 from legcal.calibration.location.frames import PosePairs, tool_motions
-from legcal.calibration.result_folder import MODEL_NAME, RESULT_NAME, load_result
+from legcal.calibration.result_folder import RESULT_NAME, load_result
 from legcal.data import reading_columns, readings_in
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.files import QUATERNION_TOLERANCE, Column, Table, read_table
 from legcal.geometry import Array, BoolArray, IntArray, cross_matrices, whitener
 from legcal.machine import (
+    RESULT_YAML,
     Machine,
     forward_kinematics_many,
     freedoms,
@@ -395,7 +396,7 @@ def _motions_by_model(machine: Machine, poses: Sequence[RigidTransform]) -> Arra
     None where the model does not lie in the result folder of a calibration.
     """
     path = Path(machine.yaml_path)
-    if path.name != MODEL_NAME or not os.path.isfile(path.parent / RESULT_NAME):
+    if path.name != RESULT_YAML or not os.path.isfile(path.parent / RESULT_NAME):
         return None
     try:
         result = load_result(path.parent)
