@@ -31,6 +31,10 @@ NAMES = [f"images/{view}_{k}.jpg" for view in ("c1", "c2") for k in (1, 2)]
 PORTRAIT = (
     b"<rdf:li>com.google.android.apps.camera.gallery.specialtype.SpecialType-PORTRAIT</rdf:li>"
 )
+XIAOMI = (
+    b"<rdf:Description MiCamera:XMPMeta=\"&lt;?xml version='1.0'?&gt;&lt;%s=&quot;1&quot; /&gt;\"/>"
+)
+SAMSUNG = b"\0\0\xb1\x0a\x13\0\0\0%s" + bytes(99) + b"SEFHj\0\0\0SEFT"
 XMP = b'<rdf:Description crs:LensProfileEnable="%d" crs:HasCrop="%s"/>'
 
 
@@ -137,6 +141,10 @@ DIFFERENT: tuple[tuple[bytes, list[str]], ...] = (
     (phone(rendered=8), ["portrait mode", "take them again"]),
     (phone(rendered=6), ["panoramas"]),
     (jpeg(PICTURE, 95, exif(**PHONE), PORTRAIT), ["portrait mode"]),
+    (jpeg(PICTURE, 95, exif(**PHONE), XIAOMI % b"depthmap version"), ["portrait mode"]),
+    (phone() + SAMSUNG % b"DualShot_DepthMap_5", ["portrait mode"]),
+    (phone() + SAMSUNG % b"SingeShot_DepthMap_1", ["portrait mode"]),
+    (phone() + b"V\xe9\0\0edof\0" + bytes(99), ["portrait mode"]),  # Huawei
 )
 
 
@@ -170,6 +178,8 @@ def test_a_refusal_names_what_may_be_its_cause(folder: Folder) -> None:
         phone(focus=0.51),
         jpeg(PICTURE, 60, exif(**PHONE)),
         phone(make="ACME", model="Acme One"),
+        phone() + SAMSUNG % b"MotionPhoto_Data",
+        jpeg(PICTURE, 95, exif(**PHONE), XIAOMI % b"lenswatermark offset"),
     ],
 )
 def test_differences_that_move_no_edge_are_not_spoken_of(folder: Folder, content: bytes) -> None:

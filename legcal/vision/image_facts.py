@@ -2,6 +2,12 @@
 
 Read from the segments of a JPEG before its first scan, the chunks of a PNG, the first directory of
 a TIFF. Nothing here refuses a file: what is damaged or absent says nothing.
+
+Phones that blur the background of a portrait keep the depths that they blurred by. Sources, none of
+them of the makers: Samsung's blocks behind the image by the tables of ExifTool (``Samsung.pm``);
+Huawei's, which starts with ``edof``, by github.com/jpbarraca/dual-camera-edof (P9) and
+github.com/designer2k2/depth-map-extractor (P10 to P30, Mate 20); Xiaomi's element of XMP by what
+its camera programs write (``ArcsoftDepthMap``).
 """
 
 import math
@@ -36,7 +42,15 @@ _SCREENSHOT = re.compile(
 _SETTING = rb"crs:%s\s*(?:=\s*[\"']|>\s*)(True|False|[01])"  # of Adobe's raw converters, in XMP
 _PORTRAIT, _PANORAMA = "portrait mode, which draws outlines anew", "panoramas"
 _RENDERINGS = {6.0: _PANORAMA, 7.0: _PORTRAIT, 8.0: _PORTRAIT}  # Apple's, beside those of EXIF
-_MODES = {b"SpecialType-PORTRAIT": _PORTRAIT, b"GPano:ProjectionType": _PANORAMA}  # Google's, XMP
+_MODES = {  # by what stands in XMP
+    (b"SpecialType-PORTRAIT",): _PORTRAIT,  # Google's
+    (b"GPano:ProjectionType",): _PANORAMA,
+    (b"MiCamera:XMPMeta", b"&lt;depthmap "): _PORTRAIT,  # Xiaomi's
+}
+_DEPTHS = (  # behind a JPEG
+    b"DualShot_DepthMap_", b"SingeShot_DepthMap_",  # Samsung's, of two cameras and of one
+    b"\0edof\0",  # Huawei's
+)  # fmt: skip
 _MOST_SEGMENTS = 1000
 _MOST_TEXT = 60
 _MOST_BYTES = 262_144  # of a block that is searched
@@ -113,7 +127,8 @@ def read_facts(content: bytes) -> ImageFacts:
     """Return what the bytes of an image file say of how it was made."""
     if content.startswith(JPEG_SIGNATURE):
         quality, exif, xmp = _of_jpeg(content)
-        return _facts("JPEG", read_tags(exif, _TAGS), xmp, [], is_lossy=True, quality=quality)
+        tags, mode = read_tags(exif, _TAGS), _PORTRAIT if any(d in content for d in _DEPTHS) else ""
+        return _facts("JPEG", tags, xmp, [], is_lossy=True, quality=quality, mode=mode)
     if content.startswith(PNG_SIGNATURE):
         exif, xmp, texts = _of_png(content)
         return _facts("PNG", read_tags(exif, _TAGS), xmp, texts)
@@ -135,6 +150,7 @@ def _facts(
     *,
     is_lossy: bool = False,
     quality: int | None = None,
+    mode: str = "",
 ) -> ImageFacts:
     """Return the facts of a file from its tags and texts."""
     make, model = _text(tags, _MAKE), _text(tags, _MODEL)
@@ -162,8 +178,9 @@ def _facts(
         lens_corrected=_setting(xmp, b"LensProfileEnable"),
         cropped=_setting(xmp, b"HasCrop"),
         is_screenshot=any(_SCREENSHOT.search(text) for text in (software, comment, *texts)),
-        mode=next(
-            (mode for mark, mode in _MODES.items() if mark in xmp[:_MOST_BYTES]),
+        mode=mode
+        or next(
+            (said for words, said in _MODES.items() if all(w in xmp[:_MOST_BYTES] for w in words)),
             _RENDERINGS.get(_number(tags, _RENDERED) or 0.0, ""),
         ),
     )
