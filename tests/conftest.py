@@ -14,6 +14,9 @@ from legcal.machine import Machine, loader
 from legcal.machine.files import find_model
 from legcal.machine.spanning_tree import Source
 
+# Plugins that other packages bring into Hypothesis (trio's, with selenium) warn when they load.
+os.environ.setdefault("HYPOTHESIS_NO_PLUGINS", "1")
+
 LEFT = ("observations.csv", ".legcal-cache.json")  # beside a dataset, for the next run
 STAGES = "stages.txt"
 

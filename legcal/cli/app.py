@@ -17,6 +17,7 @@ import typer
 
 from legcal.cli.calibrate import calibrate
 from legcal.cli.commands import camera, detect, evaluate, identify, inspect, locate, new, noise
+from legcal.cli.example import example
 from legcal.cli.init import init
 from legcal.cli.options import INTERRUPTED, print_failure
 from legcal.cli.simulate import simulate
@@ -33,7 +34,6 @@ app = typer.Typer(
     name="legcal",
     help="Calibrate parallel robots from photographs of their legs.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
@@ -68,6 +68,7 @@ for command in (
     init,
     noise,
     simulate,
+    example,
 ):
     app.command()(command)
 app.add_typer(study, name="study")

@@ -20,6 +20,7 @@ from .dataset import OBSERVATIONS_NAME as OBSERVATIONS_NAME
 from .dataset import Dataset as Dataset
 from .dataset import ImageReader as ImageReader
 from .dataset import load_dataset as load_dataset
+from .example import copy_example as copy_example
 from .holdout import dataset_at as dataset_at
 from .holdout import split_images as split_images
 from .image_tables import Order as Order

@@ -24,7 +24,7 @@ from legcal.data.overrides import Override
 from legcal.data.photograph_notes import photograph_notes
 from legcal.errors import DatasetError
 from legcal.files import closest, describe, path_problem
-from legcal.machine import Machine, load_mechanism, shipped_folders, shipped_names
+from legcal.machine import Machine, load_mechanism, shipped_folder, shipped_names
 from legcal.vision import (
     Camera,
     FixedBoard,
@@ -225,7 +225,7 @@ def _mechanism_path(folder: Path, named: str) -> Path:
     """Return the model's path relative to the dataset if there is one, else a shipped one."""
     path = folder / named
     if not os.path.isfile(path) and named in shipped_names():
-        return shipped_folders()[0] / f"{named}.yaml"
+        return shipped_folder("models") / f"{named}.yaml"
     return path
 
 

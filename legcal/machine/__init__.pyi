@@ -30,7 +30,7 @@ from .equations import twist_residual as twist_residual
 from .family import description_of as description_of
 from .files import DATASET_YAML as DATASET_YAML
 from .files import RESULT_YAML as RESULT_YAML
-from .files import shipped_folders as shipped_folders
+from .files import shipped_folder as shipped_folder
 from .files import shipped_names as shipped_names
 from .home import TRAVEL_MARGIN as TRAVEL_MARGIN
 from .home import home_of_legs as home_of_legs

@@ -13,17 +13,15 @@ DATASET_YAML = "dataset.yaml"
 RESULT_YAML = "calibrated.yaml"  # of the model in a result folder
 
 
-def shipped_folders() -> tuple[Path, Path]:
-    """Return the folders of the shipped models and URDFs, in a wheel or in a checkout."""
-    for top in (_PACKAGE / "shipped", _PACKAGE.parent):
-        if (top / "models").is_dir() and (top / "urdf").is_dir():
-            return top / "models", top / "urdf"
-    return _PACKAGE / "shipped" / "models", _PACKAGE / "shipped" / "urdf"
+def shipped_folder(name: str) -> Path:
+    """Return a folder that comes with legcal, in a wheel or in a checkout."""
+    folders = [top / name for top in (_PACKAGE / "shipped", _PACKAGE.parent)]
+    return next((folder for folder in folders if folder.is_dir()), folders[0])
 
 
 def shipped_names() -> list[str]:
     """Return the names of the shipped models."""
-    return sorted(path.stem for path in shipped_folders()[0].glob("*.yaml"))
+    return sorted(path.stem for path in shipped_folder("models").glob("*.yaml"))
 
 
 def find_model(model: str | Path) -> Path:
@@ -53,7 +51,7 @@ def find_model(model: str | Path) -> Path:
             )
         return path
     if is_shipped:
-        return shipped_folders()[0] / f"{model}.yaml"
+        return shipped_folder("models") / f"{model}.yaml"
     raise ModelError(
         f"{path}: the mechanism could not be read: found no such file and no shipped model of that "
         f"name, needed a mechanism YAML, its URDF, or one of {', '.join(names)}; check the path."

@@ -1,0 +1,42 @@
+"""The dataset that comes with legcal: copied whole or not at all."""
+
+from pathlib import Path
+
+import pytest
+from command_line import run
+
+from legcal import load_dataset
+from legcal.data import example
+
+EXAMPLE = Path(__file__).parents[1] / "examples/hexapod"
+
+
+def test_the_example_is_copied_and_loads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "here" / "example"
+    assert run(monkeypatch, "example", "-o", str(copy)) == 0
+    assert "Next: legcal calibrate" in capsys.readouterr().out
+    copied = {path.relative_to(copy) for path in copy.rglob("*") if path.is_file()}
+    own = {path.relative_to(EXAMPLE) for path in EXAMPLE.rglob("*") if path.is_file()}
+    assert own - copied <= {Path("observations.csv"), Path(".legcal-cache.json")}
+    assert copied <= own
+    assert len(load_dataset(copy).measurements.image) == 45
+
+
+def test_a_folder_with_files_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    assert run(monkeypatch, "example", "-o", str(tmp_path)) == 2
+    assert "found a folder with files" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_an_installation_without_the_example_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(example, "EXAMPLE", "examples/none")
+    assert run(monkeypatch, "example", "-o", str(tmp_path / "copy")) == 1
+    assert "install it again" in capsys.readouterr().err
+    assert not (tmp_path / "copy").exists()
