@@ -19,6 +19,7 @@ from .machine import inverse_kinematics as inverse_kinematics
 from .machine import load_mechanism as load_mechanism
 from .machine import random_configurations as random_configurations
 from .machine import singularity as singularity
+from .report import write_report as write_report
 from .simulation import Appearance as Appearance
 from .simulation import ParameterErrors as ParameterErrors
 from .simulation import SimulationSettings as SimulationSettings

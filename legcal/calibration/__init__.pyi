@@ -3,6 +3,7 @@ from .camera_calibration.document import CameraCalibration as CameraCalibration
 from .change_detection import Explanation as Explanation
 from .detection import DETECTION_PAGE as DETECTION_PAGE
 from .detection import Detection as Detection
+from .documents import ParameterRow as ParameterRow
 from .documents import Result as Result
 from .evaluation import Evaluation as Evaluation
 from .evaluation import evaluate as evaluate
@@ -47,7 +48,9 @@ from .measurement_noise.repeatability import QUANTITIES as QUANTITIES
 from .measurement_noise.repeatability import PooledSpread as PooledSpread
 from .outline_detection import detect as detect
 from .pipeline import calibrate as calibrate
+from .residuals import OutlineResiduals as OutlineResiduals
 from .result import Calibration as Calibration
+from .result_folder import REPORT_NAME as REPORT_NAME
 from .result_folder import load_result as load_result
 from .summary import UNITS as UNITS
 from .summary import sentences as sentences

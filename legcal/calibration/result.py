@@ -46,6 +46,7 @@ from legcal.calibration.joint_fit import (
     poses_at_readings,
 )
 from legcal.calibration.plots import plot_residuals
+from legcal.calibration.residuals import OutlineResiduals, outline_residuals
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data import Corners, Dataset
 from legcal.files import motion_to_xyz_quat
@@ -114,6 +115,12 @@ class Calibration(Summarised):
     def result(self) -> Result:
         """The document of ``result.json``."""
         return _result_of(self)
+
+    @cached_property
+    def residuals(self) -> OutlineResiduals:
+        """How far each outline is from the fit; empty where axes were given."""
+        solution = self.solution
+        return outline_residuals(solution.posterior, self.dataset, solution.outlines)
 
     def plot_residuals(self) -> Figure:
         """Return a figure of how far outlines are from the fit, over the field of each view."""

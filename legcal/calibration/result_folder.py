@@ -54,6 +54,7 @@ from legcal.vision import (
 )
 
 RESULT_NAME, STAGED_NAME = "result.json", "staged.yaml"
+REPORT_NAME = "report.html"  # written beside a result, which an earlier one does not describe
 RELOAD_TOLERANCE = 1e-11  # between reloaded and written parameters [m, rad]
 # The same of the four steps: of a leg that is fixed to the platform they do not say which point of
 # its axis is B, and loading takes another one.
@@ -79,7 +80,8 @@ def write_result(calibration: Calibration, destination: Path) -> Calibration:
     """
     dataset, solution, steps = calibration.dataset, calibration.solution, calibration.steps
     machine = dataset.machine
-    stale = [OBSERVATIONS_NAME, CORNERS_NAME, STAGED_NAME, str(_urdf_of(Path(STAGED_NAME)))]
+    names = OBSERVATIONS_NAME, CORNERS_NAME, STAGED_NAME, REPORT_NAME
+    stale = [*names, str(_urdf_of(Path(STAGED_NAME)))]
     with result_folder(destination, stale=map(Path, stale)) as folder:
         _write_model(machine, solution.legs, folder / RESULT_YAML, RELOAD_TOLERANCE)
         if steps.legs is not None:

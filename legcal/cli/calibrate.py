@@ -7,7 +7,14 @@ from typing import Annotated
 
 import typer
 
-from legcal.cli.options import DatasetArgument, JsonOption, image_workers, loading, show
+from legcal.cli.options import (
+    DatasetArgument,
+    JsonOption,
+    command_line,
+    image_workers,
+    loading,
+    show,
+)
 from legcal.errors import UsageError
 from legcal.paper import Criteria, Transformation
 
@@ -79,6 +86,12 @@ def calibrate(
             rich_help_panel=_TESTS,
         ),
     ] = None,
+    with_report: Annotated[
+        bool,
+        typer.Option(
+            "--report/--no-report", help="Write OUT/report.html, a page for the browser, or not."
+        ),
+    ] = True,
     significance: Annotated[
         float | None,
         typer.Option(
@@ -135,6 +148,8 @@ def calibrate(
         free=free or (),
         holdout=holdout,
     )
+    if with_report:
+        report.write_report(found, output, command_line())
     show(
         as_json,
         lambda: found.result.document(),

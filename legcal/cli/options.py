@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import json
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -56,6 +57,11 @@ WorkersOption = Annotated[
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+
+
+def command_line() -> str:
+    """Return the command as it was given, for the record."""
+    return shlex.join(["legcal", *sys.argv[1:]])
 
 
 def image_workers(workers: int | None = None) -> int:

@@ -12,6 +12,7 @@ from .machine_picture import draw_machine as draw_machine
 from .new_dataset import matching_table as matching_table
 from .new_dataset import written_lines as written_lines
 from .noise import noise_table as noise_table
+from .page.writing import write_report as write_report
 from .render import report as report
 from .render import table as table
 from .study import study_table as study_table

@@ -1,0 +1,44 @@
+"""How far each outline is from the fit, in the order of the files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from legcal.brief import brief
+from legcal.calibration.joint_fit import Posterior
+from legcal.data import Dataset, Outlines, canonical_order
+from legcal.geometry import Array, IntArray
+
+
+@brief
+@dataclass(frozen=True, eq=False)
+class OutlineResiduals:
+    """Residuals of the outlines that entered the fit, those that it rejected too."""
+
+    index: IntArray  # (n,) rows of the table of outlines
+    # (n, 2) distance of each end from the predicted outline, common-mode edge biases removed [px]
+    offset: Array
+    whitened: Array  # (n, 2) the same, uncorrelated and over its standard deviation
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+def outline_residuals(
+    posterior: Posterior, dataset: Dataset, outlines: Outlines
+) -> OutlineResiduals:
+    """Return the residuals of a fit whose *outlines* are those of its *dataset*, in file order."""
+    problem = posterior.problem
+    offset = problem.offsets(posterior.state)
+    covariance = posterior.noise.covariance(problem.outlines.covariance)
+    L = np.linalg.cholesky(covariance) if len(offset) else covariance
+    whitened = np.linalg.solve(L, offset[..., None])[..., 0]
+    # The fit numbers outlines as they stand in canonical order.
+    order = canonical_order(dataset.measurements, dataset.machine.leg_names)
+    numbered = replace(outlines, contrast=np.arange(len(outlines), dtype=np.float64))
+    number = order.reorder(numbered).contrast.astype(np.intp)
+    index = number[problem.outlines.index]
+    back = np.argsort(index, kind="stable")
+    return OutlineResiduals(index[back], offset[back], whitened[back])

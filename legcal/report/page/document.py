@@ -1,0 +1,186 @@
+"""What a page consists of: sections of blocks, with texts as they are and nothing of HTML.
+
+The template has one macro for each class of blocks and escapes every text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
+
+from markupsafe import Markup, escape
+
+from legcal.errors import printable
+
+MAX_ROWS = 2000  # of a table
+Light = Literal["good", "doubtful", "bad"]
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number of a table."""
+
+    value: float | None  # in the unit of the column; None shows nothing
+    text: str
+
+
+@dataclass(frozen=True)
+class Link:
+    """A text that leads to a place in the page or to a file beside it."""
+
+    text: str
+    to: str
+
+
+Cell = str | Number | Link
+
+
+@dataclass(frozen=True)
+class Text:
+    """Paragraphs."""
+
+    kind: ClassVar = "text"
+    paragraphs: Sequence[str]
+    dim: bool = False
+
+
+@dataclass(frozen=True)
+class Items:
+    """A list."""
+
+    kind: ClassVar = "items"
+    items: Sequence[str]
+    ordered: bool = False
+    title: str = ""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Names and values, a line each."""
+
+    kind: ClassVar = "facts"
+    facts: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table that sorts by any column; the first :data:`MAX_ROWS` rows are shown."""
+
+    kind: ClassVar = "table"
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    title: str = ""
+    note: str = ""
+    first: str = "first"  # which rows are shown of too many: "worst"
+    folded: bool = False
+
+    @property
+    def shown(self) -> Sequence[Sequence[Cell]]:
+        """The rows that are shown."""
+        return self.rows[:MAX_ROWS]
+
+    @property
+    def left_out(self) -> str:
+        """What is said where rows are left out."""
+        n = len(self.rows)
+        return f"The {self.first} {MAX_ROWS} of {n} rows are shown." if n > MAX_ROWS else ""
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A drawing (SVG)."""
+
+    kind: ClassVar = "drawing"
+    svg: Markup
+    caption: str = ""
+    wide: bool = True
+
+
+@dataclass(frozen=True)
+class Row:
+    """Blocks side by side where there is room."""
+
+    kind: ClassVar = "row"
+    blocks: Sequence[Any]
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A chart or a scene of plotly, drawn when it comes into sight.
+
+    A scene may have ``modes``, see ``page.js``: what its sliders move.
+    """
+
+    kind: ClassVar = "plot"
+    name: str
+    data: Sequence[Mapping[str, Any]]
+    layout: Mapping[str, Any]
+    height: int
+    caption: str = ""
+    extra: Mapping[str, Any] = field(default_factory=dict)
+    title: str = ""
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A piece of an image with lines over it."""
+
+    name: str  # its anchor
+    picture: str  # as a data URL
+    width: int  # [px] of the image
+    height: int
+    lines: Sequence[tuple[str, str]]  # class, and points "x,y x,y"
+    caption: str
+    detail: str
+    link: str = ""
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """Pieces of images; one that is chosen is enlarged."""
+
+    kind: ClassVar = "gallery"
+    crops: Sequence[Crop]
+    title: str = ""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section."""
+
+    name: str  # its anchor
+    title: str
+    blocks: Sequence[Any]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a result is worth."""
+
+    light: Light
+    word: str
+    sentence: str
+    reasons: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page."""
+
+    title: str
+    subtitle: str
+    verdict: Verdict | None
+    sections: Sequence[Section]
+
+
+def plain(text: str) -> str:
+    """Return a text for plotly, which would take tags in it for its own."""
+    return str(escape(printable(text)))
+
+
+def number(value: float | None, digits: int, *, signed: bool = False) -> Number:
+    """Return a number with some digits behind the point."""
+    if value is None:
+        return Number(None, "")
+    return Number(float(value), f"{value:{'+' if signed else ''}z.{digits}f}")

@@ -1,0 +1,63 @@
+"""A page as one HTML file: template, style sheet, script and, where it has plots, plotly inside."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from legcal.errors import printable
+from legcal.report.page.document import Page, Plot, Row
+from legcal.version import __version__
+
+MARK = "legcal-page"  # the name by which a page of legcal is known
+
+
+def page_html(page: Page) -> str:
+    """Return a page as HTML."""
+    blocks = [block for section in page.sections for block in section.blocks]
+    blocks += [inner for block in blocks if isinstance(block, Row) for inner in block.blocks]
+    return (
+        _environment()
+        .get_template("page.html")
+        .render(
+            page=page,
+            mark=MARK,
+            version=__version__,
+            style=_asset("page.css"),
+            script=_asset("page.js"),
+            plotly=_plotly() if any(isinstance(block, Plot) for block in blocks) else "",
+        )
+    )
+
+
+@cache
+def _environment() -> Environment:
+    return Environment(
+        loader=PackageLoader("legcal.report.page", "assets"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_shown,
+    )
+
+
+def _shown(value: Any) -> Any:
+    """Return what is written of a value: texts without control characters."""
+    if isinstance(value, str) and not isinstance(value, Markup):
+        return printable(value)
+    return value
+
+
+@cache
+def _asset(name: str) -> Markup:
+    return Markup((files("legcal.report.page") / "assets" / name).read_text("utf-8"))
+
+
+def _plotly() -> Markup:
+    """Return the script of plotly; its package has no smaller bundle."""
+    return Markup((files("plotly") / "package_data" / "plotly.min.js").read_text("utf-8"))

@@ -1,0 +1,252 @@
+"""Drawings that need no script: bars with error bars, histograms, grids of numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from markupsafe import Markup, escape
+
+from legcal.errors import printable
+from legcal.geometry import Array
+
+INK, DIM, RULE, BLUE, GREY = "#1d2126", "#667080", "#dfe3e8", "#1f5fa8", "#8b929c"
+_FONT = 'font-family="system-ui, sans-serif"'
+
+
+@dataclass
+class Canvas:
+    """An SVG under work, all texts escaped."""
+
+    width: float
+    height: float
+    title: str
+    parts: list[str] = field(default_factory=list)
+
+    def line(
+        self, x1: float, y1: float, x2: float, y2: float, colour: str = RULE, width: float = 1.0
+    ) -> None:
+        """Draw a line."""
+        self.parts.append(
+            f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="{colour}" '
+            f'stroke-width="{width:g}"/>'
+        )
+
+    def box(
+        self, x: float, y: float, width: float, height: float, colour: str, tip: str = ""
+    ) -> None:
+        """Draw a filled rectangle, with a text that shows where the pointer rests."""
+        inside = f"<title>{escape(printable(tip))}</title>" if tip else ""
+        self.parts.append(
+            f'<rect x="{x:.1f}" y="{y:.1f}" width="{max(width, 0.0):.1f}" height="{height:.1f}" '
+            f'fill="{colour}">{inside}</rect>'
+        )
+
+    def text(
+        self,
+        x: float,
+        y: float,
+        text: str,
+        *,
+        anchor: str = "start",
+        size: float = 12,
+        colour: str = INK,
+    ) -> None:
+        """Write a text."""
+        self.parts.append(
+            f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-size="{size:g}" '
+            f'fill="{colour}">{escape(printable(text))}</text>'
+        )
+
+    def markup(self) -> Markup:
+        """Return the drawing."""
+        label = escape(printable(self.title))
+        return Markup(
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width:g} {self.height:g}" '
+            f'width="{self.width:g}" height="{self.height:g}" role="img" aria-label="{label}" '
+            f"{_FONT}>" + "".join(self.parts) + "</svg>"
+        )
+
+
+def ticks(low: float, high: float, n: int = 5) -> list[float]:
+    """Return round numbers from *low* to *high*, about *n*."""
+    if not high > low:
+        return [low]
+    raw = (high - low) / n
+    power = 10.0 ** np.floor(np.log10(raw))
+    step = power * next(s for s in (1.0, 2.0, 2.5, 5.0, 10.0) if s * power >= raw * (1 - 1e-9))
+    first = np.ceil(low / step - 1e-9)
+    last = np.floor(high / step + 1e-9)
+    return [float(k * step) + 0.0 for k in np.arange(first, last + 1)]
+
+
+def change_bars(
+    names: Sequence[str],
+    values: Sequence[float],
+    sigmas: Sequence[float | None],
+    unit: str,
+    marks: Sequence[float | None] = (),
+    marks_title: str = "",
+) -> Markup:
+    """Return bars of changes to the right and left, with error bars of two standard deviations.
+
+    *marks* are drawn as diamonds, as true values are.
+    """
+    left, width, step, top = 190.0, 900.0, 17.0, 30.0
+    reach = [abs(v) + 2.0 * (s or 0.0) for v, s in zip(values, sigmas, strict=True)]
+    reach += [abs(m) for m in marks if m is not None]
+    most = max([*reach, 1e-12]) * 1.04
+    height = top + step * len(names) + 30.0
+    canvas = Canvas(width, height, f"Changes of parameters [{unit}]")
+    scale = 0.5 * (width - left - 20.0) / most
+    zero = left + scale * most
+
+    for tick in ticks(-most, most, 8):
+        x = zero + scale * tick
+        canvas.line(x, top, x, height - 26.0, GREY if tick == 0 else RULE)
+        canvas.text(x, height - 10.0, f"{tick:g}", anchor="middle", size=11, colour=DIM)
+    canvas.text(left, 16.0, f"change against the nominal model [{unit}]", size=12, colour=DIM)
+    truth = marks or [None] * len(names)
+    for k, (name, value, sigma, mark) in enumerate(zip(names, values, sigmas, truth, strict=True)):
+        y = top + step * (k + 0.5)
+        shown = name if len(name) < 28 else f"{name[:25]}..."
+        canvas.text(left - 12.0, y + 4.0, shown, anchor="end", size=11.5)
+        spread = "" if sigma is None else f" +- {sigma:.3g} {unit} (1 sigma)"
+        tip = f"{name}: {value:+.4g} {unit}{spread}"
+        canvas.box(zero + scale * min(value, 0.0), y - 4.5, scale * abs(value), 9.0, "#9dbbe0", tip)
+        if sigma is not None:
+            a, b = (zero + scale * (value + f * sigma) for f in (-2.0, 2.0))
+            canvas.line(a, y, b, y, INK, 1.3)
+            for x in (a, b):
+                canvas.line(x, y - 3.0, x, y + 3.0, INK, 1.3)
+        if mark is not None:
+            x = zero + scale * mark
+            canvas.parts.append(
+                f'<path d="M{x:.1f} {y - 5:.1f}l5 5l-5 5l-5-5z" fill="none" stroke="#b3261e" '
+                f'stroke-width="1.4"><title>{escape(marks_title)} {mark:+.4g}</title></path>'
+            )
+    return canvas.markup()
+
+
+def histogram(values: Array, label: str, n: int = 14, mark: float | None = None) -> Markup:
+    """Return how many values lie where; a line marks one."""
+    left, width, height, top, bottom = 34.0, 440.0, 210.0, 14.0, 40.0
+    canvas = Canvas(width, height, label)
+    low, high = float(values.min()), float(values.max())
+    low, high = (0.0, high * 1.05) if low < 0.4 * high else (low, high)
+    if not high > low:
+        low, high = low - 0.5 * (abs(low) or 1.0), high + 0.5 * (abs(high) or 1.0)
+    counts, edges = np.histogram(values, bins=min(n, max(4, len(values) // 2)), range=(low, high))
+    most = max(int(counts.max()), 1)
+    sx, sy = (width - left - 12.0) / (high - low), (height - top - bottom) / most
+    base = height - bottom
+    for tick in ticks(0.0, most, 4):
+        if tick == int(tick):
+            y = base - sy * tick
+            canvas.line(left, y, width - 12.0, y)
+            canvas.text(left - 6.0, y + 4.0, f"{tick:g}", anchor="end", size=11, colour=DIM)
+    for count, a, b in zip(counts.tolist(), edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        tip = f"{count} from {a:.3g} to {b:.3g}"
+        canvas.box(
+            left + sx * (a - low) + 1.0,
+            base - sy * count,
+            sx * (b - a) - 2.0,
+            sy * count,
+            BLUE,
+            tip,
+        )
+    for tick in ticks(low, high, 5):
+        x = left + sx * (tick - low)
+        canvas.text(x, base + 15.0, f"{tick:g}", anchor="middle", size=11, colour=DIM)
+    if mark is not None:
+        x = left + sx * (mark - low)
+        canvas.line(x, top, x, base, INK, 1.3)
+    canvas.text(left, height - 6.0, label, size=12, colour=DIM)
+    return canvas.markup()
+
+
+def shade(share: float) -> str:
+    """Return a colour from nearly white to deep blue, darker for more."""
+    low, high = np.array([244, 247, 251.0]), np.array([38, 92, 158.0])
+    r, g, b = np.rint(low + (high - low) * float(np.clip(share, 0.0, 1.0))).astype(int).tolist()
+    return f"#{r:02x}{g:02x}{b:02x}"
+
+
+def number_grid(
+    x: Sequence[float], y: Sequence[float], values: Array, title: str, most: float, digits: int
+) -> Markup:
+    """Return a map of numbers over x (columns) and y (rows, upwards); NaN leaves a field empty.
+
+    Each field has its number, darker for more: it can be read without colours.
+    """
+    left, top, size = 44.0, 24.0, 37.0
+    width, height = left + size * len(x) + 8.0, top + size * len(y) + 34.0
+    canvas = Canvas(width, height, title)
+    canvas.text(left, 15.0, title, size=12.5)
+    for row, at in enumerate(y):
+        v = top + size * (len(y) - 1 - row)
+        canvas.text(
+            left - 6.0, v + 0.5 * size + 4.0, f"{at:.0f}", anchor="end", size=10.5, colour=DIM
+        )
+        for column in range(len(x)):
+            u, value = left + size * column, float(values[row, column])
+            if not np.isfinite(value):
+                canvas.box(u, v, size - 1.0, size - 1.0, "#fbfbfc")
+                continue
+            share = value / most if most else 0.0
+            canvas.box(u, v, size - 1.0, size - 1.0, shade(0.9 * share))
+            colour = "#ffffff" if share > 0.62 else INK
+            canvas.text(
+                u + 0.5 * size - 0.5, v + 0.5 * size + 4.0, f"{value:.{digits}f}",
+                anchor="middle", size=11, colour=colour,
+            )  # fmt: skip
+    base = top + size * len(y)
+    for column, at in enumerate(x):
+        canvas.text(
+            left + size * (column + 0.5), base + 13.0, f"{at:.0f}", anchor="middle", size=10.5,
+            colour=DIM,
+        )  # fmt: skip
+    canvas.text(left, base + 28.0, "x to the right, y up [mm]", size=11, colour=DIM)
+    return canvas.markup()
+
+
+def matrix(names: Sequence[str], values: Array, title: str) -> Markup:
+    """Return a symmetric matrix of numbers from -1 to 1: the area of a square is its size.
+
+    Positive ones are filled, negative ones are outlines.
+    """
+    n = len(names)
+    size = float(np.clip(700.0 / max(n, 1), 5.0, 22.0))
+    left = top = 130.0 if size > 8.0 else 20.0
+    canvas = Canvas(left + size * n + 10.0, top + size * n + 10.0, title)
+    if size > 8.0:
+        for k, name in enumerate(names):
+            at = left + size * (k + 0.5)
+            shown = name if len(name) < 20 else f"{name[:17]}..."
+            canvas.text(left - 6.0, at + 3.5, shown, anchor="end", size=min(11.0, 0.8 * size))
+            canvas.parts.append(
+                f'<text transform="translate({at + 3.5:.1f} {top - 6:.1f}) rotate(-90)" '
+                f'font-size="{min(11.0, 0.8 * size):g}" fill="{INK}">'
+                f"{escape(printable(shown))}</text>"
+            )
+    canvas.parts.append(
+        f'<rect x="{left}" y="{top}" width="{size * n:.1f}" height="{size * n:.1f}" fill="none" '
+        f'stroke="{RULE}"/>'
+    )
+    for i in range(n):
+        for j in range(n):
+            value = float(values[i, j])
+            side = (size - 1.5) * np.sqrt(min(abs(value), 1.0))
+            if i == j or side < 0.12 * size:
+                continue
+            x, y = left + size * (j + 0.5) - 0.5 * side, top + size * (i + 0.5) - 0.5 * side
+            tip = escape(printable(f"{names[i]}, {names[j]}: {value:+.2f}"))
+            look = (
+                f'fill="{BLUE}"' if value > 0 else 'fill="none" stroke="#b3261e" stroke-width="1.2"'
+            )
+            canvas.parts.append(
+                f'<rect x="{x:.1f}" y="{y:.1f}" width="{side:.1f}" height="{side:.1f}" {look}>'
+                f"<title>{tip}</title></rect>"
+            )
+    return canvas.markup()

@@ -1,0 +1,102 @@
+"""What a calibration is worth at a glance, why, and what to do next."""
+
+from __future__ import annotations
+
+import shlex
+
+import numpy as np
+
+from legcal.calibration import Calibration
+from legcal.report.page.document import Light, Verdict
+
+_WORDS: dict[Light, str] = {
+    "good": "Use it",
+    "doubtful": "Use it with care",
+    "bad": "Do not load it into the controller",
+}
+_MOST_OFF = 2.0  # times what was expected of held-out images
+
+
+def verdict_of(calibration: Calibration) -> Verdict:
+    """Return the verdict: green, amber where something speaks against parts of it, or red."""
+    doubts = _doubts(calibration)
+    light: Light = "bad"
+    if calibration.verdict.trustworthy:
+        light = "doubtful" if doubts else "good"
+    return Verdict(
+        light, _WORDS[light], calibration.verdict.sentence, [*_grounds(calibration), *doubts]
+    )
+
+
+def _grounds(calibration: Calibration) -> list[str]:
+    """Return what the verdict rests on."""
+    result, found = calibration.result, []
+    platform, seen = result.platform, result.observations
+    if platform is not None:
+        ratio = platform.change_dX_m / platform.sigma_dX_m if platform.sigma_dX_m else np.inf
+        found.append(
+            f"The change of the platform is {ratio:.1f} times its standard deviation; above 2 a "
+            "calibration counts as an improvement."
+        )
+    if seen is not None:
+        found.append(f"{seen.used} of {seen.total} {seen.kind} in {seen.images} images were used.")
+    quality = result.residuals
+    if quality.rms_px is not None:
+        found.append(f"Outlines lie {quality.rms_px:.3f} px (rms) from the fit.")
+    held_out = result.holdout
+    if held_out is not None and held_out.rms_px is not None and held_out.expected_px is not None:
+        found.append(
+            f"Images that were kept aside lie {held_out.rms_px:.3f} px off; "
+            f"{held_out.expected_px:.3f} px were expected."
+        )
+    return found
+
+
+def _doubts(calibration: Calibration) -> list[str]:
+    """Return what speaks against parts of a result."""
+    result, found = calibration.result, []
+    for view in calibration.solution.contradicted_cameras:
+        found.append(f"The outlines contradict the camera of view {view}.")
+    found += [f"{one.what} The remedy: {one.remedy}" for one in result.diagnosis or ()]
+    held_out = result.holdout
+    if held_out is not None and (held_out.rms_px or 0.0) > _MOST_OFF * (held_out.expected_px or 0):
+        found.append("Images that were kept aside are predicted worse than expected.")
+    return found
+
+
+def next_steps(calibration: Calibration, folder: str) -> list[str]:
+    """Return what to do next, the first thing first."""
+    result, steps = calibration.result, list[str]()
+    dataset, out = shlex.quote(str(calibration.dataset.folder)), shlex.quote(folder)
+    for one in result.diagnosis or ():
+        steps.append(f"{one.remedy} Then calibrate again.")
+    if calibration.verdict.trustworthy:
+        steps.append(
+            "Load calibrated.urdf, or the numbers of the table below, into the controller, and "
+            "move to a few poses whose place you can measure."
+        )
+        if result.holdout is None and calibration.dataset.machine.is_determined:
+            steps.append(
+                "See how well it predicts images that it has not seen: legcal calibrate "
+                f"{dataset} -o {out} --holdout 0.2."
+            )
+        steps.append(
+            "Where the base stands in the cell and the tool on the platform is not seen in "
+            f"photographs of legs: legcal locate {out}/calibrated.yaml POSES -o located.yaml."
+        )
+        steps.append(
+            "In some months, or after a collision, photograph a few poses and ask whether anything "
+            f"moved: legcal calibrate NEW --check {out}."
+        )
+    elif not result.diagnosis:
+        weak = f" What is known worst: {result.weakest[0].direction}." if result.weakest else ""
+        steps.append(f"Take more images, at poses further apart and from other places.{weak}")
+        steps.append(
+            "Look at the worst outlines below: blur, reflections and wrong edges show there."
+        )
+    if any("taken as exact" in note for note in result.notes):
+        steps.append(
+            "Calibrate the camera with legcal camera: its file then states how well it is known, "
+            "which belongs into the uncertainty of the result."
+        )
+    return steps

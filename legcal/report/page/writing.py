@@ -1,0 +1,63 @@
+"""Pages written as files: complete or not at all, and never over a file of somebody else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from legcal.calibration import REPORT_NAME
+from legcal.files import OutputFile
+from legcal.report.page.html import MARK, page_html
+
+if TYPE_CHECKING:
+    from legcal.calibration import Calibration
+
+_HEAD = 1000  # bytes at the beginning of a page, in which it says what it is
+
+
+@dataclass(frozen=True)
+class _Page(OutputFile):
+    """A page that says which program wrote it."""
+
+    def _is_own(self, path: Path) -> bool:
+        try:
+            with path.open("rb") as file:
+                return MARK.encode() in file.read(_HEAD)
+        except OSError:
+            return False
+
+
+PAGE = _Page("the report", "report", "", "a new file or an earlier report")
+
+
+def write_report(calibration: Calibration, folder: Path, command: str = "") -> Path:
+    """Write ``report.html`` into the result folder of a calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        What :func:`legcal.calibrate` returned.
+    folder : path
+        Its result folder.
+    command : str
+        The command that made it, for the record.
+
+    Returns
+    -------
+    path
+        The page.
+
+    Raises
+    ------
+    UsageError
+        If another file has that name.
+    OutOfResources
+        If it cannot be written.
+    """
+    from legcal.report.page.calibration_page import calibration_page
+
+    path = Path(folder) / REPORT_NAME
+    PAGE.check_place(path)
+    PAGE.write(path, page_html(calibration_page(calibration, Path(folder), command)))
+    return path

@@ -1,0 +1,130 @@
+"""The page of a calibration: one file, complete, with the numbers of the result, and harmless."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import run
+from hexapod_example import Run
+from lxml import html
+
+import legcal
+from legcal.errors import UsageError
+from legcal.report.page.calibration_page import calibration_page
+from legcal.report.page.html import page_html
+from legcal.vision import outlines_of_axis
+
+SECTIONS = ("next", "parameters", "residuals", "notes")
+HOSTILE = "<script>alert(1)</script><b>\x1b[31m\u202e"
+
+
+@pytest.fixture(scope="module")
+def page(example_run: Run) -> html.HtmlElement:
+    path = legcal.write_report(example_run.calibration, example_run.output)
+    return html.fromstring(path.read_text("utf-8"))
+
+
+def test_a_page_is_one_file_that_loads_nothing(page: html.HtmlElement) -> None:
+    assert page.xpath("//link | //iframe | //object | //embed | //@srcset | //script/@src") == []
+    loaded = page.xpath("//img/@src | //image/@href")
+    assert all(one.startswith("data:") for one in loaded)
+    assert "@import" not in page.xpath("string(//style)")
+    assert "url(" not in page.xpath("string(//style)")
+
+
+def test_a_page_has_its_sections_in_order(page: html.HtmlElement) -> None:
+    found = page.xpath("//main/section/@id")
+    assert [name for name in found if name in SECTIONS] == list(SECTIONS)
+    assert found[0] == "verdict"
+    assert page.xpath("//nav//a/@href") == [f"#{name}" for name in found[1:]]
+
+
+def test_a_page_has_the_numbers_of_the_result(example_run: Run, page: html.HtmlElement) -> None:
+    result = json.loads((example_run.output / "result.json").read_text())
+    assert result["verdict"] in page.xpath("string(//section[@id='verdict'])")
+    rows = page.xpath("(//section[@id='parameters']//table)[1]/tbody/tr")
+    scale = {"m": 1e3, "rad": 180.0 / 3.141592653589793, "px": 1.0, "": 1.0}
+    assert len(rows) == len(result["parameters"])
+    for row, one in zip(rows, result["parameters"], strict=True):
+        name, *numbers = (cell.get("data-value", cell.text_content()) for cell in row)
+        wanted = [one["nominal"], one["value"], one["value"] - one["nominal"], one["sigma"]]
+        assert name == one["name"]
+        for text, value in zip(numbers, wanted, strict=False):
+            found = float(text) if text else None
+            expected = None if value is None else scale[one["unit"]] * value
+            assert found == pytest.approx(expected, rel=1e-12, abs=1e-12)
+
+
+def test_points_of_the_plots_are_the_residuals_of_the_fit(
+    example_run: Run, page: html.HtmlElement
+) -> None:
+    found = json.loads(page.xpath("string(//script[@data-plot='residuals-leg'])"))
+    y = [value for trace in found["data"] for value in trace["y"]]
+    rms = (sum(value**2 for value in y) / len(y)) ** 0.5
+    assert rms == pytest.approx(example_run.calibration.result.residuals.rms_px, rel=1e-3)
+    assert len(y) == 2 * len(example_run.calibration.residuals)
+
+
+def test_residuals_belong_to_their_outlines(example_run: Run) -> None:
+    # By what the fit predicts of each outline, made from the result in the order of the files.
+    calibration = example_run.calibration
+    solution, residuals = calibration.solution, calibration.residuals
+    o, m = solution.outlines, calibration.dataset.measurements
+    for k in range(0, len(residuals), 37):
+        i = int(residuals.index[k])
+        row, leg = int(o.row[i]), solution.legs[int(o.leg[i])]
+        v, pose = int(m.view[row]), int(m.pose[row])
+        T = solution.T_camera_Rb[v]
+        A, B = T.apply(leg.A), (T * solution.T_Rb_Re[pose]).apply(leg.B)
+        radius = solution.radii[int(o.leg[i]), o.part[i]]
+        u = (B - A) / np.linalg.norm(B - A)
+        h = outlines_of_axis(u, A, radius)[int(o.edge[i]) - 1]
+        ends = solution.cameras[v].undistort(o.ends[i])
+        off = solution.cameras[v].line_offset(h[None], ends)
+        # but for the edge biases that outlines share, which the residuals are without
+        assert np.abs(np.abs(off) - np.abs(residuals.offset[k])).max() < 0.08
+
+
+def test_hostile_names_are_harmless(example_run: Run, tmp_path: Path) -> None:
+    calibration = example_run.calibration
+    machine = replace(calibration.dataset.machine, name=HOSTILE)
+    legs = tuple(replace(leg, name=f"{HOSTILE}{leg.name}") for leg in machine.legs)
+    machine = replace(machine, legs=legs)
+    changed = replace(
+        calibration,
+        dataset=replace(calibration.dataset, machine=machine),
+        notes=(*calibration.notes, HOSTILE),
+    )
+    changed.__dict__["result"] = calibration.result
+    text = page_html(calibration_page(changed, tmp_path / HOSTILE.replace("/", "")))
+    assert "<script>alert" not in text
+    assert "\x1b" not in text
+    assert "\u202e" not in text
+    found = html.fromstring(text)
+    assert "<script>alert(1)</script>" in found.xpath("string(//h1)")
+    for script in found.xpath("//script[@data-plot]"):
+        assert not re.search(r"<[b/s]", script.text.replace("<br>", "").replace("<extra>", ""))
+
+
+def test_a_report_is_not_written_over_another_file(example_run: Run, tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text("mine")
+    with pytest.raises(UsageError, match=r"report\.html"):
+        legcal.write_report(example_run.calibration, tmp_path)
+    assert (tmp_path / "report.html").read_text() == "mine"
+    (tmp_path / "report.html").write_bytes((example_run.output / "report.html").read_bytes())
+    assert legcal.write_report(example_run.calibration, tmp_path).exists()
+
+
+def test_calibrate_writes_the_report_unless_it_should_not(
+    example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    monkeypatch.setattr("legcal.calibration.calibrate", lambda *_, **__: example_run.calibration)
+    out.mkdir()
+    assert run(monkeypatch, "calibrate", example_run.folder, "-o", out, "--no-report") == 0
+    assert not (out / "report.html").exists()
+    assert run(monkeypatch, "calibrate", example_run.folder, "-o", out) == 0
+    assert "legcal-page" in (out / "report.html").read_text("utf-8")[:1000]
