@@ -59,9 +59,7 @@ def test_a_page_has_the_numbers_of_the_result(example_run: Run, page: Any) -> No
             assert found == pytest.approx(expected, rel=1e-12, abs=1e-12)
 
 
-def test_points_of_the_plots_are_the_residuals_of_the_fit(
-    example_run: Run, page: Any
-) -> None:
+def test_points_of_the_plots_are_the_residuals_of_the_fit(example_run: Run, page: Any) -> None:
     found = json.loads(page.xpath("string(//script[@data-plot='residuals-leg'])"))
     y = [value for trace in found["data"] for value in trace["y"]]
     rms = (sum(value**2 for value in y) / len(y)) ** 0.5
