@@ -57,7 +57,7 @@ ADDED = re.compile(  # to documents and folders since they were recorded
     r"\.(document|result\.json)(\.observations|\.stages\.staged\.from_fit"
     r"|\.board\.(corners|used|images|off)|\.left_out|\.unreached|\.motor_rank"
     r"|\.platform_board|\.base_frame|\.home|\.legs\[\d+\]\.(travel|q_home))$"
-    r"|/truth\.json\.settings\.platform_board$|\.files\.staged\.(urdf|yaml)$"
+    r"|/truth\.json\.settings\.platform_board$|\.files\.(staged\.(urdf|yaml)|report\.html)$"
 )
 OF_UNKNOWNS = {"parameters", "covariance", "kinematic", "held", "base_axes", "platform_axes"}
 
