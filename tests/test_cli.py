@@ -1,6 +1,7 @@
 """The command line: exit codes, one sentence a problem, one JSON document."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -60,7 +61,9 @@ def test_calibrate_prints_the_table_and_the_verdict(
 ) -> None:
     assert run(monkeypatch, "calibrate", example_run.folder, "-o", tmp_path / "out") == 0
     captured = capsys.readouterr()
-    assert "leg4.platform.z" in captured.out
+    assert "Joints of the platform in the link platform [mm]" in captured.out
+    assert re.search(r"leg1 +x( +-168.8750){2} +[+]0.0000 +0.0000 +defines R_e", captured.out)
+    assert "leg4.offset" in captured.out
     assert "four steps alone" in captured.out
     assert "Calibrated:" in captured.out
     assert "Joint fit" in captured.err

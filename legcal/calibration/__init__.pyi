@@ -29,6 +29,9 @@ from .joint_fit.variables import Start as Start
 from .joint_fit.variables import cameras_from_hints as cameras_from_hints
 from .joint_fit.variables import platform_poses as platform_poses
 from .joint_fit.variables import start_from as start_from
+from .link_joints import FRAMES as FRAMES
+from .link_joints import joints_in_links as joints_in_links
+from .link_joints import mark_in_words as mark_in_words
 from .location.document import LOCATION_FILE as LOCATION_FILE
 from .location.document import Location as Location
 from .location.document import load_location as load_location
@@ -52,8 +55,11 @@ from .residuals import OutlineResiduals as OutlineResiduals
 from .result import Calibration as Calibration
 from .result_folder import REPORT_NAME as REPORT_NAME
 from .result_folder import load_result as load_result
+from .summary import NUMBERS as NUMBERS
 from .summary import UNITS as UNITS
+from .summary import ParameterTable as ParameterTable
 from .summary import sentences as sentences
+from .summary import tables as tables
 from .verification import SIGNIFICANCE as SIGNIFICANCE
 from .verification import Check as Check
 from .verification import check as check

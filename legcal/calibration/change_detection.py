@@ -21,7 +21,9 @@ from legcal.geometry import Array, frame_on_points, normal_basis, whitener
 from legcal.machine import (
     Leg,
     LegKind,
+    Machine,
     Parametrization,
+    geometries,
     twist_after,
     vector_of,
     with_platform_points,
@@ -35,8 +37,9 @@ class Change:
     """One thing that may have changed."""
 
     what: str  # in words: offset of leg1, base joint of leg2, leg3
-    components: tuple[str, ...]  # its numbers: leg1.offset or x, y, z of R_b or R_e
+    components: tuple[str, ...]  # its numbers: leg1.offset or x, y, z
     units: tuple[str, ...]  # m or rad
+    links: tuple[str, ...]  # in whose axes x, y, z are; empty for what is no coordinate
     columns: Array  # (p, m) derivative of all parameters by them
 
 
@@ -161,16 +164,17 @@ def _p_value(statistic: float, dof: int, noise_dof: int) -> float:
 
 
 def possible_changes(
-    names: Sequence[str],
-    legs: Sequence[Leg],
-    frame_legs: Sequence[int],
-    parametrization: Parametrization,
+    machine: Machine, parametrization: Parametrization
 ) -> tuple[tuple[Change, ...], ...]:
-    """Return what may have changed: single lengths first, then joints, then whole legs."""
+    """Return what may have changed: single lengths first, then joints, then whole legs.
+
+    Joints move along the axes of the links of base and platform.
+    """
+    legs, frame_legs = geometries(machine), machine.frame_legs
     single, of_joints, of_legs = list[Change](), list[Change](), list[Change]()
-    for j, (name, leg) in enumerate(zip(names, legs, strict=True)):
+    for j, (name, leg) in enumerate(zip(machine.leg_names, legs, strict=True)):
         of_leg = list[Change]()
-        for what, components, unit, moved in _of_leg(name, leg):
+        for what, components, unit, link, moved in _of_leg(machine, name, leg):
             derivatives = []
             for k in range(len(components)):
                 ends = [
@@ -188,7 +192,8 @@ def possible_changes(
             found = np.any(np.abs(columns) > _STEP, axis=0)
             if found.any():
                 kept = tuple(c for c, is_found in zip(components, found, strict=True) if is_found)
-                of_leg.append(Change(what, kept, (unit,) * len(kept), columns[:, found]))
+                n = len(kept)
+                of_leg.append(Change(what, kept, (unit,) * n, (link,) * n, columns[:, found]))
         single += [change for change in of_leg if len(change.components) == 1]
         of_joints += [change for change in of_leg if len(change.components) > 1]
         if len(of_leg) > 1:
@@ -199,10 +204,15 @@ def possible_changes(
 _Moved = Callable[[int, float], Leg]  # a leg, one number of which has moved by a step
 
 
-def _of_leg(name: str, leg: Leg) -> list[tuple[str, tuple[str, ...], str, _Moved]]:
-    """Return what may change at one leg: in words, its numbers, their unit, and how."""
-    found: list[tuple[str, tuple[str, ...], str, _Moved]] = []
-    eye, xyz = np.eye(3), ("x", "y", "z")
+def _of_leg(
+    machine: Machine, name: str, leg: Leg
+) -> list[tuple[str, tuple[str, ...], str, str, _Moved]]:
+    """Return what may change at one leg: in words, its numbers, their unit, link, and how."""
+    found: list[tuple[str, tuple[str, ...], str, str, _Moved]] = []
+    xyz = ("x", "y", "z")
+    # Rows are the axes of the links in R_b and R_e.
+    base = machine.T_base_Rb.rotation.as_matrix()
+    platform = machine.T_platform_Re.rotation.as_matrix()
     if leg.kind is not LegKind.PASSIVE:
         what = "length" if leg.kind is LegKind.CONSTANT else "offset"
         found.append(
@@ -210,12 +220,20 @@ def _of_leg(name: str, leg: Leg) -> list[tuple[str, tuple[str, ...], str, _Moved
                 f"{what} of {name}",
                 (f"{name}.{what}",),
                 "m",
+                "",
                 lambda _, step: replace(leg, q0=leg.q0 + step),
             )
         )
+
+    def base_moved(k: int, step: float) -> Leg:
+        return replace(leg, A=leg.A + step * base[k])
+
+    def platform_moved(k: int, step: float) -> Leg:
+        return replace(leg, B=leg.B + step * platform[k])
+
     found += [
-        (f"base joint of {name}", xyz, "m", lambda k, s: replace(leg, A=leg.A + s * eye[k])),
-        (f"platform joint of {name}", xyz, "m", lambda k, s: replace(leg, B=leg.B + s * eye[k])),
+        (f"base joint of {name}", xyz, "m", machine.base, base_moved),
+        (f"platform joint of {name}", xyz, "m", machine.platform, platform_moved),
     ]
     a, b = leg.base_axis, leg.platform_axis
     if a is not None:
@@ -223,14 +241,14 @@ def _of_leg(name: str, leg: Leg) -> list[tuple[str, tuple[str, ...], str, _Moved
         def base_turned(k: int, step: float) -> Leg:
             return replace(leg, base_axis=_about(a, k, step).apply(a))
 
-        found.append((f"base axis of {name}", ("1", "2"), "rad", base_turned))
+        found.append((f"base axis of {name}", ("1", "2"), "rad", "", base_turned))
     if b is not None:
 
         def platform_turned(k: int, step: float) -> Leg:
             turn = _about(b, k, step)
             return replace(leg, platform_axis=turn.apply(b), twist=twist_after(leg, turn))
 
-        found.append((f"platform axis of {name}", ("1", "2"), "rad", platform_turned))
+        found.append((f"platform axis of {name}", ("1", "2"), "rad", "", platform_turned))
     return found
 
 
@@ -272,5 +290,6 @@ def _together(name: str, changes: Sequence[Change]) -> Change:
             for component in change.components
         ),
         tuple(unit for change in changes for unit in change.units),
+        tuple(link for change in changes for link in change.links),
         np.concatenate([change.columns for change in changes], axis=1),
     )

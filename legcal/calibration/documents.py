@@ -29,6 +29,7 @@ from legcal.files import (
     refuse_too_large,
     validate,
 )
+from legcal.vision import Link
 
 Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
 AxesByLeg = dict[str, Triple]  # unit vectors
@@ -82,6 +83,57 @@ class Kinematic(Document):
     held: Matrix  # how they change along each held direction, by a metre
 
 
+FrameMark = Literal["origin", "x axis", "xy plane"]  # what of R_b or R_e a joint defines
+# frame: zero by the definition of R_b or R_e; weak: part of a direction that is held
+CoordinateStatus = Literal["estimated", "fixed", "weak", "frame"]
+
+
+class JointInLink(Document):
+    """The centre of a joint in a link of the model [m]."""
+
+    leg: str
+    xyz: Triple  # calibrated
+    nominal: Triple
+    sigma: Annotated[list[NotNegative | None], Field(min_length=3, max_length=3)]  # as status says
+    covariance: Matrix  # (3, 3), zero along what is fixed or defines the frame
+    status: Annotated[list[CoordinateStatus], Field(min_length=3, max_length=3)]  # of x, y, z
+    defines: FrameMark | None  # a joint on which the frame is built
+
+
+class LinkBlock(Document):
+    """The joints on base or platform, in the link."""
+
+    link: str
+    T_link_frame: Pose  # where R_b or R_e is in it
+    joints: list[JointInLink]
+
+
+class Distance(Document):
+    """How far two frames are from each other; over poses, means."""
+
+    dX_m: NotNegative
+    dE_rad: NotNegative
+
+
+class ComparedJoint(Document):
+    """The centre of a joint in two models, in the link of the first [m]."""
+
+    leg: str
+    xyz: Triple
+    reference: Triple  # its R_b or R_e laid on that of the model
+    difference: Triple
+    defined: list[bool]  # coordinates x, y, z that agree by the definition of the frame
+    defines: FrameMark | None
+
+
+class ComparedLink(Document):
+    """The joints of two models on base or platform, R_b or R_e of the reference on the model's."""
+
+    link: str  # of the model
+    frames_apart: Distance  # of the frames, each in the link of its own model
+    joints: list[ComparedJoint]
+
+
 class WeakCombination(Document):
     """A combination of parameters that is known badly."""
 
@@ -103,13 +155,6 @@ class Gamma(Document):
     views: list[str]
     gamma: Number
     sigma: Number
-
-
-class Distance(Document):
-    """How far two frames are from each other; over poses, means."""
-
-    dX_m: NotNegative
-    dE_rad: NotNegative
 
 
 class Staged(Legs):
@@ -287,6 +332,7 @@ class Result(Legs, Heading):
     parameters: Annotated[list[ParameterRow], Field(min_length=1)]
     covariance: Matrix  # of the estimated parameters, in their order
     kinematic: Kinematic
+    links: dict[Link, LinkBlock] | None = None  # left out by earlier versions
     weakest: list[WeakCombination]
     held: list[str]
     views: dict[str, ViewPose]
@@ -306,7 +352,7 @@ class Result(Legs, Heading):
     @model_serializer(mode="wrap")
     def _without_absent_blocks(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         found: dict[str, Any] = handler(self)
-        optional = ("observations", "board", "platform_board", "holdout", "diagnosis")
+        optional = ("links", "observations", "board", "platform_board", "holdout", "diagnosis")
         absent = [key for key in optional if found[key] is None]
         return {key: value for key, value in found.items() if key not in absent}
 
@@ -345,6 +391,7 @@ class ExplanationBlock(Document):
     what: str
     components: list[str]
     units: list[str]
+    links: list[str]  # in which x, y, z are; empty for what is no coordinate
     values: list[float]
     sigma: list[float]
     remaining: float
@@ -408,3 +455,4 @@ class EvaluationDocument(Document):
     left_out: int  # poses that are not, since one of the models does not reach them
     unreached: list[UnreachedRow]  # the rows of these
     parameters: list[ComparedParameter]
+    links: dict[Link, ComparedLink]

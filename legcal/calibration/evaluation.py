@@ -14,7 +14,13 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.calibration.documents import ComparedParameter, EvaluationDocument, UnreachedRow
+from legcal.calibration.documents import (
+    ComparedLink,
+    ComparedParameter,
+    EvaluationDocument,
+    UnreachedRow,
+)
+from legcal.calibration.link_joints import compared_joints
 from legcal.data import Dataset, few, load_dataset
 from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry import Array
@@ -32,6 +38,7 @@ from legcal.machine import (
     random_poses,
     vector_of,
 )
+from legcal.vision import Link
 
 WHO: tuple[Literal["model", "reference"], ...] = ("model", "reference")
 MAX_DRAWS = 20  # of poses in place of those that the reference does not reach
@@ -54,6 +61,9 @@ class Evaluation:
     values, references : (n_parameters,) array
         The parameters of the model and of the reference. Axes are turns of the reference's axis,
         so that the reference has zero there.
+    links : dict
+        By ``base`` and ``platform`` the joint centres in the links of the model, R_b and R_e of the
+        reference laid on its own [m], and how far the frames are apart without that.
     n_left_out : int
         Poses of the dataset that are not compared, since one of the models does not reach them.
     unreached : tuple of UnreachedRow
@@ -66,6 +76,7 @@ class Evaluation:
     units: tuple[str, ...]
     values: Array
     references: Array
+    links: dict[Link, ComparedLink]
     n_left_out: int = 0
     unreached: tuple[UnreachedRow, ...] = ()
 
@@ -84,6 +95,7 @@ class Evaluation:
                 ComparedParameter(name=name, value=v, reference=r, difference=v - r)
                 for name, v, r in numbers
             ],
+            links=self.links,
         ).document()
 
 
@@ -156,6 +168,7 @@ def evaluate(
         parametrization.units,
         vector_of(parametrization, geometries(machine), origin),
         vector_of(parametrization, origin, origin),
+        compared_joints(machine, truth),
         n_left_out,
         unreached,
     )

@@ -45,6 +45,7 @@ from legcal.calibration.joint_fit import (
     known_parameters,
     poses_at_readings,
 )
+from legcal.calibration.link_joints import joints_in_links
 from legcal.calibration.plots import plot_residuals
 from legcal.calibration.residuals import OutlineResiduals, outline_residuals
 from legcal.calibration.summary import Summarised, few_lines
@@ -142,6 +143,12 @@ def _result_of(calibration: Calibration) -> Result:
         rows = np.concatenate([rows, corners.row[corners.used]])
     shown = np.unique(measurements.view[rows]).tolist()
     T_base_Rb = machine.T_base_Rb
+    parameters = _parameters(calibration)
+    kinematic = Kinematic(
+        names=list(solution.parametrization.names),
+        covariance=solution.value_covariance.tolist(),
+        held=solution.held_basis.tolist(),
+    )
     on_base, on_platform = (_board(calibration, link) for link in LINKS)
     return Result(
         legcal_result=1,
@@ -151,13 +158,10 @@ def _result_of(calibration: Calibration) -> Result:
         legs=list(names),
         **_legs(names, solution.legs),
         nominal_axes=nominal_axes(names, geometries(machine)),
-        parameters=_parameters(calibration),
+        parameters=parameters,
         covariance=solution.covariance.tolist(),
-        kinematic=Kinematic(
-            names=list(solution.parametrization.names),
-            covariance=solution.value_covariance.tolist(),
-            held=solution.held_basis.tolist(),
-        ),
+        kinematic=kinematic,
+        links=joints_in_links(machine, parameters, kinematic),
         weakest=[
             WeakCombination(
                 direction=describe_direction([name for name, _ in weak.parts], names),

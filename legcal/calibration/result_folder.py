@@ -24,6 +24,7 @@ from legcal.calibration.joint_fit import (
     KINDS,
     KnownIntrinsics,
 )
+from legcal.calibration.link_joints import joints_in_links
 from legcal.calibration.result import Calibration
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data import CORNERS_NAME, OBSERVATIONS_NAME, write_corners, write_observations
@@ -204,6 +205,9 @@ def load_result(given: str | Path) -> EarlierResult:
     fixed = {row.name for row in document.parameters if row.status == "fixed"}
     kept = [i for i, name in enumerate(known.names) if name not in fixed]
     turns = turns_between(known, legs, nominal_legs)
+    if document.links is None:
+        links = joints_in_links(machine, document.parameters, document.kinematic)
+        document = document.model_copy(update={"links": links})
     return EarlierResult(
         folder=path.parent,
         document=document,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +17,10 @@ from legcal.calibration.documents import (
     Result,
     WorkspaceAccuracy,
 )
+from legcal.calibration.link_joints import FRAMES, mark_in_words
 from legcal.calibration.plots import plot_uncertainty
 from legcal.errors import OutOfResources
-from legcal.vision import Link
+from legcal.vision import LINKS, Link
 
 if TYPE_CHECKING:
     import pandas
@@ -45,10 +46,12 @@ class ParameterTable:
     digits: tuple[int, ...]  # of the numbers of each row
 
     @classmethod
-    def of(cls, result: Result) -> ParameterTable:
-        """Return the table of a result."""
+    def of(cls, result: Result, *, joints: bool = True) -> ParameterTable:
+        """Return the table of a result, joint centres in R_b and R_e or left out."""
         rows, digits = [], []
         for row in result.parameters:
+            if not joints and row.name.endswith(_COORDINATES):
+                continue
             scale, unit, n = UNITS[row.unit]
             value, nominal = scale * row.value, scale * row.nominal
             sigma = None if row.sigma is None else scale * row.sigma
@@ -56,6 +59,41 @@ class ParameterTable:
             digits.append(n)
         columns = ("parameter", "nominal", "calibrated", "change", "sigma", "unit", "status")
         return cls(columns, tuple(rows), tuple(digits))
+
+    @classmethod
+    def of_joints(cls, result: Result, *links: Link) -> ParameterTable:
+        """Return the joint centres in the links of the model, beside R_b and R_e."""
+        rows = []
+        for side in links or LINKS:
+            block = (result.links or {}).get(side)
+            in_frame = result.base_joints if side == "base" else result.platform_joints
+            for joint, own in zip([] if block is None else block.joints, in_frame, strict=False):
+                for k, axis in enumerate("xyz"):
+                    value, nominal, sigma = joint.xyz[k], joint.nominal[k], joint.sigma[k]
+                    rows.append(
+                        (
+                            joint.leg,
+                            side,
+                            axis,
+                            "" if block is None else block.link,
+                            *(1e3 * x for x in (nominal, value, value - nominal)),
+                            None if sigma is None else 1e3 * sigma,
+                            "mm",
+                            1e3 * own[k],
+                            mark_in_words(side, joint.status[k], joint.defines),
+                        )
+                    )
+        columns = ("leg", "joint", "axis", "link", *_CALIBRATED, "unit", "in_frame", "status")
+        return cls(columns, tuple(rows), (UNITS["m"][2],) * len(rows))
+
+    def without(self, *columns: str) -> ParameterTable:
+        """Return the table without some columns."""
+        kept = [k for k, name in enumerate(self.columns) if name not in columns]
+        return ParameterTable(
+            tuple(self.columns[k] for k in kept),
+            tuple(tuple(row[k] for k in kept) for row in self.rows),
+            self.digits,
+        )
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -92,7 +130,7 @@ class ParameterTable:
         width = [max(len(row[k]) for row in cells) for k in range(len(self.columns))]
         return "\n".join(
             "  ".join(
-                text.rjust(w) if name in _NUMBERS else text.ljust(w)
+                text.rjust(w) if name in NUMBERS else text.ljust(w)
                 for name, text, w in zip(self.columns, row, width, strict=True)
             ).rstrip()
             for row in cells
@@ -103,7 +141,7 @@ class ParameterTable:
         body = "".join(
             "<tr>"
             + "".join(
-                f'<td style="text-align:{"right" if name in _NUMBERS else "left"}">'
+                f'<td style="text-align:{"right" if name in NUMBERS else "left"}">'
                 f"{escape(text)}</td>"
                 for name, text in zip(self.columns, row, strict=True)
             )
@@ -113,7 +151,9 @@ class ParameterTable:
         return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
-_NUMBERS = {"nominal", "calibrated", "change", "sigma"}
+_CALIBRATED = ("nominal", "calibrated", "change", "sigma")
+NUMBERS = {*_CALIBRATED, "in_frame", *(f"in {frame}" for frame in FRAMES.values())}
+_COORDINATES = tuple(f".{side}.{axis}" for side in LINKS for axis in "xyz")
 
 
 def _cell(column: str, x: Any, digits: int) -> str:
@@ -122,9 +162,29 @@ def _cell(column: str, x: Any, digits: int) -> str:
         return "" if x == "estimated" else str(x)
     if x is None:
         return ""
-    if column not in _NUMBERS:
+    if column not in NUMBERS:
         return str(x)
     return f"{x:{'+' if column == 'change' else ''}{'' if column == 'sigma' else 'z'}.{digits}f}"
+
+
+def tables(result: Result) -> list[tuple[str, ParameterTable]]:
+    """Return what a result says of its parameters, each table with its title.
+
+    Joints in the links of base and platform, then all that is no coordinate of a joint.
+    """
+    if result.links is None:  # of an earlier version
+        return [("Parameters", ParameterTable.of(result))]
+    found = []
+    for side, block in result.links.items():
+        joints = ParameterTable.of_joints(result, side).without("joint", "link", "unit")
+        columns = tuple(f"in {FRAMES[side]}" if c == "in_frame" else c for c in joints.columns)
+        found.append(
+            (
+                f"Joints of the {side} in the link {block.link} [mm]",
+                replace(joints, columns=columns),
+            )
+        )
+    return [*found, ("Other parameters", ParameterTable.of(result, joints=False))]
 
 
 def sentences(result: Result) -> list[str]:
@@ -143,8 +203,8 @@ def sentences(result: Result) -> list[str]:
 
 def summary(result: Result) -> str:
     """Return the table of parameters, what it means, and the verdict as one text."""
-    table = repr(ParameterTable.of(result))
-    return "\n\n".join([table, "\n".join(sentences(result)), result.verdict])
+    shown = [f"{title}\n{table!r}" for title, table in tables(result)]
+    return "\n\n".join([*shown, "\n".join(sentences(result)), result.verdict])
 
 
 def summary_html(result: Result) -> str:
@@ -153,8 +213,10 @@ def summary_html(result: Result) -> str:
     lines = "".join(f"<li>{escape(line)}</li>" for line in sentences(result))
     return (
         f'<p style="color:{colour}"><b>{escape(result.verdict)}</b></p><ul>{lines}</ul>'
-        f"<details><summary>{len(result.parameters)} parameters</summary>"
-        f"{ParameterTable.of(result)._repr_html_()}</details>"
+        + "".join(
+            f"<details><summary>{escape(title)}</summary>{table._repr_html_()}</details>"
+            for title, table in tables(result)
+        )
     )
 
 
@@ -171,7 +233,7 @@ def few_lines(name: str, result: Result) -> str:
             f"{name}: legs {', '.join(result.legs)}" if len(result.legs) < 13 else name,
             f"  {result.verdict}",
             f"  {', '.join(found)}",
-            "  more: .summary(), .table(), .plot_uncertainty(), .result",
+            "  more: .summary(), .table(), .joints(), .plot_uncertainty(), .result",
         ]
     )
 
@@ -191,6 +253,14 @@ class Summarised:
     def table(self) -> ParameterTable:
         """Return the parameters [mm, deg, px]: value, nominal value, change and sigma."""
         return ParameterTable.of(self.result)
+
+    def joints(self) -> ParameterTable:
+        """Return joint centres [mm] in the links of base and platform, as ``calibrated.urdf``.
+
+        Beside each stands the coordinate in R_b or R_e. What the definition of the frame fixes has
+        no sigma, and its status says so.
+        """
+        return ParameterTable.of_joints(self.result)
 
     def plot_uncertainty(self) -> Figure:
         """Return a figure of the standard deviations of parameters, and of the platform."""

@@ -123,6 +123,7 @@ class Check:
                     what=found.change.what,
                     components=list(found.change.components),
                     units=list(found.change.units),
+                    links=list(found.change.links),
                     values=found.values.tolist(),
                     sigma=found.sigma.tolist(),
                     remaining=found.remaining,
@@ -300,9 +301,7 @@ def _compare(
     if variance_factor == 1.0:
         dof = noise_dof(solution.dof, covariance, prior.sigma)
     legs = geometries(machine)
-    changes = possible_changes(
-        machine.leg_names, legs, machine.frame_legs, _only(parametrization, columns)
-    )
+    changes = possible_changes(machine, _only(parametrization, columns))
     movement = judge_movement(found, dof, changes, significance)
     poses = Frames.of(solution.T_Rb_Re)
     J = pose_sensitivity(legs, parametrization, machine.frame_legs, *poses)[:, :, columns]

@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
-from legcal.calibration import UNITS, sentences
+from legcal.calibration import FRAMES, NUMBERS, UNITS, mark_in_words, sentences, tables
 from legcal.report.render import report, table
 
 if TYPE_CHECKING:
@@ -20,17 +20,24 @@ if TYPE_CHECKING:
         Explanation,
     )
 
+_SAME_M, _SAME_RAD = 1e-9, 1e-9  # [m, rad]: frames that are closer are in the same place
 _EXPLANATIONS = 3  # that are named beside the best
 
 
 def summary(calibration: Calibration, output: Path) -> RenderableType:
-    """Return the table of parameters in mm, degrees and pixels, and what it means."""
-    parameters = calibration.table()
-    columns = ("parameter", ">nominal", ">calibrated", ">change", ">sigma", "unit", "status")
+    """Return tables of parameters in mm, degrees and pixels, and what they mean."""
+    shown = [
+        table(
+            *(f">{name}" if name in NUMBERS else name for name in found.columns),
+            rows=found.cells(),
+            title=title,
+        )
+        for title, found in tables(calibration.result)
+    ]
     lines = [*sentences(calibration.result), f"Written to {output}."]
     good = calibration.verdict.trustworthy
     verdict = Text(calibration.verdict.sentence, style="bold green" if good else "bold red")
-    return report(table(*columns, rows=parameters.cells()), [*lines, verdict])
+    return report(*shown, [*lines, verdict])
 
 
 def check_summary(check: Check) -> RenderableType:
@@ -61,10 +68,13 @@ def check_summary(check: Check) -> RenderableType:
 def _amount(explanation: Explanation) -> str:
     """Return by how much something changed, in words."""
     change, parts = explanation.change, []
+    named = zip(change.components, change.units, change.links, strict=True)
     numbers = zip(explanation.values.tolist(), explanation.sigma.tolist(), strict=True)
-    for name, unit, (value, sigma) in zip(change.components, change.units, numbers, strict=True):
-        scale, shown, _ = UNITS[unit]
-        parts.append(f"{name} {scale * value:+.3f} {shown} (1 sigma {scale * sigma:.3f})")
+    for (name, unit, link), (value, sigma) in zip(named, numbers, strict=True):
+        scale, shown, digits = UNITS[unit]
+        amount = f"{scale * value:+.{digits}f} {shown}"
+        moved = f"{amount} in {name} of {link}" if link else f"{name} {amount}"
+        parts.append(f"{moved} (1 sigma {scale * sigma:.{digits}f})")
     return ", ".join(parts)
 
 
@@ -88,8 +98,38 @@ def accuracy_table(evaluation: Evaluation) -> RenderableType:
     return report(
         headline,
         *_left_out(evaluation),
-        table(*columns, rows=rows, title=f"Parameters [mm{angles}]"),
+        *_joint_tables(evaluation),
+        table(*columns, rows=rows, title=f"Parameters, joints in R_b and R_e [mm{angles}]"),
     )
+
+
+def _joint_tables(evaluation: Evaluation) -> list[RenderableType]:
+    """Return the joints of two models in the links of the first, and where the frames differ."""
+    found: list[RenderableType] = []
+    for side, block in evaluation.links.items():
+        rows = [
+            (
+                joint.leg if k == 0 else "",
+                axis,
+                *(f"{1e3 * x:.4f}" for x in (joint.xyz[k], joint.reference[k])),
+                f"{1e3 * joint.difference[k]:+.4f}",
+                mark_in_words(side, "frame" if joint.defined[k] else "estimated", joint.defines),
+            )
+            for joint in block.joints
+            for k, axis in enumerate("xyz")
+        ]
+        title = f"Joints of the {side} in the link {block.link} [mm]"
+        columns = ("leg", "axis", ">model", ">reference", ">difference", "")
+        found.append(table(*columns, rows=rows, title=title))
+        apart, frame = block.frames_apart, FRAMES[side]
+        if apart.dX_m > _SAME_M or apart.dE_rad > _SAME_RAD:
+            found.append(
+                Text(
+                    f"In their links {frame} of both models are {1e3 * apart.dX_m:.4f} mm and "
+                    f"{np.degrees(apart.dE_rad):.4f} deg apart; they are laid on each other."
+                )
+            )
+    return found
 
 
 def _left_out(evaluation: Evaluation) -> list[RenderableType]:

@@ -1,0 +1,179 @@
+"""Joints in the links that an owner knows: as the written URDF has them, covariance and all."""
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from command_line import run
+from hexapod_example import Run
+from simulated import settings
+
+import legcal
+from legcal.calibration import joints_in_links
+from legcal.calibration.change_detection import possible_changes
+from legcal.calibration.documents import Kinematic, ParameterRow
+from legcal.geometry import Array
+from legcal.machine import (
+    Machine,
+    geometries,
+    load_mechanism,
+    moved_legs,
+    parametrization_of,
+    vector_of,
+    write_calibrated_yaml,
+    write_urdf,
+)
+from legcal.simulation import Level, ParameterErrors, simulate
+from legcal.vision import LINKS
+
+OBLIQUE = "nategh-agheli"  # its R_b is turned against its base link by 170 deg
+
+
+def _moved(machine: Machine, side: str, leg: int, by: list[float]) -> Machine:
+    """Return a machine of which one joint has moved in its link [m]."""
+    legs, name = list(machine.legs), "A" if side == "base" else "B"
+    legs[leg] = replace(legs[leg], **{name: getattr(legs[leg], name) + by})
+    return replace(machine, legs=tuple(legs))
+
+
+def test_joints_are_where_the_written_model_has_them(example_run: Run) -> None:
+    result = legcal.load_result(example_run.output)
+    links = result.result.links
+    assert links is not None
+    machine = result.machine
+    for side, points in zip(LINKS, (machine.A_base, machine.B_platform), strict=True):
+        joints = links[side].joints
+        np.testing.assert_allclose([joint.xyz for joint in joints], points, atol=1e-12)
+        assert [joint.defines for joint in joints][::2] == ["origin", "x axis", "xy plane"]
+        assert joints[0].sigma == [None] * 3
+        assert joints[0].xyz == pytest.approx(joints[0].nominal, abs=1e-15)
+    rows = [row for row in result.joints() if row["joint"] == "base"]
+    assert [row["status"] for row in rows[6:9]] == ["x axis of R_b", "defines R_b", "defines R_b"]
+    sigma = {row.name: row.sigma for row in result.result.parameters}
+    assert rows[5]["sigma"] == pytest.approx(1e3 * float(sigma["leg2.base.z"] or 0.0))  # z is z
+
+
+def test_earlier_results_get_their_joints_on_loading(example_run: Run, tmp_path: Path) -> None:
+    folder = shutil.copytree(example_run.output, tmp_path / "earlier")
+    document = json.loads((folder / "result.json").read_text())
+    recorded = document.pop("links")
+    (folder / "result.json").write_text(json.dumps(document))
+    found = legcal.load_result(folder).result.document()["links"]
+    for side, block in recorded.items():
+        assert found[side]["link"] == block["link"]
+        for one, other in zip(found[side]["joints"], block["joints"], strict=True):
+            for key in ("xyz", "nominal", "covariance"):
+                np.testing.assert_allclose(one[key], other[key], atol=1e-12)
+            assert one["status"] == other["status"]
+
+
+@pytest.mark.parametrize("model", [OBLIQUE, "3-rpr"])
+def test_covariance_is_that_of_joints_of_written_models(model: str, tmp_path: Path) -> None:
+    """Each parameter is moved in the URDF: the joints that are loaded give the derivatives."""
+    machine = load_mechanism(model)
+    found, legs = parametrization_of(machine, twists=True), geometries(machine)
+    rng, n = np.random.default_rng(3), len(found)
+    factor = 1e-5 * rng.normal(size=(n, n))
+    covariance = factor @ factor.T
+    fixed = found.names.index(f"{machine.leg_names[-1]}.base.x")
+    covariance[fixed], covariance[:, fixed] = 0.0, 0.0
+    values = vector_of(found, legs, legs).tolist()
+    rows = [
+        ParameterRow(
+            name=name, value=value, nominal=value, unit=unit, sigma=None if k == fixed else 1.0,
+            status="fixed" if k == fixed else "estimated",
+        )
+        for k, (name, unit, value) in enumerate(zip(found.names, found.units, values, strict=True))
+    ]  # fmt: skip
+    kinematic = Kinematic(names=list(found.names), covariance=covariance.tolist(), held=[])
+    blocks = joints_in_links(machine, rows, kinematic)
+
+    def joints_with(step: Array) -> Array:
+        """Return all base joints and all platform joints in their links (2, n_legs, 3)."""
+        moved = moved_legs(legs, found.place, step)
+        return np.array(
+            [
+                machine.T_base_Rb.apply([leg.A for leg in moved]),
+                machine.T_platform_Re.apply([leg.B for leg in moved]),
+            ]
+        )
+
+    J = np.stack(
+        [(joints_with(1e-3 * e) - joints_with(-1e-3 * e)) / 2e-3 for e in np.eye(n)], axis=-1
+    )
+    for k, side in enumerate(LINKS):
+        for joint, by in zip(blocks[side].joints, J[k], strict=True):
+            expected = by @ covariance @ by.T
+            np.testing.assert_allclose(joint.covariance, expected, atol=1e-16)
+            for sigma, status, variance in zip(
+                joint.sigma, joint.status, np.diagonal(expected), strict=True
+            ):
+                assert (sigma is not None) == (status == "estimated") == (variance > 1e-18)
+                assert sigma is None or sigma**2 == pytest.approx(variance)
+
+    # and the URDF has them there
+    write_urdf(machine, moved_legs(legs, found.place, 1e-3 * np.eye(n)[1]), tmp_path / "m.urdf")
+    write_calibrated_yaml(machine, tmp_path / "m.yaml", "m.urdf")
+    written = load_mechanism(tmp_path / "m.yaml")
+    np.testing.assert_allclose(written.A_base, joints_with(1e-3 * np.eye(n)[1])[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("model", [OBLIQUE, "3-upu-tilted", "3-rpr"])
+def test_what_may_have_moved_counts_along_the_links(model: str) -> None:
+    """A joint is moved in the link; R_b and R_e, built anew, give the parameters."""
+    machine = load_mechanism(model)
+    found, legs = parametrization_of(machine), geometries(machine)
+    before, step = vector_of(found, legs, legs), 1e-5
+    changes = {change.what: change for change in possible_changes(machine, found)[1]}
+    for side in ("base", "platform"):
+        for j, name in enumerate(machine.leg_names):
+            change = changes[f"{side} joint of {name}"]
+            for k, axis in enumerate(change.components):
+                by = [0.0, 0.0, 0.0]
+                by["xyz".index(axis)] = step
+                moved = _moved(machine, side, j, by)
+                after = vector_of(found, geometries(moved), legs)
+                np.testing.assert_allclose(change.columns[:, k], (after - before) / step, atol=2e-3)
+            assert set(change.links) == {getattr(machine, side)}
+
+
+def test_a_joint_that_was_moved_is_reported_in_its_link(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    machine = load_mechanism("3-rpr")
+    exact = settings(level=Level.AXES, poses=6, errors=ParameterErrors())
+    first = simulate("3-rpr", tmp_path / "set", exact).folder
+    legcal.calibrate(first, output=tmp_path / "result")
+    moved = _moved(machine, "base", 1, [1e-3, 0.0, 0.0])
+    write_urdf(machine, geometries(moved), tmp_path / "moved.urdf")
+    write_calibrated_yaml(machine, tmp_path / "moved.yaml", "moved.urdf")
+    new = simulate(tmp_path / "moved.yaml", tmp_path / "new", exact).folder
+    text = yaml.safe_load((new / "dataset.yaml").read_text()) | {"mechanism": "3-rpr"}
+    (new / "dataset.yaml").write_text(yaml.safe_dump(text))
+    assert run(monkeypatch, "calibrate", new, "--check", tmp_path / "result") == 1
+    said = " ".join(capsys.readouterr().out.split())
+    found = re.search(r"base joint of leg2: (\S+) mm in x of base .*, (\S+) mm in y of base", said)
+    assert found is not None
+    assert [float(x) for x in found.groups()] == pytest.approx([1.0, 0.0], abs=0.05)
+
+
+def test_two_models_are_compared_along_the_links_of_the_first() -> None:
+    # With no motor parameters alone are compared, which is quick.
+    machine = replace(load_mechanism(OBLIQUE), motor_rank=0)
+    leg = next(j for j in range(6) if j not in machine.frame_legs)
+    found = legcal.evaluate(_moved(machine, "base", leg, [1e-3, 0.0, 0.0]), machine).links["base"]
+    expected = np.zeros((6, 3))
+    expected[leg, 0] = 1e-3
+    np.testing.assert_allclose([joint.difference for joint in found.joints], expected, atol=1e-12)
+    assert found.frames_apart.dX_m == found.frames_apart.dE_rad == 0.0
+
+    third = machine.frame_legs[2]  # moved out of the plane of R_b, which turns with it
+    turned = legcal.evaluate(_moved(machine, "base", third, [0.0, 0.0, 1e-3]), machine)
+    assert turned.links["base"].frames_apart.dE_rad > 1e-3
+    for joint in turned.links["base"].joints:
+        assert not any(d for d, own in zip(joint.difference, joint.defined, strict=True) if own)
