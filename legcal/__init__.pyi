@@ -13,6 +13,8 @@ from .calibration import measure_noise as measure_noise
 from .calibration import write_location as write_location
 from .data import load_dataset as load_dataset
 from .errors import LegcalError as LegcalError
+from .exports import ExportOptions as ExportOptions
+from .exports import export as export
 from .machine import Follower as Follower
 from .machine import forward_kinematics as forward_kinematics
 from .machine import inverse_kinematics as inverse_kinematics

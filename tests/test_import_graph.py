@@ -17,6 +17,7 @@ ROOMS = (
     "perception",
     "paper",
     "calibration",
+    "exports",
     "report",
     "cli",
 )

@@ -54,6 +54,7 @@ from .pipeline import calibrate as calibrate
 from .residuals import OutlineResiduals as OutlineResiduals
 from .result import Calibration as Calibration
 from .result_folder import REPORT_NAME as REPORT_NAME
+from .result_folder import EarlierResult as EarlierResult
 from .result_folder import load_result as load_result
 from .summary import NUMBERS as NUMBERS
 from .summary import UNITS as UNITS

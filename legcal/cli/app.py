@@ -18,6 +18,7 @@ import typer
 from legcal.cli.calibrate import calibrate
 from legcal.cli.commands import camera, detect, evaluate, identify, inspect, locate, new, noise
 from legcal.cli.example import example
+from legcal.cli.export import export
 from legcal.cli.init import init
 from legcal.cli.options import INTERRUPTED, print_failure
 from legcal.cli.simulate import simulate
@@ -64,6 +65,7 @@ for command in (
     calibrate,
     evaluate,
     locate,
+    export,
     new,
     init,
     noise,

@@ -67,11 +67,11 @@ class OutputFile:
 
     noun: str  # what is written, with its article, for sentences: "the camera"
     what: str  # what the file is called where it cannot be read: "camera file"
-    key: str  # the entry by which a file of this kind is known
+    key: str  # the entry by which a file of this kind is known; "" if it has none
     needed: str  # what may stand in its place, for sentences: "a new file or an earlier location"
 
-    def check_place(self, path: Path) -> None:
-        """Refuse a place where no file can be written, or where another one stands."""
+    def check_place(self, path: Path, *, force: bool = False) -> None:
+        """Refuse a place where no file can be written, or, without *force*, another one stands."""
         start = f"{path}: {self.noun} could not be written: found"
         if not path.name or os.path.isdir(path):
             raise UsageError(f"{start} a folder, needed the name of a file; give one in it.")
@@ -85,7 +85,7 @@ class OutputFile:
                 f"{start} that {path.parent} cannot be written to, needed permission to create "
                 "files in it; give another file."
             )
-        if os.path.lexists(path) and not self._is_own(path):
+        if not force and os.path.lexists(path) and not self._is_own(path):
             raise UsageError(
                 f"{start} another file of that name, needed {self.needed}; give another file."
             )
@@ -93,13 +93,13 @@ class OutputFile:
     def _is_own(self, path: Path) -> bool:
         """Say whether a file is of this kind."""
         try:
-            return self.key in read_yaml(path, self.what)
+            return self.key != "" and self.key in read_yaml(path, self.what)
         except DatasetError:
             return False
 
-    def write(self, path: Path, content: str | bytes) -> None:
-        """Write a file; an earlier one of its kind is replaced, any other is not."""
-        self.check_place(path)
+    def write(self, path: Path, content: str | bytes, *, force: bool = False) -> None:
+        """Write a file; an earlier one of its kind is replaced, any other only with *force*."""
+        self.check_place(path, force=force)
         try:
             data = content.encode() if isinstance(content, str) else content
             write_atomically(path, data)

@@ -84,6 +84,7 @@ from .parameters import calibrated_axis as calibrated_axis
 from .parameters import free_coordinates as free_coordinates
 from .parameters import from_vector as from_vector
 from .parameters import geometries as geometries
+from .parameters import legs_in_links as legs_in_links
 from .parameters import moved_legs as moved_legs
 from .parameters import n_frame_legs as n_frame_legs
 from .parameters import nominal_axes as nominal_axes
@@ -111,6 +112,7 @@ from .ties import ties_in_words as ties_in_words
 from .ties import ties_of as ties_of
 from .ties import wholly_tied as wholly_tied
 from .urdf import Urdf as Urdf
+from .urdf import UrdfJoint as UrdfJoint
 from .urdf import UrdfPatch as UrdfPatch
 from .urdf import number_list as number_list
 from .urdf import origins_of as origins_of

@@ -1,0 +1,10 @@
+from .formats import FORMATS as FORMATS
+from .formats import Exported as Exported
+from .formats import Format as Format
+from .formats import export as export
+from .formats import formats_of as formats_of
+from .subject import ExportedFile as ExportedFile
+from .subject import ExportOptions as ExportOptions
+from .subject import Rendered as Rendered
+from .subject import Subject as Subject
+from .subject import load_subject as load_subject

@@ -1,0 +1,348 @@
+"""A table from commands to corrected commands, for controllers whose model cannot be changed.
+
+A controller with the nominal model that is asked for the pose X' = FK_nominal(IK_calibrated(X))
+gives its motors the readings at which the calibrated machine stands at X. Poses are those of the
+platform link in the base link, in the machine's own coordinates: as many of x, y, z [mm] and roll,
+pitch, yaw [deg] about fixed axes as it has freedoms, positions before angles; the others follow.
+Between nodes a table is interpolated linearly; what that leaves is measured:
+FK_calibrated(IK_nominal(X')) against X.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import OutOfClass, UsageError
+from legcal.exports.identifiers import comment
+from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.machine import (
+    LegKind,
+    Machine,
+    geometries,
+    leg_scale,
+    machine_equations,
+    poses_after,
+    solve,
+    solve_poses,
+    workspace,
+)
+from legcal.version import __version__
+
+COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
+UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
+TO_FILE = np.array([1e3] * 3 + [float(np.degrees(1.0))] * 3)
+DEFAULT_NODES = {1: 21, 2: 21, 3: 11, 4: 7, 5: 5, 6: 4}  # by freedoms: at most 4,096 nodes in all
+MAX_ROWS = 300_000
+TESTED = 1000  # cells at most in whose middle the table is tried
+HALVINGS = 20  # of the size of the grid, until all nodes lie in the travel
+REACHED = 1e-9  # of a leg length
+FREE = 0.1
+_SEED = 2002
+
+
+def correction_refusal(subject: Subject) -> str | None:
+    """Return why there is no correction, or None."""
+    if subject.nominal is None:
+        return "found a model, needed a result, which has a nominal and a calibrated model"
+    if not subject.machine.is_determined:
+        return f"found that {subject.machine.undetermined}, needed readings that give the pose"
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """A machine, as the table needs it: poses from coordinates, readings from poses and back."""
+
+    machine: Machine
+    own: IntArray  # which of COORDINATES are the machine's own
+
+    def poses(self, coordinates: Array, near: Array) -> tuple[Array, BoolArray]:
+        """Return poses (k, 3, 4) with these coordinates (k, m), and where there is one."""
+        scale = leg_scale(self.machine, self.machine.home)
+
+        def equations(poses: Array) -> tuple[Array, Array]:
+            found = machine_equations(self.machine, poses[:, :, :3], poses[:, :, 3])
+            keep = ~found.measured
+            values, slopes = coordinates_of(poses)
+            unit = np.where(self.own < 3, 1.0, scale)
+            off = _turned_back(values[:, self.own] - coordinates, self.own) * unit
+            return (
+                np.concatenate([found.values[:, keep], off], axis=1),
+                np.concatenate(
+                    [found.by_pose[:, keep], slopes[:, self.own] * unit[:, None]], axis=1
+                ),
+            )
+
+        unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
+        start = np.broadcast_to(near, (len(coordinates), 3, 4)).copy()
+        found = solve(equations, poses_after, start, tolerance=1e-14 * scale, unit=unit)
+        return found.points, found.worst <= REACHED * scale
+
+    def readings(self, poses: Array) -> Array:
+        """Return the readings (k, n_legs) at poses, zero for legs without a motor."""
+        machine = self.machine
+        vectors = (
+            np.einsum("kij,nj->kni", poses[:, :, :3], machine.B_platform)
+            + poses[:, None, :, 3]
+            - machine.A_base
+        )
+        q = machine.sign * (np.linalg.norm(vectors, axis=2) - machine.q0)
+        return np.where([leg.kind is LegKind.ACTUATED for leg in machine.legs], q, 0.0)
+
+    def in_travel(self, q: Array) -> BoolArray:
+        """Say where readings lie in the travel."""
+        ends = np.array([leg.travel for leg in self.machine.legs]).reshape(-1, 2)
+        motors = list(self.machine.motors)
+        inside = (q >= ends[:, 0]) & (q <= ends[:, 1])
+        return np.asarray(inside[:, motors].all(axis=1))
+
+    def forward(self, q: Array, near: Array) -> tuple[Array, BoolArray]:
+        """Return the poses (k, 3, 4) near others at readings, and where there is one."""
+        machine = self.machine
+        base, platform = machine.T_base_Rb.as_matrix(), machine.T_platform_Re.as_matrix()
+        start = np.linalg.inv(base) @ _square(near) @ platform
+        found = solve_poses(
+            geometries(machine),
+            machine.frame_legs,
+            start[:, :3, :3],
+            start[:, :3, 3],
+            machine.sign * q,
+        )
+        ends = np.concatenate([found.R, found.t[..., None]], axis=2)
+        poses = base @ _square(ends) @ np.linalg.inv(platform)
+        reached = found.missed <= REACHED * leg_scale(machine, machine.home)
+        if machine.is_redundant:
+            reached = np.ones(len(q), dtype=np.bool_)
+        return poses[:, :3], reached
+
+
+def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+    """Return the table."""
+    nominal = subject.nominal
+    if nominal is None:
+        raise ValueError("a model without a result has no correction")
+    calibrated = subject.machine
+    own = own_coordinates(calibrated)
+    n_nodes = _number_of_nodes(options.nodes, len(own))
+    models = _Model(calibrated, own), _Model(nominal, own)
+    low, high = _range(models, n_nodes)
+    ticks = [np.linspace(a, b, n_nodes) for a, b in zip(low, high, strict=True)]
+    nodes = np.array(list(product(*ticks)))
+    corrected, reached = _corrected(models, nodes)
+    if not reached.all():
+        raise OutOfClass(_no_grid(calibrated))
+    shape = (n_nodes,) * len(own)
+    left, raw = _residuals(models, ticks, corrected.reshape(*shape, len(own)))
+    figures = {
+        "coordinates": [COORDINATES[k] for k in own],
+        "nodes": len(nodes),
+        "residual": _figures(left),
+        "uncorrected": _figures(raw),
+        "tested": len(left),
+    }
+    sentences = _sentences(figures)
+    names = [f"{COORDINATES[k]}_{UNITS[k]}" for k in own]
+    lines = [
+        f"# Correction of {comment(subject.name)}, written by legcal {__version__}.",
+        "# Command the columns corrected_* to a controller with the nominal model: the calibrated",
+        "# platform then stands at the others. Pose of the platform link in the base link; roll,",
+        "# pitch, yaw about fixed x, y, z. Nodes of a grid, the last coordinate first.",
+        *(f"# {sentence}" for sentence in sentences),
+        ",".join([*names, *(f"corrected_{name}" for name in names)]),
+    ]
+    scale = TO_FILE[own]
+    rows = np.concatenate([nodes * scale, corrected * scale], axis=1)
+    lines += [",".join(f"{x:.9f}" for x in row) for row in rows.tolist()]
+    content = ("\n".join(lines) + "\n").encode()
+    return Rendered((ExportedFile("", content),), tuple(sentences), figures)
+
+
+def own_coordinates(machine: Machine) -> IntArray:
+    """Return which coordinates a machine has of its own, positions before angles.
+
+    A coordinate is taken where the motions that the constraints leave at home, and that those taken
+    before do not yet tell apart, move it by at least ``FREE`` of a motion; rotations count in leg
+    lengths.
+    """
+    pose = machine.home.as_matrix()[None, :3]
+    found = machine_equations(machine, pose[:, :, :3], pose[:, :, 3])
+    scale = leg_scale(machine, machine.home)
+    unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
+    constraints = found.by_pose[0, ~found.measured] * unit
+    _, _, rows = np.linalg.svd(np.vstack([constraints, np.zeros((6, 6))]))
+    free = rows[6 - machine.mobility :] * unit  # (m, 6) motions
+    slopes = coordinates_of(pose)[1][0]
+    moved = (slopes @ free.T) * np.array([1.0] * 3 + [scale] * 3)[:, None]
+    own: list[int] = []
+    for least in (FREE, 0.0):  # the second time, if need be, whatever is left
+        for k in range(len(COORDINATES)):
+            basis = np.linalg.qr(moved[own].T)[0] if own else np.zeros((machine.mobility, 0))
+            new = moved[k] - basis @ (basis.T @ moved[k])
+            if k not in own and len(own) < machine.mobility and np.linalg.norm(new) > least:
+                own.append(k)
+    return np.array(sorted(own), dtype=np.intp)
+
+
+def coordinates_of(poses: Array) -> tuple[Array, Array]:
+    """Return x, y, z, roll, pitch, yaw (k, 6) [m, rad] of poses, and their slopes (k, 6, 6).
+
+    Slopes are by rotations about the origin of the platform link and displacements in the base.
+    """
+    R = poses[:, :, :3]
+    roll = np.arctan2(R[:, 2, 1], R[:, 2, 2])
+    pitch = np.arctan2(-R[:, 2, 0], np.hypot(R[:, 2, 1], R[:, 2, 2]))
+    yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    values = np.concatenate([poses[:, :, 3], np.stack([roll, pitch, yaw], axis=1)], axis=1)
+    slopes = np.zeros((len(poses), 6, 6))
+    slopes[:, :3, 3:] = np.eye(3)
+    cos_y, sin_y = np.cos(yaw), np.sin(yaw)
+    cos_p, tan_p = np.cos(pitch), np.tan(pitch)
+    slopes[:, 3, 0], slopes[:, 3, 1] = cos_y / cos_p, sin_y / cos_p
+    slopes[:, 4, 0], slopes[:, 4, 1] = -sin_y, cos_y
+    slopes[:, 5, 0], slopes[:, 5, 1], slopes[:, 5, 2] = cos_y * tan_p, sin_y * tan_p, 1.0
+    return values, slopes
+
+
+def _number_of_nodes(given: int | None, m: int) -> int:
+    """Return the nodes along each coordinate."""
+    n = DEFAULT_NODES[m] if given is None else given
+    if n < 2 or n**m > MAX_ROWS:
+        most = int(MAX_ROWS ** (1.0 / m) + 1e-9)
+        raise UsageError(
+            f"--nodes could not be used: found {n} along each of {m} coordinates, needed 2 to "
+            f"{most}; give another number."
+        )
+    return n
+
+
+def _range(models: tuple[_Model, _Model], n_nodes: int) -> tuple[Array, Array]:
+    """Return the ends (m,) of the largest grid about the middle of the workspace in the travel."""
+    calibrated, _ = models
+    machine, own = calibrated.machine, calibrated.own
+    centre = coordinates_of(machine.home.as_matrix()[None, :3])[0][0, own]
+    there = coordinates_of(_stacked(workspace(machine)[1]))[0][:, own]
+    there = centre + _turned_back(there - centre, own)
+    middle, reach = there.mean(axis=0), np.abs(there - there.mean(axis=0)).max(axis=0)
+    part = 1.0
+    small = min(n_nodes, 3)
+    for _ in range(HALVINGS):
+        for n in (2, small, n_nodes):  # corners first: they leave the travel first
+            ticks = [
+                np.linspace(m - part * r, m + part * r, n)
+                for m, r in zip(middle, reach, strict=True)
+            ]
+            if not _corrected(models, np.array(list(product(*ticks))))[1].all():
+                break
+        else:
+            return middle - part * reach, middle + part * reach
+        part *= 0.8
+    raise OutOfClass(_no_grid(machine))
+
+
+def _corrected(models: tuple[_Model, _Model], commands: Array) -> tuple[Array, BoolArray]:
+    """Return corrected coordinates (k, m) of commands, and where both machines reach them."""
+    calibrated, nominal = models
+    home = calibrated.machine.home.as_matrix()[:3]
+    X, reached = calibrated.poses(commands, home)
+    q = calibrated.readings(X)
+    reached &= calibrated.in_travel(q)
+    moved, there = nominal.forward(q, X)
+    own = calibrated.own
+    found = coordinates_of(moved)[0][:, own]
+    return commands + _turned_back(found - commands, own), reached & there
+
+
+def _residuals(
+    models: tuple[_Model, _Model], ticks: list[Array], corrected: Array
+) -> tuple[Array, Array]:
+    """Return displacement [m] and rotation [rad] (k, 2) in the middle of cells, and uncorrected."""
+    calibrated, nominal = models
+    m, n = len(ticks), len(ticks[0])
+    cells = np.array(list(np.ndindex(*(n - 1,) * m)))
+    if len(cells) > TESTED:
+        chosen = np.random.default_rng(_SEED).choice(len(cells), TESTED, replace=False)
+        cells = cells[np.sort(chosen)]
+    commands = np.stack([0.5 * (t[c] + t[c + 1]) for t, c in zip(ticks, cells.T, strict=True)], 1)
+    corners = [corrected[tuple((cells + corner).T)] for corner in product((0, 1), repeat=m)]
+    home = calibrated.machine.home.as_matrix()[:3]
+    X, _ = calibrated.poses(commands, home)
+    found = []
+    for asked in (np.mean(corners, axis=0), commands):
+        asked_poses, _ = nominal.poses(asked, home)
+        reached, _ = calibrated.forward(nominal.readings(asked_poses), X)
+        found.append(_apart(calibrated.machine, reached, X))
+    return found[0], found[1]
+
+
+def _apart(machine: Machine, poses: Array, references: Array) -> Array:
+    """Return the displacement of the first frame leg's platform joint and the rotation, (k, 2)."""
+    point = machine.T_platform_Re.as_matrix()[:3, 3]
+    off = (poses[:, :, :3] - references[:, :, :3]) @ point + poses[:, :, 3] - references[:, :, 3]
+    between = np.swapaxes(references[:, :, :3], 1, 2) @ poses[:, :, :3]
+    across = between - np.swapaxes(between, 1, 2)
+    sine = 0.5 * np.linalg.norm(
+        np.stack([across[:, 2, 1], across[:, 0, 2], across[:, 1, 0]], axis=1), axis=1
+    )
+    cosine = 0.5 * (np.einsum("kii->k", between) - 1.0)
+    return np.stack([np.linalg.norm(off, axis=1), np.arctan2(sine, cosine)], axis=1)
+
+
+def _figures(apart: Array) -> dict[str, float]:
+    """Return root mean squares and maxima."""
+    rms, most = np.sqrt((apart**2).mean(axis=0)), apart.max(axis=0)
+    return {
+        "rms_dX_m": float(rms[0]),
+        "max_dX_m": float(most[0]),
+        "rms_dE_rad": float(rms[1]),
+        "max_dE_rad": float(most[1]),
+    }
+
+
+def _sentences(figures: dict[str, object]) -> list[str]:
+    """Return what the table leaves, in words."""
+    found = []
+    for key, what in (
+        ("residual", "Between nodes the interpolated table leaves"),
+        ("uncorrected", "Without it the platform is off by"),
+    ):
+        f = figures[key]
+        if isinstance(f, dict):
+            found.append(
+                f"{what} {1e3 * f['rms_dX_m']:.3g} mm and {np.degrees(f['rms_dE_rad']):.3g} deg "
+                f"rms, {1e3 * f['max_dX_m']:.3g} mm and {np.degrees(f['max_dE_rad']):.3g} deg "
+                f"at most (middles of {figures['tested']} cells)."
+            )
+    return found
+
+
+def _no_grid(machine: Machine) -> str:
+    """Return why there is no grid."""
+    return (
+        f"{machine.yaml_path}: the correction could not be tabulated: found no box of poses about "
+        "the middle of the workspace that both models reach inside the travel, needed one; check "
+        "the travel of the motors."
+    )
+
+
+def _turned_back(differences: Array, own: IntArray) -> Array:
+    """Return differences of coordinates with angles within half a turn."""
+    turns = np.where(own < 3, 0.0, 2.0 * np.pi)
+    return np.asarray(differences - turns * np.round(differences / np.where(own < 3, 1.0, turns)))
+
+
+def _square(poses: Array) -> Array:
+    """Return poses (k, 3, 4) as matrices (k, 4, 4)."""
+    found = np.zeros((len(poses), 4, 4))
+    found[:, :3], found[:, 3, 3] = poses, 1.0
+    return found
+
+
+def _stacked(poses: list[RigidTransform]) -> Array:
+    """Return poses as matrices (k, 3, 4)."""
+    return np.array([T.as_matrix()[:3] for T in poses])

@@ -1,0 +1,174 @@
+"""The table of formats, and their files written all of them or none."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from legcal.errors import OutOfClass, UsageError
+from legcal.exports.correction import correction_files, correction_refusal
+from legcal.exports.kinematics_code import c_files, kinematics_refusal, matlab_files, python_files
+from legcal.exports.linuxcnc import linuxcnc_files, linuxcnc_refusal
+from legcal.exports.mjcf import mjcf_files, mjcf_refusal
+from legcal.exports.parameter_files import csv_files, json_files, table_files
+from legcal.exports.robot_files import ros_files, urdf_files
+from legcal.exports.subject import ExportOptions, Rendered, Subject, load_subject
+from legcal.files import OutputFile, OutputKind, result_folder
+
+Render = Callable[[Subject, ExportOptions, Path], Rendered]
+
+
+def _every_machine(subject: Subject) -> str | None:
+    """Refuse none."""
+    return None
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format."""
+
+    what: str  # for people
+    render: Render  # its files, of a subject, options and the path that was asked for
+    refusal: Callable[[Subject], str | None] = _every_machine  # why a machine's class has it not
+    is_folder: bool = False
+    options: tuple[str, ...] = ()  # of ExportOptions that it takes
+
+
+FORMATS: dict[str, Format] = {
+    "table": Format("parameters as aligned text", table_files),
+    "csv": Format("parameters, one a row", csv_files),
+    "json": Format("legs and parameters with their covariance", json_files),
+    "urdf": Format("one URDF with its loops", urdf_files, options=("inertia",)),
+    "mjcf": Format("MuJoCo, loops as equality constraints", mjcf_files, mjcf_refusal),
+    "linuxcnc": Format("HAL lines of genhexkins", linuxcnc_files, linuxcnc_refusal),
+    "python": Format("kinematics in Python with numpy", python_files, kinematics_refusal),
+    "c": Format("kinematics in C99", c_files, kinematics_refusal),
+    "matlab": Format("kinematics in MATLAB and GNU Octave", matlab_files, kinematics_refusal),
+    "ros": Format("URDF and calibration.yaml", ros_files, is_folder=True, options=("inertia",)),
+    "correction": Format(
+        "nominal to corrected commands", correction_files, correction_refusal, options=("nodes",)
+    ),
+}
+_FILE = OutputFile("the export", "export", "", "a new file or --force")
+_FOLDER = OutputKind("export", "", "")
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written."""
+
+    format: str
+    paths: tuple[Path, ...]
+    notes: tuple[str, ...]
+    figures: dict[str, Any]
+
+    def document(self) -> dict[str, Any]:
+        """Return what ``legcal export --json`` prints."""
+        return {
+            "format": self.format,
+            "written": [str(path) for path in self.paths],
+            **self.figures,
+            "notes": list(self.notes),
+        }
+
+
+def export(
+    source: str | Path | Subject,
+    to: str,
+    path: str | Path,
+    *,
+    options: ExportOptions | None = None,
+    force: bool = False,
+) -> Exported:
+    """Write a model or a result in another format.
+
+    Parameters
+    ----------
+    source : path, name or Subject
+        A result folder, its ``result.json``, or a mechanism.
+    to : str
+        One of ``FORMATS``.
+    path : path
+        The file to write, or the folder for ``ros``.
+    options : ExportOptions, optional
+        What only some formats ask for.
+    force : bool
+        Replace what is there.
+
+    Raises
+    ------
+    UsageError
+        If the format or an option is unknown to it, or the path cannot be written.
+    OutOfClass
+        If the machine's class does not have the format.
+    """
+    given = ExportOptions() if options is None else options
+    format = _format(to)
+    _check_options(to, format, given)
+    destination = Path(path)
+    if str(path) == "":
+        raise UsageError(
+            "The export could not be written: found an empty text, needed the path of a file."
+        )
+    if not format.is_folder:
+        _FILE.check_place(destination, force=force)
+    subject = source if isinstance(source, Subject) else load_subject(source)
+    refusal = format.refusal(subject)
+    if refusal is not None:
+        raise OutOfClass(
+            f"{subject.given}: --to {to} could not be written: {refusal}; this machine has "
+            f"{', '.join(formats_of(subject))}."
+        )
+    rendered = format.render(subject, given, destination)
+    if format.is_folder:
+        paths = _write_folder(destination, rendered, force=force)
+    else:
+        _FILE.write(destination, rendered.files[0].content, force=force)
+        paths = (destination,)
+    return Exported(to, paths, rendered.notes, dict(rendered.figures))
+
+
+def formats_of(subject: Subject) -> tuple[str, ...]:
+    """Return the formats that a machine's class has."""
+    return tuple(name for name, format in FORMATS.items() if format.refusal(subject) is None)
+
+
+def _format(to: str) -> Format:
+    """Return a format by its name."""
+    if to not in FORMATS:
+        raise UsageError(
+            f"The export could not be written: found the format '{to}', needed one of "
+            f"{', '.join(FORMATS)}; give one of them with --to."
+        )
+    return FORMATS[to]
+
+
+def _check_options(to: str, format: Format, given: ExportOptions) -> None:
+    """Refuse an option that the format does not take."""
+    nothing = ExportOptions()
+    for name in vars(nothing):
+        if getattr(given, name) != getattr(nothing, name) and name not in format.options:
+            takes = [other for other, one in FORMATS.items() if name in one.options]
+            raise UsageError(
+                f"--{name} could not be used: found it with --to {to}, needed "
+                f"{' or '.join(takes)}; leave it out."
+            )
+
+
+def _write_folder(destination: Path, rendered: Rendered, *, force: bool) -> tuple[Path, ...]:
+    """Write the files of a folder."""
+    names = [Path(file.name) for file in rendered.files]
+    there = [str(name) for name in names if os.path.lexists(destination / name)]
+    if there and not force:
+        raise UsageError(
+            f"{destination}: the export could not be written: found {' and '.join(there)} already "
+            "there, needed a new folder or --force; give another folder."
+        )
+    with result_folder(destination, _FOLDER) as folder:
+        for name, file in zip(names, rendered.files, strict=True):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(file.content)
+    return tuple(destination / name for name in names)

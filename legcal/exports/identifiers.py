@@ -1,0 +1,63 @@
+"""Names of a machine as identifiers and text of other languages, whatever stands in them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+MAX_IDENTIFIER = 40  # letters: a MATLAB name holds 63, with what is put before it
+# Of Python, C and MATLAB alike, so that a machine is called the same in all of them
+_RESERVED = frozenset(
+    {
+        "false", "none", "true", "and", "as", "assert", "async", "await", "auto", "bool",
+        "break", "case", "catch", "char", "class", "classdef", "const", "continue", "def",
+        "default", "del", "do", "double", "elif", "else", "elseif", "end", "enum", "except",
+        "extern", "finally", "float", "for", "from", "function", "global", "goto", "if",
+        "import", "in", "inline", "int", "is", "lambda", "long", "nonlocal", "not", "or",
+        "otherwise", "parfor", "pass", "persistent", "raise", "register", "restrict",
+        "return", "short", "signed", "sizeof", "spmd", "static", "struct", "switch", "try",
+        "typedef", "union", "unsigned", "void", "volatile", "while", "with", "yield"
+    }
+)  # fmt: skip
+
+
+def identifier(name: str) -> str:
+    """Return a name as an identifier of ASCII letters, digits and underscores."""
+    found = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")[:MAX_IDENTIFIER].lower()
+    if not found or found[0].isdigit() or found in _RESERVED:
+        found = f"m_{found}".rstrip("_")
+    return found
+
+
+def identifiers(names: Iterable[str]) -> list[str]:
+    """Return names as identifiers that differ from each other."""
+    found: list[str] = []
+    for name in names:
+        plain, number = identifier(name), 1
+        unique = plain
+        while unique in found:
+            number += 1
+            unique = f"{plain}_{number}"
+        found.append(unique)
+    return found
+
+
+def c_string(text: str) -> str:
+    """Return text as a literal of C, in UTF-8."""
+    return '"' + "".join(_c_byte(byte) for byte in text.encode()) + '"'
+
+
+def _c_byte(byte: int) -> str:
+    letter = chr(byte)
+    is_plain = 0x20 <= byte < 0x7F and letter not in '"\\?'
+    return letter if is_plain else f"\\{byte:03o}"
+
+
+def matlab_string(text: str) -> str:
+    """Return text as a character row of MATLAB."""
+    return "'" + text.replace("'", "''") + "'"
+
+
+def comment(text: str) -> str:
+    """Return text that may stand in a comment of any language: ASCII of one line, no end of it."""
+    return re.sub(r"[^A-Za-z0-9 ._,;:()+=-]", "_", text)

@@ -1,0 +1,163 @@
+"""Kinematics of a machine as source: its numbers, readings at a pose, pose at readings.
+
+All three languages write the same equations, those of :mod:`legcal.machine.equations` in the links
+of base and platform: lengths of legs, directions that stay across a leg (R joints, legs that are
+fixed to the platform), twists, and the plane of a planar machine. The pose at readings is followed
+from a start in short steps by Newton's method, so that the assembly mode is kept.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from legcal.errors import UsageError
+from legcal.exports.identifiers import c_string, comment, identifier, identifiers, matlab_string
+from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
+from legcal.geometry import Array, normal_basis
+from legcal.machine import EquationKind, Leg, LegKind, Machine, inverse_kinematics, leg_scale
+from legcal.version import __version__
+
+TEMPLATES = Path(__file__).parent / "templates"
+MAX_STEP = 0.05  # of a leg length: of the readings, from one pose to the next
+_ALONG_PLATFORM = (EquationKind.DIRECTION_1, EquationKind.DIRECTION_2)
+
+
+def kinematics_refusal(subject: Subject) -> str | None:
+    """Return why a machine has no kinematics that Newton's method follows, or None."""
+    machine = subject.machine
+    if not machine.is_determined:
+        return f"found that {machine.undetermined}, needed readings that give the pose"
+    if machine.is_redundant:
+        return (
+            f"found {len(machine.motors)} motors of a platform with mobility {machine.mobility}, "
+            "whose poses are of least squares, needed as many motors as freedoms"
+        )
+    return None
+
+
+def python_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+    """Return a module of Python."""
+    return one_file(_rendered("kinematics.py.jinja", subject.machine, subject.name, repr))
+
+
+def c_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+    """Return a source file of C99."""
+    return one_file(_rendered("kinematics.c.jinja", subject.machine, subject.name, c_string))
+
+
+def matlab_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+    """Return a function file of MATLAB; its name is that of the file."""
+    name = path.stem
+    if identifier(name) != name.lower() or path.suffix != ".m":
+        raise UsageError(
+            f"{path}: the export could not be written: found a name that MATLAB cannot call, "
+            "needed letters, digits and '_', the first a letter, and the ending .m; give "
+            f"{path.with_name(identifier(name) + '.m')}."
+        )
+    text = _rendered(
+        "kinematics.m.jinja", subject.machine, subject.name, matlab_string, function=name
+    )
+    return one_file(text)
+
+
+def _rendered(template: str, machine: Machine, name: str, quoted: Any, **more: Any) -> str:
+    """Return a template filled in with the numbers of a machine."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,
+    )
+    environment.filters |= {"row": _row, "quoted": quoted}
+    return environment.get_template(template).render(
+        **_numbers(machine), title=comment(name), name=name, prefix=identifier(name), **more
+    )
+
+
+def _row(numbers: Any) -> str:
+    """Return numbers with commas, read back exactly."""
+    return ", ".join(repr(float(x)) for x in np.ravel(numbers))
+
+
+def _numbers(machine: Machine) -> dict[str, Any]:
+    """Return what templates are filled in with."""
+    home = machine.home.as_matrix()
+    legs = machine.legs
+    return {
+        "version": __version__,
+        "base": machine.base,
+        "platform": machine.platform,
+        "legs": [
+            {
+                "name": leg.name,
+                "identifier": own,
+                "type": leg.type,
+                "A": leg.A,
+                "B": leg.B,
+                "q0": leg.q0,
+                "sign": leg.sign,
+                "moves": int(leg.kind is not LegKind.CONSTANT),
+                "is_motor": int(leg.kind is LegKind.ACTUATED),
+                "has_length": int(leg.kind is not LegKind.PASSIVE),
+            }
+            for leg, own in zip(legs, identifiers(machine.leg_names), strict=True)
+        ],
+        "across": [row for j, leg in enumerate(legs) for row in _across(j, leg)],
+        "twists": [row for j, leg in enumerate(legs) for row in _twists(j, leg)],
+        "plane": None if machine.spatial else _plane(machine),
+        "home": home[:3],
+        "home_readings": inverse_kinematics(machine, machine.home),
+        "scale": leg_scale(machine, machine.home),
+        "max_step": MAX_STEP * leg_scale(machine, machine.home),
+    }
+
+
+def _across(j: int, leg: Leg) -> list[dict[str, Any]]:
+    """Return the directions that stay across a leg, in base or platform."""
+    found = []
+    for kind in leg.equations:
+        if kind is EquationKind.BASE_AXIS:
+            found.append({"leg": j, "in_platform": 0, "direction": leg.base_axis})
+        elif kind is EquationKind.PLATFORM_AXIS:
+            found.append({"leg": j, "in_platform": 1, "direction": leg.platform_axis})
+        elif kind in _ALONG_PLATFORM and leg.platform_axis is not None:
+            basis = normal_basis(leg.platform_axis)
+            direction: Array = basis[_ALONG_PLATFORM.index(kind)]
+            found.append({"leg": j, "in_platform": 1, "direction": direction})
+    return found
+
+
+def _twists(j: int, leg: Leg) -> list[dict[str, Any]]:
+    """Return the angle between the axes at both ends of a leg that does not twist."""
+    if leg.twist is None or leg.base_axis is None or leg.platform_axis is None:
+        return []
+    tied = normal_basis(leg.platform_axis)[0] if leg.is_fixed_to_platform else leg.platform_axis
+    return [
+        {
+            "leg": j,
+            "base_axis": leg.base_axis,
+            "base_crossed": int(leg.base_joint.inner_is_across),
+            "platform_axis": tied,
+            "platform_crossed": int(leg.platform_joint.inner_is_across),
+            "angle": leg.twist,
+        }
+    ]
+
+
+def _plane(machine: Machine) -> dict[str, Array]:
+    """Return the normal of the plane of motion in base and platform, and two directions in it."""
+    normal = machine.T_base_Rb.as_matrix()[:3, 2]
+    across = normal_basis(normal)
+    return {
+        "normal": normal,
+        "first": across[0],
+        "second": across[1],
+        "carried": machine.T_platform_Re.as_matrix()[:3, 2],
+    }

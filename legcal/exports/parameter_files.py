@@ -1,0 +1,203 @@
+"""Parameters for people and scripts, in millimetres and degrees: ``table``, ``csv``, ``json``.
+
+Every joint stands there twice: in the link that carries it, as its owner knows it, and in R_b or
+R_e, in which it was estimated and which the joints of the ``base_frame`` legs define.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
+from legcal.geometry import Array
+from legcal.machine import Leg, LegKind, geometries
+from legcal.version import __version__
+
+UNITS = {"m": (1e3, "mm"), "rad": (float(np.degrees(1.0)), "deg")}  # of files; others stay
+COLUMNS = ("name", "frame", "unit", "value", "nominal", "change", "sigma", "status")
+_DIGITS = 6  # of the table, behind the point
+_MODEL = "model"  # the status of numbers without a result
+
+
+class Row(NamedTuple):
+    """A number of a machine, in a unit of files."""
+
+    name: str
+    frame: str  # a link, R_b or R_e; "" where the number does not depend on one
+    unit: str
+    value: float
+    nominal: float | None  # None without a result
+    sigma: float | None  # None where it was not estimated
+    status: str  # estimated, fixed, weak, frame (zero by the definition of it) or model
+
+    @property
+    def change(self) -> float | None:
+        """Value less nominal."""
+        return None if self.nominal is None else self.value - self.nominal
+
+
+def csv_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+    """Return one row for each number; numbers are read back exactly."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for row in rows_of(subject):
+        writer.writerow(["" if getattr(row, c) is None else getattr(row, c) for c in COLUMNS])
+    return one_file(text.getvalue())
+
+
+def table_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+    """Return aligned text."""
+    rows = [
+        ["" if getattr(row, c) is None else _shown(getattr(row, c)) for c in COLUMNS]
+        for row in rows_of(subject)
+    ]
+    widths = [max(map(len, column)) for column in zip(COLUMNS, *rows, strict=True)]
+    lines = [
+        "  ".join(
+            cell.rjust(width) if 3 <= k <= 6 else cell.ljust(width)
+            for k, (cell, width) in enumerate(zip(cells, widths, strict=True))
+        ).rstrip()
+        for cells in [list(COLUMNS), *rows]
+    ]
+    title = f"{subject.name}, written by legcal {__version__}"
+    return one_file("\n".join([title, "", *lines]) + "\n")
+
+
+def json_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+    """Return legs in links and in R_b and R_e, and the parameters with their covariance."""
+    machine = subject.machine
+    document: dict[str, Any] = {
+        "legcal_export": 1,
+        "legcal": __version__,
+        "machine": subject.name,
+        "units": {"length": "mm", "angle": "deg"},
+        "base_link": machine.base,
+        "platform_link": machine.platform,
+        "base_frame": [machine.leg_names[j] for j in machine.frame_legs],
+        "T_base_Rb": _millimetres(machine.T_base_Rb.as_matrix()),
+        "T_platform_Re": _millimetres(machine.T_platform_Re.as_matrix()),
+        "home": _millimetres(machine.home.as_matrix()),
+        "legs": [
+            _leg(name, in_links, in_frames)
+            for name, in_links, in_frames in zip(
+                machine.leg_names, machine.legs_of_frames, geometries(machine), strict=True
+            )
+        ],
+        "rows": [{c: getattr(row, c) for c in COLUMNS} for row in rows_of(subject)],
+    }
+    if subject.result is not None:
+        result = subject.result.document
+        unit = {row.name: row.unit for row in result.parameters}
+        names = result.kinematic.names
+        scale = np.array([UNITS["rad" if unit.get(name) == "rad" else "m"][0] for name in names])
+        covariance = np.array(result.kinematic.covariance) * np.outer(scale, scale)
+        document["covariance"] = {
+            "names": names,
+            "units": [UNITS["rad" if unit.get(name) == "rad" else "m"][1] for name in names],
+            "matrix": covariance.tolist(),
+        }
+    return one_file(json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def rows_of(subject: Subject) -> list[Row]:
+    """Return all numbers of a subject."""
+    return [*_joint_rows(subject), *_parameter_rows(subject)]
+
+
+def _joint_rows(subject: Subject) -> Iterator[Row]:
+    """Give the joint centres in their links."""
+    machine, nominal = subject.machine, subject.nominal
+    for side, link in (("base", machine.base), ("platform", machine.platform)):
+        for j, leg in enumerate(machine.legs_of_frames):
+            point = leg.A if side == "base" else leg.B
+            before = None
+            if nominal is not None:
+                other = nominal.legs_of_frames[j]
+                before = other.A if side == "base" else other.B
+            for k, axis in enumerate("xyz"):
+                yield Row(
+                    f"{leg.name}.{side}.{axis}",
+                    link,
+                    "mm",
+                    1e3 * float(point[k]),
+                    None if before is None else 1e3 * float(before[k]),
+                    None,
+                    _MODEL,
+                )
+
+
+def _parameter_rows(subject: Subject) -> Iterator[Row]:
+    """Give the parameters in R_b and R_e: those of the result, or of the model."""
+    if subject.result is not None:
+        for row in subject.result.document.parameters:
+            scale, unit = UNITS.get(row.unit, (1.0, row.unit))
+            sigma = None if row.sigma is None else scale * row.sigma
+            numbers = scale * row.value, scale * row.nominal, sigma
+            yield Row(row.name, _frame_of(row.name), unit, *numbers, row.status)
+        return
+    for name, leg in zip(subject.machine.leg_names, geometries(subject.machine), strict=True):
+        for side, point in (("base", leg.A), ("platform", leg.B)):
+            for axis, x in zip("xyz", point, strict=True):
+                of = f"{name}.{side}.{axis}"
+                yield Row(of, _frame_of(of), "mm", 1e3 * float(x), None, None, _MODEL)
+        if leg.kind is not LegKind.PASSIVE:
+            what = "length" if leg.kind is LegKind.CONSTANT else "offset"
+            yield Row(f"{name}.{what}", "", "mm", 1e3 * leg.q0, None, None, _MODEL)
+
+
+def _frame_of(name: str) -> str:
+    """Return the frame of a parameter by its name."""
+    if ".base" in name:
+        return "R_b"
+    return "R_e" if ".platform" in name else ""
+
+
+def _leg(name: str, in_links: Leg, in_frames: Leg) -> dict[str, Any]:
+    """Return a leg of the document."""
+    has_travel = in_links.kind is not LegKind.CONSTANT and bool(np.isfinite(in_links.travel).all())
+    return {
+        "name": name,
+        "type": in_links.type,
+        "kind": in_links.kind.value,
+        "sign": in_links.sign,
+        "offset": None if in_links.kind is LegKind.PASSIVE else 1e3 * in_links.q0,
+        "travel": [1e3 * x for x in in_links.travel] if has_travel else None,
+        "A": {"link": _point(in_links.A), "R_b": _point(in_frames.A)},
+        "B": {"link": _point(in_links.B), "R_e": _point(in_frames.B)},
+        "base_axis": _axes(in_links.base_axis, in_frames.base_axis, "R_b"),
+        "platform_axis": _axes(in_links.platform_axis, in_frames.platform_axis, "R_e"),
+        "twist": None if in_links.twist is None else float(np.degrees(in_links.twist)),
+    }
+
+
+def _point(point: Array) -> list[float]:
+    """Return a point in millimetres."""
+    return [1e3 * float(x) for x in point]
+
+
+def _axes(in_link: Array | None, in_frame: Array | None, frame: str) -> dict[str, Any] | None:
+    """Return a direction in its link and frame."""
+    if in_link is None or in_frame is None:
+        return None
+    return {"link": in_link.tolist(), frame: in_frame.tolist()}
+
+
+def _millimetres(matrix: Array) -> list[list[float]]:
+    """Return a motion with its translation in millimetres."""
+    found = matrix.copy()
+    found[:3, 3] *= 1e3
+    rows: list[list[float]] = found.tolist()
+    return rows
+
+
+def _shown(value: str | float) -> str:
+    """Return a cell of the table."""
+    return value if isinstance(value, str) else f"{value:.{_DIGITS}f}"

@@ -1,0 +1,142 @@
+"""URDF of one file with its loops, and the folder for ROS.
+
+The tree is the machine's own, number for number. What a single file cannot hold (meshes) is left
+out; loops become ``<loop_joint>`` elements and motors ``<transmission>`` elements, so that legcal
+reads the file without a YAML; other programs skip elements they do not know.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import yaml
+from lxml import etree
+
+from legcal.exports.identifiers import identifier
+from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject
+from legcal.files import motion_to_xyz_quat
+from legcal.machine import LegKind, Machine
+from legcal.version import __version__
+
+STUB_MASS, STUB_INERTIA = 1.0, 1e-3  # [kg], [kg m^2] about all axes of the link
+_SHAPES = ("visual", "collision")
+
+
+def urdf_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+    """Return the URDF."""
+    content, notes = urdf_text(subject.machine, inertia=options.inertia)
+    return Rendered((ExportedFile("", content),), notes)
+
+
+def ros_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+    """Return the URDF and the numbers of the calibration beside it."""
+    content, notes = urdf_text(subject.machine, inertia=options.inertia)
+    name = identifier(subject.name)
+    document = {
+        "legcal_calibration": 1,
+        "legcal": __version__,
+        "robot": subject.machine.urdf.name,
+        "urdf": f"{name}.urdf",
+        **_calibration(subject),
+    }
+    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
+    files = ExportedFile(f"{name}.urdf", content), ExportedFile("calibration.yaml", text.encode())
+    return Rendered(files, notes)
+
+
+def urdf_text(machine: Machine, *, inertia: bool) -> tuple[bytes, tuple[str, ...]]:
+    """Return a URDF that stands alone, and what was left out of it."""
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
+    robot = etree.fromstring(machine.urdf.content, parser)
+    meshes = _without_meshes(robot)
+    if inertia:
+        for link in robot.iterfind("link"):
+            if link.find("inertial") is None:
+                link.append(_stub())
+    joints = machine.urdf.joints
+    for i, closure in enumerate(machine.chain.closures, start=1):
+        kind = "spherical" if closure.kind == "3d" else "fixed"
+        loop = etree.SubElement(robot, "loop_joint", name=f"loop_{i}", type=kind)
+        for tag, frame in (("link1", closure.frame_1), ("link2", closure.frame_2)):
+            link = frame if frame in machine.urdf.links else joints[frame].child
+            etree.SubElement(loop, tag, link=link)
+    named = {e.get("name") for e in robot.iterfind("transmission/joint")}
+    for leg in machine.legs:
+        if leg.kind is LegKind.ACTUATED and leg.prismatic not in named:
+            motor = etree.SubElement(robot, "transmission", name=f"{leg.prismatic}_transmission")
+            etree.SubElement(motor, "type").text = "transmission_interface/SimpleTransmission"
+            etree.SubElement(motor, "joint", name=str(leg.prismatic))
+            etree.SubElement(motor, "actuator", name=f"{leg.prismatic}_motor")
+    etree.indent(robot)
+    content = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
+    if not meshes:
+        return content, ()
+    named_meshes = ", ".join(meshes[:3]) + " and more" * (len(meshes) > 3)
+    return content, (f"Meshes lie in files of their own and were left out: {named_meshes}.",)
+
+
+def _without_meshes(robot: etree._Element) -> list[str]:
+    """Remove shapes and textures of other files; return what they were."""
+    found = []
+    for link in robot.iterfind("link"):
+        for shape in [part for part in link if part.tag in _SHAPES]:
+            mesh = shape.find("geometry/mesh")
+            if mesh is not None:
+                found.append(mesh.get("filename", "a mesh without a name"))
+                link.remove(shape)
+    for texture in list(robot.iter("texture")):
+        parent = texture.getparent()
+        if parent is not None:
+            found.append(texture.get("filename", "a texture without a name"))
+            parent.remove(texture)
+    return found
+
+
+def _stub() -> etree._Element:
+    """Return an inertia that simulators accept."""
+    inertial = etree.Element("inertial")
+    etree.SubElement(inertial, "origin", xyz="0 0 0", rpy="0 0 0")
+    etree.SubElement(inertial, "mass", value=repr(STUB_MASS))
+    moments = {f"i{pair}": "0.0" for pair in ("xy", "xz", "yz")}
+    moments |= {f"i{pair}": repr(STUB_INERTIA) for pair in ("xx", "yy", "zz")}
+    etree.SubElement(inertial, "inertia", moments)
+    return inertial
+
+
+def _calibration(subject: Subject) -> dict[str, object]:
+    """Return the numbers of calibration.yaml [m, rad]."""
+    machine = subject.machine
+    found: dict[str, object] = {
+        "base_link": machine.base,
+        "platform_link": machine.platform,
+        "closed_loop": [[c.frame_1, c.frame_2] for c in machine.chain.closures],
+        "closed_loop_type": [c.kind for c in machine.chain.closures],
+        "home": motion_to_xyz_quat(machine.home),
+        "legs": {
+            leg.name: {
+                "joint": leg.prismatic,
+                "is_motor": leg.kind is LegKind.ACTUATED,
+                "base_joint": leg.A.tolist(),
+                "platform_joint": leg.B.tolist(),
+                "offset": float(leg.q0),
+                "sign": leg.sign,
+            }
+            for leg in machine.legs
+        },
+    }
+    if subject.result is not None:
+        result = subject.result.document
+        known = {row.name: row for row in result.parameters}
+        names = result.kinematic.names
+        rows = [known.get(name) for name in names]
+        found["parameters"] = {
+            "frames": "R_b and R_e",
+            "names": names,
+            "units": ["m" if row is None else row.unit for row in rows],
+            "values": [None if row is None else row.value for row in rows],
+            "nominal": [None if row is None else row.nominal for row in rows],
+            "sigma": [None if row is None else row.sigma for row in rows],
+            "covariance": np.array(result.kinematic.covariance).tolist(),
+        }
+    return found

@@ -1,0 +1,118 @@
+"""What is exported: a machine, and of a result what is known of its parameters."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from legcal.machine import (
+    LegColumns,
+    Machine,
+    geometries,
+    legs_in_links,
+    load_mechanism,
+    model_name,
+    parametrization_of,
+)
+
+if TYPE_CHECKING:
+    from legcal.calibration import EarlierResult
+
+RESULT_NAME = "result.json"
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What only some formats ask for."""
+
+    inertia: bool = False  # urdf, ros: stubs of inertia in links that have none
+    nodes: int | None = None  # correction: of its grid, along each coordinate
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A mechanism, and the result that it comes from, if it does."""
+
+    machine: Machine
+    given: str  # as the caller named it
+    nominal: Machine | None = None  # of which only the legs are looked at; None of a model
+    result: EarlierResult | None = None
+
+    @property
+    def name(self) -> str:
+        """The name of the machine: that of its URDF for a result, else that of its file."""
+        return model_name(self.machine) if self.result is None else self.machine.urdf.name
+
+
+@dataclass(frozen=True)
+class ExportedFile:
+    """A file of an export."""
+
+    name: str  # relative to a folder; "" for the one file of a format
+    content: bytes
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What a format makes of a subject."""
+
+    files: tuple[ExportedFile, ...]
+    notes: tuple[str, ...] = ()  # what the reader should know, one sentence each
+    figures: Mapping[str, Any] = field(default_factory=dict)  # for ``--json``
+
+
+def one_file(text: str, notes: tuple[str, ...] = ()) -> Rendered:
+    """Return the rendering of a format that is one text file."""
+    return Rendered((ExportedFile("", text.encode()),), notes)
+
+
+def load_subject(given: str | Path) -> Subject:
+    """Return what is exported: the result in a folder or ``result.json``, else a mechanism.
+
+    Raises
+    ------
+    DatasetError
+        If the result is damaged, or of another version.
+    ModelError
+        If there is no such mechanism.
+    """
+    path = Path(given)
+    if os.path.isfile(path / RESULT_NAME) or path.name == RESULT_NAME:
+        from legcal.calibration import load_result
+
+        result = load_result(path)
+        return Subject(result.machine, str(given), _nominal(result), result)
+    return Subject(load_mechanism(given), str(given))
+
+
+def _nominal(result: EarlierResult) -> Machine:
+    """Return the nominal machine of a result, in the same links; its legs alone are nominal."""
+    machine, document = result.machine, result.document
+    known = parametrization_of(machine, twists=True)
+    rows = {row.name: row for row in document.parameters}
+    axes: Mapping[str, Mapping[str, list[float]]] = document.nominal_axes
+    legs = []
+    for name, place, leg in zip(machine.leg_names, known.place, geometries(machine), strict=True):
+        numbers = np.concatenate([leg.A, leg.B, [leg.q0]])
+        for column, at in enumerate(place[: LegColumns.LENGTH + 1].tolist()):
+            if at >= 0 and known.names[at] in rows:
+                numbers[column] = rows[known.names[at]].nominal
+        base, platform = (axes.get(side, {}).get(name) for side in ("base", "platform"))
+        twist = rows.get(f"{name}.twist")
+        legs.append(
+            replace(
+                leg,
+                A=numbers[LegColumns.A],
+                B=numbers[LegColumns.B],
+                q0=float(numbers[LegColumns.LENGTH]),
+                base_axis=leg.base_axis if base is None else np.array(base),
+                platform_axis=leg.platform_axis if platform is None else np.array(platform),
+                twist=leg.twist if twist is None else twist.nominal,
+            )
+        )
+    return replace(machine, legs=legs_in_links(machine, legs))

@@ -1,0 +1,507 @@
+"""Exports are read back, by the programs that they are for or by an evaluation of our own."""
+
+import csv
+import ctypes
+import importlib.util
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+from command_line import run
+from hexapod_example import Run
+from layouts import Layout, write_machine
+from lxml import etree
+from machines import planar
+from scipy.spatial.transform import RigidTransform, Rotation
+
+import legcal
+from legcal import load_mechanism
+from legcal.errors import DatasetError, LegcalError, ModelError, OutOfClass, UsageError
+from legcal.exports import FORMATS, ExportOptions, Subject, export, formats_of, load_subject
+from legcal.exports.identifiers import identifiers
+from legcal.geometry import Array
+from legcal.machine import (
+    Machine,
+    forward_kinematics,
+    inverse_kinematics,
+    random_poses,
+)
+from legcal.simulation import ParameterErrors, Spread, write_true_model
+
+NAMES = ("hexapod", "3-rps", "3-upu", "tricept", "3-rpr")
+KINEMATICS = (*NAMES, "hexapod-rod", "nategh-agheli")
+ERRORS = ParameterErrors(
+    base_joints=Spread(2e-3),
+    platform_joints=Spread(2e-3),
+    offsets=Spread(1e-3),
+    lengths=Spread(1e-3),
+    axes=Spread(3e-3),
+)
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Subject]:
+    """Give machines that are not what their nominal models say."""
+
+    @cache
+    def made(name: str) -> Subject:
+        nominal = load_mechanism(name)
+        folder = tmp_path_factory.mktemp("model")
+        true = write_true_model(nominal, ERRORS, np.random.default_rng(7), folder)
+        return Subject(true, name, nominal)
+
+    return made
+
+
+def written(subject: Subject, to: str, path: Path) -> Path:
+    """Return the file of an export."""
+    return export(subject, to, path).paths[0]
+
+
+def poses_of(machine: Machine, count: int = 3) -> tuple[Array, list[RigidTransform]]:
+    """Return readings of the motors, zero for other legs, and the poses there."""
+    q, poses = random_poses(machine, count, np.random.default_rng(11))
+    is_motor = np.isin(np.arange(machine.n_legs), machine.motors)
+    return np.where(is_motor, q, 0.0), poses
+
+
+# --- source code --------------------------------------------------------------------------------
+
+
+def module_at(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("exported", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("name", KINEMATICS)
+def test_kinematics_in_python_are_those_of_the_model(
+    name: str, calibrated: Callable[[str], Subject], tmp_path: Path
+) -> None:
+    subject = calibrated(name)
+    machine = subject.machine
+    found = module_at(written(subject, "python", tmp_path / "kinematics.py"))
+    assert machine.leg_names == found.LEGS
+    for q, T in zip(*poses_of(machine), strict=True):
+        pose = forward_kinematics(machine, q)
+        np.testing.assert_allclose(pose.as_matrix(), T.as_matrix(), atol=1e-10)
+        np.testing.assert_allclose(
+            found.inverse(T.as_matrix()), inverse_kinematics(machine, T), atol=1e-10
+        )
+        np.testing.assert_allclose(found.forward(q), T.as_matrix(), atol=1e-9)
+    off = machine.home.as_matrix()
+    off[:3, :3] = Rotation.from_rotvec([0.3, 0.2, 0.1]).as_matrix() @ off[:3, :3]
+    if any(leg.n_constraints for leg in machine.legs):
+        with pytest.raises(ValueError, match="do not allow"):
+            found.inverse(off)
+    with pytest.raises(ValueError, match=r"no pose was found|finite"):
+        found.forward(np.full(machine.n_legs, np.nan))
+    with pytest.raises(ValueError, match="no pose was found"):
+        found.forward(-5.0 * machine.sign)
+
+
+@pytest.mark.system
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on the path")
+@pytest.mark.parametrize("name", KINEMATICS)
+def test_kinematics_in_c_compile_and_are_those_of_the_model(
+    name: str, calibrated: Callable[[str], Subject], tmp_path: Path
+) -> None:
+    subject = calibrated(name)
+    machine = subject.machine
+    source = written(subject, "c", tmp_path / "kinematics.c")
+    library = tmp_path / "kinematics.so"
+    strict = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2", "-shared", "-fPIC")
+    subprocess.run(["gcc", *strict, source, "-o", library, "-lm"], check=True)
+    found: Any = ctypes.CDLL(str(library))
+    prefix = identifiers([subject.name])[0]
+    numbers = ctypes.c_double * machine.n_legs
+    pose = ctypes.c_double * 12
+
+    def packed(T: RigidTransform) -> Any:
+        matrix = T.as_matrix()
+        return pose(*matrix[:3, :3].ravel(), *matrix[:3, 3])
+
+    for q, T in zip(*poses_of(machine), strict=True):
+        readings, there = numbers(), packed(machine.home)
+        assert getattr(found, f"{prefix}_inverse")(packed(T), readings) == 0
+        np.testing.assert_allclose(np.array(readings), inverse_kinematics(machine, T), atol=1e-10)
+        assert getattr(found, f"{prefix}_forward")(numbers(*q), there) == 0
+        np.testing.assert_allclose(np.array(there), np.array(packed(T)), atol=1e-9)
+    stays = packed(machine.home)
+    assert getattr(found, f"{prefix}_forward")(numbers(*(-5.0 * machine.sign)), stays) == -1
+    np.testing.assert_array_equal(stays, packed(machine.home))
+
+
+@pytest.mark.system
+@pytest.mark.skipif(shutil.which("octave") is None, reason="no octave on the path")
+@pytest.mark.parametrize("name", KINEMATICS)
+def test_kinematics_for_matlab_run_in_octave_and_are_those_of_the_model(
+    name: str, calibrated: Callable[[str], Subject], tmp_path: Path
+) -> None:
+    subject = calibrated(name)
+    machine = subject.machine
+    written(subject, "matlab", tmp_path / "kinematics.m")
+    readings, poses = poses_of(machine)
+    lines = ["m = kinematics();", "format long"]
+    for q, T in zip(readings, poses, strict=True):
+        matrix = ";".join(" ".join(map(repr, row)) for row in T.as_matrix().tolist())
+        lines += [
+            f"q = [{' '.join(map(repr, q.tolist()))}];",
+            f"printf('%.17g ', m.inverse([{matrix}]), m.forward(q));",
+            "printf('\\n');",
+        ]
+    lines.append(f"try, m.forward({-5.0!r} * m.sign); catch e, disp(e.message), end")
+    (tmp_path / "check.m").write_text("\n".join(lines) + "\n")
+    done = subprocess.run(
+        ["octave", "--no-gui", "--quiet", "--norc", "check.m"],
+        cwd=tmp_path, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    *rows, refusal = done.stdout.splitlines()
+    assert "no pose was found" in refusal
+    for T, printed in zip(poses, rows, strict=True):
+        numbers = np.array(printed.split(), dtype=float)
+        q, pose = np.split(numbers, [machine.n_legs])
+        np.testing.assert_allclose(q, inverse_kinematics(machine, T), atol=1e-10)
+        np.testing.assert_allclose(pose.reshape(4, 4).T, T.as_matrix(), atol=1e-9)
+
+
+# --- models of other programs -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_urdf_with_its_loops_is_the_same_machine_without_a_yaml(
+    name: str, calibrated: Callable[[str], Subject], tmp_path: Path
+) -> None:
+    machine = calibrated(name).machine
+    (path,) = export(
+        calibrated(name), "urdf", tmp_path / "alone.urdf", options=ExportOptions(inertia=True)
+    ).paths
+    back = load_mechanism(path)
+    assert len(back.motors) == len(machine.motors)
+    q, poses = poses_of(machine)
+    by_slider = {leg.prismatic: j for j, leg in enumerate(back.legs)}
+    order = [by_slider[leg.prismatic] for leg in machine.legs]
+    T = back.chain.pose(back.home_configuration, machine.base, machine.platform)
+    for readings, pose in zip(q, poses, strict=True):
+        there = np.zeros(back.n_legs)
+        there[order] = readings
+        found = forward_kinematics(back, there)
+        np.testing.assert_allclose(found.as_matrix(), pose.as_matrix(), atol=1e-9)
+    assert np.isfinite(T.as_matrix()).all()
+    robot = etree.parse(path).getroot()
+    assert len(robot.findall("link/inertial/mass")) == len(robot.findall("link"))
+
+
+def test_meshes_are_left_out_of_a_urdf_and_named(tmp_path: Path) -> None:
+    machine = load_mechanism("hexapod")
+    mesh = (
+        b'<link name="base"><visual><geometry><mesh filename="a/b.stl"/></geometry></visual></link>'
+    )
+    content = machine.urdf.content.replace(b'<link name="base"/>', mesh)
+    assert content != machine.urdf.content
+    shown = replace(machine, urdf=replace(machine.urdf, content=content))
+    found = export(Subject(shown, "hexapod"), "urdf", tmp_path / "alone.urdf")
+    assert "a/b.stl" in " ".join(found.notes)
+    assert b"mesh" not in (tmp_path / "alone.urdf").read_bytes()
+
+
+def closed_in_mujoco(model: Any, data: Any, machine: Machine, q: Array) -> RigidTransform:
+    """Return the pose at readings by Newton's method on MuJoCo's own constraints."""
+    motors = [model.joint(machine.legs[j].prismatic) for j in machine.motors]
+    at, fixed = [int(m.qposadr[0]) for m in motors], [int(m.dofadr[0]) for m in motors]
+    free = np.setdiff1d(np.arange(model.nv), fixed)
+    first, last = data.qpos[at].copy(), q[list(machine.motors)]
+    for part in np.linspace(0.1, 1.0, 10):
+        data.qpos[at] = first + part * (last - first)
+        for _ in range(20):
+            mujoco.mj_forward(model, data)
+            missed = data.efc_pos[: data.ne].copy()
+            if np.abs(missed).max() < 1e-13:
+                break
+            J = data.efc_J.reshape(-1, model.nv)[: data.ne]
+            step = np.zeros(model.nv)
+            step[free] = -np.linalg.lstsq(J[:, free], missed, rcond=1e-9)[0]
+            mujoco.mj_integratePos(model, data.qpos, step, 1.0)
+    body = data.body(machine.platform)
+    return RigidTransform.from_components(body.xpos, Rotation.from_matrix(body.xmat.reshape(3, 3)))
+
+
+@pytest.mark.parametrize("name", KINEMATICS)
+def test_mujoco_loads_the_mjcf_closed_and_has_the_same_forward_kinematics(
+    name: str, calibrated: Callable[[str], Subject], tmp_path: Path
+) -> None:
+    machine = calibrated(name).machine
+    path = written(calibrated(name), "mjcf", tmp_path / "machine.xml")
+    model = mujoco.MjModel.from_xml_path(str(path))
+    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert data.ne == machine.chain.n_rows
+    assert np.abs(data.efc_pos[: data.ne]).max() < 1e-11
+    assert model.nu == len(machine.motors)
+    for q, T in zip(*poses_of(machine), strict=True):
+        mujoco.mj_resetData(model, data)
+        found = closed_in_mujoco(model, data, machine, q)
+        np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-6)
+    if machine.spatial:  # our reader has no planar joints of two slides and a hinge
+        back = load_mechanism(path)
+        assert sorted(leg.type for leg in back.legs) == sorted(leg.type for leg in machine.legs)
+        np.testing.assert_allclose(back.A_base, machine.A_base, atol=1e-9)
+        np.testing.assert_allclose(back.q0, machine.q0, atol=1e-9)
+
+
+# --- controllers --------------------------------------------------------------------------------
+
+
+def test_genhexkins_has_the_readings_of_the_model(
+    calibrated: Callable[[str], Subject], tmp_path: Path
+) -> None:
+    machine = calibrated("hexapod").machine
+    text = written(calibrated("hexapod"), "linuxcnc", tmp_path / "hexapod.hal").read_text()
+    pins = {
+        words[1]: float(words[2])
+        for line in text.splitlines()
+        if (words := line.split())[:1] == ["setp"]
+    }
+    base, platform = (
+        np.array([[pins[f"genhexkins.{side}.{j}.{axis}"] for axis in "xyz"] for j in range(6)])
+        for side in ("base", "platform")
+    )
+    offsets = [float(line.split()[-1]) for line in text.splitlines() if "HOME_OFFSET =" in line]
+    limits = [float(line.split()[-1]) for line in text.splitlines() if "MIN_LIMIT =" in line]
+    assert len(offsets) == len(limits) == 6
+    for q, T in zip(*poses_of(machine, 5), strict=True):
+        a, b, c = T.rotation.as_euler("xyz", degrees=True)  # about fixed axes
+        cos, sin = (np.vectorize(f)(np.deg2rad([a, b, c])) for f in (np.cos, np.sin))
+        Rx = np.array([[1, 0, 0], [0, cos[0], -sin[0]], [0, sin[0], cos[0]]])
+        Ry = np.array([[cos[1], 0, sin[1]], [0, 1, 0], [-sin[1], 0, cos[1]]])
+        Rz = np.array([[cos[2], -sin[2], 0], [sin[2], cos[2], 0], [0, 0, 1]])
+        joints = np.linalg.norm(1e3 * T.translation + platform @ (Rz @ Ry @ Rx).T - base, axis=1)
+        np.testing.assert_allclose((joints - offsets) * machine.sign, 1e3 * q, atol=1e-9)
+        assert (joints >= limits).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_corrected_commands_bring_the_machine_where_it_should_be(
+    name: str, calibrated: Callable[[str], Subject], tmp_path: Path
+) -> None:
+    subject = calibrated(name)
+    machine, nominal = subject.machine, subject.nominal
+    assert nominal is not None
+    found = export(subject, "correction", tmp_path / "table.csv", options=ExportOptions(nodes=3))
+    own, figures = found.figures["coordinates"], found.figures
+    assert len(own) == machine.mobility
+    assert figures["nodes"] == 3**machine.mobility
+    lines = (tmp_path / "table.csv").read_text().splitlines()
+    said = [line for line in lines if line.startswith("#")]
+    assert all(any(note in line for line in said) for note in found.notes)
+    table = np.array([row.split(",") for row in lines[len(said) + 1 :]], dtype=float)
+    assert lines[len(said)].split(",")[: len(own)] == [
+        f"{name}_{'mm' if name in 'xyz' else 'deg'}" for name in own
+    ]
+    m = len(own)
+    for row in table[:: max(1, len(table) // 5)]:
+        start = nominal.home
+        pose = _with_coordinates(nominal, own, row[m:], start)
+        reached = forward_kinematics(machine, inverse_kinematics(nominal, pose))
+        np.testing.assert_allclose(_coordinates(reached, own), row[:m], atol=1e-6)
+    off = figures["residual"]["max_dX_m"], figures["uncorrected"]["max_dX_m"]
+    assert 0.0 < off[0] < 0.1 * off[1]
+
+
+def _coordinates(T: RigidTransform, own: list[str]) -> Array:
+    """Return coordinates of a pose [mm, deg]."""
+    everything = [*(1e3 * T.translation), *T.rotation.as_euler("xyz", degrees=True)]
+    names = ["x", "y", "z", "roll", "pitch", "yaw"]
+    return np.array([everything[names.index(name)] for name in own])
+
+
+def _with_coordinates(
+    machine: Machine, own: list[str], wanted: Array, start: RigidTransform
+) -> RigidTransform:
+    """Return the pose of a machine with given coordinates, by Newton's method on its readings."""
+    q = inverse_kinematics(machine, start)
+    motors = list(machine.motors)
+    for _ in range(30):
+        here = _coordinates(forward_kinematics(machine, q), own)
+        if np.abs(here - wanted).max() < 1e-9:
+            break
+        J = np.empty((len(own), len(motors)))
+        for k, motor in enumerate(motors):
+            ahead = q.copy()
+            ahead[motor] += 1e-6
+            J[:, k] = (_coordinates(forward_kinematics(machine, ahead), own) - here) / 1e-6
+        q[motors] += np.linalg.solve(J, wanted - here)
+    return forward_kinematics(machine, q)
+
+
+# --- parameters ---------------------------------------------------------------------------------
+
+
+def test_tables_have_the_numbers_of_the_result(example_run: Run, tmp_path: Path) -> None:
+    result, subject = legcal.load_result(example_run.output), load_subject(example_run.output)
+    machine, links = result.machine, (result.machine.base, result.machine.platform)
+    text = written(subject, "csv", tmp_path / "a.csv").read_text()
+    rows = list(csv.DictReader(text.splitlines()))
+    in_links = {row["name"]: row for row in rows if row["frame"] in links}
+    others = {row["name"]: row for row in rows if row["frame"] not in links}
+    for one in result.document.parameters:
+        found = others[one.name]
+        scale = {"m": 1e3, "rad": np.degrees(1.0)}.get(one.unit, 1.0)
+        assert float(found["value"]) == pytest.approx(scale * one.value, abs=1e-12)
+        assert float(found["nominal"]) == pytest.approx(scale * one.nominal, abs=1e-12)
+        assert (found["sigma"] == "") == (one.sigma is None)
+    for j, leg in enumerate(machine.legs):
+        for k, axis in enumerate("xyz"):
+            value = float(in_links[f"{leg.name}.base.{axis}"]["value"])
+            assert value == pytest.approx(1e3 * machine.A_base[j, k], abs=1e-9)
+    document = json.loads(written(subject, "json", tmp_path / "a.json").read_text())
+    assert document["units"] == {"length": "mm", "angle": "deg"}
+    points = [leg["A"]["link"] for leg in document["legs"]]
+    np.testing.assert_allclose(points, 1e3 * machine.A_base, atol=1e-12)
+    kinematic = result.document.kinematic
+    assert document["covariance"]["names"] == kinematic.names
+    np.testing.assert_allclose(
+        document["covariance"]["matrix"], 1e6 * np.array(kinematic.covariance), rtol=1e-12
+    )
+    text = written(subject, "table", tmp_path / "a.txt").read_text()
+    assert all(f"\n{row['name']}" in text for row in rows)
+
+
+def test_the_folder_for_ros_has_model_and_covariance(example_run: Run, tmp_path: Path) -> None:
+    found = export(example_run.output, "ros", tmp_path / "ros")
+    document = yaml.safe_load((tmp_path / "ros/calibration.yaml").read_text())
+    machine = load_mechanism(tmp_path / "ros" / document["urdf"])
+    result = legcal.load_result(example_run.output)
+    np.testing.assert_allclose(machine.A_base, result.machine.A_base, atol=1e-12)
+    known = document["parameters"]
+    np.testing.assert_array_equal(known["covariance"], result.document.kinematic.covariance)
+    sigma = dict(zip(known["names"], known["sigma"], strict=True))
+    assert sigma["leg4.base.x"] == next(
+        row.sigma for row in result.document.parameters if row.name == "leg4.base.x"
+    )
+    assert sorted(path.name for path in found.paths) == ["calibration.yaml", "hexapod.urdf"]
+
+
+def test_the_nominal_model_of_a_result_is_the_one_it_started_from(example_run: Run) -> None:
+    nominal = load_mechanism(example_run.folder / "models/hexapod.yaml")
+    found = load_subject(example_run.output).nominal
+    assert found is not None
+    np.testing.assert_allclose(found.A_base, nominal.A_base, atol=1e-15)
+    np.testing.assert_allclose(found.B_platform, nominal.B_platform, atol=1e-15)
+    np.testing.assert_allclose(found.q0, nominal.q0, atol=1e-15)
+
+
+# --- names, places, refusals --------------------------------------------------------------------
+
+HOSTILE = ("*/ exit(1); /*", '1 leg\'s "end"', "leg?", "leg!", "if", "für\u202e")
+
+
+def test_names_of_any_kind_are_identifiers_that_differ() -> None:
+    found = identifiers([*HOSTILE, "leg_2", "LEG", "leg"])
+    assert len(set(found)) == len(found)
+    assert all(name.isidentifier() and name.isascii() and len(name) <= 63 for name in found)
+    assert "if" not in found
+
+
+def test_hostile_names_end_no_string_and_no_comment(tmp_path: Path) -> None:
+    machine = load_mechanism("hexapod")
+    legs = tuple(replace(leg, name=name) for leg, name in zip(machine.legs, HOSTILE, strict=True))
+    path = Path("'; exit(1); %{ */.yaml")
+    subject = Subject(replace(machine, legs=legs, yaml_path=path), "hostile")
+    found = module_at(written(subject, "python", tmp_path / "kinematics.py"))
+    assert found.LEGS == HOSTILE
+    for to, name in (("c", "a.c"), ("matlab", "a.m"), ("linuxcnc", "a.hal"), ("mjcf", "a.xml")):
+        text = written(subject, to, tmp_path / name).read_text()
+        outside = re.sub(r"""'([^']|'')*'|"(\\.|[^"\\])*"|#.*""", "", text)
+        assert "exit" not in outside
+    mujoco.MjModel.from_xml_path(str(tmp_path / "a.xml"))
+    if shutil.which("gcc"):
+        subprocess.run(["gcc", "-fsyntax-only", tmp_path / "a.c"], check=True)
+
+
+def test_formats_that_a_class_does_not_have_are_refused_with_those_it_has(tmp_path: Path) -> None:
+    refused = {
+        ("3-rps", "linuxcnc"): "six legs",
+        ("hexapod-rod", "linuxcnc"): "leg6",
+        ("hexapod", "correction"): "needed a result",
+    }
+    for (name, to), said in refused.items():
+        with pytest.raises(OutOfClass, match=said) as error:
+            export(name, to, tmp_path / "out.txt")
+        assert "this machine has table, csv, json, urdf" in str(error.value)
+    path = write_machine(tmp_path / "redundant", planar(kinds=("actuated",) * 4), Layout())
+    machine = load_mechanism(path)
+    assert not {"python", "c", "matlab", "linuxcnc"} & set(formats_of(Subject(machine, "4-rpr")))
+    with pytest.raises(OutOfClass, match="as many motors as freedoms"):
+        export(path, "c", tmp_path / "out.c")
+    assert list(tmp_path.glob("out*")) == []
+
+
+def test_places_and_options_that_cannot_be_used_are_refused_and_nothing_is_written(
+    example_run: Run, tmp_path: Path
+) -> None:
+    there = tmp_path / "there.txt"
+    there.write_text("mine")
+    (tmp_path / "ros").mkdir()
+    (tmp_path / "ros/calibration.yaml").write_text("mine")
+    other = tmp_path / "result"
+    shutil.copytree(example_run.output, other)
+    document = json.loads((other / "result.json").read_text())
+    (other / "result.json").write_text(json.dumps(document | {"legcal_result": 2}))
+    out, result = tmp_path / "a", example_run.output
+    cases: list[tuple[Any, str, Path, ExportOptions, type[LegcalError], str]] = [
+        ("hexapod", "step", tmp_path / "a", ExportOptions(), UsageError, "mjcf"),
+        ("hexapod", "table", there, ExportOptions(), UsageError, "--force"),
+        ("hexapod", "table", tmp_path, ExportOptions(), UsageError, "a folder"),
+        ("hexapod", "table", tmp_path / "no/a", ExportOptions(), UsageError, "no folder"),
+        ("hexapod", "ros", tmp_path / "ros", ExportOptions(), UsageError, "calibration.yaml"),
+        ("hexapod", "csv", tmp_path / "a", ExportOptions(inertia=True), UsageError, "--inertia"),
+        ("hexapod", "urdf", tmp_path / "a", ExportOptions(nodes=3), UsageError, "correction"),
+        ("hexapod", "matlab", tmp_path / "1-a.m", ExportOptions(), UsageError, "m_1_a.m"),
+        (result, "correction", out, ExportOptions(nodes=1), UsageError, "2 to 8"),
+        (other, "csv", tmp_path / "a", ExportOptions(), DatasetError, "legcal_result"),
+        (tmp_path / "no/result.json", "csv", out, ExportOptions(), DatasetError, "result"),
+        ("no-such-model", "csv", tmp_path / "a", ExportOptions(), ModelError, "no-such-model"),
+    ]  # fmt: skip
+    before = sorted(tmp_path.rglob("*"))
+    for source, to, path, options, error, said in cases:
+        with pytest.raises(error) as refused:
+            export(source, to, path, options=options)
+        assert said in str(refused.value), refused.value
+    assert sorted(tmp_path.rglob("*")) == before
+    assert there.read_text() == "mine"
+    export("hexapod", "table", there, force=True)
+    assert there.read_text().startswith("hexapod")
+    export("hexapod", "ros", tmp_path / "ros", force=True)
+    assert yaml.safe_load((tmp_path / "ros/calibration.yaml").read_text())["robot"] == "hexapod"
+
+
+def test_the_command_says_what_it_wrote(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        run(monkeypatch, "export", "hexapod", "--to", "csv", "-o", tmp_path / "a.csv", "--json")
+        == 0
+    )
+    found = json.loads(capsys.readouterr().out)
+    assert found["written"] == [str(tmp_path / "a.csv")]
+    assert (
+        run(monkeypatch, "export", "3-rps", "--to", "linuxcnc", "-o", tmp_path / "b", "--json") == 1
+    )
+    assert json.loads(capsys.readouterr().out)["error"]["kind"] == "OutOfClass"
+    assert set(FORMATS) >= {"table", "csv", "json", "urdf", "mjcf", "linuxcnc", "ros", "correction"}
