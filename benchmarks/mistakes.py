@@ -1,143 +1,205 @@
 """Whether common mistakes are named: sessions of photographs, each with one mistake.
 
-    OMP_NUM_THREADS=1 python benchmarks/mistakes.py [--models hexapod,3-rps,...] [--seeds 50]
-        [--keep DIR] [--only KIND] [--workers 2] [--wrong-joints 10]
+    OMP_NUM_THREADS=1 python benchmarks/mistakes.py --keep DIR --record FILE
+        [--models hexapod,3-rps,...] [--seeds 50] [--first-seed 0] [--each 1] [--minutes 7]
+        [--only KIND] [--workers 1]
 
-Each session is rendered once (45 photographs of a machine whose joints are 2 mm off, kept in DIR),
-then one mistake is drawn and made in its readings, model or images. Printed is what is named, what
-is named for it, how many images agree, and in the end how often the right kind was the first of the
-diagnosis, with its 95 % interval (Wilson), and how often anything was named of sessions without a
-mistake. Mistakes that leave the machine as it is (legs of a symmetric one relabelled) count as
-right where the diagnosis names one that does the same.
+A session is 45 photographs of a machine whose joints are 2 mm off, rendered once; their edge pairs
+are kept in DIR as well. Every other one has no rough camera poses. In each session so many mistakes
+(--each) are made one after the other, in its readings, its model or its images, dealt so that all
+kinds come about equally often; and nothing is done to it once, and once its model gets joints that
+are 10 mm off. What is named is written to FILE (JSON lines), and what FILE has is not done again,
+so that a run can be continued (--minutes ends it early). Printed is what FILE has in the end: how
+often the right kind was the first of the diagnosis, with its 95 % interval (Wilson), and how often
+anything was named of sessions without a mistake.
+
+Right is the kind of mistake that was made, or one whose undoing gives the same machine: legs at the
+same places in all images, whatever their names and wherever the camera stands. That is computed
+for each diagnosis from the nominal model and the readings (a mirror-symmetric hexapod with reversed
+columns is one whose images are mirrored).
 """
 
 import argparse
+import json
+import pickle
 import time
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import permutations
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from legcal import ParameterErrors, SimulationSettings, Spread, load_dataset, simulate
 from legcal.calibration.diagnosis.diagnosis import diagnose
-from legcal.calibration.ordered_dataset import order_dataset
+from legcal.calibration.diagnosis.mistakes import Assumed, as_given, mistakes
+from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.data import Dataset
 from legcal.geometry import Array
 from legcal.machine import Leg, LegKind, Machine
+from legcal.perception import LEFT_RIGHT, CandidatePairs, Placement, pairs_of_images
+from legcal.perception.agreement import as_if
+from legcal.perception.placement import sensor_extent
 from legcal.progress import no_progress
 from legcal.simulation import Level
-from legcal.workers import worker_pool
+from legcal.workers import Run, worker_pool
 
 MODELS = ("hexapod", "3-rps", "3-upu", "tricept")
+JOINTS, WRONG_JOINTS = 2e-3, 10e-3  # standard deviation of joint centres of the model [m]
+SAME = 0.01  # of the size of the machine: legs at the same places
+WRONG_RADIUS = 0.05  # relative
 MIRROR = np.diag([1.0, -1.0, 1.0])
-# kinds of diagnosis that name a mistake
-RIGHT = {
-    "exchanged": ("columns exchanged",),
-    "reversed": ("columns reversed", "handedness", "images mirrored", "columns exchanged"),
-    "rotated": ("columns rotated",),
-    "direction": ("direction of an encoder",),
-    "directions": ("direction of encoders",),
-    "shifted": ("readings shifted",),
-    "views": ("views exchanged",),
-    "diameter": ("diameter for radius",),
-    "handedness": ("handedness", "images mirrored", "columns reversed", "columns exchanged"),
-    "platform joints": ("platform joints from another leg", "columns rotated"),
-    "focal length": ("focal length",),
-    "mirrored": ("images mirrored", "handedness", "columns reversed", "columns exchanged"),
-}
-Make = Callable[[Dataset, np.random.Generator], Dataset]
+CLEAN, OFF = "no mistake", "joints 10 mm off"
+
+
+@dataclass(frozen=True)
+class Session:
+    """A session with the edge pairs of its images, by image."""
+
+    dataset: Dataset
+    pairs: dict[str, CandidatePairs]
+
+
+Make = Callable[[Session, np.random.Generator], Session]
 
 
 def _motors(machine: Machine) -> list[int]:
     return [j for j, leg in enumerate(machine.legs) if leg.kind is LegKind.ACTUATED]
 
 
-def _with_columns(dataset: Dataset, order: list[int]) -> Dataset:
+def _with_readings(session: Session, q: Array) -> Session:
+    dataset = session.dataset
+    measurements = replace(dataset.measurements, q=q)
+    return replace(session, dataset=replace(dataset, measurements=measurements))
+
+
+def _with_machine(session: Session, machine: Machine) -> Session:
+    return replace(session, dataset=replace(session.dataset, machine=machine))
+
+
+def _with_legs(session: Session, legs: list[Leg]) -> Session:
+    return _with_machine(session, replace(session.dataset.machine, legs=tuple(legs)))
+
+
+def _with_columns(session: Session, order: list[int]) -> Session:
     """Return a session whose motors have the readings of others."""
-    motors, q = _motors(dataset.machine), dataset.measurements.q.copy()
-    q[:, motors] = dataset.measurements.q[:, [motors[k] for k in order]]
-    return replace(dataset, measurements=replace(dataset.measurements, q=q))
+    motors, own = _motors(session.dataset.machine), session.dataset.measurements.q
+    q = own.copy()
+    q[:, motors] = own[:, [motors[k] for k in order]]
+    return _with_readings(session, q)
 
 
-def _with_legs(dataset: Dataset, legs: list[Leg]) -> Dataset:
-    return replace(dataset, machine=replace(dataset.machine, legs=tuple(legs)))
-
-
-def exchanged(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+def exchanged(session: Session, rng: np.random.Generator) -> Session:
     """Exchange two columns."""
-    order = list(range(len(_motors(dataset.machine))))
+    order = list(range(len(_motors(session.dataset.machine))))
     i, k = rng.choice(len(order), 2, replace=False).tolist()
     order[i], order[k] = order[k], order[i]
-    return _with_columns(dataset, order)
+    return _with_columns(session, order)
 
 
-def reversed_columns(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+def reversed_columns(session: Session, _: np.random.Generator) -> Session:
     """Reverse the columns."""
-    return _with_columns(dataset, list(range(len(_motors(dataset.machine))))[::-1])
+    return _with_columns(session, list(range(len(_motors(session.dataset.machine))))[::-1])
 
 
-def rotated(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+def rotated(session: Session, rng: np.random.Generator) -> Session:
     """Begin with another column."""
-    n = len(_motors(dataset.machine))
+    n = len(_motors(session.dataset.machine))
     k = int(rng.integers(1, n))
-    return _with_columns(dataset, [(j + k) % n for j in range(n)])
+    return _with_columns(session, [(j + k) % n for j in range(n)])
 
 
-def _turned(dataset: Dataset, which: list[int]) -> Dataset:
-    q = dataset.measurements.q.copy()
+def _turned(session: Session, which: list[int]) -> Session:
+    q = session.dataset.measurements.q.copy()
     for j in which:
-        low, high = dataset.machine.legs[j].travel
+        low, high = session.dataset.machine.legs[j].travel
         q[:, j] = low + high - q[:, j]
-    return replace(dataset, measurements=replace(dataset.measurements, q=q))
+    return _with_readings(session, q)
 
 
-def direction(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+def direction(session: Session, rng: np.random.Generator) -> Session:
     """Count one encoder from the other end of its travel."""
-    return _turned(dataset, [int(rng.choice(_motors(dataset.machine)))])
+    return _turned(session, [int(rng.choice(_motors(session.dataset.machine)))])
 
 
-def directions(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+def directions(session: Session, _: np.random.Generator) -> Session:
     """Count all encoders from the other end."""
-    return _turned(dataset, _motors(dataset.machine))
+    return _turned(session, _motors(session.dataset.machine))
 
 
-def shifted(dataset: Dataset, rng: np.random.Generator) -> Dataset:
-    """Shift the readings by a row within each view."""
-    m = dataset.measurements
-    q, step = m.q.copy(), int(rng.choice([-1, 1]))
-    for v in range(len(m.views)):
+def zero(session: Session, rng: np.random.Generator) -> Session:
+    """Move the zero of one encoder as far as its travel allows, by a quarter of it at most."""
+    machine, q = session.dataset.machine, session.dataset.measurements.q.copy()
+    j = int(rng.choice(_motors(machine)))
+    low, high = machine.legs[j].travel
+    up, down = high - q[:, j].max(), q[:, j].min() - low
+    size = min(max(up, down), 0.25 * (high - low))
+    q[:, j] += size if up > down else -size
+    return _with_readings(session, q)
+
+
+def _rolled(session: Session, views: list[int], step: int) -> Session:
+    m = session.dataset.measurements
+    q = m.q.copy()
+    for v in views:
         rows = np.flatnonzero(m.view == v)
         q[rows] = m.q[np.roll(rows, step)]
-    return replace(dataset, measurements=replace(m, q=q))
+    return _with_readings(session, q)
 
 
-def views(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+def shifted(session: Session, rng: np.random.Generator) -> Session:
+    """Shift the readings by a row or two within each view."""
+    n = len(session.dataset.measurements.views)
+    return _rolled(session, list(range(n)), int(rng.choice([-2, -1, 1, 2])))
+
+
+def shifted_view(session: Session, rng: np.random.Generator) -> Session:
+    """Shift the readings of one view by a row."""
+    n = len(session.dataset.measurements.views)
+    return _rolled(session, [int(rng.integers(n))], int(rng.choice([-1, 1])))
+
+
+def views(session: Session, rng: np.random.Generator) -> Session:
     """Exchange the readings of two views."""
-    m = dataset.measurements
+    m = session.dataset.measurements
     a, b = rng.choice(len(m.views), 2, replace=False).tolist()
     one, other = np.flatnonzero(m.view == a), np.flatnonzero(m.view == b)
     q = m.q.copy()
     q[one], q[other] = m.q[other], m.q[one]
-    return replace(dataset, measurements=replace(m, q=q))
+    return _with_readings(session, q)
 
 
-def diameter(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+def _with_radii(session: Session, radius: Callable[[float], float]) -> Session:
+    legs = session.dataset.machine.legs
+    cylinders = [[replace(c, radius=radius(c.radius)) for c in leg.cylinders] for leg in legs]
+    return _with_machine(session, session.dataset.machine.with_cylinders(cylinders))
+
+
+def diameter(session: Session, _: np.random.Generator) -> Session:
     """Double all radii."""
-    legs = dataset.machine.legs
-    cylinders = [[replace(c, radius=2.0 * c.radius) for c in leg.cylinders] for leg in legs]
-    return replace(dataset, machine=dataset.machine.with_cylinders(cylinders))
+    return _with_radii(session, lambda radius: 2.0 * radius)
 
 
-def handedness(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+def half_radius(session: Session, _: np.random.Generator) -> Session:
+    """Halve all radii."""
+    return _with_radii(session, lambda radius: 0.5 * radius)
+
+
+def tube_and_rod(session: Session, _: np.random.Generator) -> Session:
+    """Exchange the radii of tubes and rods."""
+    radii = sorted({c.radius for leg in session.dataset.machine.legs for c in leg.cylinders})
+    return _with_radii(session, lambda radius: radii[0] + radii[-1] - radius)
+
+
+def handedness(session: Session, _: np.random.Generator) -> Session:
     """Reverse y of all joints and axes."""
 
     def turned(axis: Array | None) -> Array | None:
         return None if axis is None else MIRROR @ axis
 
     return _with_legs(
-        dataset,
+        session,
         [
             replace(
                 leg,
@@ -146,112 +208,272 @@ def handedness(dataset: Dataset, rng: np.random.Generator) -> Dataset:
                 base_axis=turned(leg.base_axis),
                 platform_axis=turned(leg.platform_axis),
             )
-            for leg in dataset.machine.legs
+            for leg in session.dataset.machine.legs
         ],
     )
 
 
-def platform_joints(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+def platform_joints(session: Session, rng: np.random.Generator) -> Session:
     """List the platform joints from another leg on."""
-    legs = dataset.machine.legs
+    legs = session.dataset.machine.legs
     k = int(rng.integers(1, len(legs)))
+    others = [legs[(j + k) % len(legs)] for j in range(len(legs))]
+    both = zip(legs, others, strict=True)
     return _with_legs(
-        dataset,
-        [replace(leg, B=legs[(j + k) % len(legs)].B) for j, leg in enumerate(legs)],
+        session,
+        [replace(leg, B=other.B, platform_axis=other.platform_axis) for leg, other in both],
     )
 
 
-def focal_length(dataset: Dataset, rng: np.random.Generator) -> Dataset:
-    """State another focal length: images of half or twice the size."""
-    factor = float(rng.choice([0.5, 2.0]))
+def focal_length(session: Session, rng: np.random.Generator) -> Session:
+    """State another focal length: images of half or twice the size, or cropped."""
+    factor = float(rng.choice([0.5, 0.8, 1.25, 2.0]))
     K = np.array([[factor, 1.0, 1.0], [1.0, factor, 1.0], [1.0, 1.0, 1.0]])
-    m = dataset.measurements
+    m = session.dataset.measurements
     changed = {id(v.camera): replace(v.camera, K=v.camera.K * K) for v in m.views}
     of_views = tuple(replace(v, camera=changed[id(v.camera)]) for v in m.views)
-    return replace(dataset, measurements=replace(m, views=of_views))
+    dataset = replace(session.dataset, measurements=replace(m, views=of_views))
+    pairs = {image: as_if(one, np.zeros((2, 2)), np.ones(2), factor)
+             for image, one in session.pairs.items()}  # fmt: skip
+    return Session(dataset, pairs)
 
 
-MISTAKES: dict[str, Make] = {
-    "exchanged": exchanged,
-    "reversed": reversed_columns,
-    "rotated": rotated,
-    "direction": direction,
-    "directions": directions,
-    "shifted": shifted,
-    "views": views,
-    "diameter": diameter,
-    "handedness": handedness,
-    "platform joints": platform_joints,
-    "focal length": focal_length,
+def _mirrored(session: Session, which: list[int]) -> Session:
+    m, pairs = session.dataset.measurements, dict(session.pairs)
+    for image, v in zip(m.image, m.view.tolist(), strict=True):
+        if v in which:
+            corners = sensor_extent(m.views[v].camera)
+            pairs[image] = as_if(pairs[image], corners, LEFT_RIGHT, 1.0)
+    return replace(session, pairs=pairs)
+
+
+def mirrored(session: Session, _: np.random.Generator) -> Session:
+    """Mirror all images."""
+    return _mirrored(session, list(range(len(session.dataset.measurements.views))))
+
+
+def mirrored_view(session: Session, rng: np.random.Generator) -> Session:
+    """Mirror the images of one view."""
+    return _mirrored(session, [int(rng.integers(len(session.dataset.measurements.views)))])
+
+
+MISTAKES: dict[str, tuple[Make, str]] = {  # with the kind of diagnosis that is right
+    "exchanged": (exchanged, "columns exchanged"),
+    "reversed": (reversed_columns, "columns reversed"),
+    "rotated": (rotated, "columns rotated"),
+    "direction": (direction, "direction of an encoder"),
+    "directions": (directions, "direction of encoders"),
+    "zero": (zero, "zero of an encoder"),
+    "shifted": (shifted, "readings shifted"),
+    "shifted view": (shifted_view, "readings shifted"),
+    "views": (views, "views exchanged"),
+    "diameter": (diameter, "diameter for radius"),
+    "half radius": (half_radius, "diameter for radius"),
+    "tube and rod": (tube_and_rod, "tube and rod exchanged"),
+    "handedness": (handedness, "handedness"),
+    "platform joints": (platform_joints, "platform joints from another leg"),
+    "focal length": (focal_length, "focal length"),
+    "mirrored": (mirrored, "images mirrored"),
+    "mirrored view": (mirrored_view, "images mirrored"),
 }
+
+
+def is_possible(kind: str, machine: Machine) -> bool:
+    """Say whether a mistake can be made with a machine."""
+    if kind == "platform joints":
+        return len({leg.type for leg in machine.legs}) == 1
+    if kind == "tube and rod":
+        return len({c.radius for leg in machine.legs for c in leg.cylinders}) > 1
+    return True
+
+
+def joints_off(session: Session, rng: np.random.Generator) -> Session:
+    """Move all joints of the model."""
+    size = np.sqrt(WRONG_JOINTS**2 - JOINTS**2)
+    legs = session.dataset.machine.legs
+    moves = rng.normal(scale=size, size=(len(legs), 2, 3))
+    both = zip(legs, moves, strict=True)
+    return _with_legs(session, [replace(leg, A=leg.A + a, B=leg.B + b) for leg, (a, b) in both])
+
+
+def is_same(mended: Assumed, true: Assumed) -> bool:
+    """Say whether two assumptions show the same legs in all images, by whatever names."""
+    rows = list(range(len(true.q)))
+    (A, B), (A_true, B_true) = mended.joints(rows), true.joints(rows)
+    turned = np.all(mended.flip == LEFT_RIGHT, axis=1)
+    if not (turned.all() or not turned.any()) or mended.focal != true.focal:
+        return False
+    n = true.machine.n_legs
+    radii, radii_true = (
+        [sorted(c.radius for c in leg.cylinders) for leg in one.machine.legs]
+        for one in (mended, true)
+    )
+    if not (np.isfinite(B).all() and np.isfinite(B_true).all()):
+        return False
+    own = np.concatenate([A, B]).reshape(2, len(rows), n, 3)
+    own = own @ MIRROR if turned.all() else own
+    wanted = np.concatenate([A_true, B_true]).reshape(2, len(rows), n, 3)
+    size = float(np.std(wanted.reshape(-1, 3), axis=0).max())
+    for order in permutations(range(n)):
+        if not all(
+            len(radii[i]) == len(radii_true[j])
+            and np.allclose(radii[i], radii_true[j], rtol=WRONG_RADIUS)
+            for j, i in enumerate(order)
+        ):
+            continue
+        x, y = own[:, :, list(order)].reshape(-1, 3), wanted.reshape(-1, 3)
+        x, y = x - x.mean(axis=0), y - y.mean(axis=0)
+        U, s, Vt = np.linalg.svd(x.T @ y)
+        s[2] *= np.sign(np.linalg.det(U @ Vt))
+        if np.sum(x**2) + np.sum(y**2) - 2.0 * s.sum() <= len(x) * (SAME * size) ** 2:
+            return True
+    return False
 
 
 def wilson(k: int, n: int) -> tuple[float, float]:
     """Return the 95 % interval of a share of k in n."""
     z, p = 1.96, k / n
     middle, half = p + z * z / (2 * n), z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return tuple(float(x / (1 + z * z / n)) for x in (middle - half, middle + half))  # type: ignore[return-value]
+    return float((middle - half) / (1 + z * z / n)), float((middle + half) / (1 + z * z / n))
 
 
-def session(model: str, seed: int, joints: float, keep: Path) -> Dataset:
-    """Return a rendered session, made once."""
-    folder = keep / f"{model}-{seed}-{1e3 * joints:g}"
+def session(model: str, seed: int, keep: Path, pool: Run) -> Session:
+    """Return a rendered session with its edge pairs, made once."""
+    folder = keep / f"{model}-{seed}-{1e3 * JOINTS:g}"
     if not (folder / "dataset.yaml").exists():
-        spread = Spread(joints)
+        spread = Spread(JOINTS)
         settings = SimulationSettings(
             level=Level.PHOTOGRAPHS,
             seed=seed,
             errors=ParameterErrors(base_joints=spread, platform_joints=spread, offsets=spread),
         )
         simulate(model, folder, settings)
-    return load_dataset(folder)
+    dataset, kept = load_dataset(folder), folder / "pairs.pickle"
+    if not kept.exists():
+        data = order_dataset(dataset, pool, no_progress)
+        n, m = data.measurements.n_rows, data.measurements
+        nowhere = np.full((n, data.machine.n_legs, 3), np.nan)
+        search = data.photographs.search(Placement(nowhere, nowhere, (None,) * len(m.views)))
+        found = pairs_of_images(search, range(n), pool)
+        kept.write_bytes(pickle.dumps({m.image[row]: one for row, one in found.items()}))
+    if seed % 2:
+        m = dataset.measurements
+        views = tuple(replace(view, T_base_camera=None) for view in m.views)
+        dataset = replace(dataset, measurements=replace(m, views=views))
+    return Session(dataset, pickle.loads(kept.read_bytes()))
 
 
-def named(dataset: Dataset, workers: int) -> tuple[tuple[str, ...], str, float]:
-    """Return the kinds of the diagnosis, its sentence, and how long it took [s]."""
+def ordered(session: Session, pool: Run) -> OrderedDataset:
+    """Return a session as it is diagnosed, with edge pairs."""
+    data = order_dataset(session.dataset, pool, no_progress)
+    pairs = {row: session.pairs[image] for row, image in enumerate(data.measurements.image)}
+    return replace(data, edge_pairs=pairs)
+
+
+def judged(kind: str, spoiled: Session, true: Session, pool: Run) -> dict[str, object]:
+    """Return what is named of a session, and whether that is right."""
+    data = ordered(spoiled, pool)
     start = time.monotonic()
-    with worker_pool(workers) as pool:
-        found = diagnose(order_dataset(dataset, pool, no_progress))
-    spent = time.monotonic() - start
-    return tuple(d.kind for d in found), found[0].sentence if found else "nothing", spent
+    found = diagnose(data)
+    entry: dict[str, object] = {"seconds": round(time.monotonic() - start, 1)}
+    if not found:
+        return entry | {"right": kind in (CLEAN, OFF), "named": None}
+    first = found[0]
+    entry |= {"named": first.kind, "sentence": first.sentence}
+    if kind in (CLEAN, OFF):
+        return entry | {"right": False}
+    is_kind = first.kind == MISTAKES[kind][1]
+    mended = next(one.true for one in mistakes(data) if one.what == first.what)
+    reference = ordered(true, pool)
+    place = {image: row for row, image in enumerate(data.measurements.image)}
+    rows = [place[image] for image in reference.measurements.image]  # canonical orders may differ
+    is_equal = is_same(replace(mended, q=mended.q[rows]), as_given(reference))
+    return entry | {"right": bool(is_kind or is_equal), "kind": is_kind}
+
+
+def deal(machine: Machine, each: int, counts: Counter[str], rng: np.random.Generator) -> list[str]:
+    """Return the kinds of mistakes that are made in a session: the rarest so far."""
+    kinds = [kind for kind in MISTAKES if is_possible(kind, machine)]
+    rng.shuffle(kinds)
+    chosen = sorted(kinds, key=lambda kind: counts[kind])[:each]
+    counts.update(chosen)
+    return chosen
+
+
+def report(entries: list[dict[str, object]]) -> None:
+    """Print what was named, by kinds of mistakes."""
+    for kind in (*MISTAKES, CLEAN, OFF):
+        own = [one for one in entries if one["mistake"] == kind]
+        if own:
+            right = sum(bool(one["right"]) for one in own)
+            wrong = Counter(str(one["named"]) for one in own if not one["right"])
+            others = ", ".join(f"{name} {n}" for name, n in wrong.most_common())
+            print(f"{kind:17} {right:3} of {len(own):3}  {others}")
+    made = [one for one in entries if one["mistake"] in MISTAKES]
+    clean = [one for one in entries if one["mistake"] not in MISTAKES]
+    for what, own in (("right", made), ("nothing named without a mistake", clean)):
+        if own:
+            k = sum(bool(one["right"]) for one in own)
+            low, high = wilson(k, len(own))
+            print(f"{what}: {k} of {len(own)} ({low:.3f} to {high:.3f})")
+    seconds = [float(str(one["seconds"])) for one in made]
+    if seconds:
+        print(f"seconds: median {np.median(seconds):.1f}, most {max(seconds):.1f}")
 
 
 def main() -> None:
-    """Print the table."""
+    """Make mistakes, diagnose them and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--models", default=",".join(MODELS))
     parser.add_argument("--seeds", type=int, default=50)
-    parser.add_argument("--keep", type=Path, help="keep the photographs in this folder")
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--each", type=int, default=1, help="mistakes in each session")
+    parser.add_argument("--keep", type=Path, required=True, help="folder of the photographs")
+    parser.add_argument("--record", type=Path, required=True, help="JSON lines of what was named")
+    parser.add_argument("--minutes", type=float, default=np.inf, help="stop after so long")
     parser.add_argument("--only", choices=MISTAKES)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--wrong-joints", type=float, default=2.0, help="of the true machine [mm]")
+    parser.add_argument("--workers", type=int, default=1)
     args = parser.parse_args()
-    rng = np.random.default_rng(2002)
-    right = total = accused = clean = 0
-    with TemporaryDirectory() as temporary:
-        keep = args.keep or Path(temporary)
-        for number in range(args.seeds):
+    entries = [json.loads(line) for line in args.record.read_text().splitlines()
+               ] if args.record.exists() else []  # fmt: skip
+    done = {(one["model"], one["seed"], one["mistake"]) for one in entries}
+    stop, counts = time.monotonic() + 60.0 * args.minutes, Counter[str]()
+    with worker_pool(args.workers) as pool, args.record.open("a") as record:
+        for seed in range(args.first_seed, args.first_seed + args.seeds):
             for model in args.models.split(","):
-                dataset = session(model, number, 1e-3 * args.wrong_joints, keep)
-                alike = len({leg.type for leg in dataset.machine.legs}) == 1
-                every = [name for name in MISTAKES if alike or name != "platform joints"]
-                kinds = [args.only] if args.only else every
-                kind = kinds[int(rng.integers(len(kinds)))]
-                found, sentence, spent = named(dataset, args.workers)
-                clean, accused = clean + 1, accused + bool(found)
-                if found:
-                    print(f"{model:8} {number:3} without a mistake: {sentence}", flush=True)
-                found, sentence, spent = named(MISTAKES[kind](dataset, rng), args.workers)
-                is_right = bool(found) and found[0] in RIGHT[kind]
-                right, total = right + is_right, total + 1
-                print(
-                    f"{model:8} {number:3} {kind:16} {'right' if is_right else 'WRONG'} "
-                    f"{spent:5.1f} s  {sentence}",
-                    flush=True,
-                )
-    low, high = wilson(right, total)
-    print(f"right: {right} of {total} ({low:.2f} to {high:.2f}); "
-          f"without a mistake: something named of {accused} of {clean}")  # fmt: skip
+                true = None
+                for kind in (None, CLEAN, OFF):
+                    rng = np.random.default_rng([2002, seed, MODELS.index(model)])
+                    if kind is None:
+                        if true is None:
+                            true = session(model, seed, args.keep, pool)
+                        kinds = deal(true.dataset.machine, args.each, counts, rng)
+                        kinds = [args.only] if args.only else kinds
+                    else:
+                        kinds = [] if args.only else [kind]
+                    for one in kinds:
+                        if (model, seed, one) in done or true is None:
+                            continue
+                        if time.monotonic() > stop:
+                            report(entries)
+                            return
+                        spoiled = true
+                        if one in MISTAKES:
+                            spoiled = MISTAKES[one][0](true, rng)
+                        elif one == OFF:
+                            spoiled = joints_off(true, rng)
+                        entry = {"model": model, "seed": seed, "mistake": one}
+                        entry |= judged(one, spoiled, true, pool)
+                        entries.append(entry)
+                        record.write(json.dumps(entry) + "\n")
+                        record.flush()
+                        print(
+                            f"{model:8} {seed:4} {one:17} "
+                            f"{'right' if entry['right'] else 'WRONG'} {entry['seconds']:5.1f} s  "
+                            f"{entry.get('sentence', 'nothing')}",
+                            flush=True,
+                        )
+    report(entries)
 
 
 if __name__ == "__main__":

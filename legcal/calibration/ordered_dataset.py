@@ -42,7 +42,7 @@ from legcal.machine import (
     solve_poses,
 )
 from legcal.paper import Criteria, Transformation
-from legcal.perception import Photographs
+from legcal.perception import CandidatePairs, Photographs
 from legcal.progress import Report
 from legcal.workers import Run
 
@@ -74,6 +74,8 @@ class OrderedDataset:
     rows: IntArray  # the images that are here, among all of them
     # T_base_platform that images showed, by row among all images, where readings do not give it
     seen_poses: Mapping[int, RigidTransform] = field(default_factory=dict)
+    # Edge pairs of images that were searched, by row among all images
+    edge_pairs: dict[int, CandidatePairs] = field(default_factory=dict)
 
     @cached_property
     def photographs(self) -> Photographs:
@@ -87,6 +89,7 @@ class OrderedDataset:
             run=self.pool,
             detect=np.sort(detect[shows]),
             keep=self.order.reorder(self.plan.keep),
+            edge_pairs=self.edge_pairs,
         )
 
     @cached_property

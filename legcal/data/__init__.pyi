@@ -28,12 +28,14 @@ from .image_tables import canonical_order as canonical_order
 from .image_tables import inverse as inverse
 from .image_tables import measurements_at as measurements_at
 from .image_tables import reorder_measurements as reorder_measurements
+from .measurements import INCH as INCH
 from .measurements import Measurements as Measurements
 from .measurements import View as View
 from .measurements import few as few
 from .measurements import few_views as few_views
 from .measurements import reading_columns as reading_columns
 from .measurements import readings_in as readings_in
+from .measurements import readings_of_lengths as readings_of_lengths
 from .measurements import row_names as row_names
 from .new_dataset import NewDataset as NewDataset
 from .new_dataset import plan_new_dataset as plan_new_dataset

@@ -17,13 +17,23 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.files import Column, Table, closest, describe, path_problem, place_in, read_table
+from legcal.files import (
+    LENGTH,
+    Column,
+    Table,
+    closest,
+    describe,
+    path_problem,
+    place_in,
+    read_table,
+)
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import TRAVEL_MARGIN, Leg, LegKind
 from legcal.vision import Camera
 
 MAX_NAMED = 5  # views or other things, in one sentence
 MAX_READING_SPREAD = 10.0  # sigma by which rows of one pose may differ
+INCH = 0.0254  # [m]
 _MAX_SHOWN = 3  # readings quoted in a sentence about many
 
 
@@ -161,11 +171,9 @@ def readings_in(table: Table, legs: Sequence[Leg]) -> tuple[Array, tuple[str, ..
     notes = []
     for leg, column in zip(actuated, readings.T, strict=True):
         lower, upper = leg.travel
-        margin = TRAVEL_MARGIN * (upper - lower)
-        if not (np.isfinite(margin) and margin > 0.0):
+        if not 0.0 < upper - lower < np.inf:
             continue
-        outside = (column < lower) | (column > upper)
-        far = (column < lower - margin) | (column > upper + margin)
+        outside, far = (column < lower) | (column > upper), ~leg.in_travel(column)
         start = f"{table.path}, column {leg.prismatic}"
         travel = f"{lower:g} to {upper:g} m (the joint limits of the model)"
         if np.any(far):
@@ -187,28 +195,37 @@ def _likely_cause(readings: Array, legs: Sequence[Leg]) -> str:
 
     Of what would bring all of them into their travel, that with which they move in it most.
     """
-    lower, upper = np.array([leg.travel for leg in legs]).T
-    sign, q0 = np.array([(leg.sign, leg.q0) for leg in legs]).T
+    width = np.ptp([leg.travel for leg in legs], axis=1)
     whole = "subtract the leg lengths at reading zero (legcal inspect tells them)"
     tried = (
-        (1e-3 * readings, "millimetres: divide the column by 1000"),
-        (sign * (readings - q0), f"whole leg lengths: {whole}"),
+        (LENGTH["mm"] * readings, "millimetres: divide the column by 1000"),
+        (readings_of_lengths(readings, legs), f"whole leg lengths: {whole}"),
         (
-            sign * (1e-3 * readings - q0),
+            readings_of_lengths(LENGTH["mm"] * readings, legs),
             f"whole leg lengths in millimetres: divide the column by 1000, and {whole}",
         ),
-        (1e-2 * readings, "centimetres: divide the column by 100"),
-        (0.0254 * readings, "inches: multiply the column by 0.0254"),
+        (LENGTH["cm"] * readings, "centimetres: divide the column by 100"),
+        (INCH * readings, "inches: multiply the column by 0.0254"),
         (-readings, "readings with the opposite sign: reverse it"),
     )
-    width = upper - lower
     found, most = "", 0.0
     for meant, what in tried:
-        beyond = np.maximum(lower - meant, meant - upper).max(axis=0)
         moved = float(np.mean(np.ptp(meant, axis=0) / width))
-        if np.all(beyond <= TRAVEL_MARGIN * width) and moved > most:
+        if moved > most and np.all(in_travel(meant, legs)):
             found, most = f"these look like {what}", moved
     return found
+
+
+def readings_of_lengths(lengths: Array, legs: Sequence[Leg]) -> Array:
+    """Return the readings (n_rows, n_legs) of whole leg lengths (n_rows, n_legs) [m]."""
+    each = zip(legs, lengths.T, strict=True)
+    return np.array([leg.readings_at(column) for leg, column in each]).T
+
+
+def in_travel(readings: Array, legs: Sequence[Leg]) -> BoolArray:
+    """Return which readings (n_rows, n_legs) [m] are in the travel of their legs, or nearly."""
+    each = zip(legs, readings.T, strict=True)
+    return np.array([leg.in_travel(column) for leg, column in each], dtype=np.bool_).T
 
 
 def _some(table: Table, column: Array, chosen: BoolArray) -> str:

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.data.measurements import few, reading_columns
+from legcal.data.measurements import few, in_travel, reading_columns, readings_of_lengths
 from legcal.errors import DatasetError, UsageError
 from legcal.files import LENGTH, Column, Lines, Table, describe, split_heading
-from legcal.geometry import Array, BoolArray
-from legcal.machine import TRAVEL_MARGIN, Leg
+from legcal.geometry import Array
+from legcal.machine import Leg
 
 LEAST_USED = 0.01  # of the travel: less is the use that is made of it in a larger unit
 GUESSED = ("m", "mm")  # units that are tried where none is stated
@@ -116,21 +116,6 @@ class Headings:
         )
 
 
-def _fits(q: Array, motors: Sequence[Leg]) -> BoolArray:
-    """Say which readings (n_rows, n_motors) [m] lie in the travel of their legs."""
-    low, high = np.array([leg.travel for leg in motors]).T
-    margin = TRAVEL_MARGIN * (high - low)
-    return np.asarray((q >= low - margin) & (q <= high + margin))
-
-
-def _as_readings(values: Array, motors: Sequence[Leg], *, lengths: bool) -> Array:
-    """Return readings [m] of values [m] that are readings, or whole lengths."""
-    if not lengths:
-        return values
-    sign, q0 = (np.array([getattr(leg, name) for leg in motors]) for name in ("sign", "q0"))
-    return np.asarray(sign * (values - q0))
-
-
 def unit_of(table: Table, headings: Headings, given: str | None, lengths: bool) -> tuple[str, str]:
     """Return the unit of the readings and where it was found."""
     stated = sorted({unit for unit in headings.units.values() if unit})
@@ -149,9 +134,10 @@ def unit_of(table: Table, headings: Headings, given: str | None, lengths: bool) 
 
     def fits(unit: str, as_lengths: bool, *, moving: bool = True) -> bool:
         """Say whether most readings lie in the travel, and use a part of it."""
-        q = _as_readings(LENGTH[unit] * values, motors, lengths=as_lengths)
+        q = LENGTH[unit] * values
+        q = readings_of_lengths(q, motors) if as_lengths else q
         moves = np.ptp(q, axis=0) > LEAST_USED * np.ptp([leg.travel for leg in motors], axis=1)
-        return bool(2 * _fits(q, motors).mean() >= 1.0 and (not moving or moves.any()))
+        return bool(2 * in_travel(q, motors).mean() >= 1.0 and (not moving or moves.any()))
 
     known = stated[0] if stated else given
     tried = (known,) if known else GUESSED
@@ -198,10 +184,10 @@ def readings_of(table: Table, headings: Headings, unit: str, lengths: bool) -> t
     texts = [table.text(joint) for joint in headings.joints]
     exact = [[Decimal(text).scaleb(power) for text in column] for column in texts]
     values = np.array([[float(x) for x in column] for column in exact]).T
-    q = _as_readings(values, headings.motors, lengths=lengths)
+    q = values
     if lengths:
-        q = np.round(q, 12) + 0.0
-    inside = _fits(q, headings.motors)
+        q = np.round(readings_of_lengths(values, headings.motors), 12) + 0.0
+    inside = in_travel(q, headings.motors)
     for row, j in np.argwhere(~inside).tolist():
         leg = headings.motors[j]
         low, high = (1e3 * x for x in leg.travel)

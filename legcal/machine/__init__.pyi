@@ -32,7 +32,6 @@ from .files import DATASET_YAML as DATASET_YAML
 from .files import RESULT_YAML as RESULT_YAML
 from .files import shipped_folder as shipped_folder
 from .files import shipped_names as shipped_names
-from .home import TRAVEL_MARGIN as TRAVEL_MARGIN
 from .home import home_of_legs as home_of_legs
 from .home import legs_outside as legs_outside
 from .kinematics import Follower as Follower
@@ -49,6 +48,7 @@ from .kinematics import platforms_in_base as platforms_in_base
 from .kinematics import pose_differences as pose_differences
 from .kinematics import reading_residuals as reading_residuals
 from .kinematics import solve_poses as solve_poses
+from .leg import TRAVEL_MARGIN as TRAVEL_MARGIN
 from .leg import Cylinder as Cylinder
 from .leg import EquationKind as EquationKind
 from .leg import JointType as JointType

@@ -26,7 +26,6 @@ TRIALS = 200
 MIN_TRIALS = 20  # trials, where one of them found a pose above the base
 BATCH = 21  # trials solved at once
 MAX_STALLED = 5  # steps that change little
-TRAVEL_MARGIN = 0.05  # of the travel: as good as inside
 MAX_OUTSIDE = 1.0  # of the travel: refused beyond, if it is also beyond
 _MAX_OUTSIDE_OF_LEG = 0.01  # of the leg length at home, for sliders that hardly move
 

@@ -17,9 +17,10 @@ from typing import Literal
 import numpy as np
 
 from legcal.brief import brief
-from legcal.geometry import Array, distance_to_line, matrix_inverse
+from legcal.geometry import Array, BoolArray, distance_to_line, matrix_inverse
 from legcal.machine.bodies import Connection
 
+TRAVEL_MARGIN = 0.05  # of the travel: as good as inside
 MIN_LENGTH, MAX_LENGTH = 1e-3, 20.0  # [m]; legs beyond are most likely written in another unit
 MIN_RADIUS, MAX_RADIUS = 2e-4, 0.5  # of the leg length; beyond, its unit is the mistake
 MAX_LEGS = 32  # the work of all that is done with them grows with the cube of their number
@@ -289,6 +290,21 @@ class Leg:
     def length_at(self, reading: float) -> float:
         """Return the length |AB| at a reading, L = sign q + q0 [m]."""
         return self.sign * reading + self.q0
+
+    def readings_at(self, lengths: Array) -> Array:
+        """Return the readings at lengths |AB| (n,), q = sign (L - q0) [m]."""
+        return np.asarray(self.sign * (lengths - self.q0))
+
+    def in_travel(self, readings: Array) -> BoolArray:
+        """Return which readings (n,) [m] are inside the travel, or outside by at most 5 % of it.
+
+        A missing one (NaN) is not; without limits, or with equal ones, all others are.
+        """
+        lower, upper = self.travel
+        margin = TRAVEL_MARGIN * (upper - lower)
+        if not 0.0 < margin < np.inf:
+            return ~np.isnan(readings)
+        return np.asarray((readings >= lower - margin) & (readings <= upper + margin))
 
     @property
     def equations(self) -> tuple[EquationKind, ...]:

@@ -1,4 +1,5 @@
 from .agreement import Agreement as Agreement
+from .agreement import Assumption as Assumption
 from .agreement import compare_assumptions as compare_assumptions
 from .agreement import pairs_of_images as pairs_of_images
 from .board_adjustment import LOSS as LOSS
@@ -21,8 +22,10 @@ from .board_poses import camera_poses_by_board as camera_poses_by_board
 from .board_poses import plane_poses as plane_poses
 from .camera_search import LEFT_RIGHT as LEFT_RIGHT
 from .camera_search import UPSIDE_DOWN as UPSIDE_DOWN
+from .candidate_pairs import CandidatePairs as CandidatePairs
 from .diagnostics import BEFORE_FIT as BEFORE_FIT
 from .diagnostics import FAR_OFF as FAR_OFF
+from .diagnostics import far_off as far_off
 from .diagnostics import hint_notes as hint_notes
 from .diagnostics import is_visible as is_visible
 from .free_poses import require_rough_cameras as require_rough_cameras

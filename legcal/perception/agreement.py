@@ -9,16 +9,17 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, IntArray
-from legcal.perception.camera_search import START_PICTURES, flipped, place_camera
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.perception.camera_search import flipped, place_camera
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.pair_matching import Picture
 from legcal.perception.placement import Group, Search, sensor_extent
 from legcal.workers import Run
 
 AGREES = 0.5  # of the legs that an image should show, from which on it agrees
-QUICK_STARTS = 1, 1  # as START_PICTURES, where many assumptions are compared
+_MIN_EXPECTED = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,14 +27,58 @@ class Agreement:
     """How well images agree with one assumption."""
 
     row: IntArray  # (n,) of the images
-    share: Array  # (n,) of the legs that each should show
-    support: float  # legs that agree, in all images together
-    expected: float  # legs that the images should show
+    support: Array  # (n,) legs that agree with each, less its part of what shifted joints cost
+    expected: Array  # (n,) legs that each should show
+    cameras: tuple[RigidTransform | None, ...]  # T_base_group of each group of views, where found
+
+    @classmethod
+    def joined(cls, parts: Sequence["Agreement"]) -> "Agreement":
+        """Return the agreement of several groups together."""
+        return cls(
+            np.concatenate([part.row for part in parts]),
+            np.concatenate([part.support for part in parts]),
+            np.concatenate([part.expected for part in parts]),
+            tuple(T for part in parts for T in part.cameras),
+        )
+
+    def at(self, rows: Sequence[int]) -> "Agreement":
+        """Return that of some images."""
+        chosen = np.isin(self.row, rows)
+        row, support, expected = self.row[chosen], self.support[chosen], self.expected[chosen]
+        return replace(self, row=row, support=support, expected=expected)
+
+    @property
+    def share(self) -> Array:
+        """Share of the legs that each image should show, (n,)."""
+        return self.support / np.maximum(self.expected, _MIN_EXPECTED)
+
+    @property
+    def agrees(self) -> BoolArray:
+        """Which images agree, (n,)."""
+        return np.asarray(self.share >= AGREES)
 
     @property
     def images(self) -> int:
         """How many images agree."""
-        return int(np.sum(self.share >= AGREES))
+        return int(self.agrees.sum())
+
+    @property
+    def mean(self) -> float:
+        """Share of the legs that all images together should show."""
+        return float(self.support.sum() / max(self.expected.sum(), _MIN_EXPECTED))
+
+
+@dataclass(frozen=True, eq=False)
+class Assumption:
+    """What should be seen in the images of a group of views."""
+
+    search: Search  # with the edge pairs of all images
+    flip: Array  # (n_views, 2) of their images, as in :func:`as_if`
+    focal: float  # focal lengths as a part of the stated ones
+    group: Group
+    rows: Sequence[int]  # of the images that are asked
+    starts: Sequence[int]  # as START_PICTURES
+    known: Sequence[RigidTransform] = ()  # T_base_group that are tried first
 
 
 def pairs_of_images(search: Search, rows: Sequence[int], run: Run) -> dict[int, CandidatePairs]:
@@ -63,72 +108,54 @@ def as_if(pairs: CandidatePairs, corners: Array, flip: Array, focal: float) -> C
     )
 
 
-def compare_assumptions(
-    assumptions: Iterable[tuple[Search, Array, float]],
-    groups: Sequence[Group],
-    run: Run,
-    *,
-    quick: bool,
-) -> list[Agreement]:
-    """Return how well the images of some groups of views agree with each of some assumptions.
+def compare_assumptions(assumptions: Iterable[Assumption], run: Run) -> list[Agreement]:
+    """Return how well images agree with each of some assumptions.
 
-    An assumption is what should be seen (with the edge pairs of all images), whether images are
-    turned over (2,) as in :func:`as_if`, and a factor on focal lengths. Rows at which the legs are
-    not known (NaN) agree with nothing. *quick* looks at a few images of each view.
+    Rows at which the legs are not known (NaN) agree with nothing.
     """
-    tasks = []
-    for search, flip, focal in assumptions:
-        for group in groups:
-            rows = group.some if quick else group.rows
-            known = [r for r in rows if np.isfinite(search.B_base[r]).all()]
-            pictures = {row: _picture(search, row, flip, focal) for row in known}
-            tasks.append(_Task(group.pictures(pictures, known), known, search.n_legs, quick))
-    found = list(run(_agreement, tasks))
-    n = len(groups)
-    return [_together(found[k : k + n], groups, quick) for k in range(0, len(found), n)]
+    return list(run(_agreement, [_task(one) for one in assumptions]))
 
 
 @dataclass(frozen=True, eq=False)
 class _Task:
     """The images of a group of views under one assumption, for any process."""
 
-    pictures: list[Picture]
-    rows: list[int]
+    pictures: list[Picture]  # of the rows at which legs are known
+    known_rows: list[int]
+    rows: Sequence[int]
     n_legs: int
-    quick: bool
+    starts: Sequence[int]
+    known: Sequence[RigidTransform]
 
 
-def _picture(search: Search, row: int, flip: Array, focal: float) -> Picture:
+def _task(one: Assumption) -> _Task:
+    """Return what a process needs to judge an assumption."""
+    known = [r for r in one.rows if np.isfinite(one.search.B_base[r]).all()]
+    pictures = one.group.pictures({row: _picture(one, row) for row in known}, known)
+    return _Task(pictures, known, one.rows, one.search.n_legs, one.starts, one.known)
+
+
+def _picture(one: Assumption, row: int) -> Picture:
     """Return what an image shows under an assumption, and what it should."""
+    search = one.search
     view = int(search.measurements.view[row])
     corners = sensor_extent(search.measurements.views[view].camera)
-    pairs = as_if(search.edge_pairs[row], corners, flip, focal)
-    return Picture(pairs, search.targets(row, view), corners / focal)
+    pairs = as_if(search.edge_pairs[row], corners, one.flip[view], one.focal)
+    return Picture(pairs, search.targets(row, view), corners / one.focal)
 
 
 def _agreement(task: _Task) -> Agreement:
     """Return how well the images of a group agree."""
-    n = len(task.rows)
-    row, nothing = np.array(task.rows, dtype=np.intp), np.zeros(n)
-    if n == 0:
-        return Agreement(row, nothing, 0.0, 0.0)
-    placed = place_camera(
-        task.pictures, task.n_legs, QUICK_STARTS if task.quick else START_PICTURES
-    )
+    row = np.array(task.rows, dtype=np.intp)
+    support, expected = np.zeros(len(row)), np.full(len(row), float(task.n_legs))
+    nothing = Agreement(row, support, expected, (None,))
+    if not task.known_rows:
+        return nothing
+    placed = place_camera(task.pictures, task.n_legs, task.starts, task.known)
     if len(placed.poses) == 0:
-        return Agreement(row, nothing, 0.0, 0.0)
-    expected = placed.expected[0]
-    share = placed.support[0] / np.maximum(expected, 1e-9)
-    return Agreement(row, share, float(placed.score[0]), float(expected.sum()))
-
-
-def _together(parts: Sequence[Agreement], groups: Sequence[Group], quick: bool) -> Agreement:
-    """Return the agreement of all groups; images that were not compared agree with nothing."""
-    row = np.concatenate([g.some if quick else g.rows for g in groups]).astype(np.intp)
-    of_row = {r: s for part in parts for r, s in zip(part.row.tolist(), part.share, strict=True)}
-    return Agreement(
-        row,
-        np.array([of_row.get(r, 0.0) for r in row.tolist()]),
-        sum(part.support for part in parts),
-        sum(part.expected for part in parts),
-    )
+        return nothing
+    found = np.isin(row, task.known_rows)
+    cost = float(placed.support[0].sum() - placed.score[0]) / len(task.known_rows)
+    support[found] = np.maximum(placed.support[0] - cost, 0.0)
+    expected[found] = placed.expected[0]
+    return Agreement(row, support, expected, (placed.pose(),))

@@ -138,20 +138,23 @@ class PoseCandidates:
 
 
 def place_camera(
-    pictures: Sequence[Picture], n_legs: int, starts: Sequence[int] = START_PICTURES
+    pictures: Sequence[Picture],
+    n_legs: int,
+    starts: Sequence[int] = START_PICTURES,
+    known: Sequence[RigidTransform] = (),
 ) -> PoseCandidates:
     """Return the camera poses on which most legs of all pictures of a view agree.
 
     Pictures are of one camera pose at different readings; ``starts`` says how many more of them
-    suggest poses, until one is clear.
+    suggest poses, until one is clear. ``known`` are T_base_camera that are tried before.
     """
     merits = [float(p.pairs.merit[:8].sum()) if len(p.pairs) else 0.0 for p in pictures]
     best_first = [pictures[k] for k in np.argsort(-np.array(merits), kind="stable").tolist()]
     every = Pictures.of(pictures)
-    best = _candidates(every, CameraPoses.none(n_legs))
+    best = _candidates(every, _near_known(every, known, n_legs))
     done = 0
     for n in starts:
-        if done >= len(pictures):
+        if done >= len(pictures) or best.is_clear:
             break
         suggested = [_starts(picture, n_legs) for picture in best_first[done : done + n]]
         done += n
@@ -171,9 +174,21 @@ def place_camera(
         poses = poses.take(_best(score, N_KEPT[3]))
         poses = CameraPoses.joined([poses, _polished(some.take(slice(POLISHING)), poses)])
         best = _candidates(every, refined(every, poses, LAST_TOLERANCES, NOMINAL_JOINT_ERROR))
-        if best.is_clear:
-            break
     return best
+
+
+def _near_known(pictures: Pictures, known: Sequence[RigidTransform], n_legs: int) -> CameraPoses:
+    """Return poses after steps from T_base_camera that are known."""
+    T = [one.inv() for one in known]
+    R = np.array([one.rotation.as_matrix() for one in T]).reshape(-1, 3, 3)
+    poses = CameraPoses.rigid(R, np.array([one.translation for one in T]).reshape(-1, 3), n_legs)
+    return _approached(pictures, poses) if known else poses
+
+
+def _approached(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
+    """Return rough poses after all steps that lead to the pairs."""
+    poses = refined(pictures, poses, TOLERANCES[:3])
+    return refined(pictures, poses, (*TOLERANCES[2:], *LAST_TOLERANCES), NOMINAL_JOINT_ERROR)
 
 
 def _polished(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
@@ -216,9 +231,7 @@ def place_near(
     R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
     poses = CameraPoses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
     every = Pictures.of(pictures)
-    poses = refined(every, poses, TOLERANCES[:3])
-    poses = refined(every, poses, (*TOLERANCES[2:], *LAST_TOLERANCES), NOMINAL_JOINT_ERROR)
-    found = _candidates(every, poses)
+    found = _candidates(every, _approached(every, poses))
     return replace(found, hinted=True)
 
 

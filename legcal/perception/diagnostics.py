@@ -429,7 +429,7 @@ def _left_out_legs(search: Search, placement: Placement, v: int, rows: Sequence[
     ]
 
 
-def _far_off(hint: RigidTransform, T_base_camera: RigidTransform, reach: float = 1.0) -> bool:
+def far_off(hint: RigidTransform, T_base_camera: RigidTransform, reach: float = 1.0) -> bool:
     """Say whether a rough pose is farther from a pose than rough ones are."""
     distance = float(np.linalg.norm(T_base_camera.translation))
     apart, angle = pose_distance(hint, T_base_camera)
@@ -450,7 +450,7 @@ def hint_notes(
     """
     notes = []
     for name, hint, T in zip(names, hints, cameras, strict=True):
-        if hint is None or T is None or not _far_off(hint, T, reach):
+        if hint is None or T is None or not far_off(hint, T, reach):
             continue
         apart, angle = pose_distance(hint, T)
         x, y, z = T.translation
@@ -458,7 +458,7 @@ def hint_notes(
             (
                 other
                 for other, camera in zip(names, cameras, strict=True)
-                if other != name and camera is not None and not _far_off(hint, camera, reach)
+                if other != name and camera is not None and not far_off(hint, camera, reach)
             ),
             None,
         )

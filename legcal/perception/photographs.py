@@ -73,6 +73,8 @@ class Photographs:
     run: Run  # how images are searched: in turn or by several processes
     detect: IntArray  # (n,) the rows to search
     keep: Outlines  # outlines to use as they are; edited ones win over detected ones
+    # Edge pairs of rows that were searched, kept for who looks at the same images again
+    edge_pairs: dict[int, CandidatePairs] = field(default_factory=dict)
 
     @property
     def cylinders(self) -> tuple[tuple[Cylinder, ...], ...]:
@@ -175,6 +177,7 @@ def place_and_measure(
     ``together`` is as for :func:`legcal.perception.outline.measure`.
     """
     defects, pairs, rough = _inspect_images(photographs, nominal, report, joined)
+    photographs.edge_pairs.update(pairs)
     usable = np.array([row for row in photographs.detect if row not in defects], dtype=np.intp)
     nominal, free_poses = _with_free_poses(photographs, nominal, pairs, usable, report)
     search = photographs.search(nominal, pairs, rough)

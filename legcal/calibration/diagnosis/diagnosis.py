@@ -1,8 +1,9 @@
 """What is wrong with a session that images contradict: common mistakes tried, the best one named.
 
 Every mistake is undone in turn, and the images say how well they agree then (how many of the legs
-that they should show are there, with cameras placed anywhere). One is named where far more images
-agree; those that images cannot tell from it are named with it.
+that they should show are there, with cameras placed anywhere). A few images of the views that
+disagree most say which mistakes are worth a closer look, all images judge these. One is named where
+far more images agree; those that images cannot tell from it are named with it.
 """
 
 from __future__ import annotations
@@ -11,17 +12,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.diagnosis.mistakes import Assumed, Mistake, mistakes
+from legcal.calibration.board import observe_board
+from legcal.calibration.diagnosis.mistakes import Assumed, Mistake, as_given, mistakes
 from legcal.calibration.documents import DiagnosisBlock
 from legcal.calibration.ordered_dataset import OrderedDataset
+from legcal.errors import LegcalError
 from legcal.geometry import Array, IntArray
 from legcal.perception import (
     Agreement,
+    Assumption,
     Group,
     Placement,
     Search,
     compare_assumptions,
+    far_off,
     group_views,
     pairs_of_images,
 )
@@ -29,13 +35,18 @@ from legcal.perception import (
 STAGE = "Trying common mistakes"
 
 _AGREE_ALREADY = 0.9  # of the images: then nothing common is wrong
-_MIN_IMAGES = 3  # of a view
-_N_GROUPS = 2  # of views, a few of whose images say which mistakes are worth a closer look
-_FINALISTS = 5  # that all images judge
-_NEAR_BEST = 0.7  # of the support of the best, which few images gave, that all images judge as well
-_ALIKE = 0.95  # of the best support: as good
-_MIN_SHARE = 0.6  # of the images, that agree then
+_MIN_IMAGES = 3  # of a group of views
+_FEW = 6  # images, at least, that say which mistakes are worth a closer look
+_ROUNDS = 3  # of such images, until they suit a mistake
+_SUITS = 0.5  # of the legs that they should show
+_STARTS, _FEW_STARTS = (1, 1, 2), (1,)  # images that suggest cameras, of all and of a few
+_POOL = 3  # cameras of other mistakes that are tried
+_FINALISTS = 6  # mistakes that all images judge
+_NEAR_BEST = 0.5  # of the gain of the best, which few images gave, that all images judge as well
+_ALIKE = 0.9  # of the best support: as good, where images do not tell them apart
+_MIN_SHARE = 0.5  # of the images, that agree then
 _MIN_GAIN = 0.1  # in the share of legs that images show, on average
+_MIRROR_X, _MIRROR_Y = np.diag([-1.0, 1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0, 1.0])
 _MIN_SIGMAS = 2.5  # of its signed ranks: chance gains in some images and loses in others
 
 
@@ -59,6 +70,8 @@ class Diagnosis:
         Share of the legs that images then show where they should.
     remedy : str
         What to do.
+    tests : tuple of str
+        What would tell it from what it is the same as.
     """
 
     kind: str
@@ -70,14 +83,14 @@ class Diagnosis:
     after: int
     score: float
     remedy: str
+    tests: tuple[str, ...] = ()
 
     @property
     def sentence(self) -> str:
         """The diagnosis for people."""
         others = "".join(f", or {other}" for other in self.same_as)
-        is_of_legs = self.kind.startswith("columns") and bool(self.same_as)
-        tell = "; look which leg is the first in a picture to tell these apart" * is_of_legs
         what = self.what[0].upper() + self.what[1:]
+        tell = f". To tell these apart, {', or '.join(self.tests)}" if self.tests else ""
         return (
             f"{what}{others}: {self.mended} {self.after} of {self.images} images agree, as it is "
             f"{self.before}; {self.remedy}{tell}."
@@ -99,46 +112,32 @@ class Diagnosis:
 def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     """Return what looks wrong with a session, the likeliest first; nothing where nothing does.
 
-    Views of one or two images say nothing: some camera pose fits them whatever is assumed.
+    Views of one or two images that no board joins to others say nothing: some camera pose fits them
+    whatever is assumed.
     """
-    machine, photographs = data.machine, data.photographs
+    machine = data.machine
     rows = _rows_with_image(data)
     if not (machine.is_determined and len(machine.motors) and len(rows)):
         return ()
-    n_views = len(data.measurements.views)
-    every = group_views(data.measurements, rows, [None] * n_views, None)
-    groups = [group for group in every if len(group.rows) >= _MIN_IMAGES]
+    groups = _groups(data, rows)
     if not groups:
         return ()
-    rows = np.sort(np.concatenate([group.rows for group in groups]))
-    nowhere = np.full((data.measurements.n_rows, machine.n_legs, 3), np.nan)
-    search = photographs.search(Placement(nowhere, nowhere, (None,) * n_views))
-    search = replace(search, edge_pairs=pairs_of_images(search, rows.tolist(), data.pool))
-
-    def judged(
-        assumed: Sequence[Assumed], groups: Sequence[Group], *, quick: bool
-    ) -> list[Agreement]:
-        cases = ((_search(search, one), one.flip, one.focal) for one in assumed)
-        return compare_assumptions(cases, groups, data.pool, quick=quick)
-
-    given = Assumed(machine, data.measurements.q)
-    (own,) = judged([given], groups, quick=False)
-    if own.images > _AGREE_ALREADY * len(rows):
+    judge = _Judge(data, groups)
+    if judge.own.images > _AGREE_ALREADY * len(judge.own.row):
         return ()
     tried = mistakes(data)
-    data.progress(STAGE, 0, len(tried))
-    few = sorted(groups, key=lambda group: -len(group.rows))[:_N_GROUPS]
-    support = np.array([one.support for one in judged([m.true for m in tried], few, quick=True)])
-    best_first = np.argsort(-support, kind="stable")[:_FINALISTS]
-    finalists = best_first[support[best_first] >= _NEAR_BEST * support[best_first[0]]].tolist()
-    others = judged([tried[k].true for k in finalists], groups, quick=False)
-    data.progress(STAGE, len(tried), len(tried))
-    found = {k: one for k, one in zip(finalists, others, strict=True) if _explains(one, own)}
+    finalists = judge.finalists(tried)
+    found = {k: one for k in finalists if _explains(one := judge.all(tried[k].true), judge.own)}
+    data.progress(STAGE, 1, 1)
     if not found:
         return ()
-    best = max(one.support for one in found.values())
-    alike = sorted(k for k, one in found.items() if one.support >= _ALIKE * best)  # commoner first
-    return (_diagnosis([tried[k] for k in alike], found[alike[0]], own),)
+    best = max(found.values(), key=lambda one: float(one.support.sum()))
+    alike = [k for k, one in found.items() if _is_as_good(one, best)]
+    suited = {k: judge.hints_suited(found[k]) for k in alike}
+    alike.sort(key=lambda k: (-suited[k], k))  # the commoner first
+    first = [tried[k] for k in alike]
+    by_hints = len(alike) > 1 and suited[alike[0]] > max(suited[k] for k in alike[1:])
+    return (_diagnosis(first, found[alike[0]], judge.own, by_hints=by_hints),)
 
 
 def _rows_with_image(data: OrderedDataset) -> IntArray:
@@ -153,14 +152,156 @@ def _rows_with_image(data: OrderedDataset) -> IntArray:
     return np.array(shown, dtype=np.intp)
 
 
+def _groups(data: OrderedDataset, rows: IntArray) -> list[Group]:
+    """Return the views that can judge, those that show the board on the base together."""
+    try:
+        board = observe_board(data)
+    except LegcalError:  # told by others; views judge alone then
+        board = None
+    hints = [view.T_base_camera for view in data.measurements.views]
+    joined = None if board is None else board.T_board_camera
+    groups = group_views(data.measurements, rows, hints, joined)
+    return [group for group in groups if len(group.rows) >= _MIN_IMAGES]
+
+
+class _Judge:
+    """The images of groups of views, and what they say of assumptions."""
+
+    def __init__(self, data: OrderedDataset, groups: Sequence[Group]) -> None:
+        self.data, self.groups = data, groups
+        self.given = as_given(data)
+        rows = np.sort(np.concatenate([group.rows for group in groups])).tolist()
+        nowhere = np.full((data.measurements.n_rows, data.machine.n_legs, 3), np.nan)
+        placement = Placement(nowhere, nowhere, (None,) * len(data.measurements.views))
+        search = data.photographs.search(placement, data.edge_pairs)
+        missing = [row for row in rows if row not in data.edge_pairs]
+        data.edge_pairs.update(pairs_of_images(search, missing, data.pool))
+        self.search = replace(search, edge_pairs={row: data.edge_pairs[row] for row in rows})
+        self.pool: list[list[RigidTransform]] = [
+            [] if group.hint is None else [group.hint, _mirrored_camera(group.hint)]
+            for group in groups
+        ]
+        self.of_groups = [
+            self._compare([self.given], g, group.rows, _STARTS)[0] for g, group in enumerate(groups)
+        ]
+        for g, one in enumerate(self.of_groups):
+            self.pool[g] += [T for T in one.cameras if T is not None]
+        self.own = Agreement.joined(self.of_groups)
+
+    def finalists(self, tried: Sequence[Mistake]) -> list[int]:
+        """Return the mistakes that a few images of the views that disagree most speak for."""
+        missing = [float((one.expected - one.support).sum()) for one in self.of_groups]
+        left = np.argsort(-np.array(missing), kind="stable").tolist()
+        gain, own, expected = np.zeros(len(tried)), 0.0, 0.0
+        chosen = list(range(len(tried)))
+        done, total = 0, _ROUNDS * len(tried)
+        for _ in range(_ROUNDS):
+            n_images = 0
+            while left and n_images < _FEW:
+                g = left.pop(0)
+                some = self.groups[g].some
+                before = self.of_groups[g].at(some)
+                own += float(before.support.sum())
+                expected += float(before.expected.sum())
+                n_images += len(some)
+                gain += self._gains(tried, chosen, g)
+                done += len(chosen)
+                self.data.progress(STAGE, min(done, total - 1), total)
+            if not left or own + gain.max() >= _SUITS * expected:
+                break
+            best_first = np.argsort(-gain, kind="stable")
+            chosen = np.sort(best_first[: max(len(chosen) // 2, _FINALISTS)]).tolist()
+        best_first = np.argsort(-gain, kind="stable")
+        found, amounts = list[int](), set[str]()
+        for k in best_first.tolist():
+            if gain[k] <= _NEAR_BEST * gain.max() or len(found) == _FINALISTS:
+                break
+            if tried[k].amount_of not in amounts:
+                found.append(k)
+                amounts |= {tried[k].amount_of} - {""}
+        return found
+
+    def _gains(self, tried: Sequence[Mistake], chosen: Sequence[int], g: int) -> Array:
+        """Return how many more legs a few images of a group show without some mistakes.
+
+        Cameras are tried where they are known roughly, and searched for where that suits none.
+        """
+        group, found = self.groups[g], np.zeros(len(tried))
+        before = self.of_groups[g].at(group.some)
+        some = [k for k in chosen if not tried[k].true.is_as(self.given, group.rows, group.views)]
+        found[some] = -float(before.support.sum())
+        support = np.zeros(len(tried))
+
+        def look(which: Sequence[int], starts: Sequence[int]) -> None:
+            agreements = self._compare([tried[k].true for k in which], g, group.some, starts)
+            for k, one in zip(which, agreements, strict=True):
+                if (now := float(one.support.sum())) > support[k]:
+                    support[k], cameras[k] = now, one.cameras[0]
+            best = np.argsort(-support, kind="stable")[:_POOL].tolist()
+            self.pool[g] += [T for k in best if k in which and (T := cameras.get(k)) is not None]
+
+        cameras: dict[int, RigidTransform | None] = {}
+        look(some, ())
+        most = max(float(support.max()), float(before.support.sum()))
+        if most < _SUITS * float(before.expected.sum()):
+            look([k for k in some if not tried[k].is_small], _FEW_STARTS)
+            look([k for k in some if tried[k].is_small], ())
+        return found + support
+
+    def all(self, assumed: Assumed) -> Agreement:
+        """Return what all images say of an assumption."""
+        return Agreement.joined(
+            [
+                self.of_groups[g]
+                if assumed.is_as(self.given, group.rows, group.views)
+                else self._compare([assumed], g, group.rows, _STARTS)[0]
+                for g, group in enumerate(self.groups)
+            ]
+        )
+
+    def hints_suited(self, one: Agreement) -> int:
+        """Return how many rough camera poses suit the cameras that were found."""
+        both = zip(self.groups, one.cameras, strict=True)
+        return sum(
+            group.hint is not None and T is not None and not far_off(group.hint, T)
+            for group, T in both
+        )
+
+    def _compare(
+        self, assumed: Sequence[Assumed], g: int, rows: Sequence[int], starts: Sequence[int]
+    ) -> list[Agreement]:
+        """Return what some images of a group say of assumptions."""
+        assumptions = [
+            Assumption(
+                _search(self.search, one, rows),
+                one.flip,
+                one.focal,
+                self.groups[g],
+                rows,
+                starts,
+                self.pool[g],
+            )
+            for one in assumed
+        ]
+        return compare_assumptions(assumptions, self.data.pool)
+
+
 def _explains(one: Agreement, own: Agreement) -> bool:
     """Say whether images agree so much better that it is no chance."""
-    n, gain = len(one.row), one.share - own.share
+    gain = one.share - own.share
     return (
-        one.images >= max(_MIN_SHARE * n, 2)
+        one.images >= max(_MIN_SHARE * len(one.row), 2)
         and one.images > own.images
         and float(gain.mean()) >= _MIN_GAIN
         and _signed_ranks(gain) >= _MIN_SIGMAS
+    )
+
+
+def _is_as_good(one: Agreement, best: Agreement) -> bool:
+    """Say whether images do not tell an assumption from the best one."""
+    return (
+        float(one.support.sum()) >= _ALIKE * float(best.support.sum())
+        and _signed_ranks(best.share - one.share) < _MIN_SIGMAS
     )
 
 
@@ -174,10 +315,14 @@ def _signed_ranks(gain: Array) -> float:
     return float(np.sum(np.sign(some) * rank) / max(np.linalg.norm(rank), 1.0))
 
 
-def _diagnosis(alike: Sequence[Mistake], after: Agreement, before: Agreement) -> Diagnosis:
+def _diagnosis(
+    alike: Sequence[Mistake], after: Agreement, before: Agreement, *, by_hints: bool
+) -> Diagnosis:
     """Return the diagnosis of mistakes that images cannot tell apart."""
     first = alike[0]
     same = dict.fromkeys([*first.same_as, *(one.what for one in alike[1:])])
+    tests = dict.fromkeys(one.test for one in alike if one.test) if same else {}
+    rough = ["the rough T_base_camera of the views speak for the first"] * by_hints
     return Diagnosis(
         kind=first.kind,
         what=first.what,
@@ -186,14 +331,20 @@ def _diagnosis(alike: Sequence[Mistake], after: Agreement, before: Agreement) ->
         images=len(after.row),
         before=before.images,
         after=after.images,
-        score=after.support / max(after.expected, 1e-9),
-        remedy=first.remedy,
+        score=after.mean,
+        remedy=", ".join([first.remedy, *rough]) if rough else first.remedy,
+        tests=tuple(tests)[:2],
     )
 
 
-def _search(search: Search, assumed: Assumed) -> Search:
-    """Return what should be seen if something is true."""
-    A, B = assumed.joints()
+def _mirrored_camera(T_base_camera: RigidTransform) -> RigidTransform:
+    """Return where a camera sees mirrored images of a machine whose y is reversed."""
+    return RigidTransform.from_matrix(_MIRROR_Y @ T_base_camera.as_matrix() @ _MIRROR_X)
+
+
+def _search(search: Search, assumed: Assumed, rows: Sequence[int]) -> Search:
+    """Return what should be seen in some images if something is true."""
+    A, B = assumed.joints(rows)
     return replace(
         search, A_base=A, B_base=B, cylinders=[leg.cylinders for leg in assumed.machine.legs]
     )

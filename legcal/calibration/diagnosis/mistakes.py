@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.ordered_dataset import OrderedDataset
-from legcal.data import inverse
-from legcal.geometry import Array
-from legcal.machine import TRAVEL_MARGIN, Leg, LegKind, Machine, follow_poses, readings_at
+from legcal.data import INCH, inverse, readings_of_lengths
+from legcal.files import LENGTH
+from legcal.geometry import Array, IntArray
+from legcal.machine import Leg, LegKind, Machine, follow_poses, readings_at
 from legcal.perception import LEFT_RIGHT, UPSIDE_DOWN
 
 _STEP = 1.0 / 16.0  # of the way from home to readings, at least
 _MIRROR = np.diag([1.0, -1.0, 1.0])
+_MIRROR_4 = np.diag([1.0, -1.0, 1.0, 1.0])
 _FOCAL_LENGTHS = (2.0, 0.5, 1.5, 2.0 / 3.0, 1.25, 0.8)  # of scaled and cropped images
 _SHIFTS = (1, -1, 2, -2)  # rows
+_ZEROS = 8  # steps of the zero of an encoder, in its travel
+_SHARED = 1.0 / 3.0  # of the images of a session that a view has, to be tried alone
 _SAME_RADIUS = 1e-3  # relative: parts that are equally thick are one kind
+
+
+_MOVE_ONE = "move one leg alone and see which column changes, and which leg it is in a picture"
+_LETTERING = "look at lettering in a picture"
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,26 +37,41 @@ class Assumed:
 
     machine: Machine
     q: Array  # (n_rows, n_legs) readings [m]
-    flip: Array = field(default_factory=lambda: np.ones(2))  # -1 along axes images are turned over
+    flip: Array  # (n_views, 2) -1 along axes that images are turned over
     focal: float = 1.0  # focal length as a part of the stated one
 
-    def joints(self) -> tuple[Array, Array]:
-        """Return joint centres in the base link, (n_rows, n_legs, 3) each [m], NaN if not reached.
+    def joints(self, rows: Sequence[int]) -> tuple[Array, Array]:
+        """Return joint centres in the base link, (n_rows, n_legs, 3) each [m].
 
-        From home the readings are followed by the equations of the legs alone.
+        From home the readings of some rows are followed by the equations of the legs alone; what is
+        not reached, and all other rows, are NaN.
         """
         machine, motors = self.machine, list(self.machine.motors)
         first = readings_at(machine, machine.home)[motors]
-        poses, part = follow_poses(machine, machine.home, first, self.q[:, motors], _STEP)
-        B = np.einsum("kij,nj->kni", poses[:, :, :3], machine.B_platform) + poses[:, None, :, 3]
-        B[part < 1.0] = np.nan
+        chosen = np.array(rows, dtype=np.intp)
+        q = self.q[chosen][:, motors]
+        poses, part = follow_poses(machine, machine.home, first, q, _STEP)
+        found = np.einsum("kij,nj->kni", poses[:, :, :3], machine.B_platform)
+        found += poses[:, None, :, 3]
+        found[part < 1.0] = np.nan
+        B = np.full((len(self.q), machine.n_legs, 3), np.nan)
+        B[chosen] = found
         return np.broadcast_to(machine.A_base, B.shape), B
+
+    def is_as(self, other: Assumed, rows: Sequence[int], views: Sequence[int]) -> bool:
+        """Whether nothing differs from another in some rows and views."""
+        return (
+            self.machine is other.machine
+            and self.focal == other.focal
+            and np.array_equal(self.q[rows], other.q[rows], equal_nan=True)
+            and np.array_equal(self.flip[views], other.flip[views])
+        )
 
     @property
     def is_in_travel(self) -> bool:
         """Whether all readings are inside the travel of their legs, or hardly outside."""
         return all(
-            _is_inside(leg, self.q[:, j])
+            bool(leg.in_travel(self.q[:, j]).all())
             for j, leg in enumerate(self.machine.legs)
             if leg.kind is LegKind.ACTUATED
         )
@@ -63,16 +87,24 @@ class Mistake:
     remedy: str  # what to do
     true: Assumed
     same_as: tuple[str, ...] = ()  # clauses of what no image can tell from it
+    test: str = ""  # what would decide whether it is this: "move one leg alone and ..."
+    is_small: bool = False  # cameras stand about where images have them as things are
+    amount_of: str = ""  # mistakes of one name differ by how much: the best stands for all
+
+
+def as_given(data: OrderedDataset) -> Assumed:
+    """Return a session as its files have it."""
+    return Assumed(data.machine, data.measurements.q, np.ones((len(data.measurements.views), 2)))
 
 
 def mistakes(data: OrderedDataset) -> list[Mistake]:
     """Return what may be wrong with a session, the commoner before the rarer."""
-    given = Assumed(data.machine, data.measurements.q)
+    given = as_given(data)
     found = [
         *_of_columns(data, given),
         *_of_rows(data, given),
         *_of_encoders(given),
-        *_of_images(given),
+        *_of_images(data, given),
         *_of_model(data, given),
         *_of_radii(given),
         *_of_cameras(given),
@@ -104,6 +136,7 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
             "exchange their headers",
             with_columns(source),
             (f"legs {legs} look exchanged in the model",),
+            _MOVE_ONE,
         )
     if n > 2:
         yield Mistake(
@@ -113,6 +146,7 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
             "reverse their headers",
             with_columns(every[::-1]),
             ("the legs look as if they were numbered backwards in the model",),
+            _MOVE_ONE,
         )
         for k in range(1, n):
             yield Mistake(
@@ -123,6 +157,7 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
                 "correct their headers",
                 with_columns([(j + k) % n for j in every]),
                 ("the legs look as if they were numbered from another one on in the model",),
+                _MOVE_ONE,
             )
 
 
@@ -137,19 +172,29 @@ def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         for v in range(n_views)
     ]
     names = [one.name for one in data.measurements.views]
-    for k in _SHIFTS:
+    every = [rows for rows in of_view if len(rows)]
+
+    def moved(which: Sequence[IntArray], k: int, where: str) -> Iterator[Mistake]:
+        if any(len(rows) <= abs(k) + 1 for rows in which):
+            return
         q = given.q.copy()
-        for rows in of_view:
+        for rows in which:
             q[rows] = given.q[np.roll(rows, -k)]
-        if all(len(rows) > abs(k) + 1 for rows in of_view if len(rows)):
-            later = f"{abs(k)} row{'s' * (abs(k) > 1)} too {'early' if k < 0 else 'late'}"
-            yield Mistake(
-                "readings shifted",
-                f"the readings look as if they stood {later}: each image has those of another",
-                f"with them moved by {abs(k)}",
-                "check which image belongs to which row",
-                replace(given, q=q),
-            )
+        later = f"{abs(k)} row{'s' * (abs(k) > 1)} too {'early' if k < 0 else 'late'}"
+        yield Mistake(
+            "readings shifted",
+            f"the readings{where} look as if they stood {later}: each image has those of another",
+            f"with them moved by {abs(k)}",
+            "check which image belongs to which row",
+            replace(given, q=q),
+        )
+
+    for k in _SHIFTS:
+        yield from moved(every, k, "")
+    for v, rows in enumerate(of_view):
+        if len(every) > 1 and len(rows) >= _SHARED * len(view):
+            for k in _SHIFTS[:2]:
+                yield from moved([rows], k, f" of view {names[v]}")
     for a, b in combinations(range(n_views), 2):
         if len(of_view[a]) != len(of_view[b]) or len(of_view[a]) < 2:
             continue
@@ -177,9 +222,9 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
     own = given.q[:, motors]
     ends = np.array([sum(leg.travel) for leg in legs])
     ends = np.where(np.isfinite(ends), ends, own.min(axis=0) + own.max(axis=0))
-    lengths = np.array([leg.sign for leg in legs]) * (own - np.array([leg.q0 for leg in legs]))
     every = list(range(len(legs)))
-    for scale, unit in ((1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches")):
+    units = ((LENGTH["mm"], "millimetres"), (LENGTH["cm"], "centimetres"), (INCH, "inches"))
+    for scale, unit in units:
         yield Mistake(
             "unit",
             f"the readings look like {unit}",
@@ -192,7 +237,7 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
         "the readings look like whole leg lengths",
         "less the leg length at reading zero",
         "subtract that (legcal inspect shows it), or make a model whose offsets are zero",
-        with_readings(lengths, every),
+        with_readings(readings_of_lengths(own, legs), every),
     )
     for change, what in ((-own, "the opposite sign"), (ends - own, "the opposite direction")):
         yield Mistake(
@@ -210,33 +255,81 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
                 "reverse it in the table of readings",
                 with_readings(change[:, k : k + 1], [k]),
             )
-
-
-def _of_images(given: Assumed) -> Iterator[Mistake]:
-    """Yield images that are turned over."""
-    for flip, kind, what in (
-        (LEFT_RIGHT, "images mirrored", "the images look mirrored"),
-        (UPSIDE_DOWN, "images upside down", "the images look turned upside down"),
-    ):
+    steps = np.array([_zero_step(leg, own[:, k]) for k, leg in enumerate(legs)])
+    for m in range(-_ZEROS, _ZEROS + 1):
+        if m == 0:
+            continue
+        size = f"{abs(1e3 * m * float(steps.mean())):.0f} mm too {'small' if m > 0 else 'large'}"
         yield Mistake(
-            kind,
-            what,
-            "turned back",
-            "replace them by the originals",
-            replace(given, flip=flip),
+            "zero of encoders",
+            f"the readings of all legs look as if they had another zero: about {size}",
+            f"with that {'added' if m > 0 else 'taken off'}",
+            "correct the table of readings, or the offsets in the model",
+            with_readings(own + m * steps.mean(), every),
+            is_small=True,
+            amount_of="zero of all encoders",
         )
+        for k in every:
+            size = f"{abs(1e3 * m * steps[k]):.0f} mm too {'small' if m > 0 else 'large'}"
+            yield Mistake(
+                "zero of an encoder",
+                f"column {legs[k].prismatic} looks as if it had another zero: about {size}",
+                f"with that {'added' if m > 0 else 'taken off'}",
+                "correct it in the table of readings, or the offset of the leg in the model",
+                with_readings(own[:, k : k + 1] + m * steps[k], [k]),
+                is_small=True,
+                amount_of=f"zero of encoder {k}",
+            )
+
+
+def _zero_step(leg: Leg, q: Array) -> float:
+    """Return by how much the zero of an encoder is moved in one step [m]."""
+    width = leg.travel[1] - leg.travel[0]
+    return (width if 0.0 < width < np.inf else float(np.ptp(q))) / _ZEROS
+
+
+def _of_images(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
+    """Yield images that are turned over, all or those of a view."""
+    views = data.measurements.views
+    share = np.bincount(data.measurements.view, minlength=len(views)) / data.measurements.n_rows
+    which = [(list(range(len(views))), "")]
+    for v, view in enumerate(views):
+        if len(views) > 1 and share[v] >= _SHARED:
+            which.append(([v], f" of view {view.name}"))
+    for chosen, of_view in which:
+        for turn, kind, what in (
+            (LEFT_RIGHT, "images mirrored", "mirrored"),
+            (UPSIDE_DOWN, "images upside down", "turned upside down"),
+        ):
+            if of_view and turn is UPSIDE_DOWN:  # of one camera: it may be held so
+                continue
+            flip = given.flip.copy()
+            flip[chosen] = turn
+            yield Mistake(
+                kind,
+                f"the images{of_view} look {what}",
+                "turned back",
+                "replace them by the originals",
+                replace(given, flip=flip),
+                test=_LETTERING,
+            )
 
 
 def _of_model(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
     """Yield joints in other places: left-handed tables, platform joints of other legs."""
     machine = given.machine
-    mirrored = tuple(_mirrored(leg) for leg in machine.legs)
+    mirrored = replace(
+        machine,
+        legs=tuple(_mirrored(leg) for leg in machine.legs),
+        home=RigidTransform.from_matrix(_MIRROR_4 @ machine.home.as_matrix() @ _MIRROR_4),
+    )
     yield Mistake(
         "handedness",
         "the joints of the model look mirrored: the y axis of their table points the other way",
         "with the signs of y reversed",
         "reverse the signs of all y in the model",
-        replace(given, machine=replace(machine, legs=mirrored)),
+        replace(given, machine=mirrored),
+        test="compare the signs of y in the model with where the legs stand in a picture",
     )
     order = inverse(data.order.legs).tolist()
     n = len(order)
@@ -287,6 +380,19 @@ def _of_radii(given: Assumed) -> Iterator[Mistake]:
                 "correct the <visual> cylinders of the model",
                 replace(given, machine=_with_radii(given.machine, partial(scaled, factor, only))),
             )
+    for j, leg in enumerate(given.machine.legs):
+        for factor, what in ((0.5, "twice as large as they are"), (2.0, "half of what they are")):
+            cylinders = [list(one.cylinders) for one in given.machine.legs]
+            cylinders[j] = [replace(c, radius=factor * c.radius) for c in leg.cylinders]
+            if leg.cylinders:
+                yield Mistake(
+                    "diameter for radius",
+                    f"the radii of leg {leg.name} in the model look {what}",
+                    f"with {'half' if factor < 1.0 else 'twice'} of them",
+                    "correct its <visual> cylinders in the model",
+                    replace(given, machine=given.machine.with_cylinders(cylinders)),
+                    is_small=True,
+                )
     if len(kinds) == 2:
         exchanged = {kinds[0]: kinds[1], kinds[1]: kinds[0]}
 
@@ -323,15 +429,5 @@ def _of_cameras(given: Assumed) -> Iterator[Mistake]:
             "with that",
             "calibrate the camera with images as these are (legcal camera)",
             replace(given, focal=factor),
+            amount_of="focal length",
         )
-
-
-def _is_inside(leg: Leg, q: Array) -> bool:
-    """Say whether readings of a leg are inside its travel, or hardly outside."""
-    lower, upper = leg.travel
-    width = upper - lower
-    if not (np.isfinite(width) and width > 0.0):
-        return True
-    margin = TRAVEL_MARGIN * width
-    inside = (q >= lower - margin) & (q <= upper + margin)
-    return bool(np.all(inside | np.isnan(q)))
