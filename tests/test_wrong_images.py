@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from hexapod_example import Picture, Spoiled, spoiled
+from numpy.typing import NDArray
 from outline_tables import outlines_of
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
@@ -276,6 +277,52 @@ def test_a_rough_pose_may_be_off_by_what_rough_poses_are() -> None:
         turn = Rotation.from_rotvec([0.0, angle, 0.0], degrees=True)
         hint = T * RigidTransform.from_components(off, turn)
         assert len(hint_notes(["c1"], [hint], [T])) == n
+
+
+@pytest.mark.parametrize(
+    ("written", "words"),
+    [
+        (lambda T: T.inv(), "if it is inverted, the base in the camera:"),
+        (lambda T: _pose(1e3 * T.translation, T.rotation), "if its xyz are millimetres:"),
+        (lambda T: _pose(T.translation, _w_first(T.rotation)), "if its quaternion has w first:"),
+        (
+            lambda T: _pose(T.inv().translation, _w_first(T.inv().rotation)),
+            "if it is inverted, the base in the camera, and its quaternion has w first:",
+        ),
+        (
+            lambda T: T * _pose(np.zeros(3), Rotation.from_euler("x", 180, degrees=True)),
+            "if its camera has y up and z backward:",
+        ),
+        (
+            lambda T: _pose(T.translation, _forward(T.rotation)),
+            "if its camera has x forward and z up:",
+        ),
+        (
+            lambda T: T * _pose(np.zeros(3), Rotation.from_euler("y", 40, degrees=True)),
+            "needed a rough pose; correct it in dataset.yaml",
+        ),
+    ],
+)
+def test_a_rough_pose_in_another_convention_is_called_so(
+    written: Callable[[RigidTransform], RigidTransform], words: str
+) -> None:
+    near = _pose(np.array([0.01, -0.01, 0.0]), Rotation.from_rotvec([1.0, -1.0, 0.5], degrees=True))
+    T = _pose(np.array([0.3, -0.9, 0.5]), Rotation.from_quat([0.68, 0.17, -0.2, 0.68]))
+    (note,) = hint_notes(["c1"], [written(T * near)], [T])
+    assert words in note
+
+
+def _pose(xyz: NDArray[np.float64], rotation: Rotation) -> RigidTransform:
+    return RigidTransform.from_components(xyz, rotation)
+
+
+def _forward(rotation: Rotation) -> Rotation:
+    x, y, z = rotation.as_matrix().T
+    return Rotation.from_matrix(np.stack([z, -x, -y], axis=1))
+
+
+def _w_first(rotation: Rotation) -> Rotation:
+    return Rotation.from_quat(np.roll(rotation.as_quat(), 1))
 
 
 @pytest.mark.parametrize(

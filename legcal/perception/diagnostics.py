@@ -7,13 +7,13 @@ reason.
 """
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data import Measurements, Outlines, is_edited
 from legcal.geometry import BoolArray, IntArray, pose_distance
@@ -50,6 +50,13 @@ GOOD_PERCENTILE = 75.0  # percentile of what images find, for what good ones do
 NOTHING_LIKE = "it does not show the legs where its reading has them"  # a reason
 NOT_IN_SIGHT = (OUTSIDE, HIDDEN)  # beginnings of reasons
 
+MILLIMETRE = 1e-3  # [m]
+# Axes of cameras in other software, as columns the x, y and z of ours in them.
+_CAMERA_AXES = {
+    "y up and z backward": np.diag([1.0, -1.0, -1.0]),
+    "x forward and z up": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+    "x left and y up, or its images are upside down": np.diag([-1.0, -1.0, 1.0]),
+}
 FAR_OFF = (0.06, np.deg2rad(6.0))  # three times what a rough pose is good to: [m], angle
 FAR_OFF_PART = 0.06  # of the distance of the camera, where that is more
 BEFORE_FIT = 2.5  # times more, while the cameras are only where legs were recognised
@@ -437,6 +444,25 @@ def far_off(hint: RigidTransform, T_base_camera: RigidTransform, reach: float = 
     return apart > max(nearest, part * distance) or angle > reach * FAR_OFF[1]
 
 
+def _other_meanings(hint: RigidTransform) -> Iterator[tuple[str, RigidTransform]]:
+    """Yield what people write in place of T_base_camera, and the pose that it means then."""
+    t, R = hint.translation, hint.rotation
+    written = (
+        ("", t, R),
+        ("its xyz are millimetres", MILLIMETRE * t, R),
+        ("its quaternion has w first", t, Rotation.from_quat(np.roll(R.as_quat(), -1))),
+    )
+    for what, xyz, rotation in written:
+        pose = RigidTransform.from_components(xyz, rotation)
+        if what:
+            yield what, pose
+        both = f", and {what}" if what else ""
+        yield f"it is inverted, the base in the camera{both}", pose.inv()
+        for axes, R_axes in _CAMERA_AXES.items():
+            turned = RigidTransform.from_rotation(Rotation.from_matrix(R_axes))
+            yield f"its camera has {axes}{both}", pose * turned
+
+
 def hint_notes(
     names: Sequence[str],
     hints: Sequence[RigidTransform | None],
@@ -462,11 +488,13 @@ def hint_notes(
             ),
             None,
         )
-        remedy = (
-            "correct it in dataset.yaml"
-            if other is None
-            else f"it suits view {other}: check whether views or their images were exchanged"
-        )
+        meant = next((what for what, as_meant in _other_meanings(hint)
+                      if not far_off(as_meant, T, reach)), None)  # fmt: skip
+        remedy = "correct it in dataset.yaml"
+        if other is not None:
+            remedy = f"it suits view {other}: check whether views or their images were exchanged"
+        elif meant is not None:
+            remedy = f"it suits the images if {meant}: {remedy}"
         notes.append(
             f"view {name}: its T_base_camera is wrong: found it {1e3 * apart:.0f} mm and "
             f"{np.degrees(angle):.0f} deg from where the images put the camera (xyz: [{x:.3f}, "
