@@ -9,6 +9,7 @@ from .evaluation import Evaluation as Evaluation
 from .evaluation import evaluate as evaluate
 from .identify.identifiability import answer as answer
 from .identify.identifiability import identifiability as identifiability
+from .identify.identifiability import identifiability_of_dataset as identifiability_of_dataset
 from .identify.predicted_observations import legs_in_words as legs_in_words
 from .identify.predicted_observations import views_in_words as views_in_words
 from .identify.report import BoardReport as BoardReport
@@ -23,6 +24,7 @@ from .joint_fit.parameter_choices import Choices as Choices
 from .joint_fit.platform import poses_at_readings as poses_at_readings
 from .joint_fit.problem import build_fit as build_fit
 from .joint_fit.solution import Solution as Solution
+from .joint_fit.variables import DEFAULT_SETTINGS as DEFAULT_SETTINGS
 from .joint_fit.variables import FittedLegs as FittedLegs
 from .joint_fit.variables import RefinementSettings as RefinementSettings
 from .joint_fit.variables import Start as Start
@@ -64,3 +66,5 @@ from .summary import tables as tables
 from .verification import SIGNIFICANCE as SIGNIFICANCE
 from .verification import Check as Check
 from .verification import check as check
+from .workspace_errors import PlatformMap as PlatformMap
+from .workspace_errors import platform_map as platform_map

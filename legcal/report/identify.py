@@ -23,7 +23,7 @@ from legcal.report.render import report as blocks
 from legcal.report.render import table
 from legcal.vision import Link
 
-_CONDITIONS = {
+CONDITIONS = {
     "eq12": "base joints and axes (12)",
     "eq15": "offsets and lengths (15)",
     "eq17": "platform joints (17)",
@@ -110,7 +110,7 @@ def _conditions(report: Identifiability) -> Table:
         legs = f": {legs_in_words(c.legs, report.legs)}" if c.legs else ""
         numbers = ("", "") if c.equations is None else (str(c.equations), str(c.unknowns))
         remark = "" if c.needed else ", not needed with the board"
-        rows.append((_CONDITIONS[c.name], *numbers, f"{'ok' if c.ok else 'fails'}{legs}{remark}"))
+        rows.append((CONDITIONS[c.name], *numbers, f"{'ok' if c.ok else 'fails'}{legs}{remark}"))
     return table("condition of the paper", ">equations", ">unknowns", "", rows=rows)
 
 
@@ -176,7 +176,7 @@ def _board(board: BoardReport, of: int, link: Link) -> str:
     text = f"{subject} {verb}"
     if board.needed_for:
         needed = list_in_words(
-            [_NEEDS.get(name, _CONDITIONS.get(name, name)) for name in board.needed_for]
+            [_NEEDS.get(name, CONDITIONS.get(name, name)) for name in board.needed_for]
         )
         where = "" if board.present else f" on the {link}"
         text = f"{subject}{where} is needed for {needed}; it raises"
@@ -241,7 +241,7 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
     if any(direction.dX_m is not None and not direction.harmless for direction in weak):
         hidden = "The platform error of a direction is that for 1 mm in its largest component."
         lines.append(Text(hidden, style="dim"))
-    failed = [_CONDITIONS[c.name] for c in report.conditions if c.fails]
+    failed = [CONDITIONS[c.name] for c in report.conditions if c.fails]
     if failed:
         lines.append(f"The paper's conditions fail: {list_in_words(failed)}.")
     return [*lines, *(f"note: {note}" for note in report.notes)]

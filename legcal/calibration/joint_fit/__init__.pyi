@@ -23,7 +23,9 @@ from .parameter_choices import known_parameters as known_parameters
 from .parameter_choices import resolve as resolve
 from .platform import PlatformAccuracy as PlatformAccuracy
 from .platform import PlatformError as PlatformError
+from .platform import expected_error as expected_error
 from .platform import platform_accuracy as platform_accuracy
+from .platform import platform_by_parameters as platform_by_parameters
 from .platform import poses_at_readings as poses_at_readings
 from .problem import FitProblem as FitProblem
 from .problem import build_fit as build_fit

@@ -2,34 +2,80 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from legcal.calibration import Calibration
-from legcal.report.page.document import Items, Page, Row, Section
+from legcal.report.page.crops import outline_crops
+from legcal.report.page.document import Gallery, Items, Page, Row, Section, Text
+from legcal.report.page.evidence import (
+    correlation_blocks,
+    held_out_blocks,
+    identifiability_blocks,
+    note_blocks,
+    reproducibility_blocks,
+)
 from legcal.report.page.parameter_rows import change_charts, parameter_table
+from legcal.report.page.platform_blocks import platform_blocks
 from legcal.report.page.residual_plots import residual_plots
+from legcal.report.page.scene import machine_scene
 from legcal.report.page.verdicts import next_steps, verdict_of
 
 
 def calibration_page(calibration: Calibration, folder: Path, command: str = "") -> Page:
     """Return the page of a calibration whose result folder this is, made by a command."""
     machine = calibration.dataset.machine
-    sections = [
-        Section("next", "What to do next", [Items(next_steps(calibration, str(folder)), True)]),
-        Section(
-            "parameters", "Parameters", [parameter_table(calibration), *change_charts(calibration)]
-        ),
-    ]
-    if len(calibration.residuals):
-        plots = residual_plots(calibration, {})
-        sections.append(Section("residuals", "Residuals", [Row(plots)]))
-    if calibration.notes:
-        sections.append(Section("notes", "Notes", [Items(calibration.notes)]))
     when = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
+    sections = (
+        ("next", "What to do next", [Items(next_steps(calibration, str(folder)), True)]),
+        ("platform", "Platform error", platform_blocks(calibration)),
+        ("parameters", "Parameters", [parameter_table(calibration), *change_charts(calibration)]),
+        ("machine", "The machine", [machine_scene(calibration)]),
+        *_of_outlines(calibration),
+        ("identifiability", "Identifiability", identifiability_blocks(calibration)),
+        ("correlation", "Correlations", correlation_blocks(calibration)),
+        ("holdout", "Held-out images", held_out_blocks(calibration)),
+        ("notes", "Diagnosis and notes", note_blocks(calibration)),
+        ("record", "Reproducibility", reproducibility_blocks(calibration, command, when)),
+    )
     return Page(
         f"Calibration of {machine.name}",
         f"{calibration.dataset.folder.name}, {when}",
         verdict_of(calibration),
-        [section for section in sections if section.blocks],
+        [Section(*section) for section in sections if section[2]],
     )
+
+
+def _of_outlines(calibration: Calibration) -> list[tuple[str, str, Sequence[Any]]]:
+    """Return the sections on residuals and on the outlines that are furthest off."""
+    if not len(calibration.residuals):
+        return []
+    crops = outline_crops(calibration, {})
+    n = len(crops.missing)
+    missing = [Text([f"{n} image{'s' * (n != 1)} could not be read any more."])] if n else []
+    lines = Text(
+        [
+            "Green is the outline as measured, red if the fit rejected it, dashed orange where the "
+            "fit has it. A click enlarges; then scroll to zoom and drag to move."
+        ],
+        dim=True,
+    )
+    galleries = [
+        Gallery(found, title)
+        for found, title in (
+            (
+                crops.worst,
+                f"The worst {len(crops.worst)}, by their distance in standard deviations",
+            ),
+            (crops.median, f"{len(crops.median)} in the middle"),
+        )
+        if found
+    ]
+    found: list[tuple[str, str, Sequence[Any]]] = [
+        ("residuals", "Residuals", [Row(residual_plots(calibration, crops.links))])
+    ]
+    if galleries or missing:
+        found.append(("outlines", "Outlines", [*missing, lines, *galleries]))
+    return found

@@ -158,5 +158,5 @@ def _quantiles(
          "hovertemplate": "%{text}<br>%{y:.2f} sigma<extra></extra>",
          "marker": {"size": 4, "color": "#1f5fa8", "opacity": 0.7}},
     ]  # fmt: skip
-    found = layout("normal quantile", "residual over its standard deviation")
+    found = layout("normal quantile", "residual / sigma")
     return Plot("residuals-qq", data, found, 280, extra=_linked(data[1:], links), title="QQ plot")

@@ -45,8 +45,8 @@
   for (const script of document.querySelectorAll("script[data-plot]")) {
     const div = document.getElementById(script.dataset.plot);
     waiting.set(div, JSON.parse(script.textContent));
-    near.observe(div);
   }
+  document.addEventListener("DOMContentLoaded", () => { for (const div of waiting.keys()) near.observe(div); });
   addEventListener("beforeprint", () => { for (const div of [...waiting.keys()]) draw(div); });
 
   // A scene: legs from A to B of a model and of another one, whose difference is exaggerated.

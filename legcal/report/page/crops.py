@@ -1,0 +1,168 @@
+"""Pieces of photographs about single outlines, with the outline as measured and by the fit."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from markupsafe import Markup
+
+from legcal.calibration import Calibration
+from legcal.data import row_names
+from legcal.errors import LegcalError
+from legcal.geometry import Array, Image
+from legcal.report.page.document import Crop
+from legcal.vision import Camera, outlines_of_axis
+
+N_WORST, N_MEDIAN = 30, 10
+MAX_BYTES = 3_000_000  # of all pictures in a page, as they are written
+_MARGIN = 18  # about an outline [px]
+_ASPECT = 0.8  # of its sides, the shorter to the longer, at least
+_SIDE = 360  # longer side of a picture; what is larger is reduced [px]
+_QUALITY = 78  # of JPEG [percent]
+_N_POINTS = 12  # of a line
+_SMALLER = 0.7  # each attempt to keep to MAX_BYTES
+
+
+@dataclass(frozen=True)
+class Crops:
+    """The pieces that a page shows."""
+
+    worst: list[Crop]
+    median: list[Crop]
+    links: dict[int, str]  # where the outlines of the table are shown, by their row
+    missing: tuple[str, ...]  # images that could not be read any more
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A piece of an image before it is a picture."""
+
+    outline: int
+    grey: Image
+    corner: tuple[int, int]
+
+
+def outline_crops(calibration: Calibration, overlays: dict[int, str]) -> Crops:
+    """Return the worst outlines and those in the middle, by their distance in sigmas.
+
+    *overlays* are pictures of whole images beside the page, by row of the measurements.
+    """
+    residuals, outlines = calibration.residuals, calibration.solution.outlines
+    dataset = calibration.dataset
+    size = np.linalg.norm(residuals.whitened, axis=1)
+    order = np.argsort(-size, kind="stable")
+    worst = residuals.index[order[:N_WORST]].tolist()
+    middle = max(N_WORST, (len(order) - N_MEDIAN) // 2)
+    median = residuals.index[order[middle : middle + N_MEDIAN]].tolist()
+    reader = dataset.image_reader(range(dataset.measurements.n_rows))
+    pieces: dict[int, _Piece] = {}
+    missing: list[str] = []
+    wanted: dict[int, list[int]] = {}
+    for i in (*worst, *median):
+        wanted.setdefault(int(outlines.row[i]), []).append(i)
+    for row, of_row in wanted.items():
+        if dataset.image_path(row) is None:
+            continue
+        try:
+            image = reader(row)
+        except LegcalError:
+            missing.append(dataset.measurements.image[row])
+            continue
+        for i in of_row:
+            pieces[i] = _cut(i, image, outlines.ends[i])
+    scale, quality = 1.0, _QUALITY
+    pictures = {i: _picture(piece, scale, quality) for i, piece in pieces.items()}
+    while sum(map(len, pictures.values())) > MAX_BYTES:
+        scale *= _SMALLER
+        pictures = {i: _picture(piece, scale, quality) for i, piece in pieces.items()}
+    number = dict(zip(residuals.index.tolist(), range(len(residuals)), strict=True))
+    made = {
+        i: _crop(calibration, piece, pictures[i], number[i], overlays)
+        for i, piece in pieces.items()
+    }
+    links = {i: overlays[row] for i, row in enumerate(outlines.row.tolist()) if row in overlays} | {
+        i: f"#{crop.name}" for i, crop in made.items()
+    }
+    return Crops(
+        [made[i] for i in worst if i in made],
+        [made[i] for i in median if i in made],
+        links,
+        tuple(missing),
+    )
+
+
+def _cut(outline: int, image: Image, ends: Array) -> _Piece:
+    """Return the piece of an image about an outline."""
+    middle, half = ends.mean(axis=0), 0.5 * np.ptp(ends, axis=0) + _MARGIN
+    half = np.maximum(half, _ASPECT * half.max())
+    low, high = np.floor(middle - half).astype(int), np.ceil(middle + half).astype(int) + 1
+    height, width = image.shape
+    left, top = np.clip(low, 0, [width - 1, height - 1]).tolist()
+    right, bottom = np.clip(high, [left + 1, top + 1], [width, height]).tolist()
+    return _Piece(outline, image[top:bottom, left:right].copy(), (left, top))
+
+
+def _picture(piece: _Piece, scale: float, quality: int) -> str:
+    """Return a piece as a data URL."""
+    grey = np.clip(np.rint(piece.grey), 0, 255).astype(np.uint8)
+    factor = scale * min(1.0, _SIDE / max(grey.shape))
+    if factor < 1.0:
+        grey = np.asarray(
+            cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8
+        )
+    _, data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
+
+
+def _crop(
+    calibration: Calibration, piece: _Piece, picture: str, k: int, overlays: dict[int, str]
+) -> Crop:
+    """Return a piece with what is drawn over it."""
+    residuals, outlines = calibration.residuals, calibration.solution.outlines
+    dataset, solution = calibration.dataset, calibration.solution
+    i, measurements = piece.outline, dataset.measurements
+    row, j = int(outlines.row[i]), int(outlines.leg[i])
+    v, pose = int(measurements.view[row]), int(measurements.pose[row])
+    T, leg = solution.T_camera_Rb[v], solution.legs[j]
+    A, B = T.apply(leg.A), (T * solution.T_Rb_Re[pose]).apply(leg.B)
+    u = (B - A) / np.linalg.norm(B - A)
+    fit = outlines_of_axis(u, A, solution.radii[j, outlines.part[i]])[int(outlines.edge[i]) - 1]
+    given = measurements.views[v].camera
+    origin = np.array(piece.corner) - 0.5  # pixel (0, 0) is the centre of the first one
+    lines = [
+        (
+            "measured" if outlines.used[i] else "rejected",
+            _points(_curve(given, outlines.h[i], outlines.ends[i]) - origin),
+        ),
+        ("predicted", _points(_curve(solution.cameras[v], fit, outlines.ends[i]) - origin)),
+    ]
+    off, sigmas = residuals.offset[k], float(np.linalg.norm(residuals.whitened[k]))
+    name = dataset.machine.leg_names[j]
+    rejected = "" if outlines.used[i] else f"; rejected: {outlines.reason[i]}"
+    height, width = piece.grey.shape
+    return Crop(
+        name=f"outline-{i}",
+        picture=Markup(picture),
+        width=width,
+        height=height,
+        lines=lines,
+        caption=f"{name}, edge {outlines.edge[i]}: {off[0]:+.3f} and {off[1]:+.3f} px",
+        detail=f"{sigmas:.1f} sigma, {row_names(measurements)[row]}{rejected}",
+        link=overlays.get(row, ""),
+    )
+
+
+def _curve(camera: Camera, h: Array, ends: Array) -> Array:
+    """Return points in the image of a line (3,) of the sensor plane between two places [px]."""
+    xy = camera.undistort(ends)
+    normal = h[:2] / (h[:2] @ h[:2])
+    feet = xy - (xy @ h[:2] + h[2])[:, None] * normal
+    share = np.linspace(0.0, 1.0, _N_POINTS)[:, None]
+    return camera.distort(feet[0] + share * (feet[1] - feet[0]))
+
+
+def _points(pixels: Array) -> str:
+    return " ".join(f"{x:.2f},{y:.2f}" for x, y in pixels.tolist())

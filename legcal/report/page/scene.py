@@ -1,0 +1,229 @@
+"""The machine in space: nominal and calibrated, with what is uncertain, and its cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.calibration import Calibration, poses_at_readings
+from legcal.data import row_names
+from legcal.geometry import Array
+from legcal.machine import Leg, geometries, moved_legs
+from legcal.report.page.document import Plot, plain
+from legcal.report.page.residual_plots import FONT
+
+MAX_POSES = 60  # of the slider
+MAX_CAMERAS = 60
+FACTORS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000, 50000)
+_SHOWN = 0.12  # of the size of the machine: how far the largest change is drawn at first
+_RING = 0.02  # of it: the median ellipsoid
+_N_RING = 20  # points of a ring
+_GREY, _BLUE, _AMBER, _GREEN = "#9aa1ab", "#1f5fa8", "#b26a00", "#1e7d46"
+
+
+def machine_scene(calibration: Calibration) -> Plot:
+    """Return the machine, its sliders moving pose and exaggeration of what is shown."""
+    machine, solution = calibration.dataset.machine, calibration.solution
+    measurements = calibration.dataset.measurements
+    chosen = np.unique(
+        np.linspace(0, measurements.n_poses - 1, min(MAX_POSES, measurements.n_poses)).astype(int)
+    )
+    q = measurements.q[measurements.first_rows][chosen]
+    fitted = [solution.T_Rb_Re[k] for k in chosen.tolist()]
+    frame = machine.T_base_Rb
+
+    def placed(legs: Sequence[Leg], near: Sequence[RigidTransform]) -> tuple[Array, Array]:
+        """Return A (n, 3) and B (k, n, 3) of legs at the readings, in the base link."""
+        poses = poses_at_readings(machine, legs, q, near) if calibration.platform else near
+        A = frame.apply(np.array([leg.A for leg in legs]))
+        B = np.array([leg.B for leg in legs])
+        return A, np.array([(frame * T).apply(B) for T in poses])
+
+    found = placed(solution.legs, fitted)
+    size = float(np.ptp(np.concatenate([found[0], found[1][0]]), axis=0).max())
+    modes = [
+        _mode("what the calibration changed", placed(geometries(machine), fitted), found, size)
+    ]
+    for what, step in _directions(calibration):
+        legs = moved_legs(solution.legs, solution.parametrization.place, step)
+        modes.append(_mode(what, found, placed(legs, fitted), size))
+    rings, ring_factor = _rings(calibration, size)
+    images = row_names(measurements)
+    extra = {
+        "modes": modes,
+        "factors": FACTORS,
+        "steps": len(FACTORS) - 1,
+        "step": modes[0]["step"],
+        "poses": [plain(images[row]) for row in measurements.first_rows[chosen].tolist()],
+        "turns": [_rounded((frame * T).rotation.as_matrix(), 6) for T in fitted],
+        "rings": rings,
+        "outline": {"base": _around(found[0]), "platform": _around(found[1][0])},
+        "traces": {"legs": [0, 1], "base": [2, 3], "platform": [4, 5], "rings": 6},
+    }
+    names = [plain(name) for name in machine.leg_names]
+    traces = [
+        _lines("nominal", _GREY, 3),
+        _lines("calibrated", _BLUE, 6),
+        _lines("nominal base", _GREY, 2, legend=False),
+        _lines("calibrated base", _BLUE, 3, legend=False),
+        _lines("nominal platform", _GREY, 2, legend=False),
+        _lines("calibrated platform", _BLUE, 3, legend=False),
+        _lines(f"1 sigma, {ring_factor:g} times as large", _AMBER, 2),
+        _cameras(calibration, 0.25 * size),
+        _words(names, found[0], "#1d2126"),
+    ]
+    hidden = {"showbackground": False, "gridcolor": "#e8ebef", "zeroline": False,
+              "title": {"text": ""}, "tickfont": {"size": 10, "color": "#667080"}}  # fmt: skip
+    look = {
+        "font": FONT,
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "showlegend": True,
+        "legend": {"x": 0, "y": 1, "bgcolor": "rgba(255,255,255,0.7)"},
+        "uirevision": "kept",
+        "scene": {
+            "aspectmode": "data",
+            "xaxis": {**hidden, "title": {"text": "x [m]"}},
+            "yaxis": {**hidden, "title": {"text": "y [m]"}},
+            "zaxis": {**hidden, "title": {"text": "z [m]"}},
+            "camera": {"eye": {"x": 0.75, "y": -0.85, "z": 0.45}},
+        },
+    }
+    n = measurements.n_poses
+    left_out = f" {len(chosen)} of {n} poses are shown." if len(chosen) < n else ""
+    caption = (
+        "Drag to turn, scroll to zoom. Grey is the nominal model, blue the calibrated one at the "
+        "same readings; the slider exaggerates the difference. Rings are ellipsoids of one "
+        "standard deviation at the joints, in R_b and R_e: joints that define these frames have "
+        f"flat ones or none.{left_out}"
+    )
+    return Plot("machine-scene", traces, look, 560, caption, extra)
+
+
+def _mode(
+    name: str, before: tuple[Array, Array], after: tuple[Array, Array], size: float
+) -> dict[str, Any]:
+    """Return what is shown of a difference, exaggerated at first so that it is seen."""
+    moved = max(float(np.abs(b - a).max()) for a, b in zip(before, after, strict=True))
+    wanted = _SHOWN * size / max(moved, 1e-12)
+    step = max(k for k, factor in enumerate(FACTORS) if factor <= max(wanted, 1.0))
+    return {
+        "name": name,
+        "step": step,
+        "base": [_rounded(before[0], 7), _rounded(after[0], 7)],
+        "platform": [
+            [_rounded(a, 7), _rounded(b, 7)] for a, b in zip(before[1], after[1], strict=True)
+        ],
+    }
+
+
+def _rounded(values: Array, digits: int) -> Any:
+    return np.round(values, digits).tolist()
+
+
+def _directions(calibration: Calibration) -> list[tuple[str, Array]]:
+    """Return the steps of the parameters (p,) along weak and held directions, with words."""
+    solution, result = calibration.solution, calibration.result
+    names, units = solution.parametrization.names, solution.parametrization.units
+    length = float(np.mean([np.linalg.norm(T.apply(leg.B) - leg.A)
+                            for T in solution.T_Rb_Re[:1] for leg in solution.legs]))  # fmt: skip
+    found = []
+    for weak, row in zip(solution.weak, result.weakest, strict=True):
+        step = np.zeros(len(names))
+        for name, component in weak.parts:
+            if name in names:
+                i = names.index(name)
+                step[i] = weak.sigma * component / (length if units[i] == "rad" else 1.0)
+        if np.any(step):
+            found.append((f"1 sigma along: {row.direction}", step))
+    for words, row in zip(solution.held, solution.held_basis, strict=False):
+        found.append((f"1 mm along what is held: {words}", 1e-3 * row))
+    return found
+
+
+def _rings(calibration: Calibration, size: float) -> tuple[dict[str, Any], float]:
+    """Return ellipsoids at joints as rings about their centres [m], and how they are enlarged."""
+    solution, machine = calibration.solution, calibration.dataset.machine
+    names = solution.parametrization.names
+    turn = np.linspace(0.0, 2.0 * np.pi, _N_RING + 1)
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    found: dict[str, list[list[Array]]] = {"base": [], "platform": []}
+    for leg in machine.leg_names:
+        for side in found:
+            where = [
+                names.index(f"{leg}.{side}.{c}") if f"{leg}.{side}.{c}" in names else -1
+                for c in "xyz"
+            ]
+            known = [i for i, at in enumerate(where) if at >= 0]
+            covariance = np.zeros((3, 3))
+            at = [where[i] for i in known]
+            covariance[np.ix_(known, known)] = solution.value_covariance[np.ix_(at, at)]
+            value, vector = np.linalg.eigh(covariance)
+            axes = vector * np.sqrt(np.maximum(value, 0.0))
+            if side == "base":
+                axes = machine.T_base_Rb.rotation.as_matrix() @ axes
+            found[side].append([circle @ axes[:, pair].T for pair in ([0, 1], [1, 2], [0, 2])])
+    largest = [np.abs(rings).max() for side in found.values() for rings in side]
+    usual = float(np.median([one for one in largest if one > 0.0] or [1.0]))
+    wanted = _RING * size / usual
+    power = 10.0 ** np.floor(np.log10(wanted))
+    factor = power * max(s for s in (1, 2, 5) if s * power <= wanted)
+    return {
+        side: [[_rounded(factor * ring, 5) for ring in rings] for rings in of_side]
+        for side, of_side in found.items()
+    }, float(factor)
+
+
+def _around(points: Array) -> list[int]:
+    """Return joints in the order of their angles about their middle, the first again at the end."""
+    away = points - points.mean(axis=0)
+    _, _, axes = np.linalg.svd(away)
+    order = np.argsort(np.arctan2(away @ axes[1], away @ axes[0])).tolist()
+    return [*order, order[0]]
+
+
+def _lines(name: str, colour: str, width: float, *, legend: bool = True) -> dict[str, Any]:
+    return {
+        "type": "scatter3d", "mode": "lines", "name": name, "x": [], "y": [], "z": [],
+        "line": {"color": colour, "width": width}, "hoverinfo": "skip", "showlegend": legend,
+    }  # fmt: skip
+
+
+def _words(words: Sequence[str], at: Array, colour: str) -> dict[str, Any]:
+    x, y, z = np.round(at, 4).T.tolist()
+    return {
+        "type": "scatter3d", "mode": "text", "text": list(words), "x": x, "y": y, "z": z,
+        "textposition": "bottom center", "textfont": {"size": 11, "color": colour},
+        "hoverinfo": "skip", "showlegend": False,
+    }  # fmt: skip
+
+
+def _cameras(calibration: Calibration, depth: float) -> dict[str, Any]:
+    """Return the cameras of views that were used, as pyramids of what they see."""
+    solution, views = calibration.solution, calibration.dataset.measurements.views
+    frame, shown = calibration.dataset.machine.T_base_Rb, calibration.result.views
+    x: list[Any] = []
+    names: list[str] = []
+    for v, view in enumerate(views):
+        if view.name not in shown or len(names) >= MAX_CAMERAS * 13:
+            continue
+        camera = solution.cameras[v]
+        w, h = camera.width - 0.5, camera.height - 0.5
+        corners = camera.undistort(np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]]))
+        rays = depth * np.concatenate([corners, np.ones((4, 1))], axis=1)
+        points = (frame * solution.T_camera_Rb[v].inv()).apply(np.concatenate([[[0.0] * 3], rays]))
+        p = np.round(points, 4).tolist()
+        gap = [None] * 3
+        x += [p[1], p[2], p[3], p[4], p[1], gap]
+        for k in range(1, 5):
+            x += [p[0], p[k]]
+        x += [gap]
+        names += [plain(view.name)] * 15
+    columns = list(map(list, zip(*x, strict=True))) or [[], [], []]
+    return {
+        "type": "scatter3d", "mode": "lines", "name": "cameras", "x": columns[0], "y": columns[1],
+        "z": columns[2], "line": {"color": _GREEN, "width": 2}, "text": names,
+        "hovertemplate": "camera %{text}<extra></extra>", "showlegend": bool(x),
+    }  # fmt: skip
