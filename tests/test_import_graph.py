@@ -13,6 +13,7 @@ ROOMS = (
     "machine",
     "vision",
     "data",
+    "recordings",
     "estimation",
     "perception",
     "paper",

@@ -19,6 +19,7 @@ from legcal.cli.calibrate import calibrate
 from legcal.cli.commands import camera, detect, evaluate, identify, inspect, locate, new, noise
 from legcal.cli.example import example
 from legcal.cli.export import export
+from legcal.cli.import_ import import_
 from legcal.cli.init import init
 from legcal.cli.options import INTERRUPTED, print_failure
 from legcal.cli.simulate import simulate
@@ -73,6 +74,7 @@ for command in (
     example,
 ):
     app.command()(command)
+app.command("import")(import_)
 app.add_typer(study, name="study")
 
 

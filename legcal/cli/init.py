@@ -99,4 +99,4 @@ def init(
     if as_json:
         print_json(found.document() | {"written": [str(path) for path in written]})
     elif written:
-        print_table(report.written_lines(found, written))
+        print_table(report.written_lines(output, written))

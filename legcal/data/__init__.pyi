@@ -37,6 +37,7 @@ from .measurements import reading_columns as reading_columns
 from .measurements import readings_in as readings_in
 from .measurements import readings_of_lengths as readings_of_lengths
 from .measurements import row_names as row_names
+from .new_dataset import MIN_SIGMA as MIN_SIGMA
 from .new_dataset import NewDataset as NewDataset
 from .new_dataset import plan_new_dataset as plan_new_dataset
 from .new_dataset import write_new_dataset as write_new_dataset
@@ -51,4 +52,10 @@ from .outlines import write_observations as write_observations
 from .overrides import Action as Action
 from .overrides import Override as Override
 from .overrides import overrides_of_call as overrides_of_call
+from .photograph_matching import Photograph as Photograph
+from .photograph_matching import find_photographs as find_photographs
+from .photograph_matching import photograph_time as photograph_time
 from .photograph_notes import compression_note as compression_note
+from .readings_sheet import Headings as Headings
+from .readings_sheet import readings_of as readings_of
+from .readings_sheet import unit_of as unit_of

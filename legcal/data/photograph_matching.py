@@ -320,7 +320,7 @@ def _in_order(rows: Sequence[Row], photographs: Sequence[Photograph], table: str
     notes = []
     pairs: list[tuple[int, Photograph]] = []
     for name, members, inside in groups:
-        times = [_taken_at(photograph) for photograph in inside]
+        times = [photograph_time(photograph) for photograph in inside]
         known = [when for when in times if when is not None]
         if len(known) == len(times) and known != sorted(known):
             notes.append(
@@ -332,7 +332,7 @@ def _in_order(rows: Sequence[Row], photographs: Sequence[Photograph], table: str
     return Matching(tuple(pairs), how, tuple(notes))
 
 
-def _taken_at(photograph: Photograph) -> datetime | None:
+def photograph_time(photograph: Photograph) -> datetime | None:
     """Return when a photograph was taken, as its file says."""
     try:
         return _moment(read_facts(read_bytes(photograph.path, MAX_IMAGE)).taken_at)
@@ -358,7 +358,7 @@ def _by_time(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
 
     Clocks may differ by a constant where there are as many photographs as rows.
     """
-    taken = {p.name: when for p in photographs if (when := _taken_at(p)) is not None}
+    taken = {p.name: when for p in photographs if (when := photograph_time(p)) is not None}
     dated = sorted((p for p in photographs if p.name in taken), key=lambda p: taken[p.name])
     if len(dated) < len(rows):
         raise DatasetError(

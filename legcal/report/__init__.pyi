@@ -9,6 +9,7 @@ from .machine import inspect_table as inspect_table
 from .machine import location_table as location_table
 from .machine_picture import MACHINE_PICTURE as MACHINE_PICTURE
 from .machine_picture import draw_machine as draw_machine
+from .new_dataset import import_table as import_table
 from .new_dataset import matching_table as matching_table
 from .new_dataset import written_lines as written_lines
 from .noise import noise_table as noise_table

@@ -1,4 +1,4 @@
-"""What is said of a dataset that ``legcal init`` makes: the matching, and what was written."""
+"""What is said of a dataset that is made: matching, frames of recordings, what was written."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from rich.text import Text
 
 from legcal.data import NewDataset
 from legcal.errors import printable
+from legcal.recordings import Import
 from legcal.report.render import heading, report, table
 
 _MOST = 200  # rows that are shown
@@ -64,13 +65,47 @@ def matching_table(new: NewDataset) -> RenderableType:
     )
 
 
-def written_lines(new: NewDataset, written: Sequence[Path]) -> RenderableType:
+def written_lines(destination: Path, written: Sequence[Path]) -> RenderableType:
     """Return what was written, and the command that goes on from there."""
     names = ", ".join(path.name for path in written)
-    folder = shlex.quote(str(new.destination))
+    folder = shlex.quote(str(destination))
     return report(
         [
-            Text(printable(f"Written to {new.destination}: {names}."), overflow="ignore"),
+            Text(printable(f"Written to {destination}: {names}."), overflow="ignore"),
             Text(printable(f"Next: legcal calibrate {folder} -o OUT"), overflow="ignore"),
         ]
     )
+
+
+def import_table(found: Import) -> RenderableType:
+    """Return which frames of recordings are used, and why others are not."""
+    blocks: list[RenderableType | list[str] | list[Text]] = []
+    for view in found.views:
+        stills = view.stills
+        lost = [still for still in stills if still.why_not]
+        shown = [
+            (f"{s.begin:.2f}", f"{s.end - s.begin:.2f}", s.why_not or f"frame {s.frame}")
+            for s in stills[:_MOST]
+        ]
+        if len(stills) > _MOST:
+            shown.append(("...", "", f"{len(stills) - _MOST} more"))
+        apart = f"{view.offset.seconds:+.3f} s"
+        if view.offset.sigma > 0.0:
+            apart += f" (+-{view.offset.sigma:.3f} s, motion agrees to {view.offset.agreement:.0%})"
+        why = [f"{sum(s.why_not == w for s in lost)} {w}" for w in {s.why_not: 0 for s in lost}]
+        blocks += [
+            heading(
+                printable(view.name),
+                f": {len(view.used)} of {len(stills)} rests in {view.n_frames} frames are used",
+            ),
+            [
+                printable(f"Clock of {view.recording.path} less that of {view.series.source}: "
+                          f"{apart}."),
+                f"Unit of the readings: {view.series.unit}.",
+                f"Not used: {', '.join(why)}." if why else "",
+            ],
+            table(">rest from [s]", ">for [s]", "used", rows=shown),
+            [Text(printable(f"note: {note}")) for note in view.notes],
+        ]  # fmt: skip
+    sigma = f"encoder_sigma, the scatter at rest: {1e6 * found.encoder_sigma:.3g} um."
+    return report(*blocks, [sigma])

@@ -1,0 +1,103 @@
+"""``legcal import``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from legcal.cli.options import JsonOption, print_json, print_table
+
+
+def import_(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RECORDING...",
+            help="A video, a ROS bag (.bag, .mcap, folder) or a folder of images with times for "
+            "each camera position; views are named after them.",
+        ),
+    ],
+    model: Annotated[
+        str, typer.Option("--model", metavar="MODEL", help="The nominal model, as for inspect.")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="The dataset folder to write.")
+    ],
+    camera: Annotated[
+        list[str],
+        typer.Option(
+            metavar="[VIEW=]FILE", help="The camera file of all views, or of one (repeat it)."
+        ),
+    ],
+    readings: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--readings",
+            metavar="FILE",
+            help="A CSV with a column time and one for each encoder: for all recordings, or one "
+            "for each in their order; bags may hold joint states instead.",
+        ),
+    ] = None,
+    unit: Annotated[
+        str | None, typer.Option(help="Unit of the readings: m, cm, mm, um; else as for init.")
+    ] = None,
+    lengths: Annotated[
+        bool, typer.Option("--lengths", help="The table holds whole lengths of legs.")
+    ] = False,
+    offset: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="The clock of the camera less that of the readings; by default found from motion.",
+        ),
+    ] = None,
+    still: Annotated[
+        float,
+        typer.Option(
+            metavar="SECONDS", help="How long the machine rests at least where a frame is used."
+        ),
+    ] = 0.3,
+    image_topic: Annotated[
+        str | None, typer.Option(metavar="TOPIC", help="The images of a bag that holds several.")
+    ] = None,
+    joint_topic: Annotated[
+        str | None,
+        typer.Option(metavar="TOPIC", help="The joint states of a bag that holds several."),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show what would be used and write nothing.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a dataset from recordings of a machine that rests at each pose."""
+    from legcal import recordings, report
+    from legcal.progress import shown_progress
+
+    with shown_progress(True) as progress:
+        found = recordings.plan_import(
+            sources,
+            model,
+            output,
+            readings=readings or (),
+            cameras=camera,
+            unit=unit,
+            lengths=lengths,
+            offset=offset,
+            still=still,
+            image_topic=image_topic,
+            joint_topic=joint_topic,
+            progress=progress,
+        )
+    if not as_json:
+        print_table(report.import_table(found))
+    written = []
+    if not dry_run:
+        with shown_progress(True) as progress:
+            written = recordings.import_recordings(found, force=force, progress=progress)
+    if as_json:
+        print_json(found.document() | {"written": [str(path) for path in written]})
+    elif written:
+        print_table(report.written_lines(output, written))

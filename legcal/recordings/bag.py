@@ -1,0 +1,172 @@
+"""Bags of ROS 1 and 2 and MCAP files: images of one topic, and joint states."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from legcal.errors import DatasetError, UsageError
+from legcal.files import describe
+from legcal.machine import Machine
+from legcal.recordings.frames import Frame
+from legcal.recordings.series import Series, series_of_joints
+from legcal.vision import quiet_opencv
+
+_BAGS = (".bag", ".mcap", ".db3")
+_METADATA = "metadata.yaml"
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_JOINTS = ("sensor_msgs/msg/JointState",)
+_COLOURS = {
+    "rgb8": cv2.COLOR_RGB2BGR,
+    "rgba8": cv2.COLOR_RGBA2BGR,
+    "bgra8": cv2.COLOR_BGRA2BGR,
+    "bayer_rggb8": cv2.COLOR_BayerRGGB2BGR,
+    "bayer_bggr8": cv2.COLOR_BayerBGGR2BGR,
+    "bayer_gbrg8": cv2.COLOR_BayerGBRG2BGR,
+    "bayer_grbg8": cv2.COLOR_BayerGRBG2BGR,
+}
+_CHANNELS = {"mono8": 1, "8UC1": 1, "bgr8": 3, "8UC3": 3, "rgb8": 3, "rgba8": 4, "bgra8": 4}
+
+
+def is_bag(path: Path) -> bool:
+    """Say whether a path is that of a bag."""
+    return path.suffix.lower() in _BAGS or (path / _METADATA).is_file()
+
+
+class Bag:
+    """A bag with the images of one camera and, unless a table has them, joint states."""
+
+    def __init__(
+        self, path: Path, machine: Machine, image_topic: str | None, joint_topic: str | None
+    ) -> None:
+        if find_spec("rosbags") is None:
+            raise UsageError(
+                f"{path}: the bag could not be read: found no package rosbags, needed it; install "
+                "it with: pip install 'legcal[ros]'"
+            )
+        self.path = path
+        self._machine = machine
+        self._image_topic = image_topic
+        self._joint_topic = joint_topic
+        self._bad = 0
+
+    def frames(self) -> Iterator[Frame]:
+        """Yield the images in the order of the bag; damaged ones are left out and counted."""
+        self._bad, last = 0, -np.inf
+        for time, kind, message in self._messages(_IMAGES, self._image_topic, "images"):
+            image = _image(message) if kind == _IMAGES[0] else _decoded(message)
+            if image is None or time <= last:
+                self._bad += 1
+                continue
+            last = time
+            yield Frame(time, image)
+
+    def notes(self) -> tuple[str, ...]:
+        """Return how many images could not be used."""
+        if not self._bad:
+            return ()
+        one = self._bad == 1
+        return (
+            f"{self._bad} image{'' if one else 's'} of {self.path} {'was' if one else 'were'} left "
+            "out: damaged, of an unknown encoding, or not later than the one before.",
+        )
+
+    def readings(self) -> Series | None:
+        """Return the joint states, None if the bag holds none."""
+        with self._opened() as reader:
+            if self._joint_topic is None and not self._topics(reader, _JOINTS):
+                return None
+        times, states = [], []
+        for time, _, message in self._messages(_JOINTS, self._joint_topic, "joint states"):
+            times.append(time)
+            states.append(dict(zip(message.name, map(float, message.position), strict=False)))
+        topic = self._joint_topic or "joint states"
+        return series_of_joints(f"{self.path}, {topic}", times, states, self._machine)
+
+    def _messages(
+        self, kinds: tuple[str, ...], topic: str | None, what: str
+    ) -> Iterator[tuple[float, str, Any]]:
+        """Yield time [s], type and content of the messages of one topic."""
+        with self._opened() as reader:
+            topics = self._topics(reader, kinds)
+            if topic is None and len(topics) != 1:
+                found = ", ".join(map(describe, topics)) or "no topic"
+                option = "--image-topic" if kinds == _IMAGES else "--joint-topic"
+                raise DatasetError(
+                    f"{self.path}: the {what} could not be read: found {found} with them, needed "
+                    f"one; " + (f"name it with {option}." if topics else "give another bag.")
+                )
+            if topic is not None and topic not in topics:
+                raise UsageError(
+                    f"{self.path}: the {what} could not be read: found no topic {describe(topic)} "
+                    f"with them, needed {', '.join(map(describe, topics)) or 'one'}; correct the "
+                    "name."
+                )
+            chosen = [c for c in reader.connections if c.topic == (topic or next(iter(topics)))]
+            for connection, stamp, raw in reader.messages(connections=chosen):
+                message = reader.deserialize(raw, connection.msgtype)
+                yield _time(message, stamp), connection.msgtype, message
+
+    def _topics(self, reader: Any, kinds: tuple[str, ...]) -> Mapping[str, str]:
+        return {c.topic: c.msgtype for c in reader.connections if c.msgtype in kinds}
+
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
+        """Open the bag; whatever the library finds wrong with it is one sentence."""
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+
+        try:
+            with AnyReader([self.path], default_typestore=get_typestore(Stores.LATEST)) as reader:
+                yield reader
+        except (AnyReaderError, OSError, ValueError, EOFError) as error:
+            said = str(error).strip().splitlines()
+            raise DatasetError(
+                f"{self.path}: the bag could not be read: found "
+                f"{describe(said[0]) if said else 'an error'}, needed a complete bag of ROS 1 "
+                "(.bag) or 2 (its folder, .mcap); close its recording in order, or repair it "
+                "(rosbag reindex, ros2 bag reindex, mcap recover)."
+            ) from error
+
+
+def _time(message: Any, recorded: int) -> float:
+    """Return when a message was made [s]: its header's time, else that of the recording."""
+    stamp = message.header.stamp
+    made = float(stamp.sec) + 1e-9 * float(stamp.nanosec)
+    return made if made > 0.0 else 1e-9 * recorded
+
+
+def _image(message: Any) -> NDArray[np.uint8] | None:
+    """Return a raw image, None if it is damaged or of an encoding that is not known."""
+    rows, columns, step = int(message.height), int(message.width), int(message.step)
+    encoding = message.encoding
+    data = np.asarray(message.data)
+    if encoding in ("mono16", "16UC1"):
+        order = ">u2" if message.is_bigendian else "<u2"
+        if step % 2 or data.nbytes < rows * step or step < 2 * columns:
+            return None
+        deep = np.frombuffer(data.tobytes(), dtype=order)[: rows * step // 2]
+        return np.asarray(deep.reshape(rows, step // 2)[:, :columns] >> 8, dtype=np.uint8)
+    channels = 1 if encoding.startswith("bayer_") else _CHANNELS.get(encoding, 0)
+    known = encoding in _CHANNELS or encoding in _COLOURS
+    if not known or min(rows, columns) < 1 or step < columns * channels or data.size < rows * step:
+        return None
+    image = data[: rows * step].reshape(rows, step)[:, : columns * channels]
+    shaped = image if channels == 1 else image.reshape(rows, columns, channels)
+    code = _COLOURS.get(encoding)
+    shaped = np.ascontiguousarray(shaped, dtype=np.uint8)
+    return shaped if code is None else np.asarray(cv2.cvtColor(shaped, code), dtype=np.uint8)
+
+
+def _decoded(message: Any) -> NDArray[np.uint8] | None:
+    """Return a compressed image, None if it is damaged."""
+    with quiet_opencv():
+        image = cv2.imdecode(np.asarray(message.data, dtype=np.uint8), cv2.IMREAD_COLOR)
+    return None if image is None else np.asarray(image, dtype=np.uint8)

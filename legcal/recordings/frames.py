@@ -1,0 +1,148 @@
+"""Frames of a recording with their times, one at a time: of a video, or of a folder of images."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from legcal.data import Photograph, find_photographs, photograph_time
+from legcal.errors import DatasetError
+from legcal.files import MAX_IMAGE, read_bytes
+from legcal.recordings.series import Series, unix_seconds
+from legcal.vision import quiet_opencv
+
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mts", ".wmv")
+MAX_FRAMES = 1_000_000
+_STAMP = re.compile(r"\d{10,19}", re.ASCII)  # a Unix time in s, ms, us or ns
+_LOST = 0.02  # of the frames that a video promises: fewer are the rounding of its length
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One picture of a recording."""
+
+    time: float  # [s] of the recording's clock
+    image: NDArray[np.uint8]  # (height, width) or (height, width, 3), in OpenCV's order of colours
+
+
+class Recording(Protocol):
+    """What a camera recorded from one place."""
+
+    @property
+    def path(self) -> Path:
+        """The file or folder."""
+
+    def frames(self) -> Iterator[Frame]:
+        """Yield the frames in the order of their times; each call begins at the first."""
+
+    def notes(self) -> tuple[str, ...]:
+        """Return what is odd, once all frames have been seen."""
+
+    def readings(self) -> Series | None:
+        """Return the readings that the recording holds itself, if any."""
+
+
+class Video:
+    """A video file that OpenCV reads."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._notes: tuple[str, ...] = ()
+
+    def frames(self) -> Iterator[Frame]:
+        """Yield the frames; a video without any is refused."""
+        with quiet_opencv():
+            video = cv2.VideoCapture(str(self.path))
+            video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as its camera was calibrated
+            promised = video.get(cv2.CAP_PROP_FRAME_COUNT) if video.isOpened() else 0
+            rate = video.get(cv2.CAP_PROP_FPS) if video.isOpened() else 0
+            count, last = 0, -np.inf
+            try:
+                while video.isOpened() and count < MAX_FRAMES:
+                    found, image = video.read()
+                    if not found:
+                        break
+                    time = 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)  # of the frame just read
+                    if time <= last:  # a container without times of its own
+                        time = last + 1.0 / (rate or 30.0)
+                    last = time
+                    count += 1
+                    yield Frame(time, np.asarray(image, dtype=np.uint8))
+            finally:
+                video.release()
+        if count == 0:
+            raise DatasetError(
+                f"{self.path}: the video could not be read: found no frame in it, needed a "
+                "complete video that OpenCV reads; copy it again, or write it anew "
+                "(ffmpeg -i IN -c:v libx264 -qp 0 OUT.mp4)."
+            )
+        if count < (1.0 - _LOST) * promised - 1:
+            self._notes = (
+                f"{self.path} ends after {count} of {promised:.0f} frames: it is cut off or "
+                "damaged there; copy it again to use the rest.",
+            )
+
+    def notes(self) -> tuple[str, ...]:
+        """Return whether the video was cut off."""
+        return self._notes
+
+    def readings(self) -> Series | None:
+        """Return nothing: a video holds no readings."""
+        return None
+
+
+class ImageFolder:
+    """A folder of images whose names or EXIF data say when they were taken."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def frames(self) -> Iterator[Frame]:
+        """Yield the images in the order of their times."""
+        photographs = find_photographs(self.path)
+        times = {p.name: stamp_in(p.path.stem) or _taken(p) for p in photographs}
+        lost = [name for name, time in times.items() if time is None]
+        if lost:
+            raise DatasetError(
+                f"{self.path}: {lost[0]} could not be used: found no time in its name or EXIF "
+                "data, needed one for each image (a Unix time in the name, or the date of the "
+                "camera); for photographs of poses that were held use legcal init."
+            )
+        for photograph in sorted(photographs, key=lambda p: times[p.name] or 0.0):
+            content = np.frombuffer(read_bytes(photograph.path, MAX_IMAGE), dtype=np.uint8)
+            with quiet_opencv():
+                image = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+            if image is None:
+                raise DatasetError(
+                    f"{photograph.path}: the image could not be read: found bytes that are no "
+                    "complete PNG, JPEG or TIFF; copy it again or remove it."
+                )
+            yield Frame(times[photograph.name] or 0.0, np.asarray(image, dtype=np.uint8))
+
+    def notes(self) -> tuple[str, ...]:
+        """Return nothing."""
+        return ()
+
+    def readings(self) -> Series | None:
+        """Return nothing: images hold no readings."""
+        return None
+
+
+def _taken(photograph: Photograph) -> float | None:
+    """Return when a photograph was taken [s], as its EXIF data say."""
+    moment = photograph_time(photograph)
+    return None if moment is None else moment.replace(tzinfo=UTC).timestamp()
+
+
+def stamp_in(text: str) -> float | None:
+    """Return the Unix time [s] in a text, whatever its unit, or None."""
+    found = _STAMP.findall(text)
+    return unix_seconds(float(found[-1])) if found else None

@@ -1,0 +1,372 @@
+"""From recordings to a dataset: what is found first, then written complete or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from legcal.data import (
+    MIN_SIGMA,
+    few,
+    plan_new_dataset,
+    reading_columns,
+    write_new_dataset,
+)
+from legcal.errors import DatasetError, OutOfResources, UsageError
+from legcal.files import (
+    NAME_NEEDED,
+    check_path,
+    describe,
+    existing_parent,
+    format_table,
+    is_name,
+    temporary_folder,
+)
+from legcal.geometry import Array
+from legcal.machine import Machine, load_mechanism
+from legcal.progress import Report, no_progress
+from legcal.recordings.bag import Bag, is_bag
+from legcal.recordings.frames import VIDEOS, ImageFolder, Recording, Video
+from legcal.recordings.series import Series, read_series
+from legcal.recordings.stillness import (
+    NoOffset,
+    Offset,
+    Still,
+    clock_offset,
+    moving,
+    reading_speeds,
+    still_frames,
+)
+
+LEAST_STILL = 0.3  # [s]
+ONE_CLOCK = 2.0  # [s] that frames and readings in one bag are apart at most
+_WIDTH = 160  # [px] of frames that are compared
+_SHOTS, _TABLE = "shots", "readings.csv"
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What was found in the recording of one camera position.
+
+    Attributes
+    ----------
+    name : str
+        Of the view, after the file.
+    recording : Recording
+        Its frames.
+    n_frames : int
+        How many there are.
+    offset : Offset
+        The clock of the camera less that of the readings.
+    stills : tuple of Still
+        Intervals in which the frames rest.
+    readings : (n_used, n_motors) array
+        Means over the intervals that are used [m].
+    scatter : float
+        Standard deviation of a reading around them [m].
+    series : Series
+        All readings.
+    notes : tuple of str
+        What is odd.
+    """
+
+    name: str
+    recording: Recording
+    n_frames: int
+    offset: Offset
+    stills: tuple[Still, ...]
+    readings: Array
+    scatter: float
+    series: Series
+    notes: tuple[str, ...]
+
+    @property
+    def used(self) -> list[int]:
+        """The frames that are used."""
+        return [still.frame for still in self.stills if still.frame is not None]
+
+    def document(self) -> dict[str, Any]:
+        """Return what ``legcal import --json`` says of the view."""
+        return {
+            "recording": str(self.recording.path),
+            "readings": self.series.source,
+            "frames": self.n_frames,
+            "used": len(self.used),
+            "offset_s": self.offset.seconds,
+            "offset_sigma_s": self.offset.sigma,
+            "agreement": self.offset.agreement,
+            "stills": [
+                {"begin_s": s.begin, "end_s": s.end, "frame": s.frame, "why_not": s.why_not}
+                for s in self.stills
+            ],
+            "notes": list(self.notes),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Import:
+    """Recordings of which the frames to use are known, not written yet."""
+
+    machine: Machine
+    model: str | Path
+    destination: Path
+    views: tuple[View, ...]
+    cameras: tuple[str, ...]
+
+    @property
+    def encoder_sigma(self) -> float:
+        """Standard deviation of a reading at rest [m]; errors that last do not average out."""
+        return max(max(view.scatter for view in self.views), MIN_SIGMA)
+
+    def document(self) -> dict[str, Any]:
+        """Return what ``legcal import --json`` prints."""
+        return {
+            "dataset": str(self.destination),
+            "encoder_sigma": self.encoder_sigma,
+            "views": {view.name: view.document() for view in self.views},
+        }
+
+
+def plan_import(
+    sources: Sequence[Path],
+    model: str | Path,
+    destination: str | Path,
+    *,
+    readings: Sequence[Path] = (),
+    cameras: Sequence[str] = (),
+    unit: str | None = None,
+    lengths: bool = False,
+    offset: float | None = None,
+    still: float = LEAST_STILL,
+    image_topic: str | None = None,
+    joint_topic: str | None = None,
+    progress: Report = no_progress,
+) -> Import:
+    """Find the frames of recordings in which the machine stands still, and their readings.
+
+    Parameters
+    ----------
+    sources : sequence of path
+        A video, a ROS bag or a folder of images with times for each camera position.
+    model : path or str
+        The nominal model, as for :func:`legcal.load_mechanism`.
+    destination : path
+        The folder of the dataset.
+    readings : sequence of path
+        Tables of readings with a column of times: one for all recordings, or one for each; none
+        for bags that hold joint states.
+    cameras : sequence of str
+        Camera files: one for all views, or ``VIEW=FILE`` for each.
+    unit, lengths
+        As for :func:`legcal.data.plan_new_dataset`.
+    offset : float, optional
+        The clock of the camera less that of the readings [s]; found from motion by default.
+    still : float
+        How long frames and readings must rest [s].
+    image_topic, joint_topic : str, optional
+        Topics of bags that hold several.
+
+    Raises
+    ------
+    DatasetError, ModelError, UsageError
+        If a file cannot be read, nothing moves or nothing rests, or the clocks cannot be compared.
+    """
+    machine, destination = load_mechanism(model), Path(destination)
+    recordings = [open_recording(Path(path), machine, image_topic, joint_topic) for path in sources]
+    names = [_view_name(recording.path, destination) for recording in recordings]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise UsageError(
+            f"The recordings could not be imported: found {describe(twice[0])} as the name of two, "
+            "needed one for each camera position; rename the files."
+        )
+    if len(readings) not in (0, 1, len(recordings)):
+        raise UsageError(
+            f"The recordings could not be imported: found {len(readings)} tables of readings for "
+            f"{len(recordings)} recordings, needed one for all or one for each, in their order."
+        )
+    if not np.isfinite(still) or still <= 0.0:
+        raise UsageError(
+            f"The recordings could not be imported: found {still:g} s of rest, needed a time above "
+            "zero; correct --still."
+        )
+    tables = {path: read_series(path, machine, unit, lengths) for path in dict.fromkeys(readings)}
+    views = []
+    for k, (name, recording) in enumerate(zip(names, recordings, strict=True)):
+        own = tables[readings[min(k, len(readings) - 1)]] if readings else recording.readings()
+        if own is None:
+            raise UsageError(
+                f"{recording.path}: the readings could not be found: found none in it, needed a "
+                "table with times; give it with --readings."
+            )
+        views.append(_view(name, recording, own, offset, still, progress, one_clock=not readings))
+    return Import(machine, model, destination, tuple(views), tuple(cameras))
+
+
+def open_recording(
+    path: Path, machine: Machine, image_topic: str | None = None, joint_topic: str | None = None
+) -> Recording:
+    """Return the recording at a path: a bag, a folder of images or a video."""
+    if not os.path.exists(path):
+        raise DatasetError(
+            f"{path}: the recording could not be read: found no such file, needed a video, a bag "
+            "or a folder of images; check the path."
+        )
+    if is_bag(path):
+        return Bag(path, machine, image_topic, joint_topic)
+    if path.is_dir():
+        return ImageFolder(path)
+    if path.suffix.lower() in VIDEOS:
+        return Video(path)
+    raise DatasetError(
+        f"{path}: the recording could not be read: found a file ending in "
+        f"{describe(path.suffix)}, needed a video ({', '.join(VIDEOS)}), a bag (.bag, .mcap, or "
+        "the folder of a ROS 2 bag) or a folder of images."
+    )
+
+
+def _view_name(path: Path, destination: Path) -> str:
+    name = path.resolve().stem if not path.is_dir() else path.resolve().name
+    if not is_name(name) or "/" in name or "=" in name:
+        raise DatasetError(
+            f"{path}: the recording could not be used: found the name {describe(name)}, which is "
+            f"that of its view in {destination}, needed {NAME_NEEDED}; rename it."
+        )
+    return name
+
+
+def _view(
+    name: str,
+    recording: Recording,
+    series: Series,
+    given: float | None,
+    still: float,
+    progress: Report,
+    *,
+    one_clock: bool,
+) -> View:
+    """Return the frames of a recording that are used, with their readings."""
+    start = f"{recording.path}: the recording could not be used:"
+    times, changes = _changes(recording, progress, name)
+    if len(times) < 3:
+        raise DatasetError(f"{start} found {len(times)} frames, needed those of a recording.")
+    frames_move = moving(changes)
+    moves = moving(reading_speeds(series.times, series.q))
+    for what, motion in (("frames", frames_move), ("readings", moves)):
+        if motion is None:
+            raise DatasetError(
+                f"{start} found {what} that change alike all the time, needed a machine that rests "
+                "at each pose and moves between; for photographs of poses that were held use "
+                f"legcal init. ({series.source if what == 'readings' else recording.path})"
+            )
+    assert frames_move is not None
+    assert moves is not None
+    if given is not None:
+        apart = Offset(given, 0.0, 1.0)
+    else:
+        try:
+            apart = clock_offset(
+                times, frames_move, series.times, moves, ONE_CLOCK if one_clock else None
+            )
+        except NoOffset as error:
+            raise DatasetError(
+                f"{start} found {error} ({series.source}), needed the readings of the same time, "
+                "with pauses of different length; give the right table, or how far the clock of "
+                "the camera is ahead, --offset SECONDS."
+            ) from error
+    stills, kept = still_frames(times, frames_move, series.times, moves, apart, still)
+    if not kept:
+        found = few([f"{s.why_not} from {s.begin:.1f} s" for s in stills]) or "no rest"
+        raise DatasetError(
+            f"{start} found no frame to use ({found}), needed rests of {still:g} s and more with "
+            "readings; record longer rests, or lower --still."
+        )
+    q = np.array([series.q[rows].mean(axis=0) for rows in kept])
+    rest = np.concatenate([series.q[rows] - q[k] for k, rows in enumerate(kept)])
+    freedoms = max(len(rest) - len(kept), 1)
+    scatter = float(np.sqrt((rest**2).sum(axis=0).max() / freedoms))
+    return View(
+        name=name, recording=recording, n_frames=len(times), offset=apart, stills=tuple(stills),
+        readings=q, scatter=scatter, series=series,
+        notes=(*recording.notes(), *series.notes),
+    )  # fmt: skip
+
+
+def _changes(recording: Recording, progress: Report, name: str) -> tuple[Array, Array]:
+    """Return the times of frames [s] and how much each differs from the one before [levels/s]."""
+    times: list[float] = []
+    changes: list[float] = []
+    before: Array | None = None
+    for frame in recording.frames():
+        grey = frame.image if frame.image.ndim == 2 else cv2.cvtColor(
+            frame.image, cv2.COLOR_BGR2GRAY)  # fmt: skip
+        scale = min(_WIDTH / grey.shape[1], 1.0)
+        small = np.asarray(
+            cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=float
+        )
+        if before is not None:
+            if before.shape != small.shape:
+                raise DatasetError(
+                    f"{recording.path}: the recording could not be used: found frames of different "
+                    "shape, needed those of one camera; record each camera position apart."
+                )
+            changes.append(float(np.sqrt(np.mean((small - before) ** 2))))
+        times.append(frame.time)
+        before = small
+        if len(times) % 100 == 0:
+            progress(f"Looking at {name}", len(times), 0)
+    return np.array(times), np.array(changes)
+
+
+def import_recordings(
+    found: Import, *, force: bool = False, progress: Report = no_progress
+) -> list[Path]:
+    """Write the dataset of an import, complete or not at all; return its files but the images.
+
+    Raises
+    ------
+    DatasetError
+        If the frames do not fit the camera files.
+    UsageError
+        If files are in the way and *force* is not given.
+    """
+    check_path(found.destination)
+    joints = [column.name for column in reading_columns(found.machine.legs)]
+    try:
+        with temporary_folder(existing_parent(found.destination), found.destination.name) as folder:
+            rows: list[tuple[object, ...]] = []
+            for view in found.views:
+                (folder / _SHOTS / view.name).mkdir(parents=True)
+                wanted = {frame: k for k, frame in enumerate(view.used)}
+                for number, frame in enumerate(view.recording.frames()):
+                    if number not in wanted:
+                        continue
+                    name = f"{view.name}_{wanted[number] + 1:03d}.png"
+                    place = folder / _SHOTS / view.name / name
+                    done, content = cv2.imencode(".png", frame.image)
+                    assert done
+                    place.write_bytes(content.tobytes())
+                    q = view.readings[wanted[number]]
+                    rows.append((view.name, f"{view.name}/{name}", *q.tolist()))
+                    progress(f"Writing {view.name}", wanted[number] + 1, len(wanted))
+                    if wanted[number] + 1 == len(wanted):
+                        break
+            table = folder / _TABLE
+            table.write_text(format_table(["view", "image", *joints], rows), encoding="utf-8")
+            new = plan_new_dataset(
+                folder / _SHOTS, table, found.model, found.destination, cameras=found.cameras,
+                unit="m", by="name", encoder_sigma=found.encoder_sigma,
+            )  # fmt: skip
+            return write_new_dataset(new, force=force)
+    except OSError as error:
+        raise OutOfResources(
+            f"{found.destination}: the dataset could not be written: found "
+            f"'{error.strerror or error}', needed a folder that takes its files; free some space "
+            "or give another folder; nothing was written."
+        ) from error

@@ -1,0 +1,129 @@
+"""Readings over time: of a table with a column of times, or of the joint states in a bag."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from legcal.data import Headings, reading_columns, readings_of, unit_of
+from legcal.errors import DatasetError
+from legcal.files import describe, read_table
+from legcal.geometry import Array
+from legcal.machine import Machine
+
+_NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+
+
+def unix_seconds(number: float) -> float:
+    """Return a Unix time [s] of one in s, ms, us or ns: the years 2001 to 2286 tell them apart."""
+    for unit in (1e9, 1e6, 1e3):
+        if number >= 1e9 * unit:
+            return number / unit
+    return number
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Readings of all encoders at times.
+
+    Attributes
+    ----------
+    source : str
+        Where they were read, for messages.
+    times : (n,) array
+        Increasing [s], of their own clock.
+    q : (n, n_motors) array
+        Readings [m], in the order of the actuated legs.
+    taken : mapping
+        What each heading was taken for.
+    unit : str
+        Unit in the table, and where it was found, in words.
+    """
+
+    source: str
+    times: Array
+    q: Array
+    taken: Mapping[str, str] = field(default_factory=dict)
+    unit: str = "m"
+    notes: tuple[str, ...] = ()
+
+
+def read_series(path: Path, machine: Machine, unit: str | None, lengths: bool) -> Series:
+    """Return the readings of a CSV with a column of times, in the order of these."""
+    headings = Headings(path, [machine.legs[j] for j in machine.motors])
+    table = read_table(
+        path, "table of readings", "row", headings.columns(), needed="one row for each time",
+        reshape=headings.reshape,
+    )  # fmt: skip
+    table.check()
+    if "time" not in table:
+        raise DatasetError(
+            f"{path}: the readings could not be used: found no column 'time', needed one in "
+            "seconds or as dates; add it, or use legcal init for photographs of poses that were "
+            "held."
+        )
+    found, where = unit_of(table, headings, unit, lengths)
+    q, _ = readings_of(table, headings, found, lengths)
+    times = _seconds(table.text("time"), path)
+    return _in_order(
+        Series(str(path), times, q, headings.taken, f"{found}, {where}", tuple(headings.notes))
+    )
+
+
+def series_of_joints(
+    source: str, times: Sequence[float], states: Sequence[Mapping[str, float]], machine: Machine
+) -> Series:
+    """Return the readings of joint states: positions [m] by the names of joints."""
+    joints = [column.name for column in reading_columns(machine.legs)]
+    complete = [k for k, state in enumerate(states) if all(name in state for name in joints)]
+    if not complete:
+        known = sorted({name for state in states for name in state})
+        missing = [name for name in joints if name not in known]
+        raise DatasetError(
+            f"{source}: the readings could not be used: found the joints "
+            f"{', '.join(map(describe, known[:10])) or 'none'}, needed "
+            f"{', '.join(missing or joints)} in one message; rename the joints of the model or "
+            "give a table with --readings."
+        )
+    q = np.array([[states[k][name] for name in joints] for k in complete], dtype=float)
+    if not np.isfinite(q).all():
+        raise DatasetError(
+            f"{source}: the readings could not be used: found one that is no finite number, needed "
+            "positions in metres; record them again."
+        )
+    return _in_order(Series(source, np.array([times[k] for k in complete], dtype=float), q))
+
+
+def _in_order(series: Series) -> Series:
+    """Return a series in the order of its times; of equal times the first counts."""
+    times, first = np.unique(series.times, return_index=True)
+    if len(times) < 3:
+        raise DatasetError(
+            f"{series.source}: the readings could not be used: found {len(times)} different times, "
+            "needed the readings of the whole recording, some each second; record them again."
+        )
+    return Series(series.source, times, series.q[first], series.taken, series.unit, series.notes)
+
+
+def _seconds(texts: Sequence[str], path: Path) -> Array:
+    """Return times [s] of numbers (Unix times in s, ms, us or ns, or seconds) or of dates."""
+    if all(_NUMBER.fullmatch(text) for text in texts):
+        numbers = np.array([float(text) for text in texts])
+        size = float(np.median(np.abs(numbers)))
+        return numbers * (unix_seconds(size) / size if size else 1.0)
+    found = []
+    for text in texts:
+        try:
+            moment = datetime.fromisoformat(text.strip())
+        except ValueError:
+            raise DatasetError(
+                f"{path}, column time: the time could not be read: found {describe(text)}, needed "
+                "seconds, or dates such as 2026-11-23T10:15:00.125; correct the cell."
+            ) from None
+        found.append(moment.replace(tzinfo=moment.tzinfo or UTC).timestamp())
+    return np.array(found)

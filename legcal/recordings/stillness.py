@@ -1,0 +1,222 @@
+"""When the machine stood still, and how far the clocks of camera and encoders are apart.
+
+Motion shows in both: pixels change from frame to frame, and readings change. What moves is told
+from what rests by the threshold that separates the logarithms of both best (N. Otsu, *A threshold
+selection method from gray-level histograms*, 1979), so that noise of cameras and encoders needs no
+setting. The offset of the clocks is the one with which motion in the frames and in the readings
+agree best over the whole recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import correlate
+
+from legcal.geometry import Array, BoolArray
+
+MIN_CONTRAST = 5.0  # of motion to rest, in scatters of rest: a normal distribution has 2.7
+MIN_AGREEMENT = 0.5  # correlation of motion in frames and readings
+MIN_LEAD = 0.1  # of the best offset over the best other one
+_LEAST_OVERLAP = 0.5  # of the shorter recording
+_MOST_SAMPLES = 200_000
+
+
+@dataclass(frozen=True)
+class Still:
+    """An interval in which frames do not change, and what became of it."""
+
+    begin: float  # [s] of the camera's clock
+    end: float
+    frame: int | None  # the frame that is used
+    why_not: str = ""  # in words, where none is
+
+
+@dataclass(frozen=True)
+class Offset:
+    """How far the clock of the camera is ahead of that of the readings."""
+
+    seconds: float
+    sigma: float  # [s]
+    agreement: float  # correlation of motion, 1 at most
+
+
+class NoOffset(ValueError):
+    """The clocks cannot be compared: found, as a part of a sentence."""
+
+
+def moving(speeds: Array) -> BoolArray | None:
+    """Say where something moves, of speeds (n,) of any unit; None where all of them are alike."""
+    positive = speeds[speeds > 0.0]
+    if len(positive) < 2:
+        return None
+    logs = np.log(np.maximum(speeds, 1e-3 * np.quantile(positive, 0.01)))
+    order = np.sort(logs)
+    n = np.arange(1, len(order))
+    below = np.cumsum(order)[:-1] / n
+    above = (order.sum() - n * below) / (len(order) - n)
+    between = n * (len(order) - n) * (above - below) ** 2
+    k = int(np.argmax(between))
+    threshold = 0.5 * (order[k] + order[k + 1])
+    fast = logs > threshold
+    if not fast.any() or fast.all():
+        return None
+    rest = np.median(logs[~fast])
+    scatter = 1.4826 * np.median(np.abs(logs[~fast] - rest))
+    return fast if np.median(logs[fast]) - rest > MIN_CONTRAST * scatter else None
+
+
+def reading_speeds(times: Array, q: Array) -> Array:
+    """Return how fast readings (n, n_motors) change between times (n,): (n - 1,) [m/s]."""
+    return np.asarray(np.abs(np.diff(q, axis=0)).max(axis=1) / np.diff(times))
+
+
+def clock_offset(frame_times: Array, frames_move: BoolArray, times: Array, moves: BoolArray,
+                 most: float | None = None) -> Offset:  # fmt: skip
+    """Return the offset with which motion in frames and in readings agree best.
+
+    Parameters
+    ----------
+    frame_times, times : (n + 1,) arrays
+        Of frames and of readings, each of their own clock [s].
+    frames_move, moves : (n,) arrays
+        Whether something moves between two neighbouring times.
+    most : float, optional
+        The largest offset to look at [s], where both were recorded by one clock.
+
+    Raises
+    ------
+    NoOffset
+        If motion does not agree, or agrees as well with another offset.
+    """
+    span = max(np.ptp(frame_times), np.ptp(times))
+    step = max(float(np.median(np.diff(frame_times))), span / _MOST_SAMPLES)
+    one, start_one = _on_grid(frame_times, frames_move, step)
+    two, start_two = _on_grid(times, moves, step)
+    n = correlate(np.ones_like(one), np.ones_like(two))
+    sums = [correlate(a, b) for a, b in ((one, np.ones_like(two)), (np.ones_like(one), two),
+                                         (one, two), (one**2, np.ones_like(two)),
+                                         (np.ones_like(one), two**2))]  # fmt: skip
+    n = np.maximum(np.round(n), 1.0)
+    mean = [s / n for s in sums]
+    spread = [np.maximum(mean[3] - mean[0] ** 2, 1e-6), np.maximum(mean[4] - mean[1] ** 2, 1e-6)]
+    score = (mean[2] - mean[0] * mean[1]) / np.sqrt(spread[0] * spread[1])
+    # at index i the readings lie under the frames from sample i - len(two) + 1 on
+    lags = start_one - start_two + step * (np.arange(len(score)) - (len(two) - 1))
+    score[n < _LEAST_OVERLAP * min(len(one), len(two))] = -1.0
+    if most is not None:
+        score[np.abs(lags) > most] = -1.0
+    best = int(np.argmax(score))
+    if score[best] < MIN_AGREEMENT:
+        raise NoOffset(
+            f"motion in frames and in readings that agree to {max(score[best], 0.0):.0%} at best"
+        )
+    near = best
+    while near > 0 and 0.0 < score[near - 1] <= score[near]:
+        near -= 1
+    far = best
+    while far < len(score) - 1 and 0.0 < score[far + 1] <= score[far]:
+        far += 1
+    others = np.concatenate([score[:near], score[far + 1 :]])
+    if len(others) and others.max() > score[best] - MIN_LEAD:
+        at = int(np.flatnonzero(score == others.max())[0])
+        raise NoOffset(
+            f"motion that agrees as well with clocks {lags[at]:+.1f} s apart as with "
+            f"{lags[best]:+.1f} s"
+        )
+    return _refined(float(lags[best]), step, (frame_times, frames_move), (times, moves),
+                    float(score[best]))  # fmt: skip
+
+
+def _on_grid(times: Array, moves: BoolArray, step: float) -> tuple[Array, float]:
+    """Return motion on a grid of times as 1 and 0, and the first of them."""
+    grid = np.arange(times[0], times[-1], step)
+    return moves[np.searchsorted(times, grid, side="right") - 1].astype(float), float(times[0])
+
+
+def _changes(times: Array, moves: BoolArray) -> tuple[Array, Array]:
+    """Return the times at which motion begins or ends, and which of both: 1 or -1.
+
+    Motion begins and ends within an interval that shows some of it: in its middle at best guess.
+    """
+    change = np.diff(moves.astype(int))
+    at = np.flatnonzero(change)
+    shows = np.where(change[at] > 0, at + 1, at)
+    return 0.5 * (times[shows] + times[shows + 1]), change[at]
+
+
+def _refined(rough: float, step: float, frames: tuple[Array, BoolArray],
+             readings: tuple[Array, BoolArray], agreement: float) -> Offset:  # fmt: skip
+    """Return the offset by beginnings and ends of motion, better than the grid."""
+    ones, kinds = _changes(*frames)
+    twos, others = _changes(*readings)
+    reach = 3.0 * max(step, float(np.median(np.diff(readings[0]))))
+    apart = []
+    for kind in (1, -1):
+        later = twos[others == kind] + rough
+        for time in ones[kinds == kind]:
+            if len(later):
+                difference = time - later[np.argmin(np.abs(later - time))]
+                apart += [difference] if abs(difference) <= reach else []
+    if len(apart) < 2:
+        return Offset(rough, reach, agreement)
+    middle = float(np.median(apart))
+    spread = 1.4826 * float(np.median(np.abs(np.array(apart) - middle)))
+    return Offset(
+        rough + middle, max(spread, step / np.sqrt(12.0)) / np.sqrt(len(apart)), agreement
+    )
+
+
+def runs(moves: BoolArray) -> list[tuple[int, int]]:
+    """Return the runs without motion as (first, last) of what lies between the differences."""
+    rests = np.concatenate([[False], ~moves, [False]]).astype(int)
+    change = np.diff(rests)
+    return list(zip(np.flatnonzero(change == 1).tolist(), np.flatnonzero(change == -1).tolist(),
+                    strict=True))  # fmt: skip
+
+
+def still_frames(
+    frame_times: Array,
+    frames_move: BoolArray,
+    times: Array,
+    moves: BoolArray,
+    offset: Offset,
+    least: float,
+) -> tuple[list[Still], list[Sequence[int]]]:
+    """Return the intervals in which frames rest, and the readings of those that are used.
+
+    A frame is used if frames and readings rest around it for *least* seconds, less what the
+    clocks are uncertain by; it is the one in the middle.
+    """
+    shifted = times + offset.seconds
+    margin = 3.0 * offset.sigma
+    found: list[Still] = []
+    used: list[Sequence[int]] = []
+    for first, last in runs(frames_move):
+        begin, end = float(frame_times[first]), float(frame_times[last])
+        if end - begin < least:
+            continue
+        inside = np.flatnonzero((shifted >= begin + margin) & (shifted <= end - margin))
+        if not len(inside):
+            found.append(Still(begin, end, None, "no reading"))
+            continue
+        rests = max(
+            ((a, b) for a, b in runs(moves[inside[0] : inside[-1]])),
+            key=lambda run: run[1] - run[0],
+            default=(0, 0) if len(inside) == 1 else None,
+        )
+        if rests is None:
+            found.append(Still(begin, end, None, "readings moved"))
+            continue
+        kept = inside[rests[0] : rests[1] + 1]
+        low, high = max(begin, shifted[kept[0]] - margin), min(end, shifted[kept[-1]] + margin)
+        middle = 0.5 * (low + high) if len(kept) > 1 else float(shifted[kept[0]])
+        if len(inside) > 1 and high - low < least:
+            found.append(Still(begin, end, None, "readings moved"))
+            continue
+        frame = first + int(np.argmin(np.abs(frame_times[first : last + 1] - middle)))
+        found.append(Still(begin, end, frame))
+        used.append(kept.tolist())
+    return found, used

@@ -1,0 +1,268 @@
+"""Videos, folders of frames and bags with readings become datasets of the poses that were held."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from command_line import run
+
+from legcal import load_dataset, load_mechanism
+from legcal.data import reading_columns
+from legcal.geometry import Array
+
+MODEL = "hexapod"
+SIZE = 96, 64  # [px]
+RATE = 20.0  # frames a second
+AHEAD = 7.31  # [s] of the camera's clock
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A machine that rests at poses for times of different length."""
+
+    times: Array
+    s: Array  # which pose, between them while it moves
+    q: Array  # (n_poses, n_motors) readings [m]
+
+    @property
+    def rests(self) -> int:
+        return len(self.q)
+
+    def readings(self, times: Array) -> Array:
+        """Return readings with the noise of an encoder."""
+        s = np.interp(times, self.times, self.s)
+        k = np.clip(np.floor(s).astype(int), 0, self.rests - 2)
+        q = self.q[k] + (s - k)[:, None] * (self.q[k + 1] - self.q[k])
+        return np.asarray(q + np.random.default_rng(1).normal(scale=1e-6, size=q.shape))
+
+    def frame(self, time: float, rng: np.random.Generator) -> Array:
+        """Return a picture in which a bar stands where the machine is, with pixel noise."""
+        x = 8.0 + 7.0 * float(np.interp(time, self.times, self.s))
+        across = np.arange(SIZE[0])[None, :]
+        grey = 60.0 + 120.0 / (1.0 + np.exp(-np.abs(across - x) + 4.0)) * np.ones((SIZE[1], 1))
+        noise = rng.normal(scale=1.5, size=(SIZE[1], SIZE[0]))
+        return np.asarray(np.clip(grey + noise, 0, 255)[..., None].repeat(3, 2), dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def motion() -> Motion:
+    machine = load_mechanism(MODEL)
+    rng = np.random.default_rng(7)
+    low, high = np.array([leg.travel for leg in machine.legs]).T
+    q = low + (high - low) * rng.uniform(0.2, 0.8, (10, len(low)))
+    times, s = [0.0], [0.0]
+    for k in range(10):
+        times.append(times[-1] + rng.uniform(0.8, 2.5))
+        s.append(k)
+        if k < 9:
+            times.append(times[-1] + rng.uniform(0.4, 0.9))
+            s.append(k + 1)
+    return Motion(np.array(times), np.array(s, dtype=float), q)
+
+
+def _camera_file(folder: Path) -> Path:
+    path = folder / "camera_info.yaml"
+    K = [100.0, 0.0, 48.0, 0.0, 100.0, 32.0, 0.0, 0.0, 1.0]
+    lines = [f"image_width: {SIZE[0]}", f"image_height: {SIZE[1]}", "camera_name: small",
+             f"camera_matrix: {{rows: 3, cols: 3, data: {K}}}", "distortion_model: plumb_bob",
+             "distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}"]  # fmt: skip
+    path.write_text("\n".join(lines))
+    return path
+
+
+def _table(motion: Motion, path: Path, times: Array, unit: str = "mm") -> Path:
+    joints = [column.name for column in reading_columns(load_mechanism(MODEL).legs)]
+    scale = {"mm": 1e3, "m": 1.0}[unit]
+    rows = [",".join([f"{t + 1.7e9:.4f}", *(f"{scale * x:.6f}" for x in q)])
+            for t, q in zip(times, motion.readings(times), strict=True)]  # fmt: skip
+    path.write_text("\n".join([",".join(["time", *joints]), *rows]))
+    return path
+
+
+def _stamps(motion: Motion) -> Array:
+    return np.arange(0.5, motion.times[-1] - 0.3, 1.0 / RATE)
+
+
+def _video(motion: Motion, folder: Path) -> Path:
+    path = folder / "c1.avi"
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), RATE, SIZE)
+    rng = np.random.default_rng(0)
+    for time in _stamps(motion):
+        video.write(motion.frame(time, rng))
+    video.release()
+    return path
+
+
+def _folder(motion: Motion, folder: Path) -> Path:
+    (place := folder / "c1").mkdir()
+    rng = np.random.default_rng(0)
+    for time in _stamps(motion):
+        stamp = round(1e9 * (1.7e9 + AHEAD)) + round(1e9 * time)
+        cv2.imwrite(str(place / f"{stamp}.png"), motion.frame(time, rng))
+    return place
+
+
+def _bag(motion: Motion, folder: Path, **extra: str) -> Path:
+    rosbags = pytest.importorskip("rosbags.rosbag2", reason="the package rosbags is not there")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    joints = [column.name for column in reading_columns(load_mechanism(MODEL).legs)]
+    types = store.types
+    header, stamp = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
+
+    def at(time: float) -> tuple[int, Any]:
+        ns = round(1e9 * time) + 1_700_000_000 * 10**9
+        return ns, header(stamp(sec=ns // 10**9, nanosec=ns % 10**9), "")
+
+    path = folder / "c1"
+    with rosbags.Writer(path, version=9) as writer:
+        image = types["sensor_msgs/msg/Image"]
+        state = types["sensor_msgs/msg/JointState"]
+        pictures = writer.add_connection("/camera", image.__msgtype__, typestore=store)
+        states = writer.add_connection("/joint_states", state.__msgtype__, typestore=store)
+        for topic in extra.values():
+            writer.add_connection(topic, image.__msgtype__, typestore=store)
+        rng, none = np.random.default_rng(0), np.zeros(0)
+        times = np.arange(0.2, motion.times[-1], 0.02)
+        for time, q in zip(times, motion.readings(times), strict=True):
+            ns, head = at(time)
+            message = state(head, joints, q, none, none)
+            writer.write(states, ns, store.serialize_cdr(message, state.__msgtype__))
+        for time in _stamps(motion):
+            ns, head = at(time)
+            picture = motion.frame(time, rng)
+            message = image(head, SIZE[1], SIZE[0], "bgr8", 0, 3 * SIZE[0], picture.reshape(-1))
+            writer.write(pictures, ns, store.serialize_cdr(message, image.__msgtype__))
+    return path
+
+
+@pytest.fixture
+def import_(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., tuple[int, Path]]]:
+    camera = _camera_file(tmp_path)
+
+    def imported(*words: object) -> tuple[int, Path]:
+        code = run(monkeypatch, "import", *map(str, words), "--model", MODEL, "--camera",
+                   str(camera), "-o", str(tmp_path / "dataset"))  # fmt: skip
+        return code, tmp_path / "dataset"
+
+    yield imported
+    left = [p.name for p in tmp_path.iterdir() if p.name.endswith(".legcal-part")]
+    assert left == []
+
+
+@pytest.mark.parametrize("kind", ["video", "folder", "bag"])
+def test_poses_that_were_held_become_rows(
+    motion: Motion, tmp_path: Path, import_: Callable[..., tuple[int, Path]], kind: str
+) -> None:
+    source = {"video": _video, "folder": _folder, "bag": _bag}[kind](motion, tmp_path)
+    times = np.arange(0.0, motion.times[-1], 0.02)
+    words = [] if kind == "bag" else ["--readings", _table(motion, tmp_path / "q.csv", times)]
+    code, folder = import_(source, *words)
+    assert code == 0
+    dataset = load_dataset(folder)
+    found = dataset.measurements.q
+    assert [view.name for view in dataset.measurements.views] == ["c1"]
+    assert len(found) == motion.rests
+    assert np.abs(found - motion.q).max() < 3e-6
+    assert 3e-7 < dataset.measurements.sigma_q < 3e-6
+    shown = [np.asarray(cv2.imread(str(folder / image)))[:, :, 0].mean(axis=0) for image in
+             dataset.measurements.image]  # fmt: skip
+    dark = [int(np.argmin(np.convolve(row, np.ones(5), "same")[4:-4])) + 4 for row in shown]
+    assert np.abs(np.array(dark) - (8.0 + 7.0 * np.arange(10))).max() <= 2.0
+
+
+def test_clocks_are_compared_by_motion_and_json_tells_what_was_left_out(
+    motion: Motion,
+    tmp_path: Path,
+    import_: Callable[..., tuple[int, Path]],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    import json
+
+    times = np.arange(0.0, motion.times[-1], 0.02)
+    begin, end = motion.times[6], motion.times[7]  # of a rest without readings
+    table = _table(motion, tmp_path / "q.csv", times[(times < begin - 0.1) | (times > end + 0.1)])
+    code, folder = import_(_folder(motion, tmp_path), "--readings", table, "--json", "--dry-run")
+    found = json.loads(capsys.readouterr().out)["views"]["c1"]
+    assert code == 0
+    assert abs(found["offset_s"] - AHEAD) < 0.05
+    assert abs(found["offset_s"] - AHEAD) < 4.0 * found["offset_sigma_s"] + 1.0 / RATE
+    assert [still["why_not"] for still in found["stills"]].count("no reading") == 1
+    assert found["used"] == motion.rests - 1
+    assert not folder.exists()
+
+
+REFUSALS: dict[str, tuple[Callable[[Motion, Path], tuple[object, ...]], str]] = {
+    "no such file": (lambda m, t: (t / "none.mp4",), "found no such file"),
+    "another format": (lambda m, t: (_written(t / "a.txt", b"x"),), "found a file ending in"),
+    "cut-off video": (lambda m, t: (_written(t / "a.mp4", b"\0" * 99), "--readings",
+                                    _ticks(m, t)), "found no frame in it"),
+    "damaged bag": (lambda m, t: (_written(t / "a.bag", b"\0" * 99),), "a complete bag"),
+    "no readings": (lambda m, t: (_video(m, t),), "give it with --readings"),
+    "no times": (lambda m, t: (_video(m, t), "--readings", _timeless(m, t)), "no column 'time'"),
+    "nothing moves": (lambda m, t: (_video(m, t), "--readings", _resting(m, t)),
+                      "readings that change alike all the time"),
+    "other motion": (lambda m, t: (_video(m, t), "--readings", _other(m, t)),
+                     "needed the readings of the same time"),
+    "no such topic": (lambda m, t: (_bag(m, t), "--image-topic", "/other"),
+                      "found no topic '/other'"),
+    "two topics": (lambda m, t: (_bag(m, t, second="/second"),), "name it with --image-topic"),
+    "rests too short": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t), "--still", "60"),
+                        "needed rests of 60 s"),
+    "no rest": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t), "--still", "0"),
+                "correct --still"),
+    "no overlap": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t), "--offset", "1e6"),
+                   "no reading"),
+    "two tables": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t), "--readings",
+                                 _ticks(m, t)), "one for all or one for each"),
+}  # fmt: skip
+
+
+def _written(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path
+
+
+def _ticks(motion: Motion, folder: Path) -> Path:
+    return _table(motion, folder / "q.csv", np.arange(0.0, motion.times[-1], 0.02))
+
+
+def _timeless(motion: Motion, folder: Path) -> Path:
+    path = _ticks(motion, folder)
+    path.write_text("\n".join(line.split(",", 1)[1] for line in path.read_text().splitlines()))
+    return path
+
+
+def _resting(motion: Motion, folder: Path) -> Path:
+    return _table(motion, folder / "q.csv", np.arange(0.0, motion.times[1], 0.02))
+
+
+def _other(motion: Motion, folder: Path) -> Path:
+    rng = np.random.default_rng(3)
+    times = np.concatenate([[0.0], np.cumsum(rng.uniform(0.4, 2.5, 19))])
+    other = Motion(times, motion.s[np.r_[0 : len(times)]], motion.q)
+    return _table(other, folder / "q.csv", np.arange(0.0, times[-1], 0.02))
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_what_cannot_be_imported_is_refused(
+    motion: Motion,
+    tmp_path: Path,
+    import_: Callable[..., tuple[int, Path]],
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+) -> None:
+    words, said = REFUSALS[name]
+    code, folder = import_(*words(motion, tmp_path))
+    assert code in (1, 2)
+    error = " ".join(capsys.readouterr().err.split())
+    assert said in error, error
+    assert "Traceback" not in error
+    assert not folder.exists()
