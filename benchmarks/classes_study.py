@@ -29,6 +29,7 @@ from outline_bound import (
     figure_remarks,
     nse_figure,
     ratio_figure,
+    tied_directions,
     unit_of,
 )
 from outline_sessions import (
@@ -227,7 +228,8 @@ def as_stated(design: Design, solution: Solution) -> Determined:
     """Return what a fit says of the errors of its values; axes as angles from the nominal ones."""
     known = solution.parametrization.names  # twists too, which are fixed
     place, unit = [known.index(name) for name in design.parametrization.names], unit_of(design)
-    parts = across(solution.held_basis[:, place] / unit) / unit
+    tied = tied_directions(design)
+    parts = across(np.concatenate([solution.held_basis[:, place] / unit, tied])) / unit
     covariance = solution.value_covariance[np.ix_(place, place)]
     return Determined(parts, np.asarray(parts @ covariance @ parts.T))
 

@@ -21,7 +21,7 @@ from scipy.stats import chi2, norm
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array
-from legcal.machine import Leg, freedoms, moved_legs, pose_equations
+from legcal.machine import Leg, by_step, freedoms, independent, moved_legs, pose_equations
 from legcal.simulation import silhouette
 
 _STEP = 1e-6  # [m] or [rad] of differences
@@ -210,13 +210,15 @@ class Determined:
 def at_best(design: Design, sigma_q: float, radius_sigma: float, n_held: int = 0) -> Determined:
     """Return the bound of a machine of which some directions are held, those known least.
 
-    Errors count axes as angles from the true ones.
+    Errors count axes as angles from the true ones; what is tied has none.
     """
     n, unit = len(design.parametrization), unit_of(design)
     rows = information_of(design, sigma_q, radius_sigma)
     own = _without(rows[:, n:], rows[:, :n] * unit)
-    _, _, directions = np.linalg.svd(own)
-    parts = across(directions[n - n_held :])
+    tied = tied_directions(design)
+    free = across(tied) if len(tied) else np.eye(n)
+    _, _, directions = np.linalg.svd(own @ free.T)
+    parts = across(np.concatenate([directions[len(free) - n_held :] @ free, tied]))
     seen = np.linalg.qr(own @ parts.T, mode="r")
     root = np.linalg.inv(seen)
     return Determined(parts / unit, np.asarray(root @ root.T))
@@ -226,6 +228,13 @@ def across(directions: Array) -> Array:
     """Return a basis (n - w, n) of what is perpendicular to directions (w, n)."""
     n = directions.shape[1]
     return np.asarray(null_space(directions).T) if len(directions) else np.eye(n)
+
+
+def tied_directions(design: Design) -> Array:
+    """Return orthonormal directions (w, n) in which parameters cannot move, in ``unit_of``."""
+    place, legs = design.parametrization.place, design.legs
+    rows = legs.ties.at(legs.nominal)
+    return independent(rows, by_step(rows, place) * unit_of(design))[1]
 
 
 def unit_of(design: Design) -> Array:

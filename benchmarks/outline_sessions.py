@@ -41,6 +41,7 @@ from legcal.machine import (
     geometries,
     load_mechanism,
     moved_legs,
+    on_ties,
     parametrize,
     platform_in_base,
     pose_differences,
@@ -207,7 +208,12 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
     }
     return Design(
         legs=FittedLegs(
-            machine.leg_names, legs, machine.sign.astype(np.intp), machine.frame_legs, radii
+            machine.leg_names,
+            legs,
+            machine.sign.astype(np.intp),
+            machine.frame_legs,
+            radii,
+            platform_in_base(machine, machine.home),
         ),
         home=platform_in_base(machine, machine.home),
         R=R,
@@ -303,8 +309,17 @@ def draw_session(
         part: radius * float(1.0 + noise.radius_sigma * rng.normal())
         for part, radius in true.radii.items()
     }
-    legs = replace(true, nominal=nominal, radii=radii)
-    return OutlineSession(legs, measurements, outlines, design.home)
+    home = design.home
+    if true.ties:  # models of such a machine have its mobility
+        found, length = true.parametrization, float(np.linalg.norm(home.translation))
+        scale = np.where([unit == "m" for unit in found.units], length, 1.0)
+        nominal = on_ties(nominal, true.nominal, true.ties, found.place, scale)
+        at = solve_poses(
+            nominal, true.frame_legs, home.as_matrix()[None, :3, :3], home.translation[None]
+        )
+        home = RigidTransform.from_components(at.t[0], Rotation.from_matrix(at.R[0]))
+    legs = replace(true, nominal=nominal, radii=radii, home=home)
+    return OutlineSession(legs, measurements, outlines, home)
 
 
 def _parameter_errors(

@@ -251,6 +251,15 @@ def test_white_residuals_have_no_effects_at_all() -> None:
         assert gain < LEAST_GAIN
 
 
+def test_scores_of_a_fit_far_from_its_minimum_give_finite_variances() -> None:
+    v = np.random.default_rng(4).normal(size=6)
+    effects = Effects(1e12 * v, 1e22 * np.outer(v, v), np.zeros(6, dtype=np.intp))
+    with pytest.raises(np.linalg.LinAlgError):
+        effects.at(np.ones(1))  # the rounding of K exceeds one
+    variances, _ = estimate_variances(effects, LEAST_GAIN, np.ones(1))
+    assert np.isfinite(variances).all()
+
+
 def test_the_slope_is_that_of_the_likelihood() -> None:
     effects = random_effects(np.random.default_rng(2), (1.0, 0.7))
     at, step = np.array([0.4, 0.9]), 1e-5

@@ -355,6 +355,7 @@ def test_every_shipped_model_is_identifiable_from_what_is_recommended(name: str)
     assert sum(s.of for s in found.steps[2:] if s.criteria == "default") == found.full.of
     first = found.recommendation[0]
     assert first.platform_sigma is not None
+    assert found.platform_sigma is not None
     if name == "hexapod":
         sizes = [(len(r.views), r.legs_a_view) for r in found.recommendation]
         assert sizes == [(1, 6), (2, 5), (3, 4)]
@@ -363,6 +364,14 @@ def test_every_shipped_model_is_identifiable_from_what_is_recommended(name: str)
         assert best is not None
         assert rest.platform_sigma is not None
         assert best.dX_m < 1.05 * rest.platform_sigma.dX_m
+        boards = identifiability(model(name), platform_board=True)
+        assert boards.recommendation
+        with_board = boards.recommendation[0].platform_sigma
+        assert boards.platform_sigma is not None
+        assert with_board is not None
+        gain = boards.platform_sigma.dX_m / found.platform_sigma.dX_m  # of the views recommended
+        assert with_board.dX_m / first.platform_sigma.dX_m == pytest.approx(gain, rel=0.1)
+        assert gain < 0.5
 
 
 def test_the_report_does_not_depend_on_the_order_of_views() -> None:

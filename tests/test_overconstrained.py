@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from legcal import identifiability
 from legcal.calibration.joint_fit import refine
-from legcal.calibration.joint_fit.variables import start_from
+from legcal.calibration.joint_fit.problem import build_fit
+from legcal.calibration.joint_fit.variables import LegConstraints, start_from
 from legcal.errors import OutOfClass
 from legcal.estimation import Frames
 from legcal.geometry import Array, cross
@@ -27,7 +28,6 @@ from legcal.machine import (
     Machine,
     geometries,
     load_mechanism,
-    loader,
     machine_ties,
     moved_legs,
     on_ties,
@@ -135,10 +135,42 @@ def test_axes_that_must_stay_parallel_turn_together(tmp_path: Path) -> None:
     assert max(abs(leg.twist or 0.0) for leg in tied) < 1e-11
 
 
-def test_a_machine_that_cannot_be_tied_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def tilted(end: str, angle: float) -> MachineSpec:
+    """Return an Exechon with an axis of leg 1 turned out of its place [rad]."""
+    machine = exechon()
+    one, *rest = machine.legs
+    axis = np.array(getattr(one, f"{end}_axis"))
+    axis += angle * (np.array([0.0, 0.0, 1.0]) if end == "base" else np.array([1.0, 0.0, 0.0]))
+    turned = replace(one, **{f"{end}_axis": axis / np.linalg.norm(axis)})
+    return replace(machine, legs=(turned, *rest))
+
+
+@pytest.mark.parametrize(
+    ("end", "angle", "found"),
+    [
+        ("base", 1e-6, "2 of the 5 constraints of its joints follow from the others to 1 mrad"),
+        ("platform", 1e-8, "2 of the 5 constraints .* with all digits"),
+        ("base", 0.02, r"overconstrained \(1 of the 5 constraints .* mobility 2"),
+    ],
+)
+def test_a_machine_off_its_mobility_is_refused(
+    end: str, angle: float, found: str, tmp_path: Path
 ) -> None:
-    path = write_machine(tmp_path, exechon(), LAYOUTS[0])
-    monkeypatch.setattr(loader, "is_tied", lambda *_: False)
-    with pytest.raises(OutOfClass, match=r"'machine' .* overconstrained .* mobility 3"):
+    path = write_machine(tmp_path, tilted(end, angle), LAYOUTS[0])
+    with pytest.raises(OutOfClass, match=rf"'machine' .*{found}"):
         load_mechanism(path)
+
+
+def test_free_poses_that_the_legs_cannot_follow_stay(tmp_path: Path) -> None:
+    machine = write_machine(tmp_path, two_upr_two_sps(), LAYOUTS[0])
+    session = machine_session(str(machine))
+    problem = build_fit(session.legs, session.measurements, session.outlines)
+    state = problem.projected(problem.begin(session.truth))
+    t = state.platform_pose.t.copy()
+    t[0], t[1, 0], t[2] = np.inf, 1e3, t[2] + 0.01
+    there = LegConstraints(problem.parameters).with_poses(state, Frames(state.platform_pose.R, t))
+    moved = np.linalg.norm(there.platform_pose.t - state.platform_pose.t, axis=1)
+    assert moved[0] == 0.0
+    assert moved[2] > 1e-3
+    assert moved[3:].max() < 1e-9
+    assert np.isfinite(moved).all()

@@ -116,8 +116,8 @@ def estimate_variances(
     variances = np.zeros(effects.n_kinds)
     best = effects.at(variances)
     if start is not None and start.any():
-        near = effects.at(start)
-        if near.log_likelihood > best.log_likelihood:
+        near = _at(effects, start)
+        if near is not None and near.log_likelihood > best.log_likelihood:
             variances, best = start, near
     for _ in range(_MAX_STEPS):
         slope, information = best.slope()
@@ -125,8 +125,8 @@ def estimate_variances(
         before = best
         for halving in range(_HALVINGS):
             trial = np.maximum(variances + 0.5**halving * step, 0.0)
-            there = effects.at(trial)
-            if there.log_likelihood >= best.log_likelihood:
+            there = _at(effects, trial)
+            if there is not None and there.log_likelihood >= best.log_likelihood:
                 variances, best = trial, there
                 break
         gained = best.log_likelihood - before.log_likelihood
@@ -136,6 +136,14 @@ def estimate_variances(
             break
     gain = 2.0 * best.log_likelihood
     return (variances if gain > least_gain else np.zeros_like(variances)), gain
+
+
+def _at(effects: Effects, variances: Array) -> EffectsAt | None:
+    """Return the effects at variances, None at such that the rounding of K exceeds one."""
+    try:
+        return effects.at(variances)
+    except np.linalg.LinAlgError:
+        return None
 
 
 def _step(slope: Array, information: Array, inside: BoolArray) -> Array:

@@ -21,9 +21,10 @@ from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.classification import CONCURRENT, PERPENDICULAR, leg_of
 from legcal.machine.cylinders import at_visible_heights, visual_cylinders, with_cylinders
 from legcal.machine.diagnostics import mechanism_notes, proposal_notes
-from legcal.machine.equations import leg_equations
+from legcal.machine.equations import constraints_at, leg_equations
 from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home
+from legcal.machine.kinematics import MAX_POSE_ERROR
 from legcal.machine.leg import (
     MAX_LEGS,
     MAX_LENGTH,
@@ -38,6 +39,7 @@ from legcal.machine.leg import (
 from legcal.machine.mobility import (
     CONFIGURATIONS,
     generic_configurations,
+    leg_scale,
     mobility,
     motor_rank,
 )
@@ -46,7 +48,7 @@ from legcal.machine.origins import with_own_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
 from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.spanning_tree import Source
-from legcal.machine.ties import is_tied, machine_ties
+from legcal.machine.ties import is_tied, machine_ties, n_nearly_dependent
 from legcal.machine.topology import (
     any_joint,
     check_bodies,
@@ -121,7 +123,13 @@ def _load(source: Source) -> Machine:
         _check_unit(machine)  # before lengths of hundreds of metres fail to close
     if file.legcal is not None and file.legcal.home is not None:  # a drawing may be anywhere
         check_home_travel(machine)
-    pose, configuration = closed_home(machine, given)
+    try:
+        pose, configuration = closed_home(machine, given)
+    except ModelError:
+        missed = np.abs(constraints_at(machine, machine.home).values).max(initial=0.0)
+        if missed <= MAX_POSE_ERROR * leg_scale(machine, machine.home):
+            _check_dependence(machine, closes=False)
+        raise
     machine = replace(machine, home=pose, home_configuration=configuration)
     _check_unit(machine)
     # What the geometry says must be what Pinocchio finds.
@@ -130,6 +138,7 @@ def _load(source: Source) -> Machine:
     machine = replace(machine, mobility=mobility(machine, configurations))
     machine = replace(machine, motor_rank=motor_rank(machine, configurations))
     _check_equations(machine, configurations)
+    _check_dependence(machine)
     _check_ties(machine)
     proposed = proposal_notes(file.legcal, machine)
     found = map(
@@ -468,6 +477,25 @@ def _check_unit(machine: Machine) -> None:
                 )
 
 
+def _check_dependence(machine: Machine, *, closes: bool = True) -> None:
+    """Check that constraints which follow from others follow exactly; *closes*: at home they do.
+
+    Raises
+    ------
+    OutOfClass
+        If some nearly do: the machine then lacks the mobility that it is meant to have.
+    """
+    nearly = n_nearly_dependent(machine)
+    if nearly > (machine_ties(machine).n_dependent if closes else 0):
+        n = sum(leg.n_constraints for leg in machine.legs)
+        raise OutOfClass(
+            f"{machine.yaml_path}: the mechanism '{machine.name}' could not be used: found that "
+            f"{nearly} of the {n} constraints of its joints follow from the others to 1 mrad but "
+            "not exactly, needed an overconstrained machine to have its mobility exactly; write "
+            "axes that are parallel, perpendicular or meet with all digits."
+        )
+
+
 def _check_ties(machine: Machine) -> None:
     """Check that an overconstrained machine with small errors can have its mobility.
 
@@ -476,9 +504,8 @@ def _check_ties(machine: Machine) -> None:
     OutOfClass
         If errors that its constraints allow one by one destroy it together.
     """
-    ties = machine_ties(machine)
+    ties, n = machine_ties(machine), sum(leg.n_constraints for leg in machine.legs)
     if not is_tied(geometries(machine), ties, parametrization_of(machine, twists=True)):
-        n = sum(leg.n_constraints for leg in machine.legs)
         raise OutOfClass(
             f"{machine.yaml_path}: the mechanism '{machine.name}' is outside the method: found it "
             f"overconstrained ({ties.n_dependent} of the {n} constraints of its joints follow from "

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -37,7 +38,7 @@ from legcal.machine.solver import poses_after
 _POSES, _TEST_POSES = (8, 16, 32, 64), 4  # where ties are taken, and where it is seen that
 # they suffice
 _REACH = 0.15  # of these from home [rad], and of the mean leg length
-_RANK = 1e-7  # of the largest singular value
+_RANK, _NEARLY = 1e-7, 1e-3  # of the largest singular value
 _AT_REST, _STEPS = 1e-13, 30  # [m, rad], the last of so many Gauss-Newton steps
 _TRIAL = 1e-3  # of the mean leg length, and [rad]: errors that a machine must be able to have
 _WHOLLY = 1e-9
@@ -122,6 +123,7 @@ def ties_of(
     return ties
 
 
+@lru_cache(maxsize=8)  # a job asks several times about one or two machines
 def machine_ties(machine: Machine) -> Ties:
     """Return the ties of a mechanism; see :func:`ties_of`."""
     home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
@@ -171,6 +173,14 @@ def on_ties(
 def wholly_tied(rows: Array) -> BoolArray:
     """Return which parameters (p,) do not move at all, by orthonormal ties (w, p)."""
     return np.asarray(np.sum(rows**2, axis=0) > 1.0 - _WHOLLY)
+
+
+def n_nearly_dependent(machine: Machine) -> int:
+    """Return how many constraints of joints follow from the others but for 1 mrad."""
+    if len(machine.frame_legs) < 3:
+        return 0
+    home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
+    return _n_dependent(geometries(machine), home.as_matrix()[:3], _NEARLY)
 
 
 def is_tied(legs: Sequence[Leg], ties: Ties, parametrization: Parametrization) -> bool:
@@ -225,7 +235,7 @@ def _length(legs: Sequence[Leg], R: Array, t: Array) -> float:
     return float(np.mean([np.linalg.norm(R @ leg.B + t - leg.A) for leg in legs]))
 
 
-def _n_dependent(legs: Sequence[Leg], home: Array) -> int:
+def _n_dependent(legs: Sequence[Leg], home: Array, least: float = _RANK) -> int:
     """Return how many constraints follow from the others at home and at poses around it."""
     n = sum(leg.n_constraints for leg in legs)
     if n < 2:
@@ -233,14 +243,14 @@ def _n_dependent(legs: Sequence[Leg], home: Array) -> int:
     here = _constraints(legs, home[None, :, :3], home[None, :, 3]).by_pose[0]
     here = here / _unit(legs, home)
     found = np.linalg.svd(here, compute_uv=False)
-    dependent = n - int(np.sum(found > _RANK * found[0]))
+    dependent = n - int(np.sum(found > least * found[0]))
     if dependent == 0:
         return 0
     # Where home alone is special, the constraints are independent a little way off.
     R, t = _poses_near(legs, dependent, home, _TEST_POSES, 2)
     around = _constraints(legs, R, t)
     singular = np.linalg.svd(around.by_pose / _unit(legs, home), compute_uv=False)
-    rank = np.sum(singular > _RANK * singular[:, :1], axis=1)
+    rank = np.sum(singular > least * singular[:, :1], axis=1)
     return n - int(rank.max())
 
 

@@ -143,15 +143,15 @@ def identifiability(
     if hand_held:
         return _judge_hand_held(mechanism, legs, images, board=board, platform_board=platform_board)
     recommendation = None
+    boards = {"board": board, "platform_board": platform_board}
     if not legs:
-        recommendation = recommend(mechanism, images, board=board)
+        recommendation = recommend(mechanism, images, **boards)
         names = recommendation[0].views if recommendation else (mechanism.leg_names,)
         legs = read_views(names, mechanism.leg_names, images)
-    boards = {"board": board, "platform_board": platform_board}
     predicted = planned_observations(mechanism, legs, images, **boards)
     replanning = Replanning(
         lambda more: planned_observations(mechanism, legs, more, **boards),
-        lambda: recommend(mechanism, max(images, ENOUGH_IMAGES), board=board),
+        lambda: recommend(mechanism, max(images, ENOUGH_IMAGES), **boards),
     )
     return _judge(mechanism, Analysis(predicted), recommendation, replanning)
 

@@ -60,6 +60,7 @@ def recommend(
     images: int,
     *,
     board: bool = False,  # whether a calibration board on the base ties the cameras to each other
+    platform_board: bool = False,  # and whether one on the platform shows its poses
 ) -> tuple[Recommendation, ...]:
     """Return the smallest sets of views that suffice, fewest camera positions first.
 
@@ -70,7 +71,7 @@ def recommend(
     Empty where no set was found.
     """
     found = list[Recommendation]()
-    candidates = _Candidates(machine, images, board=board)
+    candidates = _Candidates(machine, images, board=board, platform_board=platform_board)
     most = machine.n_legs + 1
     for n_views in range(1, _MOST_VIEWS + 1):
         for size in range(1, most):
@@ -85,9 +86,12 @@ def recommend(
 class _Candidates:
     """Views of neighbouring legs, and what each says."""
 
-    def __init__(self, machine: Machine, images: int, *, board: bool) -> None:
+    def __init__(self, machine: Machine, images: int, *, board: bool, platform_board: bool) -> None:
         self.machine, self.images = machine, images
-        self.predicted = planned_observations(machine, [range(machine.n_legs)], images, board=board)
+        every = [range(machine.n_legs)]
+        self.predicted = planned_observations(
+            machine, every, images, board=board, platform_board=platform_board
+        )
         self.every = Analysis(self.predicted)
         self.motion = self.every.motion
         self.ring = legs_around(self.predicted)
@@ -135,11 +139,18 @@ class _Candidates:
         return not any(c.fails for c in (*counts, at_once))
 
     def together(self, chosen: Sequence[Analysis]) -> Array:
-        """Return what views say of the parameters at once; a board makes them one camera."""
+        """Return what views say of the parameters at once.
+
+        A board on the base makes them one camera, one on the platform has one place in all.
+        """
+        n_p = len(self.predicted.unit)
+        by_view = [a.of_cameras for a in chosen]
         if not self.predicted.board.all():
-            return compress(np.concatenate([a.information for a in chosen]))
-        rows = np.concatenate([a.of_cameras for a in chosen])
-        return marginal_rows(rows, np.arange(len(self.predicted.unit)))
+            if not self.predicted.platform_board.any():
+                return compress(np.concatenate([a.information for a in chosen]))
+            kept = np.r_[:n_p, n_p + 6 : by_view[0].shape[1]]
+            by_view = [marginal_rows(rows, kept) for rows in by_view]
+        return marginal_rows(np.concatenate(by_view), np.arange(n_p))
 
     def base_together(self, chosen: Sequence[Analysis]) -> Array:
         """Return what views say in step 2."""

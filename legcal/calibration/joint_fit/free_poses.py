@@ -13,9 +13,8 @@ import numpy as np
 
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.variables import State
+from legcal.calibration.joint_fit.variables import LegConstraints, State
 from legcal.estimation import (
-    Frames,
     GaussianPrior,
     Linearization,
     PseudoHuber,
@@ -23,7 +22,7 @@ from legcal.estimation import (
     minimise,
     normal_equations,
 )
-from legcal.geometry import Array, BoolArray
+from legcal.geometry import Array
 from legcal.machine import freedoms, pose_equations
 
 _SEED, _DRAWN = 1965, 16  # places from which every pose is looked for, beside where it is
@@ -74,9 +73,9 @@ def with_better_poses(problem: FitProblem, state: State, part: float = 0.0, seed
     least = _BETTER * least
     for _ in range(_DRAWN):
         moved = state.platform_pose.moved(size * rng.normal(size=(n, 6)))
-        there = problem.projected(replace(state, platform_pose=moved))
+        there = LegConstraints(problem.parameters).with_poses(state, moved)
         there, cost = _settled(problem, there, loss)
-        best = _chosen(cost < least, there, best)
+        best = best.with_chosen(cost < least, there.platform_pose)
         least = np.fmin(cost, least)
     return best
 
@@ -86,13 +85,6 @@ def have_outliers(problem: FitProblem, state: State) -> bool:
     loss = PseudoHuber(_width(problem, state))
     cost = _costs(problem, linearize(problem, state), loss, len(state.platform_pose.t))
     return bool(np.any(cost > _OUTLYING * np.median(cost)))
-
-
-def _chosen(better: BoolArray, one: State, other: State) -> State:
-    """Return a state with some poses of one, and all else of another."""
-    (R, t), (R_other, t_other) = one.platform_pose, other.platform_pose
-    R = np.where(better[:, None, None], R, R_other)
-    return replace(other, platform_pose=Frames(R, np.where(better[:, None], t, t_other)))
 
 
 def _softened(problem: FitProblem, part: float) -> FitProblem:
@@ -120,17 +112,21 @@ def _settled(problem: FitProblem, state: State, loss: PseudoHuber) -> tuple[Stat
     """Return a state with every pose at its own minimum, all else held, and their costs."""
     n = len(state.platform_pose.t)
     damping = np.full(n, _DAMPING)
+    constraints = LegConstraints(problem.parameters)
+    reach = np.repeat([1.0, state.mean_length], 3)  # of a step
     linear = linearize(problem, state)
     cost = _costs(problem, linear, loss, n)
     for _ in range(_STEPS):
         # Where a leg is not before its camera nothing is finite, and the pose stays as it is.
         step = np.nan_to_num(normal_equations(problem, state, linear, loss).element_step(damping))
-        moved = problem.projected(problem.moved(state, step))
+        own = step[problem.n_kept :].reshape(n, 6) / reach
+        own /= np.maximum(np.abs(own).max(axis=1, keepdims=True), 1.0)
+        moved = constraints.with_poses(state, state.platform_pose.moved(own * reach))
         ahead = _costs(problem, linearize(problem, moved), loss, n)
         better = ahead < cost
         if np.all(ahead > _SLOW * cost) and np.all(better | (damping > 1.0)):
             break
-        state = _chosen(better, moved, state)
+        state = state.with_chosen(better, moved.platform_pose)
         damping = np.clip(np.where(better, 0.2 * damping, 8.0 * damping), 1e-9, 1e6)
         linear = linearize(problem, state)
         cost = _costs(problem, linear, loss, n)

@@ -118,6 +118,12 @@ class State:
         ends = arms + self.platform_pose.t.T[..., None]
         return arms.reshape(3, -1), ends.reshape(3, -1)
 
+    def with_chosen(self, chosen: BoolArray, poses: Frames) -> State:
+        """Return the state with the chosen ones (n_poses,) of other poses."""
+        (R, t), (R_other, t_other) = self.platform_pose, poses
+        R = np.where(chosen[:, None, None], R_other, R)
+        return replace(self, platform_pose=Frames(R, np.where(chosen[:, None], t_other, t)))
+
     @property
     def mean_length(self) -> float:
         """Mean distance of the joints of a leg over the poses [m]."""
@@ -370,18 +376,29 @@ class LegConstraints:
         """
         if np.any(state.radii <= 0.0):
             raise DidNotConverge("The joint fit came to a radius that is not positive.")
-        if not self.binds:
-            return state
-        state = replace(state, legs=self.parameters.on_ties(state.legs))
-        found = solve_poses(state.legs, self.legs.frame_legs, *state.platform_pose)
-        size = float(found.size.max(initial=0.0))
+        there, step = self._closed(state)
+        size = float(step.max(initial=0.0))
         if size < _STEP_TOLERANCE:
-            return replace(state, platform_pose=Frames(found.R, found.t))
+            return there
         raise DidNotConverge(
             "The joint fit could not keep the platform on what its joints allow: found a pose that "
             f"still moves by {size:.2g} m or rad, needed rest; start nearer to the truth (joints "
             "to 5 mm, axes to 3 deg)."
         )
+
+    def with_poses(self, state: State, poses: Frames) -> State:
+        """Return the state with the poses (n_poses,) that can be projected; others stay."""
+        finite = np.isfinite(poses.t).all(axis=1) & np.isfinite(poses.R).all(axis=(1, 2))
+        there, step = self._closed(state.with_chosen(finite, poses))
+        return state.with_chosen(finite & (step < _STEP_TOLERANCE), there.platform_pose)
+
+    def _closed(self, state: State) -> tuple[State, Array]:
+        """Return the state where constraints hold, and the last step of each pose (n_poses,)."""
+        if not self.binds:
+            return state, np.zeros(len(state.platform_pose.t))
+        state = replace(state, legs=self.parameters.on_ties(state.legs))
+        found = solve_poses(state.legs, self.legs.frame_legs, *state.platform_pose)
+        return replace(state, platform_pose=Frames(found.R, found.t)), found.size
 
     def tangent(self, problem: Problem[State], state: State) -> Tangent | None:
         """Return the motions of poses that the constraints leave; None where all are free."""
