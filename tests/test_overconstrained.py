@@ -162,8 +162,8 @@ def test_a_machine_off_its_mobility_is_refused(
 
 
 def test_free_poses_that_the_legs_cannot_follow_stay(tmp_path: Path) -> None:
-    machine = write_machine(tmp_path, two_upr_two_sps(), LAYOUTS[0])
-    session = machine_session(str(machine))
+    machine = load_mechanism(write_machine(tmp_path, two_upr_two_sps(), LAYOUTS[0]))
+    session = wrong_but_tied(machine_session(str(machine.yaml_path)), machine)
     problem = build_fit(session.legs, session.measurements, session.outlines)
     state = problem.projected(problem.begin(session.truth))
     t = state.platform_pose.t.copy()

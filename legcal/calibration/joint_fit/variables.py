@@ -388,7 +388,7 @@ class LegConstraints:
 
     def with_poses(self, state: State, poses: Frames) -> State:
         """Return the state with the poses (n_poses,) that can be projected; others stay."""
-        finite = np.isfinite(poses.t).all(axis=1) & np.isfinite(poses.R).all(axis=(1, 2))
+        finite: BoolArray = np.isfinite(poses.t + poses.R.sum(axis=2)).all(axis=1)
         there, step = self._closed(state.with_chosen(finite, poses))
         return state.with_chosen(finite & (step < _STEP_TOLERANCE), there.platform_pose)
 
