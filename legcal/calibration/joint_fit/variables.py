@@ -42,6 +42,7 @@ from legcal.vision import Camera, intrinsic_names, intrinsic_values, with_intrin
 
 _RANK = 1e-7  # of the largest singular value
 _TIED, _TIE_STEPS = 1e-13, 20  # [m], and steps towards it
+_MET = 1e-12  # [m, rad]
 _STEP_TOLERANCE = 1e-6  # [m, rad], last step where constraints cannot all be met to rounding
 
 
@@ -393,12 +394,14 @@ class LegConstraints:
         return state.with_chosen(finite & (step < _STEP_TOLERANCE), there.platform_pose)
 
     def _closed(self, state: State) -> tuple[State, Array]:
-        """Return the state where constraints hold, and the last step of each pose (n_poses,)."""
+        """Return the state where constraints hold, and how far poses still move (n_poses,)."""
         if not self.binds:
             return state, np.zeros(len(state.platform_pose.t))
         state = replace(state, legs=self.parameters.on_ties(state.legs))
         found = solve_poses(state.legs, self.legs.frame_legs, *state.platform_pose)
-        return replace(state, platform_pose=Frames(found.R, found.t)), found.size
+        # The last step to where they hold may be long.
+        step = np.where(found.missed < _MET, 0.0, found.size)
+        return replace(state, platform_pose=Frames(found.R, found.t)), step
 
     def tangent(self, problem: Problem[State], state: State) -> Tangent | None:
         """Return the motions of poses that the constraints leave; None where all are free."""
