@@ -4,6 +4,7 @@ from .calibration import calibrate as calibrate
 from .calibration import calibrate_camera as calibrate_camera
 from .calibration import check as check
 from .calibration import detect as detect
+from .calibration import doctor as doctor
 from .calibration import evaluate as evaluate
 from .calibration import identifiability as identifiability
 from .calibration import load_location as load_location

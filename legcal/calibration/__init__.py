@@ -6,7 +6,8 @@ measures the legs, runs the four steps (``four_steps``) and the joint fit (``joi
 measures again (sections 3.1 to 3.5), judges what the platform gains (``verdict``) and writes the
 result (``result_folder``): out comes a :class:`Calibration`, and its document :class:`Result`,
 which ``check`` (``verification``, ``change_detection``) reads back. ``detect``
-(``outline_detection``) and ``check`` enter through the same phases. Beside them stand
+(``outline_detection``), ``doctor`` (``examination``) and ``check`` enter through the same phases.
+Beside them stand
 ``measure_noise`` (section 4.2, Table 1), ``evaluate`` (eq 20), ``calibrate_camera`` and ``locate``.
 What ``--json`` prints is a model for each job.
 """

@@ -7,6 +7,8 @@ from .documents import ParameterRow as ParameterRow
 from .documents import Result as Result
 from .evaluation import Evaluation as Evaluation
 from .evaluation import evaluate as evaluate
+from .examination import Examination as Examination
+from .examination import doctor as doctor
 from .identify.identifiability import answer as answer
 from .identify.identifiability import identifiability as identifiability
 from .identify.identifiability import identifiability_of_dataset as identifiability_of_dataset

@@ -101,8 +101,12 @@ class Detection:
     unplaced : dict
         Why the cameras of some views could not be placed, by name of the view; they are left where
         they were expected, and no outline of theirs is here but those that were given.
+    left_out : dict
+        Why images were left out, by row.
+    image_notes : tuple of str
+        What is odd about images, views and radii.
     notes : tuple of str
-        What else a reader should know.
+        These, and what else a reader should know.
     corners : Corners or None
         The corners of calibration boards in all images; None without a board.
     """
@@ -115,6 +119,8 @@ class Detection:
     T_base_camera: tuple[RigidTransform | None, ...]
     rows: IntArray
     unplaced: dict[str, str]
+    left_out: dict[int, str]
+    image_notes: tuple[str, ...]
     notes: tuple[str, ...]
     corners: Corners | None = None
 

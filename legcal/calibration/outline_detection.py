@@ -83,10 +83,10 @@ def detect(
         folder = source.folder if isinstance(source, Dataset) else _folder(Path(source))
         check_detection_destination(output_path(output, DETECTION), folder)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
-    images = _rows_with_image(dataset)
+    images = rows_with_image(dataset)
     with shown_progress(progress) as report, worker_pool(workers) as pool:
         data = order_dataset(dataset, pool, report)
-        detection = _detected(data, images)
+        detection = detected(data, images)
         if output is not None:
             write_detection(detection, Path(output), pool, report)
     return detection
@@ -97,7 +97,7 @@ def _folder(path: Path) -> Path:
     return path if path.is_dir() else path.parent
 
 
-def _rows_with_image(dataset: Dataset) -> IntArray:
+def rows_with_image(dataset: Dataset) -> IntArray:
     """Return the rows that have an image file; refuse a dataset without any."""
     paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
     rows = [row for row, path in enumerate(paths) if path is not None and os.path.exists(path)]
@@ -110,12 +110,13 @@ def _rows_with_image(dataset: Dataset) -> IntArray:
     return np.array(rows, dtype=np.intp)
 
 
-def _detected(data: OrderedDataset, images: IntArray) -> Detection:
+def detected(data: OrderedDataset, images: IntArray) -> Detection:
     """Recognise and measure, and return what was found in the order of the files."""
     dataset, order, photographs = data.dataset, data.order, data.photographs
     scene, board = rough_placement(data)
     outlines, cylinders = given_outlines(photographs), photographs.cylinders
-    unplaced, notes = dict[str, str](), list[str]()
+    unplaced, left_out = dict[str, str](), dict[int, str]()
+    image_notes, notes = list[str](), list[str]()
     if len(photographs.detect):
         T_board_camera = None if board is None else board.T_board_camera
         seen = place_and_measure(photographs, scene, data.progress, T_board_camera)
@@ -124,7 +125,8 @@ def _detected(data: OrderedDataset, images: IntArray) -> Detection:
         row = seen.outlines.row
         kept = placed[data.measurements.view[row]] | ~np.isin(row, photographs.detect)
         outlines, unplaced = seen.outlines.choose(kept), seen.placement.unplaced
-        notes = _notes(data, seen.placement)
+        left_out = {int(order.rows[row]): why for row, why in seen.left_out.items()}
+        image_notes, notes = _image_notes(data, seen.placement), _gamma_notes(data)
         # Legs of a view that could not be placed are drawn where its rough pose has them.
         drawn = tuple(
             T if T is not None else rough
@@ -142,20 +144,29 @@ def _detected(data: OrderedDataset, images: IntArray) -> Detection:
         T_base_camera=tuple(scene.T_base_camera[v] for v in views.tolist()),
         rows=images,
         unplaced=unplaced,
-        notes=(*dataset.notes, *notes, *data.unreached_notes()),
+        left_out=left_out,
+        image_notes=tuple(image_notes),
+        notes=(*dataset.notes, *image_notes, *notes, *data.unreached_notes()),
         corners=None if board is None else order.restore(board.corners),
     )
 
 
-def _notes(data: OrderedDataset, placement: Placement) -> list[str]:
+def _image_notes(data: OrderedDataset, placement: Placement) -> list[str]:
     """Return what is to be said of the cameras and the images."""
     views = data.measurements.views
     hints = [view.T_base_camera for view in views]
     notes = hint_notes([view.name for view in views], hints, placement.T_base_camera, BEFORE_FIT)
+    return [*notes, *placement.notes]
+
+
+def _gamma_notes(data: OrderedDataset) -> list[str]:
+    """Return a note on cameras whose gamma nobody states."""
+    views = data.measurements.views
     without_gamma = [view.name for view in views if not view.camera.gamma_is_given]
-    gamma = (
+    if not without_gamma:
+        return []
+    return [
         f"The gamma of {few_views(without_gamma)} is not given and was taken as 1: outlines of a "
         "camera that encodes light lie off by up to half of the blur; write gamma of the views in "
         "dataset.yaml, or let legcal calibrate estimate it."
-    )
-    return [*notes, *placement.notes, *([gamma] if without_gamma else [])]
+    ]

@@ -51,6 +51,7 @@ from legcal.calibration.verdict import judge
 from legcal.data import (
     Corners,
     Dataset,
+    Measurements,
     Outlines,
     Override,
     compression_note,
@@ -196,7 +197,7 @@ def calibrate(
         check_destination(output_path(output))
     overrides = overrides_of_call(priors, fixed, free)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
-    choices = _choices(dataset, overrides)
+    choices = chosen_parameters(dataset, overrides)
     fitted, held_out = _split(dataset, holdout)
     identify_notes = check_identifiable(dataset_at(dataset, fitted), choices)
 
@@ -222,7 +223,7 @@ def calibrate(
         *board_notes(dataset, found.solution, found.corners),
         *found.solution.notes,
         *_camera_notes(dataset, found.solution),
-        *_exact_cameras(dataset, choices),
+        *exact_cameras(dataset, choices),
         *_compression_note(dataset, found.solution),
     ]
     calibration = judge(
@@ -507,21 +508,26 @@ def _refuse_unseen_legs(fitted: OrderedDataset, outlines: Outlines) -> None:
     """Raise NotVisible if no image shows a leg that its view says it does."""
     if fitted.axes is not None:
         return
-    shown = set(outlines.leg[outlines.used].tolist())
-    views = [fitted.measurements.views[v] for v in np.unique(fitted.measurements.view).tolist()]
-    unseen = [
-        leg.name
-        for j, leg in enumerate(fitted.machine.legs)
-        if j not in shown
-        and leg.cylinders
-        and any(view.legs is None or leg.name in view.legs for view in views)
-    ]
+    unseen = unseen_legs(fitted.machine, fitted.measurements, outlines)
     if unseen:
         raise NotVisible(
             f"{fitted.dataset.folder}: the machine could not be calibrated: found no used outline "
             f"of {', '.join(unseen)} in any image, needed some of every leg; add images that show "
             "it, or name the legs of each view in dataset.yaml to leave it to the readings."
         )
+
+
+def unseen_legs(machine: Machine, measurements: Measurements, outlines: Outlines) -> list[str]:
+    """Return the legs that views should show, and of which no outline is used."""
+    shown = set(outlines.leg[outlines.used].tolist())
+    views = [measurements.views[v] for v in np.unique(measurements.view).tolist()]
+    return [
+        leg.name
+        for j, leg in enumerate(machine.legs)
+        if j not in shown
+        and leg.cylinders
+        and any(view.legs is None or leg.name in view.legs for view in views)
+    ]
 
 
 def outline_key(dataset: Dataset, choices: Choices) -> str:
@@ -542,7 +548,7 @@ def _store_outlines(data: OrderedDataset, estimate: Estimate, key: str) -> list[
     return [note] if note else []
 
 
-def _choices(dataset: Dataset, overrides: Sequence[Override]) -> Choices:
+def chosen_parameters(dataset: Dataset, overrides: Sequence[Override]) -> Choices:
     """Return what dataset and call choose of the parameters.
 
     Twists that nobody chooses anything of are estimated with a prior: no leg is built without an
@@ -606,7 +612,7 @@ def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
     ]
 
 
-def _exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
+def exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
     """Return a note on cameras that are taken as exact because nothing says how well they are."""
     if dataset.axes is not None:
         return []

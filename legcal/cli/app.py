@@ -16,7 +16,17 @@ from typing import Annotated
 import typer
 
 from legcal.cli.calibrate import calibrate
-from legcal.cli.commands import camera, detect, evaluate, identify, inspect, locate, new, noise
+from legcal.cli.commands import (
+    camera,
+    detect,
+    doctor,
+    evaluate,
+    identify,
+    inspect,
+    locate,
+    new,
+    noise,
+)
 from legcal.cli.example import example
 from legcal.cli.export import export
 from legcal.cli.import_ import import_
@@ -62,6 +72,7 @@ for command in (
     inspect,
     camera,
     identify,
+    doctor,
     detect,
     calibrate,
     evaluate,

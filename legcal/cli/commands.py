@@ -92,6 +92,21 @@ def detect(
         raise typer.Exit(1)
 
 
+def doctor(
+    dataset: DatasetArgument, workers: WorkersOption = None, as_json: JsonOption = False
+) -> None:
+    """Look for all that can stand in the way of calibrating a dataset, common mistakes included.
+
+    Exit 0 if nothing stands against it, 1 if something does, 2 if files cannot be used.
+    """
+    from legcal import calibration, report
+
+    found = calibration.doctor(dataset, progress=True, workers=image_workers(workers))
+    show(as_json, found.document, lambda: report.examination_table(found))
+    if not found.is_ready:
+        raise typer.Exit(1 if found.is_usable else 2)
+
+
 def evaluate(
     model: ModelArgument,
     reference: Annotated[

@@ -19,10 +19,13 @@ from .dataset import MIN_CORNERS as MIN_CORNERS
 from .dataset import OBSERVATIONS_NAME as OBSERVATIONS_NAME
 from .dataset import Dataset as Dataset
 from .dataset import ImageReader as ImageReader
+from .dataset import inspect_files as inspect_files
 from .dataset import load_dataset as load_dataset
 from .example import copy_example as copy_example
 from .holdout import dataset_at as dataset_at
 from .holdout import split_images as split_images
+from .image_causes import by_cause as by_cause
+from .image_causes import images_in_words as images_in_words
 from .image_tables import Order as Order
 from .image_tables import canonical_order as canonical_order
 from .image_tables import inverse as inverse
@@ -55,7 +58,10 @@ from .overrides import overrides_of_call as overrides_of_call
 from .photograph_matching import Photograph as Photograph
 from .photograph_matching import find_photographs as find_photographs
 from .photograph_matching import photograph_time as photograph_time
+from .photograph_notes import GOOD_QUALITY as GOOD_QUALITY
+from .photograph_notes import compressed as compressed
 from .photograph_notes import compression_note as compression_note
+from .photograph_notes import notes_on_photographs as notes_on_photographs
 from .readings_sheet import Headings as Headings
 from .readings_sheet import readings_of as readings_of
 from .readings_sheet import unit_of as unit_of

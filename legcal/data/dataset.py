@@ -21,7 +21,7 @@ from legcal.data.dataset_file import (
 from legcal.data.measurements import Measurements, View, read_measurements
 from legcal.data.outlines import Outlines, read_observations
 from legcal.data.overrides import Override
-from legcal.data.photograph_notes import photograph_notes
+from legcal.data.photograph_notes import notes_on_photographs
 from legcal.errors import DatasetError
 from legcal.files import closest, describe, path_problem
 from legcal.machine import Machine, load_mechanism, shipped_folder, shipped_names
@@ -189,16 +189,22 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         boards=boards,
         corners=read_given_corners(folder / CORNERS_NAME, boards, measurements),
     )
-    held = [view.hand_held for view in entry.views.values()]
-    of_hand = [row for row, v in enumerate(rows.view.tolist()) if held[v]]
     if not check_images:
         return dataset
-    facts, problems = inspect_rows(dataset, of_hand)
-    if problems:
-        raise DatasetError(problems)
-    of_files = tuple(photograph_notes(measurements, dataset.camera_paths, facts))
+    dataset, unusable = inspect_files(dataset)
+    if unusable:
+        raise DatasetError([what for _, what in unusable])
+    return dataset
+
+
+def inspect_files(dataset: Dataset) -> tuple[Dataset, list[tuple[int, str]]]:
+    """Return a dataset with what its images say of themselves, and what is wrong with rows."""
+    facts, problems = inspect_rows(dataset)
+    of_files = [
+        one.what for one in notes_on_photographs(dataset.measurements, dataset.camera_paths, facts)
+    ]
     notes = (*dataset.notes, *of_files)
-    return replace(dataset, notes=notes, facts=facts, file_notes=of_files)
+    return replace(dataset, notes=notes, facts=facts, file_notes=tuple(of_files)), problems
 
 
 def _refuse_two_tables(folder: Path) -> None:
@@ -293,12 +299,17 @@ def read_given_axes(
     return axes.choose(used), [note] if left_out else []
 
 
-def rows_without_axes(table_path: Path, measurements: Measurements, axes: LegAxes) -> list[str]:
+def rows_without_axes(
+    table_path: Path, measurements: Measurements, axes: LegAxes
+) -> list[tuple[int, str]]:
     """Return one sentence for each row of the measurements that has no axis."""
     blank = np.setdiff1d(np.arange(measurements.n_rows), axes.row).tolist()
     return [
-        f"{table_path}, row {row + 1}: the row could not be used: found no axis of it in "
-        f"{AXES_NAME}, needed one of a leg that its view uses; add one or remove the row."
+        (
+            row,
+            f"{table_path}, row {row + 1}: the row could not be used: found no axis of it in "
+            f"{AXES_NAME}, needed one of a leg that its view uses; add one or remove the row.",
+        )
         for row in blank
     ]
 
@@ -317,33 +328,41 @@ def read_given_corners(
     return read_corners(path, sum(b.board.n_corners for b in boards), measurements)
 
 
-def rows_without_board(dataset: Dataset, corners: Corners, hand_held: Sequence[int]) -> list[str]:
+def rows_without_board(
+    dataset: Dataset, corners: Corners, hand_held: Sequence[int]
+) -> list[tuple[int, str]]:
     """Return one sentence for each row of a hand-held view in which the board has no pose."""
     table_path, on_base = dataset.table_path, dataset.board_on("base")
     shown = corners.used if on_base is None else corners.used & on_base.has(corners.corner)
     counts = np.bincount(corners.row[shown], minlength=dataset.measurements.n_rows)
     return [
-        f"{table_path}, row {row + 1}: its camera could not be placed: found "
-        f"{counts[row] or 'no'} corners of the board in {CORNERS_NAME}, needed {MIN_CORNERS} in "
-        "every image of a camera that is held in the hand; add them or remove the row."
+        (
+            row,
+            f"{table_path}, row {row + 1}: its camera could not be placed: found "
+            f"{counts[row] or 'no'} corners of the board in {CORNERS_NAME}, needed {MIN_CORNERS} "
+            "in every image of a camera that is held in the hand; add them or remove the row.",
+        )
         for row in hand_held
         if counts[row] < MIN_CORNERS
     ]
 
 
-def inspect_rows(
-    dataset: Dataset, hand_held: Sequence[int]
-) -> tuple[dict[str, ImageFacts], list[str]]:
+def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[int, str]]]:
     """Return what images say of themselves, by their names, and what is wrong with rows.
 
     That is one sentence for each row that neither an image nor tables make usable.
     """
     table_path, measurements = dataset.table_path, dataset.measurements
+    held = [view.hand_held for view in measurements.views]
+    hand_held = [row for row, v in enumerate(measurements.view.tolist()) if held[v]]
     if dataset.corners is None:
         problems = [
-            f"{table_path}, row {row + 1}, column image: its camera could not be placed: found "
-            f"neither an image nor {CORNERS_NAME}, needed the board in every image of a camera "
-            "that is held in the hand; name an image or give the corners."
+            (
+                row,
+                f"{table_path}, row {row + 1}, column image: its camera could not be placed: found "
+                f"neither an image nor {CORNERS_NAME}, needed the board in every image of a camera "
+                "that is held in the hand; name an image or give the corners.",
+            )
             for row in hand_held
             if not measurements.image[row]
         ]
@@ -359,14 +378,15 @@ def inspect_rows(
     for row in range(measurements.n_rows):
         path = dataset.image_path(row)
         if path is None and row not in given:
-            problems.append(
+            what = (
                 f"{table_path}, row {row + 1}, column image: the row could not be used: "
                 f"found neither an image nor outlines of it in {OBSERVATIONS_NAME}, needed one of "
                 "them; name an image or remove the row."
             )
+            problems.append((row, what))
         elif path is not None and (os.path.exists(path) or row not in given):
             facts[measurements.image[row]], found = dataset.inspect_image(row)
-            problems += [found] if found else []
+            problems += [(row, found)] if found else []
     return facts, problems
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from legcal.data.measurements import Measurements, few, few_views
 from legcal.vision import Difference, ImageFacts, differences
@@ -17,10 +18,17 @@ _TURNS = {1: "not to be turned", 3: "to be turned by 180 deg", 6: "to be turned 
 _MOST = 3  # as many photographs of a view must name their camera for each that does not
 
 
-def photograph_notes(
+class PhotographNote(NamedTuple):
+    """What files of photographs say against their camera, in one sentence."""
+
+    what: str
+    is_certain: bool  # whether one calibration cannot hold for what they say
+
+
+def notes_on_photographs(
     measurements: Measurements, camera_paths: Sequence[Path], facts: Mapping[str, ImageFacts]
-) -> list[str]:
-    """Return one sentence for each thing that files of photographs say against their camera.
+) -> list[PhotographNote]:
+    """Return one note for each thing that files of photographs say against their camera.
 
     Parameters
     ----------
@@ -34,12 +42,12 @@ def photograph_notes(
     views_of: dict[Path, list[int]] = {}
     for v, path in enumerate(camera_paths):
         views_of.setdefault(path, []).append(v)
-    notes: list[str] = []
+    notes: list[PhotographNote] = []
     for path, views in views_of.items():
         images = {v: _images(measurements, v, facts) for v in views}
         notes += _against_camera(measurements, path, images)
         for v in views:
-            notes += _of_view(measurements, v, images[v])
+            notes += [PhotographNote(what, False) for what in _of_view(measurements, v, images[v])]
     return notes
 
 
@@ -54,7 +62,7 @@ def _images(
 
 def _against_camera(
     measurements: Measurements, path: Path, images: Mapping[int, list[tuple[str, ImageFacts]]]
-) -> Iterator[str]:
+) -> Iterator[PhotographNote]:
     """Yield what contradicts a camera file, and the photographs of its views each other."""
     named = [one for of_view in images.values() for one in of_view if not one[1].is_screenshot]
     camera = measurements.views[next(iter(images))].camera
@@ -62,24 +70,23 @@ def _against_camera(
     for found in differences(named, (camera.width, camera.height), camera.photographs):
         shown = sorted({view_of[name] for names in found.images.values() for name in names})
         views = few_views([measurements.views[v].name for v in shown])
+        start = f"{path} may not hold for all images of {views}: found {_in_words(found)}, "
         if len(found.images) > 1 and not found.needed:
-            yield (
-                f"{path} may not hold for all images of {views}: found {_in_words(found)}, needed "
-                f"one {found.fact.what}; leave out those that differ, or give them a view of their "
-                "own with the camera file of a calibration for them."
+            rest = (
+                f"needed one {found.fact.what}; leave out those that differ, or give them a view "
+                "of their own with the camera file of a calibration for them."
             )
         elif found.needed:
-            yield (
-                f"{path} may not hold for all images of {views}: found {_in_words(found)}, needed "
-                f"images {found.needed}, as those of the board were; calibrate the camera from "
-                "photographs that are taken and processed like these, or take these again."
+            rest = (
+                f"needed images {found.needed}, as those of the board were; calibrate the camera "
+                "from photographs that are taken and processed like these, or take these again."
             )
         else:
-            yield (
-                f"{path} may not hold for all images of {views}: found {_in_words(found)}, and no "
-                "record of the photographs of the board, needed the same in these; see that it "
-                "was so, or calibrate the camera with legcal camera, which records it."
+            rest = (
+                "and no record of the photographs of the board, needed the same in these; see "
+                "that it was so, or calibrate the camera with legcal camera, which records it."
             )
+        yield PhotographNote(start + rest, len(found.images) > 1 or bool(found.needed))
 
 
 def _in_words(found: Difference) -> str:
@@ -148,25 +155,32 @@ def compression_note(
     scale : float
         Noise of outlines over what the noise of the pixels around them explains.
     """
+    found = compressed(measurements, facts)
+    if not found:
+        return []
+    return [
+        f"Lossy compression moves outlines: found {found}, and outlines that are "
+        f"{rms_px:.2f} px off (rms), with standard deviations {scale:.2f} times those that the "
+        "noise of their pixels explains, which the stated uncertainty includes; store "
+        f"photographs without loss (PNG, TIFF) or as JPEGs of quality {GOOD_QUALITY} or more."
+    ]
+
+
+def compressed(measurements: Measurements, facts: Mapping[str, ImageFacts]) -> str:
+    """Return in words which photographs were compressed with much loss, "" if none were."""
     by_quality: dict[int, set[int]] = {}
     for v, image in zip(measurements.view.tolist(), measurements.image, strict=True):
         found = facts.get(image)
         if found is not None and (found.jpeg_quality or GOOD_QUALITY) < GOOD_QUALITY:
             by_quality.setdefault(found.jpeg_quality or 0, set()).add(v)
     if not by_quality:
-        return []
+        return ""
     names = [view.name for view in measurements.views]
     of_views: dict[tuple[int, ...], list[int]] = {}
     for quality, views in sorted(by_quality.items()):
         of_views.setdefault(tuple(sorted(views)), []).append(quality)
-    parts = [
+    return ", ".join(
         f"photographs of {few_views([names[v] for v in views])} that are JPEGs of quality "
         f"{qualities[0] if len(qualities) == 1 else f'{qualities[0]} to {qualities[-1]}'} or so"
         for views, qualities in of_views.items()
-    ]
-    return [
-        f"Lossy compression moves outlines: found {', '.join(parts)}, and outlines that are "
-        f"{rms_px:.2f} px off (rms), with standard deviations {scale:.2f} times those that the "
-        "noise of their pixels explains, which the stated uncertainty includes; store "
-        f"photographs without loss (PNG, TIFF) or as JPEGs of quality {GOOD_QUALITY} or more."
-    ]
+    )

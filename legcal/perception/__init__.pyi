@@ -25,10 +25,14 @@ from .camera_search import UPSIDE_DOWN as UPSIDE_DOWN
 from .candidate_pairs import CandidatePairs as CandidatePairs
 from .diagnostics import BEFORE_FIT as BEFORE_FIT
 from .diagnostics import FAR_OFF as FAR_OFF
+from .diagnostics import TAKE_AGAIN as TAKE_AGAIN
 from .diagnostics import far_off as far_off
 from .diagnostics import hint_notes as hint_notes
 from .diagnostics import is_visible as is_visible
+from .diagnostics import left_out_notes as left_out_notes
 from .free_poses import require_rough_cameras as require_rough_cameras
+from .image_quality import Exposure as Exposure
+from .image_quality import measure_exposure as measure_exposure
 from .outline import HIDDEN as HIDDEN
 from .outline import MIN_LENGTH as MIN_LENGTH
 from .outline import MIN_LONE_KEPT as MIN_LONE_KEPT
@@ -48,6 +52,7 @@ from .overlays import short_reason as short_reason
 from .part_edges import LegPart as LegPart
 from .photographs import MeasuredImages as MeasuredImages
 from .photographs import Photographs as Photographs
+from .photographs import defects_of as defects_of
 from .photographs import detection_settings as detection_settings
 from .photographs import given_outlines as given_outlines
 from .photographs import measure_photographs as measure_photographs

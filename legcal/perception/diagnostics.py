@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data import Measurements, Outlines, is_edited
+from legcal.data import Measurements, Outlines, by_cause, images_in_words, is_edited
 from legcal.geometry import BoolArray, IntArray, pose_distance
 from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped
 from legcal.perception.candidate_pairs import CandidatePairs
@@ -47,6 +47,7 @@ N_REFERENCES = 3  # good images that others are compared with
 MIN_VISIBLE = 0.5  # share of a leg's length in each of them, if it is clearly visible
 MIN_USUAL_SHARE = 0.3  # the least that images of a view must find to be compared with
 GOOD_PERCENTILE = 75.0  # percentile of what images find, for what good ones do
+TAKE_AGAIN = "take it again"  # a remedy
 NOTHING_LIKE = "it does not show the legs where its reading has them"  # a reason
 NOT_IN_SIGHT = (OUTSIDE, HIDDEN)  # beginnings of reasons
 
@@ -104,16 +105,19 @@ def find_wrong_images(
     usual = _usual(search, placement, found, suspects, run)
     task = partial(explain, search, placement, usual, suspects=frozenset(suspects))
     reasons = dict(defects)
-    notes = [
-        f"{_image_name(search.measurements, row)}: was left out: {why}; take it again."
-        for row, why in sorted(defects.items())
-        if view[row] not in defective
-    ]
+    single = {row: why for row, why in sorted(defects.items()) if view[row] not in defective}
+    notes = left_out_notes(search.measurements, single, dict.fromkeys(single, TAKE_AGAIN))
+    why, remedies, odd = dict[int, str](), dict[int, str](), dict[int, str]()
     for row, explanation in zip(suspects, run(task, suspects), strict=True):
-        reason, note = image_verdict(search.measurements, row, explanation, usual, found)
-        notes.append(note)
+        reason, said, remedy = image_verdict(search.measurements, row, explanation, usual, found)
         if reason:
-            reasons[row] = reason
+            reasons[row], why[row], remedies[row] = reason, said, remedy
+        else:
+            odd[row] = f"{said}; {remedy}"
+    notes += left_out_notes(search.measurements, why, remedies)
+    notes += [
+        f"{_images(search.measurements, cause.rows)}: {cause.what}." for cause in by_cause(odd)
+    ]
     notes += _leg_notes(search, placement, outlines, found, reasons)
     return replace(placement, notes=(*placement.notes, *notes)), reasons
 
@@ -166,25 +170,34 @@ def image_verdict(
     explanation: ImageExplanation,
     usual: Mapping[int, float],
     found: Mapping[int, OutlineCount],
-) -> tuple[str, str]:
-    """Return why an image is left out, "" if it is not, and the sentence that says so."""
-    name, count = _image_name(measurements, row), found[row]
+) -> tuple[str, str, str]:
+    """Return why an image is left out, "" if it is not, what is said of it, and what to do."""
+    count = found[row]
     much = f"{count.used} of {count.visible} outlines where its reading has the legs"
     if explanation.reason:
-        return (
-            explanation.reason,
-            f"{name}: was left out: {explanation.reason}; {explanation.remedy}.",
-        )
+        return explanation.reason, explanation.reason, explanation.remedy
     view = int(measurements.view[row])
     if explanation.own >= MAX_SHARE_OF_OTHERS * usual[view]:
-        return "", (
-            f"{name}: shows little of the legs: found {much}, in other images most; look at "
-            "its light and sharpness."
-        )
-    return NOTHING_LIKE, (
-        f"{name}: was left out: found {much}, and nothing else that it shows; check that it is a "
-        "photograph of this machine, taken by this camera at this reading."
+        shows = f"shows little of the legs: found {much}, in other images most"
+        return "", shows, "look at its light and sharpness"
+    return (
+        NOTHING_LIKE,
+        f"found {much}, and nothing else that it shows",
+        "check that it is a photograph of this machine, taken by this camera at this reading",
     )
+
+
+def left_out_notes(
+    measurements: Measurements, why: Mapping[int, str], remedy: Mapping[int, str]
+) -> list[str]:
+    """Return one sentence for each cause for which images were left out, by row."""
+    said = {row: f"{text}; {remedy[row]}" for row, text in why.items()}
+    return [
+        f"{_images(measurements, cause.rows)}: was left out: {cause.what}."
+        if len(cause.rows) == 1
+        else f"{_images(measurements, cause.rows)} were left out, all for one reason: {cause.what}."
+        for cause in by_cause(said)
+    ]
 
 
 def share_shown(
@@ -380,10 +393,12 @@ def _references(
     return sorted(own or found, key=lambda row: -found[row].share)[:N_REFERENCES]
 
 
-def _image_name(measurements: Measurements, row: int) -> str:
-    """Return what an image is called in notes."""
-    view = measurements.views[int(measurements.view[row])]
-    return f"view {view.name}, image {measurements.image[row]}"
+def _images(measurements: Measurements, rows: Sequence[int]) -> str:
+    """Return what images are called in notes."""
+    if len(rows) > 1:
+        return images_in_words(measurements, rows)
+    view = measurements.views[int(measurements.view[rows[0]])]
+    return f"view {view.name}, image {measurements.image[rows[0]]}"
 
 
 def _leg_notes(

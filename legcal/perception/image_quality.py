@@ -16,6 +16,7 @@ from legcal.perception.light import reduce
 from legcal.vision import Grey
 
 BLACK, WHITE = 8.0, 247.0  # what nearly all of an image is below or above [grey levels]
+BRIGHTEST = 254.5  # [grey levels]
 TAIL_PERCENT = 0.5  # percent of an image that may be otherwise
 MIN_RANGE = 10.0  # of an image in which something can be seen [grey levels]
 REDUCTION = 8  # factor by which an image is reduced before its range is taken, against noise
@@ -54,6 +55,7 @@ class Exposure:
     bright: float  # nearly all of it is darker [grey levels]
     range: float  # between the darkest and the brightest places [grey levels]
     blur: float  # standard deviation of the blur of its sharp edges [px]
+    clipped: float = 0.0  # share of it that is as bright as a file can say
 
     @property
     def defect(self) -> str:
@@ -73,7 +75,8 @@ def measure_exposure(grey: Grey) -> Exposure:
     small = reduce(half, max(1, min(REDUCTION, min(grey.shape) // 16) // 2))
     low, high = _tails(small)
     dark, bright = _tails(grey[::STRIDE, ::STRIDE])
-    return Exposure(dark, bright, high - low, _blur(grey, half))
+    clipped = float(np.mean(grey[::STRIDE, ::STRIDE] >= BRIGHTEST))
+    return Exposure(dark, bright, high - low, _blur(grey, half), clipped)
 
 
 def _tails(grey: Grey) -> tuple[float, float]:

@@ -340,11 +340,16 @@ def _inspect_images(
         if own is not None:
             pairs[row] = own
         count(row)
+    defects = defects_of(measurements, exposures)
+    return defects, pairs, {row: exposure.blur for row, exposure in exposures.items()}
+
+
+def defects_of(measurements: Measurements, exposures: Mapping[int, Exposure]) -> dict[int, str]:
+    """Return why images show nothing, by themselves or beside others of their view, by row."""
     views = measurements.views
     camera = shared_cameras([view.name for view in views], [view.camera for view in views])
-    view = {row: int(measurements.view[row]) for row in rows}
-    defects = image_defects(exposures, view, {row: camera[v] for row, v in view.items()})
-    return defects, pairs, {row: exposure.blur for row, exposure in exposures.items()}
+    view = {row: int(measurements.view[row]) for row in exposures}
+    return image_defects(exposures, view, {row: camera[v] for row, v in view.items()})
 
 
 def _inspect(

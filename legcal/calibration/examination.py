@@ -1,0 +1,585 @@
+"""All that can stand in the way of a calibration, looked for before one: ``legcal doctor``.
+
+Files, readings, cameras, photographs, what these show of the legs, what they can determine, and
+common mistakes are looked at one after the other, by what other jobs compute. What is found is one
+sentence each, with the remedy. Nothing is fitted or written.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from legcal.brief import brief
+from legcal.calibration.detection import Detection
+from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose
+from legcal.calibration.documents import DiagnosisBlock
+from legcal.calibration.identify.identifiability import check_identifiable
+from legcal.calibration.joint_fit import Choices
+from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
+from legcal.calibration.outline_detection import detected
+from legcal.calibration.pipeline import chosen_parameters, exact_cameras, unseen_legs
+from legcal.data import (
+    GOOD_QUALITY,
+    Dataset,
+    ImageReader,
+    compressed,
+    dataset_at,
+    few,
+    few_views,
+    images_in_words,
+    inspect_files,
+    load_dataset,
+    notes_on_photographs,
+    reading_columns,
+    row_names,
+)
+from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible
+from legcal.files import Document
+from legcal.geometry import Array
+from legcal.machine import LegKind
+from legcal.perception import (
+    TAKE_AGAIN,
+    Exposure,
+    defects_of,
+    left_out_notes,
+    measure_exposure,
+)
+from legcal.progress import Progress, Report, shown_progress
+from legcal.workers import Run, worker_pool
+
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+CHECKS = ("files", "readings", "camera", "photographs", "legs", "parameters", "mistakes")
+
+LITTLE_USED = 0.1  # of the travel: poses that differ by less determine little
+SOFT = 3.0  # usual blur of a view [px], from which on outlines lose much of their precision
+CLIPPED = 0.1  # of the pixels of a view
+FEW_LEGS = 0.5  # of those that a view should show
+MIN_READINGS = 6  # that have the same last digit by more than chance
+MAX_DIGITS = 10  # of readings in metres
+LOOKING = "Looking at light and sharpness"  # a stage of progress
+
+
+class Finding(Document):
+    """Something that a reader should know before calibrating."""
+
+    check: str  # one of CHECKS
+    severity: Severity  # an error stands against calibrating, a warning makes the result worse
+    what: str  # one sentence, with the remedy
+    images: tuple[str, ...] = ()  # that it is about, if it is about some
+
+
+class EncoderUse(Document):
+    """What the readings of an encoder are."""
+
+    column: str
+    least: float  # [m]
+    greatest: float
+    travel: tuple[float, float] | None  # None where the model has no limits
+    used: float | None  # share of the travel
+
+
+class ViewCondition(Document):
+    """What the photographs of a view are like, and what they show."""
+
+    view: str
+    images: int
+    camera: str  # the file
+    blur_px: float | None  # usual one of sharp edges; None without photographs
+    clipped: float | None  # usual share of pixels that are as bright as a file can say
+    jpeg_quality: int | None  # the least; None where nothing is lost
+    legs_found: int | None  # in all images together; None where none were searched
+    legs_visible: int | None
+    outlines_used: int | None
+
+
+class CheckState(Document):
+    """What one of the checks looked at, and the severity of its worst finding."""
+
+    name: str
+    state: Severity | Literal["ok"]
+    found: str
+
+
+class ExaminationDocument(Document):
+    """What ``legcal doctor --json`` prints."""
+
+    legcal_doctor: int
+    dataset: str
+    mechanism: str
+    ready: bool
+    usable: bool
+    checks: list[CheckState]
+    findings: list[Finding]
+    encoders: list[EncoderUse]
+    views: list[ViewCondition]
+    diagnosis: list[DiagnosisBlock]
+
+
+@brief
+@dataclass(frozen=True, eq=False)
+class Examination:
+    """The result of :func:`legcal.doctor`.
+
+    Attributes
+    ----------
+    dataset, mechanism : str
+        What was looked at.
+    checks : tuple of CheckState
+        What each check looked at; those that could not be made are not there.
+    findings : tuple of Finding
+        The most severe first.
+    encoders : tuple of EncoderUse
+        Readings against travel.
+    views : tuple of ViewCondition
+        The photographs of each view.
+    diagnosis : tuple of Diagnosis
+        What explains images that contradict the session, the likeliest first.
+    is_usable : bool
+        Whether all files can be used.
+    """
+
+    dataset: str
+    mechanism: str
+    checks: tuple[CheckState, ...]
+    findings: tuple[Finding, ...]
+    encoders: tuple[EncoderUse, ...]
+    views: tuple[ViewCondition, ...]
+    diagnosis: tuple[Diagnosis, ...]
+    is_usable: bool
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether nothing stands against calibrating."""
+        return all(one.severity != "error" for one in self.findings)
+
+    def document(self) -> dict[str, Any]:
+        """Return what ``legcal doctor --json`` prints."""
+        return ExaminationDocument(
+            legcal_doctor=1,
+            dataset=self.dataset,
+            mechanism=self.mechanism,
+            ready=self.is_ready,
+            usable=self.is_usable,
+            checks=list(self.checks),
+            findings=list(self.findings),
+            encoders=list(self.encoders),
+            views=list(self.views),
+            diagnosis=[one.document() for one in self.diagnosis],
+        ).document()
+
+
+def doctor(
+    source: str | Path | Dataset, *, progress: Progress = False, workers: int = 1
+) -> Examination:
+    """Look for all that can stand in the way of calibrating a dataset; nothing is fitted.
+
+    Parameters
+    ----------
+    source : path or Dataset
+        The dataset folder, or what :func:`legcal.load_dataset` returned.
+    progress : bool or callable
+        True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
+    workers : int
+        Look at the images in that many processes, as :func:`legcal.calibrate` does.
+
+    Returns
+    -------
+    Examination
+
+    Raises
+    ------
+    DatasetError, ModelError, OutOfClass
+        If the dataset file, its table, a camera or the model cannot be read. Photographs that
+        cannot be used are findings.
+    """
+    dataset = source if isinstance(source, Dataset) else load_dataset(source, check_images=False)
+    of_tables = tuple(note for note in dataset.notes if note not in dataset.file_notes)
+    dataset, problems = inspect_files(replace(dataset, notes=of_tables))
+    found, choices = _Found(dataset), chosen_parameters(dataset, ())
+    usable = _look_at_files(found, problems)
+    _look_at_readings(found, of_tables)
+    _look_at_cameras(found, choices)
+    with shown_progress(progress) as report, worker_pool(workers) as pool:
+        exposures = _look_at_photographs(found, usable, pool, report)
+        _look_at_parameters(found, usable, choices)
+        seen = None
+        if exposures:
+            data = order_dataset(dataset_at(dataset, np.array(usable)), pool, report)
+            _diagnose(found, data)
+            seen = _look_at_legs(found, data, choices)
+    return Examination(
+        dataset=str(dataset.folder),
+        mechanism=dataset.machine.name,
+        checks=tuple(
+            CheckState(name=name, state=found.state(name), found=found.checks[name])
+            for name in CHECKS
+            if name in found.checks
+        ),
+        findings=tuple(sorted(found.findings, key=_severest_first)),
+        encoders=tuple(found.encoders),
+        views=tuple(_conditions(dataset, exposures, seen)),
+        diagnosis=found.diagnosis,
+        is_usable=len(usable) == dataset.measurements.n_rows,
+    )
+
+
+@dataclass
+class _Found:
+    """What was found so far."""
+
+    dataset: Dataset
+    checks: dict[str, str] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)
+    encoders: list[EncoderUse] = field(default_factory=list)
+    diagnosis: tuple[Diagnosis, ...] = ()
+
+    def add(self, check: str, severity: Severity, what: str, rows: Sequence[int] = ()) -> None:
+        """Add a finding; rows are those of the dataset's files."""
+        names = row_names(self.dataset.measurements)
+        images = tuple(names[row] for row in rows)
+        self.findings.append(Finding(check=check, severity=severity, what=what, images=images))
+
+    def state(self, check: str) -> Severity | Literal["ok"]:
+        """Return the severity of the worst finding of a check."""
+        of_check = {one.severity for one in self.findings if one.check == check}
+        return next((one for one in SEVERITIES if one in of_check), "ok")
+
+
+def _severest_first(one: Finding) -> tuple[int, bool, bool]:
+    """Return what findings are sorted by: mistakes explain others, files are needed for all."""
+    return SEVERITIES.index(one.severity), one.check != "files", one.check != "mistakes"
+
+
+def _look_at_files(found: _Found, problems: Sequence[tuple[int, str]]) -> list[int]:
+    """Look for photographs that are not there or cannot be used; return the rows that can."""
+    dataset, m = found.dataset, found.dataset.measurements
+    n, views = sum(map(bool, m.image)), len(np.unique(m.view))
+    found.checks["files"] = (
+        f"{n} photograph{'s' * (n != 1)} of {views} view{'s' * (views != 1)}, {m.n_poses} poses, "
+        f"model {dataset.machine.name}"
+    )
+    bad = [row for row, _ in problems]
+    paths = {row: dataset.image_path(row) for row in bad}
+    missing = [row for row, path in paths.items() if path is not None and not path.exists()]
+    if missing:
+        found.add(
+            "files",
+            "error",
+            f"{dataset.table_path}: found no file of {images_in_words(m, missing)} in "
+            f"{dataset.folder}, needed one for each row; copy them there, correct their names, or "
+            "remove the rows.",
+            missing,
+        )
+    for row, what in problems:
+        if row not in missing:
+            found.add("files", "error", what, [row])
+    return [row for row in range(m.n_rows) if row not in bad]
+
+
+def _look_at_readings(found: _Found, notes: Sequence[str]) -> None:
+    """Compare readings with travel, and their digits with what is stated of their noise."""
+    dataset, q = found.dataset, found.dataset.measurements.q
+    legs = dataset.machine.legs
+    for note in notes:
+        found.add("readings", "warning", note)
+    motors = [j for j, leg in enumerate(legs) if leg.kind is LegKind.ACTUATED]
+    for j, column in zip(motors, reading_columns(legs), strict=True):
+        lower, upper = legs[j].travel
+        is_known = bool(np.isfinite(upper - lower)) and upper > lower
+        least, greatest = float(q[:, j].min()), float(q[:, j].max())
+        travel = (float(lower), float(upper)) if is_known else None
+        used = (greatest - least) / float(upper - lower) if is_known else None
+        found.encoders.append(
+            EncoderUse(column=column.name, least=least, greatest=greatest, travel=travel, used=used)
+        )
+    shares = {one.column: one.used for one in found.encoders if one.used is not None}
+    found.checks["readings"] = f"{len(motors)} encoders"
+    if shares:
+        low, high = (100.0 * end(shares.values()) for end in (min, max))
+        found.checks["readings"] += f", {low:.0f} to {high:.0f} % of their travel used"
+    still = [name for name, share in shares.items() if share < LITTLE_USED]
+    if still:
+        least = 100.0 * min(shares[name] for name in still)
+        found.add(
+            "readings",
+            "warning",
+            f"The readings hardly move: found {few(still)} in {least:.2g} % of the travel, needed "
+            f"{100 * LITTLE_USED:.0f} % or more of every encoder for poses that tell parameters "
+            "apart; take photographs at poses that differ more, and check the unit of readings.",
+        )
+    digit = _last_digit(q[:, motors])
+    if digit is not None and digit / np.sqrt(12.0) > dataset.measurements.sigma_q:
+        rounding = digit / np.sqrt(12.0)
+        found.add(
+            "readings",
+            "warning",
+            f"{dataset.table_path}: found readings in steps of {1e3 * digit:g} mm, whose rounding "
+            f"alone has a standard deviation of {rounding:.2g} m, needed no more than the "
+            f"encoder_sigma of {dataset.measurements.sigma_q:.2g} m in {dataset.yaml_path.name}; "
+            "write more digits, or state a greater encoder_sigma.",
+        )
+
+
+def _last_digit(q: Array) -> float | None:
+    """Return the size of the last digit that readings have [m]; None where they are too few."""
+    values = q[np.isfinite(q)]
+    if len(values) < MIN_READINGS:
+        return None
+    for digits in range(MAX_DIGITS):
+        scaled = values * 10.0**digits
+        if np.all(np.abs(scaled - np.rint(scaled)) < 1e-6):
+            return float(10.0**-digits)
+    return None
+
+
+def _look_at_cameras(found: _Found, choices: Choices) -> None:
+    """Look at what photographs say of how they were made, against camera files and each other."""
+    dataset, m = found.dataset, found.dataset.measurements
+    shown = sorted({int(v) for v in m.view})
+    files = {dataset.camera_paths[v]: m.views[v].camera for v in shown}
+    found.checks["camera"] = ", ".join(
+        f"{path.name}: {camera.width} x {camera.height} px" for path, camera in files.items()
+    )
+    for note in notes_on_photographs(m, dataset.camera_paths, dataset.facts):
+        found.add("camera", "error" if note.is_certain else "warning", note.what)
+    for what in exact_cameras(dataset, choices):
+        found.add("camera", "note", what)
+
+
+def _look_at_parameters(found: _Found, rows: Sequence[int], choices: Choices) -> None:
+    """Say whether some images can determine all that is planned to be estimated."""
+    if not rows:
+        return
+    try:
+        notes = check_identifiable(dataset_at(found.dataset, np.array(rows)), choices)
+    except (NotIdentifiable, DidNotConverge) as error:
+        found.checks["parameters"] = "not all of them can be identified"
+        for what in error.problems:
+            found.add("parameters", "error", what)
+        return
+    found.checks["parameters"] = "identifiable, if every view shows its legs"
+    for what in notes:
+        found.add("parameters", "note", what)
+
+
+def _look_at_photographs(
+    found: _Found, usable: list[int], pool: Run, report: Report
+) -> dict[int, Exposure]:
+    """Look at light, sharpness and equal pixels of photographs; return the first two by row.
+
+    Those that cannot be decoded are taken out of the usable rows.
+    """
+    dataset, m = found.dataset, found.dataset.measurements
+    rows = [row for row in usable if m.image[row] in dataset.facts]
+    exposures, pixels = dict[int, Exposure](), dict[str, list[int]]()
+    if not rows:
+        return {}
+    report(LOOKING, 0, len(rows))
+    look = partial(_look, dataset.image_reader(range(m.n_rows)))
+    for k, (row, (exposure, digest)) in enumerate(zip(rows, pool(look, rows), strict=True)):
+        if exposure is None:
+            found.add("files", "error", digest, [row])
+            usable.remove(row)
+        else:
+            exposures[row] = exposure
+            if not exposure.defect:
+                pixels.setdefault(digest, []).append(row)
+        report(LOOKING, k + 1, len(rows))
+    defects = defects_of(m, exposures)
+    blurs = [one.blur for one in exposures.values()]
+    found.checks["photographs"] = f"{len(exposures) - len(defects)} of {len(rows)} show something"
+    if blurs:
+        found.checks["photographs"] += f", blurred by {_median(blurs):.1f} px"
+    for what in left_out_notes(m, defects, dict.fromkeys(defects, TAKE_AGAIN)):
+        found.add("photographs", "warning", what)
+    for same in (own for own in pixels.values() if len(own) > 1):
+        several = len({int(m.pose[row]) for row in same}) > 1
+        found.add(
+            "files",
+            "error" if several else "warning",
+            f"{_sentence(images_in_words(m, same))} are the same photograph, "
+            + (
+                "with different readings: only one of them can be right"
+                if several
+                else "which would count more than once"
+            )
+            + "; remove the other rows, or name the photographs that belong to them.",
+            same,
+        )
+    _look_at_views(found, {row: one for row, one in exposures.items() if row not in defects})
+    lossy = compressed(m, dataset.facts)
+    if lossy:
+        found.add(
+            "photographs",
+            "note",
+            f"Lossy compression moves outlines: found {lossy}; store photographs without loss "
+            f"(PNG, TIFF) or as JPEGs of quality {GOOD_QUALITY} or more.",
+        )
+    return exposures
+
+
+def _look(load: ImageReader, row: int) -> tuple[Exposure | None, str]:
+    """Return how an image was exposed and a digest of its pixels, or None and why it has none."""
+    try:
+        grey = load(row)
+    except DatasetError as error:
+        return None, error.problems[0]
+    return measure_exposure(grey), hashlib.sha256(grey.tobytes()).hexdigest()
+
+
+def _look_at_views(found: _Found, exposures: Mapping[int, Exposure]) -> None:
+    """Look for views whose photographs are all blurred, or too bright."""
+    m = found.dataset.measurements
+    of_views = {
+        view.name: own
+        for v, view in enumerate(m.views)
+        if (own := [one for row, one in exposures.items() if m.view[row] == v])
+    }
+    blur = {name: _median([one.blur for one in own]) for name, own in of_views.items()}
+    clipped = {name: _median([one.clipped for one in own]) for name, own in of_views.items()}
+    if soft := [name for name in blur if blur[name] > SOFT]:
+        found.add(
+            "photographs",
+            "warning",
+            f"The photographs of {few_views(soft)} are blurred by "
+            f"{_range([blur[name] for name in soft])} px, needed {SOFT:g} px or less for outlines "
+            "that are precise; focus on the legs, close the aperture, and let machine and camera "
+            "stand still.",
+        )
+    if bright := [name for name in clipped if clipped[name] > CLIPPED]:
+        found.add(
+            "photographs",
+            "note",
+            f"In photographs of {few_views(bright)} "
+            f"{_range([100.0 * clipped[name] for name in bright])} % of the pixels are as bright "
+            "as a file can say: edges beside such places cannot be measured well; expose less if "
+            "these are legs or what is behind them.",
+        )
+
+
+def _diagnose(found: _Found, data: OrderedDataset) -> None:
+    """Try common mistakes where images contradict the session."""
+    found.diagnosis = diagnose(data)
+    found.checks["mistakes"] = (
+        "one explains the images better" if found.diagnosis else "none explains the images better"
+    )
+    for one in found.diagnosis:
+        found.add("mistakes", "error", one.sentence)
+
+
+def _look_at_legs(found: _Found, data: OrderedDataset, choices: Choices) -> Detection | None:
+    """Search the images for the legs, and judge what they determine; None if that is refused."""
+    dataset, m = data.dataset, data.dataset.measurements
+    rows = np.array([row for row in range(m.n_rows) if m.image[row]], dtype=np.intp)
+    try:
+        seen = detected(data, rows)
+    except (DatasetError, NotIdentifiable, NotVisible, DidNotConverge) as error:
+        found.checks["legs"] = "they could not be looked for"
+        for what in error.problems:
+            found.add("legs", "error", what)
+        return None
+    figures = seen.document["views"]
+    n_found = sum(one["legs_found"] for one in figures.values())
+    n_visible = sum(one["legs_visible"] for one in figures.values())
+    found.checks["legs"] = (
+        f"{n_found} of {n_visible} found, {seen.document['used']} of {seen.document['outlines']} "
+        "outlines can be used"
+    )
+    for what in dict.fromkeys(seen.unplaced.values()):
+        found.add("legs", "error", what)
+    said = {one.what for one in found.findings}
+    for what in (one for one in seen.image_notes if one not in said):
+        found.add("legs", "warning", what)
+    for what in seen.notes:
+        if what not in (*dataset.notes, *seen.image_notes):
+            found.add("legs", "note", what)
+    for name, one in figures.items():
+        if name not in seen.unplaced and one["legs_found"] < FEW_LEGS * one["legs_visible"]:
+            why = next(iter(one["rejected"]), "no reason given")
+            found.add(
+                "legs",
+                "warning",
+                f"The photographs of view {name} show {one['legs_found']} of {one['legs_visible']} "
+                f"legs that they should, needed most of them (the others mostly because {why}); "
+                "look at legcal detect, and improve light and background.",
+            )
+    _judge_what_is_left(found, seen, choices)
+    return seen
+
+
+def _judge_what_is_left(found: _Found, seen: Detection, choices: Choices) -> None:
+    """Say whether the images and legs that were found determine the parameters."""
+    dataset, m = seen.dataset, seen.dataset.measurements
+    names = np.array([view.name for view in m.views])
+    out = np.isin(np.arange(m.n_rows), list(seen.left_out)) | np.isin(
+        names[m.view], list(seen.unplaced)
+    )
+    unseen = unseen_legs(dataset.machine, m, seen.outlines)
+    if unseen and not out.all():
+        found.add(
+            "legs",
+            "error",
+            f"No photograph shows {few(unseen)} so that an outline can be used, needed some of "
+            "every leg; add images that show it, or name the legs of each view in dataset.yaml to "
+            "leave it to the readings.",
+        )
+    if out.any() and not out.all() and found.state("parameters") != "error":
+        try:
+            check_identifiable(dataset_at(dataset, np.flatnonzero(~out)), choices)
+        except (NotIdentifiable, DidNotConverge) as error:
+            found.checks["parameters"] = "the images that are left cannot determine all of them"
+            for what in error.problems:
+                found.add("parameters", "error", what)
+
+
+def _conditions(
+    dataset: Dataset, exposures: Mapping[int, Exposure], seen: Detection | None
+) -> list[ViewCondition]:
+    """Return what the photographs of each view are like."""
+    m = dataset.measurements
+    figures = {} if seen is None else seen.document["views"]
+    found = []
+    for v in np.unique(m.view).tolist():
+        rows = [row for row in np.flatnonzero(m.view == v).tolist() if row in exposures]
+        qualities = [
+            quality
+            for row in rows
+            if (quality := dataset.facts[m.image[row]].jpeg_quality) is not None
+        ]
+        own = figures.get(m.views[v].name, {})
+        found.append(
+            ViewCondition(
+                view=m.views[v].name,
+                images=len(rows),
+                camera=dataset.camera_paths[v].name,
+                blur_px=_median([exposures[row].blur for row in rows]) if rows else None,
+                clipped=_median([exposures[row].clipped for row in rows]) if rows else None,
+                jpeg_quality=min(qualities, default=None),
+                legs_found=own.get("legs_found"),
+                legs_visible=own.get("legs_visible"),
+                outlines_used=own.get("used"),
+            )
+        )
+    return found
+
+
+def _median(values: Sequence[float]) -> float:
+    return float(np.median(values))
+
+
+def _range(values: Sequence[float]) -> str:
+    """Return values from the least to the greatest, in words."""
+    least, greatest = f"{min(values):.2g}", f"{max(values):.2g}"
+    return least if least == greatest else f"{least} to {greatest}"
+
+
+def _sentence(words: str) -> str:
+    return words[0].upper() + words[1:]

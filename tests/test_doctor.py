@@ -1,0 +1,171 @@
+"""``legcal doctor``: what can stand in the way is provoked, and named once with a remedy."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from command_line import run
+from hexapod_example import Spoiled, spoiled
+from photograph_files import exif, jpeg
+
+from legcal import SimulationSettings, doctor, simulate
+from legcal.calibration import Examination
+from legcal.calibration.diagnosis.diagnosis import Diagnosis
+from legcal.calibration.examination import CHECKS, Finding
+from legcal.simulation import Level
+
+COLUMNS = [f"leg{k}_prismatic" for k in range(1, 7)]
+
+
+def made(folder: Path, n: int = 2) -> Spoiled:
+    """Return a session; views of two images are too few for mistakes to be tried."""
+    return spoiled(folder / "set", n, ("c1", "c2", "c3"))
+
+
+def found_of(found: Examination, check: str, severity: str) -> list[Finding]:
+    return [one for one in found.findings if (one.check, one.severity) == (check, severity)]
+
+
+def test_nothing_stands_against_the_example(tmp_path: Path) -> None:
+    found = doctor(made(tmp_path).write())
+    assert found.is_ready
+    assert found.is_usable
+    assert {one.severity for one in found.findings} == {"note"}
+    assert [one.name for one in found.checks] == list(CHECKS)
+    assert {one.state for one in found.checks} <= {"ok", "note"}
+    assert [one.images for one in found.views] == [2, 2, 2]
+    assert all((one.legs_found or 0) >= 10 for one in found.views)
+    assert len(found.encoders) == 6
+
+
+def test_photographs_that_cannot_be_used_are_named_and_the_others_judged(tmp_path: Path) -> None:
+    session = made(tmp_path, 5)
+    session.rows = [row for k, row in enumerate(session.rows) if k < 5 or k % 5 < 2]
+    gone, cut, spoilt = (str(session.row("c1", k)["image"]) for k in range(3))
+    (session.path / gone).unlink()
+    (session.path / cut).write_bytes((session.path / cut).read_bytes()[:-300])
+    content = (session.path / spoilt).read_bytes()
+    (session.path / spoilt).write_bytes(content[:-4000] + b"x" * 3900 + content[-100:])
+    black = session.change("c2", 0, lambda picture: 0 * picture)
+    first, same = (str(session.row("c3", k)["image"]) for k in range(2))
+    shutil.copy(session.path / first, session.path / same)
+    found = doctor(session.write())
+    assert not found.is_usable
+    missing, damaged, undecoded, twice = found_of(found, "files", "error")
+    assert missing.images == (gone,)
+    assert damaged.images == (cut,)
+    assert "cut off" in damaged.what
+    assert undecoded.images == (spoilt,)
+    assert twice.images == (first, same)
+    assert "are the same photograph, with different readings" in twice.what
+    (dark,) = found_of(found, "photographs", "warning")
+    assert "the image is black" in dark.what
+    assert black in dark.what
+    assert sum(black in one.what for one in found.findings) == 1
+
+
+def test_readings_are_compared_with_travel_digits_and_stated_noise(tmp_path: Path) -> None:
+    session = made(tmp_path)
+    for row in session.rows:
+        row |= {name: f"{float(row[name]):.4f}" for name in COLUMNS}
+        row["leg3_prismatic"] = f"{float(row['leg3_prismatic']) / 50.0 + 0.02:.4f}"
+    found = doctor(session.write())
+    still, coarse = found_of(found, "readings", "warning")
+    assert "found leg3_prismatic in" in still.what
+    assert "in steps of 0.1 mm" in coarse.what
+    assert "encoder_sigma of 2e-06 m" in coarse.what
+
+
+def _as_jpeg(session: Spoiled, view: str, k: int, quality: int, block: bytes) -> str:
+    """Write an image anew as a camera would, and return its name."""
+    row = session.row(view, k)
+    picture = cv2.imread(str(session.path / row["image"]), cv2.IMREAD_GRAYSCALE)
+    row["image"] = str(Path(row["image"]).with_suffix(".jpg"))
+    content = jpeg(np.asarray(picture, dtype=np.uint8), quality, block)
+    (session.path / row["image"]).write_bytes(content)
+    return str(row["image"])
+
+
+def test_what_photographs_say_of_camera_and_compression_is_told(tmp_path: Path) -> None:
+    session = made(tmp_path)
+    usual, other = (exif(make="Acme", model="One", focal=focal) for focal in (4.25, 6.5))
+    names = [
+        _as_jpeg(session, view, k, 60, other if (view, k) == ("c2", 1) else usual)
+        for view in ("c1", "c2", "c3")
+        for k in range(2)
+    ]
+    found = doctor(session.write())
+    (zoomed,) = found_of(found, "camera", "error")
+    assert "one focal length" in zoomed.what
+    assert names[3] in zoomed.what
+    lossy = found_of(found, "photographs", "note")
+    assert "JPEGs of quality 60" in lossy[0].what
+    assert [one.jpeg_quality for one in found.views] == [60, 60, 60]
+    assert not found.is_ready
+    assert found.is_usable
+
+
+def test_blurred_and_bright_views_are_named(tmp_path: Path) -> None:
+    session = made(tmp_path)
+    for k in range(2):
+        session.change("c1", k, lambda picture: np.minimum(picture.astype(float) + 180.0, 255.0))
+        for view in ("c1", "c2", "c3"):
+            session.change(view, k, lambda picture: cv2.GaussianBlur(picture, (0, 0), 6.0))
+    found = doctor(session.write())
+    (soft,) = found_of(found, "photographs", "warning")
+    assert "of views c1, c2, c3 are blurred by" in soft.what
+    (bright,) = found_of(found, "photographs", "note")
+    assert "In photographs of view c1 " in bright.what
+    assert len(found_of(found, "legs", "error")) >= 1  # no camera can be placed
+    assert not found.views[0].legs_found
+
+
+def test_legs_that_no_photograph_shows_and_open_parameters_are_named(tmp_path: Path) -> None:
+    session = made(tmp_path, 1)
+    for name in ("c2", "c3"):
+        session.entry["views"][name]["legs"] = ["leg1", "leg2"]
+    found = doctor(session.write())
+    (open_,) = found_of(found, "parameters", "error")
+    assert "cannot be identified" in open_.what
+    assert not found.is_ready
+
+
+def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mistake = Diagnosis(
+        "columns exchanged", "columns a and b look exchanged", (), "with them exchanged", 6, 1, 6,
+        0.9, "exchange their headers",
+    )  # fmt: skip
+    monkeypatch.setattr("legcal.calibration.examination.diagnose", lambda data: (mistake,))
+    session = made(tmp_path)
+    name = session.change("c1", 0, lambda picture: 0 * picture)
+    folder = session.write()
+    assert run(monkeypatch, "doctor", folder, "--json") == 1
+    document = json.loads(capsys.readouterr().out)
+    assert document["findings"][0]["what"] == mistake.sentence
+    assert document["diagnosis"] == [mistake.document().document()]
+    assert not document["ready"]
+    assert document["usable"]
+    (session.path / name).unlink()
+    assert run(monkeypatch, "doctor", folder) == 2
+    shown = capsys.readouterr().out
+    assert shown.index("error:") < shown.index("Columns a and b look exchanged")
+    assert "things to mend before calibrating" in shown
+
+
+def test_datasets_without_photographs_are_judged_by_what_they_have(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = SimulationSettings(level=Level.AXES, views=3, poses=6)
+    simulate("hexapod", tmp_path / "axes", settings)
+    assert run(monkeypatch, "doctor", tmp_path / "axes") == 0
+    shown = capsys.readouterr().out
+    assert "Nothing stands against calibrating" in shown
+    assert "legcal calibrate" in shown
+    (tmp_path / "axes" / "measurements.csv").unlink()
+    assert run(monkeypatch, "doctor", tmp_path / "axes", "--json") == 2
+    assert json.loads(capsys.readouterr().out)["error"]["kind"] == "DatasetError"
