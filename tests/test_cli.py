@@ -19,6 +19,11 @@ from legcal.errors import ModelError, NotVisible
         (["--help"], {"numpy", "scipy", "pinocchio", "pydantic"}, "calibrate"),
         (["inspect", "hexapod"], {"casadi", "cv2", "trimesh", "yourdfpy", "scipy.stats"}, "SPU"),
         (
+            ["export", "hexapod", "--to", "correction", "-o", "missing.csv", "--json"],
+            {"casadi", "cv2", "trimesh", "scipy.stats", "jinja2", "plotly", "matplotlib"},
+            "needed a result",
+        ),
+        (
             ["calibrate", "missing", "-o", "out", "--json"],
             {
                 *("scipy.stats", "scipy.optimize", "scipy.interpolate", "scipy.sparse.csgraph"),

@@ -367,12 +367,19 @@ def test_tables_have_the_numbers_of_the_result(example_run: Run, tmp_path: Path)
         assert (found["sigma"] == "") == (one.sigma is None)
     for j, leg in enumerate(machine.legs):
         for k, axis in enumerate("xyz"):
-            value = float(in_links[f"{leg.name}.base.{axis}"]["value"])
-            assert value == pytest.approx(1e3 * machine.A_base[j, k], abs=1e-9)
+            found = in_links[f"{leg.name}.base.{axis}"]
+            assert float(found["value"]) == pytest.approx(1e3 * machine.A_base[j, k], abs=1e-9)
+            assert (found["sigma"] == "") == (found["status"] != "estimated")
     document = json.loads(written(subject, "json", tmp_path / "a.json").read_text())
     assert document["units"] == {"length": "mm", "angle": "deg"}
     points = [leg["A"]["link"] for leg in document["legs"]]
     np.testing.assert_allclose(points, 1e3 * machine.A_base, atol=1e-12)
+    number = {row.name: row for row in result.document.parameters}
+    leg4 = next(leg for leg in document["legs"] if leg["name"] == "leg4")
+    C = 1e-6 * np.array(leg4["A"]["covariance"])
+    R = machine.T_base_Rb.rotation.as_matrix()
+    sigma = [number[f"leg4.base.{axis}"].sigma or 0.0 for axis in "xyz"]
+    np.testing.assert_allclose(np.sqrt(np.diagonal(R.T @ C @ R)), sigma, rtol=1e-9)
     kinematic = result.document.kinematic
     assert document["covariance"]["names"] == kinematic.names
     np.testing.assert_allclose(

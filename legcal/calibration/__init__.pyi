@@ -3,6 +3,7 @@ from .camera_calibration.document import CameraCalibration as CameraCalibration
 from .change_detection import Explanation as Explanation
 from .detection import DETECTION_PAGE as DETECTION_PAGE
 from .detection import Detection as Detection
+from .documents import JointInLink as JointInLink
 from .documents import ParameterRow as ParameterRow
 from .documents import Result as Result
 from .evaluation import Evaluation as Evaluation

@@ -12,6 +12,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,7 +26,6 @@ from legcal.calibration.joint_fit import (
     KnownIntrinsics,
 )
 from legcal.calibration.link_joints import joints_in_links
-from legcal.calibration.result import Calibration
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data import CORNERS_NAME, OBSERVATIONS_NAME, write_corners, write_observations
 from legcal.errors import DatasetError, DidNotConverge, ModelError, OutOfClass
@@ -53,6 +53,9 @@ from legcal.vision import (
     intrinsic_names,
     intrinsic_values,
 )
+
+if TYPE_CHECKING:
+    from legcal.calibration.result import Calibration
 
 RESULT_NAME, STAGED_NAME = "result.json", "staged.yaml"
 REPORT_NAME = "report.html"  # written beside a result, which an earlier one does not describe

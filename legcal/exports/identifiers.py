@@ -29,6 +29,11 @@ def identifier(name: str) -> str:
     return found
 
 
+def is_identifier(name: str) -> bool:
+    """Say whether a name is an identifier in all of the languages."""
+    return re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,62}", name) is not None and name not in _RESERVED
+
+
 def identifiers(names: Iterable[str]) -> list[str]:
     """Return names as identifiers that differ from each other."""
     found: list[str] = []

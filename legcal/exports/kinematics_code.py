@@ -14,7 +14,14 @@ from typing import Any
 import numpy as np
 
 from legcal.errors import UsageError
-from legcal.exports.identifiers import c_string, comment, identifier, identifiers, matlab_string
+from legcal.exports.identifiers import (
+    c_string,
+    comment,
+    identifier,
+    identifiers,
+    is_identifier,
+    matlab_string,
+)
 from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
 from legcal.geometry import Array, normal_basis
 from legcal.machine import EquationKind, Leg, LegKind, Machine, inverse_kinematics, leg_scale
@@ -51,7 +58,7 @@ def c_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
 def matlab_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
     """Return a function file of MATLAB; its name is that of the file."""
     name = path.stem
-    if identifier(name) != name.lower() or path.suffix != ".m":
+    if not is_identifier(name) or path.suffix != ".m":
         raise UsageError(
             f"{path}: the export could not be written: found a name that MATLAB cannot call, "
             "needed letters, digits and '_', the first a letter, and the ending .m; give "

@@ -68,13 +68,16 @@ class _Writer:
         self._name = {link: link for link in urdf.links}  # of bodies; the root is the world
         if WORLD in self._name and urdf.root != WORLD:
             self._name[WORLD] = _unused(WORLD, set(urdf.links))
+        self._joints = set(urdf.joints)
         self._body: dict[str, etree._Element] = {urdf.root: self._world}
 
     def model(self, name: str) -> etree._Element:
         """Return ``<mujoco>``."""
         machine = self._machine
         mujoco = etree.Element("mujoco", model=name)
-        etree.SubElement(mujoco, "compiler", angle="radian", autolimits="true")
+        etree.SubElement(
+            mujoco, "compiler", angle="radian", autolimits="true", balanceinertia="true"
+        )
         etree.SubElement(mujoco, "option", gravity="0 0 0")
         mujoco.append(self._world)
         self._shapes(machine.urdf.root, self._world)
@@ -119,7 +122,7 @@ class _Writer:
                 (f"{joint.name}_y", "slide", turned @ _Y, y),
                 (f"{joint.name}_turn", "hinge", _Z, np.arctan2(sine, cosine)),
             ):
-                _joint(body, name, kind, axis, value)
+                _joint(body, _unused(name, self._joints), kind, axis, value)
         elif joint.moves:
             value = home[chain.q_index(joint.name)]
             if joint.type == "continuous":

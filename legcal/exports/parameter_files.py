@@ -9,9 +9,10 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -20,9 +21,13 @@ from legcal.geometry import Array
 from legcal.machine import Leg, LegKind, geometries
 from legcal.version import __version__
 
+if TYPE_CHECKING:
+    from legcal.calibration import JointInLink
+
 UNITS = {"m": (1e3, "mm"), "rad": (float(np.degrees(1.0)), "deg")}  # of files; others stay
 COLUMNS = ("name", "frame", "unit", "value", "nominal", "change", "sigma", "status")
 _DIGITS = 6  # of the table, behind the point
+_OF_FRAME = re.compile(r"\.(base|platform)(\.[xyz]|_axis\.[12])$")
 _MODEL = "model"  # the status of numbers without a result
 
 
@@ -35,7 +40,7 @@ class Row(NamedTuple):
     value: float
     nominal: float | None  # None without a result
     sigma: float | None  # None where it was not estimated
-    status: str  # estimated, fixed, weak, frame (zero by the definition of it) or model
+    status: str  # estimated, fixed, weak, frame (defines R_b or R_e), derived (axes) or model
 
     @property
     def change(self) -> float | None:
@@ -73,7 +78,7 @@ def table_files(subject: Subject, options: ExportOptions, path: Path) -> Rendere
 
 def json_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
     """Return legs in links and in R_b and R_e, and the parameters with their covariance."""
-    machine = subject.machine
+    machine, known = subject.machine, _joints(subject)
     document: dict[str, Any] = {
         "legcal_export": 1,
         "legcal": __version__,
@@ -86,7 +91,7 @@ def json_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered
         "T_platform_Re": _millimetres(machine.T_platform_Re.as_matrix()),
         "home": _millimetres(machine.home.as_matrix()),
         "legs": [
-            _leg(name, in_links, in_frames)
+            _leg(name, in_links, in_frames, known)
             for name, in_links, in_frames in zip(
                 machine.leg_names, machine.legs_of_frames, geometries(machine), strict=True
             )
@@ -113,25 +118,49 @@ def rows_of(subject: Subject) -> list[Row]:
 
 
 def _joint_rows(subject: Subject) -> Iterator[Row]:
-    """Give the joint centres in their links."""
+    """Give joint centres and axes in their links."""
     machine, nominal = subject.machine, subject.nominal
+    known = _joints(subject)
     for side, link in (("base", machine.base), ("platform", machine.platform)):
         for j, leg in enumerate(machine.legs_of_frames):
-            point = leg.A if side == "base" else leg.B
-            before = None
+            joint = known.get((side, leg.name))
+            point, axis = _end(leg, side)
+            before, turned = None, None
             if nominal is not None:
-                other = nominal.legs_of_frames[j]
-                before = other.A if side == "base" else other.B
-            for k, axis in enumerate("xyz"):
+                before, turned = _end(nominal.legs_of_frames[j], side)
+            if axis is not None and turned is not None and axis @ turned < 0.0:
+                turned = -turned  # an axis is a line
+            for k, letter in enumerate("xyz"):
+                sigma = None if joint is None else joint.sigma[k]
                 yield Row(
-                    f"{leg.name}.{side}.{axis}",
+                    f"{leg.name}.{side}.{letter}",
                     link,
                     "mm",
                     1e3 * float(point[k]),
                     None if before is None else 1e3 * float(before[k]),
-                    None,
-                    _MODEL,
+                    None if sigma is None else 1e3 * sigma,
+                    _MODEL if joint is None else joint.status[k],
                 )
+            if axis is None:
+                continue
+            for k, letter in enumerate("xyz"):
+                before_k = None if turned is None else float(turned[k])
+                status = _MODEL if joint is None else "derived"
+                name = f"{leg.name}.{side}_axis.{letter}"
+                yield Row(name, link, "", float(axis[k]), before_k, None, status)
+
+
+def _joints(subject: Subject) -> dict[tuple[str, str], JointInLink]:
+    """Return what a result knows of joints in their links, by side and leg."""
+    links = None if subject.result is None else subject.result.document.links
+    return {
+        (side, joint.leg): joint for side, block in (links or {}).items() for joint in block.joints
+    }
+
+
+def _end(leg: Leg, side: str) -> tuple[Array, Array | None]:
+    """Return the joint centre and the axis of a leg at base or platform."""
+    return (leg.A, leg.base_axis) if side == "base" else (leg.B, leg.platform_axis)
 
 
 def _parameter_rows(subject: Subject) -> Iterator[Row]:
@@ -151,16 +180,20 @@ def _parameter_rows(subject: Subject) -> Iterator[Row]:
         if leg.kind is not LegKind.PASSIVE:
             what = "length" if leg.kind is LegKind.CONSTANT else "offset"
             yield Row(f"{name}.{what}", "", "mm", 1e3 * leg.q0, None, None, _MODEL)
+        if leg.twist is not None:
+            degrees = float(np.degrees(leg.twist))
+            yield Row(f"{name}.twist", "", "deg", degrees, None, None, _MODEL)
 
 
 def _frame_of(name: str) -> str:
     """Return the frame of a parameter by its name."""
-    if ".base" in name:
-        return "R_b"
-    return "R_e" if ".platform" in name else ""
+    side = _OF_FRAME.search(name)
+    return "" if side is None else {"base": "R_b", "platform": "R_e"}[side[1]]
 
 
-def _leg(name: str, in_links: Leg, in_frames: Leg) -> dict[str, Any]:
+def _leg(
+    name: str, in_links: Leg, in_frames: Leg, known: Mapping[tuple[str, str], JointInLink]
+) -> dict[str, Any]:
     """Return a leg of the document."""
     has_travel = in_links.kind is not LegKind.CONSTANT and bool(np.isfinite(in_links.travel).all())
     return {
@@ -170,8 +203,16 @@ def _leg(name: str, in_links: Leg, in_frames: Leg) -> dict[str, Any]:
         "sign": in_links.sign,
         "offset": None if in_links.kind is LegKind.PASSIVE else 1e3 * in_links.q0,
         "travel": [1e3 * x for x in in_links.travel] if has_travel else None,
-        "A": {"link": _point(in_links.A), "R_b": _point(in_frames.A)},
-        "B": {"link": _point(in_links.B), "R_e": _point(in_frames.B)},
+        "A": {
+            "link": _point(in_links.A),
+            "R_b": _point(in_frames.A),
+            **_uncertainty(known.get(("base", name))),
+        },
+        "B": {
+            "link": _point(in_links.B),
+            "R_e": _point(in_frames.B),
+            **_uncertainty(known.get(("platform", name))),
+        },
         "base_axis": _axes(in_links.base_axis, in_frames.base_axis, "R_b"),
         "platform_axis": _axes(in_links.platform_axis, in_frames.platform_axis, "R_e"),
         "twist": None if in_links.twist is None else float(np.degrees(in_links.twist)),
@@ -181,6 +222,16 @@ def _leg(name: str, in_links: Leg, in_frames: Leg) -> dict[str, Any]:
 def _point(point: Array) -> list[float]:
     """Return a point in millimetres."""
     return [1e3 * float(x) for x in point]
+
+
+def _uncertainty(joint: JointInLink | None) -> dict[str, Any]:
+    """Return what is known of a joint centre in its link [mm, mm^2]."""
+    if joint is None:
+        return {}
+    return {
+        "sigma": [None if sigma is None else 1e3 * sigma for sigma in joint.sigma],
+        "covariance": (1e6 * np.array(joint.covariance)).tolist(),
+    }
 
 
 def _axes(in_link: Array | None, in_frame: Array | None, frame: str) -> dict[str, Any] | None:
@@ -200,4 +251,4 @@ def _millimetres(matrix: Array) -> list[list[float]]:
 
 def _shown(value: str | float) -> str:
     """Return a cell of the table."""
-    return value if isinstance(value, str) else f"{value:.{_DIGITS}f}"
+    return value if isinstance(value, str) else f"{round(value, _DIGITS) + 0.0:.{_DIGITS}f}"
