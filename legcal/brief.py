@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Set
 from dataclasses import fields, is_dataclass
+from html import escape
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,11 +22,13 @@ _WIDTH = 100  # characters of a line
 
 
 def brief(cls: type[T]) -> type[T]:
-    """Give a dataclass a ``repr`` of at most ten lines, however much it holds.
+    """Give a dataclass a ``repr`` of at most ten lines, however much it holds, and a table of HTML.
 
     Large arrays are shown by their shape, sequences by what is in them, dataclasses by their name.
     """
     cls.__repr__ = _repr  # type: ignore[method-assign]
+    if not hasattr(cls, "_repr_html_"):
+        cls._repr_html_ = _repr_html  # type: ignore[attr-defined]
     return cls
 
 
@@ -42,6 +45,20 @@ def _repr(self: object) -> str:
     if len(shown) > _MAX_FIELDS:
         shown = [*shown[: _MAX_FIELDS - 1], f"... and {len(shown) - _MAX_FIELDS + 1} more"]
     return f"{name}(" + ",".join(f"\n    {one}" for one in shown) + ")"
+
+
+def _repr_html(self: object) -> str:
+    """Return what a notebook shows: the answer, if the object is one, and a row a field."""
+    answer = getattr(self, "sentence", None)
+    told = f"<p><b>{escape(answer)}</b></p>" if isinstance(answer, str) else ""
+    rows = "".join(
+        f'<tr><td style="text-align:left">{escape(field.name)}</td>'
+        f'<td style="text-align:left">{escape(_value(getattr(self, field.name)))}</td></tr>'
+        for field in fields(self)  # type: ignore[arg-type]
+        if field.repr
+    )
+    name = escape(type(self).__name__)
+    return f"{told}<details open><summary>{name}</summary><table>{rows}</table></details>"
 
 
 def _value(value: object) -> str:

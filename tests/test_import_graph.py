@@ -23,7 +23,17 @@ ROOMS = (
     "cli",
 )
 BESIDE = "simulation"  # it knows the truth
-OUTSIDE = {"__main__", "brief", "errors", "processors", "progress", "signals", "version", "workers"}
+OUTSIDE = {
+    "__main__",
+    "brief",
+    "errors",
+    "figures",
+    "processors",
+    "progress",
+    "signals",
+    "version",
+    "workers",
+}
 
 
 @cache

@@ -1,12 +1,15 @@
 """legcal in an interactive session: short to look at; arrays, texts and figures to go on with."""
 
+import contextlib
 import dataclasses
+import io
+import re
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from hexapod_example import Run
+from hexapod_example import ROOT, Run
 from matplotlib import pyplot
 from scipy.spatial.transform import Rotation
 
@@ -70,10 +73,10 @@ def test_figures_show_every_view_and_every_parameter(example_run: Run) -> None:
     residuals, sigma = calibration.plot_residuals(), calibration.plot_uncertainty()
     titles = [axes.get_title() for axes in residuals.axes]
     assert [title.split(":")[0] for title in titles] == ["c1", "c2", "c3"]
+    assert pyplot.get_fignums() == []  # nothing stays open
     labels = [label.get_text() for label in sigma.axes[0].get_yticklabels()]
     estimated = [row for row in calibration.result.parameters if row.sigma and row.unit == "m"]
     assert labels == [row.name for row in estimated]
-    pyplot.close("all")
 
 
 def test_a_fit_without_outlines_has_no_residuals_to_draw(tmp_path: Path) -> None:
@@ -99,3 +102,41 @@ def test_progress_can_be_switched_on(example_run: Run, capsys: pytest.CaptureFix
     assert "Joint fit: 1/1" in capsys.readouterr().err
     legcal.calibrate(example_run.folder, progress=False)
     assert capsys.readouterr().err == ""
+
+
+def test_a_machine_is_drawn_with_numbered_joints_and_hostile_names(tmp_path: Path) -> None:
+    machine = legcal.load_mechanism("3-rps")
+    legs = [dataclasses.replace(leg, name=f"$\\frac{{{leg.name}") for leg in machine.legs]
+    hostile = dataclasses.replace(machine, name="$x^$", legs=tuple(legs))
+    figure = hostile.plot()
+    figure.savefig(tmp_path / "machine.png", dpi=20)
+    above, side = figure.axes
+    for panel in (above, side):
+        assert {"A1", "A2", "A3", "B1", "B2", "B3"} <= {text.get_text() for text in panel.texts}
+    discs = np.asarray(above.collections[0].get_offsets(), dtype=np.float64)
+    np.testing.assert_allclose(discs, 1e3 * machine.A_base[:, :2])
+    assert len(legcal.load_mechanism("3-rpr").plot().axes) == 1  # a plane is seen from above
+    assert pyplot.get_fignums() == []
+
+
+def test_notebooks_show_other_objects_as_tables_of_text() -> None:
+    machine = dataclasses.replace(legcal.load_mechanism("3-rps"), name="<b>")
+    html = machine._repr_html_()  # type: ignore[attr-defined]
+    assert "&lt;b&gt;" in html
+    assert "<b>" not in html
+
+
+def test_the_examples_of_the_page_on_python_print_what_it_says(
+    example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (ROOT / "docs" / "python.md").read_text()
+    (tmp_path / "calibrated").symlink_to(example_run.output)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    examples = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", page, re.DOTALL)
+    assert len(examples) == page.count("```python")
+    for code, expected in examples:
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            exec(code, names)
+        assert printed.getvalue() == expected

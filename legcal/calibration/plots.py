@@ -8,6 +8,7 @@ import numpy as np
 
 from legcal.calibration.documents import ParameterRow, Result
 from legcal.errors import UsageError
+from legcal.figures import new_figure, plain
 from legcal.geometry import Array
 
 if TYPE_CHECKING:
@@ -32,8 +33,6 @@ def plot_residuals(posterior: Posterior) -> Figure:
     UsageError
         If the fit has no outlines, being made from axes or corners.
     """
-    from matplotlib import pyplot
-
     outlines, cameras = posterior.problem.outlines, posterior.state.cameras
     if not len(outlines):
         raise UsageError(
@@ -44,31 +43,23 @@ def plot_residuals(posterior: Posterior) -> Figure:
     direction = _directions(posterior)
     rms = float(np.sqrt(np.mean(off**2)))
     views = np.unique(outlines.view).tolist()
-    columns = min(len(views), _COLUMNS)
-    rows = -(-len(views) // columns)
-    figure, panels = pyplot.subplots(
-        rows, columns, figsize=(_WIDTH * columns, _HEIGHT * rows), squeeze=False
-    )
-    for panel in panels.flat[len(views) :]:
-        panel.set_visible(False)
-    for panel, view in zip(panels.flat, views, strict=False):
-        seen = outlines.view == view
-        camera, here = cameras[view], off[seen]
-        scale = _ARROW * camera.width / max(3.0 * rms, 1e-9)
-        for end in range(2):
-            arrows = scale * here[:, end, None] * direction[seen]
-            panel.quiver(
-                *outlines.pixels[seen, end].T, *arrows.T, outlines.leg[seen],
-                angles="xy", scale_units="xy", scale=1.0, width=0.004, cmap="tab10",
-            )  # fmt: skip
-        panel.set_xlim(-0.5, camera.width - 0.5)
-        panel.set_ylim(camera.height - 0.5, -0.5)
-        panel.set_aspect("equal")
-        panel.set_title(
-            f"{outlines.views[view]}: {np.sqrt(np.mean(here**2)):.3f} px rms", fontsize="medium"
-        )
-    figure.suptitle(f"Outlines less the fit, a colour a leg; arrows {scale:.0f} times as long")
-    figure.tight_layout()
+    with new_figure(len(views), _COLUMNS, (_WIDTH, _HEIGHT)) as (figure, panels):
+        for panel, view in zip(panels, views, strict=False):
+            seen = outlines.view == view
+            camera, here = cameras[view], off[seen]
+            scale = _ARROW * camera.width / max(3.0 * rms, 1e-9)
+            for end in range(2):
+                arrows = scale * here[:, end, None] * direction[seen]
+                panel.quiver(
+                    *outlines.pixels[seen, end].T, *arrows.T, outlines.leg[seen],
+                    angles="xy", scale_units="xy", scale=1.0, width=0.004, cmap="tab10",
+                )  # fmt: skip
+            panel.set_xlim(-0.5, camera.width - 0.5)
+            panel.set_ylim(camera.height - 0.5, -0.5)
+            panel.set_aspect("equal")
+            name, size = plain(outlines.views[view]), float(np.sqrt(np.mean(here**2)))
+            panel.set_title(f"{name}: {size:.3f} px rms", fontsize="medium")
+        figure.suptitle(f"Outlines less the fit, a colour a leg; arrows {scale:.0f} times as long")
     return figure
 
 
@@ -98,8 +89,6 @@ def _directions(posterior: Posterior) -> Array:
 
 def plot_uncertainty(result: Result) -> Figure:
     """Return a figure of standard deviations: of all parameters, and of the platform at poses."""
-    from matplotlib import pyplot
-
     groups = [
         (rows, scale, unit)
         for of, scale, unit in (("m", 1e3, "mm"), ("rad", float(np.degrees(1.0)), "deg"))
@@ -108,24 +97,21 @@ def plot_uncertainty(result: Result) -> Figure:
     platform = result.platform
     n = len(groups) + (platform is not None)
     longest = max((len(rows) for rows, _, _ in groups), default=0)
-    figure, panels = pyplot.subplots(
-        1, max(n, 1), figsize=(_WIDTH * max(n, 1), max(_HEIGHT, _LINE * longest)), squeeze=False
-    )
-    for panel, (rows, scale, unit) in zip(panels.flat, groups, strict=False):
-        _bars(panel, rows, scale)
-        panel.set_xlabel(f"1 sigma [{unit}]")
-    if platform is not None:
-        panel = panels.flat[n - 1]
-        number = np.arange(1, len(platform.per_pose) + 1)
-        for values, label in (
-            ([one.change_dX_m for one in platform.per_pose], "change against the nominal model"),
-            ([one.sigma_dX_m for one in platform.per_pose], "predicted error (1 sigma)"),
-        ):
-            panel.semilogy(number, 1e3 * np.array(values), ".-", label=label)
-        panel.set_xlabel("pose")
-        panel.set_ylabel("platform [mm]")
-        panel.legend(fontsize="small")
-    figure.tight_layout()
+    with new_figure(n, n, (_WIDTH, max(_HEIGHT, _LINE * longest))) as (figure, panels):
+        for panel, (rows, scale, unit) in zip(panels, groups, strict=False):
+            _bars(panel, rows, scale)
+            panel.set_xlabel(f"1 sigma [{unit}]")
+        if platform is not None:
+            panel = panels[n - 1]
+            number = np.arange(1, len(platform.per_pose) + 1)
+            for values, label in (
+                ([p.change_dX_m for p in platform.per_pose], "change against the nominal model"),
+                ([p.sigma_dX_m for p in platform.per_pose], "predicted error (1 sigma)"),
+            ):
+                panel.semilogy(number, 1e3 * np.array(values), ".-", label=label)
+            panel.set_xlabel("pose")
+            panel.set_ylabel("platform [mm]")
+            panel.legend(fontsize="small")
     return figure
 
 
@@ -133,6 +119,6 @@ def _bars(panel: Axes, rows: list[ParameterRow], scale: float) -> None:
     """Draw a bar for each parameter, the first at the top."""
     sigma = [scale * (row.sigma or 0.0) for row in rows]
     panel.barh(range(len(rows)), sigma)
-    panel.set_yticks(range(len(rows)), [row.name for row in rows], fontsize="x-small")
+    panel.set_yticks(range(len(rows)), [plain(row.name) for row in rows], fontsize="x-small")
     panel.invert_yaxis()
     panel.margins(y=0.01)

@@ -17,6 +17,11 @@ from .directions import leg_labels as leg_labels
 from .directions import list_in_words as list_in_words
 from .directions import sparse_basis as sparse_basis
 from .directions import split_by_motion as split_by_motion
+from .drawing import AXIS_COLOURS as AXIS_COLOURS
+from .drawing import BASE_COLOUR as BASE_COLOUR
+from .drawing import LEG_COLOUR as LEG_COLOUR
+from .drawing import PLATFORM_COLOUR as PLATFORM_COLOUR
+from .drawing import around as around
 from .equations import PoseEquations as PoseEquations
 from .equations import VectorOps as VectorOps
 from .equations import axis_in_leg as axis_in_leg

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -14,6 +14,7 @@ from legcal.errors import UsageError
 from legcal.files import motion_to_xyz_quat
 from legcal.geometry import Array, frame_on_points
 from legcal.machine.chain import ClosedChain
+from legcal.machine.drawing import Sketch
 from legcal.machine.leg import (
     Cylinder,
     JointType,
@@ -24,6 +25,9 @@ from legcal.machine.leg import (
     with_platform_points,
 )
 from legcal.machine.urdf import Urdf
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @brief
@@ -147,6 +151,28 @@ class Machine:
             platform[leg, rank:n_d] = 0.0
         found = parameters_of_legs(self.legs_of_frames)
         return replace(found, base_joints=base, platform_joints=platform)
+
+    def plot(self) -> "Figure":
+        """Return a figure of the machine at home from above and from the side, in millimetres.
+
+        Joints have the number of their leg (A1 on the base, B1 on the platform); those that define
+        R_b and R_e have a ring, and axes are red (x), green (y) and blue (z).
+        """
+        return self.sketch.plot()
+
+    @cached_property
+    def sketch(self) -> Sketch:
+        """What pictures of the machine at home show."""
+        B = np.asarray(self.home.apply(self.B_platform))
+        return Sketch.of(
+            self.name,
+            self.leg_names,
+            self.frame_legs,
+            tuple(max([c.radius for c in leg.cylinders], default=0.0) for leg in self.legs),
+            (self.A_base, B),
+            (("R_b", self.T_base_Rb), ("R_e", self.home * self.T_platform_Re)),
+            spatial=self.spatial,
+        )
 
     def with_cylinders(self, cylinders: Sequence[Sequence[Cylinder]]) -> "Machine":
         """Return the mechanism with other visible cylinders of its legs."""

@@ -17,12 +17,17 @@ import numpy as np
 from legcal.errors import printable
 from legcal.files import OutputFile
 from legcal.geometry import Array
-from legcal.machine import Machine
+from legcal.machine import (
+    AXIS_COLOURS,
+    BASE_COLOUR,
+    LEG_COLOUR,
+    PLATFORM_COLOUR,
+    Machine,
+    around,
+)
 
 _SIDE, _EDGE, _HEAD, _LINE = 420.0, 46.0, 44.0, 15.0  # of a panel, its margin, title, text [px]
 _ARM = 34.0  # of the axis of a frame [px]
-_BASE, _PLATFORM, _LEG = "#333333", "#1f66b0", "#b9b9b9"
-_AXES = ("#c62828", "#2e7d32", "#1565c0")
 _MARK = b"<!-- legcal inspect -->"
 
 
@@ -45,11 +50,8 @@ MACHINE_PICTURE = _Drawing(
 
 def draw_machine(machine: Machine) -> str:
     """Return a machine as SVG: from above (x to the right, y up) and from the side (z up)."""
-    A = machine.A_base
-    B = np.asarray(machine.home.apply(machine.B_platform))
-    frames = [("R_b", machine.T_base_Rb), ("R_e", machine.home * machine.T_platform_Re)]
-    views = [("from above", (0, 1))] + [("from the side", (0, 2))] * machine.spatial
-    points = np.concatenate([A, B])
+    views = machine.sketch.panels
+    points = np.concatenate([machine.A_base, machine.home.apply(machine.B_platform)])
     low, high = points.min(axis=0), points.max(axis=0)
     scale = (_SIDE - 2 * _EDGE) / max(float((high - low).max()), 1e-6)
     width, height = _SIDE * len(views), _HEAD + _SIDE + _LINE * (2 + (machine.n_legs + 3) // 4)
@@ -60,37 +62,33 @@ def draw_machine(machine: Machine) -> str:
         '<rect width="100%" height="100%" fill="white"/>',
         _text((12, 20), f"{machine.name} at home", size=15),
     ]
-    for k, (name, axes) in enumerate(views):
-        chosen = list(axes)
-        middle = 0.5 * (low + high)[chosen]
+    for k, panel in enumerate(views):
+        both = np.concatenate([panel.A, panel.B])
+        middle = 0.5 * (both.min(axis=0) + both.max(axis=0))
         corner = np.array([_SIDE * (k + 0.5), _HEAD + 0.5 * _SIDE])
 
-        def on_paper(
-            points: Array, chosen: list[int] = chosen, middle: Array = middle, at: Array = corner
-        ) -> Array:
-            return np.asarray(at + scale * (points[..., chosen] - middle) * [1.0, -1.0])
+        def on_paper(points: Array, middle: Array = middle, at: Array = corner) -> Array:
+            return np.asarray(at + scale * (points - middle) * [1.0, -1.0])
 
-        lines.append(_text((_SIDE * k + 12, _HEAD), f"{name}: x to the right, {'xyz'[axes[1]]} up"))
-        is_plan = axes == (0, 1)
-        if is_plan:
-            lines += [*_outline(on_paper(A), _BASE), *_outline(on_paper(B), _PLATFORM)]
-        for leg, a, b in zip(machine.legs, on_paper(A), on_paper(B), strict=True):
-            thick = 2.0 * scale * max([c.radius for c in leg.cylinders], default=0.0)
-            lines.append(_line(a, b, _LEG, max(thick, 1.5), opacity=0.7))
-        for letter, joints, colour in (("A", A, _BASE), ("B", B, _PLATFORM)):
-            lines += _joints(machine, letter, on_paper(joints), colour, is_plan=is_plan)
-        for frame, T in frames:
-            arms = _ARM / scale * T.rotation.as_matrix().T
-            lines += _frame(frame, on_paper(np.vstack([T.translation, T.translation + arms])))
+        A, B = on_paper(panel.A), on_paper(panel.B)
+        lines.append(_text((_SIDE * k + 12, _HEAD), panel.title))
+        if panel.is_plan:
+            lines += [*_outline(A, BASE_COLOUR), *_outline(B, PLATFORM_COLOUR)]
+        for j, (a, b) in enumerate(zip(A, B, strict=True)):
+            thick = 2.0 * scale * machine.sketch.radii[j]
+            lines.append(_line(a, b, LEG_COLOUR, max(thick, 1.5), opacity=0.7))
+        for letter, joints, colour in (("A", A, BASE_COLOUR), ("B", B, PLATFORM_COLOUR)):
+            lines += _joints(machine, letter, joints, colour, is_plan=panel.is_plan)
+        for frame, (origin, *arms) in panel.frames:
+            ends = origin + _ARM / scale * np.array(arms)
+            lines += _frame(frame, on_paper(np.vstack([origin, ends])))
     lines += _legend(machine, scale)
     return "\n".join([*lines, "</svg>"]) + "\n"
 
 
 def _outline(joints: Array, colour: str) -> Iterator[str]:
     """Yield the polygon of joints, in the order of their angles about their middle."""
-    away = joints - joints.mean(axis=0)
-    order = np.argsort(np.arctan2(away[:, 1], away[:, 0]))
-    corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in joints[order])
+    corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in around(joints))
     yield (
         f'<polygon points="{corners}" fill="{colour}" fill-opacity="0.06" stroke="{colour}" '
         'stroke-opacity="0.5" stroke-dasharray="4 3"/>'
@@ -118,7 +116,7 @@ def _joints(
 
 def _frame(name: str, points: Array) -> Iterator[str]:
     """Yield the axes of a frame: its origin and the ends of x, y and z."""
-    for axis, (end, colour) in enumerate(zip(points[1:], _AXES, strict=True)):
+    for axis, (end, colour) in enumerate(zip(points[1:], AXIS_COLOURS, strict=True)):
         if np.linalg.norm(end - points[0]) < 3.0:  # towards the eye
             continue
         yield _line(points[0], end, colour, 2.0)
@@ -131,7 +129,7 @@ def _legend(machine: Machine, scale: float) -> Iterator[str]:
     """Yield a length to compare with, and which leg has which number."""
     y = _HEAD + _SIDE
     step = _round_length(100.0 / scale)
-    yield _line((12, y), (12 + step * scale, y), _BASE, 2.0)
+    yield _line((12, y), (12 + step * scale, y), BASE_COLOUR, 2.0)
     yield _text((18 + step * scale, y + 4), f"{1e3 * step:g} mm")
     frame = ", ".join(str(j + 1) for j in machine.frame_legs)
     y += _LINE

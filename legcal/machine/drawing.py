@@ -1,0 +1,128 @@
+"""What a picture of a machine at home shows: from above and from the side, joints and frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.figures import new_figure, plain
+from legcal.geometry import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+BASE_COLOUR, PLATFORM_COLOUR, LEG_COLOUR = "#333333", "#1f66b0", "#b9b9b9"
+AXIS_COLOURS = ("#c62828", "#2e7d32", "#1565c0")  # x, y, z
+_PANEL = (5.0, 5.0)  # [inch]
+_ARM = 0.1  # of the size of the machine: the axes of a frame
+_RING = 140.0  # [pt^2]: around joints that define R_b and R_e
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """A machine seen along an axis of its base link, in the coordinates of the other two [m]."""
+
+    title: str
+    is_plan: bool  # from above
+    A: Array  # (n_legs, 2) joints of the base
+    B: Array  # (n_legs, 2) joints of the platform at home
+    frames: tuple[tuple[str, Array], ...]  # R_b and R_e: (4, 2) origin, and x, y, z from it
+
+
+def around(joints: Array) -> Array:
+    """Return joints (n, 2) in the order of their angles about their middle."""
+    away = joints - joints.mean(axis=0)
+    return np.asarray(joints[np.argsort(np.arctan2(away[:, 1], away[:, 0]))])
+
+
+@dataclass(frozen=True, eq=False)
+class Sketch:
+    """What a picture of a machine shows."""
+
+    name: str
+    leg_names: tuple[str, ...]
+    frame_legs: tuple[int, ...]
+    radii: tuple[float, ...]  # the largest of what is seen of each leg [m]; zero without any
+    panels: tuple[Panel, ...]  # from above (y up), and in space from the side (z up)
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        leg_names: tuple[str, ...],
+        frame_legs: tuple[int, ...],
+        radii: tuple[float, ...],
+        joints: tuple[Array, Array],  # (n_legs, 3) of base and platform at home, in the base [m]
+        frames: tuple[tuple[str, RigidTransform], ...],  # in the base
+        *,
+        spatial: bool,
+    ) -> Sketch:
+        """Return that of a machine with these parts."""
+        A, B = joints
+        views = [("from above", [0, 1])] + [("from the side", [0, 2])] * spatial
+        panels = tuple(
+            Panel(
+                f"{view}: x to the right, {'xyz'[axes[1]]} up",
+                axes == [0, 1],
+                A[:, axes],
+                B[:, axes],
+                tuple(
+                    (frame, np.vstack([T.translation, T.rotation.as_matrix().T])[:, axes])
+                    for frame, T in frames
+                ),
+            )
+            for view, axes in views
+        )
+        return cls(name, leg_names, frame_legs, radii, panels)
+
+    def plot(self) -> Figure:
+        """Return a Matplotlib figure, lengths in millimetres."""
+        with new_figure(len(self.panels), 2, _PANEL) as (figure, axes):
+            for panel, ax in zip(self.panels, axes, strict=True):
+                _draw(self, panel, ax)
+            rings = ", ".join(plain(self.leg_names[j]) for j in self.frame_legs)
+            figure.suptitle(
+                f"{plain(self.name)} at home [mm]; rings: joints of {rings}, which define R_b "
+                "and R_e",
+                fontsize="medium",
+            )
+        return figure
+
+
+def _draw(sketch: Sketch, panel: Panel, ax: Axes) -> None:
+    """Draw one panel."""
+    A, B = 1e3 * panel.A, 1e3 * panel.B
+    size = float(np.ptp(np.concatenate([A, B]), axis=0).max())
+    for joints, colour in ((A, BASE_COLOUR), (B, PLATFORM_COLOUR)):
+        if panel.is_plan:
+            ax.fill(*around(joints).T, facecolor=colour, edgecolor=colour, alpha=0.08)
+    for j, (a, b) in enumerate(zip(A, B, strict=True)):
+        across = np.array([a[1] - b[1], b[0] - a[0]])
+        across *= 1e3 * sketch.radii[j] / max(float(np.linalg.norm(across)), 1e-9)
+        ax.fill(*np.array([a + across, b + across, b - across, a - across]).T, color=LEG_COLOUR)
+        ax.plot(*np.array([a, b]).T, color=LEG_COLOUR, linewidth=1.0)
+    for letter, joints, colour in (("A", A, BASE_COLOUR), ("B", B, PLATFORM_COLOUR)):
+        ax.scatter(joints[:, 0], joints[:, 1], s=25.0, color=colour, zorder=3)
+        rings = joints[list(sketch.frame_legs)]
+        ax.scatter(
+            rings[:, 0], rings[:, 1], s=_RING, facecolors="none", edgecolors=colour, zorder=3
+        )
+        for j, joint in enumerate(joints):
+            ax.annotate(
+                f"{letter}{j + 1}", joint, (7.0, 7.0), textcoords="offset points", color=colour
+            )
+    for name, (origin, *arms) in panel.frames:
+        at = 1e3 * origin
+        for k, (arm, colour) in enumerate(zip(arms, AXIS_COLOURS, strict=True)):
+            end = at + _ARM * size * arm
+            if np.linalg.norm(arm) < 0.05:  # towards the eye
+                continue
+            ax.annotate("", end, at, arrowprops={"arrowstyle": "->", "color": colour})
+            ax.annotate(f"{name} x" if k == 0 else "xyz"[k], end, color=colour, fontsize="small")
+    ax.set_aspect("equal")
+    ax.margins(0.12)
+    ax.set_title(panel.title, fontsize="medium")
