@@ -17,7 +17,7 @@ from legcal.report.page.evidence import (
     note_blocks,
     reproducibility_blocks,
 )
-from legcal.report.page.parameter_rows import change_charts, parameter_table
+from legcal.report.page.parameter_rows import change_charts, parameter_tables
 from legcal.report.page.platform_blocks import platform_blocks
 from legcal.report.page.residual_plots import residual_plots
 from legcal.report.page.scene import machine_scene
@@ -31,7 +31,7 @@ def calibration_page(calibration: Calibration, folder: Path, command: str = "") 
     sections = (
         ("next", "What to do next", [Items(next_steps(calibration, str(folder)), True)]),
         ("platform", "Platform error", platform_blocks(calibration)),
-        ("parameters", "Parameters", [parameter_table(calibration), *change_charts(calibration)]),
+        ("parameters", "Parameters", [*parameter_tables(calibration), *change_charts(calibration)]),
         ("machine", "The machine", [machine_scene(calibration)]),
         *_of_outlines(calibration),
         ("identifiability", "Identifiability", identifiability_blocks(calibration)),

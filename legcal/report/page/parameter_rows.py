@@ -1,85 +1,95 @@
-"""The parameters of a calibration as a table and as bars."""
+"""The parameters of a calibration as tables and as bars."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from legcal.calibration import UNITS, Calibration, ParameterRow
+from legcal.geometry import Array
 from legcal.report.page.document import Cell, Drawing, Table, number
 from legcal.report.page.svg import change_bars
 
 _BY_PRIOR = 0.7  # of the standard deviation of a prior: beyond it the images say little
-COLUMNS = ("parameter", ">nominal", ">calibrated", ">change", ">sigma", "unit", ">prior sigma",
-           "how determined")  # fmt: skip
+_STATUS = {
+    "estimated": "by images and readings",
+    "fixed": "fixed",
+    "weak": "held at nominal: nothing determines it",
+}
+_JOINT = {"base": "A", "platform": "B"}
 
 
-def parameter_table(calibration: Calibration) -> Table:
-    """Return all parameters in mm, degrees and pixels."""
-    priors = prior_sigmas(calibration)
-    rows = [_row(row, priors.get(row.name)) for row in calibration.result.parameters]
-    return Table(
-        COLUMNS,
-        rows,
-        note="Joints of the base in R_b, those of the platform in R_e; axes are turns from the "
-        "nominal ones. Sigma is one standard deviation. A click on a heading sorts.",
+@dataclass(frozen=True)
+class _Row:
+    """A number of the machine, nominal and calibrated [m, rad, px]."""
+
+    name: str
+    nominal: float
+    value: float
+    sigma: float | None
+    unit: str
+    prior: float | None
+    how: str
+
+    @property
+    def cells(self) -> list[Cell]:
+        """The cells of its row."""
+        scale, unit, digits = UNITS[self.unit]
+        sigma, prior = (None if s is None else scale * s for s in (self.sigma, self.prior))
+        return [
+            self.name,
+            number(scale * self.nominal, digits),
+            number(scale * self.value, digits),
+            number(scale * (self.value - self.nominal), digits, signed=True),
+            number(sigma, digits),
+            unit,
+            number(prior, digits),
+            self.how,
+        ]
+
+
+def parameter_tables(calibration: Calibration) -> list[Table]:
+    """Return joints in the links with all other parameters, and those of ``result.json``."""
+    columns = ("parameter", ">nominal", ">calibrated", ">change", ">sigma", "unit", ">prior sigma",
+               "how determined")  # fmt: skip
+    of_links, rows = _of_links(calibration), _parameters(calibration)
+    if not of_links:
+        return [Table(columns, [row.cells for row in rows], note=_IN_FRAMES)]
+    links = [block.link for block in (calibration.result.links or {}).values()]
+    others = [row for row in rows if not row.name.endswith(_COORDINATES)]
+    note = (
+        f"A are joints of the base in the link {links[0]}, B those of the platform in "
+        f"{links[-1]}, as in calibrated.urdf; axes are turns from the nominal ones. Sigma is one "
+        "standard deviation; coordinates without one define where R_b or R_e stands, which cannot "
+        "be seen in photographs of legs. A click on a heading sorts."
     )
-
-
-def prior_sigmas(calibration: Calibration) -> dict[str, float]:
-    """Return the standard deviations of priors by the name of their parameter [m, rad, px]."""
-    problem = calibration.solution.posterior.problem
-    priors, named = problem.priors, problem.named
-    found = {
-        named[i]: sigma
-        for i, sigma in zip(priors.unknown.tolist(), priors.sigma.tolist(), strict=True)
-        if i < len(named)
-    }
-    return found | dict(calibration.solution.prior_sigma)
-
-
-def _row(row: ParameterRow, prior: float | None) -> list[Cell]:
-    scale, unit, digits = UNITS[row.unit]
-    sigma = None if row.sigma is None else scale * row.sigma
-    is_estimated = row.status == "estimated"
     return [
-        row.name,
-        number(scale * row.nominal, digits),
-        number(scale * row.value, digits),
-        number(scale * (row.value - row.nominal), digits, signed=True),
-        number(sigma, digits),
-        unit,
-        number(None if prior is None or not is_estimated else scale * prior, digits),
-        _how(row, prior),
-    ]
+        Table(columns, [row.cells for row in (*of_links, *others)], note=note),
+        Table(columns, [row.cells for row in rows], "The same in R_b and R_e, as in result.json",
+              _IN_FRAMES, folded=True),
+    ]  # fmt: skip
 
 
-def _how(row: ParameterRow, prior: float | None) -> str:
-    if row.status == "fixed":
-        return "fixed"
-    if row.status == "weak" or row.sigma is None:
-        return "held at nominal: nothing determines it"
-    if prior is None:
-        return "by images and readings"
-    if row.sigma > _BY_PRIOR * prior:
-        return "mostly by its prior"
-    return "by images, readings and its prior"
+_COORDINATES = tuple(f".{side}.{axis}" for side in _JOINT for axis in "xyz")
+_IN_FRAMES = "Joints of the base in R_b, those of the platform in R_e; axes are turns from nominal."
 
 
 def change_charts(calibration: Calibration) -> list[Drawing]:
     """Return the changes of the parameters as bars, a chart for each unit."""
+    of_links, rows = _of_links(calibration), _parameters(calibration)
+    if of_links:
+        rows = [*of_links, *(row for row in rows if not row.name.endswith(_COORDINATES))]
     charts = []
     for of in ("m", "rad"):
-        rows = [
-            row
-            for row in calibration.result.parameters
-            if row.unit == of and row.status == "estimated" and ".radius." not in row.name
-        ]
-        if rows:
+        shown = [r for r in rows if r.unit == of and r.sigma and ".radius." not in r.name]
+        if shown:
             scale, unit, _ = UNITS[of]
             svg = change_bars(
-                [row.name for row in rows],
-                [scale * (row.value - row.nominal) for row in rows],
-                [None if row.sigma is None else scale * row.sigma for row in rows],
+                [row.name for row in shown],
+                [scale * (row.value - row.nominal) for row in shown],
+                [None if row.sigma is None else scale * row.sigma for row in shown],
                 unit,
             )
             caption = "Bars are changes, lines two standard deviations to both sides."
@@ -87,10 +97,52 @@ def change_charts(calibration: Calibration) -> list[Drawing]:
     return charts
 
 
-def correlation(calibration: Calibration) -> tuple[list[str], np.ndarray]:
+def _of_links(calibration: Calibration) -> list[_Row]:
+    """Return the coordinates of joints in the links of the model."""
+    found = []
+    for side, block in (calibration.result.links or {}).items():
+        for joint in block.joints:
+            for k, axis in enumerate("xyz"):
+                status = joint.status[k]
+                how = _STATUS.get(status, f"the joint defines the {joint.defines} of the frame")
+                name = f"{joint.leg} {_JOINT[side]} {axis}"
+                values = joint.nominal[k], joint.xyz[k], joint.sigma[k]
+                found.append(_Row(name, *values, "m", None, how))
+    return found
+
+
+def _parameters(calibration: Calibration) -> list[_Row]:
+    """Return the parameters of the result."""
+    priors = _prior_sigmas(calibration)
+    return [
+        _Row(row.name, row.nominal, row.value, row.sigma, row.unit,
+             priors.get(row.name) if row.status == "estimated" else None,
+             _how(row, priors.get(row.name)))
+        for row in calibration.result.parameters
+    ]  # fmt: skip
+
+
+def _prior_sigmas(calibration: Calibration) -> dict[str, float]:
+    """Return the standard deviations of priors by the name of their parameter [m, rad, px]."""
+    problem = calibration.solution.posterior.problem
+    priors, named = problem.priors, problem.named
+    numbers = zip(priors.unknown.tolist(), priors.sigma.tolist(), strict=True)
+    found = {named[i]: sigma for i, sigma in numbers if i < len(named)}
+    return found | dict(calibration.solution.prior_sigma)
+
+
+def _how(row: ParameterRow, prior: float | None) -> str:
+    if row.status != "estimated" or row.sigma is None or prior is None:
+        return _STATUS[row.status]
+    if row.sigma > _BY_PRIOR * prior:
+        return "mostly by its prior"
+    return "by images, readings and its prior"
+
+
+def correlation(calibration: Calibration) -> tuple[Sequence[str], Array]:
     """Return the estimated parameters and their correlation matrix."""
     result = calibration.result
     names = [row.name for row in result.parameters if row.status == "estimated"]
     covariance = np.array(result.covariance)
     sigma = np.sqrt(np.diagonal(covariance))
-    return names, covariance / np.outer(sigma, sigma)
+    return names, np.asarray(covariance / np.outer(sigma, sigma))

@@ -33,7 +33,7 @@ def machine_scene(calibration: Calibration) -> Plot:
     )
     q = measurements.q[measurements.first_rows][chosen]
     fitted = [solution.T_Rb_Re[k] for k in chosen.tolist()]
-    frame = machine.T_base_Rb
+    frame, tool = machine.T_base_Rb, machine.T_platform_Re.inv()
 
     def placed(legs: Sequence[Leg], near: Sequence[RigidTransform]) -> tuple[Array, Array]:
         """Return A (n, 3) and B (k, n, 3) of legs at the readings, in the base link."""
@@ -58,7 +58,7 @@ def machine_scene(calibration: Calibration) -> Plot:
         "steps": len(FACTORS) - 1,
         "step": modes[0]["step"],
         "poses": [plain(images[row]) for row in measurements.first_rows[chosen].tolist()],
-        "turns": [_rounded((frame * T).rotation.as_matrix(), 6) for T in fitted],
+        "turns": [_rounded((frame * T * tool).rotation.as_matrix(), 6) for T in fitted],
         "rings": rings,
         "outline": {"base": _around(found[0]), "platform": _around(found[1][0])},
         "traces": {"legs": [0, 1], "base": [2, 3], "platform": [4, 5], "rings": 6},
@@ -96,8 +96,8 @@ def machine_scene(calibration: Calibration) -> Plot:
     caption = (
         "Drag to turn, scroll to zoom. Grey is the nominal model, blue the calibrated one at the "
         "same readings; the slider exaggerates the difference. Rings are ellipsoids of one "
-        "standard deviation at the joints, in R_b and R_e: joints that define these frames have "
-        f"flat ones or none.{left_out}"
+        "standard deviation at the joints: those that define R_b and R_e have flat ones or none."
+        f"{left_out}"
     )
     return Plot("machine-scene", traces, look, 560, caption, extra)
 
@@ -145,26 +145,15 @@ def _directions(calibration: Calibration) -> list[tuple[str, Array]]:
 
 def _rings(calibration: Calibration, size: float) -> tuple[dict[str, Any], float]:
     """Return ellipsoids at joints as rings about their centres [m], and how they are enlarged."""
-    solution, machine = calibration.solution, calibration.dataset.machine
-    names = solution.parametrization.names
     turn = np.linspace(0.0, 2.0 * np.pi, _N_RING + 1)
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
     found: dict[str, list[list[Array]]] = {"base": [], "platform": []}
-    for leg in machine.leg_names:
-        for side in found:
-            where = [
-                names.index(f"{leg}.{side}.{c}") if f"{leg}.{side}.{c}" in names else -1
-                for c in "xyz"
-            ]
-            known = [i for i, at in enumerate(where) if at >= 0]
-            covariance = np.zeros((3, 3))
-            at = [where[i] for i in known]
-            covariance[np.ix_(known, known)] = solution.value_covariance[np.ix_(at, at)]
-            value, vector = np.linalg.eigh(covariance)
+    for side, block in (calibration.result.links or {}).items():
+        for joint in block.joints:
+            value, vector = np.linalg.eigh(np.array(joint.covariance))
             axes = vector * np.sqrt(np.maximum(value, 0.0))
-            if side == "base":
-                axes = machine.T_base_Rb.rotation.as_matrix() @ axes
-            found[side].append([circle @ axes[:, pair].T for pair in ([0, 1], [1, 2], [0, 2])])
+            pairs = ([0, 1], [1, 2], [0, 2])
+            found[side].append([circle @ axes[:, pair].T for pair in pairs])
     largest = [np.abs(rings).max() for side in found.values() for rings in side]
     usual = float(np.median([one for one in largest if one > 0.0] or [1.0]))
     wanted = _RING * size / usual
