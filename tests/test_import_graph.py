@@ -10,6 +10,7 @@ ROOT = Path(__file__).parents[1]
 ROOMS = (
     "geometry",
     "files",
+    "pages",
     "machine",
     "vision",
     "data",

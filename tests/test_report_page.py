@@ -18,8 +18,8 @@ from scipy.ndimage import map_coordinates
 import legcal
 from legcal.calibration import platform_map
 from legcal.errors import UsageError
+from legcal.pages import page_html
 from legcal.report.page.calibration_page import calibration_page
-from legcal.report.page.html import page_html
 from legcal.vision import outlines_of_axis
 
 SECTIONS = (
@@ -62,7 +62,13 @@ def test_a_page_has_its_sections_in_order(page: Any) -> None:
 def test_a_page_has_the_numbers_of_the_result(example_run: Run, page: Any) -> None:
     result = json.loads((example_run.output / "result.json").read_text())
     assert result["verdict"] in page.xpath("string(//section[@id='verdict'])")
-    rows = page.xpath("(//section[@id='parameters']//table)[1]/tbody/tr")
+    tables = page.xpath("//section[@id='parameters']//table")
+    joints = [
+        1e3 * x for side in result["links"].values() for one in side["joints"] for x in one["xyz"]
+    ]
+    in_links = [float(row[2].get("data-value")) for row in tables[0].xpath("tbody/tr")]
+    assert in_links[: len(joints)] == pytest.approx(joints, rel=1e-12, abs=1e-12)
+    rows = tables[1].xpath("tbody/tr")
     scale = {"m": 1e3, "rad": 180.0 / 3.141592653589793, "px": 1.0, "": 1.0}
     assert len(rows) == len(result["parameters"])
     for row, one in zip(rows, result["parameters"], strict=True):
@@ -201,3 +207,39 @@ def test_calibrate_writes_the_report_unless_it_should_not(
     assert not (out / "report.html").exists()
     assert run(monkeypatch, "calibrate", example_run.folder, "-o", out) == 0
     assert "legcal-page" in (out / "report.html").read_text("utf-8")[:1000]
+
+
+def test_other_commands_write_what_they_print_as_a_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "identify.html"
+    words = ("identify", "hexapod", "--view", "leg1,leg2", "--page", path)
+    run(monkeypatch, *words)
+    printed = capsys.readouterr().out
+    found: Any = html.fromstring(path.read_text("utf-8"))
+    assert found.xpath("//main/section/@id") == ["verdict", "result", "record"]
+    assert "doubtful" in found.xpath("//section[@id='verdict']/@class")[0]  # the fit alone can
+    cells = [cell.text_content() for cell in found.xpath("//table//td")]
+    assert len(cells) > 20
+    flat = " ".join(printed.split())
+    assert all(cell in flat for cell in cells if " " not in cell)
+    assert "legcal identify hexapod" in found.xpath("string(//section[@id='record'])")
+    before = path.read_bytes()
+    (tmp_path / "mine.html").write_text("mine")
+    assert run(monkeypatch, *words[:-1], tmp_path / "mine.html") == 2
+    assert (tmp_path / "mine.html").read_text() == "mine"
+    assert run(monkeypatch, *words[:-1], tmp_path / "none" / "page.html") == 2
+    assert path.read_bytes() == before
+
+
+def test_a_check_writes_a_page_and_never_over_that_of_a_result(
+    example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("calibrate", example_run.folder, "--check", example_run.output, "-o")
+    page = example_run.output / "report.html"
+    before = page.read_bytes() if page.exists() else b""
+    assert run(monkeypatch, *words, example_run.output) == 2
+    assert (page.read_bytes() if page.exists() else b"") == before
+    assert run(monkeypatch, *words, tmp_path / "check") == 0
+    found: Any = html.fromstring((tmp_path / "check" / "report.html").read_text("utf-8"))
+    assert "No change was detected" in found.xpath("string(//section[@id='verdict'])")

@@ -14,10 +14,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
-from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -49,6 +47,7 @@ from legcal.files import (
 )
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Cylinder
+from legcal.pages import Cell, Link, Page, Picture, Row, Section, Table, Text, number, page_html
 from legcal.perception import HIDDEN, OUTSIDE, PartMarks, draw, marks_of_image, short_reason
 from legcal.progress import Report
 from legcal.vision import PredictedLeg, predict_legs
@@ -60,19 +59,8 @@ OVERLAYS = "overlays"  # the subfolder
 JPEG_QUALITY = 88  # percent
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")  # in names of files
 _MAX_NAME = 80  # letters of such a name
-_HEAD = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
-body {{ font: 15px/1.45 system-ui, sans-serif; margin: 1.5em; color: #222; }}
-table {{ border-collapse: collapse; margin: .7em 0; }}
-th, td {{ padding: .25em .8em; border-bottom: 1px solid #ddd; text-align: right; }}
-th:first-child, td:first-child, th:last-child, td:last-child {{ text-align: left; }}
-.views {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(330px, 1fr)); gap: 1em; }}
-figure {{ margin: 0; }} figcaption {{ font-size: 13px; }} img {{ width: 100%; }}
-.bad {{ color: #b00; }} .dim {{ color: #777; }}
-</style></head><body>
-"""
-_TABLE_HEADINGS = ("view", "images", "legs found", "of visible", "outlines used", "of", "contrast",
-            "length [px]", "residual [px]", "rejected")  # fmt: skip
+_TABLE_HEADINGS = ("view", ">images", ">legs found", ">of visible", ">outlines used", ">of",
+                   ">contrast", ">length [px]", ">residual [px]", "rejected")  # fmt: skip
 _HOW_TO_CORRECT = (
     "To correct an outline, edit its row in observations.csv: set its verdict, or its line "
     "(a, b, c) and ends, and its source to edited; then copy the file into the dataset."
@@ -287,61 +275,43 @@ def _median(values: Array) -> float | None:
 def _page(detection: Detection) -> str:
     """Return the text of ``index.html``."""
     document, files = detection.document, detection.overlay_files
-    title = f"Outlines of {detection.dataset.machine.name}"
-    parts = [_HEAD.format(title=escape(title)), f"<h1>{escape(title)}</h1>\n"]
-    parts.append(
-        f"<p>{document['used']} of {document['outlines']} outlines in {document['images']} images "
-        f"are used.</p>\n{_table(document['views'])}<p class=dim>{escape(_HOW_TO_CORRECT)}</p>\n"
+    views, names = document["views"], row_names(detection.dataset.measurements)
+    anchors = dict(zip(views, _unique_names(f"view-{view}" for view in views), strict=True))
+    found = (
+        f"{document['used']} of {document['outlines']} outlines in {document['images']} images are "
+        "used."
     )
-    parts += [f"<p>{escape(note)}</p>\n" for note in document["notes"]]
-    names = row_names(detection.dataset.measurements)
-    for view, figures in document["views"].items():
+    table = Table(_TABLE_HEADINGS, [_cells(name, views[name], to) for name, to in anchors.items()])
+    sections = [
+        Section("found", "What was found", [table, *(Text([n]) for n in document["notes"])]),
+        Section("correct", "To correct an outline", [Text([_HOW_TO_CORRECT])]),
+    ]
+    for view, figures in views.items():
         rows = [row for row in files if detection.view_of(row) == view]
-        parts.append(f'<h2 id="{escape(view)}">{escape(view)}</h2>\n')
-        if figures["problem"]:
-            parts.append(f"<p class=bad>{escape(figures['problem'])}</p>\n")
-        parts.append("<div class=views>\n")
-        parts += [_figure(names[row], files[row], _summary(detection, row)) for row in rows]
-        parts.append("</div>\n")
-    return "".join([*parts, "</body></html>\n"])
+        pictures = [Picture(files[row], *_summary(detection, names, row)) for row in rows]
+        problem = [Text([figures["problem"]])] if figures["problem"] else []
+        sections.append(Section(anchors[view], view, [*problem, Row(pictures)]))
+    return page_html(Page(f"Outlines of {detection.dataset.machine.name}", found, None, sections))
 
 
-def _table(views: Mapping[str, Any]) -> str:
-    """Return the figures of the views as a table."""
-    rows = ["<tr>" + "".join(f"<th>{name}</th>" for name in _TABLE_HEADINGS) + "</tr>"]
-    for name, view in views.items():
-        rejected = ", ".join(f"{n} {escape(why)}" for why, n in view["rejected"].items())
-        cells = (
-            f'<a href="#{escape(name)}">{escape(name)}</a>',
-            view["images"],
-            view["legs_found"],
-            view["legs_visible"],
-            view["used"],
-            view["outlines"],
-            _number(view["contrast"], 1),
-            _number(view["length"], 0),
-            _number(view["residual"], 3),
-            "<span class=bad>camera not placed</span>" if view["problem"] else rejected,
-        )
-        rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
-    return "<table>" + "\n".join(rows) + "</table>\n"
+def _cells(name: str, view: Mapping[str, Any], to: str) -> list[Cell]:
+    """Return the figures of a view as cells of the table."""
+    rejected = ", ".join(f"{n} {why}" for why, n in view["rejected"].items())
+    return [
+        Link(name, f"#{to}"),
+        *(
+            number(view[key], digits)
+            for key, digits in (
+                ("images", 0), ("legs_found", 0), ("legs_visible", 0), ("used", 0),
+                ("outlines", 0), ("contrast", 1), ("length", 0), ("residual", 3),
+            )
+        ),
+        "camera not placed" if view["problem"] else rejected,
+    ]  # fmt: skip
 
 
-def _number(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
-
-
-def _figure(name: str, file: str, summary: str) -> str:
-    """Return an overlay with the name of its image and what was found."""
-    url = quote(file)
-    return (
-        f'<figure><a href="{url}"><img loading=lazy src="{url}" alt=""></a>'
-        f"<figcaption>{escape(name)}: {summary}</figcaption></figure>\n"
-    )
-
-
-def _summary(detection: Detection, row: int) -> str:
-    """Return what was found in the image of a row, and why legs are rejected (HTML)."""
+def _summary(detection: Detection, names: Sequence[str], row: int) -> tuple[str, str]:
+    """Return what was found in the image of a row, and why legs are rejected."""
     outlines, legs = detection.outlines, detection.dataset.machine.leg_names
     here = np.flatnonzero(outlines.row == row).tolist()
     used = f"{np.count_nonzero(outlines.used[here])} of {len(here)} used"
@@ -349,11 +319,11 @@ def _summary(detection: Detection, row: int) -> str:
     for i in here:
         if not outlines.used[i] and outlines.reason[i] != OUTSIDE:
             name = legs[outlines.leg[i]]
-            names = rejected.setdefault(_counted_reason(outlines.reason[i]), [])
-            if name not in names:
-                names.append(name)
-    reasons = "; ".join(f"{', '.join(names)}: {why}" for why, names in rejected.items())
-    return used + (f" <span class=bad>({escape(reasons)})</span>" if reasons else "")
+            of_reason = rejected.setdefault(_counted_reason(outlines.reason[i]), [])
+            if name not in of_reason:
+                of_reason.append(name)
+    reasons = "; ".join(f"{', '.join(legs)}: {why}" for why, legs in rejected.items())
+    return f"{names[row]}: {used}", f"({reasons})" if reasons else ""
 
 
 def check_detection_destination(destination: Path, dataset: Path | None) -> None:

@@ -14,6 +14,7 @@ from legcal.cli.options import (
     image_workers,
     loading,
     show,
+    write_page,
 )
 from legcal.errors import UsageError
 from legcal.paper import Criteria, Transformation
@@ -82,7 +83,7 @@ def calibrate(
         typer.Option(
             metavar="RESULT",
             help="Change detection: test the result folder of an earlier calibration with the "
-            "images of DATASET; nothing is written. Exit 1 if something has moved.",
+            "images of DATASET; with --output a page is written. Exit 1 if something has moved.",
             rich_help_panel=_TESTS,
         ),
     ] = None,
@@ -104,7 +105,6 @@ def calibrate(
     """Compute the calibrated model from images and encoder readings, or check an earlier one."""
     if check is not None:
         others = {
-            "--output": output,
             "--prior": prior,
             "--fix": fix,
             "--free": free,
@@ -117,9 +117,10 @@ def calibrate(
         if named:
             raise UsageError(
                 f"The command could not be run: found {', '.join(named)} beside --check, which "
-                "writes nothing and takes all of it from the earlier result; leave one of them out."
+                "takes all of it from the earlier result; leave one of them out."
             )
-        _check(dataset, check, significance, as_json=as_json)
+        page = None if output is None or not with_report else _page_of_check(output)
+        _check(dataset, check, significance, page, as_json=as_json)
         return
     if significance is not None:
         raise UsageError(
@@ -159,7 +160,35 @@ def calibrate(
         raise typer.Exit(1)
 
 
-def _check(dataset: Path, result: Path, significance: float | None, *, as_json: bool) -> None:
+def _page_of_check(output: Path) -> Path:
+    """Return where the page of a check is written; refuse a folder that holds a result.
+
+    Its own page would be lost.
+    """
+    from legcal import calibration, report
+    from legcal.files import RESULT, check_path
+
+    check_path(output)
+    if RESULT.is_in(output):
+        raise UsageError(
+            f"{output}: the page of the check could not be written: found the result of a "
+            "calibration, needed another folder; give one."
+        )
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(
+            f"{output}: the page of the check could not be written: found '{error.strerror}', "
+            "needed a path that can be created; give another output folder."
+        ) from error
+    page = output / calibration.REPORT_NAME
+    report.PAGE.check_place(page)
+    return page
+
+
+def _check(
+    dataset: Path, result: Path, significance: float | None, page: Path | None, *, as_json: bool
+) -> None:
     """Test an earlier result with new images."""
     from legcal import calibration, report
 
@@ -170,6 +199,8 @@ def _check(dataset: Path, result: Path, significance: float | None, *, as_json: 
         progress=True,
         workers=image_workers(),
     )
+    title = f"Check of {result.resolve().name}"
+    write_page(page, title, report.check_summary(found), report.check_verdict(found))
     show(as_json, found.document, lambda: report.check_summary(found))
     if found.movement.moved:
         raise typer.Exit(1)

@@ -13,9 +13,12 @@ from legcal.cli.options import (
     DatasetArgument,
     JsonOption,
     ModelArgument,
+    PageOption,
     WorkersOption,
+    check_page,
     image_workers,
     show,
+    write_page,
 )
 from legcal.errors import UsageError
 from legcal.vision import DistortionModel
@@ -171,15 +174,19 @@ def identify(
             help="Every image of a view is taken from a place of its own; with --board.",
         ),
     ] = False,
+    page: PageOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Say which parameters a calibration can identify, and what would identify the others."""
     from legcal import calibration, report
 
+    check_page(page)
     views = [text.split(",") for text in view or []]
     found = calibration.answer(
         model, views, images, board=board, platform_board=platform_board, hand_held=hand_held
     )
+    verdict = report.identify_verdict(found)
+    write_page(page, f"Identifiability of {model}", report.identify_table(found), verdict)
     show(as_json, found.document, lambda: report.identify_table(found))
 
 
@@ -261,6 +268,7 @@ def locate(
         "world"
     ),
     tool_link: Annotated[str, typer.Option(help="With --urdf: name of the tool link.")] = "tool",
+    page: PageOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find the base in the world and the tool in the platform from measured tool poses."""
@@ -277,6 +285,7 @@ def locate(
     def quantity(text: str | None, units: Mapping[str, float], what: str) -> float | None:
         return None if text is None else parse_quantity(text, units, what)
 
+    check_page(page)
     calibration.LOCATION_FILE.check_place(output)
     machine = load_mechanism(model)
     location = calibration.locate(
@@ -295,6 +304,8 @@ def locate(
         written += [str(path) for path in paths]
     calibration.write_location(location, output)
     written.append(str(output))
+    title = f"Base and tool of {machine.name}"
+    write_page(page, title, report.location_table(location, written))
     show(
         as_json,
         lambda: calibration.location_document(location) | {"written": written},
@@ -448,10 +459,14 @@ def noise(
     dataset: Annotated[
         Path, typer.Argument(metavar="DATASET", help="A dataset with several images of each pose.")
     ],
+    page: PageOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate how precisely images tell where legs are, from repeated images of the same poses."""
     from legcal import calibration, report
 
+    check_page(page)
     found = calibration.measure_noise(dataset, progress=True, workers=image_workers())
+    title = f"Measurement noise of {found.dataset.machine.name}"
+    write_page(page, title, report.noise_table(found))
     show(as_json, found.document, lambda: report.noise_table(found))

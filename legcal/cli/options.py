@@ -55,8 +55,35 @@ WorkersOption = Annotated[
 ]
 
 
+PageOption = Annotated[
+    Path | None,
+    typer.Option("--page", metavar="FILE.html", help="Write the same as a page for the browser."),
+]
+
+
 if TYPE_CHECKING:
     from rich.console import RenderableType
+
+    from legcal.pages import Verdict
+
+
+def check_page(page: Path | None) -> None:
+    """Refuse, before any work, a place where no page can be written."""
+    from legcal import report
+
+    if page is not None:
+        report.PAGE.check_place(page)
+
+
+def write_page(
+    page: Path | None, title: str, text: RenderableType, verdict: Verdict | None = None
+) -> None:
+    """Write what is printed as a page, where one is asked for."""
+    from legcal import report
+
+    if page is not None:
+        found = report.text_page(title, text, verdict=verdict, command=command_line())
+        report.write_page(found, page)
 
 
 def command_line() -> str:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from legcal.cli.options import JsonOption, WorkersOption, print_table, show
+from legcal.cli.options import JsonOption, WorkersOption, print_table, show, write_page
 from legcal.errors import UsageError
 from legcal.processors import processors
 
@@ -67,6 +67,8 @@ def paper(
         progress=True,
     )
     document = result.document()
+    if output is not None:
+        write_page(output / "report.html", "The paper's simulation", study_table(document))
     show(as_json, lambda: document, lambda: study_table(document))
     if output is not None and not as_json:
         print_table(f"\nRuns, document and figures: {output}")

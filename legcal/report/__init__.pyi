@@ -14,6 +14,11 @@ from .new_dataset import import_table as import_table
 from .new_dataset import matching_table as matching_table
 from .new_dataset import written_lines as written_lines
 from .noise import noise_table as noise_table
+from .page.text_page import text_page as text_page
+from .page.verdicts import check_verdict as check_verdict
+from .page.verdicts import identify_verdict as identify_verdict
+from .page.writing import PAGE as PAGE
+from .page.writing import write_page as write_page
 from .page.writing import write_report as write_report
 from .render import report as report
 from .render import table as table

@@ -1,5 +1,5 @@
-"""Pages: what people open in a browser, each one file that needs no other and no network.
+"""What the pages of the jobs say: sections and blocks of :mod:`legcal.pages`, made of results.
 
-A page is a :class:`Page` of sections and blocks (``document``), which a job's module makes of its
-result; ``html`` renders any of them with one template, one style sheet and one script.
+``calibration_page`` is the page of a calibration, ``text_page`` that of any job whose text says
+all: ``writing`` renders them and writes the files.
 """

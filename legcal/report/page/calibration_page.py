@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from legcal.calibration import Calibration
+from legcal.pages import Gallery, Items, Page, Row, Section, Text
 from legcal.report.page.crops import outline_crops
-from legcal.report.page.document import Gallery, Items, Page, Row, Section, Text
 from legcal.report.page.evidence import (
     correlation_blocks,
     held_out_blocks,

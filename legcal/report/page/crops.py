@@ -13,7 +13,7 @@ from legcal.calibration import Calibration
 from legcal.data import row_names
 from legcal.errors import LegcalError
 from legcal.geometry import Array, Image
-from legcal.report.page.document import Crop
+from legcal.pages import Crop
 from legcal.vision import Camera, outlines_of_axis
 
 N_WORST, N_MEDIAN = 30, 10

@@ -15,10 +15,9 @@ import numpy as np
 from legcal.calibration import DEFAULT_SETTINGS, Calibration, identifiability_of_dataset
 from legcal.data import OBSERVATIONS_NAME
 from legcal.errors import LegcalError
+from legcal.pages import Cell, Drawing, Facts, Items, Table, Text, matrix, number
 from legcal.report.identify import CONDITIONS
-from legcal.report.page.document import Cell, Drawing, Facts, Items, Table, Text, number
 from legcal.report.page.parameter_rows import correlation
-from legcal.report.page.svg import matrix
 from legcal.version import __version__
 
 MAX_HASHED = 400_000_000  # of images [bytes]: more would be waited for

@@ -9,8 +9,7 @@ import numpy as np
 
 from legcal.calibration import UNITS, Calibration, ParameterRow
 from legcal.geometry import Array
-from legcal.report.page.document import Cell, Drawing, Table, number
-from legcal.report.page.svg import change_bars
+from legcal.pages import Cell, Drawing, Table, change_bars, number
 
 _BY_PRIOR = 0.7  # of the standard deviation of a prior: beyond it the images say little
 _STATUS = {

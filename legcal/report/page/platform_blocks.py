@@ -8,9 +8,8 @@ import numpy as np
 
 from legcal.calibration import Calibration, PlatformMap, platform_map
 from legcal.geometry import Array
-from legcal.report.page.document import Drawing, Plot, Row, Table, Text, number
+from legcal.pages import Drawing, Plot, Row, Table, Text, histogram, number, number_grid
 from legcal.report.page.residual_plots import FONT
-from legcal.report.page.svg import histogram, number_grid
 
 
 def platform_blocks(calibration: Calibration) -> list[Any]:

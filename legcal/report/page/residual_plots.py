@@ -11,7 +11,7 @@ from scipy.special import ndtri
 from legcal.calibration import Calibration
 from legcal.data import row_names
 from legcal.geometry import Array, IntArray
-from legcal.report.page.document import Plot, plain
+from legcal.pages import Plot, plain
 
 MAX_POINTS = 3000  # of a chart: what a browser draws at once
 _SYMBOLS = ("circle", "square", "diamond", "cross", "x", "triangle-up", "star", "pentagon")

@@ -12,7 +12,7 @@ from legcal.calibration import Calibration, poses_at_readings
 from legcal.data import row_names
 from legcal.geometry import Array
 from legcal.machine import Leg, geometries, moved_legs
-from legcal.report.page.document import Plot, plain
+from legcal.pages import Plot, plain
 from legcal.report.page.residual_plots import FONT
 
 MAX_POSES = 60  # of the slider

@@ -6,8 +6,8 @@ import shlex
 
 import numpy as np
 
-from legcal.calibration import Calibration
-from legcal.report.page.document import Light, Verdict
+from legcal.calibration import Calibration, Check, Identifiability
+from legcal.pages import Light, Verdict
 
 _WORDS: dict[Light, str] = {
     "good": "Use it",
@@ -100,3 +100,26 @@ def next_steps(calibration: Calibration, folder: str) -> list[str]:
             "which belongs into the uncertainty of the result."
         )
     return steps
+
+
+def check_verdict(check: Check) -> Verdict:
+    """Return whether anything has moved: green or red."""
+    if check.movement.moved:
+        return Verdict("bad", "Something has moved", check.sentence, [])
+    return Verdict("good", "No change was detected", check.sentence, [])
+
+
+def identify_verdict(report: Identifiability) -> Verdict:
+    """Return whether a session determines its machine: amber where only the joint fit does."""
+    full, staged = report.full, report.staged
+    sentence = (
+        f"The joint fit determines {full.rank} of {full.of} parameters, the four steps "
+        f"{staged.rank} of {staged.of}."
+    )
+    if not report.identifiable:
+        word = "These images cannot determine the machine"
+        reasons = [f"Open: {one.direction}." for one in full.weak if not one.harmless]
+        return Verdict("bad", word, sentence, reasons)
+    if not (staged.complete and report.conditions_hold):
+        return Verdict("doubtful", "The joint fit can determine it, the steps cannot", sentence, [])
+    return Verdict("good", "These images determine the machine", sentence, [])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from legcal.calibration import REPORT_NAME
 from legcal.files import OutputFile
-from legcal.report.page.html import MARK, page_html
+from legcal.pages import MARK, Page, page_html
 
 if TYPE_CHECKING:
     from legcal.calibration import Calibration
@@ -28,7 +28,20 @@ class _Page(OutputFile):
             return False
 
 
-PAGE = _Page("the report", "report", "", "a new file or an earlier report")
+PAGE = _Page("the page", "page", "", "a new file or an earlier page of legcal")
+
+
+def write_page(page: Page, path: Path) -> None:
+    """Write a page; an earlier one of legcal is replaced, any other file is not.
+
+    Raises
+    ------
+    UsageError
+        If another file has that name, or no file can have it.
+    OutOfResources
+        If it cannot be written.
+    """
+    PAGE.write(path, page_html(page))
 
 
 def write_report(calibration: Calibration, folder: Path, command: str = "") -> Path:
@@ -59,5 +72,5 @@ def write_report(calibration: Calibration, folder: Path, command: str = "") -> P
 
     path = Path(folder) / REPORT_NAME
     PAGE.check_place(path)
-    PAGE.write(path, page_html(calibration_page(calibration, Path(folder), command)))
+    write_page(calibration_page(calibration, Path(folder), command), path)
     return path

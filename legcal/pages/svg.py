@@ -63,7 +63,7 @@ class Canvas:
         """Return the drawing."""
         label = escape(printable(self.title))
         return Markup(
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width:g} {self.height:g}" '
+            f'<svg viewBox="0 0 {self.width:g} {self.height:g}" '
             f'width="{self.width:g}" height="{self.height:g}" role="img" aria-label="{label}" '
             f"{_FONT}>" + "".join(self.parts) + "</svg>"
         )

@@ -10,7 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from legcal.errors import printable
-from legcal.report.page.document import Page, Plot, Row
+from legcal.pages.document import Page, Plot, Row
 from legcal.version import __version__
 
 MARK = "legcal-page"  # the name by which a page of legcal is known
@@ -37,7 +37,7 @@ def page_html(page: Page) -> str:
 @cache
 def _environment() -> Environment:
     return Environment(
-        loader=PackageLoader("legcal.report.page", "assets"),
+        loader=PackageLoader("legcal.pages", "assets"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -55,7 +55,7 @@ def _shown(value: Any) -> Any:
 
 @cache
 def _asset(name: str) -> Markup:
-    return Markup((files("legcal.report.page") / "assets" / name).read_text("utf-8"))
+    return Markup((files("legcal.pages") / "assets" / name).read_text("utf-8"))
 
 
 def _plotly() -> Markup:

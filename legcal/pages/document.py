@@ -146,6 +146,16 @@ class Gallery:
 
 
 @dataclass(frozen=True)
+class Picture:
+    """An image beside the page."""
+
+    kind: ClassVar = "picture"
+    file: str  # its place, relative to the page
+    caption: str
+    warning: str = ""  # what is said in red
+
+
+@dataclass(frozen=True)
 class Section:
     """A section."""
 
