@@ -4,6 +4,7 @@ import csv
 import ctypes
 import importlib.util
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -96,22 +97,22 @@ def test_kinematics_in_python_are_those_of_the_model(
     machine = subject.machine
     found = module_at(written(subject, "python", tmp_path / "kinematics.py"))
     assert machine.leg_names == found.LEGS
-    for q, T in zip(*poses_of(machine), strict=True):
+    for q, T in zip(*poses_of(machine, 2), strict=True):
         pose = forward_kinematics(machine, q)
         np.testing.assert_allclose(pose.as_matrix(), T.as_matrix(), atol=1e-10)
         np.testing.assert_allclose(
-            found.inverse(T.as_matrix()), inverse_kinematics(machine, T), atol=1e-10
+            found.inverse_kinematics(T.as_matrix()), inverse_kinematics(machine, T), atol=1e-10
         )
-        np.testing.assert_allclose(found.forward(q), T.as_matrix(), atol=1e-9)
+        np.testing.assert_allclose(found.forward_kinematics(q), T.as_matrix(), atol=1e-9)
     off = machine.home.as_matrix()
     off[:3, :3] = Rotation.from_rotvec([0.3, 0.2, 0.1]).as_matrix() @ off[:3, :3]
     if any(leg.n_constraints for leg in machine.legs):
         with pytest.raises(ValueError, match="do not allow"):
-            found.inverse(off)
+            found.inverse_kinematics(off)
     with pytest.raises(ValueError, match=r"no pose was found|finite"):
-        found.forward(np.full(machine.n_legs, np.nan))
+        found.forward_kinematics(np.full(machine.n_legs, np.nan))
     with pytest.raises(ValueError, match="no pose was found"):
-        found.forward(-5.0 * machine.sign)
+        found.forward_kinematics(-5.0 * machine.sign)
 
 
 @pytest.mark.system
@@ -137,12 +138,14 @@ def test_kinematics_in_c_compile_and_are_those_of_the_model(
 
     for q, T in zip(*poses_of(machine), strict=True):
         readings, there = numbers(), packed(machine.home)
-        assert getattr(found, f"{prefix}_inverse")(packed(T), readings) == 0
+        assert getattr(found, f"{prefix}_inverse_kinematics")(packed(T), readings) == 0
         np.testing.assert_allclose(np.array(readings), inverse_kinematics(machine, T), atol=1e-10)
-        assert getattr(found, f"{prefix}_forward")(numbers(*q), there) == 0
+        assert getattr(found, f"{prefix}_forward_kinematics")(numbers(*q), there) == 0
         np.testing.assert_allclose(np.array(there), np.array(packed(T)), atol=1e-9)
     stays = packed(machine.home)
-    assert getattr(found, f"{prefix}_forward")(numbers(*(-5.0 * machine.sign)), stays) == -1
+    assert (
+        getattr(found, f"{prefix}_forward_kinematics")(numbers(*(-5.0 * machine.sign)), stays) == -1
+    )
     np.testing.assert_array_equal(stays, packed(machine.home))
 
 
@@ -161,10 +164,10 @@ def test_kinematics_for_matlab_run_in_octave_and_are_those_of_the_model(
         matrix = ";".join(" ".join(map(repr, row)) for row in T.as_matrix().tolist())
         lines += [
             f"q = [{' '.join(map(repr, q.tolist()))}];",
-            f"printf('%.17g ', m.inverse([{matrix}]), m.forward(q));",
+            f"printf('%.17g ', m.inverse_kinematics([{matrix}]), m.forward_kinematics(q));",
             "printf('\\n');",
         ]
-    lines.append(f"try, m.forward({-5.0!r} * m.sign); catch e, disp(e.message), end")
+    lines.append(f"try, m.forward_kinematics({-5.0!r} * m.sign); catch e, disp(e.message), end")
     (tmp_path / "check.m").write_text("\n".join(lines) + "\n")
     done = subprocess.run(
         ["octave", "--no-gui", "--quiet", "--norc", "check.m"],
@@ -485,6 +488,10 @@ def test_places_and_options_that_cannot_be_used_are_refused_and_nothing_is_writt
         (tmp_path / "no/result.json", "csv", out, ExportOptions(), DatasetError, "result"),
         ("no-such-model", "csv", tmp_path / "a", ExportOptions(), ModelError, "no-such-model"),
     ]  # fmt: skip
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with pytest.raises(UsageError, match="another file"):
+        export("hexapod", "table", pipe, force=True)
     before = sorted(tmp_path.rglob("*"))
     for source, to, path, options, error, said in cases:
         with pytest.raises(error) as refused:

@@ -30,7 +30,6 @@ def _every_machine(subject: Subject) -> str | None:
 class Format:
     """A format."""
 
-    what: str  # for people
     render: Render  # its files, of a subject, options and the path that was asked for
     refusal: Callable[[Subject], str | None] = _every_machine  # why a machine's class has it not
     is_folder: bool = False
@@ -38,19 +37,17 @@ class Format:
 
 
 FORMATS: dict[str, Format] = {
-    "table": Format("parameters as aligned text", table_files),
-    "csv": Format("parameters, one a row", csv_files),
-    "json": Format("legs and parameters with their covariance", json_files),
-    "urdf": Format("one URDF with its loops", urdf_files, options=("inertia",)),
-    "mjcf": Format("MuJoCo, loops as equality constraints", mjcf_files, mjcf_refusal),
-    "linuxcnc": Format("HAL lines of genhexkins", linuxcnc_files, linuxcnc_refusal),
-    "python": Format("kinematics in Python with numpy", python_files, kinematics_refusal),
-    "c": Format("kinematics in C99", c_files, kinematics_refusal),
-    "matlab": Format("kinematics in MATLAB and GNU Octave", matlab_files, kinematics_refusal),
-    "ros": Format("URDF and calibration.yaml", ros_files, is_folder=True, options=("inertia",)),
-    "correction": Format(
-        "nominal to corrected commands", correction_files, correction_refusal, options=("nodes",)
-    ),
+    "table": Format(table_files),
+    "csv": Format(csv_files),
+    "json": Format(json_files),
+    "urdf": Format(urdf_files, options=("inertia",)),
+    "mjcf": Format(mjcf_files, mjcf_refusal),
+    "linuxcnc": Format(linuxcnc_files, linuxcnc_refusal),
+    "python": Format(python_files, kinematics_refusal),
+    "c": Format(c_files, kinematics_refusal),
+    "matlab": Format(matlab_files, kinematics_refusal),
+    "ros": Format(ros_files, is_folder=True, options=("inertia",)),
+    "correction": Format(correction_files, correction_refusal, options=("nodes",)),
 }
 _FILE = OutputFile("the export", "export", "", "a new file or --force")
 _FOLDER = OutputKind("export", "", "")

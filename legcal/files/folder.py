@@ -85,7 +85,8 @@ class OutputFile:
                 f"{start} that {path.parent} cannot be written to, needed permission to create "
                 "files in it; give another file."
             )
-        if not force and os.path.lexists(path) and not self._is_own(path):
+        may_go = os.path.isfile(path) if force else self._is_own(path)
+        if os.path.lexists(path) and not may_go:
             raise UsageError(
                 f"{start} another file of that name, needed {self.needed}; give another file."
             )
