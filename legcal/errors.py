@@ -55,11 +55,15 @@ def printable(text: str) -> str:
     written as escapes; words and texts that are too long are cut in the middle.
     """
     text = _LONG_WORD.sub(lambda word: _cut(word[0], MAX_WORD), text)
-    text = _CONTROL.sub(_escaped, text)
-    return _cut(text, MAX_SENTENCE)
+    return _cut(escaped(text), MAX_SENTENCE)
 
 
-def _escaped(match: re.Match[str]) -> str:
+def escaped(text: str) -> str:
+    """Return text with control characters written as escapes, ends of lines as spaces."""
+    return _CONTROL.sub(_escape, text)
+
+
+def _escape(match: re.Match[str]) -> str:
     character = match[0]
     return " " if character in "\n\r\t" else character.encode("unicode_escape").decode()
 

@@ -173,6 +173,57 @@ def test_photographs_are_matched_by_name_order_or_time(
     load_dataset(tmp_path / "dataset")
 
 
+IN_NAMES = ("c1_IMG_2.jpg", "c1_IMG_10.jpg", "c2_IMG_2.jpg", "c2_IMG_10.jpg")
+AT_THE_END = ("002-left.png", "002-right.png", "010-left.png", "010-right.png")
+
+
+@pytest.mark.parametrize(
+    ("photographs", "pattern", "columns", "expected"),
+    [
+        (IN_NAMES, "{view}_*", {}, [("c1", 0), ("c1", 1), ("c2", 0), ("c2", 1)]),
+        (IN_NAMES, "{view}_IMG*", {"image": ("10", "2")},
+         [("c1", 0), ("c1", 1), ("c2", 0), ("c2", 1)]),
+        (AT_THE_END, "*-{view}", {"image": ("2", "10")},
+         [("left", 0), ("left", 1), ("right", 0), ("right", 1)]),
+        (AT_THE_END, "*-{view}.png", {"image": ("010", "002")},
+         [("left", 0), ("left", 1), ("right", 0), ("right", 1)]),
+    ],
+)  # fmt: skip
+def test_views_are_found_in_names_of_photographs_in_one_folder(
+    photographs: Sequence[str],
+    pattern: str,
+    columns: Columns,
+    expected: list[tuple[str, int]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    table(own_folder(tmp_path, photographs), columns, 2)
+    assert init(monkeypatch, tmp_path, "--view-pattern", pattern) == 0
+    shown = capsys.readouterr().out
+    found = pairs(tmp_path)
+    assert [(view, k) for view, _, k in found] == expected
+    for view, image, k in found:
+        name = image.removeprefix("images/")
+        assert view in name
+        number = int(columns.get("image", ("2", "10"))[k])
+        assert int("".join(x for x in name.replace(view, "") if x.isdigit())) == number
+        assert name in shown
+    load_dataset(tmp_path / "dataset")
+
+
+def test_a_pattern_of_views_is_proposed_and_not_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table(own_folder(tmp_path, AT_THE_END), n=4)
+    assert init(monkeypatch, tmp_path, "--dry-run") == 0
+    assert "give --view-pattern '*-{view}'" in " ".join(capsys.readouterr().out.split())
+    table(tmp_path, {"view": ("left", "right", "left", "right")}, n=4)  # or a column says it
+    assert init(monkeypatch, tmp_path) == 0
+    views = {Path(image).name: view for view, image, _ in pairs(tmp_path)}
+    assert views == {name: name[4:].removesuffix(".png") for name in AT_THE_END}
+
+
 @pytest.mark.parametrize(
     ("names", "factor", "add", "words"),
     [
@@ -218,6 +269,9 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (FLAT, {}, ("--unit", "inch"), ("'inch'", "um")),
     (FLAT, {}, ("--camera", "c7=x.yaml"), ("c7=x.yaml", "c1")),
     (FLAT, {}, ("--camera", "missing.yaml"), ("missing.yaml",)),
+    (FLAT, {}, ("--camera", "c1=a.yaml", "--camera", "c1=b.yaml"), ("c1=a.yaml", "c1=b.yaml")),
+    (FLAT, {}, ("--view-pattern", "img_*"), ("'img_*'", "{view} once")),
+    (FLAT, {}, ("--view-pattern", "{view}-*"), ("'IMG_2.JPG'", "'{view}-*'")),
     (FLAT, {}, ("--camera", str(HEXAPOD / "camera_info.yaml")), ("IMG_2.JPG", "64 x 48", "1024")),
     (FLAT, {}, ("--match", "time"), ("by time", "column 'time'")),
     (FLAT, {"columns": {"time": ("10:00", "x", "10:02")}}, (), ("EXIF",)),

@@ -67,7 +67,7 @@ def test_the_table_shows_millimetres_axes_and_twists_in_80_columns() -> None:
     assert "A in base [mm]" in text
     assert "mobility 6, 6 motors" in text
     row = next(line for line in text.splitlines() if line.startswith("leg5"))
-    numbers = ["0.0", "270.0", "0.0", "0.0", "195.0", "0.0", "345.000"]
+    numbers = ["0.00", "270.00", "0.00", "0.00", "195.00", "0.00", "345.00"]
     assert row.split() == ["leg5", "SPU", *numbers, "+", "q", "10"]
     tilted = _described("3-upu-tilted")
     text = _printed(inspect_table(tilted))
@@ -86,7 +86,7 @@ def test_the_table_shows_signs_kinds_and_notes(tmp_path: Path) -> None:
     path.write_text(text.replace("../urdf/", "").replace("- leg2_prismatic\n", "", 1))
     text = _printed(inspect_table(_described(path)))
     assert "passive" in text
-    assert "520.000 - q" in text
+    assert "520.00 - q" in text
     assert "note: the motors do not determine the pose" in text
 
 

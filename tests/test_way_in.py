@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from command_line import run
 from csv_rows import read_rows
-from hexapod_example import HEXAPOD, TRUTH, Run
+from hexapod_example import HEXAPOD, ROOT, TRUTH, Run
 from lxml import etree
 
 from legcal import evaluate, load_mechanism
@@ -104,6 +105,7 @@ def test_the_template_is_a_table_and_replaces_nothing(
     assert (tmp_path / "mine.csv").read_text() == "mine"
     assert run(monkeypatch, *words, "--force") == 0
     assert run(monkeypatch, *words, "--force", "--unit", "mm") == 2
+    assert run(monkeypatch, *words, "--force", "--tilt", "0") == 2
 
 
 def test_platform_joints_in_the_base_are_asked_about_and_taken_as_said(
@@ -257,3 +259,33 @@ def test_three_commands_lead_from_files_to_a_calibration(
     )
     assert found < 0.2 * nominal
     assert found < 2e-4
+
+
+def test_hostile_names_do_nothing_in_a_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Escape sequences, changes of direction and markup in names of files and links."""
+    odd = "\x1b]0;me\x07[red]\u202e"
+    urdf = (ROOT / "urdf/3-rpr.urdf").read_text()
+    folder = tmp_path / odd
+    folder.mkdir()
+    (folder / f"{odd}.urdf").write_text(urdf.replace('"platform"', '"plat[red]form"'))
+    entry = yaml.safe_load((ROOT / "models/3-rpr.yaml").read_text())
+    entry["legcal"] |= {"urdf": f"{odd}.urdf", "platform": "plat[red]form"}
+    model = folder / f"{odd}.yaml"
+    model.write_text(yaml.safe_dump(entry))
+    for words in (
+        ("inspect", model, "--picture", folder / f"{odd}.svg", "--write", folder / "copy"),
+        ("evaluate", model, model),
+        ("inspect", folder / "none"),
+        ("new", "--template", "-o", folder, "--name", "mine"),
+        ("new", "--family", "3-RPR", "--unit", "mm", "--base-radius", "300", "--platform-radius",
+         "150", "-o", folder),
+    ):  # fmt: skip
+        code = run(monkeypatch, *words)
+        said = capsys.readouterr()
+        for text in (said.out, said.err):
+            assert not {"\x1b", "\x07", "\u202e"} & set(text), words
+        assert code == (2 if "none" in str(words[1]) else 0), said.err
+    drawn = (folder / f"{odd}.svg").read_text()
+    assert not {"\x1b", "\u202e"} & set(drawn)

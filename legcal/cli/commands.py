@@ -20,7 +20,7 @@ from legcal.cli.options import (
     show,
     write_page,
 )
-from legcal.errors import UsageError
+from legcal.errors import UsageError, printable
 from legcal.vision import DistortionModel
 
 
@@ -223,10 +223,10 @@ def inspect(
     description = machine_document(machine)
     if picture is not None:
         report.MACHINE_PICTURE.write(picture, report.draw_machine(machine))
-        typer.echo(f"Wrote {picture}.", err=True)
+        typer.echo(printable(f"Wrote {picture}."), err=True)
     if write is not None:
         for path in write_model(machine, write):
-            typer.echo(f"Wrote {path}.", err=True)
+            typer.echo(printable(f"Wrote {path}."), err=True)
     show(as_json, lambda: description, lambda: report.inspect_table(description))
 
 
@@ -427,7 +427,8 @@ def new(
         "tilt": tilt,
     }
     if template:
-        if table is not None or family is not None or unit is not None or any(dimensions.values()):
+        given = [table, family, unit, *dimensions.values()]
+        if any(value is not None for value in given):
             raise UsageError(
                 "The template could not be written: found other options beside --template, needed "
                 "--output and --name only; leave them out, and write your numbers in the table."

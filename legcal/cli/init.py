@@ -54,7 +54,16 @@ def init(
     views: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME,NAME,...", help="Use only the photographs in these folders of FOLDER."
+            metavar="NAME,NAME,...",
+            help="Use only these views (folders of FOLDER).",
+        ),
+    ] = None,
+    view_pattern: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PATTERN",
+            help="Which part of the file names is the view, where all photographs are in one "
+            "folder: '{view}_*' for left_012.jpg, '*-{view}' for 012-left.jpg.",
         ),
     ] = None,
     match: Annotated[
@@ -90,6 +99,7 @@ def init(
         unit=unit,
         lengths=lengths,
         views=[] if views is None else views.split(","),
+        view_pattern=view_pattern,
         by=match,
         encoder_sigma=sigma,
     )

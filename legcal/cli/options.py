@@ -121,6 +121,10 @@ def print_table(renderable: RenderableType) -> None:
     """Print what a person reads on stdout."""
     from rich.console import Console
 
+    if isinstance(renderable, str):
+        from legcal.report import report
+
+        renderable = report(renderable)
     with _writing_to_stdout():
         Console(highlight=False).print(renderable)
         sys.stdout.flush()

@@ -20,7 +20,14 @@ import yaml
 
 from legcal.data.dataset_file import ENCODER_SIGMAS
 from legcal.data.measurements import few, reading_columns
-from legcal.data.photograph_matching import Matching, Photograph, Row, find_photographs, match
+from legcal.data.photograph_matching import (
+    Matching,
+    Photograph,
+    Row,
+    find_photographs,
+    likely_pattern,
+    match,
+)
 from legcal.data.readings_sheet import Headings, readings_of, unit_of
 from legcal.errors import DatasetError, UsageError
 from legcal.files import (
@@ -154,6 +161,7 @@ def plan_new_dataset(
     unit: str | None = None,
     lengths: bool = False,
     views: Sequence[str] = (),
+    view_pattern: str | None = None,
     by: str | None = None,
     encoder_sigma: float | None = None,
 ) -> NewDataset:
@@ -176,7 +184,9 @@ def plan_new_dataset(
     lengths : bool
         Whether the table holds whole lengths of legs in place of readings.
     views : sequence of str
-        Folders to use, all by default.
+        Folders (or views by the pattern) to use, all by default.
+    view_pattern : str, optional
+        Which part of the file names is the view, if it is not the folder: ``{view}_*``.
     by : str, optional
         How to match photographs: ``name``, ``time`` or ``order``.
     encoder_sigma : float, optional
@@ -190,7 +200,7 @@ def plan_new_dataset(
     folder, path, destination = Path(folder), Path(readings), Path(destination)
     machine = load_mechanism(model)
     _check_place(folder, destination)
-    photographs = find_photographs(folder, [view.strip("/") for view in views])
+    photographs = find_photographs(folder, [view.strip("/") for view in views], view_pattern)
     headings = Headings(path, [machine.legs[j] for j in machine.motors])
     table = read_table(
         path, "table of readings", "row", headings.columns(), needed="one row for each photograph",
@@ -221,9 +231,13 @@ def plan_new_dataset(
     sigma, note = _sigma(encoder_sigma, digit)
     notes = [*headings.notes, *matching.notes, *note]
     if set(view_of) == {ONE_VIEW} and not any(row.view for row in rows):
+        likely = likely_pattern([photograph for _, photograph in matching.pairs])
+        remedy = "put those of each place in a folder, add a column view, or give --view-pattern"
+        if likely is not None:
+            remedy = f"as the names of the files look, give --view-pattern '{likely}'"
         notes.append(
-            f"All photographs are one view, {ONE_VIEW}: if the camera stood in several places, put "
-            "those of each place in a folder, or add a column view."
+            f"All photographs are one view, {ONE_VIEW}: if the camera stood in several places, "
+            f"{remedy}."
         )
     return NewDataset(
         machine=machine,
@@ -346,8 +360,15 @@ def _cameras(
 ) -> tuple[dict[str, Path], list[str]]:
     """Return the camera file of each view: as given, else beside its photographs or above them."""
     for_all = [text for text in given if "=" not in text or os.path.isfile(text)]
-    of_one = dict(text.split("=", 1) for text in given if text not in for_all)
-    problems = []
+    named = [text.split("=", 1) for text in given if text not in for_all]
+    of_one, problems = dict[str, str](), list[str]()
+    for name, file in named:
+        if of_one.setdefault(name, file) != file:
+            problems.append(
+                f"The camera file of view {describe(name)} could not be decided: found "
+                f"--camera {name}={of_one[name]} and --camera {name}={file}, needed one; leave "
+                "the other out."
+            )
     if len(for_all) > 1:
         problems.append(
             f"The camera files could not be used: found {few(for_all)}, needed one for all views, "

@@ -11,18 +11,20 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date, datetime, time, timedelta
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 from legcal.data.measurements import few
-from legcal.errors import DatasetError
+from legcal.errors import DatasetError, UsageError
 from legcal.files import MAX_IMAGE, closest, describe, is_name, read_bytes
 from legcal.vision import CONVERT, FOREIGN_SUFFIXES, read_facts
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 MAX_PHOTOGRAPHS = 50_000
+MAX_VIEWS = 12  # that names of photographs are taken for
+_SEPARATORS = " _-."
 _NUMBERS = re.compile(r"(\d+)", re.ASCII)
 _EXIF_DATE = re.compile(r"(\d{4}):(\d\d):(\d\d)")
 
@@ -33,11 +35,16 @@ class Photograph:
 
     path: Path
     name: str  # relative to that folder, with "/"
+    view: str = ""  # by a pattern of names
+    label: str = ""  # what the pattern leaves of the name without the view
 
     @property
     def folder(self) -> str:
-        """The folder that holds it, relative to the given one; "." for that."""
-        return PurePosixPath(self.name).parent.as_posix()
+        """What has the photographs of a view: the view by a pattern of names, else the folder.
+
+        That folder is relative to the given one; "." for it.
+        """
+        return self.view or PurePosixPath(self.name).parent.as_posix()
 
 
 @dataclass(frozen=True)
@@ -59,11 +66,61 @@ class Matching:
     notes: tuple[str, ...] = ()
 
 
-def find_photographs(folder: Path, chosen: Sequence[str] = ()) -> list[Photograph]:
+class ViewPattern:
+    """Which part of a file name is the view: ``{view}_*`` of ``left_012.jpg``."""
+
+    def __init__(self, pattern: str) -> None:
+        self.pattern = pattern
+        if pattern.count("{view}") != 1 or "/" in pattern:
+            raise UsageError(
+                f"The pattern of the views could not be used: found {describe(pattern)}, needed a "
+                "file name with {view} once and * for what changes, such as '{view}_*'; correct "
+                "--view-pattern."
+            )
+        before, after = (".*?".join(map(re.escape, part.split("*"))) for part in
+                         pattern.split("{view}"))  # fmt: skip
+        self._form = re.compile(f"(?P<before>{before})(?P<view>.+?)(?P<after>{after})", re.DOTALL)
+
+    def of(self, photograph: Photograph) -> Photograph | None:
+        """Return a photograph with its view, or None if its name has another form."""
+        path = PurePosixPath(photograph.name)
+        for name in (path.stem, path.name):
+            found = self._form.fullmatch(name)
+            if found is not None:
+                label = (found["before"] + found["after"]).removesuffix(path.suffix)
+                return replace(photograph, view=found["view"], label=label.strip(_SEPARATORS))
+        return None
+
+
+def likely_pattern(photographs: Sequence[Photograph]) -> str | None:
+    """Return a pattern by which names in one folder are those of several views, as many of each.
+
+    Names of views are words rather than numbers, and few.
+    """
+    likely: list[tuple[bool, int, int, str]] = []
+    for pattern in ("{view}_*", "{view}-*", "*_{view}", "*-{view}"):
+        form, labels = ViewPattern(pattern), dict[str, set[str]]()
+        named = [one for photograph in photographs if (one := form.of(photograph)) is not None]
+        for one in named:
+            labels.setdefault(one.view, set()).add(one.label)
+        sizes = {len(of_view) for of_view in labels.values()}
+        if len(named) == len(photographs) and 1 < len(labels) <= MAX_VIEWS and len(sizes) == 1:
+            are_numbers = all(view.isdecimal() for view in labels)
+            if max(sizes) > 1:
+                likely.append((are_numbers, len(labels), len(likely), pattern))
+    return min(likely)[-1] if likely else None
+
+
+def find_photographs(
+    folder: Path, chosen: Sequence[str] = (), pattern: str | None = None
+) -> list[Photograph]:
     """Return the images in a folder and in the folders in it, in the order of their names.
 
-    ``chosen`` are the only folders to look at, all if empty.
+    ``chosen`` are the only folders (views, where a *pattern* of names gives these) to look at, all
+    if empty.
     """
+    form = None if pattern is None else ViewPattern(pattern)
+    others: list[str] = []
     if not os.path.isdir(folder):
         found = "a file" if os.path.exists(folder) else "no such folder"
         raise DatasetError(
@@ -78,6 +135,12 @@ def find_photographs(folder: Path, chosen: Sequence[str] = ()) -> list[Photograp
         for name in files:
             suffix = Path(name).suffix.lower()
             file = Photograph(Path(above) / name, (here / name).as_posix())
+            if form is not None and suffix in SUFFIXES and not name.startswith("."):
+                named = form.of(file)
+                if named is None:
+                    others.append(file.name)
+                    continue
+                file = named
             if name.startswith(".") or (chosen and file.folder not in chosen):
                 continue
             if suffix in SUFFIXES:
@@ -89,6 +152,12 @@ def find_photographs(folder: Path, chosen: Sequence[str] = ()) -> list[Photograp
                 f"{folder}: the photographs could not be used: found more than {MAX_PHOTOGRAPHS}, "
                 "needed fewer; give the folder of one calibration."
             )
+    if others:
+        raise DatasetError(
+            f"{folder}: the views of the photographs could not be found: found "
+            f"{few([describe(name) for name in others])}, needed names of the form "
+            f"{describe(pattern)}; correct --view-pattern, or move them to another folder."
+        )
     if not photographs:
         found, remedy = "none", "check the path"
         if foreign:
@@ -210,7 +279,8 @@ def _by_name(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
             continue
         by_key: dict[str, list[Photograph]] = {}
         for photograph in photographs:
-            by_key.setdefault(key(photograph.name), []).append(photograph)
+            for text in {key(photograph.name), *([key(photograph.label)] * bool(photograph.view))}:
+                by_key.setdefault(text, []).append(photograph)
         found = {}
         for k in named:
             same = by_key.get(key(rows[k].image), [])

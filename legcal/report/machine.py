@@ -91,10 +91,10 @@ def _direction(axis: Sequence[float] | None) -> str:
 
 
 def _points(points: Sequence[Sequence[float]]) -> list[str]:
-    """Return points in millimetres, decimals aligned."""
-    words = [[f"{round(1e3 * x, 1) + 0.0:.1f}" for x in point] for point in points]
-    width = max(len(word) for row in words for word in row)
-    return [" ".join(word.rjust(width) for word in row) for row in words]
+    """Return points in millimetres, decimals of each coordinate aligned."""
+    words = [[f"{1e3 * x:z.2f}" for x in point] for point in points]
+    width = [max(len(row[k]) for row in words) for k in range(3)]
+    return [" ".join(map(str.rjust, row, width)) for row in words]
 
 
 def _radii(leg: dict[str, Any]) -> str:
@@ -123,7 +123,7 @@ def _home(home: dict[str, Sequence[float]]) -> str:
 
 def _length(leg: dict[str, Any]) -> str:
     """Return the length law of a leg in millimetres."""
-    q0 = f"{1e3 * leg['q0']:.3f}"
+    q0 = f"{1e3 * leg['q0']:.2f}"
     return q0 if leg["kind"] == "constant" else f"{q0} {'+' if leg['sign'] > 0 else '-'} q"
 
 

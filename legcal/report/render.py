@@ -8,7 +8,18 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from legcal.errors import escaped
+
 Cells = Sequence[str | Text]
+
+
+def shown(text: str | Text) -> Text:
+    """Return text as a terminal may show it: names of files and links do nothing there."""
+    if isinstance(text, Text):
+        if text.plain != (plain := escaped(text.plain)):
+            return Text(plain, style=text.style, overflow=text.overflow)
+        return text
+    return Text(escaped(text))
 
 
 def table(
@@ -22,7 +33,7 @@ def table(
     ``least`` are the characters that a column keeps on a narrow terminal.
     """
     found = Table(
-        title=Text(title) if title else None,
+        title=shown(title) if title else None,
         title_justify="left",
         box=None,
         pad_edge=False,
@@ -31,14 +42,14 @@ def table(
     for k, column in enumerate(columns):
         is_number = column.startswith(">")
         found.add_column(
-            Text(column.removeprefix(">")),
+            shown(column.removeprefix(">")),
             justify="right" if is_number else "left",
             overflow="fold",
             no_wrap=is_number,
             min_width=(least or {}).get(k),
         )
     for row in rows:
-        found.add_row(*(cell if isinstance(cell, Text) else Text(cell) for cell in row))
+        found.add_row(*map(shown, row))
     return found
 
 
@@ -47,12 +58,14 @@ def report(*blocks: str | RenderableType | Sequence[str | RenderableType] | None
     parts: list[RenderableType] = []
     for block in blocks:
         lines = [block] if isinstance(block, str) or not isinstance(block, Sequence) else [*block]
-        shown = [Text(line) if isinstance(line, str) else line for line in lines if line]
-        if shown:
-            parts += [Text(), *shown] if parts else shown
+        parts_of_block = [
+            shown(line) if isinstance(line, str | Text) else line for line in lines if line
+        ]
+        if parts_of_block:
+            parts += [Text(), *parts_of_block] if parts else parts_of_block
     return Group(*parts)
 
 
 def heading(name: str, rest: str) -> Text:
     """Return what a report is of, the name in bold."""
-    return Text.assemble((name, "bold"), rest)
+    return Text.assemble((escaped(name), "bold"), escaped(rest))
