@@ -339,8 +339,8 @@ def _search_tags(
 
 
 def _eight_bits(grey: NDArray[np.generic]) -> NDArray[np.uint8]:
-    levels = np.clip(np.rint(grey), 0.0, 255.0)
-    return np.asarray(levels, dtype=np.uint8)
+    positive = grey if grey.dtype == np.uint8 else np.maximum(grey, 0)
+    return np.asarray(cv2.convertScaleAbs(positive), dtype=np.uint8)  # rounded, and 255 at most
 
 
 @lru_cache(maxsize=1)
