@@ -208,7 +208,7 @@ def test_a_contradicted_focal_length_counts_in_the_verdict(
     ],
 )
 def test_fit_and_steps_come_nearer_to_the_truth(model: str, tmp_path: Path) -> None:
-    made = simulate(model, tmp_path / "set", settings(poses=8, views=3))
+    made = simulated(tmp_path / "set", model, poses=8, views=3)
     out = tmp_path / "out"
     found = calibrate(made.folder, transformation="cross_product", output=out)
     assert found.verdict.trustworthy
@@ -228,7 +228,8 @@ def test_fit_and_steps_come_nearer_to_the_truth(model: str, tmp_path: Path) -> N
         pose_differences(poses, true)[0].mean() for poses in (nominal, staged, fitted)
     )
     assert before > 1e-3
-    assert by_fit < 0.1 * before
+    assert found.platform is not None
+    assert by_fit < 3.0 * found.platform.sigma.mean_displacement < 0.2 * before
     assert by_steps < 0.2 * before or model in {"3-upu", "tricept"}
     twists = {n: s for n, s in found.solution.status.items() if n.endswith(".twist")}
     assert bool(twists) == any(leg.twist is not None for leg in geometries(made.nominal))

@@ -16,7 +16,7 @@ from legcal.errors import DatasetError
 from legcal.files.schema import _PLAIN_TEXT, _Loader, _QuickLoader
 from legcal.vision import read_camera
 
-PARTS = 8  # of 2000 files
+PARTS = 16  # of 2000 files
 
 
 @pytest.mark.parametrize(

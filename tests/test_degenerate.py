@@ -94,7 +94,8 @@ def test_collinear_joints_of_a_3_rpr_are_found(
 ) -> None:
     xyz, turn = home
     model = planar(tmp_path, base, platform, {"xyz": xyz, "rpy_deg": [0, 0, turn]})
-    folder = simulate(model, tmp_path / "set", settings(poses=5, seed=1)).folder
+    five = settings(poses=5, shared_poses=True, seed=1)
+    folder = simulate(model, tmp_path / "set", five).folder
     calibration = calibrate(folder, output=tmp_path / "out")
     before, after = errors(calibration, folder, tmp_path / "out")
     assert calibration.verdict.trustworthy

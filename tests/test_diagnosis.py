@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 from hexapod_example import Spoiled, spoiled
+from simulated import simulated
 
-from legcal import SimulationSettings, calibrate, load_dataset, simulate
+from legcal import calibrate, load_dataset
 from legcal.calibration.diagnosis.diagnosis import diagnose
 from legcal.calibration.diagnosis.mistakes import mistakes
 from legcal.calibration.ordered_dataset import order_dataset
 from legcal.errors import DatasetError, NotVisible
 from legcal.progress import no_progress
-from legcal.simulation import Level
 from legcal.workers import in_turn
 
 COLUMNS = [f"leg{k}_prismatic" for k in range(1, 7)]
@@ -67,9 +67,8 @@ def test_nothing_is_wrong_with_a_session_that_is_right(tmp_path: Path) -> None:
 @pytest.mark.parametrize("model", ["3-rpr", "3-upu-tilted", "tricept", "hexapod-strut"])
 def test_every_mistake_can_be_tried_on_every_kind_of_machine(model: str, tmp_path: Path) -> None:
     """Legs of other types, constant and passive ones, a plane: joints are known or left out."""
-    settings = SimulationSettings(level=Level.OUTLINES, views=2, poses=3)
-    simulate(model, tmp_path / "set", settings)
-    data = order_dataset(load_dataset(tmp_path / "set"), in_turn, no_progress)
+    dataset = load_dataset(simulated(tmp_path / "set", model).folder)
+    data = order_dataset(dataset, in_turn, no_progress)
     tried = mistakes(data)
     assert {"columns exchanged", "readings shifted", "handedness"} <= {one.kind for one in tried}
     for one in tried:

@@ -27,7 +27,7 @@ from legcal import load_dataset, load_mechanism
 from legcal.errors import DatasetError, ModelError, OutOfResources, UsageError
 from legcal.files import check_destination, closest, parse_yaml, result_folder, write_atomically
 from legcal.signals import raise_if_stopped, stopped_by_signals
-from legcal.workers import KeptArrays, worker_pool
+from legcal.workers import KeptArrays, Run, worker_pool
 
 __all__ = ["folder"]
 
@@ -193,29 +193,40 @@ def test_a_pool_that_is_left_in_the_middle_of_its_work_ends_at_once() -> None:
     assert not [t for t in threading.enumerate() if "Executor" in type(t).__name__]
 
 
-def test_what_goes_to_another_process_and_back_is_the_same_bit_by_bit() -> None:
+@pytest.fixture(scope="module")
+def two_processes() -> Iterator[Run]:
+    """A pool that was started where libraries may have three threads."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OMP_NUM_THREADS", "3")
+        patch.delenv("OPENCV_FOR_THREADS_NUM", raising=False)
+        with worker_pool(2) as run:
+            list(run(abs, range(2)))
+            assert (os.getenv("OMP_NUM_THREADS"), os.getenv("OPENCV_FOR_THREADS_NUM")) == (
+                "3",
+                None,
+            )
+            yield run
+
+
+def test_what_goes_to_another_process_and_back_is_the_same_bit_by_bit(two_processes: Run) -> None:
     rng = np.random.default_rng(0)
     rotations = Rotation.random(64, rng=rng)
     motions = tuple(RigidTransform.from_components(rng.normal(size=(64, 3)), rotations))
-    with worker_pool(2) as run:
-        found = list(run(motions.__getitem__, range(64)))
+    found = list(two_processes(motions.__getitem__, range(64)))
     for one, other in zip(motions, found, strict=True):
         assert one.as_matrix().tobytes() == other.as_matrix().tobytes()
 
 
 def test_libraries_have_one_thread_in_each_process_and_as_many_as_before_in_this_one(
-    monkeypatch: pytest.MonkeyPatch,
+    two_processes: Run,
 ) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    monkeypatch.delenv("OPENCV_FOR_THREADS_NUM", raising=False)
-    with worker_pool(2) as run:
-        found = list(run(os.getenv, ["OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"]))
+    found = list(two_processes(os.getenv, ["OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"]))
     assert found == ["1", "1"]
     assert (os.getenv("OMP_NUM_THREADS"), os.getenv("OPENCV_FOR_THREADS_NUM")) == ("3", None)
 
 
 def test_results_come_as_they_are_finished_and_rows_are_taken_as_processes_get_free(
-    tmp_path: Path,
+    two_processes: Run, tmp_path: Path
 ) -> None:
     taken = []
 
@@ -233,8 +244,7 @@ def test_results_come_as_they_are_finished_and_rows_are_taken_as_processes_get_f
     assert first != 0
     assert sorted([first, *rest]) == taken == list(range(40))
     (tmp_path / "done").unlink()
-    with worker_pool(2) as run:
-        assert list(run(work, range(6))) == list(range(6))
+    assert list(two_processes(work, range(6))) == list(range(6))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs memory files")

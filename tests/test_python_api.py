@@ -12,6 +12,7 @@ import pytest
 from hexapod_example import ROOT, Run
 from matplotlib import pyplot
 from scipy.spatial.transform import Rotation
+from simulated import simulated
 
 import legcal
 from legcal.errors import OutOfResources, UsageError
@@ -80,8 +81,7 @@ def test_figures_show_every_view_and_every_parameter(example_run: Run) -> None:
 
 
 def test_a_fit_without_outlines_has_no_residuals_to_draw(tmp_path: Path) -> None:
-    settings = legcal.SimulationSettings(level=Level.AXES, views=3, poses=6)
-    legcal.simulate("3-rpr", tmp_path / "set", settings)
+    simulated(tmp_path / "set", "3-rpr", level=Level.AXES, views=3, poses=6)
     with pytest.raises(UsageError, match="found a fit without outlines"):
         legcal.calibrate(tmp_path / "set").plot_residuals()
 

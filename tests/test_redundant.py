@@ -7,12 +7,14 @@ from tempfile import mkdtemp
 
 import numpy as np
 import pytest
+from csv_rows import read_rows, write_rows
 from layouts import Layout, LegSpec, MachineSpec, write_machine
 from machines import displaced, of_types, planar, ring
 from outline_sessions import made
 from parameter_steps import written_with
 from scipy.spatial.transform import RigidTransform
 from simulated import settings
+from thinned import thinned
 
 import legcal
 from legcal.calibration.joint_fit.platform import platform_by_parameters
@@ -150,7 +152,9 @@ def test_poses_are_those_of_least_squares(name: str) -> None:
         assert min(change) > -1e-12
 
 
-@pytest.mark.parametrize("name", ["7-UPS", "4-RPR", "2-RPS + 2-SPS + rod"])
+@pytest.mark.parametrize(
+    "name", thinned(["7-UPS", "4-RPR", "2-RPS + 2-SPS + rod"], ["4-RPR", "2-RPS + 2-SPS + rod"])
+)
 def test_predicted_errors_are_those_of_written_models(name: str, tmp_path: Path) -> None:
     machine = machine_of(name)
     parametrization = parametrization_of(machine)
@@ -189,7 +193,7 @@ def test_readings_that_contradict_each_other_are_refused_with_the_motor(tmp_path
 
 def test_a_redundant_machine_calibrates_and_a_wrong_reading_is_refused(tmp_path: Path) -> None:
     machine, folder = made("4-rpr", tmp_path), tmp_path / "dataset"
-    simulate(machine.yaml_path, folder, settings(poses=6))
+    simulate(machine.yaml_path, folder, settings(poses=6, shared_poses=True))
     calibration = legcal.calibrate(folder, output=tmp_path / "result")
     truth = next((folder / "truth/models").glob("*.yaml"))
     before, after = (
@@ -201,10 +205,9 @@ def test_a_redundant_machine_calibrates_and_a_wrong_reading_is_refused(tmp_path:
     sigma = calibration.platform.sigma.mean_displacement
     assert after.mean() < 3.0 * sigma < 0.1 * before.mean()
     table = folder / "measurements.csv"
-    header, first, *rows = table.read_text().splitlines()
-    columns, cells = header.split(","), first.split(",")
-    column = columns.index(str(machine.legs[1].prismatic))
-    cells[column] = "0.12" if float(cells[column]) < 0.06 else "0.0"
-    table.write_text("\n".join([header, ",".join(cells), *rows, ""]))
+    rows, column = read_rows(table), str(machine.legs[1].prismatic)
+    wrong = "0.12" if float(rows[0][column]) < 0.06 else "0.0"
+    of_pose = [row | {column: wrong} if row["pose"] == rows[0]["pose"] else row for row in rows]
+    write_rows(table, of_pose)
     with pytest.raises(DatasetError, match=r"readings of view .* from where the other motors put"):
         legcal.calibrate(folder, output=tmp_path / "refused")

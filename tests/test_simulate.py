@@ -157,13 +157,13 @@ def test_photographs_are_those_of_the_kind_of_camera_and_its_file(tmp_path: Path
 def test_photographs_do_not_depend_on_the_number_of_processes(tmp_path: Path) -> None:
     look = legcal.Appearance(gamma=1.8, clutter=0, samples=13)
     few = settings(
-        level=Level.PHOTOGRAPHS, poses=2, views=1, images=2, camera=small_camera(tmp_path),
+        level=Level.PHOTOGRAPHS, poses=1, views=1, images=2, camera=small_camera(tmp_path),
         appearance=look,
     )  # fmt: skip
     one, two = (simulate("3-rps", tmp_path / str(n), few, workers=n) for n in (1, 2))
     assert files_of(one.folder) == files_of(two.folder)
     images = [x for name, x in files_of(one.folder).items() if name.endswith(".png")]
-    assert len(set(images)) == 4  # repeated images differ by the noise of the sensor
+    assert len(set(images)) == 2  # repeated images differ by the noise of the sensor
     (view,) = load_dataset(one.folder).measurements.views
     assert (view.camera.gamma, view.camera.gamma_is_given) == (1.8, True)
     console = Console(width=400, record=True, file=io.StringIO())

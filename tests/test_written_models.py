@@ -179,12 +179,15 @@ def test_origins_and_radii_are_added_and_changed_in_place() -> None:
 
 @pytest.mark.parametrize(
     ("machine", "leg", "others"),
-    [
-        ("6-UPS", 0, {}),
-        ("3-RPR", 1, {"hung": "platform"}),
-        ("3-UPU", 2, {"cut": "mid"}),
-        ("Tricept", 3, {"sphere": False}),
-    ],
+    thinned(
+        [
+            ("6-UPS", 0, {}),
+            ("3-RPR", 1, {"hung": "platform"}),
+            ("3-UPU", 2, {"cut": "mid"}),
+            ("Tricept", 3, {"sphere": False}),
+        ],
+        lambda machine, leg, others: leg in (1, 3),
+    ),
 )
 def test_models_are_written_whose_platform_is_the_child_of_a_last_joint(
     machine: str, leg: int, others: dict[str, Any], tmp_path: Path
@@ -370,8 +373,6 @@ def test_a_true_model_of_a_shipped_one_has_the_drawn_numbers(name: str, tmp_path
         product(["6-UPS", "3-UPU", "Tricept"], LAYOUTS),
         [
             ("6-UPS", "S as revolutes, hung from the platform"),
-            ("6-UPS", "carried by leg 2"),
-            ("3-UPU", "cut behind the slider"),
             ("3-UPU", "cut before the slider"),
             ("Tricept", "cut behind the slider"),
             ("Tricept", "carried by leg 2"),

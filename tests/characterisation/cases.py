@@ -104,8 +104,8 @@ class Places(Case):
 
 
 QUICK_CHAINS = {  # why the others are slow is said in README.md
-    *("3-rpr-outlines", "hexapod-outlines", "hexapod-rod-outlines", "hexapod-strut-outlines"),
-    *("3-rpr-axes", "3-rps-axes", "3-upu-axes", "hexapod-axes", "tricept-axes"),
+    *("3-rpr-outlines", "hexapod-outlines", "hexapod-strut-outlines"),
+    *("3-rpr-axes", "3-rps-axes", "3-upu-axes", "tricept-axes"),
 }
 QUICK = "--level outlines --poses 1 --views 1 --seed 3 --json"
 SMALL = (
@@ -405,9 +405,7 @@ def _studies() -> Iterable[Case]:
     ):
         runs = "1" if name == "paper" else "2"
         command = f"study {name} --runs {runs} --seed 5 --workers 1 {words} --output {{out}} --json"
-        yield Case(
-            f"study-{name}", (Step(command, folder=folder),), slow=name in {"bound", "convergence"}
-        )
+        yield Case(f"study-{name}", (Step(command, folder=folder),), slow=name != "classes")
     resumed = f"study convergence --runs {{}} --seed 5 --workers 2 {machine} -o {{{{out}}}} --json"
     yield Case(
         "study-resumed",
