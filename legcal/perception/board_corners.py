@@ -339,7 +339,7 @@ def _search_tags(
 
 
 def _eight_bits(grey: NDArray[np.generic]) -> NDArray[np.uint8]:
-    positive = grey if grey.dtype == np.uint8 else np.maximum(grey, 0)
+    positive = np.maximum(np.asarray(grey, dtype=np.float32), 0.0)
     return np.asarray(cv2.convertScaleAbs(positive), dtype=np.uint8)  # rounded, and 255 at most
 
 
