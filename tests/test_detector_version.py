@@ -7,42 +7,25 @@ once DETECTOR_VERSION is raised.
 """
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from six_photographs import FOLDER, six_photographs
 
-from legcal.data import Outlines, load_dataset, no_outlines
-from legcal.perception import Photographs, Placement, measure_photographs
+from legcal.data import Outlines
+from legcal.perception import measure_photographs
 from legcal.perception.photographs import DETECTOR_VERSION
 from legcal.progress import no_progress
-from legcal.workers import in_turn
 
-FOLDER = Path(__file__).parent / "data" / "six-photographs"
 VALUES = FOLDER / "values.json"
 # What rounding may change: verdicts, the median end, nine in ten [px], the median covariance.
 VERDICTS, PX, MOST_PX, PART = 3, 2e-3, 0.05, 3e-3
 RAISE = "outlines came out differently: raise DETECTOR_VERSION and record the values again"
-OFF, BLUR = 2e-3, 0.6  # of joint centres [m], and the blur that is taken to be known [px]
 
 
 def measured() -> dict[str, list[Any]]:
     """Return the outlines of the six photographs, measured in three ways."""
-    dataset = load_dataset(FOLDER)
-    m, rows = dataset.measurements, np.arange(6)
-    load = dataset.image_reader(rows.tolist())
-    photographs = Photographs(dataset.machine, m, load, in_turn, rows, no_outlines())
-    truth = json.loads((FOLDER / "truth.json").read_text(encoding="utf-8"))
-    A, B = np.array([truth["A_base"]] * 6), np.array(truth["B_base"])
-    poses = [truth["T_base_camera"][view.name] for view in m.views]
-    cameras = [
-        RigidTransform.from_components(pose["xyz"], Rotation.from_quat(pose["quat_xyzw"]))
-        for pose in poses
-    ]
-    signs = np.resize([1.0, -1.0, -1.0, 1.0, -1.0], B.shape)
-    rough = Placement(A + OFF * signs, B - OFF * signs, tuple(cameras))
-    near = Placement.of_fit(A, B, cameras, (BLUR, BLUR))
+    photographs, rough, near = six_photographs()
     tables = {
         "quickly": measure_photographs(photographs, rough, no_progress, together=False),
         "with care": measure_photographs(photographs, rough, no_progress),

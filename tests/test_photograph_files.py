@@ -268,12 +268,14 @@ def test_lossy_compression_is_noted_once_with_views_and_qualities(folder: Folder
         files = dict(enumerate(jpeg(PICTURE, q) for q in qualities))
         assert notes(folder, files) == []
         dataset = load_dataset(folder.path)
-        return compression_note(dataset.measurements, dataset.facts, 0.456, 1.234)
+        return compression_note(dataset.measurements, dataset.facts, 0.456, 1.234, "9.8 times")
 
     assert note(95, 95, 100, 97) == []
     (both,) = note(75, 75, 75, 75)
     assert [
-        w for w in ("views c1, c2", "quality 75 or", "0.46 px", "1.23", "95") if w not in both
+        w
+        for w in ("views c1, c2", "quality 75 or", "0.46 px", "1.23", "9.8 times", "95")
+        if w not in both
     ] == []
     (one,) = note(95, 95, 60, 80)
     assert "view c2" in one

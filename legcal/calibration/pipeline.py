@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from legcal.calibration.board import BoardViews, base_of_board, board_notes, observe_board
+from legcal.calibration.compression import compression_effect
 from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose
 from legcal.calibration.four_steps import Steps, four_steps, starts
 from legcal.calibration.identify.identifiability import check_identifiable
@@ -72,6 +73,7 @@ from legcal.machine import Machine
 from legcal.paper import Criteria, Transformation
 from legcal.perception import (
     MeasuredImages,
+    Photographs,
     Placement,
     detection_settings,
     given_outlines,
@@ -224,7 +226,6 @@ def calibrate(
         *found.solution.notes,
         *_camera_notes(dataset, found.solution),
         *exact_cameras(dataset, choices),
-        *_compression_note(dataset, found.solution),
     ]
     calibration = judge(
         dataset_at(dataset, fitted),
@@ -399,12 +400,16 @@ def _measure_again(
         return estimate
     again = seen.photographs.narrowed(np.array(rows, dtype=np.intp), estimate.outlines)
 
-    def fitted(near: Estimate, gammas: Mapping[str, float], like: Outlines | None) -> Estimate:
+    def at_fit(near: Estimate, gammas: Mapping[str, float]) -> tuple[Photographs, Placement]:
         machine = _with_fitted_radii(again.machine, near.solution)
         photographs = replace(again, machine=machine).with_gammas(gammas)
         here = near.fitted.with_fitted_poses(near.solution.T_Rb_Re)
         every = replace(data, seen_poses=here.seen_poses)
-        placement = _fitted_placement(every, near.solution, seen)
+        return photographs, _fitted_placement(every, near.solution, seen)
+
+    def fitted(near: Estimate, gammas: Mapping[str, float], like: Outlines | None) -> Estimate:
+        photographs, placement = at_fit(near, gammas)
+        here = near.fitted.with_fitted_poses(near.solution.T_Rb_Re)
         stage = "Measuring outlines near the fit"
         if gammas:
             stage += f", gamma {few(sorted({f'{gamma:.2f}' for gamma in gammas.values()}))}"
@@ -424,12 +429,13 @@ def _measure_again(
         trials = trials.tried(gammas, there.solution)
         if trials.best == len(trials.solutions) - 1:
             best = there
-    last, refused = first, trials.found()
+    last, refused, gammas = first, trials.found(), {}
     if refused:
         found = fitted(best, refused, None)
         if not loses_outlines(first.outlines, found.outlines):
-            last, refused = found, {}
-    return replace(last, image_notes=trials.notes(refused))
+            last, refused, gammas = found, {}, refused
+    notes = _compression_note(data, last, *at_fit(last, gammas))
+    return replace(last, image_notes=(*trials.notes(refused), *notes))
 
 
 def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
@@ -630,13 +636,16 @@ def exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
     ]
 
 
-def _compression_note(dataset: Dataset, solution: Solution) -> list[str]:
+def _compression_note(
+    data: OrderedDataset, estimate: Estimate, photographs: Photographs, placement: Placement
+) -> list[str]:
     """Return a note where outlines were measured in photographs compressed with much loss."""
-    o, measurements = solution.outlines, dataset.measurements
-    measured = {
-        measurements.image[row]
-        for row, source in zip(o.row.tolist(), o.source, strict=True)
-        if source == "detected"
-    }
-    facts = {image: found for image, found in dataset.facts.items() if image in measured}
-    return compression_note(measurements, facts, solution.rms_px or 0.0, solution.noise.scale)
+    solution, measured = estimate.solution, photographs.detect.tolist()
+    names = {data.measurements.image[row] for row in measured}
+    facts = {image: found for image, found in data.dataset.facts.items() if image in names}
+    effect = compression_effect(
+        photographs, placement, estimate.outlines, facts, solution.noise, data.progress
+    )
+    words = "" if effect is None else str(effect)
+    rms, scale = solution.rms_px or 0.0, solution.noise.scale
+    return compression_note(data.measurements, facts, rms, scale, words)

@@ -140,7 +140,11 @@ def _of_view(
 
 
 def compression_note(
-    measurements: Measurements, facts: Mapping[str, ImageFacts], rms_px: float, scale: float
+    measurements: Measurements,
+    facts: Mapping[str, ImageFacts],
+    rms_px: float,
+    scale: float,
+    effect: str = "",
 ) -> list[str]:
     """Return a note on photographs that were compressed with much loss.
 
@@ -154,6 +158,8 @@ def compression_note(
         How far outlines are from the fit, root mean square [px].
     scale : float
         Noise of outlines over what the noise of the pixels around them explains.
+    effect : str
+        How much larger standard deviations are for it, in words; "" if that is not known.
     """
     found = compressed(measurements, facts)
     if not found:
@@ -161,7 +167,8 @@ def compression_note(
     return [
         f"Lossy compression moves outlines: found {found}, and outlines that are "
         f"{rms_px:.2f} px off (rms), with standard deviations {scale:.2f} times those that the "
-        "noise of their pixels explains, which the stated uncertainty includes; store "
+        f"noise of their pixels explains{effect and f' and {effect}'}; the stated uncertainty "
+        "includes it; store "
         f"photographs without loss (PNG, TIFF) or as JPEGs of quality {GOOD_QUALITY} or more."
     ]
 

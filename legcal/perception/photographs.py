@@ -52,7 +52,7 @@ from legcal.progress import Report
 from legcal.vision import shared_cameras
 from legcal.workers import Run
 
-DETECTOR_VERSION = 4  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 5  # raise it whenever outlines or notes that are kept come out differently
 MEASURING = "Measuring outlines"  # a stage of progress
 TOO_SHORT = "px in the image"  # end of the reason for parts that are not looked for
 MAX_USED_SHARE = 0.3  # of the outlines of a part that should be seen
