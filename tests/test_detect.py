@@ -29,6 +29,7 @@ from legcal.perception.overlays import (
     PartMarks,
     draw,
     marks_of_image,
+    marks_of_pairs,
     short_reason,
 )
 from legcal.perception.photographs import MeasuredImages, Photographs, place_and_measure
@@ -94,6 +95,10 @@ def test_folder_json_and_summary_tell_the_same(
     assert view["contrast"] == pytest.approx(np.median(contrast))
     assert sum(view["rejected"].values()) == view["outlines"] - view["used"]
     assert "c2" in document["views"]["c2"]["problem"]
+    in_c1, in_c2 = document["left_out"]
+    assert [image["view"] for image in in_c1["images"]] == ["c1"]
+    assert in_c2["why"] == "the camera of its view could not be placed"
+    assert [image["view"] for image in in_c2["images"]] == ["c2"]
     files = [entry["file"] for entry in document["overlays"]]
     assert len(files) == len(set(files)) == document["images"] == 5
     page = (out / "index.html").read_text()
@@ -121,11 +126,24 @@ def test_captions_say_only_of_a_camera_with_a_hint_where_it_was_expected(
 ) -> None:
     assert _caption(found, 0).startswith("c1  images/p0_0.png  1")
     assert _caption(found, 4).endswith(
-        "the camera could not be placed: legs are drawn where it was expected"
+        "the camera could not be placed: edge pairs that were found, and legs where it was expected"
     )
     unknown = replace(found, T_base_camera=(found.T_base_camera[0], None))
     assert unknown.predicted(4) == []
-    assert _caption(unknown, 4).endswith("the camera could not be placed")
+    caption = _caption(unknown, 4)
+    assert caption.endswith("the camera could not be placed: edge pairs that were found")
+
+
+def test_pictures_of_a_view_that_is_not_placed_show_the_edge_pairs_that_were_found() -> None:
+    cam = Camera(np.array([[500.0, 0.0, 199.5], [0.0, 500.0, 149.5], [0.0, 0.0, 1.0]]), 400, 300)
+    image = np.full((300, 400), 200.0, dtype=np.float32)
+    image[:, 180:210] = 40.0
+    part = marks_of_pairs(cam, image)
+    where = sorted(float(mark.points[:, 0].mean()) for mark in part.marks)
+    assert where == pytest.approx([179.5, 209.5], abs=1.0)
+    drawn = draw(image, [part], "c1 a.png").astype(int)
+    near = np.abs(drawn - COLOURS["pair"]).max(axis=2) < 60
+    assert near[: 4 * 280].any(axis=1).mean() > 0.9
 
 
 def test_legs_are_drawn_by_the_radii_that_were_searched_by(

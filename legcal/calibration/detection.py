@@ -22,6 +22,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
+from legcal.calibration.documents import LeftOut, left_out_blocks
 from legcal.data import (
     CORNERS_NAME,
     OBSERVATIONS_NAME,
@@ -48,9 +49,19 @@ from legcal.files import (
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Cylinder
 from legcal.pages import Cell, Link, Page, Picture, Row, Section, Table, Text, number, page_html
-from legcal.perception import HIDDEN, OUTSIDE, PartMarks, draw, marks_of_image, short_reason
+from legcal.perception import (
+    HIDDEN,
+    NOT_PLACED,
+    OUTSIDE,
+    PartMarks,
+    draw,
+    images_left_out,
+    marks_of_image,
+    marks_of_pairs,
+    short_reason,
+)
 from legcal.progress import Report
-from legcal.vision import PredictedLeg, predict_legs
+from legcal.vision import Camera, PredictedLeg, predict_legs
 from legcal.workers import Run
 
 DETECTION = OutputKind("detection", "detection.json", "legcal_detection")
@@ -89,8 +100,6 @@ class Detection:
     unplaced : dict
         Why the cameras of some views could not be placed, by name of the view; they are left where
         they were expected, and no outline of theirs is here but those that were given.
-    left_out : dict
-        Why images were left out, by row.
     image_notes : tuple of str
         What is odd about images, views and radii.
     notes : tuple of str
@@ -107,7 +116,6 @@ class Detection:
     T_base_camera: tuple[RigidTransform | None, ...]
     rows: IntArray
     unplaced: dict[str, str]
-    left_out: dict[int, str]
     image_notes: tuple[str, ...]
     notes: tuple[str, ...]
     corners: Corners | None = None
@@ -134,6 +142,12 @@ class Detection:
             row,
         )
         return [leg for leg in found if used is None or legs[leg.leg].name in used]
+
+    @cached_property
+    def left_out(self) -> dict[int, str]:
+        """Why no outline of images is used that should show some, by row."""
+        of_views = [row for row in self.rows.tolist() if self.view_of(row) in self.unplaced]
+        return images_left_out(self.outlines) | dict.fromkeys(of_views, NOT_PLACED)
 
     @cached_property
     def overlay_files(self) -> dict[int, str]:
@@ -167,6 +181,7 @@ class Detection:
                 for row, file in self.overlay_files.items()
             ],
             notes=list(self.notes),
+            left_out=left_out_blocks(self.dataset.measurements, self.left_out),
         ).document()
 
 
@@ -227,6 +242,7 @@ class DetectionDocument(Document):
     used: int
     overlays: list[Overlay]
     notes: list[str]
+    left_out: list[LeftOut]
 
 
 def _view_figures(detection: Detection) -> dict[str, ViewFigures]:
@@ -382,6 +398,7 @@ class _Drawings(NamedTuple):
     load: ImageReader
     marks: tuple[tuple[PartMarks, ...], ...]
     captions: tuple[str, ...]
+    unplaced: tuple[Camera | None, ...]  # cameras that could not be placed
     files: tuple[Path, ...]
 
 
@@ -395,6 +412,7 @@ def _draw_all(detection: Detection, folder: Path, run: Run, progress: Report) ->
         detection.dataset.image_reader(rows),
         tuple(tuple(_marks(detection, row)) for row in rows),
         tuple(_caption(detection, row) for row in rows),
+        tuple(_unplaced_camera(detection, row) for row in rows),
         files,
     )
     progress("Drawing overlays", 0, len(rows))
@@ -404,7 +422,9 @@ def _draw_all(detection: Detection, folder: Path, run: Run, progress: Report) ->
 
 def _write_overlay(drawings: _Drawings, k: int) -> None:
     """Draw overlay k and write it."""
-    picture = draw(drawings.load(k), drawings.marks[k], drawings.captions[k])
+    image, camera = drawings.load(k), drawings.unplaced[k]
+    marks = [] if camera is None else [marks_of_pairs(camera, image)]
+    picture = draw(image, [*drawings.marks[k], *marks], drawings.captions[k])
     ok, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not ok:
         raise OutOfResources(
@@ -426,6 +446,12 @@ def _marks(detection: Detection, row: int) -> list[PartMarks]:
     )
 
 
+def _unplaced_camera(detection: Detection, row: int) -> Camera | None:
+    """Return the camera of a row if it could not be placed: edge pairs are drawn then."""
+    view = detection.dataset.measurements.views[int(detection.dataset.measurements.view[row])]
+    return view.camera if view.name in detection.unplaced else None
+
+
 def _caption(detection: Detection, row: int) -> str:
     """Return what stands below the overlay of a row."""
     view, outlines = detection.view_of(row), detection.outlines
@@ -433,9 +459,9 @@ def _caption(detection: Detection, row: int) -> str:
     here = outlines.used[outlines.row == row]
     found = f"{np.count_nonzero(here)} of {len(here)} outlines used"
     if view in detection.unplaced:
-        found = "the camera could not be placed"
+        found = "the camera could not be placed: edge pairs that were found"
         if detection.T_base_camera[int(measurements.view[row])] is not None:
-            found += ": legs are drawn where it was expected"
+            found += ", and legs where it was expected"
     text = f"{view}  {measurements.image[row]}  {found}"
     return text.encode("ascii", "replace").decode()
 

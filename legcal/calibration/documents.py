@@ -7,6 +7,7 @@ an earlier result is read (docs/results.md).
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,6 +20,7 @@ from pydantic import (
     model_serializer,
 )
 
+from legcal.data import Measurements, by_cause, row_names
 from legcal.errors import DatasetError
 from legcal.files import (
     Document,
@@ -200,6 +202,30 @@ class ResidualsBlock(FitQuality):
     shared_px: dict[str, NotNegative]
 
 
+class NamedImage(Document):
+    """An image, as tables name it."""
+
+    view: str
+    image: str
+
+
+class LeftOut(Document):
+    """Images that were left out, and why."""
+
+    why: str
+    images: list[NamedImage]
+
+
+def left_out_blocks(measurements: Measurements, why: Mapping[int, str]) -> list[LeftOut]:
+    """Return images that were left out, by row, a block a cause."""
+    names = row_names(measurements)
+    views = [measurements.views[v].name for v in measurements.view.tolist()]
+    return [
+        LeftOut(why=what, images=[NamedImage(view=views[r], image=names[r]) for r in rows])
+        for what, rows in by_cause(dict(sorted(why.items())))
+    ]
+
+
 class Observations(Document):
     """What the fit was made from."""
 
@@ -208,6 +234,9 @@ class Observations(Document):
     total: int
     images: int
     rejected: dict[str, int]  # outlines, by the reason
+    left_out: list[LeftOut] = Field(
+        default_factory=list
+    )  # images that should show legs, none of whose outlines is used
 
 
 class BoardBlock(Document):
@@ -347,6 +376,7 @@ class Result(Legs, Heading):
     platform: PlatformBlock | None
     holdout: Holdout | None = None  # left out without held-out images
     notes: list[str]
+    details: list[str] = Field(default_factory=list)  # how the fit went, for those who ask
     diagnosis: list[DiagnosisBlock] | None = None  # left out where nothing looks wrong
 
     @model_serializer(mode="wrap")

@@ -50,6 +50,7 @@ from legcal.perception import (
     defects_of,
     left_out_notes,
     measure_exposure,
+    unplaced_notes,
 )
 from legcal.progress import Progress, Report, shown_progress
 from legcal.workers import Run, worker_pool
@@ -493,7 +494,7 @@ def _look_at_legs(found: _Found, data: OrderedDataset, choices: Choices) -> Dete
         f"{n_found} of {n_visible} found, {seen.document['used']} of {seen.document['outlines']} "
         "outlines can be used"
     )
-    for what in dict.fromkeys(seen.unplaced.values()):
+    for what in unplaced_notes(seen.unplaced):
         found.add("legs", "error", what)
     said = {one.what for one in found.findings}
     for what in (one for one in seen.image_notes if one not in said):

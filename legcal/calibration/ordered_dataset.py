@@ -20,9 +20,11 @@ from legcal.data import (
     LegAxes,
     Measurements,
     Order,
+    by_cause,
     canonical_order,
     dataset_at,
     few,
+    images_in_words,
     inverse,
     measurements_at,
     plan_dataset,
@@ -212,7 +214,7 @@ def nominal_poses(
     Raises
     ------
     DatasetError
-        With one sentence for each image whose residual is more than 3 % of the mean leg length.
+        Naming the images whose residual is more than 3 % of the mean leg length.
     """
     q = measurements.q[measurements.first_rows]
     if not machine.is_determined:
@@ -229,23 +231,30 @@ def nominal_poses(
     B = machine.home.apply(machine.B_platform)
     most = MAX_NOMINAL_RESIDUAL * float(np.linalg.norm(B - machine.A_base, axis=1).mean())
     contradicting = _contradictions(machine, measurements, T)
-    problems = list(contradicting.values())
-    problems += [
-        f"The readings of {_image_of(measurements, k)} could not be used: found that the legs of "
-        f"the nominal model miss them by {1e3 * residual[k]:.1f} mm at the nearest pose, needed at "
-        f"most {1e3 * most:.1f} mm; check these readings and legcal.home, or take the image out."
+    first = measurements.first_rows.tolist()
+    wrong = {first[k]: what for k, what in contradicting.items()}
+    wrong |= {
+        first[k]: "found that the legs of the nominal model miss them by "
+        f"{1e3 * residual[k]:.1f} mm at the nearest pose, needed at most {1e3 * most:.1f} mm; "
+        "check these readings and legcal.home, or take"
         for k in off
         if not residual[k] <= most and k not in contradicting
-    ]
-    if problems:
-        raise DatasetError(problems)
+    }
+    if wrong:
+        raise DatasetError(
+            [
+                f"The readings of {images_in_words(measurements, rows)} could not be used: {what} "
+                f"the image{'s' * (len(rows) > 1)} out."
+                for what, rows in by_cause(wrong)
+            ]
+        )
     return tuple(T), residual
 
 
 def _contradictions(
     machine: Machine, measurements: Measurements, T_Rb_Re: Sequence[RigidTransform]
 ) -> dict[int, str]:
-    """Return a sentence on each pose at which readings of redundant motors contradict others."""
+    """Return what is found of poses at which readings of redundant motors contradict others."""
     if not machine.is_redundant:
         return {}
     q = measurements.q[measurements.first_rows][:, list(machine.motors)]
@@ -255,8 +264,7 @@ def _contradictions(
         for T, row in zip(T_Rb_Re, q, strict=True)
     ]
     return {
-        k: f"The readings of {_image_of(measurements, k)} could not be used: found {words}; check "
-        "this reading, its encoder and the offset of the leg, or take the image out."
+        k: f"found {words}; check this reading, its encoder and the offset of the leg, or take"
         for k, words in enumerate(found)
         if words is not None
     }

@@ -63,7 +63,7 @@ class _Shown:
 def outlier_images(
     measurements: Measurements, machine: Machine, solution: Solution
 ) -> dict[int, str]:
-    """Return a note on every outlier image that was fitted, by row."""
+    """Return what is said of every outlier image that was fitted, by row, without its name."""
     o = solution.outlines
     rejected = np.array([why.startswith(DISAGREES) for why in o.reason], dtype=np.bool_)
     notes = {}
@@ -75,8 +75,6 @@ def outlier_images(
         ]
         if len(wrong) < MIN_REJECTED * len(judged) or len(legs) < MIN_REJECTED_LEGS:
             continue
-        view = measurements.views[int(measurements.view[row])]
-        name = f"view {view.name}, image {measurements.image[row] or f'of row {row + 1}'}"
         explanation = _wrong_reading(measurements, machine, solution, row, judged)
         if not explanation:
             alone = _shown(measurements, machine, solution, row, judged)
@@ -84,7 +82,7 @@ def outlier_images(
         if not explanation and len(wrong) < MIN_REJECTED_UNEXPLAINED * len(judged):
             continue  # the outlines are wrong, not the image
         notes[row] = (
-            f"{name}: {len(wrong)} of its {len(judged)} outlines disagree with the fit and were "
+            f"{len(wrong)} of its {len(judged)} outlines disagree with the fit and were "
             f"left out; {explanation or CAMERA_MOVED}."
         )
     return notes

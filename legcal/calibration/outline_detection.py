@@ -115,7 +115,7 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
     dataset, order, photographs = data.dataset, data.order, data.photographs
     scene, board = rough_placement(data)
     outlines, cylinders = given_outlines(photographs), photographs.cylinders
-    unplaced, left_out = dict[str, str](), dict[int, str]()
+    unplaced = dict[str, str]()
     image_notes, notes = list[str](), list[str]()
     if len(photographs.detect):
         T_board_camera = None if board is None else board.T_board_camera
@@ -125,7 +125,6 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
         row = seen.outlines.row
         kept = placed[data.measurements.view[row]] | ~np.isin(row, photographs.detect)
         outlines, unplaced = seen.outlines.choose(kept), seen.placement.unplaced
-        left_out = {int(order.rows[row]): why for row, why in seen.left_out.items()}
         image_notes, notes = _image_notes(data, seen.placement), _gamma_notes(data)
         # Legs of a view that could not be placed are drawn where its rough pose has them.
         drawn = tuple(
@@ -144,7 +143,6 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
         T_base_camera=tuple(scene.T_base_camera[v] for v in views.tolist()),
         rows=images,
         unplaced=unplaced,
-        left_out=left_out,
         image_notes=tuple(image_notes),
         notes=(*dataset.notes, *image_notes, *notes, *data.unreached_notes()),
         corners=None if board is None else order.restore(board.corners),

@@ -59,6 +59,7 @@ from legcal.data import (
     dataset_at,
     few,
     fingerprint,
+    image_notes,
     load_dataset,
     overrides_of_call,
     plan_dataset,
@@ -113,7 +114,7 @@ class Estimate:
 
     @cached_property
     def outliers(self) -> dict[int, str]:
-        """Notes on images that contradict the fit, by their row."""
+        """What is said of images that contradict the fit, by their row."""
         return outlier_images(self.fitted.measurements, self.fitted.machine, self.solution)
 
     def in_file_order(self) -> Estimate:
@@ -472,11 +473,12 @@ def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredIm
 def _not_found_again(first: Estimate, again: Estimate) -> list[str]:
     """Return the notes of a first fit on images in which hardly anything is found near it."""
     after, o = again.outliers, again.solution.outlines
-    return [
-        note
-        for row, note in first.outliers.items()
+    gone = {
+        row: what
+        for row, what in first.outliers.items()
         if row not in after and o.used[o.row == row].mean() < MIN_FOUND_AGAIN
-    ]
+    }
+    return image_notes(first.fitted.measurements, gone)
 
 
 def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
@@ -489,7 +491,7 @@ def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
         for v, T in enumerate(estimate.solution.T_camera_Rb)
     ]
     hints = hint_notes([view.name for view in views], [v.T_base_camera for v in views], cameras)
-    return (*hints, *estimate.outliers.values())
+    return (*hints, *image_notes(fitted.measurements, estimate.outliers))
 
 
 def _refuse_too_few(

@@ -34,6 +34,7 @@ from legcal.calibration.documents import (
     ViewPose,
     WeakCombination,
     WorkspaceAccuracy,
+    left_out_blocks,
 )
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit import (
@@ -61,6 +62,7 @@ from legcal.machine import (
     pose_differences,
     vector_of,
 )
+from legcal.perception import images_left_out
 from legcal.vision import LINKS, Link, camera_numbers, shared_cameras
 
 if TYPE_CHECKING:
@@ -192,6 +194,7 @@ def _result_of(calibration: Calibration) -> Result:
         platform=_platform(calibration),
         holdout=_holdout(calibration),
         notes=list(calibration.notes),
+        details=list(calibration.solution.details),
         diagnosis=[one.document() for one in calibration.diagnosis] or None,
     )
 
@@ -278,6 +281,7 @@ def _observations(calibration: Calibration) -> Observations:
         total=len(outlines),
         images=n_images,
         rejected=dict(reasons.most_common()),
+        left_out=left_out_blocks(calibration.dataset.measurements, images_left_out(outlines)),
     )
 
 

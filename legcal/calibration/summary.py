@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from html import escape
@@ -13,6 +14,7 @@ from legcal.calibration.documents import (
     BoardBlock,
     Holdout,
     NoSteps,
+    Observations,
     PlatformBlock,
     Result,
     WorkspaceAccuracy,
@@ -20,6 +22,7 @@ from legcal.calibration.documents import (
 from legcal.calibration.link_joints import FRAMES, mark_in_words
 from legcal.calibration.plots import plot_uncertainty
 from legcal.errors import OutOfResources
+from legcal.machine import list_in_words
 from legcal.vision import LINKS, Link
 
 if TYPE_CHECKING:
@@ -187,16 +190,20 @@ def tables(result: Result) -> list[tuple[str, ParameterTable]]:
     return [*found, ("Other parameters", ParameterTable.of(result, joints=False))]
 
 
-def sentences(result: Result) -> list[str]:
-    """Return what a result says beside its parameters, but for the verdict: a line each."""
+def sentences(result: Result, *, verbose: bool = False) -> list[str]:
+    """Return what a result says beside its parameters, but for the verdict: a line each.
+
+    *verbose* says how the fit went too, and names what moves the platform by nothing.
+    """
     return [
         *(f"Note: {note}" for note in result.notes),
+        *(result.details if verbose else ()),
         *_observation_lines(result),
         *_board_lines(result),
         *_steps_lines(result),
         _fit_line(result),
         *_direction_lines(result),
-        *([] if result.platform is None else _platform_lines(result.platform)),
+        *([] if result.platform is None else _platform_lines(result.platform, verbose=verbose)),
         *([] if result.holdout is None else _holdout_lines(result.holdout)),
     ]
 
@@ -285,7 +292,21 @@ def _observation_lines(result: Result) -> list[str]:
         ]
     most = sorted(seen.rejected.items(), key=lambda one: -one[1])[:_MAX_REASONS]
     rejected = ", ".join(f"{count} {reason}" for reason, count in most)
-    return [f"Outlines: {seen.used} of {seen.total} used{f'; rejected: {rejected}' * bool(most)}."]
+    lines = [f"Outlines: {seen.used} of {seen.total} used{f'; rejected: {rejected}' * bool(most)}."]
+    return [*lines, *_left_out_lines(seen)]
+
+
+def _left_out_lines(seen: Observations) -> list[str]:
+    """Return how many images and views were left out."""
+    of_views = Counter(image.view for cause in seen.left_out for image in cause.images)
+    if not of_views:
+        return []
+    counts = list_in_words([f"{n} of {view}" for view, n in of_views.items()])
+    n_views = len(of_views)
+    return [
+        f"Left out: {sum(of_views.values())} of {seen.images} images, in {n_views} "
+        f"view{'s' * (n_views != 1)} ({counts})."
+    ]
 
 
 _MAX_REASONS = 4
@@ -356,7 +377,7 @@ def _direction_lines(result: Result) -> list[str]:
     return lines
 
 
-def _platform_lines(found: PlatformBlock) -> list[str]:
+def _platform_lines(found: PlatformBlock, *, verbose: bool) -> list[str]:
     """Return the predicted error of the platform, and what would add to it."""
     parts = [f"at the {found.poses} poses {_predicted(found)}"]
     if found.workspace is not None:
@@ -367,7 +388,7 @@ def _platform_lines(found: PlatformBlock) -> list[str]:
             f"{one.what.capitalize()} would move the platform by {_mm_deg(one.dX_m, one.dE_rad)}, "
             f"at most {_mm_deg(one.dX_max_m, one.dE_max_rad)}."
             for one in found.sensitivities
-            if 1e3 * one.dX_max_m > _NONE or np.degrees(one.dE_max_rad) > 0.1 * _NONE
+            if verbose or 1e3 * one.dX_max_m > _NONE or np.degrees(one.dE_max_rad) > 0.1 * _NONE
         ),
     ]
 

@@ -30,6 +30,10 @@ def calibrate(
         typer.Option("--output", "-o", metavar="OUT", help="The result folder to write."),
     ] = None,
     as_json: JsonOption = False,
+    verbose: Annotated[
+        bool,
+        typer.Option("--verbose", "-v", help="Also say how the fit went, and terms that are zero."),
+    ] = False,
     criteria: Annotated[
         Criteria,
         typer.Option(help="What the four steps minimise: legcal's criteria, or the paper's."),
@@ -154,7 +158,7 @@ def calibrate(
     show(
         as_json,
         lambda: found.result.document(),
-        lambda: summary(found, output),
+        lambda: summary(found, output, verbose=verbose),
     )
     if not found.verdict.trustworthy:
         raise typer.Exit(1)

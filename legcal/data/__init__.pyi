@@ -25,6 +25,7 @@ from .example import copy_example as copy_example
 from .holdout import dataset_at as dataset_at
 from .holdout import split_images as split_images
 from .image_causes import by_cause as by_cause
+from .image_causes import image_notes as image_notes
 from .image_causes import images_in_words as images_in_words
 from .image_tables import Order as Order
 from .image_tables import canonical_order as canonical_order

@@ -27,13 +27,24 @@ def by_cause(said: Mapping[int, str]) -> list[Cause]:
     return [Cause(_with_ranges(list(own.values())), tuple(own)) for own in alike.values()]
 
 
+def image_notes(measurements: Measurements, said: Mapping[int, str]) -> list[str]:
+    """Return what is said of rows as sentences, one a cause, that begin with the images."""
+    return [
+        f"{images_in_words(measurements, rows)}{': ' if len(rows) == 1 else ', each: '}{what}"
+        for what, rows in by_cause(said)
+    ]
+
+
 def images_in_words(measurements: Measurements, rows: Sequence[int]) -> str:
-    """Return rows as a sentence names them: ``3 images of views c1, c2 (a.png, b.png, c.png)``."""
+    """Return rows as a sentence names them: ``3 images of views c1, c2 (a.png, b.png, c.png)``.
+
+    A single one is ``view c1, image a.png``.
+    """
     names = row_names(measurements)
     views = dict.fromkeys(measurements.views[int(measurements.view[row])].name for row in rows)
     of_views = few_views(list(views))
     if len(rows) == 1:
-        return f"image {names[rows[0]]} of {of_views}"
+        return f"view {next(iter(views))}, image {names[rows[0]]}"
     return f"{len(rows)} images of {of_views} ({few([names[row] for row in rows])})"
 
 

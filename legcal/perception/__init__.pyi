@@ -23,11 +23,13 @@ from .board_poses import plane_poses as plane_poses
 from .camera_search import LEFT_RIGHT as LEFT_RIGHT
 from .camera_search import UPSIDE_DOWN as UPSIDE_DOWN
 from .candidate_pairs import CandidatePairs as CandidatePairs
+from .detection import NOT_PLACED as NOT_PLACED
 from .diagnostics import BEFORE_FIT as BEFORE_FIT
 from .diagnostics import FAR_OFF as FAR_OFF
 from .diagnostics import TAKE_AGAIN as TAKE_AGAIN
 from .diagnostics import far_off as far_off
 from .diagnostics import hint_notes as hint_notes
+from .diagnostics import images_left_out as images_left_out
 from .diagnostics import is_visible as is_visible
 from .diagnostics import left_out_notes as left_out_notes
 from .free_poses import require_rough_cameras as require_rough_cameras
@@ -48,6 +50,7 @@ from .outline import used_as_before as used_as_before
 from .overlays import PartMarks as PartMarks
 from .overlays import draw as draw
 from .overlays import marks_of_image as marks_of_image
+from .overlays import marks_of_pairs as marks_of_pairs
 from .overlays import short_reason as short_reason
 from .part_edges import LegPart as LegPart
 from .photographs import MeasuredImages as MeasuredImages
@@ -63,3 +66,4 @@ from .placement import Group as Group
 from .placement import Placement as Placement
 from .placement import Search as Search
 from .placement import group_views as group_views
+from .placement import unplaced_notes as unplaced_notes

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data import Measurements, Outlines, by_cause, images_in_words, is_edited
+from legcal.data import Measurements, Outlines, by_cause, image_notes, images_in_words, is_edited
 from legcal.geometry import BoolArray, IntArray, pose_distance
 from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped
 from legcal.perception.candidate_pairs import CandidatePairs
@@ -113,11 +113,9 @@ def find_wrong_images(
         if reason:
             reasons[row], why[row], remedies[row] = reason, said, remedy
         else:
-            odd[row] = f"{said}; {remedy}"
+            odd[row] = f"{said}; {remedy}."
     notes += left_out_notes(search.measurements, why, remedies)
-    notes += [
-        f"{_images(search.measurements, cause.rows)}: {cause.what}." for cause in by_cause(odd)
-    ]
+    notes += image_notes(search.measurements, odd)
     notes += _leg_notes(search, placement, outlines, found, reasons)
     return replace(placement, notes=(*placement.notes, *notes)), reasons
 
@@ -136,6 +134,11 @@ def reject_images(outlines: Outlines, reasons: Mapping[int, str]) -> Outlines:
         )
     )
     return replace(outlines, used=outlines.used & ~out, reason=reason)
+
+
+def is_out_of_sight(outlines: Outlines) -> BoolArray:
+    """Return which outlines an image cannot show: they are outside it, or hidden."""
+    return np.array([why.startswith(NOT_IN_SIGHT) for why in outlines.reason], dtype=np.bool_)
 
 
 def is_visible(outlines: Outlines) -> BoolArray:
@@ -192,12 +195,26 @@ def left_out_notes(
 ) -> list[str]:
     """Return one sentence for each cause for which images were left out, by row."""
     said = {row: f"{text}; {remedy[row]}" for row, text in why.items()}
-    return [
-        f"{_images(measurements, cause.rows)}: was left out: {cause.what}."
-        if len(cause.rows) == 1
-        else f"{_images(measurements, cause.rows)} were left out, all for one reason: {cause.what}."
-        for cause in by_cause(said)
-    ]
+    notes = []
+    for what, rows in by_cause(said):
+        verb = ": was left out" if len(rows) == 1 else " were left out, all for one reason"
+        notes.append(f"{images_in_words(measurements, rows)}{verb}: {what}.")
+    return notes
+
+
+def images_left_out(outlines: Outlines) -> dict[int, str]:
+    """Return why no outline is used of images that should show some, by row: what most say."""
+    found = {}
+    for row in np.unique(outlines.row[~is_out_of_sight(outlines)]).tolist():
+        own = np.flatnonzero(outlines.row == row)
+        if not outlines.used[own].any():
+            reasons = Counter(
+                why
+                for i in own.tolist()
+                if (why := outlines.reason[i]) and not why.startswith(NOT_IN_SIGHT)
+            )
+            found[row] = reasons.most_common(1)[0][0] if reasons else "no outline is used"
+    return found
 
 
 def share_shown(
@@ -391,14 +408,6 @@ def _references(
     """Return the images of a view in which most was found; of all views if it has none."""
     own = [row for row in found if measurements.view[row] == view]
     return sorted(own or found, key=lambda row: -found[row].share)[:N_REFERENCES]
-
-
-def _images(measurements: Measurements, rows: Sequence[int]) -> str:
-    """Return what images are called in notes."""
-    if len(rows) > 1:
-        return images_in_words(measurements, rows)
-    view = measurements.views[int(measurements.view[rows[0]])]
-    return f"view {view.name}, image {measurements.image[rows[0]]}"
 
 
 def _leg_notes(

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from legcal.data import Outlines
 from legcal.geometry import Array, Image
+from legcal.perception.candidate_pairs import find_candidate_pairs, find_segments
 from legcal.perception.outline import OUTSIDE
-from legcal.vision import Camera, PredictedLeg
+from legcal.vision import Camera, Grey, PredictedLeg
 
-MarkKind = Literal["edge 1", "edge 2", "axis", "rejected", "predicted"]
+MarkKind = Literal["edge 1", "edge 2", "axis", "rejected", "predicted", "pair"]
 N_POINTS = 40  # of a curve
 OTHER_FAILS = "other outline fails"
 
@@ -34,6 +35,7 @@ COLOURS: dict[MarkKind, tuple[int, int, int]] = {  # blue, green, red
     "axis": (0, 225, 255),
     "rejected": (70, 70, 255),
     "predicted": (30, 150, 255),
+    "pair": (255, 120, 230),
 }
 _MEANING: dict[MarkKind, str] = {
     "edge 1": "edge 1",
@@ -41,6 +43,7 @@ _MEANING: dict[MarkKind, str] = {
     "axis": "axis",
     "rejected": "rejected",
     "predicted": "expected here, not found",
+    "pair": "edge pair",
 }
 _WHITE = (255, 255, 255)
 _DARK = (32, 32, 32)
@@ -66,7 +69,7 @@ class Mark(NamedTuple):
 class PartMarks(NamedTuple):
     """What is drawn of a part of a leg."""
 
-    name: str  # the leg, and the part where the leg has several
+    name: str  # the leg, and the part where the leg has several; "" for what has no label
     reason: str  # why an outline of it is not used, shortened; "" if both are
     marks: tuple[Mark, ...]
 
@@ -114,6 +117,20 @@ def marks_of_image(
         if marks:
             found.append(PartMarks(leg_names[absent.leg], "", marks))
     return found
+
+
+def marks_of_pairs(camera: Camera, image: Grey) -> PartMarks:
+    """Return the edge pairs of an image, by which its camera is looked for."""
+    pairs = find_candidate_pairs(find_segments(image, camera))
+    marks = []
+    for k in range(len(pairs)):
+        steps = np.linspace(-1.0, 1.0, N_POINTS)[:, None]
+        axis = pairs.middle[k] + pairs.half_length[k] * steps * pairs.along[k]
+        width = pairs.width[k, 0] + 0.5 * (1.0 + steps) * (pairs.width[k, 1] - pairs.width[k, 0])
+        for side in (0.5, -0.5):
+            edge = axis + side * width * pairs.normal[k]
+            marks.append(Mark("pair", camera.distort(edge)))
+    return PartMarks("", "", tuple(marks))
 
 
 def _reason(pair: Outlines) -> str:
@@ -200,7 +217,8 @@ def draw(image: Image, parts: Sequence[PartMarks], caption: str) -> Canvas:
     lines = np.concatenate([np.zeros((0, 2)), *(m.points for marks in curves for m in marks)])
     places = LabelPlaces(picture.shape[1], picture.shape[0], lines)
     for part, marks in zip(parts, curves, strict=True):
-        _label(picture, places, part, marks, letter)
+        if part.name:
+            _label(picture, places, part, marks, letter)
     return np.vstack([picture, _legend(picture.shape[1], letter, width, caption)])
 
 
@@ -210,7 +228,7 @@ def _draw_curve(picture: Canvas, mark: Mark, width: int) -> None:
     if mark.kind == "predicted":
         for dash in _dashes(mark.points, width):
             _polyline(picture, dash, colour, width)
-    elif mark.kind == "axis":
+    elif mark.kind in ("axis", "pair"):
         _polyline(picture, mark.points, colour, max(1, width // 2))
     else:
         _polyline(picture, mark.points, colour, width)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data import Measurements
+from legcal.data import Measurements, by_cause, few_views
 from legcal.errors import NotVisible
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Cylinder
@@ -133,12 +133,29 @@ class Placement:
     def require_one(self) -> None:
         """Raise NotVisible, one sentence for each view, if no view could be placed."""
         if self.unplaced and all(T is None for T in self.T_base_camera):
-            raise NotVisible(list(dict.fromkeys(self.unplaced.values())))
+            raise NotVisible(unplaced_notes(self.unplaced))
 
     @property
     def all_notes(self) -> tuple[str, ...]:
         """What a reader should know, with the views that could not be placed."""
-        return (*dict.fromkeys(self.unplaced.values()), *self.notes)
+        return (*unplaced_notes(self.unplaced), *self.notes)
+
+
+def unplaced_notes(unplaced: Mapping[str, str]) -> list[str]:
+    """Return why views have no camera, by name, one sentence a cause."""
+    said: dict[str, list[str]] = {}
+    for name, what in unplaced.items():
+        said.setdefault(what, []).append(name)
+    alone = {k: what for k, (what, names) in enumerate(said.items()) if len(names) == 1}
+    named = [names[0] for names in said.values()]
+    without = {k: what.removeprefix(f"view {named[k]}: ") for k, what in alone.items()}
+    notes = [what for what, names in said.items() if len(names) > 1]
+    for what, places in by_cause(without):
+        if len(places) == 1:
+            notes.append(alone[places[0]])
+        else:
+            notes.append(f"{few_views([named[k] for k in places])}, each: {what}")
+    return notes
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ _SAME_M, _SAME_RAD = 1e-9, 1e-9  # [m, rad]: frames that are closer are in the s
 _EXPLANATIONS = 3  # that are named beside the best
 
 
-def summary(calibration: Calibration, output: Path) -> RenderableType:
+def summary(calibration: Calibration, output: Path, *, verbose: bool = False) -> RenderableType:
     """Return tables of parameters in mm, degrees and pixels, and what they mean."""
     shown = [
         table(
@@ -34,7 +34,7 @@ def summary(calibration: Calibration, output: Path) -> RenderableType:
         )
         for title, found in tables(calibration.result)
     ]
-    lines = [*sentences(calibration.result), f"Written to {output}."]
+    lines = [*sentences(calibration.result, verbose=verbose), f"Written to {output}."]
     good = calibration.verdict.trustworthy
     verdict = Text(calibration.verdict.sentence, style="bold green" if good else "bold red")
     return report(*shown, [*lines, verdict])

@@ -39,6 +39,9 @@ def _of_mapping(document: dict[Any, Any], path: tuple[str, ...]) -> Any:
     found = {str(k): facts(v, str(k), (*path, str(k))) for k, v in document.items()}
     if "quat_xyzw" in found and isinstance(found["quat_xyzw"], list):
         found["quat_xyzw"] = _upright(found["quat_xyzw"])
+    if isinstance(document.get("details"), list):  # were notes when the facts were recorded
+        found["notes"] = {"sentences": len(document["notes"]) + len(document["details"])}
+        del found["details"]
     if "weak" in document and "rank" in document:
         found["weak"] = _weak(document["weak"])
     return found

@@ -142,7 +142,7 @@ def refine_from_best(
         legs, measurements, outlines, settings, axes=axes, board=board, choices=choices
     )
     candidates: list[tuple[Start, Minimum[State]]] = []
-    notes: list[str] = []
+    notes, details = list[str](), list[str]()
     failures: list[LegcalError] = []
     for start in starts:
         begun = _called(start)
@@ -154,7 +154,7 @@ def refine_from_best(
             continue
         if len(starts) > 1:
             cost = f"{minimum.cost:.6g}"
-            notes.append(f"Started from {begun}, the joint fit came to a cost of {cost}.")
+            details.append(f"Started from {begun}, the joint fit came to a cost of {cost}.")
         least = (1.0 + _COST_TOLERANCE) * minimum.cost
         place = sum(other.cost <= least for _, other in candidates)
         candidates.insert(place, (start, minimum))
@@ -165,7 +165,7 @@ def refine_from_best(
             failures.append(failure)
             notes.append(f"The joint fit started from {_called(start)} was given up. {failure}")
             continue
-        return dataclasses.replace(found, notes=(*found.notes, *notes))
+        return dataclasses.replace(found, notes=(*found.notes, *notes), details=tuple(details))
     if failures and all(isinstance(failure, NotIdentifiable) for failure in failures):
         raise failures[0]
     problems = dict.fromkeys(problem for failure in failures for problem in failure.problems)

@@ -112,6 +112,7 @@ class Solution:
     iterations: int  # of the solver, all rounds
     posterior: Posterior  # what it predicts of other images; in the order that was fitted
     notes: tuple[str, ...] = ()  # one sentence each
+    details: tuple[str, ...] = ()  # how it was found, the same
     focal_error: float = 0.0  # relative error of a focal length that the measurements contradict
     contradicted_cameras: tuple[str, ...] = ()  # views that stand for such cameras
 
