@@ -216,7 +216,7 @@ def followed_poses(
 
 
 def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> Array:
-    """Return the joint value of every leg at a pose, q = sign (|AB| - q0).
+    """Return the joint value of every leg at a pose, ``q = sign (|AB| - q0)``.
 
     A length is a distance, so that no leg is ever flipped. Values outside the travel are
     returned as they are.

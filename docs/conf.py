@@ -1,0 +1,30 @@
+"""Sphinx: pages in MyST, the tutorial executed, no network, warnings are errors (-W)."""
+
+from legcal.version import __version__
+
+project = "legcal"
+author = "The legcal developers"
+copyright = "the legcal developers, BSD-2-Clause"
+release = version = __version__
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+exclude_patterns = ["_build"]
+suppress_warnings = ["mystnb.unknown_mime_type"]
+
+myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
+myst_heading_anchors = 4
+nb_execution_mode = "cache"  # a page is executed again only where its code has changed
+nb_execution_timeout = 300
+nb_execution_raise_on_error = True
+nb_merge_streams = True
+nb_output_stderr = "remove"  # progress
+
+autodoc_typehints = "none"
+autodoc_member_order = "bysource"
+napoleon_numpy_docstring = True
+
+html_theme = "furo"
+html_title = f"legcal {release}"
+html_static_path: list[str] = []
+html_copy_source = False
+html_show_sphinx = False
