@@ -329,6 +329,7 @@ def in_other_frames(axes: LegAxes, R: Array) -> LegAxes:
     [
         *(("3-rps", change) for change in ("cameras", "legs", "views", "images")),
         ("3-rpr", "legs"),
+        ("3-spr", "cameras"),
     ],
 )
 def test_turned_cameras_and_other_orders_change_nothing(

@@ -84,7 +84,8 @@ class SeenBoard:
 
         The corners of a part of a chessboard may be numbered in several ways, which differ by
         whole squares and turns; it is one of these, and not certain. Such a choice moves the board
-        before the camera and nothing else.
+        before the camera and nothing else if the board is flat; of a bent one or an uneven print a
+        quarter turn also exchanges both sides.
         """
         nx, ny = board.grid
         if board.kind != "chessboard" or not len(self.ij):
