@@ -17,6 +17,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal import detect, load_dataset
 from legcal.calibration.detection import Detection, _caption, _counted_reason
+from legcal.data.corners import found_corners
 from legcal.data.image_tables import canonical_order
 from legcal.data.outlines import QUALITY, Outlines, read_observations
 from legcal.errors import UsageError
@@ -28,6 +29,7 @@ from legcal.perception.overlays import (
     Mark,
     PartMarks,
     draw,
+    marks_of_corners,
     marks_of_image,
     marks_of_pairs,
     short_reason,
@@ -392,6 +394,20 @@ def test_pictures_of_every_size_have_lines_and_letters_of_the_same_share(factor:
     assert 0.0008 < thick / picture.shape[1] < 0.0025
     lit = np.flatnonzero(np.any(image[..., 2] > 200, axis=1))  # the name is red
     assert 0.02 < np.ptp(lit) / picture.shape[1] < 0.06
+
+
+def test_corners_of_boards_are_crosses_where_they_were_found() -> None:
+    px, none = np.array([[300.2, 200.0], [1200.0, 700.5]]), np.zeros(2, dtype=np.intp)
+    found = found_corners(none, none, px, np.ones(2))
+    found = replace(found, used=np.array([True, False]), reason=("", "far off"))
+    grey = np.full((1200, 1600), 100.0)
+    picture = draw(grey, [], "c1 a.png", marks_of_corners(found)).astype(int)
+    for (x, y), kind in zip(px, ("corner", "rejected"), strict=True):
+        is_lit = np.abs(picture[:1200] - COLOURS[kind]).max(axis=2) < 60
+        rows, columns = np.nonzero(is_lit)
+        assert abs(rows.mean() - y) < 0.6
+        assert abs(columns.mean() - x) < 0.6
+    assert np.any(picture[1200:] != draw(grey, [], "c1 a.png")[1200:])  # the legend says so
 
 
 def test_texts_stand_inside_the_picture_and_apart() -> None:

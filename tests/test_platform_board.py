@@ -23,6 +23,7 @@ from simulated import settings
 from legcal import calibrate, evaluate, identifiability, load_dataset, simulate
 from legcal.calibration.identify.identifiability import identifiability_of_dataset
 from legcal.calibration.joint_fit import refine
+from legcal.data import row_names
 from legcal.data.outlines import no_outlines
 from legcal.errors import DatasetError
 from legcal.simulation import SimulatedDataset
@@ -79,6 +80,8 @@ def test_corners_of_the_board_on_the_platform_have_noise_and_outliers_of_their_o
     assert set(found.rejected_corners) == {
         (m.views[m.view[row]].name, int(m.pose[row]), fixed.first + 5) for row in rows
     }
+    said = next(note for note in found.notes if "disagree with the fit" in note)
+    assert f"{fixed.first + 5} in c1, {row_names(m)[0]}" in said
     right = refine(session.legs, m, no_outlines(), start, board=seen)
     np.testing.assert_allclose(found.sigma, right.sigma, rtol=0.1)
     assert found.rms_corners_px["platform"] == pytest.approx(0.05, rel=0.1)

@@ -53,9 +53,11 @@ from legcal.perception import (
     HIDDEN,
     NOT_PLACED,
     OUTSIDE,
+    Mark,
     PartMarks,
     draw,
     images_left_out,
+    marks_of_corners,
     marks_of_image,
     marks_of_pairs,
     short_reason,
@@ -397,6 +399,7 @@ class _Drawings(NamedTuple):
 
     load: ImageReader
     marks: tuple[tuple[PartMarks, ...], ...]
+    corners: tuple[tuple[Mark, ...], ...]
     captions: tuple[str, ...]
     unplaced: tuple[Camera | None, ...]  # cameras that could not be placed
     files: tuple[Path, ...]
@@ -411,6 +414,7 @@ def _draw_all(detection: Detection, folder: Path, run: Run, progress: Report) ->
     drawings = _Drawings(
         detection.dataset.image_reader(rows),
         tuple(tuple(_marks(detection, row)) for row in rows),
+        tuple(_corner_marks(detection, row) for row in rows),
         tuple(_caption(detection, row) for row in rows),
         tuple(_unplaced_camera(detection, row) for row in rows),
         files,
@@ -424,7 +428,7 @@ def _write_overlay(drawings: _Drawings, k: int) -> None:
     """Draw overlay k and write it."""
     image, camera = drawings.load(k), drawings.unplaced[k]
     marks = [] if camera is None else [marks_of_pairs(camera, image)]
-    picture = draw(image, [*drawings.marks[k], *marks], drawings.captions[k])
+    picture = draw(image, [*drawings.marks[k], *marks], drawings.captions[k], drawings.corners[k])
     ok, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not ok:
         raise OutOfResources(
@@ -450,6 +454,12 @@ def _unplaced_camera(detection: Detection, row: int) -> Camera | None:
     """Return the camera of a row if it could not be placed: edge pairs are drawn then."""
     view = detection.dataset.measurements.views[int(detection.dataset.measurements.view[row])]
     return view.camera if view.name in detection.unplaced else None
+
+
+def _corner_marks(detection: Detection, row: int) -> tuple[Mark, ...]:
+    """Return what is drawn of the boards over the image of a row."""
+    corners = detection.corners
+    return () if corners is None else marks_of_corners(corners.choose(corners.row == row))
 
 
 def _caption(detection: Detection, row: int) -> str:

@@ -75,10 +75,12 @@ def four_steps(
             )
         except (NotIdentifiable, DidNotConverge) as failure:
             return Steps(None, cameras, str(failure))
-        legs = reframed(found.legs, data.machine.frame_legs)
-        known = parametrization_of(data.machine)
+        frame_legs, known = data.machine.frame_legs, parametrization_of(data.machine)
         ties, unit = machine_ties(data.machine), np.ones(len(known))
-        legs = on_ties(legs, nominal.legs, ties, known.place, unit)
+        legs = on_ties(reframed(found.legs, frame_legs), nominal.legs, ties, known.place, unit)
+        # B of legs that are fixed to the platform where models put it
+        origin = np.asarray(data.machine.T_platform_Re.inv().translation)
+        legs = reframed(legs, frame_legs, origin)
         return Steps(legs, cameras, "", found.diagnostics)
     except (NotIdentifiable, NotVisible, DidNotConverge) as failure:
         return Steps(None, None, str(failure))

@@ -60,9 +60,6 @@ if TYPE_CHECKING:
 RESULT_NAME, STAGED_NAME = "result.json", "staged.yaml"
 REPORT_NAME = "report.html"  # written beside a result, which an earlier one does not describe
 RELOAD_TOLERANCE = 1e-11  # between reloaded and written parameters [m, rad]
-# The same of the four steps: of a leg that is fixed to the platform they do not say which point of
-# its axis is B, and loading takes another one.
-STAGED_TOLERANCE = 1e-7
 MAX_HOME_RESIDUAL = 0.2  # of a leg length: of calibrated legs at the nominal home
 ROUNDING = 1e-9  # of numbers in files [m]
 SYMMETRY_TOLERANCE = 1e-6  # relative, of covariances
@@ -87,10 +84,10 @@ def write_result(calibration: Calibration, destination: Path) -> Calibration:
     names = OBSERVATIONS_NAME, CORNERS_NAME, STAGED_NAME, REPORT_NAME
     stale = [*names, str(_urdf_of(Path(STAGED_NAME)))]
     with result_folder(destination, stale=map(Path, stale)) as folder:
-        _write_model(machine, solution.legs, folder / RESULT_YAML, RELOAD_TOLERANCE)
+        _write_model(machine, solution.legs, folder / RESULT_YAML)
         if steps.legs is not None:
             try:
-                _write_model(machine, steps.legs, folder / STAGED_NAME, STAGED_TOLERANCE)
+                _write_model(machine, steps.legs, folder / STAGED_NAME)
             except (DidNotConverge, ModelError, OutOfClass) as failure:
                 why = " ".join(failure.problems).replace(str(folder), str(destination))
                 note = f"There is no model of the four steps (staged.yaml). {why}"
@@ -112,7 +109,7 @@ def _urdf_of(yaml: Path) -> Path:
     return yaml.with_suffix(".urdf")
 
 
-def _write_model(machine: Machine, legs: Sequence[Leg], yaml: Path, tolerance: float) -> None:
+def _write_model(machine: Machine, legs: Sequence[Leg], yaml: Path) -> None:
     """Write a mechanism with other legs; loaded again it must be what was computed, and close."""
     start = f"{yaml}: the model could not be written: found"
     write_urdf(machine, legs, _urdf_of(yaml))
@@ -128,10 +125,10 @@ def _write_model(machine: Machine, legs: Sequence[Leg], yaml: Path, tolerance: f
     found = parametrization_of(written, twists=True)
     apart = vector_of(found, geometries(written), legs) - vector_of(found, legs, legs)
     off = float(np.abs(apart).max())
-    if not off <= tolerance:
+    if not off <= RELOAD_TOLERANCE:
         raise DidNotConverge(
             f"{start} that its parameters, loaded again, differ by {off:.1e} m or rad from the "
-            f"computed ones, needed at most {tolerance:.0e}; please report this."
+            f"computed ones, needed at most {RELOAD_TOLERANCE:.0e}; please report this."
         )
 
 

@@ -47,8 +47,10 @@ from .outline import find_parts as find_parts
 from .outline import measure as measure
 from .outline import outline_table as outline_table
 from .outline import used_as_before as used_as_before
+from .overlays import Mark as Mark
 from .overlays import PartMarks as PartMarks
 from .overlays import draw as draw
+from .overlays import marks_of_corners as marks_of_corners
 from .overlays import marks_of_image as marks_of_image
 from .overlays import marks_of_pairs as marks_of_pairs
 from .overlays import short_reason as short_reason

@@ -266,7 +266,7 @@ def _stepped(
     unit = _pose_unit(scene)
     step = np.linalg.solve(H + np.diag(unit**-2), b[..., None])[..., 0]
     longest = np.abs(step / unit).max(axis=1, keepdims=True)
-    return poses_after(poses, step * np.minimum(1.0, MAX_STEP / longest))
+    return poses_after(poses, step * (MAX_STEP / np.maximum(longest, MAX_STEP)))
 
 
 def _pose_unit(scene: _Scene) -> Array:
@@ -417,6 +417,6 @@ def _fitted(
             ),
         )
         step, _ = information(problem, state, linearize(problem, state)).step(0.0)
-        longest = np.abs(step[-6 * len(keys) :].reshape(-1, 6) / unit).max()
-        state = problem.moved(state, step * min(1.0, MAX_STEP / longest))
+        longest = float(np.abs(step[-6 * len(keys) :].reshape(-1, 6) / unit).max())
+        state = problem.moved(state, step * (MAX_STEP / max(longest, MAX_STEP)))
     return dict(zip(keys.tolist(), state.poses, strict=True)), placed(state)

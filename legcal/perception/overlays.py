@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from legcal.data import Outlines
+from legcal.data import Corners, Outlines
 from legcal.geometry import Array, Image
 from legcal.perception.candidate_pairs import find_candidate_pairs, find_segments
 from legcal.perception.outline import OUTSIDE
 from legcal.vision import Camera, Grey, PredictedLeg
 
-MarkKind = Literal["edge 1", "edge 2", "axis", "rejected", "predicted", "pair"]
+MarkKind = Literal["edge 1", "edge 2", "axis", "rejected", "predicted", "pair", "corner"]
 N_POINTS = 40  # of a curve
 OTHER_FAILS = "other outline fails"
 
@@ -36,6 +36,7 @@ COLOURS: dict[MarkKind, tuple[int, int, int]] = {  # blue, green, red
     "rejected": (70, 70, 255),
     "predicted": (30, 150, 255),
     "pair": (255, 120, 230),
+    "corner": (255, 255, 0),
 }
 _MEANING: dict[MarkKind, str] = {
     "edge 1": "edge 1",
@@ -44,6 +45,7 @@ _MEANING: dict[MarkKind, str] = {
     "rejected": "rejected",
     "predicted": "expected here, not found",
     "pair": "edge pair",
+    "corner": "corner of a board",
 }
 _WHITE = (255, 255, 255)
 _DARK = (32, 32, 32)
@@ -52,6 +54,7 @@ _LETTER = 22.0  # height of a letter of this font at scale 1 [px]
 _FRACTION_BITS = 4  # of coordinates that OpenCV draws at
 _SMALLER = 0.8  # letters of reasons and of the legend
 _DASH, _GAP = 9.0, 7.0  # in widths of a line
+_CROSS = 5.0  # arms of a corner, in widths of a line
 
 _PLACES = (0.5, 0.3, 0.7, 0.15, 0.85)  # along a curve
 _ORDER = 0.02  # of the area of a text, by which an earlier place is preferred
@@ -191,7 +194,17 @@ def _prediction(camera: Camera, leg: PredictedLeg, i: int) -> list[Mark]:
     ]
 
 
-def draw(image: Image, parts: Sequence[PartMarks], caption: str) -> Canvas:
+def marks_of_corners(corners: Corners) -> tuple[Mark, ...]:
+    """Return the crosses over the corners of boards in an image."""
+    return tuple(
+        Mark("corner" if used else "rejected", px[None])
+        for px, used in zip(corners.px, corners.used.tolist(), strict=True)
+    )
+
+
+def draw(
+    image: Image, parts: Sequence[PartMarks], caption: str, corners: Sequence[Mark] = ()
+) -> Canvas:
     """Return a grey image with lines, names and reasons over it, and a legend below, BGR.
 
     The caption stands in the legend.
@@ -214,12 +227,16 @@ def draw(image: Image, parts: Sequence[PartMarks], caption: str) -> Canvas:
     for marks in curves:
         for mark in marks:
             _draw_curve(picture, mark, width)
+    for mark in corners:
+        for arm in np.array([[[-1.0, -1.0], [1.0, 1.0]], [[-1.0, 1.0], [1.0, -1.0]]]):
+            at = (mark.points + 0.5) * factor - 0.5 + _CROSS * width * arm
+            _polyline(picture, at, COLOURS[mark.kind], width)
     lines = np.concatenate([np.zeros((0, 2)), *(m.points for marks in curves for m in marks)])
     places = LabelPlaces(picture.shape[1], picture.shape[0], lines)
     for part, marks in zip(parts, curves, strict=True):
         if part.name:
             _label(picture, places, part, marks, letter)
-    return np.vstack([picture, _legend(picture.shape[1], letter, width, caption)])
+    return np.vstack([picture, _legend(picture.shape[1], letter, width, caption, bool(corners))])
 
 
 def _draw_curve(picture: Canvas, mark: Mark, width: int) -> None:
@@ -282,7 +299,7 @@ def _lettering(letter: float) -> tuple[float, int]:
     return letter / _LETTER, max(1, round(letter / 12.0))
 
 
-def _legend(width: int, letter: float, line: int, caption: str) -> Canvas:
+def _legend(width: int, letter: float, line: int, caption: str, has_corners: bool) -> Canvas:
     """Return the strip below a picture: what it shows, and what the colours mean."""
     height = round(3.6 * letter)
     strip = np.full((height, width, 3), _DARK, dtype=np.uint8)
@@ -295,6 +312,8 @@ def _legend(width: int, letter: float, line: int, caption: str) -> Canvas:
     )
     x, y = letter, 2.9 * letter
     for kind, meaning in _MEANING.items():
+        if kind == "corner" and not has_corners:
+            continue
         (w, _), _ = cv2.getTextSize(meaning, _FONT, _SMALLER * scale, thick)
         start = np.array([x, y - 0.3 * letter])
         sample = np.linspace(start, (start[0] + 3.0 * letter, start[1]), 8)

@@ -10,7 +10,7 @@ measurement is a class with a factor, registered in
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -46,7 +46,7 @@ from legcal.calibration.joint_fit.variables import (
     changed_cameras,
     intrinsic_of,
 )
-from legcal.data import LegAxes, Measurements, Outlines
+from legcal.data import LegAxes, Measurements, Outlines, row_names
 from legcal.errors import NotIdentifiable
 from legcal.estimation import (
     NO_PRIOR,
@@ -84,6 +84,7 @@ class FitProblem(Problem[State]):
     first_cameras: tuple[Camera, ...]
     first_board_scale: Array  # (2,)
     keys: tuple[str, ...]  # what the unknown intrinsics are
+    images: Mapping[tuple[int, int], str]  # the name of an image of a view and a pose
     rejected_corners: tuple[tuple[int, int, int], ...] = ()  # view, pose (-1: all), number
 
     @property
@@ -213,7 +214,14 @@ class FitProblem(Problem[State]):
         owners = shared_cameras(self.outlines.views, self.first_cameras)
         observed = self.observed._replace(outlines=self.outlines.without_biases())
         return _built(
-            self.legs, choices, observed, self.first_cameras, owners, self.n_elements, settings
+            self.legs,
+            choices,
+            observed,
+            self.first_cameras,
+            owners,
+            self.n_elements,
+            settings,
+            self.images,
         )
 
 
@@ -242,7 +250,16 @@ def build_fit(
         _with_values(camera, owner, choices) for camera, owner in zip(given, owners, strict=True)
     )
     observed = observed_arrays(measurements, legs, outlines, axes, board, cameras)
-    problem = _built(legs, choices, observed, cameras, owners, measurements.n_poses, settings)
+    problem = _built(
+        legs,
+        choices,
+        observed,
+        cameras,
+        owners,
+        measurements.n_poses,
+        settings,
+        _images(measurements),
+    )
     equations = problem.n_equations + len(problem.priors.mean)
     if equations < problem.n_unknowns:
         shown = f"{len(problem.outlines)} outlines"
@@ -266,6 +283,12 @@ def _with_values(camera: Camera, owner: str, choices: Choices) -> Camera:
     return with_intrinsics(camera, given) if given else camera
 
 
+def _images(measurements: Measurements) -> dict[tuple[int, int], str]:
+    """Return the names of images by view and pose."""
+    places = zip(measurements.view.tolist(), measurements.pose.tolist(), strict=True)
+    return dict(zip(places, row_names(measurements), strict=True))
+
+
 def _built(
     legs: FittedLegs,
     choices: Choices,
@@ -274,6 +297,7 @@ def _built(
     owners: tuple[str, ...],
     n_poses: int,
     settings: RefinementSettings,
+    images: Mapping[tuple[int, int], str],
 ) -> FitProblem:
     """Return the problem of measurements, with the unknowns and the priors of choices."""
     outlines, boards = observed.outlines, observed.boards
@@ -333,6 +357,7 @@ def _built(
         first_cameras=cameras,
         first_board_scale=np.array([choices.values.get(board_scale(k), 1.0) for k in LINKS]),
         keys=keys,
+        images=images,
     )
 
 

@@ -315,8 +315,13 @@ def corner_notes(problem: FitProblem) -> tuple[str, ...]:
     rejected = problem.rejected_corners
     if not rejected:
         return ()
-    views = problem.outlines.views
-    named = few([f"{corner} in {views[view]}" for view, _, corner in sorted(rejected)])
+    views, images = problem.outlines.views, problem.images
+    named = few(
+        [
+            f"{corner} in {views[view]}" + f", {images[view, pose]}" * (pose >= 0)
+            for view, pose, corner in sorted(rejected)
+        ]
+    )
     n = len(rejected) + sum(map(len, problem.boards))
     return (
         f"Of {n} corners of the calibration board {len(rejected)} disagree with the fit and were "
