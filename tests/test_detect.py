@@ -402,8 +402,8 @@ def test_corners_of_boards_are_crosses_where_they_were_found() -> None:
     found = replace(found, used=np.array([True, False]), reason=("", "far off"))
     grey = np.full((1200, 1600), 100.0)
     picture = draw(grey, [], "c1 a.png", marks_of_corners(found)).astype(int)
-    for (x, y), kind in zip(px, ("corner", "rejected"), strict=True):
-        is_lit = np.abs(picture[:1200] - COLOURS[kind]).max(axis=2) < 60
+    for (x, y), colour in zip(px, (COLOURS["corner"], COLOURS["rejected"]), strict=True):
+        is_lit = np.abs(picture[:1200] - np.array(colour)).max(axis=2) < 60
         rows, columns = np.nonzero(is_lit)
         assert abs(rows.mean() - y) < 0.6
         assert abs(columns.mean() - x) < 0.6

@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 import legcal
 from legcal.calibration import refine
 from legcal.data import Measurements, View
-from legcal.errors import NotIdentifiable, UsageError
+from legcal.errors import LegcalError, NotIdentifiable, UsageError
 from legcal.geometry import Array
 from legcal.machine import Machine, load_mechanism
 from legcal.perception.candidate_pairs import find_candidate_pairs
@@ -283,3 +283,16 @@ def test_no_images_are_kept_aside_where_readings_give_no_poses(
     path = free_set(folder, monkeypatch, tmp_path)
     with pytest.raises(UsageError, match="3 motors do not determine the pose"):
         legcal.calibrate(path, holdout=0.25)
+
+
+@pytest.mark.parametrize(("kind", "says"), [("6-UPS by hand", True), ("5-SPS", False)])
+def test_a_fit_that_fails_without_any_length_says_what_to_measure(
+    kind: str, says: bool, tmp_path: Path
+) -> None:
+    path = write_machine(tmp_path, drawn(kind), Layout())
+    session = machine_session(str(path), n_views=1, n_poses=3)
+    some = session.outlines.choose(session.outlines.leg < 4)
+    with pytest.raises(LegcalError) as refusal:
+        refine(session.legs, session.measurements, some, session.start)
+    first = refusal.value.problems[0]
+    assert ("no measured length" in first and "board on the platform" in first) == says

@@ -6,7 +6,8 @@ parameter; a fixed value by a wider fit in which it is free.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -444,6 +445,28 @@ def naming_stated_values(problem: FitProblem, failure: LegcalError) -> LegcalErr
             *failure.problems,
         ]
     )
+
+
+@contextmanager
+def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
+    """Say first, where a fit fails, that radii alone say how large its machine is, if they do."""
+    try:
+        yield
+    except (DidNotConverge, NotIdentifiable) as failure:
+        stated = {name.split(".")[1] for name in _stated(problem)}
+        measured = len(problem.readings) + sum(map(len, problem.boards))
+        if measured or stated & {"base", "platform", "offset", "length"}:
+            raise
+        raise type(failure)(
+            [
+                "The joint fit could not be made: found no measured length, neither a reading of a "
+                "leg nor a board, so that radii alone say how large the machine is, and hardly "
+                "where its platform joints are; put a calibration board on the platform and one "
+                "on the base, give a leg an encoder, or state measured coordinates of joints "
+                "(--prior).",
+                *failure.problems,
+            ]
+        ) from None
 
 
 def _stated(problem: FitProblem) -> list[str]:

@@ -15,6 +15,7 @@ from legcal.calibration.joint_fit.determinacy import (
     refuse_undetermined_inliers,
 )
 from legcal.calibration.joint_fit.diagnostics import (
+    naming_missing_lengths,
     naming_stated_values,
     refuse_contradicted_priors,
     refuse_contradicted_values,
@@ -107,8 +108,9 @@ def refine(
     problem = build_fit(
         legs, measurements, outlines, settings, axes=axes, board=board, choices=choices
     )
-    minimum = _first(problem, start, settings)
-    return _refined(problem, outlines, start, minimum, settings)
+    with naming_missing_lengths(problem):
+        minimum = _first(problem, start, settings)
+        return _refined(problem, outlines, start, minimum, settings)
 
 
 def _called(start: Start) -> str:
@@ -141,6 +143,14 @@ def refine_from_best(
     problem = build_fit(
         legs, measurements, outlines, settings, axes=axes, board=board, choices=choices
     )
+    with naming_missing_lengths(problem):
+        return _best(problem, outlines, starts, settings)
+
+
+def _best(
+    problem: FitProblem, outlines: Outlines, starts: Sequence[Start], settings: RefinementSettings
+) -> Solution:
+    """Return the fit from the start with the least cost; see :func:`refine_from_best`."""
     candidates: list[tuple[Start, Minimum[State]]] = []
     notes, details = list[str](), list[str]()
     failures: list[LegcalError] = []
