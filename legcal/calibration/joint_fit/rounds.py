@@ -318,7 +318,7 @@ def corner_notes(problem: FitProblem) -> tuple[str, ...]:
     views, images = problem.outlines.views, problem.images
     named = few(
         [
-            f"{corner} in {views[view]}" + f", {images[view, pose]}" * (pose >= 0)
+            f"{corner} in {views[view]}" + (f", {images[view, pose]}" if pose >= 0 else "")
             for view, pose, corner in sorted(rejected)
         ]
     )
