@@ -40,7 +40,7 @@ TO_FILE = np.array([1e3] * 3 + [float(np.degrees(1.0))] * 3)
 DEFAULT_NODES = {1: 21, 2: 21, 3: 11, 4: 7, 5: 5, 6: 4}  # by freedoms: at most 4,096 nodes in all
 MAX_ROWS = 300_000
 TESTED = 1000  # cells at most in whose middle the table is tried
-HALVINGS = 20  # of the size of the grid, until all nodes lie in the travel
+SHRINKING, ATTEMPTS = 0.8, 20  # of the grid, until all nodes lie in the travel
 REACHED = 1e-9  # of a leg length
 FREE = 0.1
 _SEED = 2002
@@ -131,12 +131,7 @@ def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Re
     own = own_coordinates(calibrated)
     n_nodes = _number_of_nodes(options.nodes, len(own))
     models = _Model(calibrated, own), _Model(nominal, own)
-    low, high = _range(models, n_nodes)
-    ticks = [np.linspace(a, b, n_nodes) for a, b in zip(low, high, strict=True)]
-    nodes = np.array(list(product(*ticks)))
-    corrected, reached = _corrected(models, nodes)
-    if not reached.all():
-        raise OutOfClass(_no_grid(calibrated))
+    ticks, nodes, corrected = _grid(models, n_nodes)
     shape = (n_nodes,) * len(own)
     left, raw = _residuals(models, ticks, corrected.reshape(*shape, len(own)))
     figures = {
@@ -221,37 +216,41 @@ def _number_of_nodes(given: int | None, m: int) -> int:
     return n
 
 
-def _range(models: tuple[_Model, _Model], n_nodes: int) -> tuple[Array, Array]:
-    """Return the ends (m,) of the largest grid about the middle of the workspace in the travel."""
+def _grid(models: tuple[_Model, _Model], n_nodes: int) -> tuple[list[Array], Array, Array]:
+    """Return ticks, nodes (k, m) and corrected nodes (k, m) of the largest grid in the travel.
+
+    It stands about the middle of the workspace and has its proportions.
+    """
     calibrated, _ = models
     machine, own = calibrated.machine, calibrated.own
     centre = coordinates_of(machine.home.as_matrix()[None, :3])[0][0, own]
     there = coordinates_of(_stacked(workspace(machine)[1]))[0][:, own]
     there = centre + _turned_back(there - centre, own)
     middle, reach = there.mean(axis=0), np.abs(there - there.mean(axis=0)).max(axis=0)
-    part = 1.0
-    small = min(n_nodes, 3)
-    for _ in range(HALVINGS):
-        for n in (2, small, n_nodes):  # corners first: they leave the travel first
-            ticks = [
-                np.linspace(m - part * r, m + part * r, n)
-                for m, r in zip(middle, reach, strict=True)
-            ]
-            if not _corrected(models, np.array(list(product(*ticks))))[1].all():
+    for part in SHRINKING ** np.arange(ATTEMPTS):
+        for n in sorted({2, min(n_nodes, 3), n_nodes}):  # corners first: they leave it first
+            ticks = list(np.linspace(middle - part * reach, middle + part * reach, n).T)
+            nodes = np.array(list(product(*ticks)))
+            corrected, reached = _corrected(models, nodes)
+            if not reached.all():
                 break
         else:
-            return middle - part * reach, middle + part * reach
-        part *= 0.8
+            return ticks, nodes, corrected
     raise OutOfClass(_no_grid(machine))
 
 
 def _corrected(models: tuple[_Model, _Model], commands: Array) -> tuple[Array, BoolArray]:
-    """Return corrected coordinates (k, m) of commands, and where both machines reach them."""
+    """Return corrected coordinates (k, m) of commands, and where both machines reach them.
+
+    Where the calibrated one does not reach all of them they are not corrected.
+    """
     calibrated, nominal = models
     home = calibrated.machine.home.as_matrix()[:3]
     X, reached = calibrated.poses(commands, home)
     q = calibrated.readings(X)
     reached &= calibrated.in_travel(q)
+    if not reached.all():
+        return commands, reached
     moved, there = nominal.forward(q, X)
     own = calibrated.own
     found = coordinates_of(moved)[0][:, own]
