@@ -1,17 +1,23 @@
 """Common mistakes of owners are named: in readings, models and images that disagree."""
 
 import pickle
+import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from csv_rows import read_rows, write_rows
 from hexapod_example import Spoiled, spoiled
 from simulated import simulated
 
 from legcal import calibrate, load_dataset
+from legcal.calibration.diagnosis import diagnosis
 from legcal.calibration.diagnosis.diagnosis import diagnose
 from legcal.calibration.diagnosis.mistakes import mistakes
 from legcal.calibration.ordered_dataset import order_dataset
+from legcal.data import Dataset
 from legcal.errors import DatasetError, NotVisible
 from legcal.progress import no_progress
 from legcal.workers import in_turn
@@ -74,6 +80,109 @@ def test_every_mistake_can_be_tried_on_every_kind_of_machine(model: str, tmp_pat
     for one in tried:
         A, B = one.true.joints(range(6))
         assert A.shape == B.shape == (6, data.machine.n_legs, 3)
+
+
+def _exchanged(d: Dataset) -> Dataset:
+    q = d.measurements.q[:, [0, 1, 3, 2, 4, 5]]
+    return replace(d, measurements=replace(d.measurements, q=q))
+
+
+def _another_zero(d: Dataset) -> Dataset:
+    q = d.measurements.q - 0.05 * (np.arange(6) == 1)
+    leg = replace(d.machine.legs[1], travel=(-0.2, 0.2))
+    machine = replace(d.machine, legs=(d.machine.legs[0], leg, *d.machine.legs[2:]))
+    return replace(d, machine=machine, measurements=replace(d.measurements, q=q))
+
+
+def _late_in_one_view(d: Dataset) -> Dataset:
+    q, rows = d.measurements.q.copy(), np.flatnonzero(d.measurements.view == 1)
+    q[rows] = q[np.roll(rows, 1)]
+    return replace(d, measurements=replace(d.measurements, q=q))
+
+
+def _left_handed(d: Dataset) -> Dataset:
+    y = np.array([1.0, -1.0, 1.0])
+    legs = tuple(replace(leg, A=y * leg.A, B=y * leg.B) for leg in d.machine.legs)
+    return replace(d, machine=replace(d.machine, legs=legs))
+
+
+def _thick(d: Dataset) -> Dataset:
+    cylinders = [[replace(c, radius=2.0 * c.radius) for c in leg.cylinders]
+                 for leg in d.machine.legs]  # fmt: skip
+    return replace(d, machine=d.machine.with_cylinders(cylinders))
+
+
+@pytest.fixture(scope="module")
+def outlines(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("outlines") / "set"
+    simulated(folder, "hexapod", poses=6)
+    return load_dataset(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "what", "other"),
+    [
+        (_exchanged, "columns leg3_prismatic and leg4_prismatic look exchanged", "legs leg3 and"),
+        (_another_zero, "column leg2_prismatic looks as if it had another zero: about", ""),
+        (_late_in_one_view, "the readings of view c2 look as if they stood 1 row too late", ""),
+        (_left_handed, "the joints of the model look mirrored", "the outlines look mirrored"),
+        (_thick, "the radii of the legs in the model look twice as large as they are", ""),
+    ],
+)
+def test_given_outlines_name_a_mistake_as_photographs_do(
+    outlines: Dataset,
+    change: Callable[[Dataset], Dataset],
+    what: str,
+    other: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    data = order_dataset(change(outlines), in_turn, no_progress)
+    kinds = {what[:11], "the outline", "images look"}  # the others would take seconds
+    few = [one for one in mistakes(data) if one.what[:11] in kinds]
+    assert len(few) > 1
+    monkeypatch.setattr(diagnosis, "mistakes", lambda _: few)
+    (found,) = diagnose(data)
+    assert found.what.startswith(what)
+    assert found.images == 12
+    assert found.after >= 11 > found.before
+    assert any(one.startswith(other) for one in found.same_as) or not other
+    assert ("To tell these apart" in found.sentence) == bool(found.same_as)
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (lambda x: {"b": -x["b"]}, "b had the opposite sign: reverse it"),
+        (lambda x: {"a": x["b"], "b": x["a"]}, "a and b were exchanged"),
+        (
+            lambda x: {"u0": x["v0"], "v0": x["u0"], "u1": x["v1"], "v1": x["u1"]},
+            "u and v were exchanged",
+        ),
+        (
+            lambda x: {name: x["height"] - 1.0 - x[name] for name in ("v0", "v1")},
+            "v counted from the bottom",
+        ),
+        (lambda x: {"a": x["c"], "b": x["a"], "c": x["b"]}, "c came before a and b"),
+        (lambda x: {name: x[name] + 30.0 for name in ("v0", "v1")}, ""),
+    ],
+)
+def test_a_table_of_outlines_in_another_form_is_called_what_it_looks_like(
+    outlines: Dataset,
+    change: Callable[[dict[str, float]], dict[str, float]],
+    cause: str,
+    tmp_path: Path,
+) -> None:
+    folder = shutil.copytree(outlines.folder, tmp_path / "set")
+    rows = read_rows(folder / "observations.csv")
+    height = float(outlines.measurements.views[0].camera.height)
+    for row in rows:
+        numbers = {name: float(row[name]) for name in ("a", "b", "c", "u0", "v0", "u1", "v1")}
+        row.update({key: repr(x) for key, x in change(numbers | {"height": height}).items()})
+    write_rows(folder / "observations.csv", rows)
+    with pytest.raises(DatasetError, match=r"from the(ir)? lines? ") as refusal:
+        load_dataset(folder)
+    assert (len(refusal.value.problems) == 1) == bool(cause)
+    assert f"they would suit them if {cause}" in refusal.value.problems[0] or not cause
 
 
 @pytest.mark.parametrize(

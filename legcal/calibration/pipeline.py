@@ -283,7 +283,12 @@ def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimat
     photographs = data.photographs.with_gammas(kept_gammas)
     if len(photographs.detect) == 0:  # outlines, or axes, are given
         estimate = _fit(fitted, given_outlines(photographs), placement, board, options)
-        return replace(estimate, image_notes=data.plan.notes, fit_notes=_notes_on_images(estimate))
+        return replace(
+            estimate,
+            image_notes=data.plan.notes,
+            fit_notes=_notes_on_images(estimate),
+            diagnosis=diagnose(data) if _unused_share(estimate) > MAX_LEFT_OUT else (),
+        )
     # 2. Recognise, and measure the outlines.
     T_board_camera = None if board is None else board.T_board_camera
     seen = place_and_measure(photographs, placement, data.progress, T_board_camera, together=False)
@@ -318,9 +323,13 @@ def _is_doubtful(
     """Say whether so much was left out that the session itself may be wrong."""
     cameras, view = seen.placement.T_base_camera, data.measurements.view
     left_out = [r for r in rows.tolist() if r in seen.left_out or cameras[view[r]] is None]
+    return max(len(left_out) / len(rows), _unused_share(estimate)) > MAX_LEFT_OUT
+
+
+def _unused_share(estimate: Estimate) -> float:
+    """Return which part of the outlines that should be seen was not used."""
     shown = estimate.solution.outlines.choose(is_visible(estimate.solution.outlines))
-    unused = 1.0 - float(shown.used.mean()) if len(shown) else 1.0
-    return max(len(left_out) / len(rows), unused) > MAX_LEFT_OUT
+    return 1.0 - float(shown.used.mean()) if len(shown) else 1.0
 
 
 def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]:

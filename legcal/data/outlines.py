@@ -8,7 +8,7 @@ reason and source; and, where legcal measured it, how well it was seen.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -35,9 +35,12 @@ from legcal.files import (
 )
 from legcal.geometry import Array, BoolArray, IntArray, cross
 from legcal.machine import Leg
+from legcal.vision import Camera
 
 QUALITY = ("contrast", "length", "residual")  # how well an outline was seen
 ENCODING = ("gamma", "by_gamma")  # how an outline depends on the gamma of the camera
+MAX_OFF = 0.5  # of the outlines off their lines, from which on the table is wrong, not they
+MIN_NEAR = 0.9  # of the outlines near their lines, if the table is taken otherwise
 NUMBERS = ("a", "b", "c", "u0", "v0", "u1", "v1", "s00", "s01", "s11")
 VERDICTS = ("used", "rejected")
 SOURCES = ("detected", "edited")
@@ -347,7 +350,57 @@ def _refuse_ends_off_line(table: Table, outlines: Outlines, measurements: Measur
         chosen = (view == v) & outlines.used
         camera, h = measurements.views[v].camera, outlines.h[chosen][:, None]
         offset[chosen] = np.abs(camera.line_offset(h, xy[chosen])).max(axis=1)
-    for i in np.flatnonzero(~(offset <= LINE_TOLERANCE_PX)).tolist():
+    off = ~(offset <= LINE_TOLERANCE_PX)
+    most_are = off.sum() > MAX_OFF * outlines.used.sum()
+    meant = _likely_form(outlines.choose(outlines.used), measurements) if most_are else ""
+    if meant:
+        table.refuse_file(
+            f"{table.path}: the outlines could not be used: found the ends of {off.sum()} of "
+            f"{outlines.used.sum()} up to {offset[off].max():.3g} px from their lines (a, b, c), "
+            f"needed at most {LINE_TOLERANCE_PX:g} px; they would suit them if {meant}."
+        )
+        return
+    for i in np.flatnonzero(off).tolist():
         found = f"ends {offset[i]:.3g} px from the line (a, b, c)"
         needed = f"at most {LINE_TOLERANCE_PX:g} px; correct the line or its ends"
         table.refuse(i, found, needed, *NUMBERS[:7])
+
+
+def _likely_form(outlines: Outlines, measurements: Measurements) -> str:
+    """Return what outlines look like whose ends are off their lines; "" where it is not clear."""
+    near: dict[str, int] = {}
+    for v in np.unique(measurements.view[outlines.row]):
+        own = outlines.choose(measurements.view[outlines.row] == v)
+        camera = measurements.views[v].camera
+        for what, h, xy in _forms(camera, own.h, own.ends):
+            offset = np.abs(camera.line_offset(h[:, None], xy)).max(axis=1)
+            near[what] = near.get(what, 0) + int(np.sum(offset <= LINE_TOLERANCE_PX))
+    best = max(near, key=lambda what: near[what], default="")
+    return best if near.get(best, 0) >= MIN_NEAR * len(outlines) else ""
+
+
+def _forms(camera: Camera, h: Array, ends: Array) -> Iterator[tuple[str, Array, Array]]:
+    """Yield what people write in place of lines (n, 3) and ends (n, 2, 2) [px], and what it means.
+
+    Ends are on the sensor plane then.
+    """
+    size = np.array([camera.width, camera.height], dtype=np.float64)
+    xy = camera.undistort(ends)
+    up = np.array([1.0, -1.0, 1.0])
+    below = np.array([0.0, size[1] - 1.0]) + ends * up[:2]
+    yield "b had the opposite sign: reverse it", h * up, xy
+    below = camera.undistort(below)
+    yield "v counted from the bottom: write the height of the image less 1 less v", h, below
+    yield "a and b were exchanged: exchange their headers", h[:, [1, 0, 2]], xy
+    exchanged = camera.undistort(ends[..., ::-1])
+    yield "u and v were exchanged: exchange their headers", h, exchanged
+    yield "c came before a and b: correct the headers", h[:, [1, 2, 0]], xy
+    yield "the ends were points of the sensor plane: write pixels", h, ends
+    parts = camera.undistort(ends * size)
+    yield "the ends were parts of the size of the image: write pixels", h, parts
+    of_pixels = h @ camera.K
+    yield (
+        "(a, b, c) were a line of pixels: multiply it by the transposed camera matrix",
+        of_pixels / np.linalg.norm(of_pixels, axis=1, keepdims=True),
+        xy,
+    )

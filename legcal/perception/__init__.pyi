@@ -2,6 +2,7 @@ from .agreement import Agreement as Agreement
 from .agreement import Assumption as Assumption
 from .agreement import compare_assumptions as compare_assumptions
 from .agreement import pairs_of_images as pairs_of_images
+from .agreement import pairs_of_outlines as pairs_of_outlines
 from .board_adjustment import LOSS as LOSS
 from .board_adjustment import SHEET as SHEET
 from .board_adjustment import AdjustedBoard as AdjustedBoard

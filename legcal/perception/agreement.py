@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.data import Measurements, Outlines
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.camera_search import flipped, place_camera
 from legcal.perception.candidate_pairs import CandidatePairs
@@ -89,6 +90,41 @@ def pairs_of_images(search: Search, rows: Sequence[int], run: Run) -> dict[int, 
 def _pairs_of_image(search: Search, row: int) -> CandidatePairs:
     """Return the edge pairs of the image of a row."""
     return search.pairs(row, int(search.measurements.view[row]))
+
+
+def pairs_of_outlines(outlines: Outlines, measurements: Measurements) -> dict[int, CandidatePairs]:
+    """Return the edge pairs by row that both used outlines of a part make, whatever leg they name.
+
+    Nothing of rows without any.
+    """
+    index = {key: i for i, key in enumerate(outlines.row_keys()) if outlines.used[i]}
+    both: dict[int, list[tuple[int, int]]] = {}
+    for (row, leg, part, edge), i in index.items():
+        if edge == 1 and (other := index.get((row, leg, part, 2))) is not None:
+            both.setdefault(row, []).append((i, other))
+    found = {}
+    for row, pairs in both.items():
+        camera = measurements.views[measurements.view[row]].camera
+        one, two = np.array(pairs).T
+        # Points of the axis at both ends, and how far the two lines are from them.
+        ends = 0.5 * (camera.undistort(outlines.ends[one]) + camera.undistort(outlines.ends[two]))
+        homogeneous = np.concatenate([ends, np.ones((len(one), 2, 1))], axis=2)
+        normals = [h / np.linalg.norm(h[:, :2], axis=1)[:, None]
+                   for h in (outlines.h[one], outlines.h[two])]  # fmt: skip
+        offsets = [np.einsum("nex,nx->ne", homogeneous, h) for h in normals]
+        ends = ends - 0.5 * (offsets[0] + offsets[1])[..., None] * normals[0][:, None, :2]
+        along = ends[:, 1] - ends[:, 0]
+        length = np.linalg.norm(along, axis=1)
+        pairs_of_row = CandidatePairs(
+            middle=ends.mean(axis=1),
+            along=along / length[:, None],
+            half_length=0.5 * length,
+            width=np.abs(offsets[0] - offsets[1]),
+            merit=length,
+            pixel=1.0 / float(camera.K[0, 0]),
+        )
+        found[row] = pairs_of_row.take(np.argsort(-length, kind="stable"))
+    return found
 
 
 def as_if(pairs: CandidatePairs, corners: Array, flip: Array, focal: float) -> CandidatePairs:

@@ -30,6 +30,7 @@ from legcal.perception import (
     far_off,
     group_views,
     pairs_of_images,
+    pairs_of_outlines,
 )
 
 STAGE = "Trying common mistakes"
@@ -37,17 +38,21 @@ STAGE = "Trying common mistakes"
 _AGREE_ALREADY = 0.9  # of the images: then nothing common is wrong
 _MIN_IMAGES = 3  # of a group of views
 _FEW = 6  # images, at least, that say which mistakes are worth a closer look
-_ROUNDS = 3  # of such images, until they suit a mistake
+_ROUNDS = 2  # of such images, until they suit a mistake
 _SUITS = 0.5  # of the legs that they should show
 _STARTS, _FEW_STARTS = (1, 1, 2), (1,)  # images that suggest cameras, of all and of a few
 _POOL = 3  # cameras of other mistakes that are tried
 _FINALISTS = 6  # mistakes that all images judge
 _NEAR_BEST = 0.5  # of the gain of the best, which few images gave, that all images judge as well
+_SHOWN = 3  # of what images cannot tell from it, in a sentence
+_SAME = 0.03  # in the share of legs: no more than the lens makes of mirrored images
 _ALIKE = 0.9  # of the best support: as good, where images do not tell them apart
 _MIN_SHARE = 0.5  # of the images, that agree then
-_MIN_GAIN = 0.1  # in the share of legs that images show, on average
+_MIN_GAIN, _SURE_GAIN = 0.1, 0.05  # in the share of legs that images show, on average
 _MIRROR_X, _MIRROR_Y = np.diag([-1.0, 1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0, 1.0])
 _MIN_SIGMAS = 2.5  # of its signed ranks: chance gains in some images and loses in others
+_PLAIN_GAIN = 0.3  # of all of a few images
+_SURE_SIGMAS = 4.5  # of a gain that may be small: in nearly all of many images
 
 
 @dataclass(frozen=True)
@@ -88,7 +93,9 @@ class Diagnosis:
     @property
     def sentence(self) -> str:
         """The diagnosis for people."""
-        others = "".join(f", or {other}" for other in self.same_as)
+        more = len(self.same_as) - _SHOWN
+        others = "".join(f", or {other}" for other in self.same_as[:_SHOWN])
+        others += f", or {more} more that are alike" * (more > 0)
         what = self.what[0].upper() + self.what[1:]
         tell = f". To tell these apart, {', or '.join(self.tests)}" if self.tests else ""
         return (
@@ -116,7 +123,7 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     whatever is assumed.
     """
     machine = data.machine
-    rows = _rows_with_image(data)
+    rows = _rows_seen(data)
     if not (machine.is_determined and len(machine.motors) and len(rows)):
         return ()
     groups = _groups(data, rows)
@@ -140,14 +147,19 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     return (_diagnosis(first, found[alike[0]], judge.own, by_hints=by_hints),)
 
 
-def _rows_with_image(data: OrderedDataset) -> IntArray:
-    """Return the rows whose photographs are there, without those of views that name no leg."""
+def _rows_seen(data: OrderedDataset) -> IntArray:
+    """Return the rows of photographs or given outlines, without those of views that name no leg.
+
+    The edge pairs that outlines make are added to those of images.
+    """
     paths = [data.dataset.image_path(row) for row in data.order.rows.tolist()]
-    views = [data.measurements.views[v] for v in data.measurements.view.tolist()]
+    has_image = [path is not None and path.exists() for path in paths]
+    given = pairs_of_outlines(data.photographs.keep, data.measurements)
+    data.edge_pairs.update({row: own for row, own in given.items() if not has_image[row]})
     shown = [
-        k
-        for k, (path, view) in enumerate(zip(paths, views, strict=True))
-        if path is not None and path.exists() and view.legs != ()
+        row
+        for row, view in enumerate(data.measurements.view.tolist())
+        if data.measurements.views[view].legs != () and (has_image[row] or row in data.edge_pairs)
     ]
     return np.array(shown, dtype=np.intp)
 
@@ -192,7 +204,7 @@ class _Judge:
         """Return the mistakes that a few images of the views that disagree most speak for."""
         missing = [float((one.expected - one.support).sum()) for one in self.of_groups]
         left = np.argsort(-np.array(missing), kind="stable").tolist()
-        gain, own, expected = np.zeros(len(tried)), 0.0, 0.0
+        gain, seen = np.zeros(len(tried)), list[Agreement]()
         chosen = list(range(len(tried)))
         done, total = 0, _ROUNDS * len(tried)
         for _ in range(_ROUNDS):
@@ -200,14 +212,13 @@ class _Judge:
             while left and n_images < _FEW:
                 g = left.pop(0)
                 some = self.groups[g].some
-                before = self.of_groups[g].at(some)
-                own += float(before.support.sum())
-                expected += float(before.expected.sum())
+                seen.append(self.of_groups[g].at(some))
                 n_images += len(some)
                 gain += self._gains(tried, chosen, g)
                 done += len(chosen)
                 self.data.progress(STAGE, min(done, total - 1), total)
-            if not left or own + gain.max() >= _SUITS * expected:
+            own = Agreement.joined(seen)
+            if not left or _suits(gain.max() + own.support.sum(), own):
                 break
             best_first = np.argsort(-gain, kind="stable")
             chosen = np.sort(best_first[: max(len(chosen) // 2, _FINALISTS)]).tolist()
@@ -242,8 +253,7 @@ class _Judge:
 
         cameras: dict[int, RigidTransform | None] = {}
         look(some, ())
-        most = max(float(support.max()), float(before.support.sum()))
-        if most < _SUITS * float(before.expected.sum()):
+        if not _suits(support.max(), before):
             look([k for k in some if not tried[k].is_small], _FEW_STARTS)
             look([k for k in some if tried[k].is_small], ())
         return found + support
@@ -286,23 +296,31 @@ class _Judge:
         return compare_assumptions(assumptions, self.data.pool)
 
 
+def _suits(support: float, own: Agreement) -> bool:
+    """Say whether images suit a mistake well, by legs, and as they are by far fewer."""
+    expected = float(own.expected.sum())
+    gain = support - float(own.support.sum())
+    return support >= _SUITS * expected and gain >= _MIN_GAIN * expected
+
+
 def _explains(one: Agreement, own: Agreement) -> bool:
     """Say whether images agree so much better that it is no chance."""
     gain = one.share - own.share
-    return (
-        one.images >= max(_MIN_SHARE * len(one.row), 2)
-        and one.images > own.images
-        and float(gain.mean()) >= _MIN_GAIN
-        and _signed_ranks(gain) >= _MIN_SIGMAS
-    )
+    if one.images < max(_MIN_SHARE * len(one.row), 2) or one.images <= own.images:
+        return False
+    some = gain[gain != 0.0]
+    size, sigmas = float(some.mean()), _signed_ranks(gain)
+    is_sure = size >= _SURE_GAIN and sigmas >= _SURE_SIGMAS
+    is_plain = size >= _PLAIN_GAIN and len(some) >= _FEW and bool(np.all(some > 0.0))
+    return is_plain or is_sure or (size >= _MIN_GAIN and sigmas >= _MIN_SIGMAS)
 
 
 def _is_as_good(one: Agreement, best: Agreement) -> bool:
     """Say whether images do not tell an assumption from the best one."""
-    return (
-        float(one.support.sum()) >= _ALIKE * float(best.support.sum())
-        and _signed_ranks(best.share - one.share) < _MIN_SIGMAS
-    )
+    if float(one.support.sum()) < _ALIKE * float(best.support.sum()):
+        return False
+    lack = best.share - one.share
+    return float(lack.mean()) < _SAME or _signed_ranks(lack) < _MIN_SIGMAS
 
 
 def _signed_ranks(gain: Array) -> float:

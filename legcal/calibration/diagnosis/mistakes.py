@@ -224,7 +224,8 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
     ends = np.where(np.isfinite(ends), ends, own.min(axis=0) + own.max(axis=0))
     every = list(range(len(legs)))
     units = ((LENGTH["mm"], "millimetres"), (LENGTH["cm"], "centimetres"), (INCH, "inches"))
-    for scale, unit in units:
+    has_travel = all(0.0 < leg.travel[1] - leg.travel[0] < np.inf for leg in legs)
+    for scale, unit in () if has_travel else units:  # readings in their travel are metres
         yield Mistake(
             "unit",
             f"the readings look like {unit}",
@@ -305,11 +306,15 @@ def _of_images(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
                 continue
             flip = given.flip.copy()
             flip[chosen] = turn
+            things = "images"
+            remedy = "replace them by the originals"
+            if len(data.photographs.detect) == 0:
+                things, remedy = "outlines", "correct the direction of an axis of their table"
             yield Mistake(
                 kind,
-                f"the images{of_view} look {what}",
+                f"the {things}{of_view} look {what}",
                 "turned back",
-                "replace them by the originals",
+                remedy,
                 replace(given, flip=flip),
                 test=_LETTERING,
             )
