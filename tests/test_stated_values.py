@@ -326,7 +326,10 @@ def test_a_wrong_encoder_scale_shows_in_the_radii(factor: float, way: str) -> No
 def test_one_wrong_radius_is_no_wrong_scale(noisy: MachineSession) -> None:
     radii = {part: r * (1.1 if part[0] == 0 else 1.0) for part, r in noisy.legs.radii.items()}
     found = fitted(replace(noisy, legs=replace(noisy.legs, radii=radii)))
-    assert found.notes == ()
+    (note,) = found.notes
+    name = noisy.legs.names[0]
+    assert note.startswith(f"The measurements contradict radii of the model: found {name}.radius.")
+    assert note.count(" against ") == sum(part[0] == 0 for part in radii)
 
 
 def _sized(seen: BoardCorners, factor: float) -> BoardCorners:

@@ -10,6 +10,7 @@ noted. Once a joint fit has placed everything, :func:`measure_photographs` measu
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -20,6 +21,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.data import (
     Measurements,
     Outlines,
+    images_in_words,
     is_edited,
     join_outlines,
     merge_edited,
@@ -45,16 +47,17 @@ from legcal.perception.placement import (
     Search,
     group_views,
 )
-from legcal.perception.radii import LegRadius, radius_notes
+from legcal.perception.radii import LegRadius, RadiusFactors, radius_notes
 from legcal.perception.recognition import recognise
 from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
-from legcal.vision import shared_cameras
+from legcal.vision import look_alike, shared_cameras
 from legcal.workers import Run
 
-DETECTOR_VERSION = 5  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 6  # raise it whenever outlines or notes that are kept come out differently
 MEASURING = "Measuring outlines"  # a stage of progress
 TOO_SHORT = "px in the image"  # end of the reason for parts that are not looked for
+MIN_VIEWS = 2  # in which a part must show another radius than the model's
 MAX_USED_SHARE = 0.3  # of the outlines of a part that should be seen
 
 
@@ -188,24 +191,36 @@ def place_and_measure(
 
     placement = recognised()
     outlines, blur = _measured(photographs, search, placement, report, together=together)
-    suspects = _parts_not_found(photographs.machine.legs, outlines)
-    if suspects:
+    suspects, legs = _parts_not_found(photographs.machine.legs, outlines), photographs.machine.legs
+    while suspects:
         other = recognised(suspects)
-        if other.radii.factor:
-            machine = photographs.machine.with_cylinders(other.radii.corrected(search.cylinders))
-            corrected = replace(photographs, machine=machine)
-            by_other = corrected.search(nominal, pairs, rough)
-            again, also = _measured(
-                corrected,
-                by_other,
-                other,
-                report,
-                together=together,
-                stage=f"{MEASURING} with other radii",
-            )
-            blur = np.where(np.isnan(also), blur, also)
-            if again.used.sum() > outlines.used.sum():
-                photographs, search, placement, outlines = corrected, by_other, other, again
+        if not other.radii.factor:
+            break
+        machine = photographs.machine.with_cylinders(other.radii.corrected(search.cylinders))
+        corrected = replace(photographs, machine=machine)
+        by_other = corrected.search(nominal, pairs, rough)
+        again, also = _measured(
+            corrected,
+            by_other,
+            other,
+            report,
+            together=together,
+            stage=f"{MEASURING} with other radii",
+        )
+        blur = np.where(np.isnan(also), blur, also)
+        m = photographs.measurements
+        shown = _images_with_more(legs, other.radii, m.view, outlines, again)
+        of_one = [part for part, rows in shown.items() if len(set(m.view[rows])) < MIN_VIEWS]
+        if of_one and not other.radii.common:  # what one camera sees may be light and shade
+            left = [part for part in suspects if not _is_among(part, of_one)]
+            suspects = left if len(left) < len(suspects) else []
+            continue
+        if again.used.sum() > outlines.used.sum():
+            photographs, search, placement, outlines = corrected, by_other, other, again
+            seen_in = {part: images_in_words(m, rows) for part, rows in shown.items() if rows}
+            notes = radius_notes(other.radii, search.leg_names, seen_in)
+            placement = replace(placement, notes=(*placement.notes, *notes))
+        break
     groups = group_views(photographs.measurements, usable, hints, joined)
     is_own = np.isin(outlines.row, usable)
     own, others = outlines.choose(is_own), outlines.choose(~is_own)
@@ -291,12 +306,11 @@ def _recognised(
     joined: Joined,
     suspects: Collection[LegRadius] = (),
 ) -> Placement:
-    """Return what is recognised in some images, with notes on radii."""
+    """Return what is recognised in some images."""
     progress = _counted(report, "Recognising legs", len(rows))
-    found = recognise(
+    return recognise(
         search, rows, hints, joined, suspects=suspects, run=photographs.run, progress=progress
     )
-    return replace(found, notes=tuple(radius_notes(found.radii, search.leg_names)))
 
 
 def _measured(
@@ -384,6 +398,40 @@ def _parts_not_found(legs: Sequence[Leg], outlines: Outlines) -> list[LegRadius]
             if is_seen and used[own].sum() <= MAX_USED_SHARE * own.sum():
                 parts.append((j, radius))
     return parts
+
+
+def _is_among(part: LegRadius, others: Sequence[LegRadius]) -> bool:
+    """Say whether a part is one of others, whose radii may differ by rounding."""
+    return any(part[0] == leg and look_alike(part[1], radius) for leg, radius in others)
+
+
+def _images_with_more(
+    legs: Sequence[Leg],
+    radii: RadiusFactors,
+    view: IntArray,
+    before: Outlines,
+    after: Outlines,
+) -> dict[LegRadius, list[int]]:
+    """Return the rows that show another radius of each part, of views that do as a whole.
+
+    With a radius that is wrong by as much as light and shade suggest, a part loses its outlines in
+    most images; where it gains some in all together, views that gain speak for that radius.
+    """
+    found = {}
+    for leg, radius in radii.factor:
+        links = [link for link, r in legs[leg].radius_of_part.items() if look_alike(r, radius)]
+        gain = Counter[int]()
+        for outlines, sign in ((before, -1), (after, 1)):
+            is_part = np.isin(outlines.part, links) & (outlines.leg == leg) & outlines.used
+            for row in outlines.row[is_part].tolist():
+                gain[row] += sign
+        of_view = Counter[int]()
+        for row, more in gain.items():
+            of_view[int(view[row])] += more
+        speaks = {v for v, more in of_view.items() if more > 0} if gain.total() > 0 else set()
+        rows = [row for row, more in gain.items() if more > 0 and int(view[row]) in speaks]
+        found[leg, radius] = sorted(rows)
+    return found
 
 
 def _counted(report: Report, stage: str, total: int) -> Callable[[int], None]:

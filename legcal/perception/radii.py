@@ -7,7 +7,7 @@ outlines were not found.
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -222,8 +222,10 @@ def _width(ends: Array, radius: float, middle: Array) -> float:
     return float(2.0 * radius * max(inverse_depth, 1e-9) / max(flat, 0.1))
 
 
-def radius_notes(found: RadiusFactors, legs: Sequence[str]) -> list[str]:
-    """Return notes on radii that differ from the model."""
+def radius_notes(
+    found: RadiusFactors, legs: Sequence[str], seen_in: Mapping[LegRadius, str]
+) -> list[str]:
+    """Return notes on radii that differ from the model; where it is seen, in words, of each."""
     if not found.factor:
         return []
     if found.common:
@@ -234,9 +236,9 @@ def radius_notes(found: RadiusFactors, legs: Sequence[str]) -> list[str]:
             "the readings if the radii are right."
         ]
     return [
-        f"{legs[leg]} is seen {_away(factor)} than its radius in the model: found a radius of "
-        f"about {1e3 * factor * radius:.1f} mm, given {1e3 * radius:.2f} mm; that of the images "
-        "was used; correct the model."
+        f"{legs[leg]} may be {_away(factor)} than in the model: found a radius of about "
+        f"{1e3 * factor * radius:.1f} mm in {seen_in[leg, radius]}, given {1e3 * radius:.2f} mm, "
+        "and used what these images show; measure the leg, and correct the model if it is so."
         for (leg, radius), factor in sorted(found.factor.items())
     ]
 

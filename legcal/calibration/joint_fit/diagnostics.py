@@ -47,7 +47,7 @@ _MIN_SHARE = 0.01  # of the variance that a camera file states, which measuremen
 _MANY_REJECTED = 0.1  # of all outlines
 _MOST_REJECTED = 0.5  # of those of a leg or a view
 _MIN_COUNT = 3  # rejected outlines of a leg or a view, at least, before it is noted
-_RADIUS_SIGMAS = 3.0  # of the prior of a radius, between all radii and the model's
+_RADIUS_SIGMAS = 3.0  # between radii and the model's, of whose prior nobody said a word
 _RADIUS_SPREAD = 0.25  # of their common difference
 _MAX_NAMES = 4  # names, before they are only counted
 
@@ -430,6 +430,33 @@ def scale_notes(problem: FitProblem, state: State, settings: RefinementSettings)
         f"may be that much {way} than it is; check the unit and the scale of the encoders, or the "
         "radii of the model.",
     )
+
+
+def contradicted_radii(problem: FitProblem, state: State, normal: NormalEquations) -> list[str]:
+    """Return a note on the radii of the model that the measurements contradict.
+
+    *normal* is the information at *state*. They have a prior of their own, which nobody stated.
+    """
+    radii = {radius_name(problem.legs.names[leg], part) for leg, part in problem.outlines.parts}
+    priors, said = problem.priors, []
+    for i, mean, sigma in zip(
+        priors.unknown.tolist(), priors.mean.tolist(), priors.sigma.tolist(), strict=True
+    ):
+        name = problem.named[i]
+        if name not in radii or name in problem.choices.priors:
+            continue
+        found = estimate_without_prior(problem, state, normal, i, mean, sigma)
+        if found is not None and found.apart > _RADIUS_SIGMAS:
+            said.append(
+                f"{name} {1e3 * found.value:.2f} mm against {1e3 * mean:.2f} +- {1e3 * sigma:.2f} "
+                f"mm ({found.apart:.0f} standard deviations)"
+            )
+    if not said:
+        return []
+    return [
+        f"The measurements contradict radii of the model: found {'; '.join(said)}, needed at most "
+        f"{_RADIUS_SIGMAS:g} standard deviations; measure these parts and correct the model."
+    ]
 
 
 def naming_stated_values(problem: FitProblem, failure: LegcalError) -> LegcalError:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.brief import brief
 from legcal.calibration.joint_fit.determinacy import HeldDirections, held_spread, named_units
 from legcal.calibration.joint_fit.diagnostics import (
+    contradicted_radii,
     doubted_cameras,
     rejected_notes,
     scale_notes,
@@ -176,6 +177,7 @@ def assemble_solution(
     of_files = {named[i] for i in problem.calibrated.tolist()}
     shown = [i for i, name in enumerate(names) if name not in of_files]
     gammas = _gammas(problem, state, kept, outlines)
+    scale = scale_notes(problem, state, settings)
     return Solution(
         legs=state.legs,
         T_camera_Rb=state.camera_pose.motions,
@@ -241,7 +243,7 @@ def assemble_solution(
             *rejected_notes(problem, fit.accepted),
             *corner_notes(problem),
             *map(str, gammas),
-            *scale_notes(problem, state, settings),
+            *(scale or contradicted_radii(problem, state, normal)),
             *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
             *map(str, disagreeing),
             *map(str, doubted),
