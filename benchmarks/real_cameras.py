@@ -7,7 +7,7 @@ Cameras of five kinds (``legcal simulate --camera KIND``), from industrial ones 
 photograph simulated machines from tilted poses and a chessboard; the models take turns, each
 session has a seed of its own. As people do it, the intrinsics come from ``legcal camera`` on the
 photographs of the board, and nobody tells the gamma; then the machine is calibrated. A line a
-session, and a line a kind and for all of them:
+session, and a line a kind, a machine and for all of them:
 
     n          sessions, and of these: how many were refused, how many are trusted ("Calibrated")
     e'C^-1e    mean of e' C^-1 e / rank: e the errors of the platform at the session's poses,
@@ -196,7 +196,7 @@ def outcomes(sessions: Sequence[Session], kept: Path, workers: int) -> Iterable[
 
 
 def main() -> None:
-    """Print a line a session, a kind, and for all."""
+    """Print a line a session, a kind, a machine, and for all."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--sessions", type=int, default=60, help="of each kind of camera; 60")
     parser.add_argument("--kinds", nargs="+", choices=CAMERAS, default=list(CAMERAS))
@@ -220,6 +220,8 @@ def main() -> None:
     print()
     for kind in options.kinds:
         print(summary(kind, [one for one in found if one.session.kind == kind]))
+    for model in options.models:
+        print(summary(model, [one for one in found if one.session.model == model]))
     print(summary("all", found))
 
 
