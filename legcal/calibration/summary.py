@@ -368,7 +368,8 @@ def _fit_line(result: Result) -> str:
 def _direction_lines(result: Result) -> list[str]:
     """Return which combinations of parameters are least certain, and which are held."""
     worst = [f"{weak.direction} ({1e3 * weak.sigma_m:.3f} mm)" for weak in result.weakest]
-    lines = [f"Least certain combinations (1 sigma): {'; '.join(worst)}."] if worst else []
+    told = f"Least certain combinations (1 sigma, in R_b and R_e): {'; '.join(worst)}."
+    lines = [told] if worst else []
     if result.held:
         lines.append(
             "Held at nominal, as nothing determines them and they do not move the platform: "

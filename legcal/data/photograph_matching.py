@@ -19,9 +19,15 @@ from pathlib import Path, PurePosixPath
 from legcal.data.measurements import few
 from legcal.errors import DatasetError, UsageError
 from legcal.files import MAX_IMAGE, closest, describe, is_name, read_bytes
-from legcal.vision import CONVERT, FOREIGN_SUFFIXES, read_facts
+from legcal.vision import (
+    CONVERT,
+    CONVERT_HEIC,
+    FOREIGN_SUFFIXES,
+    HEIC_SUFFIXES,
+    image_suffixes,
+    read_facts,
+)
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 MAX_PHOTOGRAPHS = 50_000
 MAX_VIEWS = 12  # that names of photographs are taken for
 _SEPARATORS = " _-."
@@ -127,6 +133,7 @@ def find_photographs(
             f"{folder}: the photographs could not be found: found {found}, needed the folder that "
             "holds them; check the path."
         )
+    suffixes = image_suffixes()
     photographs: list[Photograph] = []
     foreign: list[str] = []
     for above, inside, files in os.walk(folder):
@@ -135,7 +142,7 @@ def find_photographs(
         for name in files:
             suffix = Path(name).suffix.lower()
             file = Photograph(Path(above) / name, (here / name).as_posix())
-            if form is not None and suffix in SUFFIXES and not name.startswith("."):
+            if form is not None and suffix in suffixes and not name.startswith("."):
                 named = form.of(file)
                 if named is None:
                     others.append(file.name)
@@ -143,7 +150,7 @@ def find_photographs(
                 file = named
             if name.startswith(".") or (chosen and file.folder not in chosen):
                 continue
-            if suffix in SUFFIXES:
+            if suffix in suffixes:
                 photographs.append(file)
             elif suffix in FOREIGN_SUFFIXES:
                 foreign.append(file.name)
@@ -161,7 +168,9 @@ def find_photographs(
     if not photographs:
         found, remedy = "none", "check the path"
         if foreign:
-            found, remedy = f"{len(foreign)} of another format ({few(foreign)})", CONVERT
+            found = f"{len(foreign)} of another format ({few(foreign)})"
+            are_heic = any(name.lower().endswith(HEIC_SUFFIXES) for name in foreign)
+            remedy = CONVERT_HEIC if are_heic else CONVERT
         elif chosen:
             found, remedy = f"none in {few(chosen)}", "check --views"
         raise DatasetError(

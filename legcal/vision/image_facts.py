@@ -1,7 +1,8 @@
 """What the file of a photograph says of how it was made: compression, camera, lens, processing.
 
 Read from the segments of a JPEG before its first scan, the chunks of a PNG, the first directory of
-a TIFF. Nothing here refuses a file: what is damaged or absent says nothing.
+a TIFF, the blocks of a HEIC file. Nothing here refuses a file: what is damaged or absent says
+nothing.
 
 Phones that blur the background of a portrait keep the depths that they blurred by. Sources, none of
 them of the makers: Samsung's blocks behind the image by the tables of ExifTool (``Samsung.pm``);
@@ -18,6 +19,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from legcal.vision.exif import Value, read_tags
+from legcal.vision.heic import heic_blocks, is_heic
 
 JPEG_SIGNATURE = b"\xff\xd8\xff"
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -71,7 +73,7 @@ class ImageFacts:
     Attributes
     ----------
     form : str
-        JPEG, PNG or TIFF.
+        JPEG, PNG, TIFF or HEIC.
     is_lossy : bool
         Whether pixels are compressed with loss.
     jpeg_quality : int or None
@@ -139,6 +141,11 @@ def read_facts(content: bytes) -> ImageFacts:
         packet = tags.get(_XMP, b"")
         xmp = packet if isinstance(packet, bytes) else b""
         return _facts("TIFF", tags, xmp, [], is_lossy=is_lossy, quality=quality)
+    if is_heic(content):
+        exif, xmp = heic_blocks(content)
+        # pixels come turned already
+        upright = {tag: x for tag, x in read_tags(exif, _TAGS).items() if tag != _ORIENTATION}
+        return _facts("HEIC", upright, xmp, [], is_lossy=True)
     return ImageFacts()
 
 

@@ -19,6 +19,14 @@ from legcal.errors import DatasetError
 from legcal.files import MAX_IMAGE, read_bytes
 from legcal.geometry import Array
 from legcal.vision.camera import Camera
+from legcal.vision.heic import (
+    HEIC_SUFFIXES,
+    UnreadableError,
+    can_read_heic,
+    heic_pixels,
+    heic_size,
+    is_heic,
+)
 from legcal.vision.image_facts import (
     JPEG_SIGNATURE,
     PNG_SIGNATURE,
@@ -66,6 +74,7 @@ _MOST_TAGS, _MOST_STRIPS = 200, 100_000  # of a TIFF
 _SIDEWAYS = 5  # EXIF orientation, from which on width and height are exchanged for looking
 _STRIP = 256  # rows of an image that become grey levels at once
 
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 FOREIGN_SUFFIXES = (".heic", ".heif", ".hif", ".avif", ".webp", ".gif", ".bmp", ".jp2", ".jxl",
                     ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")  # fmt: skip
 CONVERT = (
@@ -73,8 +82,8 @@ CONVERT = (
     "(magick mogrify -format jpg -quality 98 *.HEIC), or set the phone to the most compatible "
     "format"
 )
-_BRANDS = {b"heic": "HEIC", b"heix": "HEIC", b"hevc": "HEIC", b"hevx": "HEIC", b"mif1": "HEIC",
-           b"msf1": "HEIC", b"avif": "AVIF", b"avis": "AVIF", b"crx ": "CR3"}  # fmt: skip
+CONVERT_HEIC = f"install what reads HEIC (pip install 'legcal[heic]'), or {CONVERT}"
+_BRANDS = {b"avif": "AVIF", b"avis": "AVIF", b"crx ": "CR3"}
 
 _COMPLETE = "a complete PNG, JPEG or TIFF file"
 _AGAIN = "copy it again or remove the row"
@@ -108,10 +117,14 @@ def decode_image(path: Path, camera: Camera, where: str = "") -> NDArray[np.uint
     content, problem = _complete_content(path, camera, where)
     if problem:
         raise DatasetError(problem)
+    pixels: NDArray[np.generic] | None
     try:
-        with quiet_opencv():
-            pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), _FLAGS)
-    except cv2.error:
+        if is_heic(content):
+            pixels = heic_pixels(content)
+        else:
+            with quiet_opencv():
+                pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), _FLAGS)
+    except (cv2.error, UnreadableError):
         pixels = None
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         found = "data that cannot be decoded" if pixels is None else f"{pixels.dtype} pixels"
@@ -165,11 +178,31 @@ def image_size(content: bytes) -> ImageSize:
                 return size
     except (struct.error, IndexError) as error:
         raise BadImage(f"a file cut off after {len(content)} bytes") from error
+    if is_heic(content):
+        return _heic_size(content)
     if content[4:8] == b"ftyp" and content[8:12] in _BRANDS:
         raise BadImage(
             f"a {_BRANDS[content[8:12]]} file, which cannot be read here", remedy=CONVERT
         )
     raise BadImage("a file that is none of these")
+
+
+def _heic_size(content: bytes) -> ImageSize:
+    """Return the size of a HEIC photograph, if its package is there."""
+    if not can_read_heic():
+        raise BadImage("a HEIC file, which cannot be read here", remedy=CONVERT_HEIC)
+    try:
+        size = ImageSize(*heic_size(content))
+    except UnreadableError as error:
+        raise BadImage(f"a HEIC file that cannot be read ({error})") from error
+    if problem := size_problem(size.width, size.height):
+        raise BadImage(*problem)
+    return size
+
+
+def image_suffixes() -> tuple[str, ...]:
+    """Return the endings of image files that can be read here."""
+    return SUFFIXES + HEIC_SUFFIXES if can_read_heic() else SUFFIXES
 
 
 def size_problem(width: int, height: int) -> tuple[str, str] | None:

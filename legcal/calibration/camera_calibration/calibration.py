@@ -54,6 +54,7 @@ from legcal.vision import (
     board_of,
     differences,
     image_size,
+    image_suffixes,
     likely_cause,
     read_facts,
     read_image,
@@ -63,7 +64,6 @@ from legcal.workers import Run, worker_pool
 
 _STAGE = "Searching the board"
 _N_DESCRIBED = 2  # images of which it is said what they show instead
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 
 
 def calibrate_camera(
@@ -300,8 +300,8 @@ def _listed_images(named: Sequence[str | Path]) -> list[Path]:
         if not paths:
             problems.append(
                 f"The images {describe(str(name))} could not be read: found no such file, folder "
-                f"with images or pattern that matches one, needed {', '.join(_SUFFIXES)}; check "
-                "the path."
+                f"with images or pattern that matches one, needed {', '.join(image_suffixes())}; "
+                "check the path."
             )
         found |= dict.fromkeys(paths)
     if problems or not found:
@@ -315,13 +315,13 @@ def _matching(name: str) -> list[Path]:
     """Return the images that one name stands for."""
     if not name:
         return []
-    path = Path(name)
+    path, suffixes = Path(name), image_suffixes()
     if path.is_dir():
-        return [p for p in sorted(path.iterdir()) if p.suffix.lower() in _SUFFIXES and p.is_file()]
+        return [p for p in sorted(path.iterdir()) if p.suffix.lower() in suffixes and p.is_file()]
     if os.path.lexists(path):
         return [path]
     hits = [Path(hit) for hit in sorted(glob.glob(name, recursive=True))]
-    return [hit for hit in hits if hit.suffix.lower() in _SUFFIXES and hit.is_file()]
+    return [hit for hit in hits if hit.suffix.lower() in suffixes and hit.is_file()]
 
 
 def _common_size(paths: Sequence[Path]) -> tuple[ImageSize, list[ImageFacts]]:
