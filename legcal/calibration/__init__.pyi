@@ -12,7 +12,7 @@ from .examination import Examination as Examination
 from .examination import doctor as doctor
 from .identify.identifiability import answer as answer
 from .identify.identifiability import identifiability as identifiability
-from .identify.identifiability import identifiability_of_dataset as identifiability_of_dataset
+from .identify.identifiability import ranks_of_dataset as ranks_of_dataset
 from .identify.predicted_observations import legs_in_words as legs_in_words
 from .identify.predicted_observations import views_in_words as views_in_words
 from .identify.report import BoardReport as BoardReport

@@ -28,7 +28,6 @@ from legcal.machine import (
     geometries,
     platforms_in_base,
     pose_differences,
-    readings_at,
     workspace,
 )
 
@@ -83,7 +82,9 @@ def platform_map(calibration: Calibration) -> PlatformMap | None:
     places = np.stack([grid.ravel() for grid in grids[::-1]], axis=1)
     R = np.broadcast_to(machine.home.rotation.as_matrix(), (len(places), 3, 3))
     poses = list(motions_of(R, places))
-    readings = np.array([readings_at(machine, T) for T in poses])
+    ends = machine.home.rotation.apply(machine.B_platform) + places[:, None]
+    lengths = np.linalg.norm(ends - machine.A_base, axis=2)
+    readings = machine.sign * (lengths - machine.q0)
     inside = _inside(machine, readings)
     every = [*drawn, *(poses[k] for k in np.flatnonzero(inside))]
     found = _errors(calibration, np.concatenate([q, readings[inside]]), every)

@@ -184,6 +184,17 @@ def identifiability_of_dataset(
     return replace(report, notes=(*report.notes, note))
 
 
+def ranks_of_dataset(
+    dataset: Dataset, choices: Choices = NO_CHOICES
+) -> tuple[tuple[Condition, ...], Ranks, Ranks]:
+    """Return conditions, and ranks step by step and at once, of what a dataset records.
+
+    They are those of :func:`identifiability_of_dataset`, without what would change them.
+    """
+    analysis = _analysis_of(dataset, choices)
+    return conditions_of(dataset.machine, analysis.predicted), analysis.staged, analysis.full
+
+
 def _analysis_of(dataset: Dataset, choices: Choices) -> Analysis:
     """Return the analysis of what a dataset records."""
     twists = any(name.endswith(".twist") for name in (*choices.free, *choices.priors))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from legcal.calibration import DEFAULT_SETTINGS, Calibration, identifiability_of_dataset
+from legcal.calibration import DEFAULT_SETTINGS, Calibration, ranks_of_dataset
 from legcal.data import OBSERVATIONS_NAME
 from legcal.errors import LegcalError
 from legcal.pages import Cell, Drawing, Facts, Items, Table, Text, matrix, number
@@ -52,10 +52,10 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
     }
     blocks: list[Any] = [Facts(counts)]
     try:
-        report = identifiability_of_dataset(calibration.dataset, problem.choices)
+        conditions, staged, full = ranks_of_dataset(calibration.dataset, problem.choices)
     except LegcalError:
-        report = None
-    if report is not None:
+        conditions = ()
+    if conditions:
         rows: list[list[Cell]] = [
             [
                 CONDITIONS[c.name],
@@ -63,11 +63,11 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
                 number(c.unknowns, 0),
                 "holds" if c.ok else "fails" if c.needed else "fails, not needed with the board",
             ]
-            for c in report.conditions
+            for c in conditions
         ]
         ranks: list[list[Cell]] = [
             [title, number(one.rank, 0), number(one.of, 0), "" if one.complete else "not enough"]
-            for title, one in (("four steps", report.staged), ("joint fit", report.full))
+            for title, one in (("four steps", staged), ("joint fit", full))
         ]
         blocks += [
             Table(("condition of the paper", ">equations", ">unknowns", ""), rows),

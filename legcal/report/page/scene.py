@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration import Calibration, poses_at_readings
 from legcal.data import row_names
-from legcal.geometry import Array
+from legcal.geometry import Array, components
 from legcal.machine import Leg, geometries, moved_legs
 from legcal.pages import Plot, plain
 from legcal.report.page.residual_plots import FONT
@@ -33,14 +33,18 @@ def machine_scene(calibration: Calibration) -> Plot:
     )
     q = measurements.q[measurements.first_rows][chosen]
     fitted = [solution.T_Rb_Re[k] for k in chosen.tolist()]
-    frame, tool = machine.T_base_Rb, machine.T_platform_Re.inv()
+    frame = machine.T_base_Rb
+    turn_base = frame.rotation.as_matrix()
+    turn_platform = machine.T_platform_Re.rotation.as_matrix().T
 
     def placed(legs: Sequence[Leg], near: Sequence[RigidTransform]) -> tuple[Array, Array]:
         """Return A (n, 3) and B (k, n, 3) of legs at the readings, in the base link."""
         poses = poses_at_readings(machine, legs, q, near) if calibration.platform else near
         A = frame.apply(np.array([leg.A for leg in legs]))
         B = np.array([leg.B for leg in legs])
-        return A, np.array([(frame * T).apply(B) for T in poses])
+        R, t = components(poses)
+        in_frame = B @ R.transpose(0, 2, 1) + t[:, None]
+        return A, in_frame @ frame.rotation.as_matrix().T + frame.translation
 
     found = placed(solution.legs, fitted)
     size = float(np.ptp(np.concatenate([found[0], found[1][0]]), axis=0).max())
@@ -58,7 +62,7 @@ def machine_scene(calibration: Calibration) -> Plot:
         "steps": len(FACTORS) - 1,
         "step": modes[0]["step"],
         "poses": [plain(images[row]) for row in measurements.first_rows[chosen].tolist()],
-        "turns": [_rounded((frame * T * tool).rotation.as_matrix(), 6) for T in fitted],
+        "turns": _rounded(turn_base @ components(fitted)[0] @ turn_platform, 6),
         "rings": rings,
         "outline": {"base": _around(found[0]), "platform": _around(found[1][0])},
         "traces": {"legs": [0, 1], "base": [2, 3], "platform": [4, 5], "rings": 6},
