@@ -113,9 +113,7 @@ def test_tables_sort_by_numbers_and_back(page: Any) -> None:
     button = page.find_element("xpath", "//*[@id='parameters']//th/button[text()='change']")
 
     def column() -> list[float]:
-        cells = page.find_elements(
-            "css selector", "#parameters div.scroll:first-of-type tbody td:nth-child(4)"
-        )
+        cells = page.find_elements("css selector", "#parameters > .scroll tbody td:nth-child(4)")
         return [float(one.get_dom_attribute("data-value")) for one in cells]
 
     before = column()
@@ -132,7 +130,8 @@ def test_an_outline_is_enlarged_and_zoomed(page: Any) -> None:
     width = "return document.querySelector('#enlarged svg').viewBox.baseVal.width"
     before = page.execute_script(width)
     page.execute_script(
-        """const stage = document.querySelector("#enlarged div"), box = stage.getBoundingClientRect();
+        """const stage = document.querySelector("#enlarged div");
+        const box = stage.getBoundingClientRect();
         stage.dispatchEvent(new WheelEvent("wheel", {deltaY: -500, clientX: box.x + 9,
                                                      clientY: box.y + 9, cancelable: true}));"""
     )
@@ -142,7 +141,11 @@ def test_an_outline_is_enlarged_and_zoomed(page: Any) -> None:
 
 def test_it_prints_on_a4(page: Any) -> None:
     _draw_all(page)
-    pdf = base64.b64decode(page.print_page())
+    from selenium.webdriver.common.print_page_options import PrintOptions
+
+    options = PrintOptions()
+    options.set_page_size(PrintOptions.A4)
+    pdf = base64.b64decode(page.print_page(options))
     sizes = {
         tuple(round(float(x)) for x in found.split())
         for found in re.findall(rb"/MediaBox\s*\[0 0 ([\d.]+ [\d.]+)\]", pdf)

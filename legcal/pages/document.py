@@ -184,9 +184,10 @@ class Page:
     sections: Sequence[Section]
 
 
-def plain(text: str) -> str:
-    """Return a text for plotly, which would take tags in it for its own."""
-    return str(escape(printable(text)))
+def plain(text: str, most: int = 60) -> str:
+    """Return a text for plotly, which would take tags in it for its own; long ones are cut."""
+    shown = printable(text)
+    return str(escape(shown if len(shown) <= most else f"{shown[: most - 3]}..."))
 
 
 def number(value: float | None, digits: int, *, signed: bool = False) -> Number:

@@ -13,6 +13,7 @@ from legcal.data import row_names
 from legcal.geometry import Array, IntArray
 from legcal.pages import Plot, plain
 
+_MAX_WORD = 14  # letters of a name at an axis
 MAX_POINTS = 3000  # of a chart: what a browser draws at once
 _SYMBOLS = ("circle", "square", "diamond", "cross", "x", "triangle-up", "star", "pentagon")
 _COLOURS = ("#1f5fa8", "#b26a00", "#1e7d46", "#8e44ad", "#b3261e", "#4a5568", "#00838f", "#6d4c41")
@@ -123,7 +124,8 @@ def _chart(
 ) -> Plot:
     found = layout(label, "outline less fit [px]")
     if words:
-        found["xaxis"] |= {"tickvals": list(range(len(words))), "ticktext": [*map(plain, words)]}
+        shown = [plain(word, _MAX_WORD) for word in words]
+        found["xaxis"] |= {"tickvals": list(range(len(words))), "ticktext": shown}
     return Plot(name, data, found, 280, extra=_linked(data, links), title=title)
 
 
