@@ -243,3 +243,16 @@ def test_a_check_writes_a_page_and_never_over_that_of_a_result(
     assert run(monkeypatch, *words, tmp_path / "check") == 0
     found: Any = html.fromstring((tmp_path / "check" / "report.html").read_text("utf-8"))
     assert "No change was detected" in found.xpath("string(//section[@id='verdict'])")
+
+
+def test_images_that_were_moved_away_are_told_and_nothing_else_is_lost(
+    example_run: Run, tmp_path: Path
+) -> None:
+    calibration = example_run.calibration
+    moved = replace(calibration, dataset=replace(calibration.dataset, folder=tmp_path / "gone"))
+    moved.__dict__["result"] = calibration.result
+    found: Any = html.fromstring(page_html(calibration_page(moved, tmp_path)))
+    assert tuple(found.xpath("//main/section/@id")) == SECTIONS
+    assert "could not be read any more" in found.xpath("string(//section[@id='outlines'])")
+    assert found.xpath("//figure[@class='crop']") == []
+    assert "no longer there" in found.xpath("string(//section[@id='record'])")

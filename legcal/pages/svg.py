@@ -86,16 +86,10 @@ def change_bars(
     values: Sequence[float],
     sigmas: Sequence[float | None],
     unit: str,
-    marks: Sequence[float | None] = (),
-    marks_title: str = "",
 ) -> Markup:
-    """Return bars of changes to the right and left, with error bars of two standard deviations.
-
-    *marks* are drawn as diamonds, as true values are.
-    """
+    """Return bars of changes to the right and left, with error bars of two standard deviations."""
     left, width, step, top = 190.0, 900.0, 17.0, 30.0
     reach = [abs(v) + 2.0 * (s or 0.0) for v, s in zip(values, sigmas, strict=True)]
-    reach += [abs(m) for m in marks if m is not None]
     most = max([*reach, 1e-12]) * 1.04
     height = top + step * len(names) + 30.0
     canvas = Canvas(width, height, f"Changes of parameters [{unit}]")
@@ -107,8 +101,7 @@ def change_bars(
         canvas.line(x, top, x, height - 26.0, GREY if tick == 0 else RULE)
         canvas.text(x, height - 10.0, f"{tick:g}", anchor="middle", size=11, colour=DIM)
     canvas.text(left, 16.0, f"change against the nominal model [{unit}]", size=12, colour=DIM)
-    truth = marks or [None] * len(names)
-    for k, (name, value, sigma, mark) in enumerate(zip(names, values, sigmas, truth, strict=True)):
+    for k, (name, value, sigma) in enumerate(zip(names, values, sigmas, strict=True)):
         y = top + step * (k + 0.5)
         shown = name if len(name) < 28 else f"{name[:25]}..."
         canvas.text(left - 12.0, y + 4.0, shown, anchor="end", size=11.5)
@@ -120,17 +113,11 @@ def change_bars(
             canvas.line(a, y, b, y, INK, 1.3)
             for x in (a, b):
                 canvas.line(x, y - 3.0, x, y + 3.0, INK, 1.3)
-        if mark is not None:
-            x = zero + scale * mark
-            canvas.parts.append(
-                f'<path d="M{x:.1f} {y - 5:.1f}l5 5l-5 5l-5-5z" fill="none" stroke="#b3261e" '
-                f'stroke-width="1.4"><title>{escape(marks_title)} {mark:+.4g}</title></path>'
-            )
     return canvas.markup()
 
 
-def histogram(values: Array, label: str, n: int = 14, mark: float | None = None) -> Markup:
-    """Return how many values lie where; a line marks one."""
+def histogram(values: Array, label: str, n: int = 14) -> Markup:
+    """Return how many values lie where."""
     left, width, height, top, bottom = 34.0, 440.0, 210.0, 14.0, 40.0
     canvas = Canvas(width, height, label)
     low, high = float(values.min()), float(values.max())
@@ -159,9 +146,6 @@ def histogram(values: Array, label: str, n: int = 14, mark: float | None = None)
     for tick in ticks(low, high, 5):
         x = left + sx * (tick - low)
         canvas.text(x, base + 15.0, f"{tick:g}", anchor="middle", size=11, colour=DIM)
-    if mark is not None:
-        x = left + sx * (mark - low)
-        canvas.line(x, top, x, base, INK, 1.3)
     canvas.text(left, height - 6.0, label, size=12, colour=DIM)
     return canvas.markup()
 
