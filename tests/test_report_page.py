@@ -17,6 +17,7 @@ from scipy.ndimage import map_coordinates
 
 import legcal
 from legcal.calibration import platform_map
+from legcal.calibration.result_folder import write_result
 from legcal.errors import UsageError
 from legcal.pages import page_html
 from legcal.report.page.calibration_page import calibration_page
@@ -207,6 +208,21 @@ def test_calibrate_writes_the_report_unless_it_should_not(
     assert not (out / "report.html").exists()
     assert run(monkeypatch, "calibrate", example_run.folder, "-o", out) == 0
     assert "legcal-page" in (out / "report.html").read_text("utf-8")[:1000]
+
+
+def test_pages_of_earlier_results_go_and_files_of_others_stay(
+    example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calibration, page = example_run.calibration, tmp_path / "report.html"
+    write_result(calibration, tmp_path)
+    legcal.write_report(calibration, tmp_path)
+    write_result(calibration, tmp_path)  # which that page does not describe
+    assert not page.exists()
+    page.write_text("mine")
+    write_result(calibration, tmp_path)
+    assert page.read_text() == "mine"
+    monkeypatch.setattr("legcal.calibration.calibrate", lambda *_, **__: pytest.fail("too late"))
+    assert run(monkeypatch, "calibrate", example_run.folder, "-o", tmp_path) == 2
 
 
 def test_other_commands_write_what_they_print_as_a_page(

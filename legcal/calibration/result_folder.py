@@ -47,6 +47,7 @@ from legcal.machine import (
     write_calibrated_yaml,
     write_urdf,
 )
+from legcal.pages import is_page
 from legcal.vision import (
     Camera,
     camera_numbers,
@@ -81,8 +82,8 @@ def write_result(calibration: Calibration, destination: Path) -> Calibration:
     """
     dataset, solution, steps = calibration.dataset, calibration.solution, calibration.steps
     machine = dataset.machine
-    names = OBSERVATIONS_NAME, CORNERS_NAME, STAGED_NAME, REPORT_NAME
-    stale = [*names, str(_urdf_of(Path(STAGED_NAME)))]
+    stale = [OBSERVATIONS_NAME, CORNERS_NAME, STAGED_NAME, str(_urdf_of(Path(STAGED_NAME)))]
+    stale += [REPORT_NAME] * is_page(destination / REPORT_NAME)
     with result_folder(destination, stale=map(Path, stale)) as folder:
         _write_model(machine, solution.legs, folder / RESULT_YAML)
         if steps.legs is not None:

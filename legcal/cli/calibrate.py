@@ -140,6 +140,9 @@ def calibrate(
         from legcal import calibration, report
 
         run, summary = calibration.calibrate, report.summary
+    page = output / calibration.REPORT_NAME
+    if with_report and page.exists():
+        report.PAGE.check_place(page)
     found = run(
         dataset,
         output=output,

@@ -17,7 +17,7 @@ from .document import Text as Text
 from .document import Verdict as Verdict
 from .document import number as number
 from .document import plain as plain
-from .html import MARK as MARK
+from .html import is_page as is_page
 from .html import page_html as page_html
 from .svg import change_bars as change_bars
 from .svg import histogram as histogram

@@ -4,16 +4,29 @@ from __future__ import annotations
 
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from legcal.errors import printable
 from legcal.pages.document import Page, Plot, Row
 from legcal.version import __version__
 
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
 MARK = "legcal-page"  # the name by which a page of legcal is known
+_HEAD = 1000  # bytes at the beginning of a page, in which it stands
+
+
+def is_page(path: Path) -> bool:
+    """Say whether a file is a page that legcal wrote."""
+    try:
+        with path.open("rb") as file:
+            return MARK.encode() in file.read(_HEAD)
+    except OSError:
+        return False
 
 
 def page_html(page: Page) -> str:
@@ -36,6 +49,8 @@ def page_html(page: Page) -> str:
 
 @cache
 def _environment() -> Environment:
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # most commands need none
+
     return Environment(
         loader=PackageLoader("legcal.pages", "assets"),
         autoescape=True,

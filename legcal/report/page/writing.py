@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING
 
 from legcal.calibration import REPORT_NAME
 from legcal.files import OutputFile
-from legcal.pages import MARK, Page, page_html
+from legcal.pages import Page, is_page, page_html
 
 if TYPE_CHECKING:
     from legcal.calibration import Calibration
-
-_HEAD = 1000  # bytes at the beginning of a page, in which it says what it is
 
 
 @dataclass(frozen=True)
@@ -21,11 +19,7 @@ class _Page(OutputFile):
     """A page that says which program wrote it."""
 
     def _is_own(self, path: Path) -> bool:
-        try:
-            with path.open("rb") as file:
-                return MARK.encode() in file.read(_HEAD)
-        except OSError:
-            return False
+        return is_page(path)
 
 
 PAGE = _Page("the page", "page", "", "a new file or an earlier page of legcal")
