@@ -57,11 +57,12 @@ def _draw_all(browser: Any) -> None:
     """Bring every plot into sight and wait until it is drawn."""
     from selenium.webdriver.support.wait import WebDriverWait
 
+    def is_drawn(_: Any) -> bool:
+        return plot.get_dom_attribute("data-drawn") is not None
+
     for plot in browser.find_elements("css selector", ".plot"):
         browser.execute_script("arguments[0].scrollIntoView()", plot)
-        WebDriverWait(browser, PATIENCE).until(
-            lambda _, plot=plot: plot.get_dom_attribute("data-drawn") is not None
-        )
+        WebDriverWait(browser, PATIENCE).until(is_drawn)
 
 
 def test_everything_is_drawn_without_an_error(page: Any) -> None:
