@@ -155,3 +155,16 @@ def test_help_names_the_unit_of_the_tool_position(
     assert "Tool in the platform, in metres" in " ".join(
         capsys.readouterr().out.replace("\u2502", " ").split()
     )
+
+
+def test_progress_is_shown_unless_somebody_wants_quiet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["simulate", "3-rpr", "--level", "axes", "--poses", "5"]
+    assert run(monkeypatch, *words, "-o", tmp_path / "shown") == 0
+    shown = capsys.readouterr()
+    assert run(monkeypatch, *words, "-o", tmp_path / "quiet", "--quiet") == 0
+    quiet = capsys.readouterr()
+    assert shown.err
+    assert not quiet.err
+    assert quiet.out.count("\n") == shown.out.count("\n")

@@ -10,6 +10,7 @@ import typer
 from legcal.cli.options import (
     DatasetArgument,
     JsonOption,
+    QuietOption,
     command_line,
     image_workers,
     loading,
@@ -29,6 +30,7 @@ def calibrate(
         Path | None,
         typer.Option("--output", "-o", metavar="OUT", help="The result folder to write."),
     ] = None,
+    quiet: QuietOption = False,
     as_json: JsonOption = False,
     verbose: Annotated[
         bool,
@@ -124,7 +126,7 @@ def calibrate(
                 "takes all of it from the earlier result; leave one of them out."
             )
         page = None if output is None or not with_report else _page_of_check(output)
-        _check(dataset, check, significance, page, as_json=as_json)
+        _check(dataset, check, significance, page, quiet=quiet, as_json=as_json)
         return
     if significance is not None:
         raise UsageError(
@@ -146,7 +148,7 @@ def calibrate(
     found = run(
         dataset,
         output=output,
-        progress=True,
+        progress=not quiet,
         criteria=criteria,
         transformation=transformation,
         use_cache=not fresh,
@@ -194,7 +196,13 @@ def _page_of_check(output: Path) -> Path:
 
 
 def _check(
-    dataset: Path, result: Path, significance: float | None, page: Path | None, *, as_json: bool
+    dataset: Path,
+    result: Path,
+    significance: float | None,
+    page: Path | None,
+    *,
+    quiet: bool,
+    as_json: bool,
 ) -> None:
     """Test an earlier result with new images."""
     from legcal import calibration, report
@@ -203,7 +211,7 @@ def _check(
         dataset,
         result,
         significance=calibration.SIGNIFICANCE if significance is None else significance,
-        progress=True,
+        progress=not quiet,
         workers=image_workers(),
     )
     title = f"Check of {result.resolve().name}"

@@ -14,6 +14,7 @@ from legcal.cli.options import (
     JsonOption,
     ModelArgument,
     PageOption,
+    QuietOption,
     WorkersOption,
     check_page,
     image_workers,
@@ -52,6 +53,7 @@ def camera(
         typer.Option(metavar="FILE", help="A PNG to write: corners and residuals over the field."),
     ] = None,
     workers: WorkersOption = None,
+    quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate a camera from photographs of a chessboard, ChArUco board or AprilGrid."""
@@ -63,7 +65,7 @@ def camera(
         model=model,
         output=output,
         picture=picture,
-        progress=True,
+        progress=not quiet,
         workers=image_workers(workers),
     )
     show(as_json, found.document, lambda: report.camera_table(found, output))
@@ -82,13 +84,14 @@ def detect(
         ),
     ],
     workers: WorkersOption = None,
+    quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Find the outlines of the legs and show them over the images, to see what went wrong."""
     from legcal import calibration, report
 
     found = calibration.detect(
-        dataset, output=output, progress=True, workers=image_workers(workers)
+        dataset, output=output, progress=not quiet, workers=image_workers(workers)
     )
     show(as_json, lambda: found.document, lambda: report.detection_table(found, output))
     if found.unplaced or not found.outlines.used.any():
@@ -96,7 +99,10 @@ def detect(
 
 
 def doctor(
-    dataset: DatasetArgument, workers: WorkersOption = None, as_json: JsonOption = False
+    dataset: DatasetArgument,
+    workers: WorkersOption = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Look for all that can stand in the way of calibrating a dataset, common mistakes included.
 
@@ -104,7 +110,7 @@ def doctor(
     """
     from legcal import calibration, report
 
-    found = calibration.doctor(dataset, progress=True, workers=image_workers(workers))
+    found = calibration.doctor(dataset, progress=not quiet, workers=image_workers(workers))
     show(as_json, found.document, lambda: report.examination_table(found))
     if not found.is_ready:
         raise typer.Exit(1 if found.is_usable else 2)
@@ -461,13 +467,14 @@ def noise(
         Path, typer.Argument(metavar="DATASET", help="A dataset with several images of each pose.")
     ],
     page: PageOption = None,
+    quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate how precisely images tell where legs are, from repeated images of the same poses."""
     from legcal import calibration, report
 
     check_page(page)
-    found = calibration.measure_noise(dataset, progress=True, workers=image_workers())
+    found = calibration.measure_noise(dataset, progress=not quiet, workers=image_workers())
     title = f"Measurement noise of {found.dataset.machine.name}"
     write_page(page, title, report.noise_table(found))
     show(as_json, found.document, lambda: report.noise_table(found))

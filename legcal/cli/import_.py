@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from legcal.cli.options import JsonOption, print_json, print_table
+from legcal.cli.options import JsonOption, QuietOption, print_json, print_table
 
 
 def import_(
@@ -70,13 +70,14 @@ def import_(
         bool, typer.Option("--dry-run", help="Show what would be used and write nothing.")
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
+    quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Make a dataset from recordings of a machine that rests at each pose."""
     from legcal import recordings, report
     from legcal.progress import shown_progress
 
-    with shown_progress(True) as progress:
+    with shown_progress(not quiet) as progress:
         found = recordings.plan_import(
             sources,
             model,
@@ -95,7 +96,7 @@ def import_(
         print_table(report.import_table(found))
     written = []
     if not dry_run:
-        with shown_progress(True) as progress:
+        with shown_progress(not quiet) as progress:
             written = recordings.import_recordings(found, force=force, progress=progress)
     if as_json:
         print_json(found.document() | {"written": [str(path) for path in written]})

@@ -13,6 +13,7 @@ import typer
 from legcal.cli.options import (
     JsonOption,
     ModelArgument,
+    QuietOption,
     image_workers,
     show,
 )
@@ -30,6 +31,7 @@ def simulate(
     model: ModelArgument,
     output: OutputOption,
     force: ForceOption = False,
+    quiet: QuietOption = False,
     as_json: JsonOption = False,
     **options: Any,
 ) -> None:
@@ -45,7 +47,7 @@ def simulate(
     nominal = load_mechanism(model)
     settings = requested(Request(**options), nominal)
     workers = image_workers()
-    made = run(nominal, output, settings, force=force, workers=workers, progress=True)
+    made = run(nominal, output, settings, force=force, workers=workers, progress=not quiet)
     document, repeated = summary_document(made), options["images"] > 1
     show(as_json, lambda: document, lambda: simulation_table(document, repeated=repeated))
 
@@ -68,7 +70,8 @@ def _declare() -> None:
     """Give the command the signature that Typer reads: its own options in the order of the help."""
     own = inspect.signature(simulate, eval_str=True).parameters
     level, seed, *others = _requested()
-    order = [own["model"], own["output"], level, seed, own["force"], *others, own["as_json"]]
+    order = [own["model"], own["output"], level, seed, own["force"], *others]
+    order += [own["quiet"], own["as_json"]]
     parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in order]
     simulate.__annotations__ = {p.name: p.annotation for p in parameters}
     vars(simulate)["__signature__"] = inspect.Signature(parameters)

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from legcal.cli.options import JsonOption, WorkersOption, print_table, show, write_page
+from legcal.cli.options import JsonOption, QuietOption, WorkersOption, print_table, show, write_page
 from legcal.errors import UsageError
 from legcal.processors import processors
 
@@ -51,6 +51,7 @@ def paper(
     radians: Annotated[
         bool, typer.Option("--radians", help="Take the angles of Table 1 as radians, as printed.")
     ] = False,
+    quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Repeat section 4.3 of the paper: calibrations of a 6-SPU, before and after."""
@@ -64,7 +65,7 @@ def paper(
         seed=seed,
         workers=workers or processors(),
         output=output,
-        progress=True,
+        progress=not quiet,
     )
     document = result.document()
     if output is not None:
