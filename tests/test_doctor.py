@@ -67,13 +67,24 @@ def test_photographs_that_cannot_be_used_are_named_and_the_others_judged(tmp_pat
     assert sum(black in one.what for one in found.findings) == 1
 
 
+def test_photographs_of_another_size_are_one_finding(tmp_path: Path) -> None:
+    session = made(tmp_path)
+    names = [session.change("c1", k, lambda picture: picture[::2, ::2]) for k in range(2)]
+    (scaled,) = found_of(doctor(session.write()), "files", "error")
+    assert scaled.images == tuple(names)
+    assert f"2 images of view c1 ({', '.join(names)}) could not be read" in scaled.what
+    assert "rescaled by 0.5" in scaled.what
+
+
 def test_readings_are_compared_with_travel_digits_and_stated_noise(tmp_path: Path) -> None:
     session = made(tmp_path)
     for row in session.rows:
         row |= {name: f"{float(row[name]):.4f}" for name in COLUMNS}
+        row["leg5_prismatic"] = "0.0500"
         row["leg3_prismatic"] = f"{float(row['leg3_prismatic']) / 50.0 + 0.02:.4f}"
     found = doctor(session.write())
-    still, coarse = found_of(found, "readings", "warning")
+    constant, still, coarse = found_of(found, "readings", "warning")
+    assert "found the same reading in all rows of leg5_prismatic" in constant.what
     assert "found leg3_prismatic in" in still.what
     assert "in steps of 0.1 mm" in coarse.what
     assert "encoder_sigma of 2e-06 m" in coarse.what
@@ -142,11 +153,15 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
     )  # fmt: skip
     monkeypatch.setattr("legcal.calibration.examination.diagnose", lambda data: (mistake,))
     session = made(tmp_path)
+    session.entry["views"]["c3"]["T_base_camera"]["xyz"] = [2.0, 2.0, 2.0]
     name = session.change("c1", 0, lambda picture: 0 * picture)
     folder = session.write()
     assert run(monkeypatch, "doctor", folder, "--json") == 1
     document = json.loads(capsys.readouterr().out)
-    assert document["findings"][0]["what"] == mistake.sentence
+    said = [one["what"] for one in document["findings"]]
+    assert said[0] == mistake.sentence
+    assert any(what.startswith("1 more thing that images contradict may come") for what in said)
+    assert not any("T_base_camera is wrong" in what for what in said)
     assert document["diagnosis"] == [mistake.document().document()]
     assert not document["ready"]
     assert document["usable"]

@@ -276,6 +276,7 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (FLAT, {}, ("--match", "time"), ("by time", "column 'time'")),
     (FLAT, {"columns": {"time": ("10:00", "x", "10:02")}}, (), ("EXIF",)),
     (FLAT, {}, ("--views", "c9"), ("c9", "--views")),
+    (FLAT, {}, ("--views", ".,c9"), ("found none in 'c9'", "--views")),
     (FLAT, {}, ("--encoder-sigma", "5m"), ("5 m", "--encoder-sigma")),
     (FLAT, {}, ("--encoder-sigma", "0um"), ("0 m", "--encoder-sigma")),
     (("IMG_1.HEIC", "IMG_2.HEIC"), {}, (), ("2 of another format", "IMG_1.HEIC", "JPEG")),

@@ -29,6 +29,7 @@ from legcal.data import (
     GOOD_QUALITY,
     Dataset,
     ImageReader,
+    by_cause,
     compressed,
     dataset_at,
     few,
@@ -65,6 +66,7 @@ CLIPPED = 0.1  # of the pixels of a view
 FEW_LEGS = 0.5  # of those that a view should show
 MIN_READINGS = 6  # that have the same last digit by more than chance
 MAX_DIGITS = 10  # of readings in metres
+_UNREADABLE = " could not be read: "  # of an image; what follows is the cause
 LOOKING = "Looking at light and sharpness"  # a stage of progress
 
 
@@ -93,7 +95,7 @@ class ViewCondition(Document):
     view: str
     images: int
     camera: str  # the file
-    blur_px: float | None  # usual one of sharp edges; None without photographs
+    blur_px: float | None  # usual one of sharp edges; None where nothing can be seen
     clipped: float | None  # usual share of pixels that are as bright as a file can say
     jpeg_quality: int | None  # the least; None where nothing is lost
     legs_found: int | None  # in all images together; None where none were searched
@@ -264,8 +266,8 @@ def _look_at_files(found: _Found, problems: Sequence[tuple[int, str]]) -> list[i
     dataset, m = found.dataset, found.dataset.measurements
     n, views = sum(map(bool, m.image)), len(np.unique(m.view))
     found.checks["files"] = (
-        f"{n} photograph{'s' * (n != 1)} of {views} view{'s' * (views != 1)}, {m.n_poses} poses, "
-        f"model {dataset.machine.name}"
+        f"{n} photograph{'s' * (n != 1)} of {views} view{'s' * (views != 1)}, {m.n_poses} "
+        f"pose{'s' * (m.n_poses != 1)}, model {dataset.machine.name}"
     )
     bad = [row for row, _ in problems]
     paths = {row: dataset.image_path(row) for row in bad}
@@ -279,9 +281,17 @@ def _look_at_files(found: _Found, problems: Sequence[tuple[int, str]]) -> list[i
             "remove the rows.",
             missing,
         )
-    for row, what in problems:
-        if row not in missing:
-            found.add("files", "error", what, [row])
+    of_files = {row: what for row, what in problems if row not in missing}
+    causes = {
+        row: cause for row, what in of_files.items() if (cause := what.partition(_UNREADABLE)[2])
+    }
+    for what, rows in by_cause(causes):
+        if len(rows) > 1:
+            images = images_in_words(m, rows)
+            found.add("files", "error", f"{dataset.table_path}: {images}{_UNREADABLE}{what}", rows)
+            of_files = {row: one for row, one in of_files.items() if row not in rows}
+    for row, what in of_files.items():
+        found.add("files", "error", what, [row])
     return [row for row in range(m.n_rows) if row not in bad]
 
 
@@ -306,13 +316,22 @@ def _look_at_readings(found: _Found, notes: Sequence[str]) -> None:
     if shares:
         low, high = (100.0 * end(shares.values()) for end in (min, max))
         found.checks["readings"] += f", {low:.0f} to {high:.0f} % of their travel used"
-    still = [name for name, share in shares.items() if share < LITTLE_USED]
-    if still:
-        least = 100.0 * min(shares[name] for name in still)
+    constant = [one.column for one in found.encoders if one.least == one.greatest]
+    if 0 < len(constant) < len(motors):
         found.add(
             "readings",
             "warning",
-            f"The readings hardly move: found {few(still)} in {least:.2g} % of the travel, needed "
+            f"{dataset.table_path}: found the same reading in all rows of {few(constant)}, while "
+            "other encoders move; check that these were recorded, and move these legs as well.",
+        )
+        shares = {name: share for name, share in shares.items() if name not in constant}
+    still = [name for name, share in shares.items() if share < LITTLE_USED]
+    if still:
+        percent = _range([100.0 * shares[name] for name in still])
+        found.add(
+            "readings",
+            "warning",
+            f"The readings hardly move: found {few(still)} in {percent} % of the travel, needed "
             f"{100 * LITTLE_USED:.0f} % or more of every encoder for poses that tell parameters "
             "apart; take photographs at poses that differ more, and check the unit of readings.",
         )
@@ -395,7 +414,7 @@ def _look_at_photographs(
                 pixels.setdefault(digest, []).append(row)
         report(LOOKING, k + 1, len(rows))
     defects = defects_of(m, exposures)
-    blurs = [one.blur for one in exposures.values()]
+    blurs = [one.blur for row, one in exposures.items() if row not in defects]
     found.checks["photographs"] = f"{len(exposures) - len(defects)} of {len(rows)} show something"
     if blurs:
         found.checks["photographs"] += f", blurred by {_median(blurs):.1f} px"
@@ -497,7 +516,16 @@ def _look_at_legs(found: _Found, data: OrderedDataset, choices: Choices) -> Dete
     for what in unplaced_notes(seen.unplaced):
         found.add("legs", "error", what)
     said = {one.what for one in found.findings}
-    for what in (one for one in seen.image_notes if one not in said):
+    odd = [one for one in seen.image_notes if one not in said]
+    if odd and found.diagnosis:  # most likely its consequences, which would accuse others
+        found.add(
+            "legs",
+            "note",
+            f"{len(odd)} more thing{'s' * (len(odd) != 1)} that images contradict may come from "
+            "what looks wrong above: mend that, then run legcal doctor again.",
+        )
+        odd = []
+    for what in odd:
         found.add("legs", "warning", what)
     for what in seen.notes:
         if what not in (*dataset.notes, *seen.image_notes):
@@ -550,6 +578,7 @@ def _conditions(
     found = []
     for v in np.unique(m.view).tolist():
         rows = [row for row in np.flatnonzero(m.view == v).tolist() if row in exposures]
+        blurs = [exposures[row].blur for row in rows if not exposures[row].defect]
         qualities = [
             quality
             for row in rows
@@ -561,7 +590,7 @@ def _conditions(
                 view=m.views[v].name,
                 images=len(rows),
                 camera=dataset.camera_paths[v].name,
-                blur_px=_median([exposures[row].blur for row in rows]) if rows else None,
+                blur_px=_median(blurs) if blurs else None,
                 clipped=_median([exposures[row].clipped for row in rows]) if rows else None,
                 jpeg_quality=min(qualities, default=None),
                 legs_found=own.get("legs_found"),

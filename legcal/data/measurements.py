@@ -169,24 +169,36 @@ def readings_in(table: Table, legs: Sequence[Leg]) -> tuple[Array, tuple[str, ..
     actuated = [leg for leg in legs if leg.kind is LegKind.ACTUATED]
     readings = table.numbers(str(leg.prismatic) for leg in actuated)
     notes = []
+    beyond: list[tuple[str, str, bool]] = []  # column, what was found of it, whether of most rows
     for leg, column in zip(actuated, readings.T, strict=True):
         lower, upper = leg.travel
         if not 0.0 < upper - lower < np.inf:
             continue
-        outside, far = (column < lower) | (column > upper), ~leg.in_travel(column)
-        start = f"{table.path}, column {leg.prismatic}"
+        outside = (column < lower) | (column > upper)
+        far = outside & ~leg.in_travel(column)
         travel = f"{lower:g} to {upper:g} m (the joint limits of the model)"
         if np.any(far):
-            remedy = "correct the readings or the limits"
-            if 2 * np.sum(far) >= len(column):
-                remedy = _likely_cause(readings, actuated) or remedy
-            table.refuse_file(
-                f"{start}: readings are outside the travel: found {_some(table, column, far)}, "
-                f"needed {travel} with a margin of {TRAVEL_MARGIN:.0%}; {remedy}."
-            )
+            found = f"found {_some(table, column, far)}, needed {travel} with a margin of "
+            found += f"{TRAVEL_MARGIN:.0%}"
+            beyond.append((str(leg.prismatic), found, 2 * np.sum(far) >= len(column)))
         elif np.any(outside):
-            found = _some(table, column, outside)
-            notes.append(f"{start}: readings are a little outside the travel {travel}: {found}.")
+            notes.append(
+                f"{table.path}, column {leg.prismatic}: readings are a little outside the travel "
+                f"{travel}: {_some(table, column, outside)}."
+            )
+    cause = _likely_cause(readings, actuated) if any(most for *_, most in beyond) else ""
+    alike = [name for name, _, most in beyond if most and cause]
+    for name, found, _ in beyond:
+        if name in alike[1:]:
+            continue
+        of_this, remedy = f"column {name}", "correct the readings or the limits"
+        if name in alike:
+            remedy = cause
+            if len(alike) > 1:
+                of_this, found = f"columns {few(alike)}", f"in {name} {found}"
+        table.refuse_file(
+            f"{table.path}, {of_this}: readings are outside the travel: {found}; {remedy}."
+        )
     return readings, tuple(notes)
 
 
@@ -198,15 +210,15 @@ def _likely_cause(readings: Array, legs: Sequence[Leg]) -> str:
     width = np.ptp([leg.travel for leg in legs], axis=1)
     whole = "subtract the leg lengths at reading zero (legcal inspect tells them)"
     tried = (
-        (LENGTH["mm"] * readings, "millimetres: divide the column by 1000"),
+        (LENGTH["mm"] * readings, "millimetres: divide them by 1000"),
         (readings_of_lengths(readings, legs), f"whole leg lengths: {whole}"),
         (
             readings_of_lengths(LENGTH["mm"] * readings, legs),
-            f"whole leg lengths in millimetres: divide the column by 1000, and {whole}",
+            f"whole leg lengths in millimetres: divide them by 1000, and {whole}",
         ),
-        (LENGTH["cm"] * readings, "centimetres: divide the column by 100"),
-        (INCH * readings, "inches: multiply the column by 0.0254"),
-        (-readings, "readings with the opposite sign: reverse it"),
+        (LENGTH["cm"] * readings, "centimetres: divide them by 100"),
+        (INCH * readings, "inches: multiply them by 0.0254"),
+        (-readings, "readings with the opposite sign: reverse them"),
     )
     found, most = "", 0.0
     for meant, what in tried:

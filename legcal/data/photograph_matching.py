@@ -162,8 +162,15 @@ def find_photographs(
     if others:
         raise DatasetError(
             f"{folder}: the views of the photographs could not be found: found "
-            f"{few([describe(name) for name in others])}, needed names of the form "
+            f"{few([describe(name) for name in sorted(others)])}, needed names of the form "
             f"{describe(pattern)}; correct --view-pattern, or move them to another folder."
+        )
+    empty = [name for name in chosen if name not in {one.folder for one in photographs}]
+    if photographs and empty:
+        words = few([describe(name) for name in empty])
+        raise DatasetError(
+            f"{folder}: the photographs could not be found: found none in {words}, needed some in "
+            "each of them; check --views."
         )
     if not photographs:
         found, remedy = "none", "check the path"

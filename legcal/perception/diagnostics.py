@@ -157,11 +157,14 @@ def _without_views(
     cameras, unplaced = list(placement.T_base_camera), dict(placement.unplaced)
     for v in defective:
         name = measurements.views[v].name
-        own = [row for row in defects if measurements.view[row] == v]
+        own = {row: why for row, why in defects.items() if measurements.view[row] == v}
+        why = "; ".join(what for what, _ in by_cause(own))
+        if len(own) == 1:
+            why = f"{measurements.image[next(iter(own))]}: {why}"
         cameras[v] = None
         unplaced[name] = (
             f"view {name}: its camera could not be placed: found nothing to see in its {len(own)} "
-            f"image{'s' * (len(own) != 1)} ({measurements.image[own[0]]}: {defects[own[0]]}), "
+            f"image{'s' * (len(own) != 1)} ({why}), "
             "needed photographs of the legs; take them again."
         )
     return replace(placement, T_base_camera=tuple(cameras), unplaced=unplaced)

@@ -57,7 +57,10 @@ def matching_table(new: NewDataset) -> RenderableType:
         ),
         [
             *(
-                printable(f"View {view}: {counts[view]} photographs, camera file {camera}.")
+                printable(
+                    f"View {view}: {counts[view]} photograph{'s' * (counts[view] != 1)}, camera "
+                    f"file {camera}."
+                )
                 for view, camera in new.cameras.items()
             ),
             *(Text(printable(f"note: {note}")) for note in new.notes),

@@ -23,6 +23,7 @@ _MIRROR_4 = np.diag([1.0, -1.0, 1.0, 1.0])
 _FOCAL_LENGTHS = (2.0, 0.5, 1.5, 2.0 / 3.0, 1.25, 0.8)  # of scaled and cropped images
 _SHIFTS = (1, -1, 2, -2)  # rows
 _ZEROS = 8  # steps of the zero of an encoder, in its travel
+_STILL = 0.1  # of such a step: readings that move by less are of an encoder that stands still
 _SHARED = 1.0 / 3.0  # of the images of a session that a view has, to be tried alone
 _SAME_RADIUS = 1e-3  # relative: parts that are equally thick are one kind
 
@@ -223,6 +224,9 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
     ends = np.array([sum(leg.travel) for leg in legs])
     ends = np.where(np.isfinite(ends), ends, own.min(axis=0) + own.max(axis=0))
     every = list(range(len(legs)))
+    steps = np.array([_zero_step(leg, own[:, k]) for k, leg in enumerate(legs)])
+    # An encoder that stands still has no direction or zero that images of all poses could confirm.
+    moving = np.flatnonzero(np.ptp(own, axis=0) > _STILL * steps).tolist()
     units = ((LENGTH["mm"], "millimetres"), (LENGTH["cm"], "centimetres"), (INCH, "inches"))
     has_travel = all(0.0 < leg.travel[1] - leg.travel[0] < np.inf for leg in legs)
     for scale, unit in () if has_travel else units:  # readings in their travel are metres
@@ -248,7 +252,7 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
             "reverse it in the table of readings",
             with_readings(change, every),
         )
-        for k in every:
+        for k in moving:
             yield Mistake(
                 "direction of an encoder",
                 f"column {legs[k].prismatic} looks as if it had {what}",
@@ -256,7 +260,6 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
                 "reverse it in the table of readings",
                 with_readings(change[:, k : k + 1], [k]),
             )
-    steps = np.array([_zero_step(leg, own[:, k]) for k, leg in enumerate(legs)])
     for m in range(-_ZEROS, _ZEROS + 1):
         if m == 0:
             continue
@@ -270,7 +273,7 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
             is_small=True,
             amount_of="zero of all encoders",
         )
-        for k in every:
+        for k in moving:
             size = f"{abs(1e3 * m * steps[k]):.0f} mm too {'small' if m > 0 else 'large'}"
             yield Mistake(
                 "zero of an encoder",
