@@ -4,7 +4,8 @@ import json
 import re
 import tomllib
 from importlib.metadata import distribution, requires
-from pathlib import Path
+from importlib.resources import files
+from pathlib import Path, PurePath
 
 import pytest
 from hexapod_example import Run
@@ -105,6 +106,19 @@ def test_the_installed_package_asks_for_what_pyproject_says() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     installed = {_plain(r) for r in requires("legcal") or [] if "extra ==" not in r}
     assert installed == {_plain(requirement) for requirement in project["dependencies"]}
+
+
+def test_the_package_holds_all_that_pages_are_made_of() -> None:
+    assets = {one.name for one in (files("legcal.pages") / "assets").iterdir()}
+    assert assets == {"page.css", "page.html", "page.js"}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    targets = project["tool"]["hatch"]["build"]["targets"]
+    assert targets["wheel"]["packages"] == ["legcal"]
+    assert not any("exclude" in target for target in targets.values())
+    ignored = re.findall(r"\S+", (ROOT / ".gitignore").read_text())  # hatchling leaves that out too
+    places = [f"legcal/pages/assets/{name}" for name in assets]
+    assert not any(PurePath(place).match(one) for place in places for one in ignored)
+    assert not {f"{part}/" for part in PurePath(places[0]).parts} & set(ignored)
 
 
 def _plain(requirement: str) -> str:

@@ -155,6 +155,18 @@ def test_it_prints_on_a4(page: Any) -> None:
     assert all(abs(w - 595) <= 1 and abs(h - 842) <= 1 for w, h in sizes)
 
 
+def test_scenes_are_there_for_the_printer_and_no_longer_than_that(page: Any) -> None:
+    _draw_all(page)
+    copies = """dispatchEvent(new Event(arguments[0]));
+        return [...document.querySelectorAll("#machine-scene canvas, #platform-space canvas")]
+            .filter((one) => one.className === "copy").map((one) => new Set(
+                one.getContext("2d").getImageData(0, 0, one.width, one.height).data).size);"""
+    colours = page.execute_script(copies, "beforeprint")
+    assert len(colours) == 2
+    assert min(colours) > 50
+    assert page.execute_script(copies, "afterprint") == []
+
+
 def test_it_is_interactive_within_two_seconds(example_run: Run, browser: Any) -> None:
     path = legcal.write_report(example_run.calibration, example_run.output)
     times = []

@@ -13,14 +13,18 @@ import pytest
 from command_line import run
 from hexapod_example import Run
 from lxml import html
+from rich.console import Group
+from rich.table import Table as TextTable
 from scipy.ndimage import map_coordinates
 
 import legcal
 from legcal.calibration import platform_map
 from legcal.calibration.result_folder import write_result
 from legcal.errors import UsageError
-from legcal.pages import page_html
+from legcal.pages import Items, Number, Text, Verdict, number, page_html
 from legcal.report.page.calibration_page import calibration_page
+from legcal.report.page.parameter_rows import parameter_tables
+from legcal.report.page.text_page import text_page
 from legcal.vision import outlines_of_axis
 
 SECTIONS = (
@@ -80,6 +84,34 @@ def test_a_page_has_the_numbers_of_the_result(example_run: Run, page: Any) -> No
             found = float(text) if text else None
             expected = None if value is None else scale[one["unit"]] * value
             assert found == pytest.approx(expected, rel=1e-12, abs=1e-12)
+
+
+def test_a_prior_of_a_coordinate_is_told_with_its_joint(example_run: Run) -> None:
+    calibration, sigma = example_run.calibration, 1e-5
+    known = {"leg2.base.x": sigma, "leg1.base.x": sigma}  # the latter is no parameter
+    solution = replace(calibration.solution, prior_sigma=known)
+    changed = replace(calibration, solution=solution)
+    changed.__dict__["result"] = calibration.result
+    rows = {row[0]: row for row in parameter_tables(changed)[0].rows}
+    assert (rows["leg2 A x"][6], rows["leg2 A x"][7]) == (number(0.01, 4), "mostly by its prior")
+    assert all(rows[name][6] == number(None, 4) for name in ("leg1 A x", "leg2 A y", "leg2 B x"))
+
+
+def test_a_table_sorts_where_its_rows_stand_alone() -> None:
+    tables = [TextTable("leg", "ratio") for _ in range(2)]
+    for name, table in zip(("b", ""), tables, strict=True):
+        table.columns[1].justify = "right"
+        table.add_row("a", "10.5 +- 2")
+        table.add_row(name, "-")
+    text = Group(*tables, "It moved.\n- one\n- two\nend")
+    verdict = Verdict("bad", "Moved", "It moved.", [])
+    section = text_page("title", text, verdict=verdict).sections[0]
+    alone, grouped, items, last = section.blocks
+    assert (alone.sortable, grouped.sortable) == (True, False)
+    assert alone.rows == [["a", Number(10.5, "10.5 +- 2")], ["b", Number(None, "-")]]
+    assert (items, last) == (Items(["one", "two"]), Text(["end"]))
+    page: Any = html.fromstring(page_html(text_page("title", text)))
+    assert [len(one.xpath(".//th/button")) for one in page.xpath("//table")] == [2, 0]
 
 
 def test_points_of_the_plots_are_the_residuals_of_the_fit(example_run: Run, page: Any) -> None:

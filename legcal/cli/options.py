@@ -7,9 +7,10 @@ import json
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -77,13 +78,20 @@ def check_page(page: Path | None) -> None:
 
 
 def write_page(
-    page: Path | None, title: str, text: RenderableType, verdict: Verdict | None = None
+    page: Path | None,
+    title: str,
+    text: RenderableType,
+    verdict: Verdict | None = None,
+    figures: Mapping[str, Path] = MappingProxyType({}),
 ) -> None:
-    """Write what is printed as a page, where one is asked for."""
+    """Write what is printed as a page, with figures (PNG) by their captions, where one is asked."""
     from legcal import report
 
     if page is not None:
-        found = report.text_page(title, text, verdict=verdict, command=command_line())
+        blocks = [report.picture(path, caption) for caption, path in figures.items()]
+        found = report.text_page(
+            title, text, verdict=verdict, blocks=blocks, command=command_line()
+        )
         report.write_page(found, page)
 
 

@@ -69,7 +69,13 @@ def paper(
     )
     document = result.document()
     if output is not None:
-        write_page(output / "report.html", "The paper's simulation", study_table(document))
+        caption = "Mean errors of the parameters, as in Fig. 4 of the paper; fig4.html enlarges it."
+        write_page(
+            output / "report.html",
+            "The paper's simulation",
+            study_table(document),
+            figures={caption: output / "fig4.png"},
+        )
     show(as_json, lambda: document, lambda: study_table(document))
     if output is not None and not as_json:
         print_table(f"\nRuns, document and figures: {output}")

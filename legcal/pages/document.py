@@ -65,7 +65,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Table:
-    """A table that sorts by any column; the first :data:`MAX_ROWS` rows are shown."""
+    """A table, which sorts by any column or not; the first :data:`MAX_ROWS` rows are shown."""
 
     kind: ClassVar = "table"
     columns: Sequence[str]
@@ -74,6 +74,7 @@ class Table:
     note: str = ""
     first: str = "first"  # which rows are shown of too many: "worst"
     folded: bool = False
+    sortable: bool = True
 
     @property
     def shown(self) -> Sequence[Sequence[Cell]]:
@@ -147,12 +148,17 @@ class Gallery:
 
 @dataclass(frozen=True)
 class Picture:
-    """An image beside the page."""
+    """An image, beside the page or in it."""
 
     kind: ClassVar = "picture"
-    file: str  # its place, relative to the page
+    file: str  # its place, relative to the page; or a data URL
     caption: str
     warning: str = ""  # what is said in red
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether the page holds it."""
+        return self.file.startswith("data:")
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from .new_dataset import import_table as import_table
 from .new_dataset import matching_table as matching_table
 from .new_dataset import written_lines as written_lines
 from .noise import noise_table as noise_table
+from .page.text_page import picture as picture
 from .page.text_page import text_page as text_page
 from .page.verdicts import check_verdict as check_verdict
 from .page.verdicts import identify_verdict as identify_verdict

@@ -38,7 +38,7 @@ _STEPS = {
     "platform_joints": "4 platform joints, axes (16-19)",
 }
 _LEGEND = (
-    "as printed: the rank with the equations of the paper as it prints them\n"
+    "as printed: the rank with the equations of the paper as it prints them; "
     "known length law: a leg with a reading (length = reading + offset), or constant"
 )
 _NEEDS = {"staged": "the four steps", "full": "the joint fit"}

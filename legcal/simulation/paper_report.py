@@ -273,7 +273,7 @@ def _as_html(found: PaperSummary) -> bytes:
         specs=[[{"secondary_y": True}] * n_columns] * n_rows,
         subplot_titles=[panel.title for row in grid for panel in row],
         vertical_spacing=0.1,
-        horizontal_spacing=0.1,
+        horizontal_spacing=0.18,
     )
     for i, row in enumerate(grid):
         for j, panel in enumerate(row):

@@ -47,7 +47,21 @@
     waiting.set(div, JSON.parse(script.textContent));
   }
   document.addEventListener("DOMContentLoaded", () => { for (const div of waiting.keys()) near.observe(div); });
-  addEventListener("beforeprint", () => { for (const div of [...waiting.keys()]) draw(div); });
+
+  // Printers get none of what WebGL drew once it is shown: scenes are copied while it is there.
+  addEventListener("beforeprint", () => {
+    for (const div of [...waiting.keys()]) draw(div);
+    for (const div of document.querySelectorAll(".plot")) {
+      const scene = div._fullLayout?.scene?._scene;
+      if (!scene?.glplot) continue;
+      scene.glplot.redraw();
+      const drawn = scene.glplot.canvas, copy = document.createElement("canvas");
+      copy.className = "copy"; copy.width = drawn.width; copy.height = drawn.height;
+      copy.getContext("2d").drawImage(drawn, 0, 0);
+      drawn.after(copy);
+    }
+  });
+  addEventListener("afterprint", () => { for (const copy of document.querySelectorAll(".plot .copy")) copy.remove(); });
 
   // A scene: legs from A to B of a model and of another one, whose difference is exaggerated.
   const control = (div, { extra }) => {

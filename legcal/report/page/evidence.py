@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from legcal.calibration import DEFAULT_SETTINGS, Calibration, ranks_of_dataset
+from legcal.calibration import DEFAULT_SETTINGS, UNITS, Calibration, ranks_of_dataset
 from legcal.data import OBSERVATIONS_NAME
 from legcal.errors import LegcalError
 from legcal.pages import Cell, Drawing, Facts, Items, Table, Text, matrix, number
@@ -162,7 +162,6 @@ def note_blocks(calibration: Calibration) -> list[Any]:
 def reproducibility_blocks(calibration: Calibration, command: str, when: str) -> list[Any]:
     """Return version, command, settings, and the hashes of all files that went in."""
     dataset, problem = calibration.dataset, calibration.solution.posterior.problem
-    choices = problem.choices.document()
     settings = {name.replace("_", " "): f"{v:g}" for name, v in asdict(DEFAULT_SETTINGS).items()}
     facts = {
         "Version": f"legcal {__version__}, Python {system.python_version()}, {system.machine()}",
@@ -172,12 +171,33 @@ def reproducibility_blocks(calibration: Calibration, command: str, when: str) ->
         "Encoder sigma": f"{1e6 * dataset.measurements.sigma_q:g} um",
         "Start of the fit": f"{calibration.result.start}, {calibration.solution.iterations} "
         "iterations",
-        "Chosen parameters": "; ".join(f"{k}: {v}" for k, v in choices.items()) or "none",
+        "Chosen parameters": _chosen(calibration) or "none",
+        "Least common-mode biases": ", ".join(
+            f"{name} {px:.3g} px" for name, px in sorted(problem.choices.least_shared_px.items())
+        )
+        or "none",
         "Settings of the fit": ", ".join(f"{name} {value}" for name, value in settings.items()),
     }
     rows, note = _hashes(calibration)
     columns = ("file", ">bytes", "SHA-256")
     return [Facts(facts), Table(columns, rows, "Files that went in", note, folded=True)]
+
+
+def _chosen(calibration: Calibration) -> str:
+    """Return which parameters were chosen to be fixed, free, or to have a prior."""
+    choices = calibration.solution.posterior.problem.choices
+    units = {row.name: row.unit for row in calibration.result.parameters}
+
+    def shown(name: str, *values: float) -> str:
+        scale, unit, digits = UNITS[units.get(name, "")]
+        return " +- ".join(f"{scale * value:.{digits}f}" for value in values) + f" {unit}".rstrip()
+
+    found = [f"{name} fixed" for name in sorted(choices.fixed - choices.values.keys())]
+    found += [f"{k} fixed at {shown(k, v)}" for k, v in sorted(choices.values.items())]
+    found += [f"{name} free" for name in sorted(choices.free)]
+    found += [f"{k} {shown(k, p.mean, p.sigma)}" for k, p in sorted(choices.priors.items())]
+    found += [f"camera of {view} from an earlier result" for view in sorted(choices.cameras)]
+    return ", ".join(found)
 
 
 def _hashes(calibration: Calibration) -> tuple[list[list[Cell]], str]:
@@ -212,4 +232,5 @@ def _size(path: Path) -> int | None:
 
 
 def _name(path: Path, folder: Path) -> str:
+    path, folder = path.absolute(), folder.absolute()
     return os.path.relpath(path, folder) if path.is_relative_to(folder) else str(path)

@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from legcal.calibration import UNITS, Calibration, ParameterRow
+from legcal.calibration import UNITS, Calibration
 from legcal.geometry import Array
 from legcal.pages import Cell, Drawing, Table, change_bars, number
 
 _BY_PRIOR = 0.7  # of the standard deviation of a prior: beyond it the images say little
+_PARALLEL = 1e-9
 _STATUS = {
     "estimated": "by images and readings",
     "fixed": "fixed",
@@ -98,15 +100,26 @@ def change_charts(calibration: Calibration) -> list[Drawing]:
 
 def _of_links(calibration: Calibration) -> list[_Row]:
     """Return the coordinates of joints in the links of the model."""
-    found = []
+    found, priors = [], _prior_sigmas(calibration)
     for side, block in (calibration.result.links or {}).items():
+        turn = np.abs(Rotation.from_quat(block.T_link_frame.quat_xyzw).as_matrix())
         for joint in block.joints:
             for k, axis in enumerate("xyz"):
-                status = joint.status[k]
-                how = _STATUS.get(status, f"the joint defines the {joint.defines} of the frame")
+                status, sigma = joint.status[k], joint.sigma[k]
+                along = int(turn[k].argmax())  # a prior of one axis of the frame, if parallel
+                prior = (
+                    priors.get(f"{joint.leg}.{side}.{'xyz'[along]}")
+                    if status == "estimated" and turn[k, along] > 1.0 - _PARALLEL
+                    else None
+                )
+                how = (
+                    _how(status, sigma, prior)
+                    if status in _STATUS
+                    else f"the joint defines the {joint.defines} of the frame"
+                )
                 name = f"{joint.leg} {_JOINT[side]} {axis}"
-                values = joint.nominal[k], joint.xyz[k], joint.sigma[k]
-                found.append(_Row(name, *values, "m", None, how))
+                values = joint.nominal[k], joint.xyz[k], sigma
+                found.append(_Row(name, *values, "m", prior, how))
     return found
 
 
@@ -116,7 +129,7 @@ def _parameters(calibration: Calibration) -> list[_Row]:
     return [
         _Row(row.name, row.nominal, row.value, row.sigma, row.unit,
              priors.get(row.name) if row.status == "estimated" else None,
-             _how(row, priors.get(row.name)))
+             _how(row.status, row.sigma, priors.get(row.name)))
         for row in calibration.result.parameters
     ]  # fmt: skip
 
@@ -130,10 +143,10 @@ def _prior_sigmas(calibration: Calibration) -> dict[str, float]:
     return found | dict(calibration.solution.prior_sigma)
 
 
-def _how(row: ParameterRow, prior: float | None) -> str:
-    if row.status != "estimated" or row.sigma is None or prior is None:
-        return _STATUS[row.status]
-    if row.sigma > _BY_PRIOR * prior:
+def _how(status: str, sigma: float | None, prior: float | None) -> str:
+    if status != "estimated" or sigma is None or prior is None:
+        return _STATUS[status]
+    if sigma > _BY_PRIOR * prior:
         return "mostly by its prior"
     return "by images, readings and its prior"
 

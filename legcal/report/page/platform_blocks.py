@@ -34,15 +34,15 @@ def platform_blocks(calibration: Calibration) -> list[Any]:
             _figures(f"after, {n} places of the workspace", found.sigma.displacement,
                      found.sigma.rotation),
         ]  # fmt: skip
-    columns = ("", ">mean [mm]", ">most [mm]", ">mean [deg]", ">most [deg]")
+    columns = ("", ">mean [mm]", ">largest [mm]", ">mean [deg]", ">largest [deg]")
     note = (
         f"The first two rows are at the {platform.poses} poses of the images. Both models get the "
         "same readings; errors of the readings themselves are not in sigma."
     )
     histograms = [
-        Drawing(histogram(1e3 * change.displacement, "before: displacement at the poses [mm]"),
+        Drawing(histogram(1e3 * change.displacement, "before: displacement [mm], how many poses"),
                 wide=False),
-        Drawing(histogram(1e3 * sigma.displacement, "after: predicted error, 1 sigma [mm]"),
+        Drawing(histogram(1e3 * sigma.displacement, "after: 1 sigma [mm], how many poses"),
                 wide=False),
     ]  # fmt: skip
     blocks: list[Any] = [Table(columns, rows, note=note), Row(histograms)]
@@ -127,7 +127,8 @@ def _in_space(found: PlatformMap, before: Array, after: Array) -> Plot:
         "updatemenus": [{"type": "buttons", "direction": "right", "x": 0, "xanchor": "left",
                          "y": 1.0, "yanchor": "top", "buttons": buttons, "showactive": True}],
         "scene": {f"{a}axis": {**axis, "title": {"text": f"{a} [mm]"}} for a in "xyz"}
-        | {"aspectmode": "data"},
+        | {"aspectmode": "data",
+           "camera": {"eye": {"x": 1.1, "y": -1.6, "z": 1.1}, "center": {"z": -0.2}}},
     }  # fmt: skip
     caption = "The same in space: larger and darker marks are larger errors."
     return Plot("platform-space", data, look, 420, caption)

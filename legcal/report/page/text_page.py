@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import base64
 import re
 from collections.abc import Sequence
 from datetime import datetime
+from itertools import groupby
+from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
 from rich.console import Group, RenderableType
 from rich.table import Table as TextTable
 from rich.text import Text as TextLine
 
-from legcal.pages import Cell, Facts, Number, Page, Section, Table, Text, Verdict
+from legcal.pages import Cell, Facts, Items, Number, Page, Picture, Section, Table, Text, Verdict
 from legcal.version import __version__
 
-_NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")  # a cell that sorts by its value
+_NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")  # that begins a cell: it sorts by its value
+_ITEM = "- "
 
 
 def text_page(
@@ -25,29 +30,40 @@ def text_page(
     blocks: Sequence[Any] = (),
     command: str = "",
 ) -> Page:
-    """Return a page with the tables and sentences of a text, and more blocks after them."""
+    """Return a page with the tables and sentences of a text, and more blocks after them.
+
+    A sentence that the verdict says stands there alone.
+    """
     when = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     record = {"Version": f"legcal {__version__}", "Command": command or "from Python", "Time": when}
-    sections = [Section("result", "Result", _blocks(text))]
+    said = verdict.sentence if verdict is not None else ""
+    sections = [Section("result", "Result", _blocks(text, said))]
     if blocks:
         sections.append(Section("figures", "Figures", blocks))
     sections.append(Section("record", "Reproducibility", [Facts(record)]))
     return Page(title, when, verdict, sections)
 
 
-def _blocks(text: RenderableType) -> list[Any]:
-    """Return the parts of a text as blocks."""
+def picture(path: Path, caption: str) -> Picture:
+    """Return a figure (PNG) as a part of a page."""
+    data = base64.b64encode(path.read_bytes()).decode()
+    return Picture(Markup(f"data:image/png;base64,{data}"), caption)
+
+
+def _blocks(text: RenderableType, said: str) -> list[Any]:
+    """Return the parts of a text as blocks, without a line that is said already."""
     found: list[Any] = []
-    lines: list[str] = []
     for part in text.renderables if isinstance(text, Group) else [text]:
         if isinstance(part, TextTable):
-            if lines:
-                found.append(Text(lines))
-                lines = []
             found.append(_table(part))
-        elif str(part).strip():
-            lines += str(part).splitlines()
-    return [*found, Text(lines)] if lines else found
+            continue
+        lines = [line for line in str(part).splitlines() if line.strip() and line != said]
+        for is_item, group in groupby(lines, lambda line: line.startswith(_ITEM)):
+            kind, texts = (Items if is_item else Text), [one.removeprefix(_ITEM) for one in group]
+            if found and type(found[-1]) is kind:
+                texts = [*(found.pop().items if is_item else found.pop().paragraphs), *texts]
+            found.append(kind(texts))
+    return found
 
 
 def _table(table: TextTable) -> Table:
@@ -62,9 +78,12 @@ def _table(table: TextTable) -> Table:
         ]
         for row in zip(*by_column, strict=True)
     ]
-    title = table.title
-    return Table(columns, rows, str(title) if isinstance(title, str | TextLine) else "")
+    title = str(table.title) if isinstance(table.title, str | TextLine) else ""
+    # Rows that belong to one above them, and headings among rows, would lose their place.
+    is_flat = all(row[0] and any(row[1:]) for row in zip(*by_column, strict=True))
+    return Table(columns, rows, title, sortable=is_flat)
 
 
 def _number(word: str) -> Cell:
-    return Number(float(word) if _NUMBER.fullmatch(word) else None, word)
+    found = _NUMBER.match(word)
+    return Number(float(found[0]) if found else None, word)
