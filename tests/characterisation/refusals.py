@@ -306,7 +306,7 @@ def _options() -> Iterable[Refusal]:
     yield Refusal("identify-dataset-images", "identify {in} --images 3", ("--images",), "plain")
 
     checks: list[tuple[str, str, tuple[str, ...]]] = [
-        ("output", "--check {in}/result -o {out}", ("--output", "--check")),
+        ("output", "--check {in}/result -o {in}/result", ("{in}/result", "another folder")),
         ("criteria", "--check {in}/result --criteria literal", ("--criteria", "--check")),
         ("transformation", "--check {in}/result --transformation points", ("--transformation",)),
         ("holdout", "--check {in}/result --holdout 0.2 --fix '*.offset'", ("--fix", "--holdout")),
