@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -181,6 +182,10 @@ def test_datasets_without_photographs_are_judged_by_what_they_have(
     shown = capsys.readouterr().out
     assert "Nothing stands against calibrating" in shown
     assert "legcal calibrate" in shown
+    simulate(
+        "hexapod", tmp_path / "outlines", replace(settings, level=Level.OUTLINES, views=1, poses=3)
+    )
+    assert [one.name for one in doctor(tmp_path / "outlines").checks][-1] == "mistakes"
     (tmp_path / "axes" / "measurements.csv").unlink()
     assert run(monkeypatch, "doctor", tmp_path / "axes", "--json") == 2
     assert json.loads(capsys.readouterr().out)["error"]["kind"] == "DatasetError"

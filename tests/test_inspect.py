@@ -17,7 +17,7 @@ from simulated import simulated
 
 from legcal import evaluate, load_mechanism
 from legcal.calibration import Evaluation
-from legcal.errors import DidNotConverge
+from legcal.errors import DidNotConverge, ModelError
 from legcal.machine import (
     create_model,
     geometries,
@@ -60,6 +60,13 @@ def test_counts_of_the_paper_follow_from_legs_and_motors() -> None:
         {"link": "leg1_b2_link", "radius": 0.01},
         {"link": "leg1_tube", "radius": 0.01},
     ]
+
+
+def test_a_result_folder_that_is_not_whole_is_called_so(tmp_path: Path) -> None:
+    (tmp_path / "calibrated.yaml").write_text("closed_loop: []\n")
+    (tmp_path / "result.json").write_text('{"legcal_result": 1, "mach')
+    with pytest.raises(ModelError, match=r"no whole result.json of a calibration, needed both"):
+        load_mechanism(tmp_path)
 
 
 def test_the_table_shows_millimetres_axes_and_twists_in_80_columns() -> None:

@@ -214,10 +214,10 @@ def doctor(
         exposures = _look_at_photographs(found, usable, pool, report)
         _look_at_parameters(found, usable, choices)
         seen = None
-        if exposures:
+        if exposures or (usable and dataset.observations is not None):
             data = order_dataset(dataset_at(dataset, np.array(usable)), pool, report)
             _diagnose(found, data)
-            seen = _look_at_legs(found, data, choices)
+            seen = _look_at_legs(found, data, choices) if exposures else None
     return Examination(
         dataset=str(dataset.folder),
         mechanism=dataset.machine.name,

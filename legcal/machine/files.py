@@ -35,8 +35,14 @@ def find_model(model: str | Path) -> Path:
     if os.path.isdir(path) and not is_shipped:
         if (path / FOLDER_YAML).is_file():
             return path / FOLDER_YAML
-        if (path / RESULT_YAML).is_file() and RESULT.is_in(path):
-            return path / RESULT_YAML
+        if (path / RESULT_YAML).is_file():
+            if RESULT.is_in(path):
+                return path / RESULT_YAML
+            raise ModelError(
+                f"{path}: the mechanism could not be read: found {RESULT_YAML} and no whole "
+                f"{RESULT.marker} of a calibration, needed both; copy the result folder again, or "
+                f"give {path / RESULT_YAML} if it is the model that you mean."
+            )
         if (path / DATASET_YAML).is_file():
             raise ModelError(what_a_dataset_is_for(path))
         raise ModelError(
