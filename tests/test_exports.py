@@ -109,6 +109,9 @@ def test_kinematics_in_python_are_those_of_the_model(
     if any(leg.n_constraints for leg in machine.legs):
         with pytest.raises(ValueError, match="do not allow"):
             found.inverse_kinematics(off)
+    off[0, 0] = np.nan
+    with pytest.raises(ValueError, match="do not allow"):
+        found.inverse_kinematics(off)
     with pytest.raises(ValueError, match=r"no pose was found|finite"):
         found.forward_kinematics(np.full(machine.n_legs, np.nan))
     with pytest.raises(ValueError, match="no pose was found"):
@@ -147,6 +150,9 @@ def test_kinematics_in_c_compile_and_are_those_of_the_model(
         getattr(found, f"{prefix}_forward_kinematics")(numbers(*(-5.0 * machine.sign)), stays) == -1
     )
     np.testing.assert_array_equal(stays, packed(machine.home))
+    off = packed(machine.home)
+    off[0] = float("nan")
+    assert getattr(found, f"{prefix}_inverse_kinematics")(off, numbers()) == -1
 
 
 @pytest.mark.system
@@ -167,14 +173,25 @@ def test_kinematics_for_matlab_run_in_octave_and_are_those_of_the_model(
             f"printf('%.17g ', m.inverse_kinematics([{matrix}]), m.forward_kinematics(q));",
             "printf('\\n');",
         ]
-    lines.append(f"try, m.forward_kinematics({-5.0!r} * m.sign); catch e, disp(e.message), end")
+    lines += [
+        f"try, {call}; catch e, disp(e.message), end"
+        for call in (
+            "m.forward_kinematics(-5.0 * m.sign)",
+            "q = m.home_readings; q(m.is_motor) = NaN; m.forward_kinematics(q)",
+            "q(m.is_motor) = Inf; m.forward_kinematics(q)",
+            "T = m.home; T(1, 1) = NaN; m.inverse_kinematics(T)",
+        )
+    ]
     (tmp_path / "check.m").write_text("\n".join(lines) + "\n")
     done = subprocess.run(
         ["octave", "--no-gui", "--quiet", "--norc", "check.m"],
-        cwd=tmp_path, capture_output=True, text=True, check=True,
+        cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60,
     )  # fmt: skip
-    *rows, refusal = done.stdout.splitlines()
+    *rows, refusal, not_a_number, infinite, no_pose = done.stdout.splitlines()
     assert "no pose was found" in refusal
+    assert "finite number" in not_a_number
+    assert "finite number" in infinite
+    assert "do not allow" in no_pose
     for T, printed in zip(poses, rows, strict=True):
         numbers = np.array(printed.split(), dtype=float)
         q, pose = np.split(numbers, [machine.n_legs])

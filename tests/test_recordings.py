@@ -13,6 +13,7 @@ from command_line import run
 from legcal import load_dataset, load_mechanism
 from legcal.data import reading_columns
 from legcal.geometry import Array
+from legcal.recordings.stillness import clock_offset
 
 MODEL = "hexapod"
 SIZE = 96, 64  # [px]
@@ -220,6 +221,12 @@ REFUSALS: dict[str, tuple[Callable[[Motion, Path], tuple[object, ...]], str]] = 
                 "correct --still"),
     "no overlap": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t), "--offset", "1e6"),
                    "no reading"),
+    "no offset": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t), "--offset", "nan"),
+                  "correct --offset"),
+    "a row without a time": (lambda m, t: (_video(m, t), "--readings", _holed(m, t)),
+                             "found '',"),
+    "dates without signs": (lambda m, t: (_video(m, t), "--readings", _dated(m, t)),
+                            "found '20261123101500',"),
     "two tables": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t), "--readings",
                                  _ticks(m, t)), "one for all or one for each"),
 }  # fmt: skip
@@ -237,6 +244,21 @@ def _ticks(motion: Motion, folder: Path) -> Path:
 def _timeless(motion: Motion, folder: Path) -> Path:
     path = _ticks(motion, folder)
     path.write_text("\n".join(line.split(",", 1)[1] for line in path.read_text().splitlines()))
+    return path
+
+
+def _holed(motion: Motion, folder: Path) -> Path:
+    path = _ticks(motion, folder)
+    first, second, *others = path.read_text().splitlines()
+    path.write_text("\n".join([first, second[second.index(",") :], *others]))
+    return path
+
+
+def _dated(motion: Motion, folder: Path) -> Path:
+    path = _ticks(motion, folder)
+    first, *rows = path.read_text().splitlines()
+    dated = [f"{20261123101500 + k // 50}{row[row.index(',') :]}" for k, row in enumerate(rows)]
+    path.write_text("\n".join([first, *dated]))
     return path
 
 
@@ -266,3 +288,12 @@ def test_what_cannot_be_imported_is_refused(
     assert said in error, error
     assert "Traceback" not in error
     assert not folder.exists()
+
+
+def test_motion_of_recordings_with_many_more_samples_than_are_compared() -> None:
+    rng = np.random.default_rng(5)
+    moves = np.repeat(np.arange(60) % 2 == 1, rng.integers(5, 30, 60))
+    steps = np.where(np.arange(len(moves)) < 0.6 * len(moves), 1e-4, 0.5)  # [s], most are short
+    times = 1.7e9 + np.concatenate([[0.0], np.cumsum(steps)])
+    found = clock_offset(times + 3.0, moves, times, moves)
+    assert abs(found.seconds - 3.0) < 0.05

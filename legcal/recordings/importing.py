@@ -196,6 +196,11 @@ def plan_import(
             f"The recordings could not be imported: found {still:g} s of rest, needed a time above "
             "zero; correct --still."
         )
+    if offset is not None and not np.isfinite(offset):
+        raise UsageError(
+            f"The recordings could not be imported: found an offset of {offset:g} s between the "
+            "clocks, needed a finite number; correct --offset."
+        )
     tables = {path: read_series(path, machine, unit, lengths) for path in dict.fromkeys(readings)}
     views = []
     for k, (name, recording) in enumerate(zip(names, recordings, strict=True)):
@@ -268,7 +273,7 @@ def _view(
     assert frames_move is not None
     assert moves is not None
     if given is not None:
-        apart = Offset(given, 0.0, 1.0)
+        apart = Offset(given, 0.0, None)
     else:
         try:
             apart = clock_offset(
@@ -299,7 +304,7 @@ def _view(
 
 
 def _changes(recording: Recording, progress: Report, name: str) -> tuple[Array, Array]:
-    """Return the times of frames [s] and how much each differs from the one before [levels/s]."""
+    """Return the times of frames [s] and how much each differs from the one before [levels]."""
     times: list[float] = []
     changes: list[float] = []
     before: Array | None = None

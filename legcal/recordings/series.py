@@ -19,11 +19,14 @@ from legcal.machine import Machine
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 
 
-def unix_seconds(number: float) -> float:
-    """Return a Unix time [s] of one in s, ms, us or ns: the years 2001 to 2286 tell them apart."""
-    for unit in (1e9, 1e6, 1e3):
+def unix_seconds(number: float) -> float | None:
+    """Return a Unix time [s] of one in s, ms, us or ns: the years 2001 to 2286 tell them apart.
+
+    Numbers that are none, as 20261123101500, are None; those before 2001 are seconds.
+    """
+    for unit in (1e9, 1e6, 1e3, 1.0):
         if number >= 1e9 * unit:
-            return number / unit
+            return number / unit if number < 1e10 * unit else None
     return number
 
 
@@ -112,18 +115,29 @@ def _in_order(series: Series) -> Series:
 
 def _seconds(texts: Sequence[str], path: Path) -> Array:
     """Return times [s] of numbers (Unix times in s, ms, us or ns, or seconds) or of dates."""
-    if all(_NUMBER.fullmatch(text) for text in texts):
+    others = [text for text in texts if not _NUMBER.fullmatch(text)]
+    if 2 * len(others) < len(texts):
+        if others:
+            raise _no_time(others[0], path)
         numbers = np.array([float(text) for text in texts])
         size = float(np.median(np.abs(numbers)))
-        return numbers * (unix_seconds(size) / size if size else 1.0)
+        seconds = unix_seconds(size)
+        wrong = np.flatnonzero(~np.isfinite(numbers) | (seconds is None))
+        if seconds is None or len(wrong):
+            raise _no_time(texts[wrong[0]], path)
+        return numbers * (seconds / size if size else 1.0)
     found = []
     for text in texts:
         try:
             moment = datetime.fromisoformat(text.strip())
         except ValueError:
-            raise DatasetError(
-                f"{path}, column time: the time could not be read: found {describe(text)}, needed "
-                "seconds, or dates such as 2026-11-23T10:15:00.125; correct the cell."
-            ) from None
+            raise _no_time(text, path) from None
         found.append(moment.replace(tzinfo=moment.tzinfo or UTC).timestamp())
     return np.array(found)
+
+
+def _no_time(text: str, path: Path) -> DatasetError:
+    return DatasetError(
+        f"{path}, column time: the time could not be read: found {describe(text)}, needed seconds, "
+        "Unix times or dates such as 2026-11-23T10:15:00.125, one form in all rows; correct it."
+    )

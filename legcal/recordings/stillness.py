@@ -40,7 +40,7 @@ class Offset:
 
     seconds: float
     sigma: float  # [s]
-    agreement: float  # correlation of motion, 1 at most
+    agreement: float | None  # correlation of motion, 1 at most; None where it was stated
 
 
 class NoOffset(ValueError):
@@ -132,8 +132,11 @@ def clock_offset(frame_times: Array, frames_move: BoolArray, times: Array, moves
 
 def _on_grid(times: Array, moves: BoolArray, step: float) -> tuple[Array, float]:
     """Return motion on a grid of times as 1 and 0, and the first of them."""
-    grid = np.arange(times[0], times[-1], step)
-    return moves[np.searchsorted(times, grid, side="right") - 1].astype(float), float(times[0])
+    elapsed = times - times[0]  # small numbers: at Unix times steps are rounded to 0.2 us
+    grid = np.arange(0.0, elapsed[-1], step)
+    at = np.searchsorted(elapsed, grid, side="right") - 1
+    at = np.minimum(at, len(moves) - 1)  # the grid may reach the last time by rounding
+    return moves[at].astype(float), float(times[0])
 
 
 def _changes(times: Array, moves: BoolArray) -> tuple[Array, Array]:

@@ -93,7 +93,7 @@ def import_table(found: Import) -> RenderableType:
         if len(stills) > _MOST:
             shown.append(("...", "", f"{len(stills) - _MOST} more"))
         apart = f"{view.offset.seconds:+.3f} s"
-        if view.offset.sigma > 0.0:
+        if view.offset.agreement is not None:
             apart += f" (+-{view.offset.sigma:.3f} s, motion agrees to {view.offset.agreement:.0%})"
         why = [f"{sum(s.why_not == w for s in lost)} {w}" for w in {s.why_not: 0 for s in lost}]
         blocks += [
