@@ -284,6 +284,25 @@ def test_mujoco_loads_the_mjcf_closed_and_has_the_same_forward_kinematics(
         np.testing.assert_allclose(back.q0, machine.q0, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "inside",
+    [
+        '<inertial><mass value="1"/><inertia ixx="0" iyy="0" izz="0"/></inertial>',
+        '<inertial><mass value="0"/><inertia ixx="1" iyy="1" izz="1"/></inertial>',
+        '<visual><geometry><cylinder radius="0.01" length="0"/></geometry></visual>',
+    ],
+)
+def test_mujoco_loads_links_with_what_no_body_has(inside: str, tmp_path: Path) -> None:
+    machine = load_mechanism("hexapod")
+    content = machine.urdf.content.replace(
+        b'<link name="platform"/>', f'<link name="platform">{inside}</link>'.encode()
+    )
+    assert content != machine.urdf.content
+    odd = replace(machine, urdf=replace(machine.urdf, content=content))
+    path = written(Subject(odd, "hexapod"), "mjcf", tmp_path / "machine.xml")
+    assert mujoco.MjModel.from_xml_path(str(path)).nu == len(machine.motors)
+
+
 # --- controllers --------------------------------------------------------------------------------
 
 

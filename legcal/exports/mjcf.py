@@ -3,7 +3,7 @@
 Bodies stand at the machine's home, where every loop is closed, and joints count from there (``ref``
 is the joint value at home), so that positions of joints are the values of the URDF, readings among
 them. A ``3d`` closure is a ``<connect>`` and a ``6d`` closure a ``<weld>`` of two sites. Links
-without inertia get a stub, as MuJoCo takes none without.
+without inertia, or with one that no body has, get a stub, as MuJoCo takes none without.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ WORLD = "world"
 _X, _Y, _Z = np.eye(3)
 STIFF = "0.001 1"  # solref of closures: a millisecond, critically damped
 GAIN = 1e4  # of the position servos [N/m]
+LEAST = 1e-15  # mass, moment of inertia or size that MuJoCo takes
 
 
 def mjcf_refusal(subject: Subject) -> str | None:
@@ -140,22 +141,26 @@ class _Writer:
         inertial = self._links[link].find("inertial")
         mass = None if inertial is None else inertial.find("mass")
         moments = None if inertial is None else inertial.find("inertia")
-        if inertial is None or mass is None or moments is None or not float(mass.get("value", 0)):
+        full = np.zeros((3, 3))
+        if mass is not None and moments is not None:
+            numbers = (
+                float(moments.get(key, 0.0)) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+            )
+            ixx, iyy, izz, ixy, ixz, iyz = numbers
+            full = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+        heavy = 0.0 if mass is None else float(mass.get("value", 0.0))
+        if inertial is None or min(heavy, np.linalg.eigvalsh(full)[0]) <= LEAST:
             stub = _text(*[STUB_INERTIA] * 3)
             etree.SubElement(body, "inertial", pos="0 0 0", mass=_text(STUB_MASS), diaginertia=stub)
             return
         T = RigidTransform.from_matrix(origins_of([inertial])[0])
-        numbers = [
-            float(moments.get(key, 0.0)) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-        ]
-        ixx, iyy, izz, ixy, ixz, iyz = numbers
         R = T.rotation.as_matrix()
-        full = R @ np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]) @ R.T
+        full = R @ full @ R.T
         etree.SubElement(
             body,
             "inertial",
             pos=_text(*T.translation),
-            mass=str(mass.get("value")),
+            mass=_text(heavy),
             fullinertia=_text(*np.diagonal(full), full[0, 1], full[0, 2], full[1, 2]),
         )
 
@@ -166,6 +171,8 @@ class _Writer:
             if cylinder is not None:
                 T = RigidTransform.from_matrix(origins_of([visual])[0])
                 size = float(cylinder.get("radius", 0)), 0.5 * float(cylinder.get("length", 0))
+                if min(size) <= LEAST:
+                    continue
                 shape = {"type": "cylinder", "size": _text(*size), "mass": "0"}
                 apart = {"contype": "0", "conaffinity": "0"}
                 etree.SubElement(body, "geom", {**shape, **apart, **_pose(T)})
