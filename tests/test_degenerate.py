@@ -140,7 +140,7 @@ def test_a_reading_out_of_reach_is_named(tmp_path: Path) -> None:
     lines[4] = ",".join([*typed[:-3], "0.0001", "0.0001", "0.0001"])
     table.write_text("\n".join(lines) + "\n")
     with pytest.raises(
-        DatasetError, match=r"readings of view c1, p04 could not be used"
+        DatasetError, match=r"readings of view c1, image p04 could not be used"
     ) as refused:
         calibrate(folder)
     assert "needed at most" in str(refused.value)

@@ -48,7 +48,7 @@ from legcal.machine.origins import with_own_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
 from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.spanning_tree import Source
-from legcal.machine.ties import is_tied, machine_ties, n_nearly_dependent
+from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
 from legcal.machine.topology import (
     any_joint,
     check_bodies,
@@ -486,7 +486,8 @@ def _check_dependence(machine: Machine, *, closes: bool = True) -> None:
         If some nearly do: the machine then lacks the mobility that it is meant to have.
     """
     nearly = n_nearly_dependent(machine)
-    if nearly > (machine_ties(machine).n_dependent if closes else 0):
+    # At a home that alone is special, constraints depend exactly and around it nearly.
+    if nearly > (n_dependent_at_home(machine) if closes else 0):
         n = sum(leg.n_constraints for leg in machine.legs)
         raise OutOfClass(
             f"{machine.yaml_path}: the mechanism '{machine.name}' could not be used: found that "

@@ -126,8 +126,13 @@ def ties_of(
 @lru_cache(maxsize=8)  # a job asks several times about one or two machines
 def machine_ties(machine: Machine) -> Ties:
     """Return the ties of a mechanism; see :func:`ties_of`."""
+    return ties_of(geometries(machine), machine.frame_legs, _home(machine))
+
+
+def _home(machine: Machine) -> Array:
+    """Return the home of R_e in R_b, (3, 4)."""
     home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
-    return ties_of(geometries(machine), machine.frame_legs, home.as_matrix()[:3])
+    return np.asarray(home.as_matrix()[:3])
 
 
 def independent(rows: TieRows, by_unknowns: Array, n: int | None = None) -> tuple[Array, Array]:
@@ -175,12 +180,16 @@ def wholly_tied(rows: Array) -> BoolArray:
     return np.asarray(np.sum(rows**2, axis=0) > 1.0 - _WHOLLY)
 
 
+def n_dependent_at_home(machine: Machine) -> int:
+    """Return how many constraints of joints follow from the others at home, there alone or not."""
+    return _n_dependent_at(geometries(machine), _home(machine), _RANK)
+
+
 def n_nearly_dependent(machine: Machine) -> int:
     """Return how many constraints of joints follow from the others but for 1 mrad."""
     if len(machine.frame_legs) < 3:
         return 0
-    home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
-    return _n_dependent(geometries(machine), home.as_matrix()[:3], _NEARLY)
+    return _n_dependent(geometries(machine), _home(machine), _NEARLY)
 
 
 def is_tied(legs: Sequence[Leg], ties: Ties, parametrization: Parametrization) -> bool:
@@ -238,12 +247,7 @@ def _length(legs: Sequence[Leg], R: Array, t: Array) -> float:
 def _n_dependent(legs: Sequence[Leg], home: Array, least: float = _RANK) -> int:
     """Return how many constraints follow from the others at home and at poses around it."""
     n = sum(leg.n_constraints for leg in legs)
-    if n < 2:
-        return 0
-    here = _constraints(legs, home[None, :, :3], home[None, :, 3]).by_pose[0]
-    here = here / _unit(legs, home)
-    found = np.linalg.svd(here, compute_uv=False)
-    dependent = n - int(np.sum(found > least * found[0]))
+    dependent = _n_dependent_at(legs, home, least)
     if dependent == 0:
         return 0
     # Where home alone is special, the constraints are independent a little way off.
@@ -252,6 +256,16 @@ def _n_dependent(legs: Sequence[Leg], home: Array, least: float = _RANK) -> int:
     singular = np.linalg.svd(around.by_pose / _unit(legs, home), compute_uv=False)
     rank = np.sum(singular > least * singular[:, :1], axis=1)
     return n - int(rank.max())
+
+
+def _n_dependent_at(legs: Sequence[Leg], home: Array, least: float) -> int:
+    """Return how many constraints follow from the others at one pose (3, 4)."""
+    n = sum(leg.n_constraints for leg in legs)
+    if n < 2:
+        return 0
+    here = _constraints(legs, home[None, :, :3], home[None, :, 3]).by_pose[0]
+    found = np.linalg.svd(here / _unit(legs, home), compute_uv=False)
+    return n - int(np.sum(found > least * found[0]))
 
 
 def _unit(legs: Sequence[Leg], home: Array) -> Array:
