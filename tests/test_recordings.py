@@ -208,6 +208,8 @@ REFUSALS: dict[str, tuple[Callable[[Motion, Path], tuple[object, ...]], str]] = 
     "damaged bag": (lambda m, t: (_written(t / "a.bag", b"\0" * 99),), "a complete bag"),
     "no readings": (lambda m, t: (_video(m, t),), "give it with --readings"),
     "no times": (lambda m, t: (_video(m, t), "--readings", _timeless(m, t)), "no column 'time'"),
+    "times of another name": (lambda m, t: (_video(m, t), "--readings", _renamed(m, t)),
+                              "Column 'Time [s]' of"),
     "nothing moves": (lambda m, t: (_video(m, t), "--readings", _resting(m, t)),
                       "readings that change alike all the time"),
     "other motion": (lambda m, t: (_video(m, t), "--readings", _other(m, t)),
@@ -259,6 +261,12 @@ def _dated(motion: Motion, folder: Path) -> Path:
     first, *rows = path.read_text().splitlines()
     dated = [f"{20261123101500 + k // 50}{row[row.index(',') :]}" for k, row in enumerate(rows)]
     path.write_text("\n".join([first, *dated]))
+    return path
+
+
+def _renamed(motion: Motion, folder: Path) -> Path:
+    path = _ticks(motion, folder)
+    path.write_text(path.read_text().replace("time", "Time [s]", 1))
     return path
 
 

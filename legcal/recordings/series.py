@@ -67,8 +67,8 @@ def read_series(path: Path, machine: Machine, unit: str | None, lengths: bool) -
     if "time" not in table:
         raise DatasetError(
             f"{path}: the readings could not be used: found no column 'time', needed one in "
-            "seconds or as dates; add it, or use legcal init for photographs of poses that were "
-            "held."
+            "seconds or as dates; add it or call it so, or use legcal init for photographs of "
+            f"poses that were held. {' '.join(headings.notes)}".rstrip()
         )
     found, where = unit_of(table, headings, unit, lengths)
     q, _ = readings_of(table, headings, found, lengths)
