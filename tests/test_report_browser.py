@@ -17,7 +17,7 @@ pytestmark = pytest.mark.system
 
 PATIENCE = 60  # [s] for plots in a browser that draws without a graphics card
 INTERACTIVE = 2000  # [ms]
-HOSTILE = "<img src=x onerror=alert(1)><script>alert(1)</script>"
+HOSTILE = "\"'`</script><img src=x onerror=alert(1)><script>alert(1)</script>"
 
 
 @pytest.fixture(scope="module")
@@ -184,7 +184,13 @@ def test_hostile_names_do_nothing(example_run: Run, browser: Any, tmp_path: Path
     calibration = example_run.calibration
     machine = calibration.dataset.machine
     legs = tuple(replace(leg, name=f"{leg.name}{HOSTILE}") for leg in machine.legs)
-    dataset = replace(calibration.dataset, machine=replace(machine, name=HOSTILE, legs=legs))
+    measured = calibration.dataset.measurements
+    views = tuple(replace(view, name=f"{HOSTILE}{view.name}") for view in measured.views)
+    dataset = replace(
+        calibration.dataset,
+        machine=replace(machine, name=HOSTILE, legs=legs),
+        measurements=replace(measured, views=views),
+    )
     changed = replace(calibration, dataset=dataset, notes=(HOSTILE,))
     changed.__dict__["result"] = calibration.result
     browser.get(legcal.write_report(changed, tmp_path).as_uri())

@@ -171,7 +171,7 @@ def number_grid(
     for row, at in enumerate(y):
         v = top + size * (len(y) - 1 - row)
         canvas.text(
-            left - 6.0, v + 0.5 * size + 4.0, f"{at:.0f}", anchor="end", size=10.5, colour=DIM
+            left - 6.0, v + 0.5 * size + 4.0, f"{at:z.0f}", anchor="end", size=10.5, colour=DIM
         )
         for column in range(len(x)):
             u, value = left + size * column, float(values[row, column])
@@ -183,12 +183,12 @@ def number_grid(
             colour = "#ffffff" if share > 0.62 else INK
             canvas.text(
                 u + 0.5 * size - 0.5, v + 0.5 * size + 4.0, f"{value:.{digits}f}",
-                anchor="middle", size=11, colour=colour,
+                anchor="middle", size=11 if digits < 4 else 9, colour=colour,
             )  # fmt: skip
     base = top + size * len(y)
     for column, at in enumerate(x):
         canvas.text(
-            left + size * (column + 0.5), base + 13.0, f"{at:.0f}", anchor="middle", size=10.5,
+            left + size * (column + 0.5), base + 13.0, f"{at:z.0f}", anchor="middle", size=10.5,
             colour=DIM,
         )  # fmt: skip
     canvas.text(left, base + 28.0, "x to the right, y up [mm]", size=11, colour=DIM)

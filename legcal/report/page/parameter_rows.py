@@ -17,7 +17,7 @@ _PARALLEL = 1e-9
 _STATUS = {
     "estimated": "by images and readings",
     "fixed": "fixed",
-    "weak": "held at nominal: nothing determines it",
+    "weak": "in a combination that nothing determines, held at nominal",
 }
 _JOINT = {"base": "A", "platform": "B"}
 

@@ -11,6 +11,17 @@ from legcal.geometry import Array
 from legcal.pages import Drawing, Plot, Row, Table, Text, histogram, number, number_grid
 from legcal.report.page.residual_plots import FONT
 
+_FLAT = 1e-3  # of its extent: the height of a workspace in a plane
+_IN_SPACE = {
+    "aspectmode": "data",
+    "camera": {"eye": {"x": 1.1, "y": -1.6, "z": 1.1}, "center": {"z": -0.2}},
+}
+_IN_A_PLANE = {
+    "aspectmode": "manual",  # by the data a flat scene is drawn as large as it is flat
+    "aspectratio": {"x": 1.0, "y": 1.0, "z": 0.01},
+    "camera": {"eye": {"x": 0.0, "y": 0.0, "z": 1.6}, "up": {"x": 0.0, "y": 1.0, "z": 0.0}},
+}
+
 
 def platform_blocks(calibration: Calibration) -> list[Any]:
     """Return figures, histograms and maps of the error of the platform."""
@@ -75,7 +86,7 @@ def _maps(found: PlatformMap) -> list[Any]:
                         (1e3 * found.x).tolist(),
                         (1e3 * found.y).tolist(),
                         np.where(level >= 0, values[level], np.nan),
-                        f"{name} [mm], z = {1e3 * z:.0f} mm",
+                        f"{name} [mm], z = {1e3 * z:z.0f} mm",
                         float(values.max()),
                         digits,
                     ),
@@ -92,6 +103,7 @@ def _maps(found: PlatformMap) -> list[Any]:
 
 
 def _in_space(found: PlatformMap, before: Array, after: Array) -> Plot:
+    is_flat = np.ptp(found.position[:, 2]) < _FLAT * np.ptp(found.position, axis=0).max()
     x, y, z = np.round(1e3 * found.position, 1).T.tolist()
     data = [
         {
@@ -127,8 +139,7 @@ def _in_space(found: PlatformMap, before: Array, after: Array) -> Plot:
         "updatemenus": [{"type": "buttons", "direction": "right", "x": 0, "xanchor": "left",
                          "y": 1.0, "yanchor": "top", "buttons": buttons, "showactive": True}],
         "scene": {f"{a}axis": {**axis, "title": {"text": f"{a} [mm]"}} for a in "xyz"}
-        | {"aspectmode": "data",
-           "camera": {"eye": {"x": 1.1, "y": -1.6, "z": 1.1}, "center": {"z": -0.2}}},
+        | (_IN_A_PLANE if is_flat else _IN_SPACE),
     }  # fmt: skip
     caption = "The same in space: larger and darker marks are larger errors."
     return Plot("platform-space", data, look, 420, caption)

@@ -20,6 +20,8 @@ MAX_CAMERAS = 60
 FACTORS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000, 50000)
 _SHOWN = 0.12  # of the size of the machine: how far the largest change is drawn at first
 _RING = 0.02  # of it: the median ellipsoid
+_ROOM = 0.8  # of it: about the machine
+_EYE = np.array([1.3, -1.5, 0.8])  # where it is looked at from, in its size
 _N_RING = 20  # points of a ring
 _GREY, _BLUE, _AMBER, _GREEN = "#9aa1ab", "#1f5fa8", "#b26a00", "#1e7d46"
 
@@ -68,6 +70,7 @@ def machine_scene(calibration: Calibration) -> Plot:
         "traces": {"legs": [0, 1], "base": [2, 3], "platform": [4, 5], "rings": 6},
     }
     names = [plain(name) for name in machine.leg_names]
+    cameras = _cameras(calibration, 0.25 * size)
     traces = [
         _lines("nominal", _GREY, 3),
         _lines("calibrated", _BLUE, 6),
@@ -76,11 +79,13 @@ def machine_scene(calibration: Calibration) -> Plot:
         _lines("nominal platform", _GREY, 2, legend=False),
         _lines("calibrated platform", _BLUE, 3, legend=False),
         _lines(f"1 sigma, {ring_factor:g} times as large", _AMBER, 2),
-        _cameras(calibration, 0.25 * size),
+        cameras,
         _words(names, found[0], "#1d2126"),
     ]
     hidden = {"showbackground": False, "gridcolor": "#e8ebef", "zeroline": False,
               "title": {"text": ""}, "tickfont": {"size": 10, "color": "#667080"}}  # fmt: skip
+    seen = [[v for v in cameras[a] if v is not None] for a in "xyz"]
+    frame_of_view = _view(np.concatenate([found[0], *found[1]]), np.array(seen).T, size)
     look = {
         "font": FONT,
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
@@ -88,12 +93,10 @@ def machine_scene(calibration: Calibration) -> Plot:
         "legend": {"x": 0, "y": 1, "bgcolor": "rgba(255,255,255,0.7)"},
         "uirevision": "kept",
         "scene": {
-            "aspectmode": "data",
-            "xaxis": {**hidden, "title": {"text": "x [m]"}},
-            "yaxis": {**hidden, "title": {"text": "y [m]"}},
-            "zaxis": {**hidden, "title": {"text": "z [m]"}},
-            "camera": {"eye": {"x": 0.75, "y": -0.85, "z": 0.45}},
-        },
+            f"{a}axis": {**hidden, "title": {"text": f"{a} [m]"}, "range": between}
+            for a, between in zip("xyz", frame_of_view["range"], strict=True)
+        }
+        | frame_of_view["look"],
     }
     n = measurements.n_poses
     left_out = f" {len(chosen)} of {n} poses are shown." if len(chosen) < n else ""
@@ -104,6 +107,26 @@ def machine_scene(calibration: Calibration) -> Plot:
         f"{left_out}"
     )
     return Plot("machine-scene", traces, look, 560, caption, extra)
+
+
+def _view(machine: Array, cameras: Array, size: float) -> dict[str, Any]:
+    """Return ranges of the axes that hold machine and cameras, and a look at the machine."""
+    everything = np.concatenate([machine - _ROOM * size, machine + _ROOM * size, cameras])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    middle = 0.5 * (machine.min(axis=0) + machine.max(axis=0))
+    centre = (middle - 0.5 * (low + high)) / size  # scenes measure from the middle of the ranges
+
+    def place(xyz: Array) -> dict[str, float]:
+        return dict(zip("xyz", np.round(xyz, 4).tolist(), strict=True))
+
+    return {
+        "range": _rounded(np.stack([low, high], axis=1), 4),
+        "look": {
+            "aspectmode": "manual",
+            "aspectratio": place((high - low) / size),
+            "camera": {"center": place(centre), "eye": place(centre + _EYE)},
+        },
+    }
 
 
 def _mode(
