@@ -29,6 +29,7 @@ ROOT = Path(__file__).parents[2]
 MAX_STOP = 20.0  # [s] on a busy machine, from the signal to the end
 LINGER = 10.0  # [s] that a process of a pool may take to end after the command
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+PAGE, PART_OF_PAGE = "out/report.html", "out/.report.html."
 STOPPED = "legcal: Stopped before the end."
 FALSE_WORDS = ("Traceback", "ended from outside", "mistake in legcal")
 MARK = "LEGCAL_KILL"  # in the environment of the command and of all that it starts
@@ -195,11 +196,16 @@ def _is_one_of(found: Contents, results: Sequence[Contents], command: Command) -
 
 
 def _result(contents: Contents, command: Command) -> Contents:
-    """Return what a command writes, apart from checkpoints and caches."""
+    """Return what a command writes, apart from checkpoints and caches.
+
+    Nor does the page count, nor a part of it: it says when it was made, and is written after a
+    result that is whole.
+    """
     return {
         name: digest
         for name, digest in contents.items()
-        if name.startswith("out/") and name not in command.kept
+        if name.startswith("out/") and name not in {*command.kept, PAGE}
+        if not name.startswith(PART_OF_PAGE)
     }
 
 
