@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from characterisation.running import fits_schema
 from command_line import run
 from hexapod_example import Spoiled, spoiled
 from photograph_files import exif, jpeg
@@ -159,6 +160,7 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
     folder = session.write()
     assert run(monkeypatch, "doctor", folder, "--json") == 1
     document = json.loads(capsys.readouterr().out)
+    fits_schema(["doctor"], document)
     said = [one["what"] for one in document["findings"]]
     assert said[0] == mistake.sentence
     assert any(what.startswith("1 more thing that images contradict may come") for what in said)

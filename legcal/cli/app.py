@@ -32,6 +32,7 @@ from legcal.cli.export import export
 from legcal.cli.import_ import import_
 from legcal.cli.init import init
 from legcal.cli.options import INTERRUPTED, print_failure
+from legcal.cli.schema import schema
 from legcal.cli.simulate import simulate
 from legcal.cli.study import study
 from legcal.errors import LegcalError, UsageError, printable
@@ -83,6 +84,7 @@ for command in (
     noise,
     simulate,
     example,
+    schema,
 ):
     app.command()(command)
 app.command("import")(import_)

@@ -7,11 +7,19 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BeforeValidator, Field, Strict, field_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    Strict,
+    WithJsonSchema,
+    field_validator,
+)
 
 from legcal.data.overrides import Override, read_override
 from legcal.errors import DatasetError
 from legcal.files import (
+    PRIOR_SCHEMA,
     FileSchema,
     MotionEntry,
     Name,
@@ -27,6 +35,7 @@ from legcal.machine import DATASET_YAML
 from legcal.vision import Link
 
 ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
+_BOUNDS = ("minimum", "maximum")
 GAMMAS = (0.2, 5.0)  # no camera encodes light more strongly
 
 
@@ -57,9 +66,9 @@ def _can_be_fixed(text: str) -> str:
 class ParametersEntry(FileSchema):
     """What is known of parameters, which are left as they are and which are looked for."""
 
-    priors: dict[Name, Annotated[Quantity, BeforeValidator(read_prior)]] = Field(
-        default_factory=dict
-    )
+    priors: dict[
+        Name, Annotated[Quantity, BeforeValidator(read_prior), WithJsonSchema(PRIOR_SCHEMA)]
+    ] = Field(default_factory=dict)
     fixed: list[Annotated[Name, AfterValidator(_can_be_fixed)]] = Field(default_factory=list)
     free: list[Name] = Field(default_factory=list)
 
@@ -88,7 +97,9 @@ class DatasetEntry(FileSchema):
     legcal_dataset: Version
     mechanism: str
     measurements: str
-    encoder_sigma: Annotated[Number, Field(gt=0.0)]
+    encoder_sigma: Annotated[
+        Number, Field(gt=0.0, json_schema_extra=dict(zip(_BOUNDS, ENCODER_SIGMAS, strict=True)))
+    ]
     views: Annotated[dict[Name, ViewEntry], Field(min_length=1)]
     parameters: ParametersEntry = Field(default_factory=ParametersEntry)
     board: dict[str, Any] | list[Any] | None = None  # read by their kinds

@@ -39,6 +39,7 @@ from legcal.files import (
     is_name,
     read_table,
     result_folder,
+    with_schema,
 )
 from legcal.geometry import Array
 from legcal.machine import DATASET_YAML, Machine, load_mechanism, shipped_names
@@ -306,7 +307,7 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
             _link(path, folder / name)
         (folder / MEASUREMENTS).write_text(format_table(header, rows), encoding="utf-8")
         text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
-        (folder / DATASET_YAML).write_text(text, encoding="utf-8")
+        (folder / DATASET_YAML).write_text(with_schema("dataset", text), encoding="utf-8")
     return [new.destination / name for name in own]
 
 

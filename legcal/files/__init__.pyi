@@ -18,10 +18,15 @@ from .motions import Quaternion as Quaternion
 from .motions import Vector as Vector
 from .motions import motion_from_xyz_quat as motion_from_xyz_quat
 from .motions import motion_to_xyz_quat as motion_to_xyz_quat
+from .published import schema_content as schema_content
+from .published import schema_names as schema_names
+from .published import with_schema as with_schema
+from .published import write_schemas as write_schemas
 from .quantity import ANGLE as ANGLE
 from .quantity import EXAMPLE as EXAMPLE
 from .quantity import LENGTH as LENGTH
 from .quantity import PIXELS as PIXELS
+from .quantity import PRIOR_SCHEMA as PRIOR_SCHEMA
 from .quantity import Quantity as Quantity
 from .quantity import parse_quantity as parse_quantity
 from .quantity import read_prior as read_prior

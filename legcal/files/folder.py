@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from legcal.errors import DatasetError, LegcalError, OutOfResources, UsageError
+from legcal.files.published import SCHEMAS, write_schemas
 from legcal.files.reading import read_json
 from legcal.files.schema import read_yaml
 from legcal.signals import held_back_signals, raise_if_stopped
@@ -31,6 +32,8 @@ def write_atomically(path: Path, content: bytes) -> None:
         (folder / path.name).write_bytes(content)
         raise_if_stopped()
         os.replace(folder / path.name, path)
+    if path.suffix == ".yaml":
+        write_schemas(path)
 
 
 @contextmanager
@@ -228,6 +231,8 @@ def result_folder(
             new.mkdir()
             with _named(destination, new):
                 yield new
+            for path in sorted(new.rglob("*.yaml")):
+                write_schemas(path)
             _check_places(new, destination, kind, replaceable)
             destination.parent.mkdir(parents=True, exist_ok=True)
             raise_if_stopped()
@@ -267,7 +272,9 @@ def _check_places(
                 found = f"{name}, which is a folder"
             elif (destination / name).exists() and not (destination / name).is_file():
                 found = f"{name}, which is a pipe or a device"
-            elif replaceable is not None and name not in replaceable:
+            elif (
+                replaceable is not None and name not in replaceable and name.parent.name != SCHEMAS
+            ):
                 found = f"{name}, which legcal did not write"
         if found:
             raise UsageError(in_the_way(destination, kind, found))

@@ -45,6 +45,19 @@ _DIMENSIONS = {"m": LENGTH, "rad": ANGLE, "px": PIXELS}
 _SIZES = {unit: size for units in _DIMENSIONS.values() for unit, size in units.items()}
 _DIMENSION = {unit: name for name, units in _DIMENSIONS.items() for unit in units}
 EXAMPLE = "0.4200±0.0001 or 420±0.1 mm"
+_NUMBERS = {"value": {"type": "number"}, "sigma": {"type": "number", "exclusiveMinimum": 0}}
+PRIOR_SCHEMA = {  # what read_prior takes, as JSON Schema
+    "anyOf": [
+        {"type": "string", "pattern": r"±|\+/?-"},
+        {"type": "array", "prefixItems": [*_NUMBERS.values()], "minItems": 2, "maxItems": 2},
+        {
+            "type": "object",
+            "properties": _NUMBERS,
+            "required": [*_NUMBERS],
+            "additionalProperties": False,
+        },
+    ]
+}
 
 
 @dataclass(frozen=True)

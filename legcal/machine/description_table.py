@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, WithJsonSchema
 from scipy.spatial.transform import Rotation
 
 from legcal.errors import DatasetError, ModelError
@@ -71,6 +71,21 @@ def _is_radius(value: Any) -> bool:
 def _is_pair(value: object) -> bool:
     """Say whether a value is one pair of readings."""
     return isinstance(value, list) and len(value) == 2 and all(_is_number(x) for x in value)
+
+
+_NUMBER: dict[str, Any] = {
+    "type": "number",
+    "exclusiveMinimum": -MAX_NUMBER,
+    "exclusiveMaximum": MAX_NUMBER,
+}
+_POSITIVE = {**_NUMBER, "exclusiveMinimum": 0}
+_ROW = {"type": "array", "items": _NUMBER}
+
+
+def _schema_of_legs(one: dict[str, Any]) -> WithJsonSchema:
+    """Return the JSON Schema of what :func:`_of_legs` takes."""
+    of_each = {"type": "array", "items": {"anyOf": [one, {"type": "null"}]}}
+    return WithJsonSchema({"anyOf": [one, of_each]})
 
 
 def _of_legs(fits: Callable[[Any], bool], needed: str) -> BeforeValidator:
@@ -147,24 +162,47 @@ def _type(value: object) -> object:
     return value
 
 
-Points = Annotated[list[Any], BeforeValidator(_points)]
-Directions = Annotated[list[Any], BeforeValidator(_directions)]
+Points = Annotated[
+    list[Any],
+    BeforeValidator(_points),
+    WithJsonSchema({"type": "array", "items": {**_ROW, "minItems": 2, "maxItems": 3}}),
+]
+Directions = Annotated[
+    list[Any],
+    BeforeValidator(_directions),
+    _schema_of_legs({**_ROW, "minItems": 3, "maxItems": 3}),
+]
 Lengths = Annotated[
     Any,
     _of_legs(
         _is_number, f"a number below {MAX_NUMBER:g}, or a list with a number (or null) for each leg"
     ),
+    _schema_of_legs(_NUMBER),
 ]
 Travel = Annotated[
     Any,
     BeforeValidator(_lower_first),  # the last one is applied first
     _of_legs(_is_pair, "[lowest, highest] reading, or a list with that pair (or null) a leg"),
+    _schema_of_legs({**_ROW, "minItems": 2, "maxItems": 2}),
 ]
 Radius = Annotated[
     Any,
     _of_legs(
         _is_radius,
         "a positive number, {tube: ..., rod: ...}, or a list with one of these (or null) a leg",
+    ),
+    _schema_of_legs(
+        {
+            "anyOf": [
+                _POSITIVE,
+                {
+                    "type": "object",
+                    "properties": {"tube": _POSITIVE, "rod": _POSITIVE},
+                    "additionalProperties": False,
+                    "minProperties": 1,
+                },
+            ]
+        }
     ),
 ]
 
@@ -195,7 +233,9 @@ class TableFile(FileSchema):
     max_length: Lengths = None
     travel: Travel = None
     radius: Radius = None
-    kinds: Annotated[Any, BeforeValidator(_kinds)] = None
+    kinds: Annotated[
+        Any, BeforeValidator(_kinds), _schema_of_legs({"enum": [kind.value for kind in LegKind]})
+    ] = None
     base_axes: Directions | None = None
     platform_axes: Directions | None = None
     home: HomeEntry | None = None

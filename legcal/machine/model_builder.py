@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from legcal.errors import LegcalError, OutOfResources, UsageError
-from legcal.files import temporary_folder
+from legcal.files import temporary_folder, write_schemas
 from legcal.geometry import Array, cross
 from legcal.machine.assembly import Assembled, AssembledLeg, assemble
 from legcal.machine.description import Description
@@ -254,6 +254,7 @@ def _write(machine: Assembled, source: str, output: Path) -> Created:
                     made.insert(0, path.parent)
             for path, place in zip(reversed(written), reversed(places), strict=True):
                 os.replace(path, place)  # the YAML last: a URDF alone is no model
+            write_schemas(places[0])
     except BaseException:
         for folder in made:
             if folder.is_dir() and not os.listdir(folder):

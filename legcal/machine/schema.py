@@ -8,7 +8,16 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from legcal.errors import DatasetError, ModelError
-from legcal.files import FileSchema, MotionEntry, PlainName, Version, closest, parse_yaml, validate
+from legcal.files import (
+    FileSchema,
+    MotionEntry,
+    PlainName,
+    Version,
+    closest,
+    parse_yaml,
+    validate,
+    with_schema,
+)
 from legcal.machine.files import DATASET_YAML, read_file, what_a_dataset_is_for
 
 WHAT = "mechanism file"
@@ -156,6 +165,5 @@ def mechanism_yaml(
         "joint_type": [],
         "legcal": {"version": 1, **legcal},
     }
-    return str(
-        yaml.safe_dump(document, sort_keys=False, default_flow_style=False, allow_unicode=True)
-    )
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=False, allow_unicode=True)
+    return with_schema("mechanism", text)

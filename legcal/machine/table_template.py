@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from legcal.errors import OutOfResources, UsageError
-from legcal.files import plain_name, write_atomically
+from legcal.files import plain_name, with_schema, write_atomically
 
 TEMPLATE_NAME = "my-hexapod"
 
@@ -72,11 +72,8 @@ def write_template(folder: Path, name: str | None, *, force: bool = False) -> tu
             "there, needed new files; give another --name or --output, or --force to replace them."
         )
     rows = [[f"{x:g}" for x in joint] for joint in _JOINTS]
-    text = _YAML.format(
-        name=name,
-        base="\n".join(f"  - [{', '.join(row[:3])}]" for row in rows),
-        platform="\n".join(f"  - [{', '.join(row[3:])}]" for row in rows),
-    )
+    joints = ["\n".join(f"  - [{', '.join(row[i : i + 3])}]" for row in rows) for i in (0, 3)]
+    text = with_schema("table", _YAML.format(name=name, base=joints[0], platform=joints[1]))
     header = "leg,type,bx,by,bz,px,py,pz,min_length,max_length,tube,rod,unit"
     lines = [f"leg{j + 1},UPS,{','.join(row)},380,500,14,9,mm" for j, row in enumerate(rows)]
     try:

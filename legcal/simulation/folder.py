@@ -38,6 +38,7 @@ from legcal.files import (
     read_json,
     read_table,
     result_folder,
+    with_schema,
 )
 from legcal.machine import LegKind, Machine, main_cylinders
 from legcal.simulation.board import documents
@@ -92,7 +93,7 @@ def write_session(
     if board is not None:
         document["board"] = board
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
-    (folder / "dataset.yaml").write_text(text, encoding="utf-8")
+    (folder / "dataset.yaml").write_text(with_schema("dataset", text), encoding="utf-8")
     motors = list(machine.motors)
     joints = [str(machine.legs[j].prismatic) for j in motors]
     names, readings = list(groups) or [view.name for view in m.views], m.q[:, motors].tolist()
@@ -188,9 +189,9 @@ def dataset_folder(destination: Path, *, force: bool) -> Iterator[Path]:
 
 
 def files_in(folder: Path) -> list[str]:
-    """Return the files of a folder, relative to it, in order."""
-    found = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file()]
-    return [path.as_posix() for path in sorted(found)]
+    """Return the files of a folder, relative to it, in order; none of hidden folders."""
+    found = [path.relative_to(folder) for path in folder.rglob("[!.]*") if path.is_file()]
+    return [path.as_posix() for path in sorted(found) if not path.parent.name.startswith(".")]
 
 
 def _earlier(destination: Path) -> list[Path]:
@@ -236,7 +237,7 @@ def _foreign(destination: Path) -> str:
         here = Path(above).relative_to(destination)
         for name in sorted([here / name for name in inside + files]):
             path = destination / name
-            if not _is_place(name) or name.name.startswith("."):
+            if not _is_place(name) or any(part.startswith(".") for part in name.parts):
                 continue
             if path.is_symlink():
                 return f"{name}, which is a link"

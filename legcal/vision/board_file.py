@@ -53,14 +53,22 @@ def _count(number: int) -> int:
     return number
 
 
-Side = Annotated[Number, AfterValidator(_in_metres)]
-Count = Annotated[int, Strict(), AfterValidator(_count)]
+Side = Annotated[
+    Number,
+    AfterValidator(_in_metres),
+    Field(json_schema_extra={"minimum": SIDES[0], "maximum": SIDES[1]}),
+]
+Count = Annotated[
+    int,
+    Strict(),
+    AfterValidator(_count),
+    Field(json_schema_extra={"minimum": 1, "maximum": MAX_COUNT}),
+]
 
 
 class _BoardEntry(FileSchema):
     """What every board has."""
 
-    kind: str
     on: Literal["base", "platform"] = "base"
     T_base_board: MotionEntry | None = None
     T_platform_board: MotionEntry | None = None
@@ -79,6 +87,7 @@ class _BoardEntry(FileSchema):
 class ChessboardEntry(_BoardEntry):
     """A chessboard: squares are counted, not inner corners."""
 
+    kind: Literal["chessboard"]
     squares_x: Count
     squares_y: Count
     square: Side
@@ -107,6 +116,7 @@ class ChessboardEntry(_BoardEntry):
 class CharucoEntry(_BoardEntry):
     """A ChArUco board: markers in the white squares of a chessboard."""
 
+    kind: Literal["charuco"]
     squares_x: Count
     squares_y: Count
     square: Side
@@ -161,6 +171,7 @@ class CharucoEntry(_BoardEntry):
 class AprilgridEntry(_BoardEntry):
     """An AprilGrid as Kalibr prints it."""
 
+    kind: Literal["aprilgrid"]
     tags_x: Count
     tags_y: Count
     tag_size: Side

@@ -12,7 +12,7 @@ import yaml
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from legcal.errors import DatasetError
-from legcal.files import FileSchema, content_of, parse_yaml, validate
+from legcal.files import FileSchema, content_of, parse_yaml, validate, with_schema
 from legcal.geometry import Array
 from legcal.vision.camera import DISTORTION_MODELS, Camera, intrinsic_names
 from legcal.vision.distortion import DistortionModel
@@ -416,4 +416,5 @@ def camera_info(camera: Camera, name: str, more: Mapping[str, Any] | None = None
         "projection_matrix": {"rows": 3, "cols": 4, "data": projection.ravel().tolist()},
         **(more or {}),
     }
-    return str(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100))
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
+    return with_schema("camera", text)

@@ -110,7 +110,7 @@ def folder_facts(folder: Path, printed: Any = None) -> dict[str, Any]:
     return {
         path.relative_to(folder).as_posix(): file_facts(path, printed)
         for path in sorted(folder.rglob("*"))
-        if path.is_file()
+        if path.is_file() and path.parent.name != ".schemas"
     }
 
 

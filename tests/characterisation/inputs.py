@@ -126,7 +126,7 @@ def _model(folder: Path) -> None:
 
 def _tables(folder: Path) -> None:
     """Copy the tables of all shipped models, and write one as CSV."""
-    for path in (ROOT / "models/tables").iterdir():
+    for path in (ROOT / "models/tables").glob("[!.]*"):
         shutil.copy(path, folder)
     (folder / "tripod.csv").write_text(
         "type,base_x,base_y,platform_x,platform_y,platform_z,offset,travel_low,travel_high,tube\n"

@@ -22,6 +22,7 @@ from legcal.files import (
     motion_to_xyz_quat,
     read_yaml,
     validate,
+    with_schema,
 )
 from legcal.geometry import Array
 
@@ -287,7 +288,7 @@ class _Covariance(FileSchema):
     matrix: list[list[Number]]
 
 
-class _LocationFile(FileSchema):
+class LocationFile(FileSchema):
     """The file."""
 
     legcal_location: Version
@@ -383,7 +384,7 @@ def write_location(location: Location, file: str | Path) -> None:
         allow_unicode=True,
         width=120,
     )
-    LOCATION_FILE.write(Path(file), text)
+    LOCATION_FILE.write(Path(file), with_schema("location", text))
 
 
 def load_location(file: str | Path) -> Location:
@@ -406,7 +407,7 @@ def load_location(file: str | Path) -> Location:
             f"{path}: the {_WHAT} could not be read: found no key '{_KEY}', needed a file that "
             "legcal locate wrote; give that file."
         )
-    document = validate(_LocationFile, found, path)
+    document = validate(LocationFile, found, path)
     determined, residuals = document.determined, document.residuals
     return Location(
         model=document.model,

@@ -1,0 +1,86 @@
+"""Make the JSON Schemas of the formats: ``python tests/format_schemas.py`` writes them."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, Field, create_model
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core import core_schema
+
+from legcal.calibration.camera_calibration.document import CameraDocument
+from legcal.calibration.detection import DetectionDocument
+from legcal.calibration.documents import CheckDocument, EvaluationDocument, Result
+from legcal.calibration.examination import ExaminationDocument
+from legcal.calibration.location.document import LocationFile
+from legcal.calibration.measurement_noise.document import NoiseDocument
+from legcal.data.dataset_file import DatasetEntry
+from legcal.files.published import write_schemas
+from legcal.machine.description_table import TableFile
+from legcal.machine.schema import MechanismFile
+from legcal.vision.board_file import AprilgridEntry, CharucoEntry, ChessboardEntry
+from legcal.vision.camera_file import RosEntry
+
+ROOT = Path(__file__).parents[1]
+FOLDER = ROOT / "legcal/files/schemas"
+
+Board = Annotated[ChessboardEntry | CharucoEntry | AprilgridEntry, Field(discriminator="kind")]
+FILES: Mapping[str, type[BaseModel]] = {  # that people write
+    "dataset": create_model(
+        "Dataset",
+        __base__=DatasetEntry,
+        __doc__=DatasetEntry.__doc__,
+        board=(Board | Annotated[list[Board], Field(min_length=1)] | None, None),
+    ),
+    "mechanism": MechanismFile,
+    "table": TableFile,
+    "camera": RosEntry,
+}
+DOCUMENTS: Mapping[str, type[BaseModel]] = {  # that legcal writes
+    "location": LocationFile,
+    "result": Result,
+    "check": CheckDocument,
+    "evaluate": EvaluationDocument,
+    "detect": DetectionDocument,
+    "doctor": ExaminationDocument,
+    "camera-calibration": CameraDocument,
+    "noise": NoiseDocument,
+}
+
+
+class _AsRead(GenerateJsonSchema):
+    """Schemas of what is read: YAML takes names such as 1 for numbers, reading makes them text."""
+
+    def str_schema(self, schema: core_schema.StringSchema) -> JsonSchemaValue:
+        found = super().str_schema(schema)
+        return (
+            {**found, "type": ["string", "number"]} if self._config.coerce_numbers_to_str else found
+        )
+
+
+def schema_of(name: str) -> dict[str, Any]:
+    """Return the schema of a format."""
+    model = {**FILES, **DOCUMENTS}[name]
+    found = model.model_json_schema(schema_generator=_AsRead)
+    found = {"$schema": "https://json-schema.org/draft/2020-12/schema", **found}
+    return {**found, "title": f"legcal {name}"}
+
+
+def schema_text(name: str) -> str:
+    """Return the text of the file of a schema."""
+    return json.dumps(schema_of(name), indent=1, ensure_ascii=False) + "\n"
+
+
+def main() -> None:
+    """Write all schemas, and those beside the YAML files of this tree that name them."""
+    FOLDER.mkdir(exist_ok=True)
+    for name in {**FILES, **DOCUMENTS}:
+        (FOLDER / f"{name}.json").write_text(schema_text(name), encoding="utf-8")
+    for folder in ("examples", "models"):
+        for path in sorted((ROOT / folder).rglob("*.yaml")):
+            write_schemas(path)
+
+
+if __name__ == "__main__":
+    main()
