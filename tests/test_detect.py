@@ -1,5 +1,7 @@
 """``legcal detect``: the folder that people look at, what is drawn, and that nothing is lost."""
 
+import base64
+import gzip
 import json
 import re
 from dataclasses import replace
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 from command_line import run
 from csv_rows import read_rows, write_rows
+from lxml import html
 from outline_tables import assert_same
 from rendering import SIZE, RepeatedImages, repeated_images
 from scipy.spatial.transform import RigidTransform
@@ -113,6 +116,36 @@ def test_folder_json_and_summary_tell_the_same(
     assert "https:" not in page
     kept = json.loads((out / "detection.json").read_text())
     assert {key: kept[key] for key in document} == document
+
+
+def test_the_page_holds_the_table_the_photographs_and_where_lost_outlines_should_be(
+    found: Detection, folder: Path
+) -> None:
+    page: Any = html.fromstring((folder / "index.html").read_text())
+    packed = page.xpath("string(//script[@id='editor-table'])")
+    table = gzip.decompress(base64.b64decode(packed))
+    assert table == (folder / "observations.csv").read_bytes()
+    editor = json.loads(page.xpath("string(//script[@id='editor-images'])"))
+    for row, image in zip(found.rows.tolist(), editor["images"], strict=True):
+        grey = cv2.imread(str(folder / image["photograph"]), cv2.IMREAD_GRAYSCALE)
+        assert grey is not None
+        assert grey.shape == (image["height"], image["width"])
+        shown = found.dataset.image_reader([row])(0)
+        assert np.abs(grey - np.rint(shown)).mean() < 4.0  # of compression and noise
+    assert page.xpath("//figcaption/button/@data-edit") == [str(k) for k in range(5)]
+    blank = next(one for one in editor["images"] if one["image"] == BLANK)
+    names, o = found.dataset.machine.leg_names, found.outlines
+    seen = {
+        f"{names[o.leg[i]]}\n{o.part[i]}\n{o.edge[i]}": o.h[i]
+        for i in np.flatnonzero(o.row == 2).tolist()  # of the same pose
+    }
+    cam = found.dataset.measurements.views[0].camera
+    lines = [(seen[key], cam.undistort(np.array(px))) for key, px in blank["expected"].items()]
+    off = [np.abs(cam.line_offset(h, xy)).max() for h, xy in lines]
+    signs = [np.cross([*xy[1], 1.0], [*xy[0], 1.0]) @ h for h, xy in lines]
+    assert len(lines) > 10
+    assert np.nanmedian(off) < 2.0
+    assert np.nanmin(signs) > 0.0  # the first end is nearer to the base
 
 
 def test_views_without_a_camera_pose_are_told_and_drawn_where_they_were_expected(

@@ -1,17 +1,24 @@
-"""The page of a calibration in a browser: Chromium without a window, driven by Selenium."""
+"""Pages in a browser: Chromium without a window, driven by Selenium."""
 
 import base64
+import csv
+import io
 import re
 import shutil
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from hexapod_example import Run
+from hexapod_example import HEXAPOD, Run
 
 import legcal
+from legcal.calibration.detection import Detection, _page, write_detection
+from legcal.vision.camera import Camera
+from legcal.vision.distortion import DistortionModel
 
 pytestmark = pytest.mark.system
 
@@ -195,6 +202,275 @@ def test_hostile_names_do_nothing(example_run: Run, browser: Any, tmp_path: Path
     changed.__dict__["result"] = calibration.result
     browser.get(legcal.write_report(changed, tmp_path).as_uri())
     _draw_all(browser)
+    assert _errors(browser) == []
+    assert browser.execute_script("return document.querySelectorAll('img[src=x]').length") == 0
+    assert HOSTILE in browser.find_element("css selector", "h1").text
+
+
+# Correcting outlines on the page of ``legcal detect``.
+
+SIGMA = 0.37  # [px] of what is placed by hand in these tests
+END_SCALE = 12.0  # pixels of the screen for one of the image, where an end is enlarged
+
+
+@pytest.fixture(scope="module")
+def detection(example_run: Run, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Detection]:
+    """The outlines of the example as given ones, some images of each view, and their pages."""
+    folder = tmp_path_factory.mktemp("corrected") / "hexapod"
+    shutil.copytree(HEXAPOD, folder)
+    shutil.copy(example_run.output / "observations.csv", folder)
+    return folder, legcal.detect(folder, output=folder.parent / "found")
+
+
+class Editor:
+    """The editor of a page, used as people do."""
+
+    def __init__(self, browser: Any, page: Path, downloads: Path) -> None:
+        self.browser, self.downloads = browser, downloads
+        browser.execute_cdp_cmd(
+            "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(downloads)}
+        )
+        browser.get(page.as_uri())
+
+    def open(self, image: int) -> None:
+        """Open the editor at an image."""
+        from selenium.webdriver.support.wait import WebDriverWait
+
+        button = self.browser.find_element("css selector", f"figcaption [data-edit='{image}']")
+        self.browser.execute_script("arguments[0].click()", button)
+        shown = (
+            "return [...document.querySelectorAll('#editor image')].every((i) => i.getBBox().width)"
+        )
+        WebDriverWait(self.browser, PATIENCE).until(
+            lambda _: (
+                self.browser.find_elements("css selector", "#editor .rows button")
+                and self.browser.execute_script(shown)
+            )
+        )
+        self.find("[name=sigma]").clear()
+        self.find("[name=sigma]").send_keys(str(SIGMA))
+
+    def close(self) -> None:
+        self.find("[name=close]").click()
+
+    def find(self, selector: str) -> Any:
+        return self.browser.find_element("css selector", f"#editor {selector}")
+
+    def choose(self, name: str) -> None:
+        self.browser.find_element(
+            "xpath", f"//*[@id='editor']//li/button[b[text()='{name}']]"
+        ).click()
+
+    def press(self, *keys: str) -> None:
+        """Press keys; one of several words, as "Shift ArrowDown", holds the first."""
+        from selenium.webdriver.common.action_chains import ActionChains
+        from selenium.webdriver.common.keys import Keys
+
+        named = {"Ctrl": Keys.CONTROL, "Shift": Keys.SHIFT, "Esc": Keys.ESCAPE,
+                 "Left": Keys.ARROW_LEFT, "Down": Keys.ARROW_DOWN}  # fmt: skip
+        actions = ActionChains(self.browser)
+        for words in keys:
+            *held, key = (named.get(word, word) for word in words.split())
+            for one in held:
+                actions.key_down(one)
+            actions.send_keys(key)
+            for one in held:
+                actions.key_up(one)
+        actions.perform()
+
+    def drag(self, end: int, dx: float, dy: float, *, to_the_end: bool = True) -> None:
+        """Drag an end by pixels of the image, enlarged."""
+        from selenium.webdriver.common.action_chains import ActionChains
+
+        self.press(str(end))
+        handle = self.find(f".handle[data-end='{end - 1}'] circle")
+        held = ActionChains(self.browser).click_and_hold(handle)
+        held = held.move_by_offset(round(END_SCALE * dx), round(END_SCALE * dy))
+        (held.release() if to_the_end else held).perform()
+
+    def release(self) -> None:
+        from selenium.webdriver.common.action_chains import ActionChains
+
+        ActionChains(self.browser).release().perform()
+
+    def state(self, name: str) -> str:
+        row = self.browser.find_element(
+            "xpath", f"//*[@id='editor']//li/button[b[text()='{name}']]/span"
+        )
+        return str(row.text)
+
+    def download(self) -> str:
+        """Return the text of the table."""
+        path = self.downloads / "observations.csv"
+        path.unlink(missing_ok=True)
+        self.find("[data-download]").click()
+        end = time.monotonic() + PATIENCE
+        while not path.exists():
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        return path.read_text("utf-8")
+
+
+def _rows(text: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def _ends(row: dict[str, str]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.array([float(row[name]) for name in ("u0", "v0", "u1", "v1")])
+
+
+def test_outlines_are_corrected_on_the_page_and_calibrate_takes_them(
+    detection: tuple[Path, Detection], browser: Any, tmp_path: Path
+) -> None:
+    folder, found = detection
+    out = folder.parent / "found"
+    editor = Editor(browser, out / "index.html", tmp_path)
+    before = _rows((out / "observations.csv").read_text())
+    moved, dropped = 4, 1  # rows of the first image
+    editor.open(0)
+    names = [
+        row.text.splitlines()[0] for row in browser.find_elements("css selector", ".rows button")
+    ]
+    editor.choose(names[moved])
+    editor.drag(1, 2.0, 1.0)
+    assert editor.state(names[moved]) == "used (edited)"
+    editor.drag(2, -3.0, 0.0)
+    editor.press("Ctrl z")  # the second end is where it was
+    editor.drag(2, 9.0, 9.0, to_the_end=False)
+    editor.press("Esc")  # nothing has moved, and the editor stays
+    assert "stays as it was" in editor.find("[role=status]").text
+    editor.release()
+    editor.choose(names[dropped])
+    editor.press("r")
+    assert editor.state(names[dropped]) == "rejected by hand (edited)"
+    editor.choose(names[0])
+    editor.press("r")
+    assert editor.state(names[0]).startswith("rejected")
+    editor.find("[name=undo]").click()
+    assert editor.state(names[0]) == "used"
+    text = editor.download()
+    editor.close()
+    assert "2 outlines are edited" in browser.find_element("id", "edit-state").text
+    after = _rows(text)
+    changed = [i for i, (a, b) in enumerate(zip(before, after, strict=True)) if a != b]
+    assert changed == [dropped, moved]
+    # What is still true of a rejected outline stays; of a moved one nothing that was measured does.
+    verdict = {"verdict": "rejected", "reason": "rejected by hand", "source": "edited"}
+    assert after[dropped] == before[dropped] | verdict
+    assert _ends(after[moved]) - _ends(before[moved]) == pytest.approx(
+        [2.0, 1.0, 0.0, 0.0], abs=0.1
+    )
+    of_image = dict.fromkeys(("contrast", "length", "residual", "gamma", "by_gamma"), "")
+    numbers = ("a", "b", "c", "u0", "v0", "u1", "v1")
+    variance = {"s00": str(SIGMA**2), "s01": "0", "s11": str(SIGMA**2)}
+    expected = before[moved] | of_image | variance | {"source": "edited"}
+    assert after[moved] == expected | {name: after[moved][name] for name in numbers}
+
+    corrected = tmp_path / "hexapod"
+    shutil.copytree(folder, corrected)
+    (corrected / "observations.csv").write_text(text)
+    calibration = legcal.calibrate(corrected)
+    used = calibration.solution.outlines
+    assert [i for i, source in enumerate(used.source) if source == "edited"] == changed
+    assert (used.used[dropped], used.reason[dropped]) == (False, "rejected by hand")
+    k = calibration.residuals.index.tolist().index(moved)
+    line = np.array([float(after[moved][name]) for name in "abc"])
+    camera = calibration.dataset.measurements.views[0].camera
+    off = camera.line_offset(found.outlines.h[moved], camera.undistort(used.ends[moved]))
+    assert used.h[moved] == pytest.approx(line, abs=1e-12)
+    assert 1.0 < abs(off[0]) < 2.5  # across the line
+    assert np.abs(calibration.residuals.offset[k]) == pytest.approx(np.abs(off), abs=0.3)
+    assert _errors(browser) == []
+
+
+def test_lines_are_those_of_every_camera_and_lost_outlines_are_placed(
+    detection: tuple[Path, Detection], browser: Any, tmp_path: Path
+) -> None:
+    folder, found = detection
+    measured = found.dataset.measurements
+    lenses: dict[DistortionModel, list[float]] = {
+        "plumb_bob": [-0.21, 0.08, 1e-3, -7e-4, -0.02],
+        "rational_polynomial": [0.3, -0.1, 8e-4, -5e-4, 0.02, 0.55, -0.06, 0.01],
+        "equidistant": [0.04, -0.02, 0.01, -0.003],
+    }
+    views = tuple(
+        replace(view, camera=replace(view.camera, distortion=np.array(lens), model=model))
+        for view, (model, lens) in zip(measured.views, lenses.items(), strict=True)
+    )
+    lost, h = 2, found.outlines.h.copy()
+    of_view = [int(np.flatnonzero(measured.view[found.outlines.row] == v)[lost]) for v in range(3)]
+    h[of_view] = np.nan
+    outlines = replace(
+        found.outlines,
+        h=h,
+        used=~np.isnan(h[:, 0]),
+        reason=tuple("no edges" if np.isnan(a) else "" for a in h[:, 0]),
+    )
+    dataset = replace(found.dataset, measurements=replace(measured, views=views))
+    changed = replace(found, dataset=dataset, outlines=outlines)
+    page = folder.parent / "found" / "lenses.html"  # beside the same photographs
+    page.write_text(_page(changed), "utf-8")
+    editor = Editor(browser, page, tmp_path)
+    for v in range(3):
+        row = int(outlines.row[of_view[v]])
+        editor.open(list(changed.overlay_files).index(row))
+        buttons = browser.find_elements("css selector", ".rows button")
+        name = buttons[lost].text.splitlines()[0]
+        editor.choose(name)
+        assert editor.state(name) == "not found: no edges"
+        editor.press("u", "1", "Left", "Shift Down")
+        assert editor.state(name) == "used (edited)"
+        editor.close()
+    editor.open(0)
+    rows = _rows(editor.download())
+    for v, i in enumerate(of_view):
+        camera: Camera = views[v].camera
+        ends = _ends(rows[i]).reshape(2, 2)
+        (leg,) = (p for p in changed.predicted(int(outlines.row[i])) if p.leg == outlines.leg[i])
+        band, expected = leg.bands[0], leg.outlines[0][int(outlines.edge[i]) - 1]
+        assert band is not None
+        t = np.array([0.0, band.length])
+        placed = camera.distort(band.points(t, band.offsets(expected, t)))
+        assert np.linalg.norm(ends - placed, axis=1) == pytest.approx(
+            [np.hypot(0.1, 1.0), 0.0], abs=0.02
+        )
+        rays = np.column_stack([camera.undistort(ends), np.ones(2)])
+        line = np.cross(rays[1], rays[0])
+        written = np.array([float(rows[i][name]) for name in "abc"])
+        assert written == pytest.approx(line / np.linalg.norm(line), abs=1e-9)
+        assert written @ expected > 0.99
+    assert _errors(browser) == []
+
+
+def test_the_page_of_a_detection_is_ready_in_time_and_hostile_names_do_nothing(
+    detection: tuple[Path, Detection], browser: Any, tmp_path: Path
+) -> None:
+    _, found = detection
+    machine, measured = found.dataset.machine, found.dataset.measurements
+    legs = tuple(replace(leg, name=f'{leg.name}, "{HOSTILE}') for leg in machine.legs)
+    views = tuple(replace(view, name=f"{view.name}{HOSTILE}") for view in measured.views)
+    dataset = replace(
+        found.dataset,
+        machine=replace(machine, name=HOSTILE, legs=legs),
+        measurements=replace(measured, views=views),
+    )
+    changed = replace(found, dataset=dataset, rows=found.rows[:2])
+    write_detection(changed, tmp_path / "out", map, lambda *_: None)
+    editor = Editor(browser, tmp_path / "out" / "index.html", tmp_path)
+    assert (
+        browser.execute_script(
+            "return performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd"
+        )
+        <= INTERACTIVE
+    )
+    editor.open(1)
+    buttons = browser.find_elements("css selector", ".rows button")
+    buttons[0].click()
+    editor.press("r")
+    before = _rows((tmp_path / "out" / "observations.csv").read_text())
+    after = _rows(editor.download())
+    assert [a["leg"] for a in after] == [b["leg"] for b in before]
+    assert sum(a != b for a, b in zip(before, after, strict=True)) == 1
     assert _errors(browser) == []
     assert browser.execute_script("return document.querySelectorAll('img[src=x]').length") == 0
     assert HOSTILE in browser.find_element("css selector", "h1").text

@@ -23,6 +23,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.calibration.documents import LeftOut, left_out_blocks
+from legcal.calibration.outline_editor import outline_editor
 from legcal.data import (
     CORNERS_NAME,
     OBSERVATIONS_NAME,
@@ -68,15 +69,21 @@ from legcal.workers import Run
 
 DETECTION = OutputKind("detection", "detection.json", "legcal_detection")
 DETECTION_PAGE = "index.html"
-OVERLAYS = "overlays"  # the subfolder
+OVERLAYS, PHOTOGRAPHS = "overlays", "photographs"  # the subfolders
 JPEG_QUALITY = 88  # percent
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")  # in names of files
 _MAX_NAME = 80  # letters of such a name
 _TABLE_HEADINGS = ("view", ">images", ">legs found", ">of visible", ">outlines used", ">of",
                    ">contrast", ">length [px]", ">residual [px]", "rejected")  # fmt: skip
 _HOW_TO_CORRECT = (
-    "To correct an outline, edit its row in observations.csv: set its verdict, or its line "
-    "(a, b, c) and ends, and its source to edited; then copy the file into the dataset."
+    "Use or reject outlines, and drag their ends, over the photographs; then download the table "
+    "and copy it into the dataset, where legcal calibrate takes it. An end that is placed by hand "
+    "has the standard deviation that you state. Nothing changes in the files beside this page."
+)
+_TOO_MANY = (
+    "There are more outlines than a page should hold. To correct one, edit its row in "
+    "observations.csv: set its verdict, or its line (a, b, c) and ends, and its source to edited; "
+    "then copy the file into the dataset."
 )
 
 
@@ -166,6 +173,13 @@ class Detection:
             for row, stem in zip(rows, _unique_names(stems), strict=True):
                 files[row] = f"{OVERLAYS}/{folder}/{stem}.jpg"
         return files
+
+    @property
+    def photograph_files(self) -> dict[int, str]:
+        """The file of each row's photograph as it was searched, relative to the folder."""
+        return {
+            row: file.replace(OVERLAYS, PHOTOGRAPHS, 1) for row, file in self.overlay_files.items()
+        }
 
     @cached_property
     def document(self) -> dict[str, Any]:
@@ -300,13 +314,19 @@ def _page(detection: Detection) -> str:
         "used."
     )
     table = Table(_TABLE_HEADINGS, [_cells(name, views[name], to) for name, to in anchors.items()])
+    dataset, photographs = detection.dataset, detection.photograph_files
+    editor = outline_editor(dataset, detection.outlines, detection.predicted, photographs)
+    correct = [Text([_TOO_MANY])] if editor is None else [Text([_HOW_TO_CORRECT]), editor]
     sections = [
         Section("found", "What was found", [table, *(Text([n]) for n in document["notes"])]),
-        Section("correct", "To correct an outline", [Text([_HOW_TO_CORRECT])]),
+        Section("correct", "To correct an outline", correct),
     ]
+    place = {} if editor is None else {row: k for k, row in enumerate(files)}
     for view, figures in views.items():
         rows = [row for row in files if detection.view_of(row) == view]
-        pictures = [Picture(files[row], *_summary(detection, names, row)) for row in rows]
+        pictures = [
+            Picture(files[row], *_summary(detection, names, row), place.get(row)) for row in rows
+        ]
         problem = [Text([figures["problem"]])] if figures["problem"] else []
         sections.append(Section(anchors[view], view, [*problem, Row(pictures)]))
     return page_html(Page(f"Outlines of {detection.dataset.machine.name}", found, None, sections))
@@ -403,13 +423,17 @@ class _Drawings(NamedTuple):
     captions: tuple[str, ...]
     unplaced: tuple[Camera | None, ...]  # cameras that could not be placed
     files: tuple[Path, ...]
+    photographs: tuple[Path, ...]  # where each image is written without what is drawn over it
 
 
 def _draw_all(detection: Detection, folder: Path, run: Run, progress: Report) -> None:
     """Write the overlay of every row that has an image."""
     rows = list(detection.overlay_files)
-    files = tuple(folder / file for file in detection.overlay_files.values())
-    for file in files:
+    files, photographs = (
+        tuple(folder / file for file in named.values())
+        for named in (detection.overlay_files, detection.photograph_files)
+    )
+    for file in (*files, *photographs):
         file.parent.mkdir(parents=True, exist_ok=True)
     drawings = _Drawings(
         detection.dataset.image_reader(rows),
@@ -418,6 +442,7 @@ def _draw_all(detection: Detection, folder: Path, run: Run, progress: Report) ->
         tuple(_caption(detection, row) for row in rows),
         tuple(_unplaced_camera(detection, row) for row in rows),
         files,
+        photographs,
     )
     progress("Drawing overlays", 0, len(rows))
     for done, _ in enumerate(run(partial(_write_overlay, drawings), range(len(rows))), start=1):
@@ -425,17 +450,19 @@ def _draw_all(detection: Detection, folder: Path, run: Run, progress: Report) ->
 
 
 def _write_overlay(drawings: _Drawings, k: int) -> None:
-    """Draw overlay k and write it."""
+    """Draw overlay k and write it, and the photograph beside it."""
     image, camera = drawings.load(k), drawings.unplaced[k]
     marks = [] if camera is None else [marks_of_pairs(camera, image)]
     picture = draw(image, [*drawings.marks[k], *marks], drawings.captions[k], drawings.corners[k])
-    ok, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    if not ok:
-        raise OutOfResources(
-            f"{drawings.files[k].name}: the picture could not be written: found that it cannot be "
-            "encoded, needed enough memory; try again with fewer workers."
-        )
-    drawings.files[k].write_bytes(content.tobytes())
+    grey = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    for path, pixels in ((drawings.files[k], picture), (drawings.photographs[k], grey)):
+        ok, content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        if not ok:
+            raise OutOfResources(
+                f"{path.name}: the picture could not be written: found that it cannot be encoded, "
+                "needed enough memory; try again with fewer workers."
+            )
+        path.write_bytes(content.tobytes())
 
 
 def _marks(detection: Detection, row: int) -> list[PartMarks]:
@@ -505,4 +532,4 @@ def _is_place(name: Path) -> bool:
         Path(DETECTION_PAGE),
         Path(DETECTION.marker),
     }
-    return name in own or (name.parts[0] == OVERLAYS and name.suffix == ".jpg")
+    return name in own or (name.parts[0] in (OVERLAYS, PHOTOGRAPHS) and name.suffix == ".jpg")

@@ -7,6 +7,7 @@ from .document import Items as Items
 from .document import Light as Light
 from .document import Link as Link
 from .document import Number as Number
+from .document import OutlineEditor as OutlineEditor
 from .document import Page as Page
 from .document import Picture as Picture
 from .document import Plot as Plot

@@ -5,8 +5,11 @@ The template has one macro for each class of blocks and escapes every text.
 
 from __future__ import annotations
 
+import base64
+import gzip
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 from markupsafe import Markup, escape
@@ -154,11 +157,36 @@ class Picture:
     file: str  # its place, relative to the page; or a data URL
     caption: str
     warning: str = ""  # what is said in red
+    edit: int | None = None  # its place in the editor of outlines of the page
 
     @property
     def is_inside(self) -> bool:
         """Whether the page holds it."""
         return self.file.startswith("data:")
+
+
+@dataclass(frozen=True)
+class OutlineEditor:
+    """A table of outlines that people correct over their photographs and download.
+
+    An image has ``view`` and ``image`` as the table names it, a ``label``, its ``photograph``
+    relative to the page, ``width`` and ``height`` [px], the number of its ``camera``, and
+    ``expected``: both ends [px] of outlines that were not found, by leg, part and edge. A camera
+    has ``K``, ``distortion`` and ``model``.
+    """
+
+    kind: ClassVar = "editor"
+    file: str  # the name of the table
+    table: str  # its text
+    images: Sequence[Mapping[str, Any]]
+    cameras: Sequence[Mapping[str, Any]]
+    sigma: float  # of ends that are placed by hand, unless people say otherwise [px]
+
+    @cached_property
+    def packed(self) -> Markup:
+        """The table, compressed, as a text."""
+        data = gzip.compress(self.table.encode(), mtime=0)
+        return Markup(base64.b64encode(data).decode())
 
 
 @dataclass(frozen=True)

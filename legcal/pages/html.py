@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from markupsafe import Markup
 
 from legcal.errors import printable
-from legcal.pages.document import Page, Picture, Plot, Row
+from legcal.pages.document import OutlineEditor, Page, Picture, Plot, Row
 from legcal.version import __version__
 
 if TYPE_CHECKING:
@@ -42,6 +42,11 @@ def page_html(page: Page) -> str:
             version=__version__,
             style=_asset("page.css"),
             script=_asset("page.js"),
+            editor_script=(
+                _asset("editor.js")
+                if any(isinstance(block, OutlineEditor) for block in blocks)
+                else ""
+            ),
             pictures=any(isinstance(block, Picture) and not block.is_inside for block in blocks),
             plotly=_plotly() if any(isinstance(block, Plot) for block in blocks) else "",
         )
