@@ -16,7 +16,8 @@ anything was named of sessions without a mistake.
 Right is the kind of mistake that was made, or one whose undoing gives the same machine: legs at the
 same places in all images, whatever their names and wherever the camera stands. That is computed
 for each diagnosis from the nominal model and the readings (a mirror-symmetric hexapod with reversed
-columns is one whose images are mirrored).
+columns is one whose images are mirrored). Where what was done leaves the machine the same, as with
+columns of a threefold symmetric one that are moved on, nothing should be named.
 """
 
 import argparse
@@ -49,6 +50,7 @@ MODELS = ("hexapod", "3-rps", "3-upu", "tricept")
 JOINTS, WRONG_JOINTS = 2e-3, 10e-3  # standard deviation of joint centres of the model [m]
 SAME = 0.01  # of the size of the machine: legs at the same places
 WRONG_RADIUS = 0.05  # relative
+ZERO = 0.1, 0.25  # least and greatest error of an encoder's zero, in its travel
 MIRROR = np.diag([1.0, -1.0, 1.0])
 CLEAN, OFF = "no mistake", "joints 10 mm off"
 
@@ -59,6 +61,14 @@ class Session:
 
     dataset: Dataset
     pairs: dict[str, CandidatePairs]
+    flip: tuple[int, ...] = ()  # views whose images are mirrored
+    focal: float = 1.0  # the right focal length as a part of the stated one
+
+    def true(self, data: OrderedDataset) -> Assumed:
+        """Return what is true of the session, by the data of one without the mistake."""
+        given = as_given(data)
+        given.flip[list(self.flip)] = LEFT_RIGHT
+        return replace(given, focal=self.focal)
 
 
 Make = Callable[[Session, np.random.Generator], Session]
@@ -129,14 +139,15 @@ def directions(session: Session, _: np.random.Generator) -> Session:
 
 
 def zero(session: Session, rng: np.random.Generator) -> Session:
-    """Move the zero of one encoder as far as its travel allows, by a quarter of it at most."""
+    """Move the zero of one encoder by a tenth to a quarter of its travel, which is stated wider."""
     machine, q = session.dataset.machine, session.dataset.measurements.q.copy()
     j = int(rng.choice(_motors(machine)))
     low, high = machine.legs[j].travel
-    up, down = high - q[:, j].max(), q[:, j].min() - low
-    size = min(max(up, down), 0.25 * (high - low))
-    q[:, j] += size if up > down else -size
-    return _with_readings(session, q)
+    size = float(rng.uniform(*ZERO)) * (high - low)
+    q[:, j] += float(rng.choice([-1.0, 1.0])) * size
+    legs = [replace(leg, travel=(low - size, high + size)) if k == j else leg
+            for k, leg in enumerate(machine.legs)]  # fmt: skip
+    return _with_readings(_with_legs(session, legs), q)
 
 
 def _rolled(session: Session, views: list[int], step: int) -> Session:
@@ -158,6 +169,16 @@ def shifted_view(session: Session, rng: np.random.Generator) -> Session:
     """Shift the readings of one view by a row."""
     n = len(session.dataset.measurements.views)
     return _rolled(session, [int(rng.integers(n))], int(rng.choice([-1, 1])))
+
+
+def dropped(session: Session, rng: np.random.Generator) -> Session:
+    """Shift the readings of one view by a row from one of its rows on."""
+    m = session.dataset.measurements
+    rows = np.flatnonzero(m.view == int(rng.integers(len(m.views))))
+    first = int(rng.integers(len(rows) // 4, len(rows) // 2))
+    q = m.q.copy()
+    q[rows[first:]] = m.q[np.roll(rows[first:], int(rng.choice([-1, 1])))]
+    return _with_readings(session, q)
 
 
 def views(session: Session, rng: np.random.Generator) -> Session:
@@ -235,7 +256,7 @@ def focal_length(session: Session, rng: np.random.Generator) -> Session:
     dataset = replace(session.dataset, measurements=replace(m, views=of_views))
     pairs = {image: as_if(one, np.zeros((2, 2)), np.ones(2), factor)
              for image, one in session.pairs.items()}  # fmt: skip
-    return Session(dataset, pairs)
+    return Session(dataset, pairs, focal=1.0 / factor)
 
 
 def _mirrored(session: Session, which: list[int]) -> Session:
@@ -244,7 +265,7 @@ def _mirrored(session: Session, which: list[int]) -> Session:
         if v in which:
             corners = sensor_extent(m.views[v].camera)
             pairs[image] = as_if(pairs[image], corners, LEFT_RIGHT, 1.0)
-    return replace(session, pairs=pairs)
+    return replace(session, pairs=pairs, flip=tuple(which))
 
 
 def mirrored(session: Session, _: np.random.Generator) -> Session:
@@ -266,6 +287,7 @@ MISTAKES: dict[str, tuple[Make, str]] = {  # with the kind of diagnosis that is 
     "zero": (zero, "zero of an encoder"),
     "shifted": (shifted, "readings shifted"),
     "shifted view": (shifted_view, "readings shifted"),
+    "dropped": (dropped, "readings shifted"),
     "views": (views, "views exchanged"),
     "diameter": (diameter, "diameter for radius"),
     "half radius": (half_radius, "diameter for radius"),
@@ -300,7 +322,7 @@ def is_same(mended: Assumed, true: Assumed) -> bool:
     """Say whether two assumptions show the same legs in all images, by whatever names."""
     rows = list(range(len(true.q)))
     (A, B), (A_true, B_true) = mended.joints(rows), true.joints(rows)
-    turned = np.all(mended.flip == LEFT_RIGHT, axis=1)
+    turned = np.any(mended.flip != true.flip, axis=1)
     if not (turned.all() or not turned.any()) or mended.focal != true.focal:
         return False
     n = true.machine.n_legs
@@ -376,19 +398,25 @@ def judged(kind: str, spoiled: Session, true: Session, pool: Run) -> dict[str, o
     start = time.monotonic()
     found = diagnose(data)
     entry: dict[str, object] = {"seconds": round(time.monotonic() - start, 1)}
-    if not found:
-        return entry | {"right": kind in (CLEAN, OFF), "named": None}
-    first = found[0]
-    entry |= {"named": first.kind, "sentence": first.sentence}
-    if kind in (CLEAN, OFF):
-        return entry | {"right": False}
-    is_kind = first.kind == MISTAKES[kind][1]
-    mended = next(one.true for one in mistakes(data) if one.what == first.what)
     reference = ordered(true, pool)
     place = {image: row for row, image in enumerate(data.measurements.image)}
     rows = [place[image] for image in reference.measurements.image]  # canonical orders may differ
-    is_equal = is_same(replace(mended, q=mended.q[rows]), as_given(reference))
-    return entry | {"right": bool(is_kind or is_equal), "kind": is_kind}
+    truth = spoiled.true(reference)
+
+    def is_true(one: Assumed) -> bool:
+        return is_same(replace(one, q=one.q[rows]), truth)
+
+    is_mistake = kind not in (CLEAN, OFF) and not is_true(as_given(data))
+    if not found:
+        return entry | {"right": not is_mistake, "named": None}
+    first = found[0]
+    entry |= {"named": first.kind, "sentence": first.sentence}
+    if not is_mistake:
+        return entry | {"right": False}
+    is_kind = first.kind == MISTAKES[kind][1]
+    mended = [one.true for one in mistakes(data) if one.what == first.what]
+    right = is_kind or any(is_true(one) for one in mended)
+    return entry | {"right": bool(right), "kind": is_kind}
 
 
 def deal(machine: Machine, each: int, counts: Counter[str], rng: np.random.Generator) -> list[str]:

@@ -17,7 +17,7 @@ from legcal.calibration.diagnosis import diagnosis
 from legcal.calibration.diagnosis.diagnosis import diagnose
 from legcal.calibration.diagnosis.mistakes import mistakes
 from legcal.calibration.ordered_dataset import order_dataset
-from legcal.data import Dataset
+from legcal.data import Dataset, dataset_at, row_names
 from legcal.errors import DatasetError, NotVisible
 from legcal.progress import no_progress
 from legcal.workers import in_turn
@@ -88,7 +88,7 @@ def _exchanged(d: Dataset) -> Dataset:
 
 
 def _another_zero(d: Dataset) -> Dataset:
-    q = d.measurements.q - 0.05 * (np.arange(6) == 1)
+    q = d.measurements.q - 0.038 * (np.arange(6) == 1)  # between two of the zeros that are tried
     leg = replace(d.machine.legs[1], travel=(-0.2, 0.2))
     machine = replace(d.machine, legs=(d.machine.legs[0], leg, *d.machine.legs[2:]))
     return replace(d, machine=machine, measurements=replace(d.measurements, q=q))
@@ -123,7 +123,7 @@ def outlines(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     ("change", "what", "other"),
     [
         (_exchanged, "columns leg3_prismatic and leg4_prismatic look exchanged", "legs leg3 and"),
-        (_another_zero, "column leg2_prismatic looks as if it had another zero: about", ""),
+        (_another_zero, "column leg2_prismatic looks as if it had another zero: about 38 mm", ""),
         (_late_in_one_view, "the readings of view c2 look as if they stood 1 row too late", ""),
         (_left_handed, "the joints of the model look mirrored", "the outlines look mirrored"),
         (_thick, "the radii of the legs in the model look twice as large as they are", ""),
@@ -147,6 +147,88 @@ def test_given_outlines_name_a_mistake_as_photographs_do(
     assert found.after >= 11 > found.before
     assert any(one.startswith(other) for one in found.same_as) or not other
     assert ("To tell these apart" in found.sentence) == bool(found.same_as)
+
+
+def _mirrored(d: Dataset, v: int) -> Dataset:
+    """Mirror the outlines of a view, of all for -1."""
+    outlines, camera = d.observations, d.measurements.views[0].camera
+    assert outlines is not None
+    chosen = (d.measurements.view[outlines.row] == v) | (v < 0)
+    h = np.where(chosen[:, None], outlines.h * [-1.0, 1.0, 1.0], outlines.h)
+    ends = outlines.ends.copy()
+    ends[chosen, :, 0] = 2.0 * camera.K[0, 2] - ends[chosen, :, 0]
+    return replace(d, observations=replace(outlines, h=h, ends=ends))
+
+
+def _late_from(d: Dataset, v: int, first: int) -> Dataset:
+    q, rows = d.measurements.q.copy(), np.flatnonzero(d.measurements.view == v)[first:]
+    q[rows] = q[np.roll(rows, 1)]
+    return replace(d, measurements=replace(d.measurements, q=q))
+
+
+def _diagnosed(d: Dataset, kinds: set[str], monkeypatch: pytest.MonkeyPatch) -> diagnosis.Diagnosis:
+    data = order_dataset(d, in_turn, no_progress)
+    few = [one for one in mistakes(data) if one.kind in kinds]
+    monkeypatch.setattr(diagnosis, "mistakes", lambda _: few)
+    (found,) = diagnose(data)
+    return found
+
+
+@pytest.fixture(scope="module")
+def of_symmetric_machine(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("outlines") / "set"
+    simulated(folder, "3-upu", poses=10)
+    return load_dataset(folder)
+
+
+def _of_few_poses(d: Dataset) -> Dataset:
+    return dataset_at(d, np.flatnonzero(d.measurements.pose % 10 < 7))
+
+
+def test_mirrored_outlines_of_one_view_lose_to_no_mistake_of_all_views(
+    of_symmetric_machine: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exchanged columns would mend that view alike, and spoil the other one."""
+    d = _mirrored(_of_few_poses(of_symmetric_machine), 1)
+    found = _diagnosed(d, {"columns exchanged", "images mirrored"}, monkeypatch)
+    assert found.what == "the outlines of view c2 look mirrored"
+    assert (found.after, found.same_as) == (14, ())
+
+
+def test_a_diagnosis_names_each_kind_of_mistake_that_images_do_not_tell_from_it(
+    of_symmetric_machine: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Any two columns of a threefold symmetric machine exchanged are its mirror image."""
+    kinds = {"columns exchanged", "images mirrored", "handedness"}
+    d = _mirrored(_of_few_poses(of_symmetric_machine), -1)
+    views = tuple(replace(view, T_base_camera=None) for view in d.measurements.views)
+    d = replace(d, measurements=replace(d.measurements, views=views))
+    found = _diagnosed(d, kinds, monkeypatch)
+    assert found.kind == "columns exchanged"
+    assert len([one for one in found.same_as if one.startswith("columns")]) == 2
+    told = found.sentence.partition(": with them exchanged")[0]
+    assert "or the outlines look mirrored, or the joints of the model look mirrored" in told
+    assert "or 2 more that are alike" in told
+
+
+def test_a_row_from_which_on_readings_are_late_is_named(
+    of_symmetric_machine: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    d = _late_from(of_symmetric_machine, 1, 3)
+    found = _diagnosed(d, {"readings shifted", "images mirrored"}, monkeypatch)
+    row = row_names(d.measurements)[int(np.flatnonzero(d.measurements.view == 1)[3])]
+    assert found.what.startswith(
+        f"the readings of view c2 look as if they stood 1 row too late from {row} on"
+    )
+    assert found.after > found.before
+
+
+def test_columns_of_a_symmetric_machine_that_begin_with_another_leg_are_no_mistake(
+    of_symmetric_machine: Dataset,
+) -> None:
+    d = _of_few_poses(of_symmetric_machine)
+    d = replace(d, measurements=replace(d.measurements, q=np.roll(d.measurements.q, 1, axis=1)))
+    assert diagnose(order_dataset(d, in_turn, no_progress)) == ()
 
 
 def test_an_encoder_that_stands_still_is_not_said_to_have_another_zero(outlines: Dataset) -> None:

@@ -8,18 +8,27 @@ far more images agree; those that images cannot tell from it are named with it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations, product
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.board import observe_board
-from legcal.calibration.diagnosis.mistakes import Assumed, Mistake, as_given, mistakes
+from legcal.calibration.diagnosis.mistakes import (
+    Assumed,
+    Mistake,
+    as_given,
+    mistakes,
+    rows_of_views,
+    shifted_from,
+)
 from legcal.calibration.documents import DiagnosisBlock
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.errors import LegcalError
 from legcal.geometry import Array, IntArray
+from legcal.machine import Machine
 from legcal.perception import (
     Agreement,
     Assumption,
@@ -44,14 +53,16 @@ _STARTS, _FEW_STARTS = (1, 1, 2), (1,)  # images that suggest cameras, of all an
 _POOL = 3  # cameras of other mistakes that are tried
 _FINALISTS = 6  # mistakes that all images judge
 _NEAR_BEST = 0.5  # of the gain of the best, which few images gave, that all images judge as well
-_SHOWN = 3  # of what images cannot tell from it, in a sentence
+_ONE_ROW = (1, -1)  # by which readings stand late from a row on
+_FINER = (0.5, 0.25)  # steps of an amount between those that are tried
+_SYMMETRIC = 0.03  # of the size of the machine, and the sine of angles
 _SAME = 0.03  # in the share of legs: no more than the lens makes of mirrored images
 _ALIKE = 0.9  # of the best support: as good, where images do not tell them apart
 _MIN_SHARE = 0.5  # of the images, that agree then
 _MIN_GAIN, _SURE_GAIN = 0.1, 0.05  # in the share of legs that images show, on average
 _MIRROR_X, _MIRROR_Y = np.diag([-1.0, 1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0, 1.0])
 _MIN_SIGMAS = 2.5  # of its signed ranks: chance gains in some images and loses in others
-_PLAIN_GAIN = 0.3  # of all of a few images
+_PLAIN_GAIN, _FEW_SIGMAS = 0.3, 2.2  # of all of six images
 _SURE_SIGMAS = 4.5  # of a gain that may be small: in nearly all of many images
 
 
@@ -66,7 +77,10 @@ class Diagnosis:
     what : str
         The same as a clause that names columns, views and legs.
     same_as : tuple of str
-        Clauses of what images cannot tell from it, the commoner first.
+        Clauses of what images cannot tell from it: one of each kind, then more of these kinds, the
+        commoner first.
+    n_kinds : int
+        How many of these the sentence has.
     mended : str
         What it would take.
     images, before, after : int
@@ -89,18 +103,21 @@ class Diagnosis:
     score: float
     remedy: str
     tests: tuple[str, ...] = ()
+    n_kinds: int = 0
 
     @property
     def sentence(self) -> str:
         """The diagnosis for people."""
-        more = len(self.same_as) - _SHOWN
-        others = "".join(f", or {other}" for other in self.same_as[:_SHOWN])
-        others += f", or {more} more that are alike" * (more > 0)
+        more = len(self.same_as) - self.n_kinds
+        others = "".join(f", or {other}" for other in self.same_as[: self.n_kinds])
+        others += f", or {more} more that {'is' if more == 1 else 'are'} alike" * (more > 0)
         what = self.what[0].upper() + self.what[1:]
         tell = f". To tell these apart, {', or '.join(self.tests)}" if self.tests else ""
+        rest = " (what the others show may have another cause as well)"
         return (
-            f"{what}{others}: {self.mended} {self.after} of {self.images} images agree, as it is "
-            f"{self.before}; {self.remedy}{tell}."
+            f"{what}{others}: {self.mended} {self.after} of {self.images} images agree"
+            f"{rest * (self.after < _MIN_SHARE * self.images)}, as it is {self.before}; "
+            f"{self.remedy}{tell}."
         )
 
     def document(self) -> DiagnosisBlock:
@@ -132,19 +149,19 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     judge = _Judge(data, groups)
     if judge.own.images > _AGREE_ALREADY * len(judge.own.row):
         return ()
-    tried = mistakes(data)
-    finalists = judge.finalists(tried)
-    found = {k: one for k in finalists if _explains(one := judge.all(tried[k].true), judge.own)}
+    tried = [*mistakes(data), *judge.shifted_from_a_row_on()]
+    judged = judge.judged({k: tried[k] for k in judge.finalists(tried)})
+    found = {k: (what, one) for k, (what, one) in judged.items() if _explains(one, judge.own)}
     data.progress(STAGE, 1, 1)
     if not found:
         return ()
-    best = max(found.values(), key=lambda one: float(one.support.sum()))
-    alike = [k for k, one in found.items() if _is_as_good(one, best)]
-    suited = {k: judge.hints_suited(found[k]) for k in alike}
+    best = max((one for _, one in found.values()), key=lambda one: float(one.support.sum()))
+    alike = [k for k, (_, one) in found.items() if _is_as_good(one, best)]
+    suited = {k: judge.hints_suited(found[k][1]) for k in alike}
     alike.sort(key=lambda k: (-suited[k], k))  # the commoner first
-    first = [tried[k] for k in alike]
+    first = [found[k][0] for k in alike]
     by_hints = len(alike) > 1 and suited[alike[0]] > max(suited[k] for k in alike[1:])
-    return (_diagnosis(first, found[alike[0]], judge.own, by_hints=by_hints),)
+    return (_diagnosis(first, found[alike[0]][1], judge.own, by_hints=by_hints),)
 
 
 def _rows_seen(data: OrderedDataset) -> IntArray:
@@ -199,6 +216,28 @@ class _Judge:
         for g, one in enumerate(self.of_groups):
             self.pool[g] += [T for T in one.cameras if T is not None]
         self.own = Agreement.joined(self.of_groups)
+        self.symmetries = symmetries(data.machine)
+
+    def shifted_from_a_row_on(self) -> list[Mistake]:
+        """Return where rows of single views may begin to stand late or early: the likeliest row.
+
+        Images before it agree as they are, those from it on with the readings of the next row.
+        """
+        found, of_views = list[Mistake](), rows_of_views(self.data)
+        for g, group in enumerate(self.groups):
+            for v, k in product(group.views, _ONE_ROW):
+                order = [row for row in of_views[v].tolist() if row in group.rows]
+                if len(order) < 2 * _MIN_IMAGES:
+                    continue
+                late = shifted_from(self.data, v, 0, k).true
+                now, then = self.of_groups[g], self._compare([late], g, group.rows, ())[0]
+                gain = dict(zip(now.row.tolist(), then.support - now.support, strict=True))
+                from_on = np.cumsum([gain[row] for row in order][::-1])[::-1]
+                first = int(np.argmax(from_on[_MIN_IMAGES : 1 - _MIN_IMAGES])) + _MIN_IMAGES
+                if from_on[first] > 0.0:
+                    place = of_views[v].tolist().index(order[first])
+                    found.append(shifted_from(self.data, v, place, k))
+        return found
 
     def finalists(self, tried: Sequence[Mistake]) -> list[int]:
         """Return the mistakes that a few images of the views that disagree most speak for."""
@@ -222,13 +261,15 @@ class _Judge:
                 break
             best_first = np.argsort(-gain, kind="stable")
             chosen = np.sort(best_first[: max(len(chosen) // 2, _FINALISTS)]).tolist()
-        best_first = np.argsort(-gain, kind="stable")
         found, amounts = list[int](), set[str]()
-        for k in best_first.tolist():
-            if gain[k] <= _NEAR_BEST * gain.max() or len(found) == _FINALISTS:
+        left_for = {True: _FINALISTS, False: _FINALISTS // 2}  # whether of all views, or of some
+        for k in np.argsort(-gain, kind="stable").tolist():
+            if gain[k] <= _NEAR_BEST * gain.max():
                 break
-            if tried[k].amount_of not in amounts:
+            of_all = not any(tried[k].true.is_as(self.given, g.rows, g.views) for g in self.groups)
+            if tried[k].amount_of not in amounts and left_for[of_all]:
                 found.append(k)
+                left_for[of_all] -= 1
                 amounts |= {tried[k].amount_of} - {""}
         return found
 
@@ -243,8 +284,11 @@ class _Judge:
         found[some] = -float(before.support.sum())
         support = np.zeros(len(tried))
 
-        def look(which: Sequence[int], starts: Sequence[int]) -> None:
-            agreements = self._compare([tried[k].true for k in which], g, group.some, starts)
+        def look(
+            which: Sequence[int], starts: Sequence[int], known: Sequence[RigidTransform] = ()
+        ) -> None:
+            which_true = [tried[k].true for k in which]
+            agreements = self._compare(which_true, g, group.some, starts, known)
             for k, one in zip(which, agreements, strict=True):
                 if (now := float(one.support.sum())) > support[k]:
                     support[k], cameras[k] = now, one.cameras[0]
@@ -256,18 +300,66 @@ class _Judge:
         if not _suits(support.max(), before):
             look([k for k in some if not tried[k].is_small], _FEW_STARTS)
             look([k for k in some if tried[k].is_small], ())
+        best = int(np.argmax(support))
+        if _suits(support.max(), before) and (T_best := cameras[best]) is not None:
+            worse = [k for k in some if support[k] < _ALIKE * support[best]]
+            look([k for k in worse if not tried[k].is_small], (), self._alike(T_best))
         return found + support
 
-    def all(self, assumed: Assumed) -> Agreement:
+    def judged(self, finalists: Mapping[int, Mistake]) -> dict[int, tuple[Mistake, Agreement]]:
+        """Return what all images say of some mistakes, with the amounts that suit them best."""
+        found = {k: (one, self.all(one.true)) for k, one in finalists.items()}
+        if not found:
+            return {}
+        first = max(found.values(), key=lambda one: float(one[1].support.sum()))[1]
+        alike = [[] if T is None else self._alike(T) for T in first.cameras]
+        for k, (what, one) in found.items():
+            if not _is_as_good(one, first):
+                one = _better(one, self.all(what.true, (), alike))
+            found[k] = self._best_amount(what, one)
+        return found
+
+    def _best_amount(self, what: Mistake, one: Agreement) -> tuple[Mistake, Agreement]:
+        """Return the amount of a mistake that suits all images best, by halving steps."""
+        known = [[] if T is None else [T] for T in one.cameras]
+        for step in _FINER if what.finer is not None else ():
+            assert what.finer is not None
+            for other in (what.finer(step), what.finer(-step)):
+                again = self.all(other.true, (), known)
+                if again.support.sum() > one.support.sum():
+                    what, one = other, again
+                    break
+        return what, one
+
+    def all(
+        self,
+        assumed: Assumed,
+        starts: Sequence[int] = _STARTS,
+        known: Sequence[Sequence[RigidTransform]] = (),
+    ) -> Agreement:
         """Return what all images say of an assumption."""
         return Agreement.joined(
             [
                 self.of_groups[g]
                 if assumed.is_as(self.given, group.rows, group.views)
-                else self._compare([assumed], g, group.rows, _STARTS)[0]
+                else self._compare([assumed], g, group.rows, starts, known[g] if known else ())[0]
                 for g, group in enumerate(self.groups)
             ]
         )
+
+    def _alike(self, T_base_camera: RigidTransform) -> list[RigidTransform]:
+        """Return the cameras that see the same under mistakes that are the same."""
+        found = []
+        for S in self.symmetries:
+            T = S @ T_base_camera.as_matrix()
+            if np.linalg.det(S[:3, :3]) < 0.0:
+                found.append(RigidTransform.from_matrix(T @ _MIRROR_X))
+            else:
+                found += [
+                    RigidTransform.from_matrix(T),
+                    _mirrored_camera(RigidTransform.from_matrix(T)),
+                ]
+        return found
 
     def hints_suited(self, one: Agreement) -> int:
         """Return how many rough camera poses suit the cameras that were found."""
@@ -278,9 +370,17 @@ class _Judge:
         )
 
     def _compare(
-        self, assumed: Sequence[Assumed], g: int, rows: Sequence[int], starts: Sequence[int]
+        self,
+        assumed: Sequence[Assumed],
+        g: int,
+        rows: Sequence[int],
+        starts: Sequence[int],
+        known: Sequence[RigidTransform] = (),
     ) -> list[Agreement]:
-        """Return what some images of a group say of assumptions."""
+        """Return what some images of a group say of assumptions, near cameras that are known.
+
+        These are the pool's where none are given.
+        """
         assumptions = [
             Assumption(
                 _search(self.search, one, rows),
@@ -289,11 +389,40 @@ class _Judge:
                 self.groups[g],
                 rows,
                 starts,
-                self.pool[g],
+                known or self.pool[g],
             )
             for one in assumed
         ]
         return compare_assumptions(assumptions, self.data.pool)
+
+
+def symmetries(machine: Machine) -> list[Array]:
+    """Return the motions (4, 4) of the base link that lay all legs at home on legs, and mirrorings.
+
+    Two legs of a machine may come to lie on any two others: four points on four define a motion.
+    """
+    B = machine.home.apply(machine.B_platform)
+    legs = np.stack([machine.A_base, B], axis=1)  # (n_legs, 2, 3)
+    size = float(np.std(legs.reshape(-1, 3), axis=0).max())
+    found = list[Array]()
+    for j, k in permutations(range(len(legs)), 2):
+        x, y = legs[[0, 1]].reshape(-1, 3), legs[[j, k]].reshape(-1, 3)
+        x_mean, y_mean = x.mean(axis=0), y.mean(axis=0)
+        U, _, Vt = np.linalg.svd((y - y_mean).T @ (x - x_mean))
+        for sign in (1.0, -1.0):
+            R = U @ np.diag([1.0, 1.0, sign]) @ Vt
+            moved = (legs - x_mean) @ R.T + y_mean
+            apart = np.linalg.norm(moved[:, None] - legs[None], axis=-1).max(axis=-1)
+            S = RigidTransform.identity().as_matrix()
+            S[:3, :3], S[:3, 3] = R, y_mean - R @ x_mean
+            is_new = all(np.abs(S - other).max() > _SYMMETRIC for other in found)
+            if np.all(apart.min(axis=1) < _SYMMETRIC * size) and is_new:
+                found.append(S)
+    return found
+
+
+def _better(one: Agreement, other: Agreement) -> Agreement:
+    return one if one.support.sum() >= other.support.sum() else other
 
 
 def _suits(support: float, own: Agreement) -> bool:
@@ -306,12 +435,14 @@ def _suits(support: float, own: Agreement) -> bool:
 def _explains(one: Agreement, own: Agreement) -> bool:
     """Say whether images agree so much better that it is no chance."""
     gain = one.share - own.share
-    if one.images < max(_MIN_SHARE * len(one.row), 2) or one.images <= own.images:
+    if one.images < 2 or one.images <= own.images:
         return False
     some = gain[gain != 0.0]
     size, sigmas = float(some.mean()), _signed_ranks(gain)
+    if one.images < _MIN_SHARE * len(one.row):  # images show little, whatever is true
+        return size >= _MIN_GAIN and sigmas >= _SURE_SIGMAS
     is_sure = size >= _SURE_GAIN and sigmas >= _SURE_SIGMAS
-    is_plain = size >= _PLAIN_GAIN and len(some) >= _FEW and bool(np.all(some > 0.0))
+    is_plain = size >= _PLAIN_GAIN and sigmas >= _FEW_SIGMAS
     return is_plain or is_sure or (size >= _MIN_GAIN and sigmas >= _MIN_SIGMAS)
 
 
@@ -338,7 +469,9 @@ def _diagnosis(
 ) -> Diagnosis:
     """Return the diagnosis of mistakes that images cannot tell apart."""
     first = alike[0]
-    same = dict.fromkeys([*first.same_as, *(one.what for one in alike[1:])])
+    kinds = {one.kind: one for one in reversed(alike) if one.kind != first.kind}  # their first
+    of_kinds = [*first.same_as, *(one.what for one in alike if kinds.get(one.kind) is one)]
+    same = dict.fromkeys([*of_kinds, *(one.what for one in alike[1:])])
     tests = dict.fromkeys(one.test for one in alike if one.test) if same else {}
     rough = ["the rough T_base_camera of the views speak for the first"] * by_hints
     return Diagnosis(
@@ -352,6 +485,7 @@ def _diagnosis(
         score=after.mean,
         remedy=", ".join([first.remedy, *rough]) if rough else first.remedy,
         tests=tuple(tests)[:2],
+        n_kinds=len(of_kinds),
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.ordered_dataset import OrderedDataset
-from legcal.data import INCH, inverse, readings_of_lengths
+from legcal.data import INCH, inverse, readings_of_lengths, row_names
 from legcal.files import LENGTH
 from legcal.geometry import Array, IntArray
 from legcal.machine import Leg, LegKind, Machine, follow_poses, readings_at
@@ -21,10 +21,10 @@ _STEP = 1.0 / 16.0  # of the way from home to readings, at least
 _MIRROR = np.diag([1.0, -1.0, 1.0])
 _MIRROR_4 = np.diag([1.0, -1.0, 1.0, 1.0])
 _FOCAL_LENGTHS = (2.0, 0.5, 1.5, 2.0 / 3.0, 1.25, 0.8)  # of scaled and cropped images
+_FOCAL_STEP = 1.25  # between them, about
 _SHIFTS = (1, -1, 2, -2)  # rows
 _ZEROS = 8  # steps of the zero of an encoder, in its travel
 _STILL = 0.1  # of such a step: readings that move by less are of an encoder that stands still
-_SHARED = 1.0 / 3.0  # of the images of a session that a view has, to be tried alone
 _SAME_RADIUS = 1e-3  # relative: parts that are equally thick are one kind
 
 
@@ -91,6 +91,8 @@ class Mistake:
     test: str = ""  # what would decide whether it is this: "move one leg alone and ..."
     is_small: bool = False  # cameras stand about where images have them as things are
     amount_of: str = ""  # mistakes of one name differ by how much: the best stands for all
+    # The same by more or less, in steps between those that are tried; None where it has no amount.
+    finer: Callable[[float], Mistake] | None = None
 
 
 def as_given(data: OrderedDataset) -> Assumed:
@@ -139,7 +141,7 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
             (f"legs {legs} look exchanged in the model",),
             _MOVE_ONE,
         )
-    if n > 2:
+    if n > 3:  # of three these are two exchanged
         yield Mistake(
             "columns reversed",
             "the columns of readings look as if they were in reverse order",
@@ -162,41 +164,70 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
             )
 
 
+def shifted_from(data: OrderedDataset, v: int, first: int, k: int) -> Mistake:
+    """Return readings of a view that stand k rows late from its first-th one on in the file.
+
+    The last ones, whose own are not known, are left as they are.
+    """
+    given, rows = as_given(data), rows_of_views(data)[v][first:]
+    q = given.q.copy()
+    q[rows[:-k] if k > 0 else rows[-k:]] = given.q[rows[k:] if k > 0 else rows[:k]]
+    name, row = data.measurements.views[v].name, data.order.rows[rows[0]]
+    where = row_names(data.dataset.measurements)[row]
+    return Mistake(
+        "readings shifted",
+        f"the readings of view {name} look as if they stood {_rows_late(k)} from {where} on, as if "
+        + ("an image were missing there" if k > 0 else "a row of readings were missing there"),
+        f"with them moved by {abs(k)}",
+        "check which image belongs to which row",
+        replace(given, q=q),
+        amount_of=f"rows of view {name}",
+    )
+
+
+def rows_of_views(data: OrderedDataset) -> list[IntArray]:
+    """Return the rows of each view in the order of the file."""
+    view, to_file = data.measurements.view, data.order.rows
+    return [
+        np.flatnonzero(view == v)[np.argsort(to_file[view == v], kind="stable")]
+        for v in range(len(data.measurements.views))
+    ]
+
+
+def _rows_late(k: int) -> str:
+    return f"{abs(k)} row{'s' * (abs(k) > 1)} too {'early' if k < 0 else 'late'}"
+
+
 def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
     """Yield readings of other images: shifted by rows, views exchanged."""
-    to_file = data.order.rows
-    view = data.measurements.view
-    n_views = len(data.measurements.views)
-    # Rows of each view in the order of the file.
-    of_view = [
-        np.flatnonzero(view == v)[np.argsort(to_file[view == v], kind="stable")]
-        for v in range(n_views)
-    ]
+    of_view = rows_of_views(data)
     names = [one.name for one in data.measurements.views]
     every = [rows for rows in of_view if len(rows)]
 
-    def moved(which: Sequence[IntArray], k: int, where: str) -> Iterator[Mistake]:
+    def moved(which: Sequence[IntArray], k: int, view: str = "") -> Iterator[Mistake]:
         if any(len(rows) <= abs(k) + 1 for rows in which):
             return
         q = given.q.copy()
         for rows in which:
             q[rows] = given.q[np.roll(rows, -k)]
-        later = f"{abs(k)} row{'s' * (abs(k) > 1)} too {'early' if k < 0 else 'late'}"
+        where = f" of view {view}" if view else ""
         yield Mistake(
             "readings shifted",
-            f"the readings{where} look as if they stood {later}: each image has those of another",
+            f"the readings{where} look as if they stood {_rows_late(k)}: each image has those of "
+            "another",
             f"with them moved by {abs(k)}",
             "check which image belongs to which row",
             replace(given, q=q),
+            amount_of=f"rows{where}",
         )
 
     for k in _SHIFTS:
-        yield from moved(every, k, "")
+        yield from moved(every, k)
     for v, rows in enumerate(of_view):
-        if len(every) > 1 and len(rows) >= _SHARED * len(view):
+        if len(every) > 1:
             for k in _SHIFTS[:2]:
-                yield from moved([rows], k, f" of view {names[v]}")
-    for a, b in combinations(range(n_views), 2):
+                yield from moved([rows], k, names[v])
+    for a, b in combinations(range(len(of_view)), 2):
         if len(of_view[a]) != len(of_view[b]) or len(of_view[a]) < 2:
             continue
         q = given.q.copy()
@@ -260,30 +291,41 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
                 "reverse it in the table of readings",
                 with_readings(change[:, k : k + 1], [k]),
             )
-    for m in range(-_ZEROS, _ZEROS + 1):
-        if m == 0:
-            continue
-        size = f"{abs(1e3 * m * float(steps.mean())):.0f} mm too {'small' if m > 0 else 'large'}"
-        yield Mistake(
-            "zero of encoders",
-            f"the readings of all legs look as if they had another zero: about {size}",
+
+    def another_zero(which: Sequence[int], m: float) -> Mistake:
+        step = steps[which[0]] if len(which) == 1 else float(steps.mean())
+        size = f"{abs(1e3 * m * step):.0f} mm too {'small' if m > 0 else 'large'}"
+        change = with_readings(own[:, which] + m * step, which)
+        added, finer = (
             f"with that {'added' if m > 0 else 'taken off'}",
-            "correct the table of readings, or the offsets in the model",
-            with_readings(own + m * steps.mean(), every),
-            is_small=True,
-            amount_of="zero of all encoders",
+            partial(another_zero, which),
         )
-        for k in moving:
-            size = f"{abs(1e3 * m * steps[k]):.0f} mm too {'small' if m > 0 else 'large'}"
-            yield Mistake(
-                "zero of an encoder",
-                f"column {legs[k].prismatic} looks as if it had another zero: about {size}",
-                f"with that {'added' if m > 0 else 'taken off'}",
-                "correct it in the table of readings, or the offset of the leg in the model",
-                with_readings(own[:, k : k + 1] + m * steps[k], [k]),
+        if len(which) > 1:
+            return Mistake(
+                "zero of encoders",
+                f"the readings of all legs look as if they had another zero: about {size}",
+                added,
+                "correct the table of readings, or the offsets in the model",
+                change,
                 is_small=True,
-                amount_of=f"zero of encoder {k}",
+                amount_of="zero of all encoders",
+                finer=lambda more: finer(m + more),
             )
+        return Mistake(
+            "zero of an encoder",
+            f"column {legs[which[0]].prismatic} looks as if it had another zero: about {size}",
+            added,
+            "correct it in the table of readings, or the offset of the leg in the model",
+            change,
+            is_small=True,
+            amount_of=f"zero of encoder {which[0]}",
+            finer=lambda more: finer(m + more),
+        )
+
+    for m in (*range(-_ZEROS, 0), *range(1, _ZEROS + 1)):
+        yield another_zero(every, m)
+        for k in moving:
+            yield another_zero([k], m)
 
 
 def _zero_step(leg: Leg, q: Array) -> float:
@@ -295,10 +337,9 @@ def _zero_step(leg: Leg, q: Array) -> float:
 def _of_images(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
     """Yield images that are turned over, all or those of a view."""
     views = data.measurements.views
-    share = np.bincount(data.measurements.view, minlength=len(views)) / data.measurements.n_rows
     which = [(list(range(len(views))), "")]
     for v, view in enumerate(views):
-        if len(views) > 1 and share[v] >= _SHARED:
+        if len(views) > 1:
             which.append(([v], f" of view {view.name}"))
     for chosen, of_view in which:
         for turn, kind, what in (
@@ -429,13 +470,17 @@ def _with_radii(machine: Machine, radius: Callable[[float], float]) -> Machine:
 
 def _of_cameras(given: Assumed) -> Iterator[Mistake]:
     """Yield focal lengths of images that were scaled or cropped."""
-    for factor in _FOCAL_LENGTHS:
-        yield Mistake(
-            "focal length",
-            f"the focal length looks as if it were {factor:.2g} times the stated one: images "
-            "that were scaled or cropped after the camera was calibrated, or another zoom",
-            "with that",
-            "calibrate the camera with images as these are (legcal camera)",
-            replace(given, focal=factor),
-            amount_of="focal length",
-        )
+    yield from (_focal_length(given, factor) for factor in _FOCAL_LENGTHS)
+
+
+def _focal_length(given: Assumed, factor: float) -> Mistake:
+    return Mistake(
+        "focal length",
+        f"the focal length looks as if it were {factor:.2g} times the stated one: images that were "
+        "scaled or cropped after the camera was calibrated, or another zoom",
+        "with that",
+        "calibrate the camera with images as these are (legcal camera)",
+        replace(given, focal=factor),
+        amount_of="focal length",
+        finer=lambda more: _focal_length(given, factor * _FOCAL_STEP**more),
+    )
