@@ -22,6 +22,7 @@ from .machine import inverse_kinematics as inverse_kinematics
 from .machine import load_mechanism as load_mechanism
 from .machine import random_configurations as random_configurations
 from .machine import singularity as singularity
+from .planning import plan as plan
 from .report import write_report as write_report
 from .simulation import Appearance as Appearance
 from .simulation import ParameterErrors as ParameterErrors

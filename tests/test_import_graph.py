@@ -19,6 +19,7 @@ ROOMS = (
     "perception",
     "paper",
     "calibration",
+    "planning",
     "exports",
     "report",
     "cli",

@@ -14,8 +14,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
 from legcal.geometry import Array
 from legcal.machine import (
+    JITTER,
     MIN_SINGULARITY,
     Configurations,
+    Feasibility,
     LegKind,
     Machine,
     forward_kinematics,
@@ -27,7 +29,7 @@ from legcal.machine import (
 from legcal.machine.mobility import determinant_sign
 from legcal.simulation import Sampling, commanded_poses, draw_poses, write_true_model
 from legcal.simulation import poses as module
-from legcal.simulation.poses import JITTER, Feasibility, are_extreme, given_poses
+from legcal.simulation.poses import are_extreme, given_poses
 from legcal.simulation.settings import DEFAULT_ERRORS
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))

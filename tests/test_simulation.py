@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge
-from legcal.machine import load_mechanism, to_vector
+from legcal.machine import JITTER, load_mechanism, to_vector
 from legcal.simulation import (
     OutlineNoise,
     TableNoise,
@@ -21,7 +21,6 @@ from legcal.simulation import (
     perturb,
 )
 from legcal.simulation.hexapod import follow_from_home, poses_with_lengths, simulated_leg_vectors
-from legcal.simulation.poses import JITTER
 
 
 def test_the_hexapod_in_memory_is_the_shipped_one() -> None:

@@ -32,6 +32,7 @@ from legcal.cli.export import export
 from legcal.cli.import_ import import_
 from legcal.cli.init import init
 from legcal.cli.options import INTERRUPTED, print_failure
+from legcal.cli.plan import plan
 from legcal.cli.schema import schema
 from legcal.cli.simulate import simulate
 from legcal.cli.study import study
@@ -82,6 +83,7 @@ for command in (
     new,
     init,
     noise,
+    plan,
     simulate,
     example,
     schema,

@@ -33,6 +33,12 @@ from .equations import pose_equations as pose_equations
 from .equations import pose_sensitivity as pose_sensitivity
 from .equations import twist_residual as twist_residual
 from .family import description_of as description_of
+from .feasibility import JITTER as JITTER
+from .feasibility import Feasibility as Feasibility
+from .feasibility import feasible_poses as feasible_poses
+from .feasibility import motor_travel as motor_travel
+from .feasibility import near_ends as near_ends
+from .feasibility import poses_at as poses_at
 from .files import DATASET_YAML as DATASET_YAML
 from .files import RESULT_YAML as RESULT_YAML
 from .files import shipped_folder as shipped_folder

@@ -17,6 +17,7 @@ from legcal.geometry import Array, BoolArray, IntArray, frame_on_points
 from legcal.machine import (
     KinematicParameters,
     from_vector,
+    near_ends,
     point_like_legs,
     pose_equations,
     solve_poses,
@@ -31,7 +32,6 @@ from legcal.simulation.observe import (
     outlines_of,
     plain_scene,
 )
-from legcal.simulation.poses import near_ends
 from legcal.simulation.visibility import Viewpoint
 from legcal.vision import Camera
 

@@ -1,68 +1,44 @@
 """Poses that a controller could command: both the true machine and its nominal model reach them.
 
-Readings of the motors are drawn (or given) and followed from home on the closed chain. A pose
-counts if joints stay inside their limits, no leg runs through another, and no singularity is near,
-there and on the way (:class:`Feasibility`). Where motors do not determine the pose, a random walk
-takes the place of readings.
+They are drawn (:func:`legcal.machine.feasible_poses`) or given by their readings.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from legcal.data import reading_columns, readings_in
-from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
+from legcal.errors import DatasetError, DidNotConverge, UsageError
 from legcal.files import read_table
-from legcal.geometry import Array, BoolArray, IntArray, segment_distance
+from legcal.geometry import Array, BoolArray
 from legcal.machine import (
-    MIN_SINGULARITY,
+    JITTER,
     TRAVEL_TOLERANCE,
     Configurations,
+    Feasibility,
     Machine,
-    beyond_travel,
-    consistent_readings,
     contradiction,
+    feasible_poses,
     follow,
     forward_kinematics,
-    joint_values,
+    motor_travel,
     platform_pose,
-    random_walk,
+    poses_at,
     singularity,
     slider_columns,
-    vectors_A_to_B,
 )
 from legcal.progress import Report, no_progress
 from legcal.simulation.request import Sampling
-
-JITTER = 0.12  # of the travel, by which extreme readings stay away from its ends at most
-
-_ANGLE_ROUNDING = 1e-9  # [rad]
-
-_MAX_DRAWS = 60  # for each pose
-_FULL_EXTREME, _FULL = 12, 2  # draws over all of the travel; the next are nearer to home
-_NEARER = 0.85  # each
-_BEFORE_LAST = 6  # draws before the one that reached the last pose; extremes begin at the first
-_WAY = (0.25, 0.5, 0.75, 1.0)  # parts of the way from home at which the pose must be feasible
-_SHORTEST = 0.25  # least step of such a part; what is harder to reach is drawn again
-_MAX_FAILED_POSES = 5  # one after the other
 
 _REGULAR_NOMINAL = 0.05  # of the nominal model's singularity measure at home
 _MAX_ROUNDS = 20  # of draws for poses that the nominal model does not reach
 
 
-def near_ends(end: IntArray, draws: Array) -> Array:
-    """Return places in the travel, 0 the shortest and 1 the longest, near given ends of it."""
-    return np.asarray(np.abs(end - JITTER * draws))
-
-
 def are_extreme(machine: Machine, readings: Array) -> BoolArray:
     """Say in which poses every motor is near an end of its travel, (n_poses,)."""
-    lower, upper = _travel(machine)
+    lower, upper = motor_travel(machine)
     part = (readings[:, list(machine.motors)] - lower) / (upper - lower)
     return np.asarray(np.all(np.minimum(part, 1.0 - part) <= JITTER, axis=1))
 
@@ -80,33 +56,8 @@ def draw_poses(
             f"Poses could not be drawn: found {n_poses} poses and the sampling '{sampling}', "
             f"needed at least one pose and {' or '.join(Sampling)}; choose them."
         )
-    problems: Counter[str] = Counter()
     extreme = Sampling(sampling) is Sampling.EXTREME
-    draws = (
-        _followed(machine, rng, problems, extreme=extreme)
-        if machine.is_determined
-        else _walked(machine, rng, problems)
-    )
-    found: list[Array] = []
-    failed = 0
-    progress("Poses", 0, n_poses)
-    while len(found) < n_poses and failed < _MAX_FAILED_POSES:
-        configuration = next(draws)
-        if configuration is None:
-            failed += 1
-        else:
-            failed = 0
-            found.append(configuration)
-            progress("Poses", len(found), n_poses)
-    if len(found) < n_poses:
-        common = ", ".join(f"{count} times {what}" for what, count in problems.most_common(3))
-        raise DidNotConverge(
-            f"{machine.yaml_path}: {n_poses} poses could not be drawn: found {len(found)} that "
-            f"the machine reaches in {problems.total() + len(found)} draws "
-            f"({common}), needed all; check legcal.home and the limits of the joints, or "
-            "give poses."
-        )
-    return _poses(machine, found)
+    return feasible_poses(machine, n_poses, rng, extreme=extreme, progress=progress)
 
 
 def given_poses(machine: Machine, path: Path) -> Configurations:
@@ -154,7 +105,7 @@ def given_poses(machine: Machine, path: Path) -> Configurations:
             )
     if problems:
         raise DatasetError(problems)
-    return _poses(machine, reached[1:])
+    return poses_at(machine, reached[1:])
 
 
 def commanded_poses(
@@ -184,175 +135,12 @@ def commanded_poses(
             if _reaches(nominal, q)
         ]
         if len(kept) == n_poses:
-            return _poses(truth, kept)
+            return poses_at(truth, kept)
     raise DidNotConverge(
         f"{nominal.yaml_path}: {n_poses} poses could not be drawn: found {len(kept)} that "
         f"the true machine and the nominal model reach at the same readings in {_MAX_ROUNDS} "
         "rounds, needed all; make the errors of the true machine smaller, or give poses."
     )
-
-
-class Feasibility:
-    """What keeps a closed configuration from being a pose: limits, singularities, collisions."""
-
-    def __init__(self, machine: Machine) -> None:
-        self._machine = machine
-        limited = [
-            (joint, joint.limits)
-            for joint in machine.urdf.joints.values()
-            if joint.type == "revolute" and joint.limits is not None
-        ]
-        self._revolutes = [joint.name for joint, _ in limited]
-        self._columns = [machine.chain.q_index(name) for name in self._revolutes]
-        self._limits = np.array([limits for _, limits in limited]).reshape(-1, 2)
-        self._min_singularity = MIN_SINGULARITY * singularity(machine, machine.home)
-        cylinders = [(j, c) for j, leg in enumerate(machine.legs) for c in leg.cylinders]
-        self._leg = np.array([j for j, _ in cylinders], dtype=np.intp)
-        self._ends = np.array([(c.start, c.end) for _, c in cylinders]).reshape(-1, 2)
-        self._on_platform = np.array([c.side == "platform" for _, c in cylinders], dtype=np.bool_)
-        radius = np.array([c.radius for _, c in cylinders])
-        pairs = np.stack(np.triu_indices(len(cylinders), 1))
-        self._pairs = pairs[:, self._leg[pairs[0]] != self._leg[pairs[1]]]
-        self._clearance = radius[self._pairs].sum(axis=0)
-        apart = ~self._touching(machine.home)  # cylinders that touch at home are built so
-        self._pairs, self._clearance = self._pairs[:, apart], self._clearance[apart]
-        problem = self._beyond_limits(machine.home_configuration)
-        if problem is not None:
-            raise ModelError(
-                f"{machine.yaml_path}: no pose could be drawn: found {problem} at home, needed "
-                "every joint inside its limits there; correct legcal.home or the limits of the "
-                "URDF."
-            )
-
-    def problem(self, configuration: Array, *, of_motors: bool = True) -> str | None:
-        """Return what makes a closed configuration infeasible, None if nothing does.
-
-        The travel of motors is left out where their readings have been checked already.
-        """
-        machine = self._machine
-        outside = beyond_travel(machine, configuration)
-        if not of_motors:
-            outside[list(machine.motors)] = False
-        beyond = np.flatnonzero(outside)
-        if len(beyond):
-            return f"leg '{machine.leg_names[beyond[0]]}' outside its travel"
-        problem = self._beyond_limits(configuration)
-        if problem is not None:
-            return problem
-        T = platform_pose(machine, configuration)
-        if singularity(machine, T) < self._min_singularity:
-            return "the mechanism near a singularity"
-        collision = self.collision(T)
-        if collision is not None:
-            return f"legs '{collision[0]}' and '{collision[1]}' run through each other"
-        return None
-
-    def collision(self, T_base_platform: RigidTransform) -> tuple[str, str] | None:
-        """Return the first two legs that run through each other at a pose, None if none do."""
-        touching = np.flatnonzero(self._touching(T_base_platform))
-        if not len(touching):
-            return None
-        one, two = self._leg[self._pairs[:, touching[0]]]
-        return self._machine.leg_names[one], self._machine.leg_names[two]
-
-    def _touching(self, T_base_platform: RigidTransform) -> BoolArray:
-        """Return which pairs of cylinders are nearer than the sum of their radii."""
-        vectors = vectors_A_to_B(self._machine, T_base_platform)
-        lengths = np.linalg.norm(vectors, axis=1)
-        u = (vectors / lengths[:, None])[self._leg]
-        along = self._ends + np.where(self._on_platform, lengths[self._leg], 0.0)[:, None]
-        start = self._machine.A_base[self._leg] + along[:, :1] * u
-        one, two = self._pairs
-        span = np.diff(along, axis=1) * u
-        distance = segment_distance(start[one], span[one], start[two], span[two])
-        return np.asarray(distance < self._clearance)
-
-    def _beyond_limits(self, configuration: Array) -> str | None:
-        """Return which revolute joint is outside its limits, whole turns not counted."""
-        lower, upper = self._limits.T
-        angles = configuration[self._columns]
-        above = np.mod(angles - lower + _ANGLE_ROUNDING, 2.0 * np.pi) - _ANGLE_ROUNDING
-        beyond = np.flatnonzero(above > upper - lower + _ANGLE_ROUNDING)
-        if not len(beyond):
-            return None
-        i = int(beyond[0])
-        limits = f"{np.degrees(lower[i]):.1f} to {np.degrees(upper[i]):.1f} deg"
-        return f"joint '{self._revolutes[i]}' outside its limits of {limits}"
-
-
-def _followed(
-    machine: Machine, rng: np.random.Generator, problems: Counter[str], *, extreme: bool
-) -> Iterator[Array | None]:
-    """Yield configurations that are followed from home to drawn readings; None after many failures.
-
-    Draws that fail come nearer to home; the next pose begins a few draws before the one that
-    succeeded.
-    """
-    feasibility = Feasibility(machine)
-    home = machine.home_configuration[slider_columns(machine, machine.motors)[0]]
-    lower, upper = _travel(machine)
-    last = 0  # the draw that reached the last pose
-
-    def drawn(shrink: float) -> Array:
-        part = rng.random(len(home))
-        if extreme:
-            part = near_ends(rng.integers(0, 2, len(home)), part)
-        q = consistent_readings(machine, (lower + part * (upper - lower))[None])[0]
-        return np.asarray(q if shrink == 1.0 else np.clip(home + shrink * (q - home), lower, upper))
-
-    def reached(readings: Array) -> Array | str:
-        """Return the configuration, or what is in the way."""
-        configuration = machine.home_configuration
-        for part in _WAY:
-            q = readings if part == 1.0 else home + part * (readings - home)
-            try:
-                configuration = follow(
-                    machine, configuration, q, min_step=_SHORTEST, on_the_chain=True
-                )
-            except DidNotConverge:
-                return "legs that cannot have such lengths at the same time"
-            problem = feasibility.problem(configuration, of_motors=part == 1.0)
-            if problem is not None:
-                return problem
-        return configuration
-
-    while True:
-        first = 0 if extreme else max(0, last - _BEFORE_LAST)
-        for draw in range(first, first + _MAX_DRAWS):
-            full = _FULL_EXTREME if extreme else _FULL
-            found = reached(drawn(_NEARER ** max(0, draw + 1 - full)))
-            if not isinstance(found, str):
-                last = draw
-                yield found
-                break
-            problems[found] += 1
-        else:
-            yield None
-
-
-def _walked(
-    machine: Machine, rng: np.random.Generator, problems: Counter[str]
-) -> Iterator[Array | None]:
-    """Yield configurations of a random walk on the closed chain; None after many failures."""
-    feasibility, here = Feasibility(machine), machine.home_configuration
-    while True:
-        for _ in range(_MAX_DRAWS):
-            there = random_walk(machine, here, rng)
-            problem = feasibility.problem(there)
-            if problem is None or beyond_travel(machine, there).any():
-                here = there  # walks never lead further out of the travel
-            if problem is None:
-                yield there
-                break
-            problems[problem] += 1
-        else:
-            yield None
-
-
-def _travel(machine: Machine) -> tuple[Array, Array]:
-    """Return the lowest and the highest reading of the motors, (n_motors,) [m]."""
-    lower, upper = np.array([machine.legs[j].travel for j in machine.motors]).reshape(-1, 2).T
-    return lower, upper
 
 
 def _outside_travel(machine: Machine, row: Array) -> str | None:
@@ -375,12 +163,3 @@ def _reaches(nominal: Machine, q: Array) -> bool:
     except DidNotConverge:
         return False
     return singularity(nominal, T) >= _REGULAR_NOMINAL * singularity(nominal, nominal.home)
-
-
-def _poses(machine: Machine, configurations: list[Array]) -> Configurations:
-    """Return closed configurations as poses."""
-    return Configurations(
-        np.array(configurations),
-        np.array([joint_values(machine, c) for c in configurations]),
-        [platform_pose(machine, c) for c in configurations],
-    )

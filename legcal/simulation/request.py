@@ -95,6 +95,15 @@ class Request:
             metavar="N|CSV",
         ),
     )
+    plan: Path | None = field(
+        default=None,
+        metadata=_option(
+            "Instead of poses and cameras: a session that legcal plan wrote, with tripods as far "
+            "off as it allows for.",
+            _MOTION,
+            metavar="SESSION",
+        ),
+    )
     sampling: Sampling | None = field(
         default=None,
         metadata=_option(

@@ -38,6 +38,7 @@ from legcal.simulation.observe import (
     corners_in_images,
     outlines_of,
 )
+from legcal.simulation.planned import read_plan
 from legcal.simulation.poses import commanded_poses, given_poses
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.scene import RenderedView, prepare_view
@@ -90,10 +91,16 @@ def simulate_session(
     progress: Report = no_progress,
 ) -> SimulatedSession:
     """Return a session of a true machine of which the nominal model is known."""
+    planned = None if settings.plan is None else read_plan(settings.plan, nominal)
     cameras, given = _cameras(settings)
+    if planned is not None:
+        given = planned.viewpoints(rngs["cameras"])
+        cameras = {view.name: view.camera for view in given}
     shared = settings.shared_poses or not isinstance(settings.poses, int)
     n_sets = 1 if shared else len(cameras)
-    if isinstance(settings.poses, int):
+    if planned is not None:
+        poses = planned.poses(truth)
+    elif isinstance(settings.poses, int):
         n_poses = settings.poses * n_sets
         poses = commanded_poses(truth, nominal, n_poses, rngs["poses"], settings.sampling, progress)
     else:
@@ -142,10 +149,12 @@ def simulate_session(
         views, groups = _in_hand(truth, posed_machines, n_sets, cameras, rngs, progress)
     if settings.level is Level.PHOTOGRAPHS:
         views = _encoding(views, settings.appearance.gamma, settings.tell_gamma)
-    poses_of = [
+    poses_of: list[Sequence[int]] = [
         [v % len(posed_machines)] if groups else _poses_of(v, n_sets, posed_machines)
         for v in range(len(views))
     ]
+    if planned is not None:
+        poses_of = list(planned.poses_of)
     images = take_images(truth.legs, posed_machines, views, poses_of, settings.images, progress)
     rows = list(range(len(images)))
     if settings.level is not Level.PHOTOGRAPHS:
@@ -168,6 +177,10 @@ def simulate_session(
     measurements = _recorded(
         truth, poses, labels, scene, settings, rngs, hints=settings.hints and not groups
     )
+    if planned is not None and settings.hints:  # they are where the tripods should stand
+        both = zip(measurements.views, planned.measurements.views, strict=True)
+        hinted = tuple(replace(view, T_base_camera=p.T_base_camera) for view, p in both)
+        measurements = replace(measurements, views=hinted)
     return SimulatedSession(
         measurements, outlines, axes, corners, truth, poses, labels, posed_machines, scene,
         len(images) - len(rows), boards, groups,

@@ -199,6 +199,8 @@ class SimulationSettings:
         Seed of all random numbers.
     platform_board : Board, str, Path or None
         As ``board``, on the platform.
+    plan : Path or None
+        A session that ``legcal plan`` wrote, which says poses, cameras and views.
 
     Raises
     ------
@@ -225,11 +227,12 @@ class SimulationSettings:
     hand_held: bool = False
     seed: int = 0
     platform_board: Board | str | Path | None = None
+    plan: Path | None = None
 
     def __post_init__(self) -> None:
         for name, choices in (("level", Level), ("sampling", Sampling)):
             object.__setattr__(self, name, _choice(choices, name, getattr(self, name)))
-        for name in ("poses", "views", "camera"):
+        for name in ("poses", "views", "camera", "plan"):
             if isinstance(getattr(self, name), str):
                 object.__setattr__(self, name, Path(getattr(self, name)))
         self._check_kinds()
@@ -438,12 +441,29 @@ def requested(request: Request, nominal: Machine) -> SimulationSettings:
         readings=_spread(request.encoder_noise, LENGTH, Distribution.NORMAL, "--encoder-noise"),
         appearance=_appearance(request),
         seed=request.seed,
+        plan=request.plan,
     )
 
 
 def _refuse_contradictions(request: Request, poses: int | Path, nominal: Machine) -> None:
     """Refuse options that others make void."""
     problems = []
+    if request.plan is not None:
+        others = {
+            "--poses": request.poses != "15",
+            "--sampling": request.sampling is not None,
+            "--shared-poses": request.shared_poses is not None,
+            "--views": request.views is not None,
+            "--cameras": request.cameras is not None,
+            "--hand-held": request.hand_held,
+            "--images": request.images != 1,
+        }
+        problems += [
+            f"The plan could not be shot: found --plan and {option}, needed one of them, a plan "
+            f"says poses and cameras; leave out {option}."
+            for option, given in others.items()
+            if given
+        ]
     if request.views is not None and request.cameras is not None:
         problems.append(
             "The cameras could not be placed: found both --views and --cameras, needed one of "

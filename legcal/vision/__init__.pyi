@@ -60,6 +60,7 @@ from .visibility import Band as Band
 from .visibility import PredictedLeg as PredictedLeg
 from .visibility import Segment as Segment
 from .visibility import hidden_by as hidden_by
+from .visibility import in_picture as in_picture
 from .visibility import look_alike as look_alike
 from .visibility import predict_legs as predict_legs
 from .visibility import visible_segments as visible_segments

@@ -153,12 +153,17 @@ def bands_of_legs(
     ]
 
 
-def in_picture(camera: Camera, P_camera: Array, nearest: Array | float) -> BoolArray:
-    """Return whether points (..., 3) are in front of the camera and inside its image, (...)."""
+def in_picture(
+    camera: Camera, P_camera: Array, nearest: Array | float, margin: float = 0.0
+) -> BoolArray:
+    """Return whether points (..., 3) are in front of the camera and inside its image, (...).
+
+    They are at least ``margin`` px from its border.
+    """
     depth = P_camera[..., 2]
     front = depth > nearest
     xy = P_camera[..., :2] / np.where(front, depth, 1.0)[..., None]
-    inside = front & pixels_inside(camera, camera.distort(xy))
+    inside = front & pixels_inside(camera, camera.distort(xy), margin)
     if camera.has_distortion:  # the polynomials fold far points back into the image
         far = inside & (np.sum(xy**2, axis=-1) > camera.unfolded**2)
         if far.any():

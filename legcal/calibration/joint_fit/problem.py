@@ -244,21 +244,8 @@ def build_fit(
     DatasetError
         If an outline or an axis cannot be used.
     """
-    names, given = [v.name for v in measurements.views], [v.camera for v in measurements.views]
-    owners = shared_cameras(names, given)
-    cameras = tuple(
-        _with_values(camera, owner, choices) for camera, owner in zip(given, owners, strict=True)
-    )
-    observed = observed_arrays(measurements, legs, outlines, axes, board, cameras)
-    problem = _built(
-        legs,
-        choices,
-        observed,
-        cameras,
-        owners,
-        measurements.n_poses,
-        settings,
-        _images(measurements),
+    problem = unchecked_fit(
+        legs, measurements, outlines, settings, axes=axes, board=board, choices=choices
     )
     equations = problem.n_equations + len(problem.priors.mean)
     if equations < problem.n_unknowns:
@@ -271,6 +258,35 @@ def build_fit(
             f"{problem.n_unknowns} unknowns; add images."
         )
     return problem
+
+
+def unchecked_fit(
+    legs: FittedLegs,
+    measurements: Measurements,
+    outlines: Outlines,
+    settings: RefinementSettings = DEFAULT_SETTINGS,
+    *,
+    axes: LegAxes | None = None,
+    board: BoardCorners | None = None,
+    choices: Choices = NO_CHOICES,
+) -> FitProblem:
+    """Build the joint fit of images that need not determine it: some of those that will be."""
+    names, given = [v.name for v in measurements.views], [v.camera for v in measurements.views]
+    owners = shared_cameras(names, given)
+    cameras = tuple(
+        _with_values(camera, owner, choices) for camera, owner in zip(given, owners, strict=True)
+    )
+    observed = observed_arrays(measurements, legs, outlines, axes, board, cameras)
+    return _built(
+        legs,
+        choices,
+        observed,
+        cameras,
+        owners,
+        measurements.n_poses,
+        settings,
+        _images(measurements),
+    )
 
 
 def _with_values(camera: Camera, owner: str, choices: Choices) -> Camera:

@@ -1,0 +1,14 @@
+from .goals import Goal as Goal
+from .information import WHITE as WHITE
+from .information import PredictedNoise as PredictedNoise
+from .information import Predictor as Predictor
+from .places import Setting as Setting
+from .places import parse_bounds as parse_bounds
+from .planner import Plan as Plan
+from .planner import PlannedView as PlannedView
+from .planner import plan_session as plan_session
+from .request import plan as plan
+from .session import PLAN_NAME as PLAN_NAME
+from .session import check_session as check_session
+from .session import images_of as images_of
+from .session import write_session as write_session

@@ -1,0 +1,98 @@
+"""What a plan is to make small: errors of the platform over the workspace, or of parameters.
+
+Errors of the platform are those of all its joints at the poses that stand for the workspace: the
+root mean square distance by which the covariance of the machine moves them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from legcal.calibration import FittedLegs, PlatformError, expected_error, platform_by_parameters
+from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
+from legcal.files import closest
+from legcal.geometry import Array, cross
+from legcal.machine import Machine, platforms_in_base, workspace
+from legcal.planning.exchange import Criterion
+
+
+class Goal(StrEnum):
+    """What is made small."""
+
+    MEAN = "mean"  # error of the platform, mean over the workspace
+    WORST = "worst"  # the same where it is largest
+    D_OPTIMAL = "d"  # determinant of the covariance of all parameters
+    PARAMETERS = "parameters"  # sigma of named parameters
+
+
+@dataclass(frozen=True, eq=False)
+class Workspace:
+    """How parameters move the platform, all over the workspace."""
+
+    by_parameters: Array  # (w, 6, p): rotation vectors, displacements of the origin of R_e
+    joints: Array  # (w, n_joints, 3, p): displacements of platform joints [m]
+
+    def error(self, covariance: Array) -> PlatformError:
+        """Return what a covariance (p, p) of the kinematic parameters means there."""
+        return expected_error(self.by_parameters, covariance)
+
+
+def workspace_of(machine: Machine, legs: FittedLegs) -> Workspace | None:
+    """Return the workspace of a machine; None where readings do not give poses."""
+    if not machine.is_determined:
+        return None
+    try:
+        poses = platforms_in_base(machine, workspace(machine)[1])
+        by = platform_by_parameters(legs.nominal, legs.parametrization, machine.frame_legs, poses)
+    except (DidNotConverge, NotIdentifiable):
+        return None
+    R = np.array([T.rotation.as_matrix() for T in poses])
+    arms = np.einsum("wij,lj->wli", R, np.array([leg.B for leg in legs.nominal]))
+    turned = -cross(arms[:, :, None], np.swapaxes(by[:, None, :3], 2, 3))  # (w, l, p, 3)
+    return Workspace(by, np.swapaxes(turned, 2, 3) * -1.0 + by[:, None, 3:])
+
+
+def criterion_of(
+    goal: Goal,
+    work: Workspace | None,
+    legs: FittedLegs,
+    basis: Array,  # (n_parameters, p)
+    named: Sequence[str] = (),
+) -> Criterion:
+    """Return the criterion of a goal: of covariances (n, p, p), by their own unit.
+
+    Raises UsageError if the goal is not one of this machine.
+    """
+    units, names = legs.parametrization.units, legs.parametrization.names
+    length = float(np.mean([np.linalg.norm(leg.B) + leg.q0 for leg in legs.nominal]))
+    unit = np.array([1.0 if unit == "m" else length for unit in units])
+    if goal in (Goal.MEAN, Goal.WORST):
+        if work is None:
+            raise UsageError(
+                "The plan could not minimise the error of the platform: found a machine of which "
+                "readings do not give the pose, needed --criterion d or parameters; choose one."
+            )
+        moves = np.concatenate(list(np.moveaxis(work.joints, 1, 0)), axis=1) @ basis
+        weights = np.einsum("wri,wrj->wij", moves, moves) / work.joints.shape[1]
+        if goal is Goal.MEAN:
+            mean = weights.mean(axis=0)
+            return lambda S: np.sqrt(np.maximum(np.einsum("ij,nij->n", mean, S), 0.0))
+        return lambda S: np.sqrt(np.maximum(np.einsum("wij,nij->nw", weights, S).max(axis=1), 0.0))
+    if goal is Goal.PARAMETERS:
+        unknown = [name for name in named if name not in names]
+        if unknown or not named:
+            found = f"'{unknown[0]}'" if unknown else "no name"
+            hint = closest(unknown[0], names) if unknown else f"name one, such as {names[0]}."
+            raise UsageError(
+                f"The plan could not minimise the sigma of parameters: found {found}, needed names "
+                f"of parameters of the machine; {hint}"
+            )
+        rows = (basis * unit[:, None])[[names.index(name) for name in named]]
+        return lambda S: np.sqrt(np.einsum("ri,nij,rj->n", rows, S, rows) / len(rows))
+    p = basis.shape[1]
+    scale = float(np.linalg.slogdet(basis.T @ np.diag(unit**2) @ basis)[1])
+    return lambda S: np.exp((np.linalg.slogdet(S)[1] + scale) / (2.0 * p))

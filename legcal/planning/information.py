@@ -1,0 +1,219 @@
+"""What predicted images say: the rows that each adds to the information of the joint fit.
+
+The joint fit itself is built at predicted outlines, with its common-mode edge biases, radii,
+intrinsics of which the camera file states a covariance, and gamma where it is not given. The
+platform pose of an image is eliminated; machine, cameras and what images share are kept, so that an
+image is a low-rank update: rows U with U^T U added to the information. Unknowns have names, those
+of a view begin with its name; unknown kinematic parameters are coordinates inside what the
+mechanism ties.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import block_diag, null_space
+from scipy.spatial.transform import RigidTransform
+
+from legcal.calibration import (
+    DEFAULT_SETTINGS,
+    NO_CHOICES,
+    Choices,
+    FitProblem,
+    FittedLegs,
+    NoiseModel,
+    Start,
+    State,
+    fitted_legs,
+    possible_biases,
+    unchecked_fit,
+    with_gamma,
+)
+from legcal.data import Measurements, Outlines, View
+from legcal.estimation import PseudoHuber, linearize
+from legcal.geometry import Array, IntArray
+from legcal.machine import Leg, Machine
+from legcal.vision import Camera
+
+KINEMATIC = "machine"  # names of coordinates of the machine begin so
+_WEAK = 1.0  # [m] and [rad] that is known of what has no other prior
+_RANK = 1e-7  # of the largest singular value
+
+
+@dataclass(frozen=True)
+class PredictedNoise:
+    """Errors of outlines, whatever the contrast.
+
+    Attributes
+    ----------
+    sigma_px : float
+        Standard deviation of an edge in one pixel of length; that of an outline at both of its
+        ends falls with the root of its length [px].
+    correlation : float
+        Of the errors at both ends: -0.5 where errors of pixels are independent.
+    common_px : tuple of float
+        Standard deviations of the common-mode edge biases, in the order of their kinds [px].
+    gamma_px : float
+        How far an outline moves with the logarithm of the gamma, which counts as not known [px].
+    source : str
+        Where it is from, in words.
+    """
+
+    sigma_px: float = 0.35
+    correlation: float = 0.0
+    common_px: tuple[float, ...] = (0.02, 0.005, 0.03, 0.01, 0.012, 0.006)
+    gamma_px: float = 0.1
+    source: str = "what photographs of simulated machines show"
+
+    def of(self, outlines: Outlines) -> Outlines:
+        """Return outlines with the covariance and the dependence on gamma that are predicted."""
+        n = len(outlines.row)
+        length = np.linalg.norm(outlines.ends[:, 1] - outlines.ends[:, 0], axis=-1)
+        of_ends = 4.0 * np.array([[1.0, self.correlation], [self.correlation, 1.0]])
+        found = replace(outlines, covariance=(self.sigma_px**2 / length)[:, None, None] * of_ends)
+        if self.gamma_px == 0.0:
+            return found
+        return replace(found, gamma=np.full(n, 2.2), by_gamma=np.full(n, self.gamma_px))
+
+
+DEFAULT_NOISE = PredictedNoise()
+# White noise of edge points, as simulated outlines have it
+WHITE = PredictedNoise(0.1, -0.5, (0.0,) * 6, 0.0, "independent errors of edge points")
+
+
+@dataclass(frozen=True, eq=False)
+class Contributions:
+    """What images add to the information, by named unknowns."""
+
+    names: tuple[str, ...]  # of m unknowns, the p coordinates of the machine first
+    rows: Array  # (n_images, r, m): of each image, its platform pose eliminated
+    prior: Array  # (m, m): what is known without images
+    basis: Array  # (n_parameters, p): directions of the kinematic parameters
+
+
+@dataclass(frozen=True, eq=False)
+class Predictor:
+    """The joint fit of a machine at images that nobody has taken."""
+
+    machine: Machine
+    camera: Camera
+    noise: PredictedNoise
+    sigma_q: float  # of a reading [m]
+    choices: Choices = NO_CHOICES
+
+    @cached_property
+    def legs(self) -> FittedLegs:
+        """The legs as the joint fit sees them."""
+        return fitted_legs(self.machine)
+
+    def contributions(
+        self,
+        views: Mapping[str, RigidTransform],  # T_base_camera of views by their names
+        view: IntArray,  # (n_images,)
+        poses: Sequence[RigidTransform],  # T_Rb_Re of each image
+        outlines: Outlines,
+        legs: Sequence[Leg] | None = None,  # in R_b and R_e, if not the nominal ones
+    ) -> Contributions:
+        """Return what images add to the information."""
+        n = len(poses)
+        camera = replace(self.camera, gamma_is_given=False)
+        measurements = Measurements(
+            views=tuple(View(name, camera, T) for name, T in views.items()),
+            image=("",) * n,
+            view=view,
+            pose=np.arange(n, dtype=np.intp),
+            q=np.zeros((n, self.legs.n_legs)),
+            sigma_q=self.sigma_q,
+        )
+        problem = unchecked_fit(
+            self.legs, measurements, self.noise.of(outlines), choices=self.choices
+        )
+        biases = possible_biases(problem.outlines, self.legs.names)
+        problem = problem.with_biases(
+            biases.of_sizes(with_gamma(np.append(self.noise.common_px, 0.0)))
+        )
+        T_base_Rb = self.machine.T_base_Rb
+        start = Start(
+            tuple(legs or self.legs.nominal),
+            tuple(T.inv() * T_base_Rb for T in views.values()),
+            tuple(poses),
+            "plan",
+        )
+        state = problem.begin(start)
+        return self._rows(problem.weighted(NoiseModel()), state, list(views))
+
+    def _rows(self, problem: FitProblem, state: State, views: Sequence[str]) -> Contributions:
+        """Return the whitened rows of every image, and the priors of all unknowns."""
+        linear, n = linearize(problem, state), problem.n_elements
+        tangent = problem.constraint.tangent(problem, state) if problem.constraint else None
+        loss = PseudoHuber(DEFAULT_SETTINGS.loss_width)
+        blocks = []
+        for factor in problem.factors:
+            if not factor.n or factor.element is None:
+                continue
+            found, where = linear[factor.name], problem.places[factor.name]
+            q = found.r.shape[1]
+            J = np.zeros((factor.n, q, problem.n_kept + 1))
+            at = np.arange(factor.n)[:, None, None], np.arange(q)[None, :, None]
+            np.add.at(J, (*at, where.index[:, None, :]), found.J)
+            both = np.concatenate([found.J_element, J[..., :-1]], axis=2)
+            both *= np.sqrt(loss.efficiency(q)) if factor.robust else 1.0
+            blocks.append(_by_element(both, factor.element, n))
+        stacked = np.concatenate(blocks, axis=1)
+        own, kept = stacked[..., :6], stacked[..., 6:]
+        if tangent is not None:
+            kept = kept + np.einsum("krd,mkd->krm", own, tangent.Q)
+            own = own @ tangent.Z
+        U, s, _ = np.linalg.svd(own, full_matrices=False)
+        U = U * (s > _RANK * s[:, :1])[:, None]
+        kept = kept - U @ (np.swapaxes(U, 1, 2) @ kept)
+        names = _names(problem, views)
+        prior = linear.prior_J.T @ linear.prior_J
+        weak = np.array([prior[i, i] == 0.0 for i in range(len(prior))])
+        prior[weak, weak] = 1.0 / _WEAK**2
+        k, untied = problem.n_kinematic, np.eye(problem.n_kinematic)
+        if problem.parameters.n_tied:
+            untied = null_space(problem.parameters.tie_rows(state.legs)[1])
+        basis = np.zeros((len(problem.free), untied.shape[1]))
+        basis[problem.free] = untied
+        rows = np.concatenate([kept[..., :k] @ untied, kept[..., k:]], axis=2)
+        whole = block_diag(untied.T @ prior[:k, :k] @ untied, prior[k:, k:])
+        named = *(f"{KINEMATIC} {i}" for i in range(untied.shape[1])), *names[k:]
+        return Contributions(named, rows, whole, basis)
+
+
+def _by_element(rows: Array, element: IntArray, n: int) -> Array:
+    """Return rows (m, q, c) by their element, (n, r, c), with zeros where an element has fewer."""
+    m, q, c = rows.shape
+    order = np.argsort(element, kind="stable")
+    count = np.bincount(element, minlength=n)
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    found = np.zeros((n, int(count.max(initial=0)), q, c))
+    found[element[order], np.arange(m) - first[element[order]]] = rows[order]
+    return found.reshape(n, -1, c)
+
+
+def _names(problem: FitProblem, views: Sequence[str]) -> list[str]:
+    """Return a name for each kept unknown; those of one view begin with ``VIEW:``."""
+    names = [""] * problem.n_kept
+    for block in problem.variables:
+        where = problem.where(block.name)
+        labels = block.labels or tuple(str(i) for i in range(block.n_unknowns))
+        for i, label in zip(where.tolist(), labels, strict=True):
+            head, _, rest = label.partition(".")
+            if block.name == "cameras" or (block.name == "biases" and rest == "gamma"):
+                names[i] = f"camera {rest}"  # all views share one
+            elif block.name == "biases" and head in views:
+                names[i] = f"{head}: {rest}"
+            else:
+                names[i] = f"{block.name} {label}"
+    of_views = problem.block("camera_pose").unknown
+    where = problem.where("camera_pose")
+    for v, numbers in enumerate(of_views):
+        for k, number in enumerate(numbers.tolist()):
+            if number >= 0:
+                names[where[number]] = f"{views[v]}: pose {k}"
+    return names

@@ -1,0 +1,94 @@
+"""The order in which poses are taken, and what to pass on the way between them.
+
+Between two poses motors move together in a straight line. A way counts if the machine can be
+everywhere on it: inside its limits, no leg through another, no singularity near.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from legcal.errors import DidNotConverge
+from legcal.geometry import Array
+from legcal.machine import (
+    Configurations,
+    Feasibility,
+    Machine,
+    follow,
+    motor_travel,
+    slider_columns,
+)
+
+HOME = "home"
+_STOPS = np.linspace(0.2, 1.0, 5)  # parts of a way that are looked at
+_ROUNDS = 20  # of exchanges for a shorter way
+
+
+def in_short_order(machine: Machine, poses: Configurations) -> list[int]:
+    """Return an order of poses in which the motors travel little, beginning near home."""
+    columns = slider_columns(machine, machine.motors)[0]
+    lower, upper = motor_travel(machine)
+    q = np.concatenate([machine.home_configuration[None], poses.configurations])[:, columns]
+    q = q / (upper - lower)
+    far = np.abs(q[:, None] - q).max(axis=2)
+    order, left = [0], set(range(1, len(q)))
+    while left:
+        order.append(min(left, key=lambda k: (far[order[-1], k], k)))
+        left.remove(order[-1])
+    for _ in range(_ROUNDS):
+        shorter = False
+        for i in range(1, len(order) - 1):
+            for j in range(i + 1, len(order)):
+                after = far[order[j], order[j + 1]] if j + 1 < len(order) else 0.0
+                new = far[order[i], order[j + 1]] if j + 1 < len(order) else 0.0
+                gain = far[order[i - 1], order[i]] + after - far[order[i - 1], order[j]] - new
+                if gain > 1e-12:
+                    order[i : j + 1] = order[i : j + 1][::-1]
+                    shorter = True
+        if not shorter:
+            break
+    return [k - 1 for k in order[1:]]
+
+
+def ways(machine: Machine, poses: Configurations) -> tuple[tuple[str, ...], int]:
+    """Return what to pass before each pose, and for how many poses no way was found.
+
+    That is "" where the straight way is free, ``home``, or an earlier pose, as its place from 1.
+    """
+    if not machine.is_determined:
+        return ("",) * len(poses.poses), 0
+    feasibility, home = Feasibility(machine), machine.home_configuration
+    known: dict[tuple[int, int], bool] = {}
+    stations = [home, *poses.configurations]
+
+    def is_free(a: int, b: int) -> bool:
+        key = min(a, b), max(a, b)
+        if key not in known:
+            known[key] = _is_free(machine, feasibility, stations[key[0]], stations[key[1]])
+        return known[key]
+
+    found, missing = [], 0
+    for b in range(1, len(stations)):
+        a = b - 1
+        if is_free(a, b):
+            found.append("")
+            continue
+        others = [0, *range(b - 1, 0, -1)]
+        via = next((k for k in others if k != a and is_free(a, k) and is_free(k, b)), None)
+        missing += via is None
+        found.append(HOME if not via else str(via))
+    return tuple(found), missing
+
+
+def _is_free(machine: Machine, feasibility: Feasibility, first: Array, last: Array) -> bool:
+    """Say whether the machine can go straight from one configuration to another."""
+    columns = slider_columns(machine, machine.motors)[0]
+    here, start = first, first[columns]
+    try:
+        for part in _STOPS:
+            here = follow(machine, here, start + part * (last[columns] - start), min_step=0.25)
+            if feasibility.problem(here, of_motors=False) is not None:
+                return False
+    except DidNotConverge:
+        return False
+    return bool(np.abs(here - last)[columns].max() < 1e-9)

@@ -1,0 +1,224 @@
+"""Where cameras may stand: around the machine, at places of a list, within bounds.
+
+A tripod is set to 5 cm and 5 deg, so a place counts with a margin in the picture
+(:class:`Setting`): from where it stands the joints of all poses are in the picture even if it is
+set that much wrongly, or, nearer, most of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.errors import NotVisible, UsageError
+from legcal.files import FileSchema, PlainName, Quaternion, Vector, read_yaml, validate
+from legcal.geometry import Array, cross, motion_of, normal_basis
+from legcal.machine import Machine
+from legcal.vision import Camera, in_picture
+
+UP = np.array([0.0, 0.0, 1.0])
+
+_TURNS = 16  # directions around the machine
+_LIFTS = (0.1, 0.4, 0.75, 1.15)  # [rad] above the plane across the machine
+_LIFTS_PLANAR = (0.65, 1.0, 1.35)  # above the plane of motion
+_NEARER = (1.0, 0.8)  # of the distance from where all is in the picture
+_DISTANCES = np.geomspace(0.4, 12.0, 60)  # sizes of the machine, that are tried
+_CLEARANCE = 0.3  # of the size, between camera and machine, at least
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How well a tripod is set, and what is known of the machine before.
+
+    Attributes
+    ----------
+    shift, turn : float
+        How far a camera may stand from its place [m], and look elsewhere [rad], at most.
+    length, angle : float
+        How far lengths and coordinates [m], and axes [rad], are from the model, at most.
+    draws : int
+        How many such sessions are drawn to judge a plan.
+    """
+
+    shift: float = 0.05
+    turn: float = float(np.deg2rad(5.0))
+    length: float = 2e-3
+    angle: float = float(np.deg2rad(0.1))
+    draws: int = 20
+
+    def margin(self, camera: Camera, nearest: float) -> float:
+        """Return how far in the picture a point moves at most, at that distance [px]."""
+        focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
+        return focal * float(np.tan(self.turn) + (self.shift + self.length) / nearest)
+
+    def camera_elsewhere(self, T: RigidTransform, rng: np.random.Generator) -> RigidTransform:
+        """Return a camera pose as it may be set instead of another."""
+        shift, turn = rng.normal(size=(2, 3))
+        shift *= self.shift * rng.random() / np.linalg.norm(shift)
+        turn *= self.turn * rng.random() / np.linalg.norm(turn)
+        return RigidTransform.from_components(
+            T.translation + shift, Rotation.from_rotvec(turn) * T.rotation
+        )
+
+
+USUAL = Setting()
+
+
+class PlaceEntry(FileSchema):
+    """A place of a tripod; without an orientation the camera looks at the machine."""
+
+    xyz: Vector
+    quat_xyzw: Quaternion | None = None
+
+
+class PlacesEntry(FileSchema):
+    """A file of places of tripods."""
+
+    places: Annotated[dict[PlainName, PlaceEntry], Field(min_length=1)]
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A place of a camera."""
+
+    T_base_camera: RigidTransform
+    name: str = ""  # that of a list
+    fixed: bool = False  # it is not moved any more
+
+
+def upward(machine: Machine) -> Array:
+    """Return the direction from base to platform at home, or the normal of the plane of motion."""
+    if machine.base_normal is not None:
+        return machine.base_normal
+    A, B = machine.A_base, machine.home.apply(machine.B_platform)
+    across = (B - A).mean(axis=0)
+    size = float(np.linalg.norm(across))
+    return np.asarray(across / size) if size > 1e-3 * np.ptp(A, axis=0).max() else UP
+
+
+def look_at(position: Array, target: Array, up: Array) -> RigidTransform:
+    """Return the pose of a camera that looks at a point, with its y axis down."""
+    z = (target - position) / np.linalg.norm(target - position)
+    x = cross(z, up)
+    if np.linalg.norm(x) < 1e-6:  # it looks along *up*
+        x = normal_basis(z)[0]
+    x /= np.linalg.norm(x)
+    return motion_of(np.column_stack([x, cross(z, x), z]), position)
+
+
+def read_places(path: Path, points: Array, up: Array) -> list[Place]:
+    """Return the places of a list; without an orientation cameras look at the points (n, 3)."""
+    entry = validate(PlacesEntry, read_yaml(path, "places file"), path)
+    found = []
+    for name, place in entry.places.items():
+        position = np.array(place.xyz)
+        T = look_at(position, 0.5 * (points.min(axis=0) + points.max(axis=0)), up)
+        if place.quat_xyzw is not None:
+            turned = Rotation.from_quat(place.quat_xyzw)
+            T = RigidTransform.from_components(position, turned)
+        found.append(Place(T, name, fixed=True))
+    return found
+
+
+def places_around(
+    machine: Machine,
+    points: Array,  # (n, 3) joints in the base link, of many poses [m]
+    camera: Camera,
+    setting: Setting,
+    bounds: Array | None,  # (3, 2) lowest and highest coordinates in the base link [m]
+) -> list[Place]:
+    """Return places all around a machine. Raises NotVisible if there are none."""
+    up, found = upward(machine), []
+    for lift in _LIFTS if machine.spatial else _LIFTS_PLANAR:
+        for turn in np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False):
+            found += places_along(direction(up, turn, lift), up, points, camera, setting)
+    inside = [place for place in found if _is_inside(place, bounds)]
+    if not inside:
+        near = min(float(np.linalg.norm(p.T_base_camera.translation)) for p in found or [_NOWHERE])
+        raise NotVisible(
+            f"{machine.yaml_path}: no camera could be placed: found none of {len(found)} places "
+            f"around the machine inside --bounds, needed one; the nearest that shows all legs "
+            f"stands {near:.2f} m from the base: give wider bounds or a camera with a wider view."
+        )
+    return inside
+
+
+_NOWHERE = Place(RigidTransform.identity())
+
+
+def direction(up: Array, turn: float, lift: float) -> Array:
+    """Return the unit direction at an angle around *up* and a height [rad]."""
+    x, y = normal_basis(up)
+    level = np.cos(turn) * x + np.sin(turn) * y
+    return np.asarray(np.cos(lift) * level + np.sin(lift) * up)
+
+
+def places_along(
+    toward: Array, up: Array, points: Array, camera: Camera, setting: Setting
+) -> list[Place]:
+    """Return the places in a direction from where all, or most, points are in the picture."""
+    target = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    reach = float(((points - target) @ toward).max())
+    for distance in _DISTANCES * size:
+        nearest = distance - reach
+        if nearest < _CLEARANCE * size:
+            continue
+        T = look_at(target + distance * toward, target, up)
+        P = T.inv().apply(points)
+        if in_picture(camera, P, 0.0, setting.margin(camera, nearest)).all():
+            return [
+                Place(look_at(target + d * toward, target, up))
+                for d in distance * np.array(_NEARER)
+                if d - reach >= _CLEARANCE * size
+            ]
+    return []
+
+
+def _is_inside(place: Place, bounds: Array | None) -> bool:
+    """Say whether a camera stands within bounds."""
+    if bounds is None:
+        return True
+    x = place.T_base_camera.translation
+    return bool(np.all((x >= bounds[:, 0] - _ROUNDING) & (x <= bounds[:, 1] + _ROUNDING)))
+
+
+def parse_bounds(text: str) -> Array:
+    """Return bounds (3, 2) [m] of a text ``-2:2,-2:2,0:1.5``."""
+    from legcal.files import LENGTH, parse_quantity
+
+    parts = [part.split(":") for part in text.split(",")]
+    if len(parts) != 3 or any(len(part) != 2 for part in parts):
+        raise UsageError(
+            f"--bounds could not be used: found '{text}', needed lowest and highest x, y and z of "
+            "the camera in the base link; write them like -2m:2m,-2m:2m,0m:1.5m."
+        )
+    found = np.array([[parse_quantity(x, LENGTH, "--bounds") for x in part] for part in parts])
+    if np.any(found[:, 0] >= found[:, 1]):
+        raise UsageError(
+            f"--bounds could not be used: found '{text}', needed the lower number first in each "
+            "pair; exchange them."
+        )
+    return found
+
+
+def near(place: Place, target: Array, up: Array, step: float, rng: np.random.Generator) -> Place:
+    """Return a place that stands a little elsewhere and looks at the machine."""
+    if place.fixed:
+        return place
+    position = place.T_base_camera.translation
+    away = np.linalg.norm(position - target)
+    return Place(look_at(position + step * away * rng.normal(size=3), target, up))
+
+
+def all_points(machine: Machine, poses: Sequence[RigidTransform]) -> Array:
+    """Return the joints (n, 3) of a machine in poses, in the base link [m]."""
+    ends = [T.apply(machine.B_platform) for T in poses]
+    return np.concatenate([machine.A_base, *ends])

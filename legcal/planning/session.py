@@ -1,0 +1,139 @@
+"""The folder of a planned session: a dataset whose photographs are still to be taken.
+
+``dataset.yaml``, ``measurements.csv``, the model and the camera file are those of the dataset;
+``poses.csv`` says in millimetres and degrees what to set, ``plan.json`` what to expect.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from legcal.data import reading_columns
+from legcal.errors import UsageError
+from legcal.files import (
+    OutputKind,
+    check_destination,
+    format_table,
+    holds_files,
+    motion_to_xyz_quat,
+    output_path,
+    result_folder,
+)
+from legcal.geometry import roll_pitch_yaw
+from legcal.machine import write_model
+from legcal.planning.planner import Plan
+from legcal.vision import camera_info
+
+PLAN_NAME = "plan.json"
+PLANNED = OutputKind("session", PLAN_NAME, "legcal_plan")
+
+
+def check_session(output: str | Path, *, force: bool = False) -> Path:
+    """Return the folder of a session; refuse one that holds anything that must not be replaced."""
+    destination = output_path(output, PLANNED)
+    check_destination(destination, PLANNED)
+    if destination.is_dir() and holds_files(destination) and not force:
+        raise UsageError(
+            f"{destination}: the session could not be written: found an earlier session, needed a "
+            "new or empty folder; give another folder, or replace it with --force (in Python: "
+            "force=True)."
+        )
+    if (destination / "images").exists():
+        raise UsageError(
+            f"{destination}: the session could not be written: found photographs there, needed a "
+            "folder without any; they belong to the earlier plan: give another folder."
+        )
+    return destination
+
+
+def write_session(
+    plan: Plan,
+    output: str | Path,
+    *,
+    force: bool = False,
+    pictures: Mapping[str, str | bytes] | None = None,
+) -> list[Path]:
+    """Write the folder of a session, complete or not at all, and return its files.
+
+    *pictures* are further files by their names: drawings and pages.
+    """
+    destination = check_session(output, force=force)
+    with result_folder(destination, PLANNED) as folder:
+        yaml_path, _ = write_model(plan.machine, folder)
+        texts = {
+            "camera_info.yaml": camera_info(plan.camera, "camera"),
+            "dataset.yaml": _dataset(plan, yaml_path.relative_to(folder).as_posix()),
+            "measurements.csv": _measurements(plan),
+            "poses.csv": _poses(plan),
+            PLAN_NAME: json.dumps(plan.document(), indent=1, allow_nan=False) + "\n",
+            **(pictures or {}),
+        }
+        for name, content in texts.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            data = content if isinstance(content, bytes) else content.encode()
+            (folder / name).write_bytes(data)
+    return [destination / name for name in texts]
+
+
+def images_of(plan: Plan) -> list[tuple[str, str, str, int, int]]:
+    """Return view, image, label of the pose, and the numbers of view and pose of every image."""
+    width = max(2, len(str(plan.n_images)))
+    found, n = [], 0
+    for v, view in enumerate(plan.views):
+        for k in range(len(view.poses.poses)):
+            n += 1
+            label = f"p{n:0{width}d}"
+            found.append((view.name, f"images/{view.name}_{label}.jpg", label, v, k))
+    return found
+
+
+def _dataset(plan: Plan, model: str) -> str:
+    views = {}
+    for view in plan.views:
+        motion = motion_to_xyz_quat(view.T_base_camera)
+        entry: dict[str, Any] = {"camera": "camera_info.yaml"}
+        entry["T_base_camera"] = {key: [round(x, 5) for x in motion[key]] for key in motion}
+        shown = np.asarray(view.shows.any(axis=0))
+        if not shown.all():
+            names = plan.machine.leg_names
+            entry["legs"] = [
+                name for name, is_seen in zip(names, shown.tolist(), strict=True) if is_seen
+            ]
+        views[view.name] = entry
+    document = {
+        "legcal_dataset": 1,
+        "mechanism": model,
+        "measurements": "measurements.csv",
+        "encoder_sigma": plan.sigma_q,
+        "views": views,
+    }
+    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
+
+
+def _measurements(plan: Plan) -> str:
+    motors = list(plan.machine.motors)
+    rows = [
+        [name, image, label, *plan.views[v].poses.readings[k, motors].tolist()]
+        for name, image, label, v, k in images_of(plan)
+    ]
+    joints = [column.name for column in reading_columns(plan.machine.legs)]
+    return format_table(["view", "image", "pose", *joints], rows)
+
+
+def _poses(plan: Plan) -> str:
+    motors, rows = list(plan.machine.motors), []
+    for name, image, label, v, k in images_of(plan):
+        view = plan.views[v]
+        T = view.poses.poses[k]
+        angles = np.degrees(roll_pitch_yaw(T.rotation.as_matrix()))
+        numbers = [*(1e3 * view.poses.readings[k, motors]), *(1e3 * T.translation), *angles]
+        rows.append([name, label, image, view.via[k], *(f"{x:z.4f}" for x in numbers)])
+    joints = [f"{column.name} [mm]" for column in reading_columns(plan.machine.legs)]
+    pose = [*(f"{x} [mm]" for x in "xyz"), *(f"{x} [deg]" for x in ("roll", "pitch", "yaw"))]
+    return format_table(["view", "pose", "image", "on the way", *joints, *pose], rows)

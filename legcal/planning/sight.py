@@ -1,0 +1,207 @@
+"""What a camera will see of a machine: the visible stretch of every part of every leg.
+
+A stretch counts where it is in the picture by a margin, in front of the camera, and behind neither
+another leg nor the plates that the joints of base and platform span. It is found along rays to
+points of the axis, of many poses at once; its outlines follow from eqs (3) and (5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import RigidTransform
+
+from legcal.data import Outlines
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.machine import Cylinder
+from legcal.vision import EPSILON, Camera, in_picture, outlines_of_axis, visible_segments
+
+N_SAMPLES = 24  # points along a part that are tested
+MIN_LENGTH_PX = 20.0  # of a stretch that is measured
+_NEAREST = 0.1  # [m] before the camera
+_OUTSIDE = 1.2  # radii between the camera and an axis, at least
+_PLATE = 1.1  # size of a plate, over that of its joints
+_IN_PLATE = 3.0  # radii of the thickest leg: nearer to a plate, points are in it
+_THIN = 1e-3  # of the largest extent of joints that span no plate
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Visible stretches of legs in images of one camera, n of them."""
+
+    image: IntArray  # (n,)
+    leg: IntArray  # (n,)
+    part: tuple[str, ...]  # the URDF link of the cylinder
+    h: Array  # (n, 2, 3) both outlines, eq (3)
+    ends: Array  # (n, 2, 2, 2) of both outlines, both ends [px], the first nearer to the base joint
+    length_px: Array  # (n,)
+
+    def outlines(self, sigma_px: float, row: IntArray) -> Outlines:
+        """Return the outlines with errors of so much in every pixel of length; rows of images."""
+        n = len(self.leg)
+        of_ends = np.array([[4.0, -2.0], [-2.0, 4.0]])  # of a line through many points
+        covariance = (sigma_px**2 / self.length_px)[:, None, None] * of_ends
+        return Outlines(
+            row=np.repeat(row[self.image], 2),
+            leg=np.repeat(self.leg, 2),
+            part=tuple(part for part in self.part for _ in EPSILON),
+            edge=np.tile(np.array([1, 2], dtype=np.intp), n),
+            h=self.h.reshape(-1, 3),
+            ends=self.ends.reshape(-1, 2, 2),
+            covariance=np.repeat(covariance, 2, axis=0),
+            used=np.ones(2 * n, dtype=np.bool_),
+            reason=("",) * (2 * n),
+            source=("detected",) * (2 * n),
+        )
+
+    def legs_in(self, n_images: int, n_legs: int) -> BoolArray:
+        """Return which legs each image shows, (n_images, n_legs)."""
+        shown = np.zeros((n_images, n_legs), dtype=np.bool_)
+        shown[self.image, self.leg] = True
+        return shown
+
+
+def what_is_seen(
+    camera: Camera,
+    T_base_camera: RigidTransform,
+    A: Array,  # (n_legs, 3) in the base link [m]
+    B: Array,  # (n_images, n_legs, 3) the same
+    cylinders: Sequence[Sequence[Cylinder]],  # of each leg
+    margin_px: float = 0.0,  # that stays free at the border of the picture
+) -> Seen:
+    """Return the visible stretches of the legs in images of one camera."""
+    T = T_base_camera.as_matrix()
+    A, B = ((X - T[:3, 3]) @ T[:3, :3] for X in (A, B))  # in the camera frame
+    along = B - A
+    length = np.linalg.norm(along, axis=-1)
+    u = along / length[..., None]
+    leg, link, radius, start, end = _parts(cylinders, length)
+    share = np.linspace(0.0, 1.0, N_SAMPLES)
+    s = start[..., None] + (end - start)[..., None] * share
+    u_part = u[:, leg]
+    P = A[leg, None] + s[..., None] * u_part[:, :, None]  # (n_images, n_parts, N_SAMPLES, 3)
+    seen = (end > start)[..., None] & in_picture(camera, P, _NEAREST, margin_px)
+    foot = A[leg] - u_part * np.sum(u_part * A[leg], axis=-1, keepdims=True)
+    seen &= (np.linalg.norm(foot, axis=-1) > _OUTSIDE * radius)[..., None]
+    of_leg = np.zeros(len(cylinders))
+    np.maximum.at(of_leg, leg, radius)
+    seen &= ~_behind_legs(P, leg, radius, A, u, length, of_leg)
+    thick = _IN_PLATE * float(of_leg.max(initial=0.0))
+    seen &= ~_behind_plate(P, np.broadcast_to(A, B.shape), thick)
+    seen &= ~_behind_plate(P, B, thick)
+    first, last = _longest_runs(seen)
+    image, part = np.nonzero(last > first)
+    begin, finish = (s[image, part, k[image, part]] for k in (first, last))
+    u_seen, M = u_part[image, part], A[leg[part]]
+    h = outlines_of_axis(u_seen, M, radius[part])
+    axis = M[:, None] + np.stack([begin, finish], axis=1)[..., None] * u_seen[:, None]
+    # h . M = epsilon R on the axis: the cylinder touches the plane of its outline at M - eps R h.
+    touching = EPSILON[:, None, None] * radius[part][:, None, None, None] * h[:, :, None]
+    ends = camera.project(axis[:, None] - touching)
+    length_px = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1).mean(axis=1)
+    kept = length_px >= MIN_LENGTH_PX
+    parts = part[kept]
+    return Seen(
+        image[kept],
+        leg[parts],
+        tuple(link[k] for k in parts),
+        h[kept],
+        ends[kept],
+        length_px[kept],
+    )
+
+
+def _parts(
+    cylinders: Sequence[Sequence[Cylinder]], length: Array
+) -> tuple[IntArray, list[str], Array, Array, Array]:
+    """Return leg, link and radius of all parts, and their stretches (n_images, n_parts) each [m].
+
+    Stretches of parts that a length leaves no room for are empty.
+    """
+    of_image = [
+        [visible_segments(some, float(long)) for some, long in zip(cylinders, row, strict=True)]
+        for row in length
+    ]
+    number: dict[tuple[int, str], int] = {}
+    radius: list[float] = []
+    for row in of_image:
+        for j, segments in enumerate(row):
+            for segment in segments:
+                if number.setdefault((j, segment.link), len(number)) == len(radius):
+                    radius.append(segment.radius)
+    start, end = np.zeros((2, len(length), len(number)))
+    for k, row in enumerate(of_image):
+        for j, segments in enumerate(row):
+            for segment in segments:
+                i = number[j, segment.link]
+                start[k, i], end[k, i] = segment.start, segment.end
+    leg = np.array([j for j, _ in number], dtype=np.intp)
+    return leg, [link for _, link in number], np.array(radius), start, end
+
+
+def _behind_legs(
+    P: Array,  # (k, n_parts, m, 3)
+    own: IntArray,  # (n_parts,)
+    radius: Array,  # (n_parts,)
+    A: Array,  # (n_legs, 3)
+    u: Array,  # (k, n_legs, 3)
+    length: Array,  # (k, n_legs)
+    of_leg: Array,  # (n_legs,) the largest radius
+) -> BoolArray:
+    """Return which points have another leg in front of them, wholly or in part."""
+    distance = np.linalg.norm(P, axis=-1)
+    ray = P / distance[..., None]
+    shape = (len(u), 1, 1, len(A))
+    c = np.einsum("kpmx,klx->kpml", ray, u)
+    to_A = ray @ A.T
+    from_foot = np.sum(u * A, axis=-1)
+    along = (c * to_A - from_foot.reshape(shape)) / np.maximum(1.0 - c**2, 1e-12)
+    along = np.clip(along, 0.0, length.reshape(shape))
+    depth = to_A + along * c
+    square = np.sum(A * A, axis=-1) + along * (along + 2.0 * from_foot.reshape(shape)) - depth**2
+    # A ray to the edge of the leg itself passes at its radius, as far as the other leg is nearer.
+    beside = radius[:, None, None] * depth / distance[..., None]
+    hides = (square < (of_leg + beside) ** 2) & (depth > 0.0) & (depth < distance[..., None])
+    hides &= own[:, None, None] != np.arange(len(A))
+    return np.asarray(hides.any(axis=-1))
+
+
+def _behind_plate(P: Array, joints: Array, thick: float) -> BoolArray:
+    """Return which points (k, n, m, 3) have the plate between joints (k, n_legs, 3) before them.
+
+    Points in the plate are not behind it, by its thickness [m]: so are legs of a planar machine.
+    """
+    middle = joints.mean(axis=1, keepdims=True)
+    _, extent, axes = np.linalg.svd(joints - middle)
+    if joints.shape[1] < 3 or extent[:, 1].min() < _THIN * extent[:, 0].max():
+        return np.zeros(P.shape[:-1], dtype=np.bool_)
+    x, y, normal = (axes[:, i] for i in range(3))
+    across = np.einsum("kpmx,kx->kpm", P, normal)
+    where = np.sum(normal * middle[:, 0], axis=-1)[:, None, None] / np.where(
+        np.abs(across) < 1e-12, 1e-12, across
+    )
+    before = (where > 0.0) & ((1.0 - where) * np.linalg.norm(P, axis=-1) > thick)
+    hit = where[..., None] * P - middle[:, :, None]
+    inside = np.ones(P.shape[:-1], dtype=np.bool_)
+    flat = np.stack([np.einsum("klx,kx->kl", joints - middle, axis) for axis in (x, y)], axis=-1)
+    at = np.stack([np.einsum("kpmx,kx->kpm", hit, axis) for axis in (x, y)], axis=-1)
+    for k, corners in enumerate(flat):
+        try:
+            sides = ConvexHull(corners * _PLATE).equations
+        except QhullError:
+            return np.zeros(P.shape[:-1], dtype=np.bool_)
+        inside[k] = np.all(at[k] @ sides[:, :2].T + sides[:, 2] < 0.0, axis=-1)
+    return np.asarray(before & inside)
+
+
+def _longest_runs(flags: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return first and last index (...) of the longest run of true values of flags (..., m)."""
+    run = best = last = np.zeros(flags.shape[:-1], dtype=np.intp)
+    for i in range(flags.shape[-1]):
+        run = (run + 1) * flags[..., i]
+        last = np.where(run > best, i, last)
+        best = np.maximum(run, best)
+    return last - np.maximum(best - 1, 0), last
