@@ -1,4 +1,4 @@
-"""The one pool of processes: results are the same in one process and in several, bit by bit.
+"""The one way to run work: results are the same in one process, several or a cluster, bit by bit.
 
 Threads do not pay: the work is many short steps, and they would wait for each other.
 """
@@ -7,22 +7,25 @@ import copyreg
 import mmap
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from itertools import chain, count, islice
+from itertools import islice
 from multiprocessing import connection, get_context, resource_tracker
 from threading import Thread
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, SupportsIndex, TypeGuard, TypeVar, cast
+from uuid import uuid4
 from weakref import WeakValueDictionary, finalize
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import OutOfResources
+from legcal.cluster import Cluster, GivenExecutor, Submitter, connected
+from legcal.errors import OutOfResources, UsageError
 from legcal.signals import held_back_signals, leave_interrupts_to_parent, raise_if_stopped
 
 S = TypeVar("S")
@@ -39,8 +42,18 @@ def _reduced(motion: RigidTransform) -> tuple[Any, ...]:
 
 copyreg.pickle(RigidTransform, _reduced)
 
-_CHUNKS = 4  # tasks for each process: few enough to spare messages, enough to share the work
-_AHEAD = 2  # tasks for each process that are handed out where results come as they are finished
+Workers = int | str | Submitter
+"""A number of processes; the address of a Dask scheduler; or a Dask client or another executor."""
+
+
+def is_number(workers: object) -> TypeGuard[int]:
+    """Say whether workers are a number of processes, or nothing that could be used."""
+    return not isinstance(workers, str) and not hasattr(workers, "submit")
+
+
+_CHUNKS = 4  # tasks for each worker: few enough to spare messages, enough to share the work
+_AHEAD = 2  # tasks for each worker that are handed out where results come as they are finished
+_AHEAD_IN_ORDER = 2 * _CHUNKS  # where they wait for those before them
 _ONE_THREAD = (  # of these libraries, read when a process loads them
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -62,11 +75,27 @@ def in_turn(task: Callable[[S], T], rows: Iterable[S], /) -> Iterable[T]:
     return map(task, rows)
 
 
+class Pool:
+    """A :class:`Run`, and what is to be said of results that come from it."""
+
+    def __init__(self, run: Run, backend: Cluster | GivenExecutor | None = None) -> None:
+        self._run, self._backend = run, backend
+
+    def __call__(self, task: Callable[[S], T], rows: Iterable[S], /) -> Iterable[T]:
+        """Return the results."""
+        return self._run(task, rows)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """How workers differ from this process, where results depend on it."""
+        return () if self._backend is None else self._backend.notes
+
+
 @contextmanager
 def worker_pool(
-    workers: int, failure: str = "The images could not be worked on", *, in_order: bool = True
-) -> Iterator[Run]:
-    """Give a way to work in that many processes; one means in this process.
+    workers: Workers, failure: str = "The images could not be worked on", *, in_order: bool = True
+) -> Iterator[Pool]:
+    """Give a way to work in that many processes, or on a cluster; one means in this process.
 
     Processes are started when they are first needed. On Linux they are copies of this one, with all
     that it has loaded, if it has no threads, which copies would lack; else they are started anew: a
@@ -76,32 +105,49 @@ def worker_pool(
 
     Parameters
     ----------
-    workers : int
-        Number of processes.
+    workers : int, str or Submitter
+        Number of processes, the address of a Dask scheduler, or a Dask client or executor.
     failure : str
-        What could not be done if one of them is ended from outside: the message begins so.
+        What could not be done if workers are lost: the message begins so.
     in_order : bool
-        Whether results come in the order of the rows. Otherwise they come as they are finished,
-        and rows are taken as processes get free: memory does not grow with their number.
+        Whether results come in the order of the rows. Otherwise they come as they are finished.
+        Rows are taken as workers get free: memory does not grow with their number, but for local
+        processes and results in order, where all rows are taken at once.
 
     Raises
     ------
     OutOfResources
-        If one of the processes is ended from outside.
+        If one of the processes is ended from outside, or a cluster lost.
+    UsageError
+        If workers cannot be used.
     """
+    if not is_number(workers):
+        with connected(cast("str | Submitter", workers), failure) as backend:
+
+            def run_there(task: Callable[[S], T], rows: Iterable[S], /) -> Iterable[T]:
+                return _results(backend, partial(_each, task), rows, in_order)
+
+            yield Pool(run_there, backend)
+        return
+    if not isinstance(workers, SupportsIndex):
+        raise UsageError(
+            f"{failure}: found {type(workers).__name__} as workers, needed a number of processes, "
+            "the address of a Dask scheduler, or an object with submit as executors have it; give "
+            "one."
+        )
     if workers <= 1:
-        yield in_turn
+        yield Pool(in_turn)
         return
     with ExitStack() as stack:
-        started: list[tuple[ProcessPoolExecutor, connection.Connection]] = []
+        started: list[_Processes] = []
 
         def run(task: Callable[[S], T], rows: Iterable[S], /) -> Iterable[T]:
             if not started:
                 started.append(stack.enter_context(_processes(workers)))
-            return (_in_order if in_order else _as_they_come)(started[0][0], workers, task, rows)
+            return _results(started[0], partial(_each, task), rows, in_order)
 
         try:
-            yield run
+            yield Pool(run)
         except BrokenProcessPool as error:
             raise_if_stopped()  # the signal may have reached them first
             raise OutOfResources(
@@ -110,14 +156,40 @@ def worker_pool(
                 "command again."
             ) from error
         except BaseException:
-            for _, lifeline in started:
-                lifeline.close()  # nobody waits for work that is not wanted any more
+            for processes in started:
+                processes.lifeline.close()  # nobody waits for work that is not wanted any more
             raise
 
 
+class _Processes:
+    """Processes of this machine."""
+
+    patience = None
+    most_rows = None
+
+    def __init__(
+        self, pool: ProcessPoolExecutor, slots: int, lifeline: connection.Connection
+    ) -> None:
+        self.slots, self.lifeline, self._pool = slots, lifeline, pool
+
+    def submitter(
+        self, work: Callable[[Sequence[S]], list[T]]
+    ) -> Callable[[Sequence[S]], Future[list[T]]]:
+        """Return what hands rows out."""
+
+        def submit(rows: Sequence[S]) -> Future[list[T]]:
+            with _starting():
+                return self._pool.submit(work, rows)
+
+        return submit
+
+    def check(self) -> None:
+        """Trust the pool, which says by itself that it is broken."""
+
+
 @contextmanager
-def _processes(workers: int) -> Iterator[tuple[ProcessPoolExecutor, connection.Connection]]:
-    """Give the processes, and the lifeline at whose end they end."""
+def _processes(workers: int) -> Iterator[_Processes]:
+    """Give the processes, which end with their lifeline."""
     copies = _has_one_thread()
     if not copies:
         _start_tracker()
@@ -128,7 +200,7 @@ def _processes(workers: int) -> Iterator[tuple[ProcessPoolExecutor, connection.C
         workers, mp_context=context, initializer=_end_with, initargs=arguments
     )
     try:
-        yield pool, lifeline
+        yield _Processes(pool, workers, lifeline)
     finally:
         try:
             pool.shutdown(cancel_futures=True)
@@ -145,39 +217,40 @@ def _has_one_thread() -> bool:
         return False
 
 
-def _in_order(
-    pool: ProcessPoolExecutor, workers: int, task: Callable[[S], T], rows: Iterable[S], /
-) -> Iterable[T]:
-    rows = list(rows)
-    size = max(1, len(rows) // (_CHUNKS * workers))
-    with _starting():
-        parts = [pool.submit(_each, task, part) for part in _parts(rows, size)]
-    # Not pool.map: what is left of it cancels parts, and a pool whose processes end would stand.
-    return chain.from_iterable(part.result() for part in parts)
+def _results(
+    backend: Cluster | GivenExecutor | _Processes,
+    work: Callable[[Sequence[S]], list[T]],
+    rows: Iterable[S],
+    in_order: bool,
+) -> Iterator[T]:
+    """Yield results; rows are handed out as those before them are done.
 
-
-def _parts(rows: list[S], size: int) -> list[list[S]]:
-    return [rows[k : k + size] for k in range(0, len(rows), size)]
-
-
-def _each(task: Callable[[S], T], rows: list[S]) -> list[T]:
-    return [task(row) for row in rows]
-
-
-def _as_they_come(
-    pool: ProcessPoolExecutor, workers: int, task: Callable[[S], T], rows: Iterable[S], /
-) -> Iterable[T]:
-    rest = iter(rows)
-    running: set[Future[T]] = set()
+    What is not wanted any more is not cancelled here: a pool whose processes end would stand.
+    """
+    size, ahead = 1, _AHEAD
+    if in_order:
+        rows = list(rows)
+        size = max(1, min(len(rows) // (_CHUNKS * backend.slots), backend.most_rows or len(rows)))
+        ahead = _AHEAD_IN_ORDER
+    rest, running = iter(rows), deque[Future[list[T]]]()
+    submit = backend.submitter(work)
     while True:
-        with _starting():
-            more = islice(rest, _AHEAD * workers - len(running))
-            running |= {pool.submit(task, row) for row in more}
+        for _ in range(ahead * backend.slots - len(running)):
+            if not (part := list(islice(rest, min(size, backend.most_rows or size)))):
+                break
+            running.append(submit(part))
         if not running:
             return
-        done, running = wait(running, return_when=FIRST_COMPLETED)
+        waited = [running[0]] if in_order else list(running)
+        while not (done := wait(waited, backend.patience, FIRST_COMPLETED).done):
+            backend.check()
         for future in sorted(done, key=lambda future: future.exception() is not None):
-            yield future.result()  # before an error of another one
+            running.remove(future)
+            yield from future.result()  # before an error of another one
+
+
+def _each(task: Callable[[S], T], rows: Sequence[S]) -> list[T]:
+    return [task(row) for row in rows]
 
 
 class KeptArrays:
@@ -188,7 +261,7 @@ class KeptArrays:
     """
 
     def __init__(self, n: int, most_bytes: int) -> None:
-        self._name = (os.getpid(), next(_numbers))
+        self._name = uuid4().hex  # numbers of processes are the same on several machines
         _kept_arrays[self._name] = self
         self._file, first = -1, 8 * _ENTRY * (n + 1)
         self._most = first + most_bytes
@@ -207,7 +280,7 @@ class KeptArrays:
         self._entries[n, 0] = first
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _kept_here, self._name
+        return _kept_here, (self._name,)
 
     def get(self, k: int) -> NDArray[Any] | None:
         """Return a copy of array k, None if it is not kept."""
@@ -244,13 +317,12 @@ class KeptArrays:
 
 
 _ENTRY = 4  # numbers
-_numbers = count()
-_kept_arrays: WeakValueDictionary[tuple[int, int], KeptArrays] = WeakValueDictionary()
+_kept_arrays: WeakValueDictionary[str, KeptArrays] = WeakValueDictionary()
 
 
-def _kept_here(pid: int, number: int) -> KeptArrays:
+def _kept_here(name: str) -> KeptArrays:
     """Return the arrays of a name, if this process made them or is a copy of the one that did."""
-    return _kept_arrays.get((pid, number)) or KeptArrays(0, 0)
+    return _kept_arrays.get(name) or KeptArrays(0, 0)
 
 
 # How processes start and end

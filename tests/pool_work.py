@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.errors import DatasetError
 from legcal.workers import KeptArrays
 
 
@@ -22,3 +23,10 @@ def keep_row(kept: KeptArrays, row: int) -> bool:
     before = kept.get(row) is not None
     kept.keep(row, np.full((2, 3), row, dtype=np.float32))
     return before
+
+
+def negative(row: int, refused: int = -1) -> int:
+    """Return the row with the other sign; one is refused."""
+    if row == refused:
+        raise DatasetError(f"row {row} could not be used.")
+    return -row

@@ -28,6 +28,7 @@ BESIDE = "simulation"  # it knows the truth
 OUTSIDE = {
     "__main__",
     "brief",
+    "cluster",
     "errors",
     "figures",
     "processors",

@@ -415,15 +415,14 @@ def write_detection(detection: Detection, destination: Path, run: Run, progress:
 
 
 class _Drawings(NamedTuple):
-    """What is drawn over each image, and where it is written; it travels to worker processes."""
+    """What is drawn over each image, and the name of its file; it travels to worker processes."""
 
     load: ImageReader
     marks: tuple[tuple[PartMarks, ...], ...]
     corners: tuple[tuple[Mark, ...], ...]
     captions: tuple[str, ...]
     unplaced: tuple[Camera | None, ...]  # cameras that could not be placed
-    files: tuple[Path, ...]
-    photographs: tuple[Path, ...]  # where each image is written without what is drawn over it
+    names: tuple[str, ...]
 
 
 def _draw_all(detection: Detection, folder: Path, run: Run, progress: Report) -> None:
@@ -441,28 +440,33 @@ def _draw_all(detection: Detection, folder: Path, run: Run, progress: Report) ->
         tuple(_corner_marks(detection, row) for row in rows),
         tuple(_caption(detection, row) for row in rows),
         tuple(_unplaced_camera(detection, row) for row in rows),
-        files,
-        photographs,
+        tuple(file.name for file in files),
     )
     progress("Drawing overlays", 0, len(rows))
-    for done, _ in enumerate(run(partial(_write_overlay, drawings), range(len(rows))), start=1):
+    pictures = run(partial(_overlay, drawings), range(len(rows)))
+    places = zip(files, photographs, strict=True)
+    for done, (paths, contents) in enumerate(zip(places, pictures, strict=True), start=1):
+        for path, content in zip(paths, contents, strict=True):
+            path.write_bytes(content)
         progress("Drawing overlays", done, len(rows))
 
 
-def _write_overlay(drawings: _Drawings, k: int) -> None:
-    """Draw overlay k and write it, and the photograph beside it."""
+def _overlay(drawings: _Drawings, k: int) -> list[bytes]:
+    """Return the files of overlay k and of the photograph without it."""
     image, camera = drawings.load(k), drawings.unplaced[k]
     marks = [] if camera is None else [marks_of_pairs(camera, image)]
     picture = draw(image, [*drawings.marks[k], *marks], drawings.captions[k], drawings.corners[k])
     grey = np.clip(np.rint(image), 0, 255).astype(np.uint8)
-    for path, pixels in ((drawings.files[k], picture), (drawings.photographs[k], grey)):
+    found = []
+    for pixels in (picture, grey):
         ok, content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not ok:
             raise OutOfResources(
-                f"{path.name}: the picture could not be written: found that it cannot be encoded, "
-                "needed enough memory; try again with fewer workers."
+                f"{drawings.names[k]}: the picture could not be written: found that it cannot be "
+                "encoded, needed enough memory; try again with fewer workers."
             )
-        path.write_bytes(content.tobytes())
+        found.append(content.tobytes())
+    return found
 
 
 def _marks(detection: Detection, row: int) -> list[PartMarks]:

@@ -54,7 +54,7 @@ from legcal.perception import (
     unplaced_notes,
 )
 from legcal.progress import Progress, Report, shown_progress
-from legcal.workers import Run, worker_pool
+from legcal.workers import Run, Workers, worker_pool
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -180,7 +180,7 @@ class Examination:
 
 
 def doctor(
-    source: str | Path | Dataset, *, progress: Progress = False, workers: int = 1
+    source: str | Path | Dataset, *, progress: Progress = False, workers: Workers = 1
 ) -> Examination:
     """Look for all that can stand in the way of calibrating a dataset; nothing is fitted.
 
@@ -190,8 +190,8 @@ def doctor(
         The dataset folder, or what :func:`legcal.load_dataset` returned.
     progress : bool or callable
         True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
-    workers : int
-        Look at the images in that many processes, as :func:`legcal.calibrate` does.
+    workers : int, str or executor
+        Look at the images there, as :func:`legcal.calibrate` does.
 
     Returns
     -------

@@ -38,7 +38,7 @@ from legcal.perception import (
     place_and_measure,
 )
 from legcal.progress import Progress, shown_progress
-from legcal.workers import worker_pool
+from legcal.workers import Workers, worker_pool
 
 
 def detect(
@@ -46,7 +46,7 @@ def detect(
     *,
     output: str | Path | None = None,
     progress: Progress = False,
-    workers: int = 1,
+    workers: Workers = 1,
 ) -> Detection:
     """Find and measure the outlines of the legs in all images, without a fit.
 
@@ -60,8 +60,8 @@ def detect(
         found in it.
     progress : bool or callable
         True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
-    workers : int
-        Search and draw the images in that many processes, as :func:`legcal.calibrate` does.
+    workers : int, str or executor
+        Search and draw the images there, as :func:`legcal.calibrate` does.
 
     Returns
     -------

@@ -88,7 +88,7 @@ from legcal.perception import (
 )
 from legcal.progress import Progress, shown_progress
 from legcal.vision import shared_cameras, stated_covariances
-from legcal.workers import worker_pool
+from legcal.workers import Workers, worker_pool
 
 TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal one [rad]
 # Of all outlines that are measured in photographs: light at the limb that no model of shading
@@ -138,7 +138,7 @@ def calibrate(
     criteria: Criteria = "default",
     transformation: Transformation | None = None,
     use_cache: bool = True,
-    workers: int = 1,
+    workers: Workers = 1,
     priors: Mapping[str, tuple[float, float] | str] | Sequence[str] = (),
     fixed: Sequence[str] = (),
     free: Sequence[str] = (),
@@ -161,9 +161,10 @@ def calibrate(
         default as the criteria are.
     use_cache : bool
         Use the outlines that an earlier run left beside the dataset, if they still fit.
-    workers : int
-        Search the images in that many processes. With more than one, the program that calls
-        this must be safe to import (``if __name__ == "__main__":``).
+    workers : int, str or executor
+        Search the images in that many processes; with more than one, the program that calls this
+        must be safe to import (``if __name__ == "__main__":``). Or on a Dask cluster: the address
+        of its scheduler, a client, or another object with ``submit``, as executors have it.
     priors : mapping or sequence of str
         What is known of parameters: (value, sigma) in SI units or pixels, or text such as
         ``420±0.1 mm``, by name or pattern; or texts that begin with ``NAME=``. These three
@@ -227,6 +228,7 @@ def calibrate(
         *found.solution.notes,
         *_camera_notes(dataset, found.solution),
         *exact_cameras(dataset, choices),
+        *pool.notes,
     ]
     calibration = judge(
         dataset_at(dataset, fitted),

@@ -47,7 +47,7 @@ from legcal.machine import (
 )
 from legcal.progress import Progress, shown_progress
 from legcal.vision import shared_cameras
-from legcal.workers import worker_pool
+from legcal.workers import Workers, worker_pool
 
 SIGNIFICANCE = 0.01
 MAX_SIGNIFICANCE = 0.5
@@ -149,7 +149,7 @@ def check(
     *,
     significance: float = SIGNIFICANCE,
     progress: Progress = False,
-    workers: int = 1,
+    workers: Workers = 1,
 ) -> Check:
     """Test with a few new images whether an earlier calibration still holds.
 
@@ -163,8 +163,8 @@ def check(
         Probability of a false alarm.
     progress : bool or callable
         True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
-    workers : int
-        Search the images in that many processes.
+    workers : int, str or executor
+        Search the images there, as :func:`legcal.calibrate` does.
 
     Returns
     -------

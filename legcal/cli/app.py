@@ -9,6 +9,7 @@ import gc
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Annotated
@@ -103,6 +104,12 @@ def _refuse_empty(words: Sequence[str]) -> None:
             )
 
 
+def _print_warning(message: Warning | str, *_others: object, **_more: object) -> None:
+    """Say a warning on stderr in one line."""
+    if sys.stderr is not None:
+        sys.stderr.write(f"legcal: {printable(str(message))}\n")
+
+
 def run(*, as_json: bool) -> int:
     """Run the command line and return 0, 1 (data), 2 (use) or 3 (internal)."""
     # Thousands of small matrices: threads inside a product only get in each other's way.
@@ -110,6 +117,7 @@ def run(*, as_json: bool) -> int:
     # Plugins for models of files are of no use here, and are looked for in all that is installed.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     gc.set_threshold(_ALLOCATIONS)
+    warnings.showwarning = _print_warning
     usage_error: type[Exception] = typer.BadParameter.__bases__[0]
     try:
         _refuse_empty(sys.argv[1:])

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from legcal.cli.options import (
+    ClusterOption,
     DatasetArgument,
     JsonOption,
     QuietOption,
@@ -30,6 +31,7 @@ def calibrate(
         Path | None,
         typer.Option("--output", "-o", metavar="OUT", help="The result folder to write."),
     ] = None,
+    cluster: ClusterOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
     verbose: Annotated[
@@ -126,7 +128,7 @@ def calibrate(
                 "takes all of it from the earlier result; leave one of them out."
             )
         page = None if output is None or not with_report else _page_of_check(output)
-        _check(dataset, check, significance, page, quiet=quiet, as_json=as_json)
+        _check(dataset, check, significance, page, cluster, quiet=quiet, as_json=as_json)
         return
     if significance is not None:
         raise UsageError(
@@ -152,7 +154,7 @@ def calibrate(
         criteria=criteria,
         transformation=transformation,
         use_cache=not fresh,
-        workers=image_workers(),
+        workers=image_workers(cluster),
         priors=prior or (),
         fixed=fix or (),
         free=free or (),
@@ -200,6 +202,7 @@ def _check(
     result: Path,
     significance: float | None,
     page: Path | None,
+    cluster: str | None,
     *,
     quiet: bool,
     as_json: bool,
@@ -212,7 +215,7 @@ def _check(
         result,
         significance=calibration.SIGNIFICANCE if significance is None else significance,
         progress=not quiet,
-        workers=image_workers(),
+        workers=image_workers(cluster),
     )
     title = f"Check of {result.resolve().name}"
     write_page(page, title, report.check_summary(found), report.check_verdict(found))

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from legcal.cli.options import (
+    ClusterOption,
     DatasetArgument,
     JsonOption,
     ModelArgument,
@@ -53,6 +54,7 @@ def camera(
         typer.Option(metavar="FILE", help="A PNG to write: corners and residuals over the field."),
     ] = None,
     workers: WorkersOption = None,
+    cluster: ClusterOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -66,7 +68,7 @@ def camera(
         output=output,
         picture=picture,
         progress=not quiet,
-        workers=image_workers(workers),
+        workers=image_workers(cluster, workers),
     )
     show(as_json, found.document, lambda: report.camera_table(found, output))
 
@@ -84,6 +86,7 @@ def detect(
         ),
     ],
     workers: WorkersOption = None,
+    cluster: ClusterOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -91,7 +94,7 @@ def detect(
     from legcal import calibration, report
 
     found = calibration.detect(
-        dataset, output=output, progress=not quiet, workers=image_workers(workers)
+        dataset, output=output, progress=not quiet, workers=image_workers(cluster, workers)
     )
     show(as_json, lambda: found.document, lambda: report.detection_table(found, output))
     if found.unplaced or not found.outlines.used.any():
@@ -101,6 +104,7 @@ def detect(
 def doctor(
     dataset: DatasetArgument,
     workers: WorkersOption = None,
+    cluster: ClusterOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -110,7 +114,7 @@ def doctor(
     """
     from legcal import calibration, report
 
-    found = calibration.doctor(dataset, progress=not quiet, workers=image_workers(workers))
+    found = calibration.doctor(dataset, progress=not quiet, workers=image_workers(cluster, workers))
     show(as_json, found.document, lambda: report.examination_table(found))
     if not found.is_ready:
         raise typer.Exit(1 if found.is_usable else 2)
@@ -467,6 +471,7 @@ def noise(
         Path, typer.Argument(metavar="DATASET", help="A dataset with several images of each pose.")
     ],
     page: PageOption = None,
+    cluster: ClusterOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -474,7 +479,7 @@ def noise(
     from legcal import calibration, report
 
     check_page(page)
-    found = calibration.measure_noise(dataset, progress=not quiet, workers=image_workers())
+    found = calibration.measure_noise(dataset, progress=not quiet, workers=image_workers(cluster))
     title = f"Measurement noise of {found.dataset.machine.name}"
     write_page(page, title, report.noise_table(found))
     show(as_json, found.document, lambda: report.noise_table(found))

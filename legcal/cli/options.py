@@ -57,6 +57,18 @@ WorkersOption = Annotated[
 ]
 
 
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        metavar="ADDRESS",
+        envvar="LEGCAL_CLUSTER",
+        help="Work on the Dask cluster of this scheduler (tcp://host:8786), not in processes of "
+        "this machine.",
+    ),
+]
+
+
 PageOption = Annotated[
     Path | None,
     typer.Option("--page", metavar="FILE.html", help="Write the same as a page for the browser."),
@@ -100,9 +112,9 @@ def command_line() -> str:
     return shlex.join(["legcal", *sys.argv[1:]])
 
 
-def image_workers(workers: int | None = None) -> int:
-    """Return the number of processes that search images, by default few: each takes memory."""
-    return workers or min(processors(), MAX_IMAGE_WORKERS)
+def image_workers(cluster: str | None, workers: int | None = None) -> int | str:
+    """Return the cluster or the number of processes that search images, few: each takes memory."""
+    return cluster or workers or min(processors(), MAX_IMAGE_WORKERS)
 
 
 @contextmanager

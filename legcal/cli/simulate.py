@@ -11,6 +11,7 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from legcal.cli.options import (
+    ClusterOption,
     JsonOption,
     ModelArgument,
     QuietOption,
@@ -31,6 +32,7 @@ def simulate(
     model: ModelArgument,
     output: OutputOption,
     force: ForceOption = False,
+    cluster: ClusterOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
     **options: Any,
@@ -46,7 +48,7 @@ def simulate(
 
     nominal = load_mechanism(model)
     settings = requested(Request(**options), nominal)
-    workers = image_workers()
+    workers = image_workers(cluster)
     made = run(nominal, output, settings, force=force, workers=workers, progress=not quiet)
     document, repeated = summary_document(made), options["images"] > 1
     show(as_json, lambda: document, lambda: simulation_table(document, repeated=repeated))

@@ -9,7 +9,15 @@ from typing import Annotated
 
 import typer
 
-from legcal.cli.options import JsonOption, QuietOption, WorkersOption, print_table, show, write_page
+from legcal.cli.options import (
+    ClusterOption,
+    JsonOption,
+    QuietOption,
+    WorkersOption,
+    print_table,
+    show,
+    write_page,
+)
 from legcal.errors import UsageError
 from legcal.processors import processors
 
@@ -47,6 +55,7 @@ def paper(
     runs: Annotated[int, typer.Option(help="Number of runs.")] = 100,
     seed: Annotated[int, typer.Option(help="Seed of all runs.")] = 0,
     workers: WorkersOption = None,
+    cluster: ClusterOption = None,
     output: OutputFolder = None,
     radians: Annotated[
         bool, typer.Option("--radians", help="Take the angles of Table 1 as radians, as printed.")
@@ -63,7 +72,7 @@ def paper(
         PaperStudy(noise),
         runs,
         seed=seed,
-        workers=workers or processors(),
+        workers=cluster or workers or processors(),
         output=output,
         progress=not quiet,
     )

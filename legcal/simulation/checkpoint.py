@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from io import FileIO
+from itertools import islice
 from math import isfinite
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -24,9 +26,12 @@ CHECKPOINT_NAME = "runs.jsonl"
 _KEY = "legcal_study"
 _VERSION = 1
 _INTERRUPTED = b"NonIpopt_Exception_Thrown"  # an interrupt that earlier versions took for a failure
+_MERGED = 100  # lines that reach the disk together
 _MOST_OF_LINE = 4_000_000  # bytes
 _NEXT = "free some space and start the same command again; the runs before are kept"
 _NEXT_WITHOUT = "free some space, or give an output folder elsewhere, which keeps what is done"
+
+MOST_RUNS = 1_000_000
 
 IsRecord = Callable[[Any], bool]
 """Whether a document is what a study records."""
@@ -57,6 +62,25 @@ def open_checkpoint(
         yield checkpoint
 
 
+class _Places:
+    """Where the line of each run begins: 8 bytes a run."""
+
+    def __init__(self) -> None:
+        self._at = array("q")
+
+    def __contains__(self, run: int) -> bool:
+        return run < len(self._at) and self._at[run] >= 0
+
+    def __getitem__(self, run: int) -> int:
+        return self._at[run]
+
+    def add(self, run: int, place: int) -> None:
+        """Remember the first line of a run."""
+        self._at.extend([-1] * (run + 1 - len(self._at)))
+        if self._at[run] < 0:
+            self._at[run] = place
+
+
 class Checkpoint:
     """The runs of a study that are done, in a file."""
 
@@ -65,7 +89,7 @@ class Checkpoint:
         path: Path,
         reader: BinaryIO,
         writer: FileIO,
-        offsets: dict[int, int],
+        offsets: _Places,
         *,
         kept: bool,
     ) -> None:
@@ -78,22 +102,48 @@ class Checkpoint:
     def append(self, lines: Sequence[dict[str, Any]]) -> None:
         """Add the lines of some runs; they are on the disk when this returns."""
         place = self._writer.seek(0, os.SEEK_END)
-        places, content = {}, [_encoded(line) for line in lines]
-        for line, text in zip(lines, content, strict=True):
-            places[int(line["run"])] = place
-            place += len(text)
+        content = [_encoded(line) for line in lines]
         self._write(b"".join(content))
-        self.offsets.update(places)
+        for line, text in zip(lines, content, strict=True):
+            self.offsets.add(int(line["run"]), place)
+            place += len(text)
 
     def begin(self, first: dict[str, Any]) -> None:
         """Write the first line of an empty checkpoint; raises as :meth:`append`."""
         self._write(_encoded(first))
 
-    def lines(self, n_runs: int) -> Iterator[dict[str, Any]]:
-        """Return the lines of the first runs, in the order of their numbers."""
-        for run in range(n_runs):
+    def lines(self, runs: Iterable[int]) -> Iterator[dict[str, Any]]:
+        """Return the lines of runs, in the order of their numbers."""
+        for run in runs:
             self._reader.seek(self.offsets[run])
             yield json.loads(self._reader.readline())
+
+    def merge(self, other: Path, runs: Iterable[int], is_record: IsRecord) -> None:
+        """Add the lines of runs that another checkpoint of the same study has, and this lacks.
+
+        Raises
+        ------
+        UsageError
+            If the other one cannot be read, or is of another study.
+        """
+        self._reader.seek(0)
+        expected = json.loads(self._reader.readline())
+        try:
+            file = open_regular(other)
+        except OSError as error:
+            raise UsageError(
+                f"{other}: the runs could not be merged: found '{error.strerror}', needed the "
+                f"{CHECKPOINT_NAME} of a part of the study; name its folder."
+            ) from error
+        with file:
+            places, _ = _read(other, file, expected, is_record)
+            new = (run for run in runs if run in places and run not in self.offsets)
+            for some in iter(lambda: list(islice(new, _MERGED)), []):
+                lines = []
+                for run in some:
+                    file.seek(places[run])
+                    lines.append(json.loads(file.readline()))
+                self.append(lines)
 
     def _write(self, content: bytes) -> None:
         """Append bytes and wait until the disk has them; nothing once a signal was heard."""
@@ -149,13 +199,13 @@ def _parsed(line: bytes) -> Any:
 
 def _read(
     path: Path, file: BinaryIO, expected: dict[str, Any], is_record: IsRecord
-) -> tuple[dict[int, int], int]:
+) -> tuple[_Places, int]:
     """Return where the line of each run begins, and where the last complete line ends."""
     first = file.readline(_MOST_OF_LINE)
     if not first.endswith(b"\n") and _encoded(expected).startswith(first):
-        return {}, 0  # empty, or killed while it was begun
+        return _Places(), 0  # empty, or killed while it was begun
     _check_header(path, first, expected)
-    offsets: dict[int, int] = {}
+    offsets = _Places()
     end, broken, number = len(first), 0, 1
     for line in iter(lambda: file.readline(_MOST_OF_LINE), b""):
         number += 1
@@ -168,7 +218,7 @@ def _read(
         if not _is_run(found, is_record):
             raise _damaged(path, number)
         if _INTERRUPTED not in line:  # such a run is done again
-            offsets.setdefault(found["run"], end)
+            offsets.add(found["run"], end)
         end += len(line)
     return offsets, end
 
@@ -233,7 +283,9 @@ def _differences(found: Any, expected: Any, name: str = "") -> Iterator[str]:
 
 def _is_run(found: Any, is_record: IsRecord) -> bool:
     """Return whether a document is the record of a run, or its failure."""
-    if not isinstance(found, dict) or type(found.get("run")) is not int or found["run"] < 0:
+    if not isinstance(found, dict) or type(found.get("run")) is not int:
+        return False
+    if not 0 <= found["run"] < MOST_RUNS:
         return False
     if found.keys() == {"run", "record"}:
         return is_record(found["record"])

@@ -48,6 +48,7 @@ from legcal.simulation.session import (
 )
 from legcal.simulation.settings import SimulationSettings, whole_number
 from legcal.simulation.truth import write_true_model
+from legcal.workers import Workers, is_number
 
 
 @brief
@@ -92,7 +93,7 @@ def simulate(
     settings: SimulationSettings | None = None,
     *,
     force: bool = False,
-    workers: int = 1,
+    workers: Workers = 1,
     progress: Progress = False,
 ) -> SimulatedDataset:
     """Write a dataset of a machine that differs from its nominal model by drawn errors.
@@ -111,8 +112,8 @@ def simulate(
         What to simulate.
     force : bool
         Replace an earlier simulated dataset.
-    workers : int
-        Render photographs in that many processes.
+    workers : int, str or executor
+        Render photographs there, as :func:`legcal.calibrate` searches them.
     progress : bool or callable
         True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
 
@@ -133,7 +134,8 @@ def simulate(
     """
     settings = settings or SimulationSettings()
     destination = output_path(output, SIMULATED)
-    whole_number("workers", workers, 1)
+    if is_number(workers):
+        whole_number("workers", workers, 1)
     check_dataset_destination(destination, force=force)
     nominal = model if isinstance(model, Machine) else load_mechanism(model)
     _check_readings(nominal, settings)
@@ -181,7 +183,7 @@ def _write_photographs(
     session: SimulatedSession,
     settings: SimulationSettings,
     rngs: Streams,
-    workers: int,
+    workers: Workers,
     progress: Report,
 ) -> None:
     """Write the photograph of every row."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from uuid import uuid4
 
 import numpy as np
 
@@ -47,7 +48,7 @@ from legcal.simulation.settings import Distribution, SimulationSettings
 from legcal.simulation.solids import PlacedSolid, PosedMachine, dressed, pose_machine
 from legcal.simulation.visibility import Images, Viewpoint, take_images
 from legcal.vision import Camera, FixedBoard
-from legcal.workers import worker_pool
+from legcal.workers import Workers, worker_pool
 
 Streams = Mapping[str, np.random.Generator]
 
@@ -309,18 +310,22 @@ def _recorded(
 
 
 def photographs(
-    session: SimulatedSession, appearance: Appearance, rng: np.random.Generator, workers: int = 1
+    session: SimulatedSession,
+    appearance: Appearance,
+    rng: np.random.Generator,
+    workers: Workers = 1,
 ) -> Generator[tuple[int, bytes]]:
     """Yield row and file of all images of a session."""
     views, images = session.scene.views, session.scene.images
     of_views, of_images = rng.spawn(len(views)), rng.spawn(len(images))
+    name = uuid4().hex  # workers of a cluster see many sessions
     try:
         with worker_pool(workers) as run:
             for v, view in enumerate(views):
                 rows = np.flatnonzero(images.view == v).tolist()
                 machines = {row: session.posed_machines[images.pose[row]].solids for row in rows}
                 sensor_rngs = {row: of_images[row] for row in rows}
-                key = f"{id(session)} {v}"
+                key = f"{name} {v}"
                 studio = _Studio(key, view, appearance, of_views[v], machines, sensor_rngs)
                 yield from zip(rows, run(studio.photograph, rows), strict=True)
     finally:

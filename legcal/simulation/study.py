@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import json
 import tempfile
+from array import array
 from collections import Counter
-from collections.abc import Generator, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -26,17 +27,18 @@ from legcal.processors import processors
 from legcal.progress import Progress, shown_progress
 from legcal.simulation.checkpoint import (
     CHECKPOINT_NAME,
+    MOST_RUNS,
     Checkpoint,
     header,
     is_begun,
     open_checkpoint,
 )
-from legcal.workers import worker_pool
+from legcal.workers import Workers, is_number, worker_pool
 
 DOCUMENT_NAME = "study.json"
-MOST_RUNS = 1_000_000
 _LARGEST_CHUNK = 10  # runs between two lines of the checkpoint reaching the disk
 _PROCESSES = 4  # for each core; more only wait for each other
+_MANY = 64  # workers that a cluster may have
 _CHUNKS = 16  # for each process: the work is shared evenly to the end
 
 Record = dict[str, Any]
@@ -89,6 +91,8 @@ class StudyResult:
     n_runs: int
     failures: dict[str, int]  # how many runs failed as a whole, by kind of error
     summary: Summary  # what the others found
+    notes: tuple[str, ...] = ()  # on workers that differ from each other
+    part: tuple[int, int] | None = None  # which part of how many the runs are
 
     def document(self) -> dict[str, Any]:
         """Return the document that ``legcal study --json`` prints."""
@@ -99,6 +103,8 @@ class StudyResult:
             "seed": self.seed,
             "runs": self.n_runs,
             "failures": self.failures,
+            **({"notes": list(self.notes)} if self.notes else {}),
+            **({"part": list(self.part)} if self.part else {}),
         }
 
 
@@ -107,9 +113,11 @@ def run_study(
     n_runs: int,
     *,
     seed: int = 0,
-    workers: int = 1,
+    workers: Workers = 1,
     output: Path | None = None,
     progress: Progress = False,
+    part: tuple[int, int] | None = None,
+    merge: Sequence[Path] = (),
 ) -> StudyResult:
     """Run a study, or what is missing of it.
 
@@ -121,14 +129,18 @@ def run_study(
         Number of runs.
     seed : int
         Seed of the study.
-    workers : int
-        Number of processes; more than a few for each core are not started. With more than one,
-        the program must be safe to import (``if __name__ == "__main__":``).
+    workers : int, str or executor
+        Number of processes, of which no more than a few for each core are started, or a cluster, as
+        :func:`legcal.calibrate` takes them.
     output : Path, optional
         Folder for the checkpoint, the document and the figures. One that holds a checkpoint of
         the same study is continued; more runs than before are added to those that are there.
     progress : bool or callable
         True shows a bar on stderr; a function is called as ``progress(stage, done, total)``.
+    part : (k, n), optional
+        Only every n-th run, from run k - 1 on: n such parts make the study.
+    merge : sequence of Path
+        Folders of parts of the study, whose runs are taken over.
 
     Returns
     -------
@@ -144,33 +156,55 @@ def run_study(
         If a file cannot be written or a process is ended from outside.
     """
     _check_numbers(n_runs, seed, workers)
-    stage = f"Study {study.name}"
+    runs = _runs_of_part(n_runs, part)
+    stage, notes = f"Study {study.name}", tuple[str, ...]()
     with shown_progress(progress) as report, _folder(output) as folder:
         path = folder / CHECKPOINT_NAME
         first = header(study.name, study.settings, seed)
         kept = output is not None
         with open_checkpoint(path, first, study.is_record, kept=kept) as checkpoint:
-            missing = [run for run in range(n_runs) if run not in checkpoint.offsets]
-            done = n_runs - len(missing)
-            report(stage, done, n_runs)
-            with closing(lines_of_runs(study, seed, missing, workers)) as chunks:
-                for lines in chunks:
-                    checkpoint.append(lines)
-                    done += len(lines)
-                    report(stage, done, n_runs)
-            result = _result(study, seed, n_runs, checkpoint)
+            for other in merge:
+                checkpoint.merge(other / CHECKPOINT_NAME, runs, study.is_record)
+            missing = array("q", (run for run in runs if run not in checkpoint.offsets))
+            done = len(runs) - len(missing)
+            report(stage, done, len(runs))
+            if missing:
+                slots = _MANY
+                if is_number(workers):
+                    workers = slots = min(workers, len(missing), _PROCESSES * processors())
+                with worker_pool(workers, "The study could not be finished", in_order=False) as run:
+                    chunks = _chunks(missing, slots)
+                    for lines in run(partial(run_chunk, study, seed), chunks):
+                        checkpoint.append(lines)
+                        done += len(lines)
+                        report(stage, done, len(runs))
+                    notes = run.notes
+            result = replace(_result(study, seed, runs, checkpoint), notes=notes, part=part)
         if output is not None:
             _write(result, folder)
     return result
 
 
-def _result(study: Study, seed: int, n_runs: int, checkpoint: Checkpoint) -> StudyResult:
-    """Return what all runs found."""
+def _runs_of_part(n_runs: int, part: tuple[int, int] | None) -> range:
+    """Return the numbers of the runs; refuse a part that the study does not have."""
+    if part is None:
+        return range(n_runs)
+    k, n = part
+    if not 1 <= k <= n <= n_runs:
+        raise UsageError(
+            f"The study could not be run: found part {k}/{n}, needed K/N with K from 1 to N and N "
+            f"no more than the {n_runs} runs; correct it."
+        )
+    return range(k - 1, n_runs, n)
+
+
+def _result(study: Study, seed: int, runs: range, checkpoint: Checkpoint) -> StudyResult:
+    """Return what runs found, read one after the other."""
     failures: Counter[str] = Counter()
     messages: list[str] = []
 
     def records() -> Iterator[Record]:
-        for line in checkpoint.lines(n_runs):
+        for line in checkpoint.lines(runs):
             if "record" in line:
                 yield line["record"]
             else:
@@ -179,12 +213,12 @@ def _result(study: Study, seed: int, n_runs: int, checkpoint: Checkpoint) -> Stu
                     messages.append(line["failure"]["message"])
 
     summary = study.summary(records())
-    if failures.total() == n_runs:
+    if failures.total() == len(runs):
         raise DidNotConverge(
-            f"The study {study.name} found nothing: all of its {n_runs} runs failed, needed one "
+            f"The study {study.name} found nothing: all of its {len(runs)} runs failed, needed one "
             f"that does not; the first one says: {messages[0]}"
         )
-    return StudyResult(study.name, study.settings, seed, n_runs, dict(failures), summary)
+    return StudyResult(study.name, study.settings, seed, len(runs), dict(failures), summary)
 
 
 def _write(result: StudyResult, folder: Path) -> None:
@@ -237,14 +271,15 @@ def _check_folder(output: Path) -> None:
         )
 
 
-def _check_numbers(n_runs: int, seed: int, workers: int) -> None:
+def _check_numbers(n_runs: int, seed: int, workers: Workers) -> None:
     """Refuse numbers that make no sense."""
     if n_runs > MOST_RUNS:
         raise UsageError(
             f"The study could not be run: found runs = {n_runs}, needed {MOST_RUNS} at most; give "
             "another number."
         )
-    for name, found, least in (("runs", n_runs, 1), ("seed", seed, 0), ("workers", workers, 1)):
+    processes = workers if is_number(workers) else 1
+    for name, found, least in (("runs", n_runs, 1), ("seed", seed, 0), ("workers", processes, 1)):
         if found < least:
             raise UsageError(
                 f"The study could not be run: found {name} = {found}, needed {least} or more; "
@@ -258,19 +293,6 @@ def _check_numbers(n_runs: int, seed: int, workers: int) -> None:
 def child_seed(seed: int, run: int) -> np.random.SeedSequence:
     """Return the seed of a run: child ``run`` of the study's seed, however many there are."""
     return np.random.SeedSequence(seed, spawn_key=(run,))
-
-
-def lines_of_runs(
-    study: Study, seed: int, runs: Sequence[int], workers: int
-) -> Generator[list[dict[str, Any]]]:
-    """Return the lines of runs, chunk by chunk, in the order in which they are finished.
-
-    Chunks are handed out as processes get free, so that memory does not grow with their number.
-    """
-    workers = min(workers, max(len(runs), 1), _PROCESSES * processors())
-    failure = "The study could not be finished"
-    with worker_pool(workers, failure, in_order=False) as run:
-        yield from run(partial(run_chunk, study, seed), _chunks(runs, workers))
 
 
 def run_chunk(study: Study, seed: int, runs: Iterable[int]) -> list[dict[str, Any]]:

@@ -60,7 +60,7 @@ from legcal.vision import (
     read_image,
     recorded,
 )
-from legcal.workers import Run, worker_pool
+from legcal.workers import Run, Workers, worker_pool
 
 _STAGE = "Searching the board"
 _N_DESCRIBED = 2  # images of which it is said what they show instead
@@ -73,7 +73,7 @@ def calibrate_camera(
     model: DistortionModel | None = None,
     output: str | Path | None = None,
     progress: Progress = False,
-    workers: int = 1,
+    workers: Workers = 1,
     picture: str | Path | None = None,
 ) -> CameraCalibration:
     """Calibrate a camera from photographs of a flat board.
@@ -93,8 +93,8 @@ def calibrate_camera(
         :func:`legcal.calibrate` takes as their prior.
     progress : bool or callable
         True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
-    workers : int
-        Search the images in that many processes, as :func:`legcal.calibrate` does.
+    workers : int, str or executor
+        Search the images there, as :func:`legcal.calibrate` does.
     picture : path, optional
         Write a PNG there of where corners were seen, and how residuals lean over the field.
 

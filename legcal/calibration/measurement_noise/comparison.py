@@ -41,7 +41,7 @@ from legcal.perception import (
 )
 from legcal.progress import Progress, Report, shown_progress
 from legcal.vision import EPSILON
-from legcal.workers import worker_pool
+from legcal.workers import Workers, worker_pool
 
 _METHODS: dict[str, tuple[Method, str]] = {
     "detector": (measure, "Measuring outlines"),
@@ -61,7 +61,7 @@ _MIN_JUMP = 3.0  # ratio of spread to claim of an edge that jumps, and the same 
 
 
 def measure_noise(
-    source: str | Path | Dataset, *, progress: Progress = False, workers: int = 1
+    source: str | Path | Dataset, *, progress: Progress = False, workers: Workers = 1
 ) -> DatasetNoise:
     """Estimate the noise of outlines and leg axes from repeated images of the same poses.
 
@@ -72,8 +72,8 @@ def measure_noise(
         any, are left alone: the images are searched.
     progress : bool or callable
         True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
-    workers : int
-        Search the images in that many processes, as :func:`legcal.calibrate` does.
+    workers : int, str or executor
+        Search the images there, as :func:`legcal.calibrate` does.
 
     Raises
     ------
