@@ -78,6 +78,13 @@ def stopped_by_signals() -> Iterator[None]:
         _SignalState.handling = _SignalState.stopped = False
 
 
+def forget_stop() -> None:
+    """Forget the signal that was heard: what it was to end has ended as it should."""
+    _SignalState.stopped = False
+    if _HAS_TIMER:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
 def _raise_again(_number: int, _frame: FrameType | None) -> None:
     """Raise the interrupt, unless it is on its way and cleans up."""
     error = sys.exception()

@@ -21,7 +21,9 @@ ROOMS = (
     "calibration",
     "planning",
     "exports",
+    "scene",
     "report",
+    "viewer",
     "cli",
 )
 BESIDE = "simulation"  # it knows the truth

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from browser import PATIENCE, chromium
+from browser import errors as _errors
 from hexapod_example import HEXAPOD, Run
 
 import legcal
@@ -22,31 +24,13 @@ from legcal.vision.distortion import DistortionModel
 
 pytestmark = pytest.mark.system
 
-PATIENCE = 60  # [s] for plots in a browser that draws without a graphics card
 INTERACTIVE = 2000  # [ms]
 HOSTILE = "\"'`</script><img src=x onerror=alert(1)><script>alert(1)</script>"
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """Start Chromium; skip without it, and fail where it is there and cannot be driven."""
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-    if chromium is None:
-        pytest.skip("there is no Chromium (apt-get install chromium chromium-driver)")
-    driver = shutil.which("chromedriver")
-    if driver is None:
-        pytest.fail("Chromium is there and chromedriver is not (apt-get install chromium-driver)")
-    from selenium import webdriver
-    from selenium.webdriver.chrome.service import Service
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = chromium
-    for word in ("headless=new", "no-sandbox", "disable-gpu", "enable-unsafe-swiftshader",
-                 "window-size=1280,900"):  # fmt: skip
-        options.add_argument(f"--{word}")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    with webdriver.Chrome(service=Service(driver), options=options) as found:
-        found.set_script_timeout(PATIENCE)
+    with chromium() as found:
         yield found
 
 
@@ -54,10 +38,6 @@ def browser() -> Iterator[Any]:
 def page(example_run: Run, browser: Any) -> Any:
     browser.get(legcal.write_report(example_run.calibration, example_run.output).as_uri())
     return browser
-
-
-def _errors(browser: Any) -> list[str]:
-    return [one["message"] for one in browser.get_log("browser") if one["level"] == "SEVERE"]
 
 
 def _draw_all(browser: Any) -> None:

@@ -37,6 +37,7 @@ from legcal.cli.plan import plan
 from legcal.cli.schema import schema
 from legcal.cli.simulate import simulate
 from legcal.cli.study import study
+from legcal.cli.view import view
 from legcal.errors import LegcalError, UsageError, printable
 from legcal.signals import raise_if_stopped
 from legcal.version import __version__
@@ -88,6 +89,7 @@ for command in (
     simulate,
     example,
     schema,
+    view,
 ):
     app.command()(command)
 app.command("import")(import_)

@@ -21,6 +21,7 @@ from .dataset import Dataset as Dataset
 from .dataset import ImageReader as ImageReader
 from .dataset import inspect_files as inspect_files
 from .dataset import load_dataset as load_dataset
+from .dataset import read_outlines as read_outlines
 from .example import copy_example as copy_example
 from .holdout import dataset_at as dataset_at
 from .holdout import split_images as split_images

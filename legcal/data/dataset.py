@@ -182,7 +182,7 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         camera_paths=tuple(camera_paths[v] for v in origin),
         machine=machine,
         measurements=measurements,
-        observations=_read_outlines(folder, machine, measurements),
+        observations=read_outlines(folder, machine, measurements),
         notes=(*notes, *left_out, *_unused_views(yaml_path, rows)),
         axes=axes,
         overrides=entry.parameters.overrides(yaml_path),
@@ -258,7 +258,7 @@ def _view(name: str, entry: ViewEntry, camera: Camera) -> View:
     )
 
 
-def _read_outlines(folder: Path, machine: Machine, measurements: Measurements) -> Outlines | None:
+def read_outlines(folder: Path, machine: Machine, measurements: Measurements) -> Outlines | None:
     """Return the outlines beside the dataset, if there are any."""
     path = folder / OBSERVATIONS_NAME
     if not os.path.exists(path):

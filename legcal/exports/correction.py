@@ -22,19 +22,20 @@ from legcal.exports.identifiers import comment
 from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
+    COORDINATES,
     LegKind,
     Machine,
+    coordinates_of,
     geometries,
     leg_scale,
-    machine_equations,
-    poses_after,
-    solve,
+    own_coordinates,
+    poses_at_coordinates,
     solve_poses,
+    turned_back,
     workspace,
 )
 from legcal.version import __version__
 
-COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
 UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
 TO_FILE = np.array([1e3] * 3 + [float(np.degrees(1.0))] * 3)
 DEFAULT_NODES = {1: 21, 2: 21, 3: 11, 4: 7, 5: 5, 6: 4}  # by freedoms: at most 4,096 nodes in all
@@ -42,7 +43,6 @@ MAX_ROWS = 300_000
 TESTED = 1000  # cells at most in whose middle the table is tried
 SHRINKING, ATTEMPTS = 0.8, 20  # of the grid, until all nodes lie in the travel
 REACHED = 1e-9  # of a leg length
-FREE = 0.1
 _SEED = 2002
 
 
@@ -64,25 +64,7 @@ class _Model:
 
     def poses(self, coordinates: Array, near: Array) -> tuple[Array, BoolArray]:
         """Return poses (k, 3, 4) with these coordinates (k, m), and where there is one."""
-        scale = leg_scale(self.machine, self.machine.home)
-
-        def equations(poses: Array) -> tuple[Array, Array]:
-            found = machine_equations(self.machine, poses[:, :, :3], poses[:, :, 3])
-            keep = ~found.measured
-            values, slopes = coordinates_of(poses)
-            unit = np.where(self.own < 3, 1.0, scale)
-            off = _turned_back(values[:, self.own] - coordinates, self.own) * unit
-            return (
-                np.concatenate([found.values[:, keep], off], axis=1),
-                np.concatenate(
-                    [found.by_pose[:, keep], slopes[:, self.own] * unit[:, None]], axis=1
-                ),
-            )
-
-        unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
-        start = np.broadcast_to(near, (len(coordinates), 3, 4)).copy()
-        found = solve(equations, poses_after, start, tolerance=1e-14 * scale, unit=unit)
-        return found.points, found.worst <= REACHED * scale
+        return poses_at_coordinates(self.machine, self.own, coordinates, near)
 
     def readings(self, poses: Array) -> Array:
         """Return the readings (k, n_legs) at poses, zero for legs without a motor."""
@@ -158,52 +140,6 @@ def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Re
     return Rendered((ExportedFile("", content),), tuple(sentences), figures)
 
 
-def own_coordinates(machine: Machine) -> IntArray:
-    """Return which coordinates a machine has of its own, positions before angles.
-
-    A coordinate is taken where the motions that the constraints leave at home, and that those taken
-    before do not yet tell apart, move it by at least ``FREE`` of a motion; rotations count in leg
-    lengths.
-    """
-    pose = machine.home.as_matrix()[None, :3]
-    found = machine_equations(machine, pose[:, :, :3], pose[:, :, 3])
-    scale = leg_scale(machine, machine.home)
-    unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
-    constraints = found.by_pose[0, ~found.measured] * unit
-    _, _, rows = np.linalg.svd(np.vstack([constraints, np.zeros((6, 6))]))
-    free = rows[6 - machine.mobility :] * unit  # (m, 6) motions
-    slopes = coordinates_of(pose)[1][0]
-    moved = (slopes @ free.T) * np.array([1.0] * 3 + [scale] * 3)[:, None]
-    own: list[int] = []
-    for least in (FREE, 0.0):  # the second time, if need be, whatever is left
-        for k in range(len(COORDINATES)):
-            basis = np.linalg.qr(moved[own].T)[0] if own else np.zeros((machine.mobility, 0))
-            new = moved[k] - basis @ (basis.T @ moved[k])
-            if k not in own and len(own) < machine.mobility and np.linalg.norm(new) > least:
-                own.append(k)
-    return np.array(sorted(own), dtype=np.intp)
-
-
-def coordinates_of(poses: Array) -> tuple[Array, Array]:
-    """Return x, y, z, roll, pitch, yaw (k, 6) [m, rad] of poses, and their slopes (k, 6, 6).
-
-    Slopes are by rotations about the origin of the platform link and displacements in the base.
-    """
-    R = poses[:, :, :3]
-    roll = np.arctan2(R[:, 2, 1], R[:, 2, 2])
-    pitch = np.arctan2(-R[:, 2, 0], np.hypot(R[:, 2, 1], R[:, 2, 2]))
-    yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0])
-    values = np.concatenate([poses[:, :, 3], np.stack([roll, pitch, yaw], axis=1)], axis=1)
-    slopes = np.zeros((len(poses), 6, 6))
-    slopes[:, :3, 3:] = np.eye(3)
-    cos_y, sin_y = np.cos(yaw), np.sin(yaw)
-    cos_p, tan_p = np.cos(pitch), np.tan(pitch)
-    slopes[:, 3, 0], slopes[:, 3, 1] = cos_y / cos_p, sin_y / cos_p
-    slopes[:, 4, 0], slopes[:, 4, 1] = -sin_y, cos_y
-    slopes[:, 5, 0], slopes[:, 5, 1], slopes[:, 5, 2] = cos_y * tan_p, sin_y * tan_p, 1.0
-    return values, slopes
-
-
 def _number_of_nodes(given: int | None, m: int) -> int:
     """Return the nodes along each coordinate."""
     n = DEFAULT_NODES[m] if given is None else given
@@ -225,7 +161,7 @@ def _grid(models: tuple[_Model, _Model], n_nodes: int) -> tuple[list[Array], Arr
     machine, own = calibrated.machine, calibrated.own
     centre = coordinates_of(machine.home.as_matrix()[None, :3])[0][0, own]
     there = coordinates_of(_stacked(workspace(machine)[1]))[0][:, own]
-    there = centre + _turned_back(there - centre, own)
+    there = centre + turned_back(there - centre, own)
     middle, reach = there.mean(axis=0), np.abs(there - there.mean(axis=0)).max(axis=0)
     for part in SHRINKING ** np.arange(ATTEMPTS):
         for n in sorted({2, min(n_nodes, 3), n_nodes}):  # corners first: they leave it first
@@ -254,7 +190,7 @@ def _corrected(models: tuple[_Model, _Model], commands: Array) -> tuple[Array, B
     moved, there = nominal.forward(q, X)
     own = calibrated.own
     found = coordinates_of(moved)[0][:, own]
-    return commands + _turned_back(found - commands, own), reached & there
+    return commands + turned_back(found - commands, own), reached & there
 
 
 def _residuals(
@@ -327,12 +263,6 @@ def _no_grid(machine: Machine) -> str:
         "the middle of the workspace that both models reach inside the travel, needed one; check "
         "the travel of the motors."
     )
-
-
-def _turned_back(differences: Array, own: IntArray) -> Array:
-    """Return differences of coordinates with angles within half a turn."""
-    turns = np.where(own < 3, 0.0, 2.0 * np.pi)
-    return np.asarray(differences - turns * np.round(differences / np.where(own < 3, 1.0, turns)))
 
 
 def _square(poses: Array) -> Array:

@@ -9,6 +9,11 @@ from .configurations import random_poses as random_poses
 from .configurations import random_poses_of_legs as random_poses_of_legs
 from .configurations import random_walk as random_walk
 from .configurations import workspace as workspace
+from .coordinates import COORDINATES as COORDINATES
+from .coordinates import coordinates_of as coordinates_of
+from .coordinates import own_coordinates as own_coordinates
+from .coordinates import poses_at_coordinates as poses_at_coordinates
+from .coordinates import turned_back as turned_back
 from .cylinders import COAXIAL as COAXIAL
 from .diagnostics import singularity_note as singularity_note
 from .directions import SHOWN as SHOWN

@@ -123,18 +123,31 @@ class Follower:
         self._machine = mechanism
         self.configuration = mechanism.home_configuration
         if start is not None:
-            projected, problem = project_pose(mechanism, start)
-            if problem is not None:
-                raise UsageError(
-                    f"The pose could not be followed from its start: found {problem} there, needed "
-                    "a pose that the legs allow; correct the start."
-                )
-            self.configuration = close_at(mechanism, projected, self.configuration, exact=False)
+            self.place(start)
 
     @property
     def pose(self) -> RigidTransform:
         """T_base_platform at the last readings."""
         return platform_pose(self._machine, self.configuration)
+
+    def place(self, T_base_platform: RigidTransform) -> RigidTransform:
+        """Return the pose of the closed chain with the platform at a pose, its legs following.
+
+        Raises
+        ------
+        UsageError
+            If the legs do not allow the pose, by more than 1 % of a leg length.
+        DidNotConverge
+            If the legs do not reach it; the configuration stays where it was.
+        """
+        projected, problem = project_pose(self._machine, T_base_platform)
+        if problem is not None:
+            raise UsageError(
+                f"The pose could not be followed from its start: found {problem} there, needed "
+                "a pose that the legs allow; correct the start."
+            )
+        self.configuration = close_at(self._machine, projected, self.configuration, exact=False)
+        return self.pose
 
     def move_to(self, q: Array) -> RigidTransform:
         """Return the platform pose at readings, followed from the last ones.
@@ -260,17 +273,23 @@ def reading_residuals(machine: Machine, T_base_platform: RigidTransform, q: Arra
     return found
 
 
-def consistent_readings(machine: Machine, readings: Array) -> Array:
-    """Return the nearest readings (k, n_motors) that motors can have together, linearly from home.
+def consistent_readings(
+    machine: Machine, readings: Array, at: RigidTransform | None = None
+) -> Array:
+    """Return the nearest readings (k, n_motors) that motors can have together.
 
-    Readings of motors that are not redundant are returned as they are.
+    They are so linearly, from home or another pose T_base_platform. Readings of motors that are not
+    redundant are returned as they are.
     """
     if not machine.is_redundant:
         return readings
     motors = list(machine.motors)
-    home = machine.home_configuration[slider_columns(machine, motors)[0]]
-    span = machine.sign[motors][:, None] * _reading_span(machine, machine.home)
-    return np.asarray(home + (readings - home) @ span @ span.T)
+    if at is None:
+        at, here = machine.home, machine.home_configuration[slider_columns(machine, motors)[0]]
+    else:
+        here = readings_at(machine, at)[motors]
+    span = machine.sign[motors][:, None] * _reading_span(machine, at)
+    return np.asarray(here + (readings - here) @ span @ span.T)
 
 
 def _reading_span(machine: Machine, T: RigidTransform) -> Array:

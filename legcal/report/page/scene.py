@@ -8,19 +8,26 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration import Calibration, poses_at_readings
+from legcal.calibration import Calibration
 from legcal.data import row_names
 from legcal.geometry import Array, components
 from legcal.machine import Leg, geometries, moved_legs
 from legcal.pages import Plot, plain
 from legcal.report.page.residual_plots import FONT
+from legcal.scene import (
+    FACTORS,
+    around,
+    directions,
+    ellipsoids,
+    enlargement,
+    joints_at,
+    pyramid,
+    step_shown,
+)
 
 MAX_POSES = 60  # of the slider
 MAX_CAMERAS = 60
-FACTORS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000, 50000)
-_SHOWN = 0.12  # of the size of the machine: how far the largest change is drawn at first
-_RING = 0.02  # of it: the median ellipsoid
-_ROOM = 0.8  # of it: about the machine
+_ROOM = 0.8  # of the size of the machine: about it
 _EYE = np.array([1.3, -1.5, 0.8])  # where it is looked at from, in its size
 _N_RING = 20  # points of a ring
 _GREY, _BLUE, _AMBER, _GREEN = "#9aa1ab", "#1f5fa8", "#b26a00", "#1e7d46"
@@ -35,26 +42,23 @@ def machine_scene(calibration: Calibration) -> Plot:
     )
     q = measurements.q[measurements.first_rows][chosen]
     fitted = [solution.T_Rb_Re[k] for k in chosen.tolist()]
-    frame = machine.T_base_Rb
-    turn_base = frame.rotation.as_matrix()
+    turn_base = machine.T_base_Rb.rotation.as_matrix()
     turn_platform = machine.T_platform_Re.rotation.as_matrix().T
 
     def placed(legs: Sequence[Leg], near: Sequence[RigidTransform]) -> tuple[Array, Array]:
         """Return A (n, 3) and B (k, n, 3) of legs at the readings, in the base link."""
-        poses = poses_at_readings(machine, legs, q, near) if calibration.platform else near
-        A = frame.apply(np.array([leg.A for leg in legs]))
-        B = np.array([leg.B for leg in legs])
-        R, t = components(poses)
-        in_frame = B @ R.transpose(0, 2, 1) + t[:, None]
-        return A, in_frame @ frame.rotation.as_matrix().T + frame.translation
+        by_readings = calibration.platform is not None
+        return joints_at(machine, legs, q, near, by_readings=by_readings)
 
     found = placed(solution.legs, fitted)
     size = float(np.ptp(np.concatenate([found[0], found[1][0]]), axis=0).max())
     modes = [
         _mode("what the calibration changed", placed(geometries(machine), fitted), found, size)
     ]
-    for what, step in _directions(calibration):
-        legs = moved_legs(solution.legs, solution.parametrization.place, step)
+    parameters = solution.parametrization
+    length = float(np.mean(np.linalg.norm(found[1][0] - found[0], axis=1)))
+    for what, step in directions(calibration.result, parameters, length):
+        legs = moved_legs(solution.legs, parameters.place, step)
         modes.append(_mode(what, found, placed(legs, fitted), size))
     rings, ring_factor = _rings(calibration, size)
     images = row_names(measurements)
@@ -66,7 +70,7 @@ def machine_scene(calibration: Calibration) -> Plot:
         "poses": [plain(images[row]) for row in measurements.first_rows[chosen].tolist()],
         "turns": _rounded(turn_base @ components(fitted)[0] @ turn_platform, 6),
         "rings": rings,
-        "outline": {"base": _around(found[0]), "platform": _around(found[1][0])},
+        "outline": {"base": around(found[0]), "platform": around(found[1][0])},
         "traces": {"legs": [0, 1], "base": [2, 3], "platform": [4, 5], "rings": 6},
     }
     names = [plain(name) for name in machine.leg_names]
@@ -134,11 +138,9 @@ def _mode(
 ) -> dict[str, Any]:
     """Return what is shown of a difference, exaggerated at first so that it is seen."""
     moved = max(float(np.abs(b - a).max()) for a, b in zip(before, after, strict=True))
-    wanted = _SHOWN * size / max(moved, 1e-12)
-    step = max(k for k, factor in enumerate(FACTORS) if factor <= max(wanted, 1.0))
     return {
         "name": name,
-        "step": step,
+        "step": step_shown(moved, size),
         "base": [_rounded(before[0], 7), _rounded(after[0], 7)],
         "platform": [
             [_rounded(a, 7), _rounded(b, 7)] for a, b in zip(before[1], after[1], strict=True)
@@ -150,54 +152,18 @@ def _rounded(values: Array, digits: int) -> Any:
     return np.round(values, digits).tolist()
 
 
-def _directions(calibration: Calibration) -> list[tuple[str, Array]]:
-    """Return the steps of the parameters (p,) along weak and held directions, with words."""
-    solution, result = calibration.solution, calibration.result
-    names, units = solution.parametrization.names, solution.parametrization.units
-    length = float(np.mean([np.linalg.norm(T.apply(leg.B) - leg.A)
-                            for T in solution.T_Rb_Re[:1] for leg in solution.legs]))  # fmt: skip
-    found = []
-    for weak, row in zip(solution.weak, result.weakest, strict=True):
-        step = np.zeros(len(names))
-        for name, component in weak.parts:
-            if name in names:
-                i = names.index(name)
-                step[i] = weak.sigma * component / (length if units[i] == "rad" else 1.0)
-        if np.any(step):
-            found.append((f"1 sigma along: {row.direction}", step))
-    for words, row in zip(solution.held, solution.held_basis, strict=False):
-        found.append((f"1 mm along what is held: {words}", 1e-3 * row))
-    return found
-
-
 def _rings(calibration: Calibration, size: float) -> tuple[dict[str, Any], float]:
     """Return ellipsoids at joints as rings about their centres [m], and how they are enlarged."""
     turn = np.linspace(0.0, 2.0 * np.pi, _N_RING + 1)
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    found: dict[str, list[list[Array]]] = {"base": [], "platform": []}
-    for side, block in (calibration.result.links or {}).items():
-        for joint in block.joints:
-            value, vector = np.linalg.eigh(np.array(joint.covariance))
-            axes = vector * np.sqrt(np.maximum(value, 0.0))
-            pairs = ([0, 1], [1, 2], [0, 2])
-            found[side].append([circle @ axes[:, pair].T for pair in pairs])
-    largest = [np.abs(rings).max() for side in found.values() for rings in side]
-    usual = float(np.median([one for one in largest if one > 0.0] or [1.0]))
-    wanted = _RING * size / usual
-    power = 10.0 ** np.floor(np.log10(wanted))
-    factor = power * max(s for s in (1, 2, 5) if s * power <= wanted)
-    return {
-        side: [[_rounded(factor * ring, 5) for ring in rings] for rings in of_side]
-        for side, of_side in found.items()
-    }, float(factor)
-
-
-def _around(points: Array) -> list[int]:
-    """Return joints in the order of their angles about their middle, the first again at the end."""
-    away = points - points.mean(axis=0)
-    _, _, axes = np.linalg.svd(away)
-    order = np.argsort(np.arctan2(away @ axes[1], away @ axes[0])).tolist()
-    return [*order, order[0]]
+    axes = ellipsoids(calibration.result)
+    factor = enlargement(axes, size)
+    found: dict[str, Any] = {"base": [], "platform": []}
+    for side, of_side in axes.items():
+        for one in factor * of_side:
+            rings = [circle @ one[:, pair].T for pair in ([0, 1], [1, 2], [0, 2])]
+            found[side].append([_rounded(ring, 5) for ring in rings])
+    return found, factor
 
 
 def _lines(name: str, colour: str, width: float, *, legend: bool = True) -> dict[str, Any]:
@@ -226,10 +192,7 @@ def _cameras(calibration: Calibration, depth: float) -> dict[str, Any]:
         if view.name not in shown or len(names) >= MAX_CAMERAS * 13:
             continue
         camera = solution.cameras[v]
-        w, h = camera.width - 0.5, camera.height - 0.5
-        corners = camera.undistort(np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]]))
-        rays = depth * np.concatenate([corners, np.ones((4, 1))], axis=1)
-        points = (frame * solution.T_camera_Rb[v].inv()).apply(np.concatenate([[[0.0] * 3], rays]))
+        points = pyramid(camera, frame * solution.T_camera_Rb[v].inv(), depth)
         p = np.round(points, 4).tolist()
         gap = [None] * 3
         x += [p[1], p[2], p[3], p[4], p[1], gap]

@@ -1,0 +1,61 @@
+"""``legcal view``."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from legcal.cli.options import print_table
+from legcal.signals import forget_stop
+
+
+def view(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="MODEL|RESULT|DATASET",
+            help="A mechanism as for inspect, the folder that calibrate wrote, or a dataset.",
+        ),
+    ],
+    dataset: Annotated[
+        Path | None,
+        typer.Option(help="The dataset of a result, for its poses and photographs."),
+    ] = None,
+    host: Annotated[
+        str, typer.Option(help="Who can look: 127.0.0.1 this machine alone, 0.0.0.0 everybody.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="The port; 0 for any that is free.")
+    ] = 8080,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open the browser.")
+    ] = True,
+) -> None:
+    """Show a machine in the browser, moved by sliders: readings, pose, photographs, uncertainty."""
+    from legcal import viewer
+
+    viewer.require_viser()
+    address = viewer.Address(host, port)
+    viewer.check_address(address)
+    window = viewer.Window(viewer.open_source(source, dataset), address)
+    print_table(f"{window.source.name} is shown at {window.address}; Ctrl-C ends it.")
+    if browser and _has_screen():
+        import webbrowser
+
+        webbrowser.open(str(window.address))
+    try:
+        window.run()
+    except KeyboardInterrupt:  # the way to end it
+        window.close()
+        forget_stop()
+
+
+def _has_screen() -> bool:
+    """Say whether a browser with windows can be opened."""
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

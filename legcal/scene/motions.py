@@ -1,0 +1,69 @@
+"""Where joints are at readings, and what moves them: a calibration, or a weak direction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.calibration import Result, poses_at_readings
+from legcal.geometry import Array, components
+from legcal.machine import Leg, Machine, Parametrization
+
+FACTORS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000, 50000)
+_SHOWN = 0.12  # of the size of the machine: how far the largest change is drawn at first
+_HELD = 1e-3  # [m]
+
+
+def joints_at(
+    machine: Machine,
+    legs: Sequence[Leg],
+    q: Array,
+    near: Sequence[RigidTransform],
+    *,
+    by_readings: bool = True,
+) -> tuple[Array, Array]:
+    """Return A (n, 3) and B (k, n, 3) of legs in the base link [m], the platform at readings.
+
+    Legs are in R_b and R_e, poses T_Rb_Re are looked for *near* others; the platform stays at
+    these where it is not placed *by_readings* q (k, n).
+    """
+    poses = poses_at_readings(machine, legs, q, near) if by_readings else near
+    frame = machine.T_base_Rb
+    A = frame.apply(np.array([leg.A for leg in legs]))
+    B = np.array([leg.B for leg in legs])
+    R, t = components(poses)
+    in_frame = B @ R.transpose(0, 2, 1) + t[:, None]
+    return A, in_frame @ frame.rotation.as_matrix().T + frame.translation
+
+
+def directions(
+    result: Result, parameters: Parametrization, length: float
+) -> list[tuple[str, Array]]:
+    """Return steps of the parameters (p,) along weak and held directions, with words.
+
+    Weak ones are as long as their standard deviation, held ones 1 mm; *length* is that of a leg
+    [m], by which turns count.
+    """
+    names = list(parameters.names)
+    found = []
+    for weak in result.weakest:
+        step = np.zeros(len(names))
+        for name, component in zip(weak.parameters, weak.components, strict=True):
+            if name in names:
+                i = names.index(name)
+                per = length if parameters.units[i] == "rad" else 1.0
+                step[i] = weak.sigma_m * component / per
+        if np.any(step):
+            found.append((f"1 sigma along: {weak.direction}", step))
+    order = [result.kinematic.names.index(name) for name in names]
+    for words, row in zip(result.held, result.kinematic.held, strict=False):
+        found.append((f"1 mm along what is held: {words}", _HELD * np.array(row)[order]))
+    return found
+
+
+def step_shown(moved: float, size: float) -> int:
+    """Return which of ``FACTORS`` makes a motion [m] visible on a machine of some size [m]."""
+    wanted = _SHOWN * size / max(moved, 1e-12)
+    return max(k for k, factor in enumerate(FACTORS) if factor <= max(wanted, 1.0))

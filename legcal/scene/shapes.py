@@ -1,0 +1,52 @@
+"""Shapes beside the legs: rims of base and platform, ellipsoids at joints, pyramids of cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.calibration import Result
+from legcal.geometry import Array
+from legcal.vision import Camera
+
+_USUAL = 0.02  # of the size of the machine: the median ellipsoid as it is drawn
+
+
+def around(points: Array) -> list[int]:
+    """Return joints (n, 3) in the order of their angles about their middle, the first twice."""
+    away = points - points.mean(axis=0)
+    _, _, axes = np.linalg.svd(away)
+    order = np.argsort(np.arctan2(away @ axes[1], away @ axes[0])).tolist()
+    return [*order, order[0]]
+
+
+def ellipsoids(result: Result) -> dict[str, Array]:
+    """Return half axes of one sigma at the joints of base and platform, (n, 3, 3) [m].
+
+    Columns are axes, in the link; they are zero along what is fixed or defines a frame.
+    """
+    found = {}
+    for side, block in (result.links or {}).items():
+        value, vector = np.linalg.eigh(np.array([joint.covariance for joint in block.joints]))
+        found[str(side)] = vector * np.sqrt(np.maximum(value, 0.0))[:, None]
+    return found
+
+
+def enlargement(axes: Mapping[str, Array], size: float) -> float:
+    """Return by which of 1, 2, 5, 10, ... the usual ellipsoid is seen on a machine [m]."""
+    longest = [np.linalg.norm(of_side, axis=1).max(axis=1) for of_side in axes.values()]
+    seen = np.concatenate([*longest, np.zeros(0)])
+    usual = float(np.median(seen[seen > 0.0])) if np.any(seen > 0.0) else 1.0
+    wanted = _USUAL * size / usual
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(power * max(s for s in (1, 2, 5) if s * power <= wanted))
+
+
+def pyramid(camera: Camera, T_base_camera: RigidTransform, depth: float) -> Array:
+    """Return the centre of a camera and the corners of what it sees at a depth [m], (5, 3)."""
+    w, h = camera.width - 0.5, camera.height - 0.5
+    corners = camera.undistort(np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]]))
+    rays = depth * np.concatenate([corners, np.ones((4, 1))], axis=1)
+    return np.asarray(T_base_camera.apply(np.concatenate([np.zeros((1, 3)), rays])))

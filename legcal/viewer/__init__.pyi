@@ -1,0 +1,11 @@
+from .address import Address as Address
+from .address import check_address as check_address
+from .motion import Motion as Motion
+from .motion import Posture as Posture
+from .photographs import Photographs as Photographs
+from .source import Source as Source
+from .source import open_source as open_source
+from .stage import Seen as Seen
+from .stage import Stage as Stage
+from .window import Window as Window
+from .window import require_viser as require_viser

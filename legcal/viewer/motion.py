@@ -1,0 +1,198 @@
+"""Where the machine stands, moved by readings or by the platform's own coordinates.
+
+Readings move the closed chain, each step from the last (:class:`legcal.machine.Follower`); a pose
+is met exactly and the legs follow. What cannot be reached leaves the machine where it was, with
+the reason in words.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import LegcalError
+from legcal.geometry import Array, BoolArray, motion_of
+from legcal.machine import (
+    Follower,
+    LegKind,
+    Machine,
+    consistent_readings,
+    coordinates_of,
+    followed_poses,
+    joint_values,
+    leg_scale,
+    own_coordinates,
+    poses_at_coordinates,
+    readings_at,
+)
+
+_AT_END = 1e-6  # [m] from the end of a travel
+_TICKS = 40  # by which the range of a coordinate is looked for, on either side of home
+_TURN = 0.5 * np.pi  # [rad], and
+_WAY = 1.0  # of a leg length: as far as a coordinate goes where no travel ends it
+_BEYOND = 1.15  # of the range in which legs keep their travel
+_STROKE = 0.5  # of a leg length: the range of a motor without travel
+_LEAST_SHARE = 1e-6  # of a reading that the freedoms of the platform move
+
+
+@dataclass(frozen=True, eq=False)
+class Posture:
+    """Where a machine stands."""
+
+    T: RigidTransform  # T_base_platform
+    q: Array  # (n_legs,) joint values [m]; zero for legs of constant length
+    problem: str = ""  # why it does not stand where it should; "" where it does
+
+
+class Motion:
+    """A machine that is moved; it starts at home.
+
+    Attributes
+    ----------
+    machine : Machine
+        The machine.
+    own : (m,) array of int
+        Which of x, y, z, roll, pitch, yaw are the platform's own coordinates.
+    posture : Posture
+        Where it stands.
+    """
+
+    def __init__(self, machine: Machine) -> None:
+        self.machine = machine
+        self.own = own_coordinates(machine)
+        self._follower = Follower(machine) if machine.is_determined else None
+        self.posture = self.home()
+
+    def home(self) -> Posture:
+        """Return the machine at home."""
+        T = self.machine.home
+        if self._follower is not None:
+            self._follower.configuration = self.machine.home_configuration
+        return self._stand(T, self._values(T))
+
+    @property
+    def coordinates(self) -> Array:
+        """The own coordinates of the pose, (m,) [m, rad]."""
+        values, _ = coordinates_of(self.posture.T.as_matrix()[None, :3])
+        return np.asarray(values[0, self.own])
+
+    @property
+    def at_end(self) -> BoolArray:
+        """Which legs are at an end of their travel or beyond it, (n_legs,)."""
+        lower, upper = self.travel.T
+        q = self.posture.q
+        return np.asarray(((q <= lower + _AT_END) | (q >= upper - _AT_END)) & self._slides)
+
+    @property
+    def travel(self) -> Array:
+        """The ends of the travel of all legs, (n_legs, 2) [m]; infinite where there are none."""
+        return np.array([leg.travel for leg in self.machine.legs], dtype=np.float64).reshape(-1, 2)
+
+    @property
+    def _slides(self) -> BoolArray:
+        return np.array([leg.kind is not LegKind.CONSTANT for leg in self.machine.legs])
+
+    def ranges_of_readings(self) -> Array:
+        """Return from where to where each leg is moved, (n_legs, 2) [m]."""
+        about = readings_at(self.machine, self.machine.home)[:, None]
+        stroke = _STROKE * leg_scale(self.machine, self.machine.home)
+        travel = self.travel
+        free = ~np.isfinite(travel) | (np.ptp(travel, axis=1) <= 0.0)[:, None]
+        return np.where(free, about + stroke * np.array([-1.0, 1.0]), travel)
+
+    def ranges_of_coordinates(self) -> Array:
+        """Return from where to where each own coordinate goes, (m, 2) [m, rad].
+
+        The others as at home, it goes a little farther than the legs, where travels end.
+        """
+        machine, home = self.machine, self.machine.home.as_matrix()[:3]
+        centre = coordinates_of(home[None])[0][0, self.own]
+        scale = leg_scale(machine, machine.home)
+        lower, upper = self.travel.T
+        found = np.zeros((len(self.own), 2))
+        for k, which in enumerate(self.own.tolist()):
+            most = _WAY * scale if which < 3 else _TURN
+            for side, sign in enumerate((-1.0, 1.0)):
+                steps = sign * most * np.arange(1, _TICKS + 1) / _TICKS
+                wanted = np.repeat(centre[None], _TICKS, axis=0)
+                wanted[:, k] += steps
+                poses, reached = poses_at_coordinates(machine, self.own, wanted, home)
+                in_base = machine.B_platform @ poses[:, :, :3].transpose(0, 2, 1)
+                vectors = in_base + poses[:, None, :, 3] - machine.A_base
+                q = machine.sign * (np.linalg.norm(vectors, axis=2) - machine.q0)
+                inside = reached & (((q >= lower) & (q <= upper)) | ~self._slides).all(axis=1)
+                last = int(np.argmin(inside)) if not inside.all() else _TICKS
+                found[k, side] = centre[k] + _BEYOND * steps[max(last - 1, 0)]
+        return found
+
+    def read(self, leg: int, value: float) -> Posture:
+        """Return the machine with a motor at a reading [m], the others where they are.
+
+        Of redundant motors the others give way, as little as they can.
+        """
+        if self._follower is None:
+            return self._stay(f"Readings do not move it: {self.machine.undetermined}.")
+        q = self.posture.q.copy()
+        step = value - q[leg]
+        if self.machine.is_redundant:
+            motors = list(self.machine.motors)
+            here = readings_at(self.machine, self.posture.T)[motors]
+            unit = np.eye(len(motors))[motors.index(leg)]
+            pulled = consistent_readings(self.machine, here + unit, self.posture.T) - here
+            share = pulled[motors.index(leg)]
+            if share < _LEAST_SHARE:
+                return self._stay(
+                    f"The motor of {self.machine.leg_names[leg]} cannot move alone: no freedom of "
+                    "the platform moves it here."
+                )
+            q[motors] += step / share * pulled
+        else:
+            q[leg] = value
+        try:
+            T = self._follower.move_to(q)
+        except LegcalError as error:
+            return self._stay(str(error))
+        return self._stand(T, joint_values(self.machine, self._follower.configuration))
+
+    def place(self, coordinate: int, value: float) -> Posture:
+        """Return the machine with one own coordinate of its pose at a value [m, rad]."""
+        wanted = self.coordinates
+        wanted[coordinate] = value
+        near = self.posture.T.as_matrix()[:3]
+        poses, reached = poses_at_coordinates(self.machine, self.own, wanted[None], near)
+        if not reached[0]:
+            return self._stay("The joints of the legs allow no pose with these coordinates.")
+        return self._follow(motion_of(poses[0, :, :3], poses[0, :, 3]))
+
+    def show(self, q: Array) -> Posture:
+        """Return the machine at readings (n_legs,) [m] of a session, wherever it stood."""
+        if self._follower is None:
+            return self._stay(f"Readings do not give the pose: {self.machine.undetermined}.")
+        try:
+            ((T, failure),) = followed_poses(self.machine, q[None], on_the_chain=False)
+        except LegcalError as error:
+            return self._stay(str(error))
+        return self._stay(str(failure)) if failure is not None else self._follow(T)
+
+    def _follow(self, T: RigidTransform) -> Posture:
+        """Return the machine at a pose, the chain closed there."""
+        if self._follower is not None:
+            try:
+                T = self._follower.place(T)
+            except LegcalError as error:
+                return self._stay(str(error))
+        return self._stand(T, self._values(T))
+
+    def _values(self, T: RigidTransform) -> Array:
+        """Return the joint values at a pose."""
+        return np.where(self._slides, readings_at(self.machine, T), 0.0)
+
+    def _stand(self, T: RigidTransform, q: Array) -> Posture:
+        self.posture = Posture(T, q)
+        return self.posture
+
+    def _stay(self, problem: str) -> Posture:
+        self.posture = replace(self.posture, problem=problem)
+        return self.posture

@@ -1,0 +1,87 @@
+"""What is looked at: a model, a result with what is known of it, a session with photographs."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from legcal.calibration import EarlierResult
+from legcal.data import OBSERVATIONS_NAME, Dataset, load_dataset, read_outlines
+from legcal.errors import UsageError
+from legcal.exports import load_subject
+from legcal.machine import DATASET_YAML, Machine
+
+_MARKERS = (DATASET_YAML, "result.json", "calibrated.yaml", "robot.yaml")
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A machine, and what there is of its calibration and its session."""
+
+    machine: Machine  # the calibrated one of a result
+    nominal: Machine | None = None  # of which only the legs are looked at; None without a result
+    result: EarlierResult | None = None
+    dataset: Dataset | None = None  # its readings in the order of the machine's legs
+
+    @property
+    def name(self) -> str:
+        """The name of the machine."""
+        return self.machine.name if self.result is None else self.machine.urdf.name
+
+
+def open_source(given: str | Path, dataset: str | Path | None = None) -> Source:
+    """Return what a path or the name of a shipped model stands for.
+
+    Parameters
+    ----------
+    given : str or Path
+        A dataset folder, a result folder, or a mechanism.
+    dataset : str or Path, optional
+        The dataset that a result was computed from, which a result does not name.
+
+    Raises
+    ------
+    UsageError
+        If it is a folder that is none of the three, or a dataset is given beside another.
+    DatasetError, ModelError, OutOfClass
+        If its files cannot be used.
+    """
+    path = Path(given)
+    if os.path.isdir(path) and not any(os.path.exists(path / name) for name in _MARKERS):
+        raise UsageError(
+            f"{path}: nothing could be shown: found a folder without {', '.join(_MARKERS[:-1])} or "
+            f"{_MARKERS[-1]}, needed a dataset, a result of legcal calibrate, or a model; give one."
+        )
+    is_result = os.path.isfile(path / "result.json") or path.name == "result.json"
+    is_dataset = path.name == DATASET_YAML or os.path.isfile(path / DATASET_YAML)
+    if is_dataset and not is_result:
+        if dataset is not None:
+            raise UsageError(
+                f"--dataset could not be used: found the dataset {path} beside it, needed a result "
+                "or a model; leave one of them out."
+            )
+        found = load_dataset(path, check_images=False)
+        return Source(found.machine, dataset=found)
+    subject = load_subject(given)
+    if dataset is None:
+        return Source(subject.machine, subject.nominal, subject.result)
+    session = _session(subject.machine, load_dataset(dataset, check_images=False), subject.result)
+    return Source(subject.machine, subject.nominal, subject.result, session)
+
+
+def _session(machine: Machine, dataset: Dataset, result: EarlierResult | None) -> Dataset:
+    """Return the session of a machine, with the outlines that its calibration used."""
+    names = dataset.machine.leg_names
+    if sorted(names) != sorted(machine.leg_names):
+        raise UsageError(
+            f"--dataset could not be used: found one of a machine with the legs {', '.join(names)},"
+            f" needed those of {machine.name}: {', '.join(machine.leg_names)}; give the dataset "
+            "that the result was computed from."
+        )
+    outlines = dataset.observations
+    if result is not None and os.path.isfile(result.folder / OBSERVATIONS_NAME):
+        outlines = read_outlines(result.folder, dataset.machine, dataset.measurements)
+    order = [names.index(name) for name in machine.leg_names]
+    measurements = replace(dataset.measurements, q=dataset.measurements.q[:, order])
+    return replace(dataset, measurements=measurements, observations=outlines)
