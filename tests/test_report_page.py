@@ -11,17 +11,19 @@ import cv2
 import numpy as np
 import pytest
 from command_line import run
-from hexapod_example import Run
+from hexapod_example import TRUTH, Run
 from lxml import html
 from rich.console import Group
 from rich.table import Table as TextTable
 from scipy.ndimage import map_coordinates
 
 import legcal
-from legcal.calibration import platform_map
+from legcal.calibration import Calibration, platform_map
+from legcal.calibration.fit_overlays import with_overlays
 from legcal.calibration.result_folder import write_result
-from legcal.errors import UsageError
+from legcal.errors import OutOfResources, UsageError
 from legcal.pages import Items, Number, Text, Verdict, number, page_html
+from legcal.perception.overlays import COLOURS
 from legcal.report.page.calibration_page import calibration_page
 from legcal.report.page.parameter_rows import parameter_tables
 from legcal.report.page.text_page import text_page
@@ -230,16 +232,135 @@ def test_a_report_is_not_written_over_another_file(example_run: Run, tmp_path: P
     assert legcal.write_report(example_run.calibration, tmp_path).exists()
 
 
+def _writing(calibration: Calibration) -> Any:
+    """Return a calibration of no time, which writes its result."""
+
+    def calibrate(*_: Any, output: Path, beside: Any, **__: Any) -> Calibration:
+        return write_result(calibration, output, beside=beside)
+
+    return calibrate
+
+
 def test_calibrate_writes_the_report_unless_it_should_not(
     example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
-    monkeypatch.setattr("legcal.calibration.calibrate", lambda *_, **__: example_run.calibration)
-    out.mkdir()
+    monkeypatch.setattr("legcal.calibration.calibrate", _writing(example_run.calibration))
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1790000000")
+    assert run(monkeypatch, "calibrate", example_run.folder, "-o", out) == 0
+    page = (out / "report.html").read_bytes()
+    assert b"legcal-page" in page[:1000]
+    assert b"2026-09-21" in page
+    assert run(monkeypatch, "calibrate", example_run.folder, "-o", out) == 0
+    assert (out / "report.html").read_bytes() == page  # the time is all that differs otherwise
     assert run(monkeypatch, "calibrate", example_run.folder, "-o", out, "--no-report") == 0
     assert not (out / "report.html").exists()
-    assert run(monkeypatch, "calibrate", example_run.folder, "-o", out) == 0
-    assert "legcal-page" in (out / "report.html").read_text("utf-8")[:1000]
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (KeyError("leg9"), "found KeyError: 'leg9'; please report this."),
+        (OutOfResources("The page could not be written: found no room."), "The page could not"),
+    ],
+)
+def test_a_page_that_fails_loses_nothing_else(
+    example_run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    error: Exception,
+    said: str,
+) -> None:
+    def fails(*_: Any) -> None:
+        raise error
+
+    out, words = tmp_path / "out", ("calibrate", example_run.folder, "-o", tmp_path / "out")
+    write_result(example_run.calibration, out)
+    legcal.write_report(example_run.calibration, out)  # of an earlier result: it goes
+    monkeypatch.setattr("legcal.calibration.calibrate", _writing(example_run.calibration))
+    monkeypatch.setattr("legcal.report.page.calibration_page.verdict_of", fails)
+    assert run(monkeypatch, *words, "--json") == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == json.loads((out / "result.json").read_text())
+    assert f"legcal: The result was written without report.html: {said}" in printed.err
+    assert not (out / "report.html").exists()
+    assert (out / "calibrated.urdf").exists()
+
+
+def test_the_truth_is_for_the_page_alone(
+    example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calibration = example_run.calibration
+    write_result(calibration, tmp_path)
+    path = legcal.write_report(calibration, tmp_path, truth=TRUTH)
+    found: Any = html.fromstring(path.read_text("utf-8"))
+    tips = " ".join(found.xpath("//section[@id='truth']//svg//*[local-name()='title']/text()"))
+    after = legcal.evaluate(tmp_path / "calibrated.yaml", TRUTH)
+    shown = [name for name in after.names if f"{name}, calibrated" in tips]
+    estimated = [row for row in calibration.result.parameters if ".radius." not in row.name]
+    assert shown == [row.name for row in estimated]
+    true = dict(zip(after.names, after.references.tolist(), strict=True))
+    for row in estimated:  # lengths all of them
+        for word, value in (("nominal", row.nominal), ("calibrated", row.value)):
+            assert f"{row.name}, {word}: {1e3 * abs(value - true[row.name]):.3g} mm" in tips
+    mean = 1e3 * after.displacement.mean()
+    assert f"by {mean:.3f} mm" in found.xpath("string(//section[@id='truth']/p)")
+
+    monkeypatch.setattr("legcal.calibration.calibrate", lambda *_, **__: pytest.fail("too late"))
+    words = ("calibrate", example_run.folder, "-o", tmp_path / "new", "--truth")
+    assert run(monkeypatch, *words, "hexapod", "--no-report") == 2
+    assert run(monkeypatch, *words, "3-rpr") == 2
+    assert run(monkeypatch, *words, tmp_path / "none.yaml") == 2
+    assert not (tmp_path / "new").exists()
+
+
+def test_points_lead_to_overlays_beside_the_page(example_run: Run, tmp_path: Path) -> None:
+    calibration = with_overlays(example_run.calibration)
+    files = dict(list(calibration.overlays.items())[:2])
+    calibration = replace(calibration, overlays=files)
+    write_result(calibration, tmp_path)
+    listed = json.loads((tmp_path / "result.json").read_text())["overlays"]
+    assert [one["file"] for one in listed] == list(files.values())
+    for file in files.values():
+        picture = cv2.imread(str(tmp_path / file))
+        assert picture is not None
+        green = np.all(np.abs(picture.astype(int) - COLOURS["edge 1"]) < 60, axis=2)
+        assert np.count_nonzero(green) > 1000
+    page: Any = html.fromstring(legcal.write_report(calibration, tmp_path).read_text("utf-8"))
+    plot = json.loads(page.xpath("string(//script[@data-plot='residuals-leg'])"))
+    rows = calibration.solution.outlines.row
+    residuals = calibration.residuals.index
+    crops = [name.removeprefix("outline-") for name in page.xpath("//figure[@class='crop']/@id")]
+    for i in residuals.tolist():
+        to = plot["extra"]["links"].get(str(i))
+        assert to == (f"#outline-{i}" if str(i) in crops else files.get(int(rows[i])))
+    whole = page.xpath("//figure[@class='crop']//a/@href")
+    assert set(whole) <= set(files.values())
+
+    (tmp_path / "overlays" / "mine.txt").write_text("mine")
+    write_result(example_run.calibration, tmp_path)  # which these do not show
+    assert not any((tmp_path / file).exists() for file in files.values())
+    assert (tmp_path / "overlays" / "mine.txt").read_text() == "mine"
+    with pytest.raises(UsageError, match="found overlays, which legcal did not write"):
+        legcal.calibrate(calibration.dataset, output=tmp_path, overlays=True)
+    with pytest.raises(UsageError, match="no output folder"):
+        legcal.calibrate(calibration.dataset, overlays=True)
+
+
+def test_overlays_that_cannot_be_drawn_are_left_out_and_told(
+    example_run: Run, tmp_path: Path
+) -> None:
+    calibration = with_overlays(example_run.calibration)
+    moved = replace(calibration.dataset, folder=tmp_path / "gone")
+    written = write_result(replace(calibration, dataset=moved), tmp_path / "out")
+    assert "There are no overlays." in written.notes[-1]
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert "overlays" not in result
+    assert result["notes"] == list(written.notes)
+    assert not (tmp_path / "out" / "overlays").exists()
+    with pytest.raises(UsageError, match="found no photograph"):
+        legcal.calibrate(moved, output=tmp_path / "out", overlays=True)
 
 
 def test_pages_of_earlier_results_go_and_files_of_others_stay(

@@ -130,7 +130,7 @@ def test_figures_and_checkpoints_that_cannot_be_written_are_told_and_no_run_is_l
     (tmp_path / "total.txt").unlink()
     (tmp_path / "total.txt").mkdir()
     (tmp_path / "total.txt" / "mine").touch()
-    with pytest.raises(OutOfResources, match=r"result of the study.*all runs are kept"):
+    with pytest.raises(UsageError, match=r"result of the study.*total.txt, which is a folder"):
         run_study(Draws(), 3, output=tmp_path)
     assert len(_lines(tmp_path)) == 4
     with (

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.calibration.documents import LeftOut, left_out_blocks
+from legcal.calibration.documents import LeftOut, Overlay, left_out_blocks
 from legcal.calibration.outline_editor import outline_editor
 from legcal.data import (
     CORNERS_NAME,
@@ -239,14 +239,6 @@ class ViewFigures(Document):
     problem: str | None  # why its camera could not be placed
 
 
-class Overlay(Document):
-    """The overlay of an image."""
-
-    view: str
-    image: str
-    file: str
-
-
 class DetectionDocument(Document):
     """What ``legcal detect --json`` prints."""
 
@@ -403,7 +395,7 @@ def write_detection(detection: Detection, destination: Path, run: Run, progress:
         write_observations(table, detection.outlines, dataset.measurements, names)
         if detection.corners is not None:
             write_corners(folder / CORNERS_NAME, detection.corners, dataset.measurements)
-        _draw_all(detection, folder, run, progress)
+        draw_images(detection, folder, run, progress, photographs=True)
         (folder / DETECTION_PAGE).write_text(_page(detection), encoding="utf-8", newline="\n")
         files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
         record = {
@@ -423,16 +415,19 @@ class _Drawings(NamedTuple):
     captions: tuple[str, ...]
     unplaced: tuple[Camera | None, ...]  # cameras that could not be placed
     names: tuple[str, ...]
+    photographs: bool  # whether the images are wanted with nothing drawn over them
 
 
-def _draw_all(detection: Detection, folder: Path, run: Run, progress: Report) -> None:
-    """Write the overlay of every row that has an image."""
+def draw_images(
+    detection: Detection, folder: Path, run: Run, progress: Report, *, photographs: bool = False
+) -> None:
+    """Write the overlay of every row that has an image, and the photograph by itself if asked."""
     rows = list(detection.overlay_files)
-    files, photographs = (
+    files, bare = (
         tuple(folder / file for file in named.values())
-        for named in (detection.overlay_files, detection.photograph_files)
+        for named in (detection.overlay_files, detection.photograph_files if photographs else {})
     )
-    for file in (*files, *photographs):
+    for file in (*files, *bare):
         file.parent.mkdir(parents=True, exist_ok=True)
     drawings = _Drawings(
         detection.dataset.image_reader(rows),
@@ -441,10 +436,11 @@ def _draw_all(detection: Detection, folder: Path, run: Run, progress: Report) ->
         tuple(_caption(detection, row) for row in rows),
         tuple(_unplaced_camera(detection, row) for row in rows),
         tuple(file.name for file in files),
+        photographs,
     )
     progress("Drawing overlays", 0, len(rows))
     pictures = run(partial(_overlay, drawings), range(len(rows)))
-    places = zip(files, photographs, strict=True)
+    places = zip(files, bare, strict=True) if photographs else zip(files)
     for done, (paths, contents) in enumerate(zip(places, pictures, strict=True), start=1):
         for path, content in zip(paths, contents, strict=True):
             path.write_bytes(content)
@@ -458,7 +454,7 @@ def _overlay(drawings: _Drawings, k: int) -> list[bytes]:
     picture = draw(image, [*drawings.marks[k], *marks], drawings.captions[k], drawings.corners[k])
     grey = np.clip(np.rint(image), 0, 255).astype(np.uint8)
     found = []
-    for pixels in (picture, grey):
+    for pixels in (picture, grey)[: 1 + drawings.photographs]:
         ok, content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not ok:
             raise OutOfResources(
@@ -536,4 +532,9 @@ def _is_place(name: Path) -> bool:
         Path(DETECTION_PAGE),
         Path(DETECTION.marker),
     }
-    return name in own or (name.parts[0] in (OVERLAYS, PHOTOGRAPHS) and name.suffix == ".jpg")
+    return name in own or is_overlay(name) or is_overlay(name, PHOTOGRAPHS)
+
+
+def is_overlay(name: Path, folder: str = OVERLAYS) -> bool:
+    """Say whether a path is one at which overlays, or other pictures of images, are written."""
+    return ".." not in name.parts and name.parts[:1] == (folder,) and name.suffix == ".jpg"

@@ -354,6 +354,14 @@ class Heading(Document):
     legs: list[str]  # the order of what follows
 
 
+class Overlay(Document):
+    """The overlay of an image, relative to the folder."""
+
+    view: str
+    image: str
+    file: str
+
+
 class Result(Legs, Heading):
     """``result.json``: the heading, the calibrated legs, and how well they are known."""
 
@@ -378,11 +386,13 @@ class Result(Legs, Heading):
     notes: list[str]
     details: list[str] = Field(default_factory=list)  # how the fit went, for those who ask
     diagnosis: list[DiagnosisBlock] | None = None  # left out where nothing looks wrong
+    overlays: list[Overlay] | None = None  # left out where none were asked for
 
     @model_serializer(mode="wrap")
     def _without_absent_blocks(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         found: dict[str, Any] = handler(self)
-        optional = ("links", "observations", "board", "platform_board", "holdout", "diagnosis")
+        optional = ("links", "observations", "board", "platform_board", "holdout", "diagnosis",
+                    "overlays")  # fmt: skip
         absent = [key for key in optional if found[key] is None]
         return {key: value for key, value in found.items() if key not in absent}
 

@@ -27,6 +27,7 @@ import numpy as np
 from legcal.calibration.board import BoardViews, base_of_board, board_notes, observe_board
 from legcal.calibration.compression import compression_effect
 from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose
+from legcal.calibration.fit_overlays import check_overlays, with_overlays
 from legcal.calibration.four_steps import Steps, four_steps, starts
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit import (
@@ -47,7 +48,7 @@ from legcal.calibration.joint_fit import (
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.outlier_images import outlier_images
 from legcal.calibration.result import Calibration
-from legcal.calibration.result_folder import write_result
+from legcal.calibration.result_folder import Beside, write_result
 from legcal.calibration.verdict import judge
 from legcal.data import (
     Corners,
@@ -143,6 +144,8 @@ def calibrate(
     fixed: Sequence[str] = (),
     free: Sequence[str] = (),
     holdout: float | None = None,
+    overlays: bool = False,
+    beside: Beside | None = None,
 ) -> Calibration:
     """Compute joint positions and offsets of a mechanism from a dataset.
 
@@ -176,6 +179,11 @@ def calibrate(
         radii, twists and intrinsics with a covariance to estimate without a prior.
     holdout : float, optional
         Hold out this part of the images, and compare them with what the fit of the others predicts.
+    overlays : bool
+        Draw the outlines over every photograph, into ``overlays`` of the result folder.
+    beside : callable, optional
+        Called as ``beside(calibration, folder)`` when all other files are in the folder that
+        becomes the result folder: what it writes there appears with them, or nothing does.
 
     Returns
     -------
@@ -201,6 +209,8 @@ def calibrate(
         check_destination(output_path(output))
     overrides = overrides_of_call(priors, fixed, free)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
+    if overlays:
+        check_overlays(dataset, None if output is None else Path(output))
     choices = chosen_parameters(dataset, overrides)
     fitted, held_out = _split(dataset, holdout)
     identify_notes = check_identifiable(dataset_at(dataset, fitted), choices)
@@ -240,7 +250,15 @@ def calibrate(
         diagnosis=found.diagnosis,
     )
     if output is not None:
-        calibration = write_result(calibration, Path(output))
+        drawing = worker_pool(workers if overlays else 1)
+        with shown_progress(progress) as report, drawing as pool:
+            calibration = write_result(
+                with_overlays(calibration) if overlays else calibration,
+                Path(output),
+                run=pool,
+                progress=report,
+                beside=beside,
+            )
     return calibration
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,7 @@ from legcal.calibration.documents import (
     Kinematic,
     NoSteps,
     Observations,
+    Overlay,
     ParameterRow,
     PlatformBlock,
     PlatformBoardPose,
@@ -50,7 +51,7 @@ from legcal.calibration.link_joints import joints_in_links
 from legcal.calibration.plots import plot_residuals
 from legcal.calibration.residuals import OutlineResiduals, outline_residuals
 from legcal.calibration.summary import Summarised, few_lines
-from legcal.data import Corners, Dataset
+from legcal.data import Corners, Dataset, row_names
 from legcal.files import motion_to_xyz_quat
 from legcal.machine import (
     Leg,
@@ -102,6 +103,8 @@ class Calibration(Summarised):
         The corners of the calibration board in all images; None without a board.
     diagnosis : tuple of Diagnosis
         What looks wrong with the session, the likeliest first; empty where nothing does.
+    overlays : dict
+        The overlays beside the result, relative to its folder, by row of the measurements.
     """
 
     dataset: Dataset
@@ -113,6 +116,7 @@ class Calibration(Summarised):
     held_out: HeldOut | None = None
     corners: Corners | None = None
     diagnosis: tuple[Diagnosis, ...] = ()
+    overlays: Mapping[int, str] = field(default_factory=dict)
 
     @cached_property
     def result(self) -> Result:
@@ -196,6 +200,7 @@ def _result_of(calibration: Calibration) -> Result:
         notes=list(calibration.notes),
         details=list(calibration.solution.details),
         diagnosis=[one.document() for one in calibration.diagnosis] or None,
+        overlays=_overlays(calibration),
     )
 
 
@@ -283,6 +288,16 @@ def _observations(calibration: Calibration) -> Observations:
         rejected=dict(reasons.most_common()),
         left_out=left_out_blocks(calibration.dataset.measurements, images_left_out(outlines)),
     )
+
+
+def _overlays(calibration: Calibration) -> list[Overlay] | None:
+    """Return where each image is drawn with its outlines; None without overlays."""
+    measurements = calibration.dataset.measurements
+    views, names = [view.name for view in measurements.views], row_names(measurements)
+    return [
+        Overlay(view=views[measurements.view[row]], image=names[row], file=file)
+        for row, file in calibration.overlays.items()
+    ] or None
 
 
 def _board(calibration: Calibration, link: Link) -> dict[str, Any] | None:

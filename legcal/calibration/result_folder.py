@@ -9,26 +9,29 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from legcal.calibration.detection import OVERLAYS
 from legcal.calibration.documents import (
     ParameterRow,
     Result,
     unreadable,
 )
+from legcal.calibration.fit_overlays import draw_overlays, earlier_overlays
 from legcal.calibration.joint_fit import (
     KINDS,
     KnownIntrinsics,
 )
 from legcal.calibration.link_joints import joints_in_links
+from legcal.calibration.result import Calibration
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data import CORNERS_NAME, OBSERVATIONS_NAME, write_corners, write_observations
-from legcal.errors import DatasetError, DidNotConverge, ModelError, OutOfClass
+from legcal.errors import DatasetError, DidNotConverge, ModelError, OutOfClass, OutOfResources
 from legcal.files import result_folder
 from legcal.geometry import Array
 from legcal.machine import (
@@ -48,16 +51,16 @@ from legcal.machine import (
     write_urdf,
 )
 from legcal.pages import is_page
+from legcal.progress import Report, no_progress
 from legcal.vision import (
     Camera,
     camera_numbers,
     intrinsic_names,
     intrinsic_values,
 )
+from legcal.workers import Run, in_turn
 
-if TYPE_CHECKING:
-    from legcal.calibration.result import Calibration
-
+Beside = Callable[[Calibration, Path], None]
 RESULT_NAME, STAGED_NAME = "result.json", "staged.yaml"
 REPORT_NAME = "report.html"  # written beside a result, which an earlier one does not describe
 RELOAD_TOLERANCE = 1e-11  # between reloaded and written parameters [m, rad]
@@ -66,12 +69,20 @@ ROUNDING = 1e-9  # of numbers in files [m]
 SYMMETRY_TOLERANCE = 1e-6  # relative, of covariances
 
 
-def write_result(calibration: Calibration, destination: Path) -> Calibration:
+def write_result(
+    calibration: Calibration,
+    destination: Path,
+    *,
+    run: Run = in_turn,
+    progress: Report = no_progress,
+    beside: Beside | None = None,
+) -> Calibration:
     """Write the result folder, all of it or nothing, and return what was written.
 
     The calibrated model is loaded again from the files and must have the parameters that were
     written and close at home, before the folder appears. So must the model of the four steps, or
-    it is left out, with a note that says why.
+    it is left out, with a note that says why; and so are overlays that cannot be drawn. What
+    *beside* writes into the folder that it is given appears with the result.
 
     Raises
     ------
@@ -84,7 +95,8 @@ def write_result(calibration: Calibration, destination: Path) -> Calibration:
     machine = dataset.machine
     stale = [OBSERVATIONS_NAME, CORNERS_NAME, STAGED_NAME, str(_urdf_of(Path(STAGED_NAME)))]
     stale += [REPORT_NAME] * is_page(destination / REPORT_NAME)
-    with result_folder(destination, stale=map(Path, stale)) as folder:
+    old = [*map(Path, stale), *earlier_overlays(destination)]
+    with result_folder(destination, stale=old) as folder:
         _write_model(machine, solution.legs, folder / RESULT_YAML)
         if steps.legs is not None:
             try:
@@ -95,6 +107,14 @@ def write_result(calibration: Calibration, destination: Path) -> Calibration:
                 calibration = replace(calibration, notes=(*calibration.notes, note))
                 for path in (folder / STAGED_NAME, _urdf_of(folder / STAGED_NAME)):
                     path.unlink(missing_ok=True)
+        if calibration.overlays:
+            try:
+                draw_overlays(calibration, folder, run, progress)
+            except (DatasetError, OutOfResources) as failure:
+                note = f"There are no overlays. {' '.join(failure.problems)}"
+                notes = (*calibration.notes, note)
+                calibration = replace(calibration, notes=notes, overlays={})
+                shutil.rmtree(folder / OVERLAYS, ignore_errors=True)
         document = json.dumps(calibration.result.document(), indent=1, allow_nan=False)
         (folder / RESULT_NAME).write_text(document + "\n", encoding="utf-8")
         if dataset.axes is None:
@@ -102,6 +122,8 @@ def write_result(calibration: Calibration, destination: Path) -> Calibration:
             write_observations(table, solution.outlines, measurements, machine.leg_names)
         if calibration.corners is not None:
             write_corners(folder / CORNERS_NAME, calibration.corners, dataset.measurements)
+        if beside is not None:
+            beside(calibration, folder)
     return calibration
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,6 +11,7 @@ from legcal.cli.options import (
     ClusterOption,
     DatasetArgument,
     JsonOption,
+    PageOfResult,
     QuietOption,
     command_line,
     image_workers,
@@ -20,6 +21,10 @@ from legcal.cli.options import (
 )
 from legcal.errors import UsageError
 from legcal.paper import Criteria, Transformation
+
+if TYPE_CHECKING:
+    from legcal.data import Dataset
+    from legcal.machine import Machine
 
 _TESTS = "Tests of a result"
 _PARAMETERS = "Parameters by name (or a pattern: '*.offset'); each may be repeated"
@@ -101,6 +106,20 @@ def calibrate(
             "--report/--no-report", help="Write OUT/report.html, a page for the browser, or not."
         ),
     ] = True,
+    overlays: Annotated[
+        bool,
+        typer.Option(
+            "--overlays", help="Draw the outlines over every photograph, in OUT/overlays."
+        ),
+    ] = False,
+    truth: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODEL",
+            help="The true model, of a simulated machine: the page compares the result with it. "
+            "The calibration does not see it.",
+        ),
+    ] = None,
     significance: Annotated[
         float | None,
         typer.Option(
@@ -120,6 +139,8 @@ def calibrate(
             "--fresh": fresh or None,
             "--criteria": None if criteria == "default" else criteria,
             "--transformation": transformation,
+            "--overlays": overlays or None,
+            "--truth": truth,
         }
         named = [name for name, value in others.items() if value is not None]
         if named:
@@ -140,6 +161,11 @@ def calibrate(
             "The calibration could not be run: found no --output (-o), needed the result folder to "
             "write; name one, or the result to test with --check."
         )
+    if truth is not None and not with_report:
+        raise UsageError(
+            "The truth could not be used: found --truth beside --no-report, needed the page, which "
+            "alone compares the result with it; leave one of them out."
+        )
     with loading():
         from legcal import calibration, report
 
@@ -147,8 +173,17 @@ def calibrate(
     page = output / calibration.REPORT_NAME
     if with_report and page.exists():
         report.PAGE.check_place(page)
+    given: Path | Dataset = dataset
+    true = None
+    if truth is not None:
+        given, true = _with_truth(dataset, truth)
+    page_of = PageOfResult(
+        lambda found, folder: report.write_report(
+            found, output, command_line(), truth=true, into=folder
+        )
+    )
     found = run(
-        dataset,
+        given,
         output=output,
         progress=not quiet,
         criteria=criteria,
@@ -159,9 +194,10 @@ def calibrate(
         fixed=fix or (),
         free=free or (),
         holdout=holdout,
+        overlays=overlays,
+        beside=page_of if with_report else None,
     )
-    if with_report:
-        report.write_report(found, output, command_line())
+    page_of.say()
     show(
         as_json,
         lambda: found.result.document(),
@@ -169,6 +205,17 @@ def calibrate(
     )
     if not found.verdict.trustworthy:
         raise typer.Exit(1)
+
+
+def _with_truth(folder: Path, truth: str) -> tuple[Dataset, Machine]:
+    """Return a dataset and the true model; refuse, before any work, that of another machine."""
+    from legcal.calibration import evaluate
+    from legcal.data import load_dataset
+    from legcal.machine import load_mechanism
+
+    dataset, true = load_dataset(folder), load_mechanism(truth)
+    evaluate(dataset.machine, true)
+    return dataset, true
 
 
 def _page_of_check(output: Path) -> Path:

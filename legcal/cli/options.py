@@ -9,17 +9,19 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from legcal.errors import OutOfResources, UsageError, printable
+from legcal.errors import LegcalError, OutOfResources, UsageError, printable
 from legcal.processors import processors
 
 INTERRUPTED = 130  # exit code of a command that a signal stopped
 MAX_IMAGE_WORKERS = 4  # processes that search images by default; each takes about 150 MB
+REPORT = "report.html"  # the page in the folder of a result
 MAX_WORKERS = 256  # more are a mistake: all of them are started
 
 ModelArgument = Annotated[
@@ -105,6 +107,33 @@ def write_page(
             title, text, verdict=verdict, blocks=blocks, command=command_line()
         )
         report.write_page(found, page)
+
+
+@dataclass
+class PageOfResult:
+    """Makes the page of a result in the folder of its other files, before that appears.
+
+    Whatever goes wrong then loses the page alone, and :meth:`say` says it.
+    """
+
+    make: Callable[[Any, Path], object]  # of the result, into the folder
+    failure: str = ""
+
+    def __call__(self, result: Any, folder: Path) -> None:
+        """Make the page of a result; its other files are in the folder."""
+        try:
+            self.make(result, folder)
+        except Exception as error:  # minutes of work are never lost for what only shows them
+            (folder / REPORT).unlink(missing_ok=True)
+            found = f"found {type(error).__name__}: {error}; please report this."
+            if isinstance(error, LegcalError):
+                found = " ".join(error.problems)
+            self.failure = f"The result was written without {REPORT}: {found}"
+
+    def say(self) -> None:
+        """Say on stderr what went wrong, if anything did."""
+        if self.failure and sys.stderr is not None:
+            sys.stderr.write(f"legcal: {printable(self.failure)}\n")
 
 
 def command_line() -> str:

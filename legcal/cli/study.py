@@ -10,8 +10,10 @@ from typing import Annotated
 import typer
 
 from legcal.cli.options import (
+    REPORT,
     ClusterOption,
     JsonOption,
+    PageOfResult,
     QuietOption,
     WorkersOption,
     print_table,
@@ -65,9 +67,14 @@ def paper(
 ) -> None:
     """Repeat section 4.3 of the paper: calibrations of a 6-SPU, before and after."""
     from legcal.report import study_table
-    from legcal.simulation import PaperStudy, TableNoise, run_study
+    from legcal.simulation import PaperStudy, StudyResult, TableNoise, run_study
 
-    noise = TableNoise.in_radians() if radians else TableNoise()
+    def make_page(found: StudyResult, folder: Path) -> None:
+        caption = "Mean errors of the parameters, as in Fig. 4 of the paper; fig4.html enlarges it."
+        title, figures = "The paper's simulation", {caption: folder / "fig4.png"}
+        write_page(folder / REPORT, title, study_table(found.document()), figures=figures)
+
+    noise, page = TableNoise.in_radians() if radians else TableNoise(), PageOfResult(make_page)
     result = run_study(
         PaperStudy(noise),
         runs,
@@ -75,16 +82,10 @@ def paper(
         workers=cluster or workers or processors(),
         output=output,
         progress=not quiet,
+        beside=page,
     )
+    page.say()
     document = result.document()
-    if output is not None:
-        caption = "Mean errors of the parameters, as in Fig. 4 of the paper; fig4.html enlarges it."
-        write_page(
-            output / "report.html",
-            "The paper's simulation",
-            study_table(document),
-            figures={caption: output / "fig4.png"},
-        )
     show(as_json, lambda: document, lambda: study_table(document))
     if output is not None and not as_json:
         print_table(f"\nRuns, document and figures: {output}")

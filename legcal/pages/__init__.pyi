@@ -20,7 +20,9 @@ from .document import number as number
 from .document import plain as plain
 from .html import is_page as is_page
 from .html import page_html as page_html
+from .html import time_of_page as time_of_page
 from .svg import change_bars as change_bars
+from .svg import error_bars as error_bars
 from .svg import histogram as histogram
 from .svg import matrix as matrix
 from .svg import number_grid as number_grid

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from datetime import UTC, datetime
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -18,6 +20,16 @@ if TYPE_CHECKING:
 
 MARK = "legcal-page"  # the name by which a page of legcal is known
 _HEAD = 1000  # bytes at the beginning of a page, in which it stands
+
+
+def time_of_page() -> str:
+    """Return the time that a page states: now, or that of ``SOURCE_DATE_EPOCH`` if it is set.
+
+    By that variable those who compare files have them made the same again.
+    """
+    stated = os.environ.get("SOURCE_DATE_EPOCH", "")
+    now = datetime.fromtimestamp(int(stated), UTC) if stated.isdecimal() else datetime.now()
+    return now.astimezone().strftime("%Y-%m-%d %H:%M %Z")
 
 
 def is_page(path: Path) -> bool:

@@ -116,6 +116,51 @@ def change_bars(
     return canvas.markup()
 
 
+def error_bars(
+    names: Sequence[str],
+    before: Sequence[float],
+    after: Sequence[float],
+    sigmas: Sequence[float | None],
+    unit: str,
+) -> Markup:
+    """Return errors before and after on a scale of decades, with what was predicted of the latter.
+
+    They are positive; those below a hundred-thousandth of the largest reach the left border.
+    """
+    left, width, step, top = 190.0, 900.0, 21.0, 48.0
+    shown = [x for x in (*before, *after, *(s or 0.0 for s in sigmas)) if x > 0.0] or [1.0]
+    high = np.ceil(np.log10(max(shown)))
+    low = max(np.floor(np.log10(min(shown))), high - 5.0) - 0.3
+    height = top + step * len(names) + 30.0
+    canvas = Canvas(width, height, f"Errors of parameters [{unit}]")
+
+    def place(value: float) -> float:
+        share = (np.log10(max(value, 1e-300)) - low) / (high - low)
+        return left + (width - left - 20.0) * float(np.clip(share, 0.0, 1.0))
+
+    canvas.box(left, 7.0, 22.0, 7.0, "#d6dae0")
+    canvas.text(left + 28.0, 15.0, "nominal model", size=12, colour=DIM)
+    canvas.box(left + 140.0, 7.0, 22.0, 7.0, BLUE)
+    canvas.text(left + 168.0, 15.0, "calibrated", size=12, colour=DIM)
+    canvas.line(left + 262.0, 5.0, left + 262.0, 16.0, INK, 2.0)
+    canvas.text(left + 270.0, 15.0, "its standard deviation as predicted", size=12, colour=DIM)
+    canvas.text(left, 34.0, f"distance from the truth [{unit}]", size=12, colour=DIM)
+    for decade in np.arange(np.ceil(low), high + 1.0).tolist():
+        x = place(10.0**decade)
+        canvas.line(x, top, x, height - 26.0)
+        canvas.text(x, height - 10.0, f"{10.0**decade:g}", anchor="middle", size=11, colour=DIM)
+    for k, name in enumerate(names):
+        y, sigma = top + step * (k + 0.5), sigmas[k]
+        word = name if len(name) < 28 else f"{name[:25]}..."
+        canvas.text(left - 12.0, y + 4.0, word, anchor="end", size=11.5)
+        tips = (f"{name}, nominal: {before[k]:.3g} {unit}", f"calibrated: {after[k]:.3g} {unit}")
+        canvas.box(left, y - 7.5, place(before[k]) - left, 7.0, "#d6dae0", tips[0])
+        canvas.box(left, y + 0.5, place(after[k]) - left, 7.0, BLUE, f"{name}, {tips[1]}")
+        if sigma is not None and sigma > 0.0:
+            canvas.line(place(sigma), y - 1.5, place(sigma), y + 9.5, INK, 2.0)
+    return canvas.markup()
+
+
 def histogram(values: Array, label: str, n: int = 14) -> Markup:
     """Return how many values lie where."""
     left, width, height, top, bottom = 34.0, 440.0, 210.0, 14.0, 40.0

@@ -45,6 +45,7 @@ from .settings import requested as requested
 from .solids import dressed as dressed
 from .solids import pose_machine as pose_machine
 from .study import Record as Record
+from .study import StudyResult as StudyResult
 from .study import child_seed as child_seed
 from .study import failure_of as failure_of
 from .study import run_study as run_study

@@ -11,7 +11,7 @@ import json
 import tempfile
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,7 +22,7 @@ import numpy as np
 
 from legcal.brief import brief
 from legcal.errors import DidNotConverge, LegcalError, OutOfResources, UsageError
-from legcal.files import TEMPORARY_SUFFIX, write_atomically
+from legcal.files import TEMPORARY_SUFFIX, OutputKind, result_folder
 from legcal.processors import processors
 from legcal.progress import Progress, shown_progress
 from legcal.simulation.checkpoint import (
@@ -36,6 +36,7 @@ from legcal.simulation.checkpoint import (
 from legcal.workers import Workers, is_number, worker_pool
 
 DOCUMENT_NAME = "study.json"
+_STUDY = OutputKind("result of the study", "", "")  # beside the checkpoint and other files
 _LARGEST_CHUNK = 10  # runs between two lines of the checkpoint reaching the disk
 _PROCESSES = 4  # for each core; more only wait for each other
 _MANY = 64  # workers that a cluster may have
@@ -118,6 +119,7 @@ def run_study(
     progress: Progress = False,
     part: tuple[int, int] | None = None,
     merge: Sequence[Path] = (),
+    beside: Callable[[StudyResult, Path], None] | None = None,
 ) -> StudyResult:
     """Run a study, or what is missing of it.
 
@@ -141,6 +143,9 @@ def run_study(
         Only every n-th run, from run k - 1 on: n such parts make the study.
     merge : sequence of Path
         Folders of parts of the study, whose runs are taken over.
+    beside : callable, optional
+        Called as ``beside(result, folder)`` with the figures in the folder: what it writes there
+        appears in the output with them.
 
     Returns
     -------
@@ -181,7 +186,7 @@ def run_study(
                     notes = run.notes
             result = replace(_result(study, seed, runs, checkpoint), notes=notes, part=part)
         if output is not None:
-            _write(result, folder)
+            _write(result, folder, beside)
     return result
 
 
@@ -221,15 +226,21 @@ def _result(study: Study, seed: int, runs: range, checkpoint: Checkpoint) -> Stu
     return StudyResult(study.name, study.settings, seed, len(runs), dict(failures), summary)
 
 
-def _write(result: StudyResult, folder: Path) -> None:
-    """Write the document and the figures."""
+def _write(
+    result: StudyResult, folder: Path, beside: Callable[[StudyResult, Path], None] | None
+) -> None:
+    """Write the document and the figures, all of them or nothing."""
     document = json.dumps(result.document(), indent=1, allow_nan=False).encode() + b"\n"
     try:
-        for name, content in {**result.summary.files(), DOCUMENT_NAME: document}.items():
-            write_atomically(folder / name, content)
-    except OSError as error:
+        with result_folder(folder, _STUDY) as new:
+            for name, content in {**result.summary.files(), DOCUMENT_NAME: document}.items():
+                (new / name).write_bytes(content)
+            if beside is not None:
+                beside(result, new)
+    except OutOfResources as error:
+        found = getattr(error.__cause__, "strerror", None) or str(error.__cause__)
         raise OutOfResources(
-            f"{folder}: the result of the study could not be written: found '{error.strerror}', "
+            f"{folder}: the result of the study could not be written: found '{found}', "
             "needed a folder that takes its files; free some space and start the same command "
             "again; all runs are kept."
         ) from error

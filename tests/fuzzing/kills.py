@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[2]
 MAX_STOP = 20.0  # [s] on a busy machine, from the signal to the end
 LINGER = 10.0  # [s] that a process of a pool may take to end after the command
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
-PAGE, PART_OF_PAGE = "out/report.html", "out/.report.html."
+TIME_OF_PAGES = "1790000000"  # for SOURCE_DATE_EPOCH: all that differs between pages otherwise
 STOPPED = "legcal: Stopped before the end."
 FALSE_WORDS = ("Traceback", "ended from outside", "mistake in legcal")
 MARK = "LEGCAL_KILL"  # in the environment of the command and of all that it starts
@@ -196,16 +196,11 @@ def _is_one_of(found: Contents, results: Sequence[Contents], command: Command) -
 
 
 def _result(contents: Contents, command: Command) -> Contents:
-    """Return what a command writes, apart from checkpoints and caches.
-
-    Nor does the page count, nor a part of it: it says when it was made, and is written after a
-    result that is whole.
-    """
+    """Return what a command writes, apart from checkpoints and caches."""
     return {
         name: digest
         for name, digest in contents.items()
-        if name.startswith("out/") and name not in {*command.kept, PAGE}
-        if not name.startswith(PART_OF_PAGE)
+        if name.startswith("out/") and name not in command.kept
     }
 
 
@@ -259,7 +254,13 @@ def _start(command: Command, folder: Path, mark: str) -> subprocess.Popen[bytes]
     words = command.words.split()
     if (folder / "out").exists():
         words += command.again.split()
-    environment = dict(os.environ, OMP_NUM_THREADS="1", PYTHONPATH=str(ROOT), **{MARK: mark})
+    environment = dict(
+        os.environ,
+        OMP_NUM_THREADS="1",
+        PYTHONPATH=str(ROOT),
+        SOURCE_DATE_EPOCH=TIME_OF_PAGES,
+        **{MARK: mark},
+    )
     with (folder / "said.txt").open("wb") as said:
         return subprocess.Popen(
             [sys.executable, "-c", WITH_SIGNALS, *words],

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from legcal.calibration import Calibration
-from legcal.pages import Gallery, Items, Page, Row, Section, Text
+from legcal.pages import Gallery, Items, Page, Row, Section, Text, time_of_page
 from legcal.report.page.crops import outline_crops
 from legcal.report.page.evidence import (
     correlation_blocks,
@@ -24,13 +23,22 @@ from legcal.report.page.scene import machine_scene
 from legcal.report.page.verdicts import next_steps, verdict_of
 
 
-def calibration_page(calibration: Calibration, folder: Path, command: str = "") -> Page:
-    """Return the page of a calibration whose result folder this is, made by a command."""
+def calibration_page(
+    calibration: Calibration,
+    folder: Path,
+    command: str = "",
+    against: Sequence[Any] = (),
+) -> Page:
+    """Return the page of a calibration whose result folder this is, made by a command.
+
+    *against* are the blocks of a section on the truth, where that is given.
+    """
     machine = calibration.dataset.machine
-    when = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
+    when = time_of_page()
     sections = (
         ("next", "What to do next", [Items(next_steps(calibration, str(folder)), True)]),
         ("platform", "Platform error", platform_blocks(calibration)),
+        ("truth", "Against the truth", against),
         ("parameters", "Parameters", [*parameter_tables(calibration), *change_charts(calibration)]),
         ("machine", "The machine", [machine_scene(calibration)]),
         *_of_outlines(calibration),
@@ -52,7 +60,7 @@ def _of_outlines(calibration: Calibration) -> list[tuple[str, str, Sequence[Any]
     """Return the sections on residuals and on the outlines that are furthest off."""
     if not len(calibration.residuals):
         return []
-    crops = outline_crops(calibration, {})
+    crops = outline_crops(calibration, calibration.overlays)
     n = len(crops.missing)
     missing = [Text([f"{n} image{'s' * (n != 1)} could not be read any more."])] if n else []
     lines = Text(

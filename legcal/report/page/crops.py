@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -45,7 +46,7 @@ class _Piece:
     corner: tuple[int, int]
 
 
-def outline_crops(calibration: Calibration, overlays: dict[int, str]) -> Crops:
+def outline_crops(calibration: Calibration, overlays: Mapping[int, str]) -> Crops:
     """Return the worst outlines and those in the middle, by their distance in sigmas.
 
     *overlays* are pictures of whole images beside the page, by row of the measurements.
@@ -118,7 +119,7 @@ def _picture(piece: _Piece, scale: float, quality: int) -> str:
 
 
 def _crop(
-    calibration: Calibration, piece: _Piece, picture: str, k: int, overlays: dict[int, str]
+    calibration: Calibration, piece: _Piece, picture: str, k: int, overlays: Mapping[int, str]
 ) -> Crop:
     """Return a piece with what is drawn over it."""
     residuals, outlines = calibration.residuals, calibration.solution.outlines

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import re
 from collections.abc import Sequence
-from datetime import datetime
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,19 @@ from rich.console import Group, RenderableType
 from rich.table import Table as TextTable
 from rich.text import Text as TextLine
 
-from legcal.pages import Cell, Facts, Items, Number, Page, Picture, Section, Table, Text, Verdict
+from legcal.pages import (
+    Cell,
+    Facts,
+    Items,
+    Number,
+    Page,
+    Picture,
+    Section,
+    Table,
+    Text,
+    Verdict,
+    time_of_page,
+)
 from legcal.version import __version__
 
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")  # that begins a cell: it sorts by its value
@@ -34,7 +45,7 @@ def text_page(
 
     A sentence that the verdict says stands there alone.
     """
-    when = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
+    when = time_of_page()
     record = {"Version": f"legcal {__version__}", "Command": command or "from Python", "Time": when}
     said = verdict.sentence if verdict is not None else ""
     sections = [Section("result", "Result", _blocks(text, said))]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from legcal.calibration import REPORT_NAME
 from legcal.files import OutputFile
+from legcal.machine import RESULT_YAML, Machine, load_mechanism
 from legcal.pages import Page, is_page, page_html
 
 if TYPE_CHECKING:
@@ -38,7 +39,14 @@ def write_page(page: Page, path: Path) -> None:
     PAGE.write(path, page_html(page))
 
 
-def write_report(calibration: Calibration, folder: Path, command: str = "") -> Path:
+def write_report(
+    calibration: Calibration,
+    folder: str | Path,
+    command: str = "",
+    *,
+    truth: str | Path | Machine | None = None,
+    into: str | Path | None = None,
+) -> Path:
     """Write ``report.html`` into the result folder of a calibration.
 
     Parameters
@@ -49,6 +57,11 @@ def write_report(calibration: Calibration, folder: Path, command: str = "") -> P
         Its result folder.
     command : str
         The command that made it, for the record.
+    truth : path, name or Machine, optional
+        The true model, of a simulated or measured machine: the page then shows how far the nominal
+        and the calibrated model are from it, as Fig. 4 of the paper does.
+    into : path, optional
+        Where the files of the result folder are while it is being written.
 
     Returns
     -------
@@ -59,12 +72,20 @@ def write_report(calibration: Calibration, folder: Path, command: str = "") -> P
     ------
     UsageError
         If another file has that name.
+    ModelError
+        If the truth is not a model of the same machine.
     OutOfResources
         If it cannot be written.
     """
     from legcal.report.page.calibration_page import calibration_page
+    from legcal.report.page.truth import truth_blocks
 
-    path = Path(folder) / REPORT_NAME
+    files = Path(folder if into is None else into)
+    path = files / REPORT_NAME
     PAGE.check_place(path)
-    write_page(calibration_page(calibration, Path(folder), command), path)
+    against = []
+    if truth is not None:
+        true = truth if isinstance(truth, Machine) else load_mechanism(truth)
+        against = truth_blocks(calibration, true, load_mechanism(files / RESULT_YAML))
+    write_page(calibration_page(calibration, Path(folder), command, against), path)
     return path

@@ -1,0 +1,98 @@
+"""Overlays of a calibration: its photographs with the outlines that were fitted, beside the result.
+
+They are drawn as those of a detection, with the machine and the cameras of the fit.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from legcal.calibration.detection import OVERLAYS, Detection, draw_images, is_overlay
+from legcal.calibration.joint_fit import Solution
+from legcal.calibration.result import Calibration
+from legcal.data import Dataset
+from legcal.errors import UsageError
+from legcal.files import RESULT, in_the_way, path_problem, read_json
+from legcal.progress import Report
+from legcal.workers import Run
+
+
+def with_overlays(calibration: Calibration) -> Calibration:
+    """Return a calibration whose overlays are to be drawn: it has their files, by row."""
+    files = _as_detection(calibration.dataset, calibration.solution).overlay_files
+    return replace(calibration, overlays=files)
+
+
+def draw_overlays(calibration: Calibration, folder: Path, run: Run, progress: Report) -> None:
+    """Draw the overlays of a calibration into a folder.
+
+    Raises DatasetError if a photograph cannot be read, and OutOfResources if one cannot be drawn.
+    """
+    found = _as_detection(calibration.dataset, calibration.solution)
+    rows = np.array(list(calibration.overlays), dtype=np.intp)
+    draw_images(replace(found, rows=rows, corners=calibration.corners), folder, run, progress)
+
+
+def check_overlays(dataset: Dataset, destination: Path | None) -> None:
+    """Refuse, before any work, overlays without photographs, or where files of others stand."""
+    start = f"{dataset.table_path}: the overlays could not be drawn: found"
+    if destination is None:
+        raise UsageError(f"{start} no output folder, needed one to write them into; give one.")
+    rows = _rows_with_image(dataset)
+    if not rows:
+        raise UsageError(
+            f"{start} no photograph, needed those of the outlines; leave the overlays out."
+        )
+    earlier = set(earlier_overlays(destination))
+    if os.path.lexists(destination / OVERLAYS) and not earlier:
+        raise UsageError(in_the_way(destination, RESULT, f"{OVERLAYS}, which legcal did not write"))
+
+
+def earlier_overlays(destination: Path) -> list[Path]:
+    """Return the overlays of an earlier result in a folder, relative to it."""
+    if not RESULT.is_in(destination):
+        return []
+    listed = read_json(destination / RESULT.marker).get("overlays")
+    named = [one.get("file") for one in listed or () if isinstance(one, Mapping)]
+    return [
+        Path(name)
+        for name in named
+        if isinstance(name, str)
+        and path_problem(destination, name) is None
+        and is_overlay(Path(name))
+    ]
+
+
+def _rows_with_image(dataset: Dataset) -> list[int]:
+    paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
+    return [row for row, path in enumerate(paths) if path is not None and os.path.exists(path)]
+
+
+def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
+    """Return the outlines of a fit, and where it has the legs and cameras, as a detection."""
+    machine, measurements = dataset.machine, dataset.measurements
+    T_base_Rb = machine.T_base_Rb
+    A = T_base_Rb.apply(np.array([leg.A for leg in solution.legs]))
+    B_Re = np.array([leg.B for leg in solution.legs])
+    B = np.array([(T_base_Rb * T).apply(B_Re) for T in solution.T_Rb_Re])
+    cylinders = tuple(
+        tuple(replace(c, radius=solution.radii.get((j, c.link), c.radius)) for c in leg.cylinders)
+        for j, leg in enumerate(machine.legs)
+    )
+    return Detection(
+        dataset=dataset,
+        outlines=solution.outlines,
+        A_base=np.broadcast_to(A, (measurements.n_rows, *A.shape)),
+        B_base=B[measurements.pose],
+        cylinders=cylinders,
+        T_base_camera=tuple(T_base_Rb * T.inv() for T in solution.T_camera_Rb),
+        rows=np.array(_rows_with_image(dataset), dtype=np.intp),
+        unplaced={},
+        image_notes=(),
+        notes=(),
+    )

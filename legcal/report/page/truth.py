@@ -1,0 +1,67 @@
+"""Errors of the parameters where the truth is given: Fig. 4 of the paper, of one calibration.
+
+The truth is for the page alone: the result was computed before, without it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from legcal.calibration import UNITS, Calibration, Evaluation, evaluate
+from legcal.machine import Machine
+from legcal.pages import Drawing, Text, error_bars
+
+
+def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) -> list[Any]:
+    """Return how far the nominal and the calibrated model are from the truth.
+
+    Raises
+    ------
+    ModelError
+        If the truth is not a model of the same machine.
+    DidNotConverge
+        If the models reach no readings together.
+    """
+    before = evaluate(calibration.dataset.machine, truth)
+    after = evaluate(calibrated, truth)
+    sigma = {row.name: row.sigma for row in calibration.result.parameters}
+    blocks: list[Any] = [Text([_at_the_platform(before, after), _ORIGIN])]
+    for of in ("m", "rad"):
+        # The truth itself may have coordinates that the frame makes zero: they are no parameters.
+        kept = [i for i, name in enumerate(after.names) if after.units[i] == of and name in sigma]
+        if not kept:
+            continue
+        scale, unit, _ = UNITS[of]
+        off, left = (
+            (scale * np.abs(found.values - found.references))[kept].tolist()
+            for found in (before, after)
+        )
+        names = [after.names[i] for i in kept]
+        scaled = [None if sigma[n] is None else scale * float(sigma[n] or 0.0) for n in names]
+        blocks.append(Drawing(error_bars(names, off, left, scaled, unit), _CAPTION))
+    return blocks
+
+
+_ORIGIN = "The truth was given for this page alone: the result was computed without it."
+_CAPTION = (
+    "As Fig. 4 of the paper, of this calibration alone: coordinates are those in R_b and R_e."
+)
+
+
+def _at_the_platform(before: Evaluation, after: Evaluation) -> str:
+    """Return the errors of eq (20) as a sentence."""
+    if not len(after.displacement):
+        return (
+            "The motors do not determine the pose of the platform: parameters are compared alone."
+        )
+    said = [
+        f"{1e3 * found.displacement.mean():.3f} mm and "
+        f"{np.degrees(found.rotation.mean()):.4f} deg by the {name} model"
+        for name, found in (("nominal", before), ("calibrated", after))
+    ]
+    return (
+        f"At the same readings the platform is off by {said[0]}, and by {said[1]} (means over "
+        f"{len(after.displacement)} poses of the workspace, eq 20)."
+    )
