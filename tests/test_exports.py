@@ -528,6 +528,9 @@ def test_places_and_options_that_cannot_be_used_are_refused_and_nothing_is_writt
     os.mkfifo(pipe)
     with pytest.raises(UsageError, match="another file"):
         export("hexapod", "table", pipe, force=True)
+    for name in ("result.json", "calibrated.yaml", "calibrated.urdf"):  # of what is exported
+        with pytest.raises(UsageError, match="which is exported"):
+            export(result, "json", result / name, force=True)
     before = sorted(tmp_path.rglob("*"))
     for source, to, path, options, error, said in cases:
         with pytest.raises(error) as refused:

@@ -1,5 +1,6 @@
 """More motors than freedoms: ranks, poses of least squares, errors of parameters, refusals."""
 
+import dataclasses
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -12,13 +13,14 @@ from layouts import Layout, LegSpec, MachineSpec, write_machine
 from machines import displaced, of_types, planar, ring
 from outline_sessions import made
 from parameter_steps import written_with
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings
 from thinned import thinned
 
 import legcal
 from legcal.calibration.joint_fit.platform import platform_by_parameters
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
+from legcal.exports import ExportOptions, Subject, export
 from legcal.geometry import Array
 from legcal.machine import (
     Follower,
@@ -27,6 +29,7 @@ from legcal.machine import (
     forward_kinematics_many,
     geometries,
     inverse_kinematics,
+    legs_in_links,
     load_mechanism,
     parametrization_of,
     platform_in_base,
@@ -211,3 +214,25 @@ def test_a_redundant_machine_calibrates_and_a_wrong_reading_is_refused(tmp_path:
     write_rows(table, of_pose)
     with pytest.raises(DatasetError, match=r"readings of view .* from where the other motors put"):
         legcal.calibrate(folder, output=tmp_path / "refused")
+
+
+def test_corrected_commands_of_redundant_motors_are_poses_of_least_squares(tmp_path: Path) -> None:
+    machine = machine_of("4-RPR")
+    rng = np.random.default_rng(5)
+    legs = [
+        dataclasses.replace(leg, A=leg.A + np.append(rng.normal(scale=1e-3, size=2), 0.0))
+        for leg in geometries(machine)
+    ]
+    nominal = dataclasses.replace(machine, legs=legs_in_links(machine, legs))
+    subject = Subject(machine, "machine", nominal)
+    found = export(subject, "correction", tmp_path / "a.csv", options=ExportOptions(nodes=3))
+    assert found.figures["coordinates"] == ["x", "y", "yaw"]
+    table = np.loadtxt(tmp_path / "a.csv", delimiter=",", comments=("#", "x"))
+    assert len(table) == 27
+    for x, y, yaw, *corrected in table[::5].tolist():
+        turn = Rotation.from_euler("z", yaw, degrees=True)
+        height = machine.home.translation[2]
+        pose = RigidTransform.from_components([1e-3 * x, 1e-3 * y, height], turn)
+        moved = forward_kinematics(nominal, inverse_kinematics(machine, pose))
+        angle = moved.rotation.as_euler("xyz", degrees=True)[2]
+        np.testing.assert_allclose([*(1e3 * moved.translation[:2]), angle], corrected, atol=1e-5)

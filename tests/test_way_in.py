@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import run
-from csv_rows import read_rows
-from hexapod_example import HEXAPOD, ROOT, TRUTH, Run
+from hexapod_example import ROOT, TRUTH, Run
 from lxml import etree
 
 from legcal import evaluate, load_mechanism
@@ -222,43 +221,6 @@ def test_a_result_folder_is_a_model(
     assert run(monkeypatch, "evaluate", example_run.output, TRUTH) == 0
     shutil.copy(example_run.output / "calibrated.yaml", tmp_path)
     assert run(monkeypatch, "inspect", tmp_path) == 2  # a folder that legcal did not write
-
-
-@pytest.mark.slow
-def test_three_commands_lead_from_files_to_a_calibration(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    shipped = load_mechanism(HEXAPOD / "models/hexapod.yaml")
-    joints = [("A", shipped.A_base), ("B", shipped.B_platform)]
-    points = [
-        ",".join([f"{side}{j + 1}", *(f"{1e3 * x:.3f}" for x in p)])
-        for side, all_points in joints
-        for j, p in enumerate(all_points)
-    ]
-    Path("joints.csv").write_text("\n".join(["point,x,y,z", *points]))
-    lines = ["photo," + ",".join(f"L{j} [mm]" for j in range(1, 7))]
-    for row in read_rows(HEXAPOD / "measurements.csv"):
-        name = row["image"].removeprefix("images/").upper()
-        (path := Path("photos") / row["view"] / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(HEXAPOD / row["image"], path)
-        lengths = [1e3 * float(row[f"leg{j}_prismatic"]) + 345.0 for j in range(1, 7)]
-        lines.append(",".join([row["image"], *(f"{x:.4f}" for x in lengths)]))
-    Path("readings.csv").write_text("\n".join(lines))
-    shutil.copy(HEXAPOD / "camera_info.yaml", "camera_info.yaml")
-    commands = [
-        "new joints.csv --unit mm --type SPU --min-length 345 --max-length 489 --leg-radius 10 "
-        "--height 383 -o .",
-        "init photos --readings readings.csv --lengths --model models/joints.yaml -o dataset",
-        "calibrate dataset -o calibrated",
-    ]
-    assert [run(monkeypatch, *words.split()) for words in commands] == [0, 0, 0]
-    nominal, found = (
-        evaluate(model, TRUTH, dataset=HEXAPOD).displacement.mean()
-        for model in ("models/joints.yaml", "calibrated")
-    )
-    assert found < 0.2 * nominal
-    assert found < 2e-4
 
 
 def test_hostile_names_do_nothing_in_a_terminal(

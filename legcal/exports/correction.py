@@ -26,11 +26,12 @@ from legcal.machine import (
     LegKind,
     Machine,
     coordinates_of,
-    geometries,
+    equations_of_readings,
     leg_scale,
     own_coordinates,
+    poses_after,
     poses_at_coordinates,
-    solve_poses,
+    solve,
     turned_back,
     workspace,
 )
@@ -86,22 +87,16 @@ class _Model:
 
     def forward(self, q: Array, near: Array) -> tuple[Array, BoolArray]:
         """Return the poses (k, 3, 4) near others at readings, and where there is one."""
-        machine = self.machine
-        base, platform = machine.T_base_Rb.as_matrix(), machine.T_platform_Re.as_matrix()
-        start = np.linalg.inv(base) @ _square(near) @ platform
-        found = solve_poses(
-            geometries(machine),
-            machine.frame_legs,
-            start[:, :3, :3],
-            start[:, :3, 3],
-            machine.sign * q,
+        machine, scale = self.machine, leg_scale(self.machine, self.machine.home)
+        motors = list(machine.motors)
+        found = solve(
+            equations_of_readings(machine, machine.sign[motors] * q[:, motors]),
+            poses_after,
+            near,
+            tolerance=1e-14 * scale,
+            unit=np.array([1.0 / scale] * 3 + [1.0] * 3),
         )
-        ends = np.concatenate([found.R, found.t[..., None]], axis=2)
-        poses = base @ _square(ends) @ np.linalg.inv(platform)
-        reached = found.missed <= REACHED * leg_scale(machine, machine.home)
-        if machine.is_redundant:
-            reached = np.ones(len(q), dtype=np.bool_)
-        return poses[:, :3], reached
+        return found.points, found.worst <= REACHED * scale
 
 
 def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
@@ -263,13 +258,6 @@ def _no_grid(machine: Machine) -> str:
         "the middle of the workspace that both models reach inside the travel, needed one; check "
         "the travel of the motors."
     )
-
-
-def _square(poses: Array) -> Array:
-    """Return poses (k, 3, 4) as matrices (k, 4, 4)."""
-    found = np.zeros((len(poses), 4, 4))
-    found[:, :3], found[:, 3, 3] = poses, 1.0
-    return found
 
 
 def _stacked(poses: list[RigidTransform]) -> Array:

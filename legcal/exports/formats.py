@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from legcal.exports.linuxcnc import linuxcnc_files, linuxcnc_refusal
 from legcal.exports.mjcf import mjcf_files, mjcf_refusal
 from legcal.exports.parameter_files import csv_files, json_files, table_files
 from legcal.exports.robot_files import ros_files, urdf_files
-from legcal.exports.subject import ExportOptions, Rendered, Subject, load_subject
+from legcal.exports.subject import RESULT_NAME, ExportOptions, Rendered, Subject, load_subject
 from legcal.files import OutputFile, OutputKind, result_folder
 
 Render = Callable[[Subject, ExportOptions, Path], Rendered]
@@ -120,6 +120,7 @@ def export(
             f"{', '.join(formats_of(subject))}."
         )
     rendered = format.render(subject, given, destination)
+    _keep_sources(subject, [destination / file.name for file in rendered.files])
     if format.is_folder:
         paths = _write_folder(destination, rendered, force=force)
     else:
@@ -152,6 +153,20 @@ def _check_options(to: str, format: Format, given: ExportOptions) -> None:
             raise UsageError(
                 f"--{name} could not be used: found it with --to {to}, needed "
                 f"{' or '.join(takes)}; leave it out."
+            )
+
+
+def _keep_sources(subject: Subject, places: Sequence[Path]) -> None:
+    """Refuse to replace what is exported."""
+    sources = [subject.machine.yaml_path, subject.machine.urdf_path]
+    if subject.result is not None:
+        sources.append(subject.result.folder / RESULT_NAME)
+    for place in places:
+        there = [one for one in sources if os.path.exists(one) and os.path.exists(place)]
+        if any(os.path.samefile(one, place) for one in there):
+            raise UsageError(
+                f"{place}: the export could not be written: found a file of {subject.given}, which "
+                "is exported, needed another one; give another path."
             )
 
 

@@ -53,6 +53,7 @@ from .home import legs_outside as legs_outside
 from .kinematics import Follower as Follower
 from .kinematics import consistent_readings as consistent_readings
 from .kinematics import contradiction as contradiction
+from .kinematics import equations_of_readings as equations_of_readings
 from .kinematics import follow as follow
 from .kinematics import follow_poses as follow_poses
 from .kinematics import followed_poses as followed_poses

@@ -8,6 +8,7 @@ manifold of closed configurations.
 
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,13 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge
 from legcal.geometry import Array, BoolArray, motions_of
 from legcal.machine.equations import PoseEquations, freedoms, pose_equations
-from legcal.machine.kinematics import consistent_readings, follow, follow_poses, solve_poses
+from legcal.machine.kinematics import (
+    consistent_readings,
+    follow,
+    follow_poses,
+    reading_span,
+    solve_poses,
+)
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.mobility import free_motions, project, singularities, singularity
 from legcal.machine.model import (
@@ -182,9 +189,22 @@ def _drawn_poses(
 ) -> Iterator[tuple[Array, Array]]:
     """Yield readings (n_legs,) and pose (3, 4) of what :func:`_drawn` yields.
 
-    Draws to come are followed together as if none were in vain, which is so for most machines.
+    Draws to come are followed together as if none were in vain, which is so for most machines. With
+    redundant motors many are: readings are drawn of as many motors as there are freedoms, those of
+    one share followed together, and the others' must lie in their travel.
     """
     drawn = 0
+    if machine.is_redundant:
+        driven = _by_fewest_motors(machine)
+        for share in SHARES:
+            if drawn == count:
+                return
+            q = _random_readings(driven, generator, np.full(count - drawn, share))
+            for readings, pose, is_reached in _reached(driven, q):
+                drawn += is_reached
+                if is_reached:
+                    yield readings, pose
+        return
     ahead = list[tuple[Array, Array, bool]]()
     for turn in range(count):
         if turn == MAX_FAILED and not drawn:
@@ -196,12 +216,7 @@ def _drawn_poses(
                 )
             (q,) = _random_readings(machine, generator, [share])
             readings, pose, is_reached = ahead.pop(0)
-            if machine.is_redundant:
-                if share < 1.0:
-                    ((readings, pose, is_reached),) = _reached(machine, q[None])
-                if not is_reached:
-                    continue
-            elif share < 1.0 or not is_reached:
+            if share < 1.0 or not is_reached:
                 configuration = _reached_on_the_chain(machine, q, tries)
                 if configuration is None:
                     continue
@@ -210,6 +225,20 @@ def _drawn_poses(
             drawn += 1
             yield readings, pose
             break
+
+
+def _by_fewest_motors(machine: Machine) -> Machine:
+    """Return a redundant machine with as many motors as freedoms, the other legs passive.
+
+    They are those that tell most of the pose at home.
+    """
+    _, _, order = qr(reading_span(machine, machine.home).T, mode="economic", pivoting=True)
+    idle = {machine.motors[k] for k in order[machine.mobility :].tolist()}
+    legs = (
+        replace(leg, kind=LegKind.PASSIVE) if j in idle else leg
+        for j, leg in enumerate(machine.legs)
+    )
+    return replace(machine, legs=tuple(legs))
 
 
 def _random_readings(
@@ -251,8 +280,7 @@ def _reached(machine: Machine, q: Array) -> Iterator[tuple[Array, Array, bool]]:
     lengths = np.linalg.norm(arms + poses[:, None, :, 3] - machine.A_base, axis=2)
     readings = machine.sign * (lengths - machine.q0)
     readings[:, [leg.kind is LegKind.CONSTANT for leg in machine.legs]] = 0.0
-    if not machine.is_redundant:
-        readings[:, motors] = q
+    readings[:, motors] = q
     least = MIN_SINGULARITY * singularity(machine, machine.home)
     usable = (part == 1.0) & ~_outside(machine, readings).any(axis=1)
     usable &= singularities(machine, poses) >= least

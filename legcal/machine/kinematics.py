@@ -288,11 +288,11 @@ def consistent_readings(
         at, here = machine.home, machine.home_configuration[slider_columns(machine, motors)[0]]
     else:
         here = readings_at(machine, at)[motors]
-    span = machine.sign[motors][:, None] * _reading_span(machine, at)
+    span = machine.sign[motors][:, None] * reading_span(machine, at)
     return np.asarray(here + (readings - here) @ span @ span.T)
 
 
-def _reading_span(machine: Machine, T: RigidTransform) -> Array:
+def reading_span(machine: Machine, T: RigidTransform) -> Array:
     """Return a basis (n_motors, mobility) of how lengths change together near a pose."""
     equations = equations_at(machine, T)
     J = equations.by_pose[0][equations.measured]
@@ -311,7 +311,7 @@ def contradiction(machine: Machine, T: RigidTransform, readings: Array) -> str |
     if not machine.is_redundant:
         return None
     motors = list(machine.motors)
-    span = _reading_span(machine, T)
+    span = reading_span(machine, T)
     redundancy = np.maximum(1.0 - np.sum(span**2, axis=1), UNCHECKED)
     q = np.zeros(machine.n_legs)
     q[motors] = readings
@@ -585,12 +585,12 @@ def follow(
 
 def _nearest(machine: Machine, T: RigidTransform, readings: Array) -> RigidTransform:
     """Return the pose near T_base_platform at which readings (n_motors,) miss least."""
-    equations = _equations_at(machine, machine.sign[list(machine.motors)] * readings)
+    equations = equations_of_readings(machine, machine.sign[list(machine.motors)] * readings)
     found = solve(equations, poses_after, T.as_matrix()[None, :3], tolerance=1e-15)
     return motion_of(found.points[0, :, :3], found.points[0, :, 3])
 
 
-def _equations_at(machine: Machine, lengthening: Array) -> Equations:
+def equations_of_readings(machine: Machine, lengthening: Array) -> Equations:
     """Return what poses must satisfy at s q of the motors (k, n_motors) [m]."""
 
     def equations(poses: Array) -> tuple[Array, Array]:
@@ -628,7 +628,7 @@ def follow_poses(
             share = ((part - done[rows]) / (1.0 - done[rows]))[:, None]
             lengthening = now + share * (machine.sign[motors] * last[rows] - now)
         found = newton(
-            _equations_at(machine, lengthening),
+            equations_of_readings(machine, lengthening),
             poses_after,
             poses[rows],
             tolerance=TOLERANCE * scale,
