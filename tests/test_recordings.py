@@ -13,6 +13,7 @@ from command_line import run
 from legcal import load_dataset, load_mechanism
 from legcal.data import reading_columns
 from legcal.geometry import Array
+from legcal.recordings.frames import VIDEOS
 from legcal.recordings.stillness import clock_offset
 
 MODEL = "hexapod"
@@ -90,6 +91,7 @@ def _stamps(motion: Motion) -> Array:
 
 def _video(motion: Motion, folder: Path) -> Path:
     path = folder / "c1.avi"
+    assert path.suffix in VIDEOS
     video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), RATE, SIZE)
     rng = np.random.default_rng(0)
     for time in _stamps(motion):
@@ -200,6 +202,30 @@ def test_clocks_are_compared_by_motion_and_json_tells_what_was_left_out(
     assert not folder.exists()
 
 
+def test_a_damaged_video_is_told_in_one_sentence_and_times_may_have_a_unit(
+    motion: Motion,
+    tmp_path: Path,
+    import_: Callable[..., tuple[int, Path]],
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    video, rng = _video(motion, tmp_path), np.random.default_rng(2)
+    content = bytearray(video.read_bytes())
+    end = 3 * len(content) // 4
+    for k in rng.integers(len(content) // 2, end, 40).tolist():
+        content[k : k + 30] = rng.bytes(30)
+    video.write_bytes(content[:end])
+    table = _ticks(motion, tmp_path)
+    rows = [line.split(",", 1) for line in table.read_text().splitlines()]
+    ticks = [f"{1e3 * (float(time) - 1.7e9):.1f},{rest}" for time, rest in rows[1:]]
+    table.write_text("\n".join([f"Time [ms],{rows[0][1]}", *ticks]))
+    code, folder = import_(video, "--readings", table, "--offset", "-0.5")
+    said = capfd.readouterr()
+    assert code == 0
+    assert "it is cut off or damaged there" in said.out + said.err
+    assert "@ 0x" not in said.err  # as the decoder writes
+    assert 3 <= len(load_dataset(folder).measurements.q) < motion.rests
+
+
 REFUSALS: dict[str, tuple[Callable[[Motion, Path], tuple[object, ...]], str]] = {
     "no such file": (lambda m, t: (t / "none.mp4",), "found no such file"),
     "another format": (lambda m, t: (_written(t / "a.txt", b"x"),), "found a file ending in"),
@@ -209,7 +235,7 @@ REFUSALS: dict[str, tuple[Callable[[Motion, Path], tuple[object, ...]], str]] = 
     "no readings": (lambda m, t: (_video(m, t),), "give it with --readings"),
     "no times": (lambda m, t: (_video(m, t), "--readings", _timeless(m, t)), "no column 'time'"),
     "times of another name": (lambda m, t: (_video(m, t), "--readings", _renamed(m, t)),
-                              "Column 'Time [s]' of"),
+                              "Column 'Moment' of"),
     "nothing moves": (lambda m, t: (_video(m, t), "--readings", _resting(m, t)),
                       "readings that change alike all the time"),
     "other motion": (lambda m, t: (_video(m, t), "--readings", _other(m, t)),
@@ -266,7 +292,7 @@ def _dated(motion: Motion, folder: Path) -> Path:
 
 def _renamed(motion: Motion, folder: Path) -> Path:
     path = _ticks(motion, folder)
-    path.write_text(path.read_text().replace("time", "Time [s]", 1))
+    path.write_text(path.read_text().replace("time", "Moment", 1))
     return path
 
 

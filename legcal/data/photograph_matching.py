@@ -450,7 +450,8 @@ def _by_time(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
         raise DatasetError(
             f"{table}: the photographs could not be matched by time: found {len(dated)} "
             f"photographs with a time in their EXIF data for {len(rows)} rows, needed as many or "
-            "more; copy the files from the camera as they are, or add a column image."
+            "more; copy the files from the camera as they are, add a column image, or give "
+            "--match order."
         )
     day = taken[dated[0].name].date()
     times = [_moment(row.time, day) for row in rows]

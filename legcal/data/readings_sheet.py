@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
 
@@ -27,8 +28,10 @@ _HEADINGS = {
     "image": ("image", "img", "file", "filename", "imagefile", "name", "photo", "photograph",
               "photofile", "picture", "pic", "imagename", "photoname", "frame", "shot"),
     "pose": ("pose", "poseid", "posenumber", "posename", "poselabel"),
-    "time": ("time", "timestamp", "datetime", "date", "takenat", "clock"),
+    "time": ("time", "timestamp", "datetime", "date", "takenat", "clock", "elapsed", "elapsedtime"),
 }  # fmt: skip
+_SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+_TIME = re.compile(rf"(?:{'|'.join(_HEADINGS['time'])}|t)({'|'.join(_SECONDS)})")
 _NUMBERED = re.compile(r"([^\W\d]*?)0*(\d{1,3})([^\W\d]*)")
 
 
@@ -53,10 +56,14 @@ class Headings:
         number, header = lines[0]
         split = [split_heading(text) for text in header]
         meaning: dict[int, str] = {}
+        clock: dict[int, float] = {}  # what one is in seconds, of a column of times with a unit
         for i, (key, _) in enumerate(split):
             for name, words in _HEADINGS.items():
-                if key in words and name not in meaning.values():
+                timed = _TIME.fullmatch(key) if name == "time" else None
+                if (key in words or timed) and name not in meaning.values():
                     meaning[i] = name
+                if timed and meaning.get(i) == name:
+                    clock = {i: _SECONDS[timed[1]]}
         meaning |= self._joints([i for i in range(len(header)) if i not in meaning], split, header)
         for i, name in meaning.items():
             self.taken[header[i]] = name
@@ -71,7 +78,9 @@ class Headings:
             )
         kept = sorted(meaning)
         below = [
-            (line, [cells[i] for i in kept] if len(cells) == len(header) else cells)
+            (line, [_dated(cells[i], clock.get(i)) for i in kept])
+            if len(cells) == len(header)
+            else (line, cells)
             for line, cells in lines[1:]
         ]
         return [(number, [meaning[i] for i in kept]), *below]
@@ -114,6 +123,16 @@ class Headings:
             f"the leg ({self.motors[0].name}), its joint ({self.joints[0]}) or its number "
             "(L1, q1, 1); rename the columns."
         )
+
+
+def _dated(cell: str, size: float | None) -> str:
+    """Return a number of seconds, or of a part *size* of them, as a date; other cells unchanged."""
+    if size is None:
+        return cell
+    try:
+        return datetime.fromtimestamp(float(cell) * size, UTC).replace(tzinfo=None).isoformat()
+    except (ValueError, OverflowError, OSError):
+        return cell
 
 
 def unit_of(table: Table, headings: Headings, given: str | None, lengths: bool) -> tuple[str, str]:

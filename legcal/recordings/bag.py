@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -57,16 +57,17 @@ class Bag:
         self._joint_topic = joint_topic
         self._bad = 0
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the images in the order of the bag; damaged ones are left out and counted."""
-        self._bad, last = 0, -np.inf
+        self._bad, last, number = 0, -np.inf, -1
         for time, kind, message in self._messages(_IMAGES, self._image_topic, "images"):
             image = _image(message) if kind == _IMAGES[0] else _decoded(message)
             if image is None or time <= last:
                 self._bad += 1
                 continue
-            last = time
-            yield Frame(time, image)
+            last, number = time, number + 1
+            if only is None or number in only:
+                yield Frame(time, image)
 
     def notes(self) -> tuple[str, ...]:
         """Return how many images could not be used."""

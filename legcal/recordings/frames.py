@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from datetime import UTC
 from pathlib import Path
@@ -18,6 +19,9 @@ from legcal.errors import DatasetError
 from legcal.files import MAX_IMAGE, read_bytes
 from legcal.recordings.series import Series, unix_seconds
 from legcal.vision import quiet_opencv
+
+# OpenCV's decoder reads it once: quiet (AV_LOG_QUIET), since damage is told in a sentence.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mts", ".wmv")
 MAX_FRAMES = 1_000_000
@@ -40,8 +44,11 @@ class Recording(Protocol):
     def path(self) -> Path:
         """The file or folder."""
 
-    def frames(self) -> Iterator[Frame]:
-        """Yield the frames in the order of their times; each call begins at the first."""
+    def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
+        """Yield the frames in the order of their times, or *only* those with these numbers.
+
+        Each call begins at the first.
+        """
 
     def notes(self) -> tuple[str, ...]:
         """Return what is odd, once all frames have been seen."""
@@ -57,7 +64,7 @@ class Video:
         self.path = path
         self._notes: tuple[str, ...] = ()
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the frames; a video without any is refused."""
         with quiet_opencv():
             video = cv2.VideoCapture(str(self.path))
@@ -67,7 +74,12 @@ class Video:
             count, last = 0, -np.inf
             try:
                 while video.isOpened() and count < MAX_FRAMES:
-                    found, image = video.read()
+                    if not video.grab():
+                        break
+                    if only is not None and count not in only:
+                        count += 1
+                        continue
+                    found, image = video.retrieve()
                     if not found:
                         break
                     time = 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)  # of the frame just read
@@ -84,7 +96,7 @@ class Video:
                 "complete video that OpenCV reads; copy it again, or write it anew "
                 "(ffmpeg -i IN -c:v libx264 -qp 0 OUT.mp4)."
             )
-        if count < (1.0 - _LOST) * promised - 1:
+        if only is None and count < (1.0 - _LOST) * promised - 1:
             self._notes = (
                 f"{self.path} ends after {count} of {promised:.0f} frames: it is cut off or "
                 "damaged there; copy it again to use the rest.",
@@ -105,7 +117,7 @@ class ImageFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the images in the order of their times."""
         photographs = find_photographs(self.path)
         times = {p.name: stamp_in(p.path.stem) or _taken(p) for p in photographs}
@@ -116,7 +128,10 @@ class ImageFolder:
                 "data, needed one for each image (a Unix time in the name, or the date of the "
                 "camera); for photographs of poses that were held use legcal init."
             )
-        for photograph in sorted(photographs, key=lambda p: times[p.name] or 0.0):
+        ordered = sorted(photographs, key=lambda p: times[p.name] or 0.0)
+        for number, photograph in enumerate(ordered):
+            if only is not None and number not in only:
+                continue
             content = np.frombuffer(read_bytes(photograph.path, MAX_IMAGE), dtype=np.uint8)
             with quiet_opencv():
                 image = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)

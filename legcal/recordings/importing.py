@@ -348,19 +348,17 @@ def import_recordings(
             rows: list[tuple[object, ...]] = []
             for view in found.views:
                 (folder / _SHOTS / view.name).mkdir(parents=True)
-                wanted = {frame: k for k, frame in enumerate(view.used)}
-                for number, frame in enumerate(view.recording.frames()):
-                    if number not in wanted:
-                        continue
-                    name = f"{view.name}_{wanted[number] + 1:03d}.png"
+                used = view.used
+                for k, frame in enumerate(view.recording.frames(only=frozenset(used))):
+                    name = f"{view.name}_{k + 1:03d}.png"
                     place = folder / _SHOTS / view.name / name
                     done, content = cv2.imencode(".png", frame.image)
                     assert done
                     place.write_bytes(content.tobytes())
-                    q = view.readings[wanted[number]]
+                    q = view.readings[k]
                     rows.append((view.name, f"{view.name}/{name}", *q.tolist()))
-                    progress(f"Writing {view.name}", wanted[number] + 1, len(wanted))
-                    if wanted[number] + 1 == len(wanted):
+                    progress(f"Writing {view.name}", k + 1, len(used))
+                    if k + 1 == len(used):
                         break
             table = folder / _TABLE
             table.write_text(format_table(["view", "image", *joints], rows), encoding="utf-8")
