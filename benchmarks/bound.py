@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from datetime import date
 from typing import Any, ClassVar
 
 import numpy as np
@@ -205,7 +206,7 @@ def page(machines: Sequence[Found], readings: Sequence[str]) -> str:
     lines = [
         "# The fit beside the Cramer-Rao bound",
         "",
-        "Written by `python benchmarks/bound.py`.",
+        f"Written by `python benchmarks/bound.py` on {date.today()}.",
         "",
         "| machine | runs | error / bound, each parameter | all together "
         "| normalised squared error | 95 % intervals that hold the truth | verdict |",

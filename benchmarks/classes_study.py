@@ -15,6 +15,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from datetime import date
 from functools import lru_cache, partial
 from typing import Any, ClassVar
 
@@ -337,7 +338,7 @@ def page(machines: Sequence[Found], readings: Sequence[str]) -> str:
         [
             "# Machines of every class, calibrated",
             "",
-            "Written by `python benchmarks/classes_study.py`.",
+            f"Written by `python benchmarks/classes_study.py` on {date.today()}.",
             "",
             "## What the fit is worth",
             "",
