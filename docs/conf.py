@@ -1,5 +1,9 @@
 """Sphinx: pages in MyST, the tutorial executed, no network, warnings are errors (-W)."""
 
+import re
+from pathlib import Path
+from typing import Any
+
 from legcal.version import __version__
 
 project = "legcal"
@@ -28,3 +32,28 @@ html_title = f"legcal {release}"
 html_static_path: list[str] = []
 html_copy_source = False
 html_show_sphinx = False
+
+
+def notebook_of(page: Path) -> Any:
+    """Return the notebook (nbformat) of a page with code cells; links to other pages are text."""
+    from myst_nb.core.read import read_myst_markdown_notebook
+
+    notebook = read_myst_markdown_notebook(page.read_text(encoding="utf-8"))
+    for cell in notebook.cells:
+        if cell.cell_type == "markdown":
+            cell.source = re.sub(r"\[([^]]+)\]\((?!http)[^)]+\)", r"\1", cell.source)
+    return notebook
+
+
+def _write_notebook(app: Any, failure: Exception | None) -> None:
+    """Put the tutorial beside its page, to be downloaded."""
+    import nbformat
+
+    if failure is None and app.builder.format == "html":
+        notebook = notebook_of(Path(app.srcdir) / "tutorial.md")
+        nbformat.write(notebook, Path(app.outdir) / "tutorial.ipynb")
+
+
+def setup(app: Any) -> None:
+    """Connect what is done when the site is built."""
+    app.connect("build-finished", _write_notebook)

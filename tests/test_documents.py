@@ -1,5 +1,6 @@
 """Code blocks and commands of the README and the pages: run, or held against what they are for."""
 
+import importlib
 import re
 import shlex
 import shutil
@@ -25,7 +26,7 @@ from legcal.machine.schema import MechanismFile
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 RUN_ELSEWHERE = {  # by the language of a block, or its page
     "python": "test_project.py and test_python_api.py, with what they print",
-    "{code-cell} ipython3": "the site, of which test_project.py converts the tutorial too",
+    "{code-cell} ipython3": "the site, when it is built",
 }
 FORMATS: dict[str, type[BaseModel]] = {
     "legcal_dataset": DatasetEntry,
@@ -89,7 +90,7 @@ def test_every_block_is_one_of_the_kinds_that_are_checked() -> None:
                 re.match(r"\S+\s{2,}\S", line) for line in text.splitlines() if " " in line
             )
             is_run = language == "{code-cell} ipython3" or all(
-                re.match(r"(\S*/)?(legcal|docker|pip|pytest|python3) ", f"{line} ")
+                re.match(r"(\S*/)?(legcal|docker|pip|pytest|python3|dask) ", f"{line} ")
                 for line in _commands(text)
             )
             is_known = language in kinds and (
@@ -191,6 +192,21 @@ def test_every_yaml_of_a_page_is_what_reading_takes() -> None:
             block = parse_yaml((HEXAPOD / "dataset.yaml").read_bytes(), path, "example") | content
             validate(DatasetEntry, block, path)
     assert kinds == set(FORMATS)
+
+
+@pytest.mark.system
+def test_the_tutorial_is_a_notebook_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("myst_nb", reason="myst-nb (extra docs) is not installed")
+    nbformat = importlib.import_module("nbformat")
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    notebook = importlib.import_module("conf").notebook_of(ROOT / "docs/tutorial.md")
+    nbformat.validate(notebook)
+    blocks = [text for language, text, _ in _blocks(ROOT / "docs/tutorial.md")
+              if language.startswith("{code-cell}")]  # fmt: skip
+    cells = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
+    assert len(cells) == len(blocks) > 10
+    assert all(cell in block for cell, block in zip(cells, blocks, strict=True))
+    assert not any(".md)" in cell.source for cell in notebook.cells)
 
 
 @pytest.mark.system
