@@ -1,7 +1,10 @@
+from .calibration import FleetMachine as FleetMachine
+from .calibration import FleetOptions as FleetOptions
 from .calibration import Location as Location
 from .calibration import ToolPoses as ToolPoses
 from .calibration import calibrate as calibrate
 from .calibration import calibrate_camera as calibrate_camera
+from .calibration import calibrate_fleet as calibrate_fleet
 from .calibration import check as check
 from .calibration import detect as detect
 from .calibration import doctor as doctor

@@ -37,6 +37,7 @@ _NO_WORKER = 60.0  # [s] without any worker until work is given up: they may be 
 _NAMED = 5  # workers in a message
 _WHEELS = ("numpy", "scipy", "opencv-python-headless", "casadi", "pin", "distributed")
 
+Stamp = tuple[int, int]
 Work = Callable[[Sequence[Any]], list[Any]]
 """Returns the results of some rows."""
 
@@ -289,7 +290,7 @@ class _Part:
             worker, own, content = future.result()
             self._cluster._compare(worker, own)
             for k, (value, error, read) in zip(places, pickle.loads(content), strict=True):
-                lacking = {path for path, stamp in read.items() if stamp != _stamp(path)}
+                lacking = {path for path, stamp in read.items() if stamp != stamp_of(path)}
                 if not lacking and error is not None:
                     raise error
                 if not lacking:
@@ -316,8 +317,8 @@ def _content(path: str) -> bytes | None:
         return None
 
 
-def _stamp(path: str) -> tuple[int, int] | None:
-    """Return what tells files apart without reading them; None if there is none."""
+def stamp_of(path: str | Path) -> Stamp | None:
+    """Return size and time of change [ns] of a file, None if it is not there."""
     try:
         found = os.stat(path)
     except OSError:
@@ -341,7 +342,7 @@ class _Files:
 
     def __init__(self, sent: dict[str, bytes | None], folder: str) -> None:
         self.sent, self.folder = sent, folder
-        self.read: dict[str, tuple[int, int] | None] = {}
+        self.read: dict[str, Stamp | None] = {}
 
 
 class _FileNeeded(Exception):
@@ -357,7 +358,7 @@ def file_of_task(path: Path) -> bytes | None:
     if name in files.sent:
         return files.sent[name]
     here = os.path.join(files.folder, name)
-    files.read[name] = _stamp(here)
+    files.read[name] = stamp_of(here)
     content = _content(here)
     if content is None:
         files.read[name] = None
@@ -381,7 +382,7 @@ def _work(
     """Work on rows and say who did it; each gives a result or an error, and the files it read."""
     from distributed import get_worker
 
-    found: list[tuple[Any, LegcalError | None, dict[str, tuple[int, int] | None]]] = []
+    found: list[tuple[Any, LegcalError | None, dict[str, Stamp | None]]] = []
     with _lock:
         work: Work = pickle.loads(content)  # anew, as what is drawn changes generators in it
         for row in pickle.loads(rows):

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -321,3 +322,37 @@ def test_ctrl_c_stops_all_processes_without_a_word_of_theirs(tmp_path: Path) -> 
     assert len(tracebacks) == 1  # that of the program itself, which lets the interrupt pass
     assert told.decode().splitlines()[-1].startswith("KeyboardInterrupt")
     assert len(_lines(tmp_path)) < 401
+
+
+def test_parts_of_a_study_are_merged_and_what_is_missing_is_run(tmp_path: Path) -> None:
+    parts = [tmp_path / f"part{k}" for k in (1, 2, 3)]
+    for k, folder in enumerate(parts[:2], start=1):
+        part = run_study(Draws(fails_above=1.0), 20, output=folder, part=(k, 3)).document()
+        assert (part["part"], part["runs"]) == ([k, 3], 7)
+    whole = run_study(Draws(fails_above=1.0), 20, output=tmp_path / "all", merge=parts[:2])
+    assert whole.document() == run_study(Draws(fails_above=1.0), 20).document()
+    assert len(_lines(tmp_path / "all")) == 21
+    for folder, study, message in (
+        (parts[2], Draws(fails_above=1.0), "the runs could not be merged"),
+        (parts[0], Draws(), "a checkpoint of other settings"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            run_study(study, 20, output=tmp_path / "other", merge=[folder])
+    for found in ((0, 3), (4, 3), (1, 21)):
+        with pytest.raises(UsageError, match=f"found part {found[0]}/{found[1]}, needed K/N"):
+            run_study(Draws(), 20, part=found)
+
+
+def test_a_run_takes_eight_bytes_of_memory(tmp_path: Path) -> None:
+    path = tmp_path / CHECKPOINT_NAME
+    first = header("draws", Draws().settings, 0)
+    with open_checkpoint(path, first, Draws().is_record) as checkpoint:
+        tracemalloc.start()
+        for begin in range(0, 20_000, 1000):
+            checkpoint.append(
+                [{"run": k, "record": {"x": 1.0}} for k in range(begin, begin + 1000)]
+            )
+        kept, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert kept < 20_000 * 12
+        assert sum(line["record"]["x"] for line in checkpoint.lines(range(20_000))) == 20_000

@@ -10,6 +10,13 @@ from .evaluation import Evaluation as Evaluation
 from .evaluation import evaluate as evaluate
 from .examination import Examination as Examination
 from .examination import doctor as doctor
+from .fleet import FleetDocument as FleetDocument
+from .fleet import FleetMachine as FleetMachine
+from .fleet import FleetOptions as FleetOptions
+from .fleet import calibrate_fleet as calibrate_fleet
+from .fleet import fleet_cells as fleet_cells
+from .fleet import fleet_columns as fleet_columns
+from .fleet import read_fleet as read_fleet
 from .identify.identifiability import answer as answer
 from .identify.identifiability import identifiability as identifiability
 from .identify.identifiability import ranks_of_dataset as ranks_of_dataset

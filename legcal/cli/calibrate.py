@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from legcal.cli.options import (
     ClusterOption,
-    DatasetArgument,
     JsonOption,
     PageOfResult,
     QuietOption,
+    WorkersOption,
     command_line,
     image_workers,
     loading,
@@ -21,20 +23,34 @@ from legcal.cli.options import (
 )
 from legcal.errors import UsageError
 from legcal.paper import Criteria, Transformation
+from legcal.processors import processors
 
 if TYPE_CHECKING:
+    from legcal.calibration import Calibration
     from legcal.data import Dataset
     from legcal.machine import Machine
 
 _TESTS = "Tests of a result"
+_FLEETS = "Fleets: several datasets, or --list"
 _PARAMETERS = "Parameters by name (or a pattern: '*.offset'); each may be repeated"
 
 
 def calibrate(
-    dataset: DatasetArgument,
+    datasets: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="DATASET...",
+            help="The folder that holds dataset.yaml; several are a fleet of machines.",
+        ),
+    ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="OUT", help="The result folder to write."),
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="OUT",
+            help="The result folder to write; of a fleet, the folder of its result folders.",
+        ),
     ] = None,
     cluster: ClusterOption = None,
     quiet: QuietOption = False,
@@ -120,6 +136,32 @@ def calibrate(
             "The calibration does not see it.",
         ),
     ] = None,
+    machines: Annotated[
+        Path | None,
+        typer.Option(
+            "--list",
+            metavar="FILE.csv",
+            help="Machines, a row each: dataset, and name and earlier (a result folder) or not.",
+            rich_help_panel=_FLEETS,
+        ),
+    ] = None,
+    earlier: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="OUT",
+            help="Folder of an earlier fleet: drift is counted from its results, by name.",
+            rich_help_panel=_FLEETS,
+        ),
+    ] = None,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Take results that stand in OUT and are newer than the files of their dataset.",
+            rich_help_panel=_FLEETS,
+        ),
+    ] = False,
+    workers: WorkersOption = None,
     significance: Annotated[
         float | None,
         typer.Option(
@@ -129,7 +171,22 @@ def calibrate(
         ),
     ] = None,
 ) -> None:
-    """Compute the calibrated model from images and encoder readings, or check an earlier one."""
+    """Compute the calibrated model from images and encoder readings, or check an earlier one.
+
+    Several datasets, or --list, are a fleet: a result folder for each machine, and a summary.
+    """
+    datasets = datasets or []
+    is_fleet = machines is not None or len(datasets) > 1
+    if not is_fleet and (resume or earlier is not None):
+        raise UsageError(
+            f"The command could not be run: found {'--resume' if resume else '--earlier'} with one "
+            "dataset, needed a fleet; name its machines with --list, or leave it out."
+        )
+    if not is_fleet and not datasets:
+        raise UsageError(
+            "The command could not be run: found no DATASET, needed the folder that holds "
+            "dataset.yaml, or several, or a list of them (--list); name one."
+        )
     if check is not None:
         others = {
             "--prior": prior,
@@ -141,6 +198,7 @@ def calibrate(
             "--transformation": transformation,
             "--overlays": overlays or None,
             "--truth": truth,
+            "several datasets": is_fleet or None,
         }
         named = [name for name, value in others.items() if value is not None]
         if named:
@@ -149,7 +207,8 @@ def calibrate(
                 "takes all of it from the earlier result; leave one of them out."
             )
         page = None if output is None or not with_report else _page_of_check(output)
-        _check(dataset, check, significance, page, cluster, quiet=quiet, as_json=as_json)
+        on = image_workers(cluster, workers)
+        _check(datasets[0], check, significance, page, on, quiet=quiet, as_json=as_json)
         return
     if significance is not None:
         raise UsageError(
@@ -170,13 +229,46 @@ def calibrate(
         from legcal import calibration, report
 
         run, summary = calibration.calibrate, report.summary
+    arguments: dict[str, Any] = {
+        "criteria": criteria,
+        "transformation": transformation,
+        "use_cache": not fresh,
+        "priors": prior or (),
+        "fixed": fix or (),
+        "free": free or (),
+        "holdout": holdout,
+        "overlays": overlays,
+    }
+    if is_fleet:
+        if truth is not None:
+            raise UsageError(
+                "The command could not be run: found --truth beside several datasets, needed one, "
+                "whose machine it is; leave it out."
+            )
+        fleet = [] if machines is None else calibration.read_fleet(machines)
+        fleet += [calibration.FleetMachine(path.resolve().name, path) for path in datasets]
+        if earlier is not None:
+            fleet = [replace(one, earlier=one.earlier or earlier / one.name) for one in fleet]
+        page_of_machine = partial(_page_of_machine, command_line()) if with_report else None
+        outcome = calibration.calibrate_fleet(
+            fleet,
+            output,
+            options=calibration.FleetOptions(arguments, page_of_machine),
+            workers=cluster or workers or processors(),
+            resume=resume,
+            progress=not quiet,
+        )
+        show(as_json, outcome.document, lambda: report.fleet_table(outcome, output))
+        if set(outcome.counts) != {"trustworthy"}:
+            raise typer.Exit(1)
+        return
     page = output / calibration.REPORT_NAME
     if with_report and page.exists():
         report.PAGE.check_place(page)
-    given: Path | Dataset = dataset
+    given: Path | Dataset = datasets[0]
     true = None
     if truth is not None:
-        given, true = _with_truth(dataset, truth)
+        given, true = _with_truth(datasets[0], truth)
     page_of = PageOfResult(
         lambda found, folder: report.write_report(
             found, output, command_line(), truth=true, into=folder
@@ -186,16 +278,9 @@ def calibrate(
         given,
         output=output,
         progress=not quiet,
-        criteria=criteria,
-        transformation=transformation,
-        use_cache=not fresh,
-        workers=image_workers(cluster),
-        priors=prior or (),
-        fixed=fix or (),
-        free=free or (),
-        holdout=holdout,
-        overlays=overlays,
+        workers=image_workers(cluster, workers),
         beside=page_of if with_report else None,
+        **arguments,
     )
     page_of.say()
     show(
@@ -205,6 +290,17 @@ def calibrate(
     )
     if not found.verdict.trustworthy:
         raise typer.Exit(1)
+
+
+def _page_of_machine(command: str, found: Calibration, output: Path, folder: Path) -> None:
+    """Make the page of a machine of a fleet, in any process."""
+    from legcal import report
+
+    page = PageOfResult(
+        lambda result, into: report.write_report(result, output, command, into=into)
+    )
+    page(found, folder)
+    page.say()
 
 
 def _with_truth(folder: Path, truth: str) -> tuple[Dataset, Machine]:
@@ -249,7 +345,7 @@ def _check(
     result: Path,
     significance: float | None,
     page: Path | None,
-    cluster: str | None,
+    workers: int | str,
     *,
     quiet: bool,
     as_json: bool,
@@ -262,7 +358,7 @@ def _check(
         result,
         significance=calibration.SIGNIFICANCE if significance is None else significance,
         progress=not quiet,
-        workers=image_workers(cluster),
+        workers=workers,
     )
     title = f"Check of {result.resolve().name}"
     write_page(page, title, report.check_summary(found), report.check_verdict(found))

@@ -59,6 +59,14 @@ def paper(
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
     output: OutputFolder = None,
+    part: Annotated[
+        str | None,
+        typer.Option(metavar="K/N", help="Only every N-th run, from run K on: a job of an array."),
+    ] = None,
+    merge: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="OUT", help="Take over the runs of a part; may be repeated."),
+    ] = None,
     radians: Annotated[
         bool, typer.Option("--radians", help="Take the angles of Table 1 as radians, as printed.")
     ] = False,
@@ -83,12 +91,27 @@ def paper(
         output=output,
         progress=not quiet,
         beside=page,
+        part=_part(part),
+        merge=merge or (),
     )
     page.say()
     document = result.document()
     show(as_json, lambda: document, lambda: study_table(document))
     if output is not None and not as_json:
         print_table(f"\nRuns, document and figures: {output}")
+
+
+def _part(text: str | None) -> tuple[int, int] | None:
+    """Return which part of how many a text names."""
+    if text is None:
+        return None
+    k, slash, n = text.partition("/")
+    if not (slash and k.isdecimal() and n.isdecimal()):
+        raise UsageError(
+            f"--part could not be used: found '{text}', needed K/N as in 3/100, K from 1 to N; "
+            "correct it."
+        )
+    return int(k), int(n)
 
 
 def _name_benchmark(name: str, program: str) -> Callable[[typer.Context], None]:

@@ -2,6 +2,7 @@ from .calibration import accuracy_table as accuracy_table
 from .calibration import check_summary as check_summary
 from .calibration import summary as summary
 from .doctor import examination_table as examination_table
+from .fleet import fleet_table as fleet_table
 from .identify import identify_table as identify_table
 from .images import camera_table as camera_table
 from .images import detection_table as detection_table
