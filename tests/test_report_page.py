@@ -223,6 +223,7 @@ def test_hostile_names_are_harmless(example_run: Run, tmp_path: Path) -> None:
         assert not re.search(r"<[b/s]", script.text.replace("<br>", "").replace("<extra>", ""))
 
 
+@pytest.mark.usefixtures("page")  # which writes the report of the result
 def test_a_report_is_not_written_over_another_file(example_run: Run, tmp_path: Path) -> None:
     (tmp_path / "report.html").write_text("mine")
     with pytest.raises(UsageError, match=r"report\.html"):

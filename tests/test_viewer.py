@@ -10,6 +10,7 @@ from command_line import run
 from hexapod_example import HEXAPOD, Run
 from layouts import Layout, write_machine
 from machines import of_types
+from scipy.ndimage import map_coordinates
 
 from legcal.machine import (
     Machine,
@@ -69,6 +70,16 @@ def test_redundant_motors_give_way(tmp_path: Path) -> None:
     assert abs(posture.q[2] - start[2] - 0.02) < 1e-3
     others = np.delete(posture.q - start, 2)
     assert 1e-4 < np.abs(others).max() < 0.02
+
+
+def test_a_machine_without_motors_is_moved_by_its_pose(tmp_path: Path) -> None:
+    spec = of_types(["US"] * 6, ["passive"] * 6)
+    motion = Motion(load_mechanism(write_machine(tmp_path, spec, Layout())))
+    assert "Readings do not move it" in motion.read(0, 0.1).problem
+    z = motion.posture.T.translation[2]
+    assert not motion.place(2, z + 0.01).problem
+    assert abs(motion.posture.T.translation[2] - z - 0.01) < 1e-9
+    assert "Readings do not give the pose" in motion.show(motion.posture.q).problem
 
 
 @pytest.fixture(scope="module")
@@ -194,8 +205,22 @@ def test_photographs_come_without_distortion_and_say_where_they_are_missing(
     assert not problem
     assert picture is not None
     assert abs(picture.shape[1] / picture.shape[0] - place.aspect) < 0.01
-    assert np.ptp(picture) > 50
     assert result.dataset is not None
+    grey = result.dataset.image_reader([row])(0)
+    barrel = replace(
+        place, view=-1, camera=replace(place.camera, distortion=np.array([-0.2, 0.05, 1e-3, 0, 0]))
+    )
+    straight, _ = photographs.picture(barrel, row)
+    assert straight is not None
+    pixels = np.random.default_rng(3).uniform([60, 60], [960, 700], (300, 2))
+    for seen_by, shown in ((place, picture), (barrel, straight)):
+        xy = seen_by.camera.undistort(pixels)  # lines of sight of both must show the same
+        at = 0.5 * (xy / seen_by.half + 1.0) * shown.shape[1::-1] - 0.5
+        levels = [
+            map_coordinates(of, where.T[::-1], order=1)
+            for of, where in ((grey, pixels), (shown[..., 0].astype(float), at))
+        ]
+        assert np.corrcoef(levels)[0, 1] > 0.99
     elsewhere = replace(result, dataset=replace(result.dataset, folder=tmp_path))
     nothing, problem = Photographs(elsewhere).picture(place, row)
     assert nothing is None
@@ -245,3 +270,11 @@ def test_without_viser_the_command_that_installs_it_is_said(
     monkeypatch.setattr("legcal.viewer.window.find_spec", lambda name: None)
     assert run(monkeypatch, "view", "hexapod") == 2
     assert "pip install 'legcal[view]'" in capsys.readouterr().err
+
+
+def test_rims_leave_out_a_leg_in_the_middle_and_no_other() -> None:
+    for name, n in (("tricept", 3), ("hexapod", 6), ("3-rpr", 3)):
+        for rim in Stage(Source(load_mechanism(name))).rims:
+            assert len(rim) == n + 1
+            assert rim[0] == rim[-1]
+            assert len(set(rim)) == n

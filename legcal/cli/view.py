@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from legcal.cli.options import print_table
+from legcal.cli.options import loading, print_table
 from legcal.signals import forget_stop
 
 
@@ -36,9 +36,10 @@ def view(
     ] = True,
 ) -> None:
     """Show a machine in the browser, moved by sliders: readings, pose, photographs, uncertainty."""
-    from legcal import viewer
+    with loading():
+        from legcal import viewer
 
-    viewer.require_viser()
+        viewer.require_viser()
     address = viewer.Address(host, port)
     viewer.check_address(address)
     window = viewer.Window(viewer.open_source(source, dataset), address)

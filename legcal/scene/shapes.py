@@ -11,14 +11,28 @@ from legcal.calibration import Result
 from legcal.geometry import Array
 from legcal.vision import Camera
 
-_USUAL = 0.02  # of the size of the machine: the median ellipsoid as it is drawn
+_STRAIGHT = 1e-9  # of the squared size: a bend that is none
 
 
 def around(points: Array) -> list[int]:
-    """Return joints (n, 3) in the order of their angles about their middle, the first twice."""
+    """Return the rim of joints (n, 3) in order about their middle, the first twice.
+
+    Joints within it, as of a leg in the middle, are left out.
+    """
     away = points - points.mean(axis=0)
     _, _, axes = np.linalg.svd(away)
-    order = np.argsort(np.arctan2(away @ axes[1], away @ axes[0])).tolist()
+    flat = away @ axes[:2].T
+    order = np.argsort(np.arctan2(flat[:, 1], flat[:, 0])).tolist()
+    least = -_STRAIGHT * np.ptp(flat, axis=0).max() ** 2
+    k = 0
+    while k < len(order) and len(order) > 3:
+        before, here, after = (flat[order[(k + i) % len(order)]] for i in (-1, 0, 1))
+        (a, b), (c, d) = here - before, after - here
+        if a * d - b * c < least:
+            del order[k]
+            k = 0
+        else:
+            k += 1
     return [*order, order[0]]
 
 
@@ -34,12 +48,12 @@ def ellipsoids(result: Result) -> dict[str, Array]:
     return found
 
 
-def enlargement(axes: Mapping[str, Array], size: float) -> float:
-    """Return by which of 1, 2, 5, 10, ... the usual ellipsoid is seen on a machine [m]."""
+def enlargement(axes: Mapping[str, Array], radius: float) -> float:
+    """Return by which of 1, 2, 5, 10, ... the usual ellipsoid is nearly as large as *radius*."""
     longest = [np.linalg.norm(of_side, axis=1).max(axis=1) for of_side in axes.values()]
     seen = np.concatenate([*longest, np.zeros(0)])
     usual = float(np.median(seen[seen > 0.0])) if np.any(seen > 0.0) else 1.0
-    wanted = _USUAL * size / usual
+    wanted = radius / usual
     power = 10.0 ** np.floor(np.log10(wanted))
     return float(power * max(s for s in (1, 2, 5) if s * power <= wanted))
 

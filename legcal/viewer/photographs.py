@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -22,7 +21,6 @@ MAX_CAMERAS = 60
 _SIDE = 720  # longer side of a photograph as it is shown [px]
 _RIM = 17  # points along each side of an image
 _WIDEST = 3.0  # tangent of half the field of view that is shown at most
-_KEPT = 64  # photographs
 _EMPTY = 235.0  # grey level where a lens shows nothing
 
 Picture = NDArray[np.uint8]
@@ -64,6 +62,7 @@ class Photographs:
 
     def __init__(self, source: Source) -> None:
         self._dataset = source.dataset
+        self._maps: dict[int, NDArray[np.float32]] = {}
         self.places: tuple[Place, ...] = ()
         self.poses: tuple[str, ...] = ()
         self.q = np.zeros((0, source.machine.n_legs))
@@ -97,24 +96,26 @@ class Photographs:
         if self._dataset is None or self._dataset.image_path(row) is None:
             return None, ""
         try:
-            return self._picture(place, row), ""
+            grey = self._dataset.image_reader([row])(0)
         except LegcalError as error:
             return None, str(error)
+        at = self._map(place)
+        shown = cv2.remap(grey, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=_EMPTY)
+        levels = np.clip(np.rint(shown), 0, 255).astype(np.uint8)
+        return np.repeat(levels[..., None], 3, axis=2), ""
 
-    @lru_cache(maxsize=_KEPT)  # noqa: B019 - there is one session
-    def _picture(self, place: Place, row: int) -> Picture:
-        assert self._dataset is not None
-        grey = self._dataset.image_reader([row])(0)
+    def _map(self, place: Place) -> NDArray[np.float32]:
+        """Return where in its image a camera shows each pixel of a picture, (h, w, 2) [px]."""
+        if place.view in self._maps:
+            return self._maps[place.view]
         camera = place.camera
         longer = min(_SIDE, max(camera.width, camera.height))
         w, h = (np.maximum(1, np.rint(longer * place.half / place.half.max()))).astype(int)
         x = place.half[0] * ((np.arange(w) + 0.5) / w * 2.0 - 1.0)
         y = place.half[1] * ((np.arange(h) + 0.5) / h * 2.0 - 1.0)
         rays = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        at = camera.distort(rays).reshape(h, w, 2).astype(np.float32)
-        shown = cv2.remap(grey, at[..., 0], at[..., 1], cv2.INTER_AREA, borderValue=_EMPTY)
-        levels = np.clip(np.rint(shown), 0, 255).astype(np.uint8)
-        return np.repeat(levels[..., None], 3, axis=2)
+        self._maps[place.view] = camera.distort(rays).reshape(h, w, 2).astype(np.float32)
+        return self._maps[place.view]
 
     def outlines(self, place: Place, row: int, depth: float) -> tuple[Array, BoolArray]:
         """Return the outlines of an image at a depth [m] of its camera, in the base link.

@@ -30,6 +30,8 @@ from legcal.viewer.motion import Posture
 from legcal.viewer.source import Source
 
 _THIN = 0.006  # of the size of the machine: the radius of a leg without cylinders
+_USUAL = 0.02  # of it: the median ellipsoid, and
+_WIDER = 4.0  # of the ball that it must be seen about
 _JOINT = 1.25  # of the thickest cylinder of a leg: the ball at its joints
 
 
@@ -113,7 +115,8 @@ class Stage:
         if self.source.result is None:
             return {}, 1.0
         axes = ellipsoids(self.source.result.result)
-        return axes, enlargement(axes, self.size)
+        radius = max(_USUAL * self.size, _WIDER * float(self.ball_radii.max()))
+        return axes, enlargement(axes, radius)
 
     def compared(
         self, posture: Posture, motion: int | None = None
@@ -132,8 +135,8 @@ class Stage:
             return None
         return self._joints(self._nominal, posture), here
 
-    def first_step(self, posture: Posture, motion: int | None = None) -> int:
-        """Return which of the factors of exaggeration shows a difference at first."""
+    def first_step(self, posture: Posture, motion: int) -> int:
+        """Return which of the factors of exaggeration shows a direction at first."""
         compared = self.compared(posture, motion)
         if compared is None:
             return FACTORS.index(1)

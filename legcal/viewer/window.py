@@ -35,12 +35,13 @@ if TYPE_CHECKING:
 FRAMES = 60.0  # at most, a second
 _PERIOD = 2.0  # of a motion that is played [s]
 _EYE = np.array([1.1, -1.5, 0.9])  # where it is looked at from, in its size
+_AWAY = 1.5  # times farther, where there are cameras to be seen too
 _DEPTH = 0.45  # of the size of the machine: how far from its camera a photograph is drawn
 _PLAIN = "nominal and calibrated"
 _NONE = "none"
 _STEP = 0.01  # of sliders [mm, deg]
 _STEEL, _ROD, _BASE, _PLATFORM = (88, 96, 108), (190, 197, 206), (70, 74, 80), (31, 95, 168)
-_BESIDE, _RED, _AMBER, _GREEN = (150, 156, 164), (200, 40, 30), (214, 138, 20), (30, 125, 70)
+_BESIDE, _RED, _AMBER, _GREEN = (150, 156, 164), (190, 20, 15), (190, 95, 0), (30, 125, 70)
 _USED, _LEFT_OUT = (60, 220, 90), (235, 70, 60)
 
 
@@ -129,7 +130,8 @@ class Window:
         seen = stage.seen(self.motion.posture)
         middle = np.concatenate([seen.A, seen.B]).mean(axis=0)
         camera = self._server.initial_camera
-        camera.position, camera.look_at = middle + size * _EYE, middle
+        away = (_AWAY if self.photographs.places else 1.0) * size
+        camera.position, camera.look_at = middle + away * _EYE, middle
         camera.near, camera.far = 0.01 * size, 100.0 * size
         floor = float(min(seen.A[:, 2].min(), seen.B[:, 2].min())) - 0.04 * size
         cell = float(10.0 ** np.floor(np.log10(size)))
@@ -190,7 +192,7 @@ class Window:
                 "/uncertainty", *_ball(16), np.tile([1.0, 0, 0, 0], (2 * n, 1)),
                 np.concatenate([seen.A, seen.B]),
                 batched_scales=np.maximum(np.concatenate(scales), 2e-4 * size),
-                batched_colors=_AMBER, opacity=0.75, lod="off",
+                batched_colors=_AMBER, opacity=0.85, lod="off",
             )  # fmt: skip
 
     def _rod_colours(self) -> NDArray[np.uint8]:
@@ -280,8 +282,9 @@ class Window:
         if posture.problem:
             lines.append(f"**Not reached.** {_plain(posture.problem)}")
         if seen.beside is not None:
-            what = "1 sigma" if self._shown_motion is not None else "The calibration"
-            lines.append(f"{what} moves joints by up to {1e3 * seen.apart:.3g} mm here.")
+            what = "The motion" if self._shown_motion is not None else "The calibration"
+            times = "" if self._factor == 1.0 else f", shown {self._factor:g} times as large"
+            lines.append(f"{what} moves joints by up to {1e3 * seen.apart:.3g} mm here{times}.")
         self._words.content = "\n\n".join(lines) or "Drag to turn, scroll to zoom."
 
     # Controls
@@ -417,19 +420,17 @@ class Window:
             self._show_beside: Any = _Constant(False)
             return
         with gui.add_folder("Calibration"):
-            self._show_beside = gui.add_checkbox("nominal", True)
+            self._show_beside = gui.add_checkbox("grey beside it", True)
             self._show_ellipsoids = gui.add_checkbox("uncertainty", True)
             enlarged = stage.ellipsoids[1]
             gui.add_markdown(f"Ellipsoids: 1 sigma, {enlarged:g} times as large.")
             options = (_PLAIN, *(f"{k + 1}. {w}" for k, w in enumerate(stage.motions)))
             self._show = gui.add_dropdown("show", options)
             self._play = gui.add_checkbox("play", False)
-            first = stage.first_step(self.motion.posture)
             self._exaggerate = gui.add_slider(
-                "exaggerate", 0, len(FACTORS) - 1, 1, first,
-                marks=tuple((k, f"{FACTORS[k]:g}") for k in (0, 1, 4, 7, 10, 13)),
+                "exaggerate", 0, len(FACTORS) - 1, 1, FACTORS.index(1), hint="0, 1, 2, 5, 10, ...",
+                marks=tuple((k, f"{FACTORS[k]:g}") for k in (1, 4, 7, 10, 13)),
             )  # fmt: skip
-        self._factor = float(FACTORS[first])
         for box in (self._show_beside, self._show_ellipsoids):
             self._on_update(box, "look", lambda _: None)
         self._on_update(
@@ -443,7 +444,9 @@ class Window:
     def show_motion(self, motion: int) -> None:
         """Show a weak direction as a motion, or for -1 what the calibration changed."""
         self._shown_motion = None if motion < 0 else motion
-        step = self.stage.first_step(self.motion.posture, self._shown_motion)
+        step = FACTORS.index(1)
+        if motion >= 0:
+            step = self.stage.first_step(self.motion.posture, motion)
         self._exaggerate.value, self._factor = step, float(FACTORS[step])
         self._play.value = motion >= 0
         self._set_playing(motion >= 0)

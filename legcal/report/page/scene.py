@@ -28,6 +28,7 @@ from legcal.scene import (
 MAX_POSES = 60  # of the slider
 MAX_CAMERAS = 60
 _ROOM = 0.8  # of the size of the machine: about it
+_RING = 0.02  # of it: the median ellipsoid
 _EYE = np.array([1.3, -1.5, 0.8])  # where it is looked at from, in its size
 _N_RING = 20  # points of a ring
 _GREY, _BLUE, _AMBER, _GREEN = "#9aa1ab", "#1f5fa8", "#b26a00", "#1e7d46"
@@ -157,7 +158,7 @@ def _rings(calibration: Calibration, size: float) -> tuple[dict[str, Any], float
     turn = np.linspace(0.0, 2.0 * np.pi, _N_RING + 1)
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
     axes = ellipsoids(calibration.result)
-    factor = enlargement(axes, size)
+    factor = enlargement(axes, _RING * size)
     found: dict[str, Any] = {"base": [], "platform": []}
     for side, of_side in axes.items():
         for one in factor * of_side:
