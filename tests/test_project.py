@@ -71,6 +71,12 @@ def test_every_direct_dependency_is_pinned_to_the_version_that_was_tested() -> N
         assert name in pinned, f"{name} is not in constraints.txt"
 
 
+def test_every_extra_is_listed_for_those_who_install() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    page = (ROOT / "docs/installation.md").read_text()
+    assert set(re.findall(r"`legcal\[(\w+)\]`", page)) == set(project["optional-dependencies"])
+
+
 def test_the_constraints_name_no_host_and_no_path() -> None:
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     assert all(re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.+!-]+", line) for line in lines)
