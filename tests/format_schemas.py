@@ -59,6 +59,9 @@ class _AsRead(GenerateJsonSchema):
         )
 
 
+NAMES = tuple(sorted({**FILES, **DOCUMENTS}))
+
+
 def schema_of(name: str) -> dict[str, Any]:
     """Return the schema of a format."""
     model = {**FILES, **DOCUMENTS}[name]
@@ -75,7 +78,7 @@ def schema_text(name: str) -> str:
 def main() -> None:
     """Write all schemas, and those beside the YAML files of this tree that name them."""
     FOLDER.mkdir(exist_ok=True)
-    for name in {**FILES, **DOCUMENTS}:
+    for name in NAMES:
         (FOLDER / f"{name}.json").write_text(schema_text(name), encoding="utf-8")
     for folder in ("examples", "models"):
         for path in sorted((ROOT / folder).rglob("*.yaml")):

@@ -8,9 +8,11 @@ from importlib.resources import files
 from pathlib import Path, PurePath
 
 import pytest
+from format_schemas import FOLDER, NAMES, schema_text
 from hexapod_example import Run
 
 import legcal
+from legcal.files import schema_names
 
 ROOT = Path(__file__).parents[1]
 
@@ -112,6 +114,14 @@ def test_the_installed_package_asks_for_what_pyproject_says() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     installed = {_plain(r) for r in requires("legcal") or [] if "extra ==" not in r}
     assert installed == {_plain(requirement) for requirement in project["dependencies"]}
+
+
+def test_the_shipped_schemas_are_those_of_the_models() -> None:
+    assert schema_names() == list(NAMES)
+    for name in NAMES:
+        assert (FOLDER / f"{name}.json").read_text(encoding="utf-8") == schema_text(name), (
+            "run: python tests/format_schemas.py"
+        )
 
 
 def test_the_package_holds_all_that_pages_are_made_of() -> None:
