@@ -85,7 +85,11 @@ class Chain(Case):
         before = {
             "document": facts(outcome.document),
             "tables": {path.name: table_facts(path) for path in tables},
-            "files": sorted(p.relative_to(made).as_posix() for p in made.rglob("*.*")),
+            "files": sorted(
+                p.relative_to(made).as_posix()
+                for p in made.rglob("*.*")
+                if ".schemas" not in p.parts
+            ),
         }
         return {"simulated": before} | super().observe(folder)
 

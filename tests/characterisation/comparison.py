@@ -42,11 +42,11 @@ ROUGHLY = 3.0  # sigmas
 ROUGH_SHARE = 0.3  # of other numbers, relative
 # Of such a session these say which side of a threshold single outlines are on: whether the four
 # steps suffice, sizes of errors that outlines share, which parameters of alike size are named, why
-# outlines are not used; of repeats how many there are, the largest of them and its place, and how
-# far shaded edges are from Canny's.
+# outlines are not used, which files a detection has written; of repeats how many there are, the
+# largest of them and its place, and how far shaded edges are from Canny's.
 OPEN = re.compile(
     r"\.(stages|noise|shared_px|weakest|notes|rejected|upper_bound\w*|orientations|axes"
-    r"|outlines_found|without_M_LS|difference\.\w+\.(mean|rms))$"
+    r"|outlines_found|without_M_LS|difference\.\w+\.(mean|rms)|detection\.json\.files)$"
 )
 # Spreads of repeats are compared where both are of as many outlines: one that is bad counts most.
 HOW_MANY = ("outlines_found", "samples")
@@ -57,7 +57,7 @@ ADDED = re.compile(  # to documents and folders since they were recorded
     r"\.(document|(result|detection)\.json)(\.observations|\.details|\.links|\.explanations\.keys\.links|\.stages\.staged\.from_fit"
     r"|\.board\.(corners|used|images|off)|\.left_out|\.unreached|\.motor_rank"
     r"|\.platform_board|\.base_frame|\.home|\.legs\[\d+\]\.(travel|q_home))$"
-    r"|/truth\.json\.settings\.platform_board$|\.files\.(staged\.(urdf|yaml)|report\.html)$"
+    r"|/truth\.json\.settings\.platform_board$|\.files\.(staged\.(urdf|yaml)|report\.html|photographs/.*)$"
 )
 OF_UNKNOWNS = {"parameters", "covariance", "kinematic", "held", "base_axes", "platform_axes"}
 
