@@ -19,7 +19,7 @@ from rendering import SIZE, RepeatedImages, repeated_images
 from scipy.spatial.transform import RigidTransform
 
 from legcal import detect, load_dataset
-from legcal.calibration.detection import Detection, _caption, _counted_reason
+from legcal.calibration.detection import Detection, _caption, _counted_reason, _page
 from legcal.data.corners import found_corners
 from legcal.data.image_tables import canonical_order
 from legcal.data.outlines import QUALITY, Outlines, read_observations
@@ -146,6 +146,19 @@ def test_the_page_holds_the_table_the_photographs_and_where_lost_outlines_should
     assert len(lines) > 10
     assert np.nanmedian(off) < 2.0
     assert np.nanmin(signs) > 0.0  # the first end is nearer to the base
+
+
+def test_pages_of_many_images_show_the_worst_and_leave_out_a_table_that_is_too_long(
+    found: Detection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("legcal.calibration.detection.MAX_ROWS", 2)
+    monkeypatch.setattr("legcal.calibration.outline_editor.MAX_BYTES", 1000)
+    page: Any = html.fromstring(_page(found))
+    captions = page.xpath("//figure//figcaption/text()")
+    assert [text.split(":")[0] for text in captions] == [BLANK, ASIDE]
+    assert "The 2 of 5 images with the fewest used outlines are shown." in page.xpath("string()")
+    assert "There are more outlines than a page should hold." in page.xpath("string()")
+    assert page.xpath("//dialog[@id='editor'] | //button[@data-edit]") == []
 
 
 def test_views_without_a_camera_pose_are_told_and_drawn_where_they_were_expected(

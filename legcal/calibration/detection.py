@@ -12,7 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,7 +49,19 @@ from legcal.files import (
 )
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Cylinder
-from legcal.pages import Cell, Link, Page, Picture, Row, Section, Table, Text, number, page_html
+from legcal.pages import (
+    MAX_ROWS,
+    Cell,
+    Link,
+    Page,
+    Picture,
+    Row,
+    Section,
+    Table,
+    Text,
+    number,
+    page_html,
+)
 from legcal.perception import (
     HIDDEN,
     NOT_PLACED,
@@ -314,14 +326,26 @@ def _page(detection: Detection) -> str:
         Section("correct", "To correct an outline", correct),
     ]
     place = {} if editor is None else {row: k for k, row in enumerate(files)}
+    shown = _worst(detection)
+    if len(shown) < len(files):
+        few = f"The {len(shown)} of {len(files)} images with the fewest used outlines are shown."
+        sections[0] = replace(sections[0], blocks=[*sections[0].blocks, Text([few])])
     for view, figures in views.items():
-        rows = [row for row in files if detection.view_of(row) == view]
+        rows = [row for row in files if row in shown and detection.view_of(row) == view]
         pictures = [
             Picture(files[row], *_summary(detection, names, row), place.get(row)) for row in rows
         ]
         problem = [Text([figures["problem"]])] if figures["problem"] else []
         sections.append(Section(anchors[view], view, [*problem, Row(pictures)]))
     return page_html(Page(f"Outlines of {detection.dataset.machine.name}", found, None, sections))
+
+
+def _worst(detection: Detection) -> set[int]:
+    """Return the rows whose images a page shows: all, or those with the fewest used outlines."""
+    rows = list(detection.overlay_files)
+    used = np.bincount(detection.outlines.row[detection.outlines.used], minlength=max(rows) + 1)
+    order = np.argsort(used[rows], kind="stable")[:MAX_ROWS].tolist()
+    return {rows[k] for k in order}
 
 
 def _cells(name: str, view: Mapping[str, Any], to: str) -> list[Cell]:

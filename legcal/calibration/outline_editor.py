@@ -18,7 +18,8 @@ from legcal.vision import Camera, PredictedLeg
 # Of an end that a person places over an enlarged photograph: edges are blurred over a pixel or two,
 # and where in that width their middle is the eye says to about half a pixel.
 SIGMA_BY_HAND = 0.5  # [px]
-MAX_PACKED = 8_000_000  # bytes of the table in a page
+MAX_BYTES = 8_300_000  # of the table and what is said of its images, in a page
+_OF_IMAGE = 250  # bytes in the page for each image
 
 
 def outline_editor(
@@ -59,7 +60,8 @@ def outline_editor(
     ]
     table = format_observations(outlines, measurements, machine.leg_names)
     found = OutlineEditor(OBSERVATIONS_NAME, table, images, cameras, SIGMA_BY_HAND)
-    return found if len(found.packed) <= MAX_PACKED else None
+    size = len(found.packed) + _OF_IMAGE * len(images)
+    return found if size <= MAX_BYTES else None
 
 
 def _expected(

@@ -1,3 +1,4 @@
+from .document import MAX_ROWS as MAX_ROWS
 from .document import Cell as Cell
 from .document import Crop as Crop
 from .document import Drawing as Drawing

@@ -61,25 +61,22 @@
   };
 
   // The table: cells of each row, and its text as it stands.
-  const parse = (text) => {
-    const found = [];
-    let begin = 0, cells = [], cell = "", quoted = false;
-    for (let k = 0; k < text.length; k++) {
-      const letter = text[k];
-      if (quoted) {
-        if (letter !== '"') cell += letter;
-        else if (text[k + 1] === '"') { cell += letter; k++; } else quoted = false;
-      } else if (letter === '"') quoted = true;
-      else if (letter === ",") { cells.push(cell); cell = ""; } else if (letter === "\n") {
-        found.push({ text: text.slice(begin, k), cells: [...cells, cell] });
-        begin = k + 1; cells = []; cell = "";
-      } else cell += letter;
+  const cellsOf = (line) => {
+    if (!line.includes('"')) return line.split(",");
+    const cells = [];
+    let cell = "", quoted = false;
+    for (let k = 0; k < line.length; k++) {
+      const letter = line[k];
+      if (letter === '"' && quoted && line[k + 1] === '"') { cell += letter; k++; } else if (letter === '"') quoted = !quoted;
+      else if (letter === "," && !quoted) { cells.push(cell); cell = ""; } else cell += letter;
     }
-    return found;
+    return [...cells, cell];
   };
+  const parse = (text) => text.split("\n").filter((line) => line).map((line) => ({ text: line, cells: cellsOf(line) })); // no name has ends of lines
   const numbers = (cells, ...names) => names.map((name) => (cells[column[name]] === "" ? NaN : Number(cells[column[name]])));
   const load = async () => {
-    const bytes = Uint8Array.from(atob(packed), (letter) => letter.charCodeAt(0));
+    const letters = atob(packed), bytes = new Uint8Array(letters.length);
+    for (let k = 0; k < bytes.length; k++) bytes[k] = letters.charCodeAt(k);
     const text = await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
     const lines = parse(text), image = new Map(images.map((one, k) => [JSON.stringify([one.view, one.image]), k]));
     header = lines[0].cells;
@@ -230,7 +227,7 @@
     for (const one of document.querySelectorAll("[data-download]")) one.disabled = n === 0;
   };
   const optionOf = (k) => {
-    const n = rows.filter((row) => row.image === k && edits.has(row.i)).length;
+    const n = [...edits.keys()].filter((i) => rows[i].image === k).length;
     return `${images[k].view}  ${images[k].image}${n ? `  (${n} edited)` : ""}`;
   };
   const choose = (i) => {
