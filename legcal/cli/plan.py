@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from legcal.cli.options import JsonOption, ModelArgument, QuietOption, show
+from legcal.cli.options import JsonOption, ModelArgument, QuietOption, command_line, show
+
+if TYPE_CHECKING:
+    from legcal.planning import Plan
 
 
 def plan(
@@ -22,7 +26,15 @@ def plan(
     images_per_view: Annotated[
         int | None, typer.Option(help="Photographs of each view, in place of --images.")
     ] = None,
-    cameras: Annotated[int, typer.Option(help="Camera places.")] = 3,
+    cameras: Annotated[int | None, typer.Option(help="Camera places; 3.")] = None,
+    target: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LENGTH",
+            help="Instead of --images: the fewest with which this error of the platform is "
+            "expected, 0.05mm.",
+        ),
+    ] = None,
     criterion: Annotated[
         str,
         typer.Option(
@@ -38,6 +50,13 @@ def plan(
         Path | None,
         typer.Option(metavar="FILE", help="Camera file; 1024 x 768 px, 43 deg wide by default."),
     ] = None,
+    noise: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RESULT|FILE",
+            help="Errors of outlines: an earlier result, or what legcal noise --json printed.",
+        ),
+    ] = None,
     bounds: Annotated[
         str | None,
         typer.Option(
@@ -45,7 +64,35 @@ def plan(
             help="Where cameras may stand in the base link: -2m:2m,-2m:2m,0m:1.5m.",
         ),
     ] = None,
-    encoder_sigma: Annotated[str, typer.Option(help="Sigma of a reading.")] = "2um",
+    places: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Places of tripods to choose from, a YAML with places: {NAME: {xyz, quat_xyzw}}; "
+            "without quat_xyzw the camera is turned to the machine.",
+        ),
+    ] = None,
+    given: Annotated[
+        Path | None,
+        typer.Option(metavar="DATASET", help="What was shot already: plan what to add."),
+    ] = None,
+    board: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SPEC",
+            help="A calibration board on the base in every image, as for legcal camera.",
+        ),
+    ] = None,
+    hand_held: Annotated[
+        bool,
+        typer.Option("--hand-held", help="Every image from a place of its own; with --board."),
+    ] = False,
+    model_error: Annotated[
+        str, typer.Option(help="How far joints and offsets of the machine are off at most.")
+    ] = "2mm",
+    encoder_sigma: Annotated[
+        str | None, typer.Option(help="Sigma of a reading; 2um.", show_default=False)
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of all that is drawn.")] = 0,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier plan there.")] = False,
     quiet: QuietOption = False,
@@ -56,23 +103,44 @@ def plan(
     from legcal.files import LENGTH, parse_quantity
     from legcal.signals import held_back_signals, is_waiting
 
+    def length(text: str | None, option: str) -> float | None:
+        return None if text is None else parse_quantity(text, LENGTH, option)
+
     planning.check_session(output, force=force)
-    sigma_q = parse_quantity(encoder_sigma, LENGTH, "--encoder-sigma")
-    where = None if bounds is None else planning.parse_bounds(bounds)
-    with held_back_signals():
+    error = length(model_error, "--model-error") or 0.0
+    with held_back_signals():  # Ctrl-C ends the search: the best so far is written
         found = planning.plan(
             model,
             images=images,
             images_per_view=images_per_view,
             cameras=cameras,
+            target=length(target, "--target"),
             criterion=criterion,
             parameters=parameter or (),
             camera=camera,
-            encoder_sigma=sigma_q,
-            bounds=where,
+            noise=planning.DEFAULT_NOISE if noise is None else noise,
+            encoder_sigma=length(encoder_sigma, "--encoder-sigma"),
+            bounds=None if bounds is None else planning.parse_bounds(bounds),
+            places=places,
+            given=given,
+            board=board,
+            hand_held=hand_held,
+            setting=replace(planning.USUAL, length=error),
             seed=seed,
             progress=not quiet,
             stop=is_waiting,
         )
-        planning.write_session(found, output, force=force)
+        pictures = report.plan_files(found, _previews(found), command_line())
+        planning.write_session(found, output, force=force, pictures=pictures)
     show(as_json, found.document, lambda: report.plan_table(found, output))
+
+
+def _previews(plan: Plan) -> dict[str, bytes]:
+    """Return a small rendered photograph of each view, by its name."""
+    from legcal.simulation import preview
+
+    views = plan.views[:1] if plan.hand_held else plan.views
+    return {
+        view.name: preview(plan.machine, plan.camera, view.T_base_camera, view.poses)
+        for view in views
+    }

@@ -42,6 +42,7 @@ class Session:
         for place, slot in zip(self.places[len(slots) :], given, strict=True):
             stacked = slot.rows.reshape(-1, slot.rows.shape[2])
             self.information[np.ix_(place, place)] += stacked.T @ stacked
+        self.names = names
         self.slots = list(slots)
         self.p = sum(name.startswith(KINEMATIC) for name in names)
         self.covariance = np.linalg.inv(self.information)
@@ -127,11 +128,14 @@ def exchange(
     most: int,
     *,
     progress: Report = no_progress,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Chosen:
     """Return the same number of images after exchanging single ones while that helps."""
     found.value = float(criterion(session.machine[None])[0])
     for turn in range(_MAX_PASSES):
         before = found.value
+        if stop():
+            break
         for i, (slot, image) in enumerate(list(found.images)):
             others = [pair for k, pair in enumerate(found.images) if k != i]
             count = [sum(s == other for s, _ in others) for other in range(len(session.slots))]

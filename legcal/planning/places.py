@@ -92,6 +92,13 @@ class Place:
     name: str = ""  # that of a list
     fixed: bool = False  # it is not moved any more
 
+    def is_inside(self, bounds: Array | None) -> bool:
+        """Say whether a camera stands within bounds (3, 2) [m]."""
+        if bounds is None:
+            return True
+        x = self.T_base_camera.translation
+        return bool(np.all((x >= bounds[:, 0] - _ROUNDING) & (x <= bounds[:, 1] + _ROUNDING)))
+
 
 def upward(machine: Machine) -> Array:
     """Return the direction from base to platform at home, or the normal of the plane of motion."""
@@ -113,13 +120,13 @@ def look_at(position: Array, target: Array, up: Array) -> RigidTransform:
     return motion_of(np.column_stack([x, cross(z, x), z]), position)
 
 
-def read_places(path: Path, points: Array, up: Array) -> list[Place]:
-    """Return the places of a list; without an orientation cameras look at the points (n, 3)."""
+def read_places(path: Path, machine: Machine) -> list[Place]:
+    """Return the places of a list; without an orientation cameras look at the machine at home."""
     entry = validate(PlacesEntry, read_yaml(path, "places file"), path)
-    found = []
+    points, found = all_points(machine, [machine.home]), []
     for name, place in entry.places.items():
         position = np.array(place.xyz)
-        T = look_at(position, 0.5 * (points.min(axis=0) + points.max(axis=0)), up)
+        T = look_at(position, 0.5 * (points.min(axis=0) + points.max(axis=0)), upward(machine))
         if place.quat_xyzw is not None:
             turned = Rotation.from_quat(place.quat_xyzw)
             T = RigidTransform.from_components(position, turned)
@@ -139,7 +146,7 @@ def places_around(
     for lift in _LIFTS if machine.spatial else _LIFTS_PLANAR:
         for turn in np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False):
             found += places_along(direction(up, turn, lift), up, points, camera, setting)
-    inside = [place for place in found if _is_inside(place, bounds)]
+    inside = [place for place in found if place.is_inside(bounds)]
     if not inside:
         near = min(float(np.linalg.norm(p.T_base_camera.translation)) for p in found or [_NOWHERE])
         raise NotVisible(
@@ -180,14 +187,6 @@ def places_along(
                 if d - reach >= _CLEARANCE * size
             ]
     return []
-
-
-def _is_inside(place: Place, bounds: Array | None) -> bool:
-    """Say whether a camera stands within bounds."""
-    if bounds is None:
-        return True
-    x = place.T_base_camera.translation
-    return bool(np.all((x >= bounds[:, 0] - _ROUNDING) & (x <= bounds[:, 1] + _ROUNDING)))
 
 
 def parse_bounds(text: str) -> Array:

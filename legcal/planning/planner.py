@@ -1,43 +1,28 @@
-"""``legcal.plan``: from a machine to poses and camera places of a session, with what to expect.
+"""The method: poses, camera places, images chosen and exchanged, polished, judged.
 
-:func:`plan` reads as the method: poses that the machine can take, places of cameras, places chosen
-by what they show on average, images chosen greedily and exchanged, places and poses polished by
-exchanges with others nearby, and the result judged by sessions as they will be, with
-tripods and machine a little elsewhere.
+:func:`plan_session` reads from the top. Poses that the machine can take and places of cameras are
+drawn, places chosen by what they show on average, images chosen greedily and exchanged,
+then places and poses polished by exchanges with others nearby. What is expected is judged by
+sessions as they will be, with tripods and machine a little elsewhere.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform
 
-from legcal.brief import brief
-from legcal.calibration import KINDS, FittedLegs, PlatformError, poses_at_readings
-from legcal.errors import DidNotConverge, NotVisible
+from legcal.calibration import poses_at_readings
+from legcal.errors import NotIdentifiable, NotVisible
 from legcal.estimation import Frames
-from legcal.files import motion_to_xyz_quat
-from legcal.geometry import Array, BoolArray
-from legcal.machine import (
-    Configurations,
-    Feasibility,
-    Leg,
-    LegKind,
-    Machine,
-    feasible_poses,
-    follow,
-    motor_travel,
-    moved_legs,
-    platforms_in_base,
-    poses_at,
-    slider_columns,
-)
+from legcal.geometry import Array
+from legcal.machine import Configurations, Leg, Machine, platforms_in_base
 from legcal.planning.exchange import Chosen, Criterion, Session, choose, exchange
 from legcal.planning.goals import Goal, Workspace, criterion_of, workspace_of
-from legcal.planning.information import Contributions, PredictedNoise, Predictor
+from legcal.planning.information import Contributions, Predictor
 from legcal.planning.order import in_short_order, ways
 from legcal.planning.places import (
     USUAL,
@@ -48,518 +33,501 @@ from legcal.planning.places import (
     places_around,
     upward,
 )
+from legcal.planning.planned_session import Plan, PlannedView
+from legcal.planning.poses import candidate_poses, drawn_legs, poses_near, some_of
 from legcal.planning.sight import Seen, what_is_seen
 from legcal.progress import Report, no_progress
-from legcal.version import __version__
-from legcal.vision import Camera
+from legcal.vision import Board
 
-MIN_POSES, POSES_EACH, MOST_POSES = 20, 4, 240  # candidates, half of them extreme, by images
-MIN_SHARE_REACHED = 0.2  # of these, that a machine reaches however far it is off
-N_REACHING = 10  # machines that are tried in that
-MOST_MOVED = 0.1  # of the length of a leg, by which poses then move
-CLOSED = 1e-7  # [m]
+MIN_POSES, POSES_EACH, MOST_POSES = 20, 4, 240  # candidates, by images
 N_PROBES = 12  # poses by which places are compared
+N_HANDS = 10  # places that a camera in the hand chooses from
 MIN_SHARE = 0.5  # of its equal share that each view has of the images, at least
-ROUNDS = 2  # of polishing
-N_NEAR = 3  # poses near each that was chosen
+ROUNDS = 2  # of polishing, each with half the steps of the one before
 POSE_STEP = 0.08  # of the travel
 PLACE_STEP = 0.06  # of the distance
 N_NEAR_PLACES = 8
+_NOTHING_KNOWN = 0.1  # of a length, from which on a direction counts as not determined
+_CONTINUED = (1.5, 2.0, 3.0, 4.0, 8.0, 16.0)  # times the planned images
+_MOST_NEEDED = 100  # images that are looked at to say how many would do
 
 
 @dataclass(frozen=True, eq=False)
-class PlannedView:
-    """A camera place and the images that are to be taken from it."""
+class Candidates:
+    """A camera place with poses of the machine."""
 
-    name: str
-    T_base_camera: RigidTransform
-    poses: Configurations  # in the order in which they are to be taken
-    via: tuple[str, ...]  # where to go before each pose: "" straight there, else home or a pose
-    shows: BoolArray  # (n_images, n_legs)
+    place: Place
+    poses: Configurations
 
 
-@brief
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """A planned session.
+class Task:
+    """What is asked of a plan."""
 
-    Attributes
-    ----------
-    machine : Machine
-        The nominal model.
-    views : tuple of PlannedView
-        Camera places, each with its poses.
-    goal : Goal
-        What was made small.
-    value : float
-        The criterion, as planned [m; a determinant without unit].
-    error : PlatformError or None
-        Expected error of the platform over the workspace, one standard deviation, as the root mean
-        square over the draws.
-    sigma : (p,) array
-        Expected standard deviation of each kinematic parameter [m, rad].
-    growth : (n,) array
-        The criterion with 1, 2, ... images, in the order in which they help most.
-    """
-
-    machine: Machine
-    camera: Camera
-    setting: Setting
-    noise: PredictedNoise
-    sigma_q: float
-    goal: Goal
-    views: tuple[PlannedView, ...]
-    value: float
-    error: PlatformError | None
-    sigma: Array
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    growth: Array
-    notes: tuple[str, ...] = field(default=())
+    predictor: Predictor
+    n_images: int
+    n_views: int
+    goal: Goal = Goal.MEAN
+    named: tuple[str, ...] = ()  # parameters
+    setting: Setting = USUAL
+    bounds: Array | None = None  # (3, 2) of cameras in the base link [m]
+    places: tuple[Place, ...] = ()  # in place of those around the machine
+    given: tuple[Candidates, ...] = ()  # what was shot already
+    given_name: str = ""
+    board: Board | None = None
+    hand_held: bool = False
+    seed: int = 0
 
     @property
-    def n_images(self) -> int:
-        """Number of photographs."""
-        return sum(len(view.poses.poses) for view in self.views)
-
-    def document(self) -> dict[str, Any]:
-        """Return the document of ``legcal plan --json``, which ``self.json`` holds."""
-        error = self.error
-        return {
-            "legcal_plan": 1,
-            "legcal": __version__,
-            "mechanism": self.machine.name,
-            "images": self.n_images,
-            "criterion": self.goal.value,
-            "value": self.value,
-            "expected": None
-            if error is None
-            else {
-                "dX_m": error.mean_displacement,
-                "dE_rad": error.mean_rotation,
-                "dX_max_m": error.max_displacement,
-                "dE_max_rad": error.max_rotation,
-            },
-            "tolerance": {
-                "camera_m": self.setting.shift,
-                "camera_rad": self.setting.turn,
-                "machine_m": self.setting.length,
-                "machine_rad": self.setting.angle,
-                "draws": self.setting.draws,
-            },
-            "noise": {
-                "sigma_px": self.noise.sigma_px,
-                "correlation": self.noise.correlation,
-                "common_px": dict(zip(KINDS, self.noise.common_px, strict=True)),
-                "gamma_px": self.noise.gamma_px,
-                "source": self.noise.source,
-            },
-            "views": {
-                view.name: {
-                    "T_base_camera": motion_to_xyz_quat(view.T_base_camera),
-                    "images": len(view.poses.poses),
-                    "legs": dict(
-                        zip(self.machine.leg_names, view.shows.sum(axis=0).tolist(), strict=True)
-                    ),
-                }
-                for view in self.views
-            },
-            "parameters": [
-                {"name": name, "sigma": sigma, "unit": unit}
-                for name, sigma, unit in zip(
-                    self.names, self.sigma.tolist(), self.units, strict=True
-                )
-            ],
-            "growth": [{"images": k + 1, "value": x} for k, x in enumerate(self.growth.tolist())],
-            "notes": list(self.notes),
-        }
+    def machine(self) -> Machine:
+        """The nominal model."""
+        return self.predictor.machine
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
     """The nominal machine, or one that is drawn, before cameras."""
 
-    predictor: Predictor
-    setting: Setting
+    task: Task
     A: Array  # (n_legs, 3) in the base link
     legs: tuple[Leg, ...]  # in R_b and R_e
 
     @classmethod
-    def nominal(cls, predictor: Predictor, setting: Setting) -> Scene:
+    def nominal(cls, task: Task) -> Scene:
         """Return the nominal machine."""
-        return cls(predictor, setting, predictor.machine.A_base, predictor.legs.nominal)
+        return cls(task, task.machine.A_base, task.predictor.legs.nominal)
+
+    @classmethod
+    def drawn(cls, task: Task, rng: np.random.Generator) -> Scene:
+        """Return a machine as it may be."""
+        legs = drawn_legs(task.predictor.legs, task.setting, rng)
+        return cls(task, task.machine.T_base_Rb.apply(np.array([leg.A for leg in legs])), legs)
 
     def seen(self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool) -> Seen:
         """Return what a camera sees at poses T_Rb_Re; *surely*: wherever the tripod is set."""
-        machine, camera = self.predictor.machine, self.predictor.camera
-        B_Re = np.array([leg.B for leg in self.legs])
+        machine, camera = self.task.machine, self.task.predictor.camera
         R, t = Frames.of(poses)
-        in_Rb = np.swapaxes(R @ B_Re.T, 1, 2) + t[:, None]
+        in_Rb = np.swapaxes(R @ np.array([leg.B for leg in self.legs]).T, 1, 2) + t[:, None]
         B = machine.T_base_Rb.apply(in_Rb.reshape(-1, 3)).reshape(in_Rb.shape)
-        joints = np.concatenate([self.A, B.reshape(-1, 3)])
-        depth = float(T.inv().apply(joints)[:, 2].min())
-        margin = self.setting.margin(camera, max(depth, 0.1)) if surely else 0.0
+        margin = 0.0
+        if surely:
+            joints = np.concatenate([self.A, B.reshape(-1, 3)])
+            nearest = float(T.inv().apply(joints)[:, 2].min())
+            margin = self.task.setting.margin(camera, max(nearest, 0.1))
         return what_is_seen(camera, T, self.A, B, [leg.cylinders for leg in machine.legs], margin)
 
     def contributions(
         self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool = True
-    ) -> tuple[Contributions, BoolArray] | None:
-        """Return what images of poses add and which legs they show; None if that is nothing."""
-        seen = self.seen(T, poses, surely=surely)
+    ) -> Contributions | None:
+        """Return what images of poses T_Rb_Re add; None if they show nothing."""
+        seen, n = self.seen(T, poses, surely=surely), len(poses)
         if not len(seen.leg):
             return None
-        n = len(poses)
         outlines = seen.outlines(1.0, np.arange(n, dtype=np.intp))
         view = np.zeros(n, dtype=np.intp)
-        found = self.predictor.contributions({"here": T}, view, poses, outlines, self.legs)
-        return found, seen.legs_in(n, len(self.A))
+        found = self.task.predictor.contributions({"here": T}, view, poses, outlines, self.legs)
+        if self.task.board is not None:
+            found = _tied_by_board(found, T)
+        if self.task.hand_held:  # one series of images of one camera
+            found = replace(found, names=tuple(n.replace("here: ", "hand ") for n in found.names))
+        return found
+
+    def of(self, candidates: Candidates) -> Contributions | None:
+        """Return what images of candidates add."""
+        poses = platforms_in_base(self.task.machine, candidates.poses.poses)
+        return self.contributions(candidates.place.T_base_camera, poses)
+
+
+def _tied_by_board(found: Contributions, T_base_camera: RigidTransform) -> Contributions:
+    """Return contributions of a view whose camera a board on the base places.
+
+    What the board shows of where cameras stand to it counts as exact: cameras move with it alone,
+    each turned and displaced as its own frame sees that.
+    """
+    R = T_base_camera.rotation.as_matrix().T
+    at = [found.names.index(f"here: pose {k}") for k in range(6)]
+    turned = block_diag(R, R)
+    rows, prior, names = found.rows.copy(), found.prior.copy(), list(found.names)
+    rows[..., at] = rows[..., at] @ turned
+    prior[np.ix_(at, at)] = turned.T @ prior[np.ix_(at, at)] @ turned
+    for k, i in enumerate(at):
+        names[i] = f"board {k}"
+    return replace(found, rows=rows, prior=prior, names=tuple(names))
 
 
 def plan_session(
-    predictor: Predictor,
-    n_images: int,
-    n_views: int,
-    goal: Goal,
-    *,
-    named: Sequence[str] = (),
-    setting: Setting = USUAL,
-    bounds: Array | None = None,
-    places: Sequence[Place] = (),
-    seed: int = 0,
-    progress: Report = no_progress,
-    stop: Callable[[], bool] = lambda: False,
+    task: Task, progress: Report = no_progress, stop: Callable[[], bool] = lambda: False
 ) -> Plan:
-    """Return the plan of a session; see :mod:`legcal.planning`."""
-    machine, rng = predictor.machine, np.random.default_rng(seed)
-    n_poses = min(MOST_POSES, MIN_POSES + POSES_EACH * n_images)
-    scene = Scene.nominal(predictor, setting)
-    poses = candidate_poses(scene, n_poses, rng, progress)
-    points = all_points(machine, poses.poses)
-    every = list(places) or places_around(machine, points, predictor.camera, setting, bounds)
-    in_Rb = platforms_in_base(machine, poses.poses)
-    probes = np.sort(rng.permutation(len(in_Rb))[:N_PROBES])
-    shown = []
-    for k, place in enumerate(every):
-        found = scene.contributions(place.T_base_camera, [in_Rb[i] for i in probes])
-        if found is not None:
-            shown.append((place, found[0]))
-        progress("Camera places", k + 1, len(every))
-    if not shown:
-        raise NotVisible(
-            f"{machine.yaml_path}: no session could be planned: found no leg in the picture from "
-            f"any of {len(every)} camera places, needed legs at two of them at least; give other "
-            "places or wider bounds."
-        )
-    work = workspace_of(machine, predictor.legs)
-    criterion = criterion_of(goal, work, predictor.legs, shown[0][1].basis, named)
-    chosen_places = choose_places([c for _, c in shown], n_views, n_images, criterion)
-    views = [shown[i][0] for i in chosen_places]
-    share = n_images / len(views)
-    least, most = max(1, int(MIN_SHARE * share)), n_images
-    slots = [_of(scene, place, in_Rb) for place in views]
-    session = Session([c for c, _ in slots])
-    chosen = choose(session, n_images, criterion, rng, least, most, progress=progress)
-    chosen = exchange(session, chosen, criterion, rng, least, most, progress=progress)
-    current = [
-        _Candidates(place, _some(poses, [k for s, k in chosen.images if s == v]))
-        for v, place in enumerate(views)
-    ]
-    value = chosen.value
-    target = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    """Return the plan of a session.
+
+    Raises DidNotConverge, NotVisible or NotIdentifiable if there are no poses, no places, or too
+    few images.
+    """
+    predictor, machine, rng = task.predictor, task.machine, np.random.default_rng(task.seed)
+    legs, scene = predictor.legs, Scene.nominal(task)
+    n_poses = min(MOST_POSES, MIN_POSES + POSES_EACH * task.n_images)
+    poses = candidate_poses(machine, legs, task.setting, n_poses, rng, progress)
+    places = _places(task, poses)
+    shown = _probed(scene, places, poses, rng, progress)
+    given = [found for found in map(scene.of, task.given) if found is not None]
+    work = workspace_of(machine, legs)
+    criterion = criterion_of(task.goal, work, legs, shown[0][1].basis, task.named)
+    n_places = min(N_HANDS, len(shown)) if task.hand_held else task.n_views
+    chosen = choose_places([c for _, c in shown], n_places, task.n_images, criterion, given)
+    current = [Candidates(shown[i][0], poses) for i in chosen]
+    least = 0 if task.hand_held else max(1, int(MIN_SHARE * task.n_images / task.n_views))
+    session = Session(_required(scene, current), given)
+    images = choose(session, task.n_images, criterion, rng, least, task.n_images, progress=progress)
+    images = exchange(
+        session, images, criterion, rng, least, task.n_images, progress=progress, stop=stop
+    )
+    _refuse_undetermined(task, session, criterion, given, work, shown[0][1].basis)
+    current = _of_images(current, images)
+    value = images.value
+    target = all_points(machine, poses.poses)
+    middle = 0.5 * (target.min(axis=0) + target.max(axis=0))
     for turn in range(ROUNDS):
         if stop():
             break
-        current, value = polished(
-            scene, current, criterion, rng, turn, target, bounds, least, most, value
-        )
+        current = _better_places(scene, current, given, criterion, rng, 0.5**turn, middle)
+        current, value = _better_poses(scene, current, given, criterion, rng, 0.5**turn, least)
         progress("Polishing", turn + 1, ROUNDS)
     progress("Polishing", ROUNDS, ROUNDS)
-    return judged(scene, current, goal, criterion, work, value, rng, progress)
+    return _judged(scene, current, given, criterion, work, value, progress)
 
 
-@dataclass(frozen=True, eq=False)
-class _Candidates:
-    """A place with poses."""
+def _places(task: Task, poses: Configurations) -> list[Place]:
+    """Return the places that cameras may take."""
+    if task.places:
+        return list(task.places)
+    points = all_points(task.machine, poses.poses)
+    return places_around(task.machine, points, task.predictor.camera, task.setting, task.bounds)
 
-    place: Place
-    poses: Configurations
 
-
-def candidate_poses(
-    scene: Scene, n: int, rng: np.random.Generator, progress: Report = no_progress
-) -> Configurations:
-    """Return poses that the machine can take, half of them extreme.
-
-    Raises DidNotConverge if there are too few.
-    """
-    machine = scene.predictor.machine
-    found: list[Array] = []
-    for extreme in (True, False):
-        drawn = feasible_poses(machine, n // 2, rng, extreme=extreme, progress=progress)
-        kept = surely_reached(scene, drawn, np.random.default_rng(0))
-        found += [drawn.configurations[k] for k in np.flatnonzero(kept)]
-    if len(found) < MIN_SHARE_REACHED * n:
-        raise DidNotConverge(
-            f"{machine.yaml_path}: no session could be planned: found {len(found)} of {n} poses "
-            f"that the machine reaches at the same readings if it is "
-            f"{1e3 * scene.setting.length:g} mm off, needed more; check legcal.home and the limits "
-            "of the joints, or state that the machine is known better."
+def _probed(
+    scene: Scene,
+    places: Sequence[Place],
+    poses: Configurations,
+    rng: np.random.Generator,
+    progress: Report,
+) -> list[tuple[Place, Contributions]]:
+    """Return the places that see legs, with what they show of some poses."""
+    machine, found = scene.task.machine, []
+    probes = np.sort(rng.permutation(len(poses.poses))[:N_PROBES]).tolist()
+    in_Rb = platforms_in_base(machine, [poses.poses[i] for i in probes])
+    for k, place in enumerate(places):
+        contributions = scene.contributions(place.T_base_camera, in_Rb)
+        if contributions is not None:
+            found.append((place, contributions))
+        progress("Camera places", k + 1, len(places))
+    needed = 1 if scene.task.hand_held else scene.task.n_views
+    if not found or (scene.task.places and len(found) < needed):
+        raise NotVisible(
+            f"{machine.yaml_path}: no session could be planned: found {len(found)} of "
+            f"{len(places)} camera places that see legs wherever the tripod is set within "
+            f"{1e2 * scene.task.setting.shift:g} cm and "
+            f"{np.degrees(scene.task.setting.turn):g} deg, needed {needed}; move the places "
+            "further away or turn them to the machine, or use a camera with a wider view."
         )
-    return poses_at(machine, found)
-
-
-def surely_reached(scene: Scene, poses: Configurations, rng: np.random.Generator) -> BoolArray:
-    """Return which poses machines reach, at the same readings, that are as far off as they may be.
-
-    Beside a singularity, or at the border of what legs can do, small errors decide that.
-    """
-    machine, legs = scene.predictor.machine, scene.predictor.legs
-    reached = np.ones(len(poses.poses), dtype=np.bool_)
-    if not machine.is_determined or not len(reached):
-        return reached
-    nearby = platforms_in_base(machine, poses.poses)
-    measured = [j for j, leg in enumerate(machine.legs) if leg.kind is not LegKind.PASSIVE]
-    t_nearby = Frames.of(nearby).t
-    for _ in range(N_REACHING):
-        drawn = drawn_legs(legs, scene.setting, rng)
-        R, t = Frames.of(poses_at_readings(machine, drawn, poses.readings, nearby))
-        ends = np.swapaxes(R @ np.array([leg.B for leg in drawn]).T, 1, 2) + t[:, None]
-        length = np.linalg.norm(ends - np.array([leg.A for leg in drawn]), axis=2)
-        wanted = machine.sign * poses.readings + [leg.q0 for leg in drawn]
-        off = np.abs(length - wanted)[:, measured].max(axis=1)
-        moved = np.linalg.norm(t - t_nearby, axis=1)
-        reached &= (off < CLOSED) & (moved < MOST_MOVED * length.mean())
-    return reached
-
-
-def _some(poses: Configurations, which: Sequence[int]) -> Configurations:
-    index = np.array(which, dtype=np.intp)
-    return Configurations(
-        poses.configurations[index], poses.readings[index], [poses.poses[i] for i in which]
-    )
-
-
-def _of(
-    scene: Scene, place: Place, in_Rb: Sequence[RigidTransform]
-) -> tuple[Contributions, BoolArray]:
-    found = scene.contributions(place.T_base_camera, in_Rb)
-    if found is None:
-        raise NotVisible("a place sees nothing")
     return found
 
 
+def _required(scene: Scene, candidates: Sequence[Candidates]) -> list[Contributions]:
+    """Return what images of candidates add, all of which see legs."""
+    found = [scene.of(one) for one in candidates]
+    return [one for one in found if one is not None]
+
+
 def choose_places(
-    shown: Sequence[Contributions], n_views: int, n_images: int, criterion: Criterion
+    shown: Sequence[Contributions],
+    n_views: int,
+    n_images: int,
+    criterion: Criterion,
+    given: Sequence[Contributions] = (),
 ) -> list[int]:
     """Return the places whose images, on average, determine the machine best together."""
     names: dict[str, int] = {}
-    for found in shown:
+    for found in (*shown, *given):
         for name in found.names:
             if ": " not in name:
                 names.setdefault(name, len(names))
-    shared = np.zeros((len(shown), len(names), len(names)))
+    shared = np.zeros((len(shown) + len(given), len(names), len(names)))
     prior = np.zeros((len(names), len(names)))
-    for k, found in enumerate(shown):
+    for k, found in enumerate((*shown, *given)):
         is_own = np.array([": " in name for name in found.names])
         at = np.array([names[name] for name in found.names if ": " not in name])
         stacked = found.rows.reshape(-1, len(found.names))
-        G = stacked.T @ stacked * (n_images / n_views / len(found.rows))
+        share = n_images / n_views / len(found.rows) if k < len(shown) else 1.0
+        G = stacked.T @ stacked * share
         own = G[np.ix_(is_own, is_own)] + found.prior[np.ix_(is_own, is_own)]
         mixed = G[np.ix_(is_own, ~is_own)]
         G = G[np.ix_(~is_own, ~is_own)] - mixed.T @ np.linalg.solve(own, mixed)
         shared[k][np.ix_(at, at)] = G
         prior[np.ix_(at, at)] = found.prior[np.ix_(~is_own, ~is_own)]
-    p = shown[0].basis.shape[1]
+    p, free = shown[0].basis.shape[1], shared[: len(shown)]
+    base = prior + shared[len(shown) :].sum(axis=0)
 
-    def values(base: Array) -> Array:
-        return criterion(np.asarray(np.linalg.inv(base + shared)[:, :p, :p], dtype=np.float64))
+    def values(others: Sequence[int]) -> Array:
+        inverse = np.linalg.inv(base + free[list(others)].sum(axis=0) + free)
+        of_each = criterion(np.asarray(inverse[:, :p, :p], dtype=np.float64))
+        if n_views <= len(free):
+            of_each[list(others)] = np.inf
+        return of_each
 
     chosen: list[int] = []
     while len(chosen) < n_views:
-        chosen.append(int(np.argmin(values(prior + shared[chosen].sum(axis=0)))))
-    for _ in range(3):
+        chosen.append(int(np.argmin(values(chosen))))
+    while True:
         before = list(chosen)
         for i in range(n_views):
             others = chosen[:i] + chosen[i + 1 :]
-            chosen[i] = int(np.argmin(values(prior + shared[others].sum(axis=0))))
+            of_each = values(others)
+            if of_each.min() < of_each[chosen[i]]:
+                chosen[i] = int(np.argmin(of_each))
         if chosen == before:
-            break
-    return chosen
+            return chosen
 
 
-def polished(
+def _of_images(current: Sequence[Candidates], images: Chosen) -> list[Candidates]:
+    """Return the places with the poses that were chosen, places without any left out."""
+    of_slot = [[k for s, k in images.images if s == v] for v in range(len(current))]
+    return [
+        replace(own, poses=some_of(own.poses, which))
+        for own, which in zip(current, of_slot, strict=True)
+        if which
+    ]
+
+
+def _with_all(slots: Sequence[Contributions], given: Sequence[Contributions]) -> Session:
+    """Return the session with all images of all slots."""
+    return Session([], [*slots, *given])
+
+
+def _better_places(
     scene: Scene,
-    current: list[_Candidates],
+    current: list[Candidates],
+    given: Sequence[Contributions],
     criterion: Criterion,
     rng: np.random.Generator,
-    turn: int,
+    step: float,
     target: Array,
-    bounds: Array | None,
-    least: int,
-    most: int,
-    value: float,
-) -> tuple[list[_Candidates], float]:
-    """Return places and poses after exchanges with others nearby."""
-    machine, up = scene.predictor.machine, upward(scene.predictor.machine)
-    step = 0.5**turn
-
-    def parts(candidates: _Candidates) -> tuple[Contributions, BoolArray] | None:
-        in_Rb = platforms_in_base(machine, candidates.poses.poses)
-        return scene.contributions(candidates.place.T_base_camera, in_Rb)
-
-    def all_in(found: Sequence[Contributions]) -> float:
-        session = Session(found)
-        for slot, part in zip(session.places, found, strict=True):
-            stacked = part.rows.reshape(-1, part.rows.shape[2])
-            session.information[np.ix_(slot, slot)] += stacked.T @ stacked
-        session.renewed()
-        return float(criterion(session.machine[None])[0])
-
-    known = [found[0] for found in map(parts, current) if found is not None]
+) -> list[Candidates]:
+    """Return the same poses seen from places nearby, where that is better."""
+    task, up = scene.task, upward(scene.task.machine)
+    current, known = list(current), _required(scene, current)
+    value = float(criterion(_with_all(known, given).machine[None])[0])
     for v, own in enumerate(current):
-        for _ in range(N_NEAR_PLACES):
-            place = near(own.place, target, up, PLACE_STEP * step, rng)
-            if place is own.place:
-                break
+        for _ in range(0 if own.place.fixed else N_NEAR_PLACES):
+            place = near(current[v].place, target, up, PLACE_STEP * step, rng)
             trial = replace(own, place=place)
-            found = parts(trial)
+            found = scene.of(trial) if place.is_inside(task.bounds) else None
             if found is None:
                 continue
-            trial_value = all_in([*known[:v], found[0], *known[v + 1 :]])
-            if trial_value < value:
-                own, value = trial, trial_value
-                current[v], known[v] = own, found[0]
-    slots, widened = [], []
-    for own in current:
-        more = poses_near(scene, own.poses, POSE_STEP * step, rng)
-        both = poses_at(machine, [*own.poses.configurations, *more])
-        found = parts(replace(own, poses=both))
-        assert found is not None
-        slots.append(found[0])
-        widened.append(both)
-    session = Session(slots)
+            others = [*known[:v], found, *known[v + 1 :]]
+            there = float(criterion(_with_all(others, given).machine[None])[0])
+            if there < value:
+                current[v], known[v], value = trial, found, there
+    return current
+
+
+def _better_poses(
+    scene: Scene,
+    current: list[Candidates],
+    given: Sequence[Contributions],
+    criterion: Criterion,
+    rng: np.random.Generator,
+    step: float,
+    least: int,
+) -> tuple[list[Candidates], float]:
+    """Return places and poses after exchanges with poses nearby, and the criterion."""
+    task = scene.task
+    widened = [
+        replace(
+            own,
+            poses=poses_near(
+                task.machine, task.predictor.legs, task.setting, own.poses, POSE_STEP * step, rng
+            ),
+        )
+        for own in current
+    ]
+    session = Session(_required(scene, widened), given)
     images = [(v, k) for v, own in enumerate(current) for k in range(len(own.poses.poses))]
     for slot, image in images:
         session.changed(slot, image, 1.0)
     session.renewed()
-    better = exchange(session, Chosen(images), criterion, rng, least, most)
-    if better.value < value:
-        value = better.value
-        current = [
-            replace(own, poses=_some(both, [k for s, k in better.images if s == v]))
-            for v, (own, both) in enumerate(zip(current, widened, strict=True))
-        ]
-    return current, value
+    better = exchange(session, Chosen(images), criterion, rng, least, len(images))
+    return _of_images(widened, better), better.value
 
 
-def poses_near(
-    scene: Scene, poses: Configurations, step: float, rng: np.random.Generator
-) -> list[Array]:
-    """Return closed configurations a little beside poses, those that the machine can take."""
-    machine = scene.predictor.machine
-    feasibility = Feasibility(machine)
-    columns = slider_columns(machine, machine.motors)[0]
-    lower, upper = motor_travel(machine)
-    found = []
-    for configuration in poses.configurations:
-        for _ in range(N_NEAR if machine.is_determined else 0):
-            q = configuration[columns] + step * (upper - lower) * rng.normal(size=len(columns))
-            try:
-                there = follow(machine, configuration, np.clip(q, lower, upper), min_step=0.5)
-            except DidNotConverge:
-                continue
-            if feasibility.problem(there, of_motors=False) is None:
-                found.append(there)
-    if not found:
-        return found
-    kept = surely_reached(scene, poses_at(machine, found), np.random.default_rng(0))
-    return [found[k] for k in np.flatnonzero(kept)]
-
-
-def judged(
+def _judged(
     scene: Scene,
-    current: Sequence[_Candidates],
-    goal: Goal,
+    current: Sequence[Candidates],
+    given: Sequence[Contributions],
     criterion: Criterion,
     work: Workspace | None,
     value: float,
-    rng: np.random.Generator,
     progress: Report,
 ) -> Plan:
     """Return the plan with what sessions as they will be are expected to give."""
-    predictor, setting = scene.predictor, scene.setting
-    machine, legs = predictor.machine, predictor.legs
-    found = [
-        scene.contributions(c.place.T_base_camera, platforms_in_base(machine, c.poses.poses))
-        for c in current
-    ]
-    covariances = []
-    for draw in range(setting.draws):
-        covariances.append(drawn_covariance(scene, current, rng))
-        progress("Draws", draw + 1, setting.draws)
+    task, predictor, machine = scene.task, scene.task.predictor, scene.task.machine
+    legs, found = predictor.legs, _required(scene, current)
+    session = _with_all(found, given)
+    rng, covariances = np.random.default_rng(task.seed + 1), []
+    for draw in range(task.setting.draws):
+        covariances.append(drawn_covariance(task, current, rng))
+        progress("Draws", draw + 1, task.setting.draws)
     covariance = np.mean(covariances, axis=0)
-    error = None if work is None else work.error(covariance)
     views, blocked = [], 0
-    for v, (c, part) in enumerate(zip(current, found, strict=True)):
-        assert part is not None
-        in_order = in_short_order(machine, c.poses)
-        poses = _some(c.poses, in_order)
+    for own in current:
+        order = in_short_order(machine, own.poses)
+        poses = some_of(own.poses, order)
         via, missing = ways(machine, poses)
         blocked += missing
-        name = c.place.name or f"c{v + 1}"
-        views.append(PlannedView(name, c.place.T_base_camera, poses, via, part[1][in_order]))
+        T, in_Rb = own.place.T_base_camera, platforms_in_base(machine, poses.poses)
+        views.append(PlannedView(own.place.name, T, poses, via, scene.seen(T, in_Rb, surely=False)))
     notes = []
     if blocked:
         notes.append(
             f"No free way was found to {blocked} of the poses, not even by home: lead the machine "
             "there by hand, away from singularities and collisions."
         )
-    session = Session([part[0] for part in found if part is not None])
-    n = sum(len(c.poses.poses) for c in current)
-    order = choose(session, n, criterion, np.random.default_rng(0), 0, n)
+    if task.goal in (Goal.MEAN, Goal.WORST) and not machine.is_determined:
+        notes.append(f"Readings do not give the pose: {machine.undetermined}.")
     return Plan(
         machine=machine,
         camera=predictor.camera,
-        setting=setting,
+        setting=task.setting,
         noise=predictor.noise,
         sigma_q=predictor.sigma_q,
-        goal=goal,
-        views=tuple(views),
+        goal=task.goal,
+        views=_named(views, task),
         value=value,
-        error=error,
-        sigma=np.sqrt(np.diagonal(covariance)),
+        error=None if work is None else work.error(covariance),
+        sigma=np.sqrt(np.maximum(np.diagonal(covariance), 0.0)),
         names=legs.parametrization.names,
         units=legs.parametrization.units,
-        growth=np.array(order.history),
+        growth=_growth(found, given, criterion),
+        limits=_limits(session, criterion),
+        seed=task.seed,
+        board=task.board,
+        hand_held=task.hand_held,
+        given=task.given_name,
         notes=tuple(notes),
     )
 
 
-def drawn_covariance(
-    scene: Scene, current: Sequence[_Candidates], rng: np.random.Generator
-) -> Array:
+def _named(views: Sequence[PlannedView], task: Task) -> tuple[PlannedView, ...]:
+    """Return views with the names of their places, or new ones in turn; hand-held ones by image."""
+    if task.hand_held:
+        views = [
+            replace(
+                view,
+                poses=some_of(view.poses, [k]),
+                via=(view.via[k],),
+                seen=view.seen.only(k),
+                name="",
+            )
+            for view in views
+            for k in range(len(view.poses.poses))
+        ]
+    taken = {one.place.name for one in task.given}
+    free = (f"c{k}" for k in range(1, 10**6) if f"c{k}" not in taken)
+    return tuple(view if view.name else replace(view, name=next(free)) for view in views)
+
+
+def _refuse_undetermined(
+    task: Task,
+    session: Session,
+    criterion: Criterion,
+    given: Sequence[Contributions],
+    work: Workspace | None,
+    basis: Array,
+) -> None:
+    """Refuse a session that leaves a direction open that matters, and say how many images do."""
+    joints = np.array([leg.A for leg in task.predictor.legs.nominal])
+    most = _NOTHING_KNOWN * float(np.linalg.norm(joints, axis=1).mean())
+
+    def off(S: Array) -> Array:
+        """Return the error of the platform, or the criterion where readings give no pose."""
+        if work is None:
+            return criterion(S)
+        errors = [work.error(basis @ one @ basis.T).mean_displacement for one in S]
+        return np.array(errors)
+
+    if float(off(session.machine[None])[0]) < most:
+        return
+    more = choose(
+        Session(session.slots, given),
+        _MOST_NEEDED,
+        off,
+        np.random.default_rng(task.seed),
+        0,
+        _MOST_NEEDED,
+        is_enough=lambda error: error < most,
+    )
+    n = len(more.images)
+    places = f"{task.n_views} place{'s' * (task.n_views != 1)}"
+    remedy = (
+        f"plan {n} --images or more" if more.value < most else "plan more --cameras, or --board"
+    )
+    needed = f"at least {n}" if more.value < most else "more places"
+    raise NotIdentifiable(
+        f"{task.machine.yaml_path}: no session could be planned: found that {task.n_images} "
+        f"images from {places} leave the machine undetermined, needed {needed}; {remedy}."
+    )
+
+
+def drawn_covariance(task: Task, current: Sequence[Candidates], rng: np.random.Generator) -> Array:
     """Return the covariance (p, p) of the parameters in a session as it may be."""
-    predictor, setting = scene.predictor, scene.setting
-    machine, legs = predictor.machine, predictor.legs
-    drawn = drawn_legs(legs, setting, rng)
-    A = machine.T_base_Rb.apply(np.array([leg.A for leg in drawn]))
-    there = Scene(predictor, setting, A, drawn)
-    parts = []
-    for own in current:
+    there, machine, parts = Scene.drawn(task, rng), task.machine, []
+    for own, is_set in (*((c, False) for c in current), *((c, True) for c in task.given)):
         nearby = platforms_in_base(machine, own.poses.poses)
-        poses = poses_at_readings(machine, drawn, own.poses.readings, nearby)
-        T = setting.camera_elsewhere(own.place.T_base_camera, rng)
+        poses: Sequence[RigidTransform] = nearby
+        if machine.is_determined:
+            poses = poses_at_readings(machine, there.legs, own.poses.readings, nearby)
+        T = own.place.T_base_camera
+        T = T if is_set else task.setting.camera_elsewhere(T, rng)
         found = there.contributions(T, poses, surely=False)
         if found is not None:
-            parts.append(found[0])
+            parts.append(found)
     session = Session([], parts)
     basis = parts[0].basis
     return np.asarray(basis @ session.machine @ basis.T)
 
 
-def drawn_legs(legs: FittedLegs, setting: Setting, rng: np.random.Generator) -> tuple[Leg, ...]:
-    """Return legs as they may be, within the prior errors of the machine."""
-    found = legs.parametrization
-    size = np.where([unit == "m" for unit in found.units], setting.length, setting.angle)
-    size = size * np.array([not name.endswith(".twist") for name in found.names])
-    return moved_legs(legs.nominal, found.place, size * rng.uniform(-1.0, 1.0, len(size)))
+def _growth(
+    found: Sequence[Contributions], given: Sequence[Contributions], criterion: Criterion
+) -> Array:
+    """Return numbers of images and the criterion with so many, (n, 2), and beyond those planned."""
+    n = sum(len(part.rows) for part in found)
+    order = choose(Session(found, given), n, criterion, np.random.default_rng(0), 0, n)
+    rows = [(k + 1.0, value) for k, value in enumerate(order.history)]
+    for times in _CONTINUED:
+        more = [replace(part, rows=part.rows * np.sqrt(times)) for part in found]
+        rows.append((round(times * n), float(criterion(_with_all(more, given).machine[None])[0])))
+    return np.array(rows)
+
+
+_LIMITS = {
+    "common-mode edge biases": ("bias", "tilt"),
+    "the gamma of the camera": ("camera gamma",),
+    "radii": ("radii",),
+    "intrinsics of the camera": ("camera ",),
+}
+
+
+def _limits(session: Session, criterion: Criterion) -> dict[str, float]:
+    """Return the criterion if errors of a kind were not there, or images were without end."""
+    found = {}
+    for what, words in _LIMITS.items():
+        known = [
+            i for name, i in session.names.items()
+            if any(word in name for word in words)
+            and not (what.startswith("intrinsics") and "gamma" in name)
+        ]  # fmt: skip
+        if known:
+            left = np.setdiff1d(np.arange(len(session.names)), known)
+            inverse = np.linalg.inv(session.information[np.ix_(left, left)])
+            S = np.asarray(inverse[: session.p, : session.p], dtype=np.float64)
+            found[what] = float(criterion(S[None])[0])
+    return found

@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from legcal.errors import UsageError
+from legcal.data import Dataset, load_dataset
+from legcal.errors import DatasetError, NotIdentifiable, UsageError
 from legcal.geometry import Array
-from legcal.machine import Machine, load_mechanism
+from legcal.machine import Configurations, Machine, follow, load_mechanism, poses_at, slider_columns
 from legcal.planning.goals import Goal
 from legcal.planning.information import DEFAULT_NOISE, PredictedNoise, Predictor
-from legcal.planning.places import USUAL, Setting
-from legcal.planning.planner import Plan, plan_session
-from legcal.progress import Progress, shown_progress
-from legcal.vision import Camera, read_camera
+from legcal.planning.noise import read_noise
+from legcal.planning.places import USUAL, Place, Setting, read_places
+from legcal.planning.planned_session import Plan
+from legcal.planning.planner import Candidates, Task, plan_session
+from legcal.progress import Progress, Report, shown_progress
+from legcal.vision import Board, Camera, board_of, read_camera
 
 SIGMA_Q = 2e-6  # [m] of a reading, where nobody says
-MOST_IMAGES, MOST_VIEWS = 500, 12
+IMAGES_PER_VIEW = 15
+MOST_IMAGES, MOST_VIEWS = 400, 12
+SAME_MACHINE = 0.01  # [m] between joints of the model and of a dataset that was shot of it
+_ROUNDS = 5  # plans, until the fewest images are found that reach a target
+_BEGIN = 24  # images of the first of them
+_NEARLY = 0.9  # of the images of a plan that reaches it: another with so many is tried
 
 
 def default_camera() -> Camera:
@@ -32,13 +41,18 @@ def plan(
     *,
     images: int | None = None,
     images_per_view: int | None = None,
-    cameras: int = 3,
+    cameras: int | None = None,
+    target: float | None = None,
     criterion: Goal | str = Goal.MEAN,
     parameters: Sequence[str] = (),
     camera: str | Path | Camera | None = None,
-    noise: PredictedNoise = DEFAULT_NOISE,
-    encoder_sigma: float = SIGMA_Q,
+    noise: PredictedNoise | str | Path = DEFAULT_NOISE,
+    encoder_sigma: float | None = None,
     bounds: Array | None = None,
+    places: str | Path | None = None,
+    given: str | Path | Dataset | None = None,
+    board: str | Path | Board | None = None,
+    hand_held: bool = False,
     setting: Setting = USUAL,
     seed: int = 0,
     progress: Progress = False,
@@ -52,21 +66,33 @@ def plan(
         The nominal model, as :func:`legcal.load_mechanism` takes it.
     images, images_per_view : int, optional
         Photographs of the whole session, 45 by default; or of each view.
-    cameras : int
-        Camera places.
+    cameras : int, optional
+        Camera places, 3 by default.
+    target : float, optional
+        Expected error of the platform, mean over the workspace [m]: the fewest images that reach
+        it, in place of a number of images.
     criterion : Goal or str
         What is made small: ``mean`` or ``worst`` error of the platform over the workspace, ``d``
         (determinant of the covariance of all parameters), or sigma of ``parameters``.
     parameters : sequence of str
         Names of parameters, for that criterion.
     camera : path or Camera, optional
-        The camera, or its file; 1024 x 768 pixels and 43 degrees wide by default.
-    noise : PredictedNoise
-        Errors of outlines.
-    encoder_sigma : float
-        One standard deviation of a reading [m].
+        The camera, or its file; 1024 x 768 pixels and 43 degrees wide by default, or that of the
+        dataset that is given.
+    noise : PredictedNoise or path
+        Errors of outlines; an earlier result, or a document of ``legcal noise --json``.
+    encoder_sigma : float, optional
+        One standard deviation of a reading [m]; 2 um by default, or that of the dataset.
     bounds : (3, 2) array, optional
         Lowest and highest x, y, z of cameras in the base link [m].
+    places : path, optional
+        A file of places of tripods, from which cameras are chosen.
+    given : path or Dataset, optional
+        What was shot already; the plan says what to add.
+    board : str, path or Board, optional
+        A calibration board on the base that every image shows, as ``legcal camera`` takes it.
+    hand_held : bool
+        Every image from a place of its own; with a board.
     setting : Setting
         How well tripods are set, and what is known of the machine before.
     seed : int
@@ -84,47 +110,241 @@ def plan(
     ------
     UsageError
         If an option cannot be used.
+    DatasetError, ModelError
+        If a file cannot be used, or the dataset is of another machine.
     DidNotConverge, NotVisible, NotIdentifiable
-        If there are no poses, no places that show legs, or too few images.
+        If there are no poses, no places that show legs, too few images, or a target that no number
+        of images reaches.
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
-    n_views = _whole("--cameras", cameras, 1, MOST_VIEWS)
-    if images is not None and images_per_view is not None:
-        raise UsageError(
-            f"The plan could not be made: found {images} images and {images_per_view} images per "
-            "view, needed one of the two; leave out --images-per-view, or --images."
-        )
-    n_images = 15 * n_views
-    if images is not None:
-        n_images = _whole("--images", images, 1, MOST_IMAGES)
-    elif images_per_view is not None:
-        n_images = n_views * _whole("--images-per-view", images_per_view, 1, MOST_IMAGES // n_views)
-    if n_images < n_views:
-        raise UsageError(
-            f"The plan could not be made: found {n_images} images for {n_views} cameras, needed "
-            "one for each at least; give more --images or fewer --cameras."
-        )
-    if criterion not in list(Goal):
-        raise UsageError(
-            f"The plan could not be made: found the criterion '{criterion}', needed "
-            f"{', '.join(Goal)}; choose one."
-        )
-    chosen = default_camera() if camera is None else camera
-    lens = chosen if isinstance(chosen, Camera) else read_camera(Path(chosen))
-    predictor = Predictor(machine, lens, noise, encoder_sigma)
+    listed = () if places is None else tuple(read_places(Path(places), machine))
+    n_views = _n_views(cameras, len(listed), hand_held=hand_held)
+    n_images = _n_images(images, images_per_view, n_views, target)
+    _check(criterion, target, bounds, listed, board, hand_held, setting, n_images, n_views)
+    shot = given if isinstance(given, Dataset) or given is None else _shot(Path(given))
+    before = () if shot is None else _given(machine, shot)
+    if camera is None:
+        chosen = default_camera() if shot is None else shot.measurements.views[0].camera
+    else:
+        chosen = camera if isinstance(camera, Camera) else read_camera(Path(camera))
+    if encoder_sigma is None:
+        encoder_sigma = SIGMA_Q if shot is None else shot.measurements.sigma_q
+    errors = noise if isinstance(noise, PredictedNoise) else read_noise(Path(noise))
+    task = Task(
+        Predictor(machine, chosen, errors, encoder_sigma),
+        n_images,
+        n_views,
+        Goal(criterion),
+        tuple(parameters),
+        setting,
+        bounds,
+        listed,
+        before,
+        "" if shot is None else str(shot.folder),
+        None if board is None else board_of(board),
+        hand_held,
+        seed,
+    )
     with shown_progress(progress) as report:
-        return plan_session(
-            predictor,
-            n_images,
-            n_views,
-            Goal(criterion),
-            named=parameters,
-            setting=setting,
-            bounds=bounds,
-            seed=seed,
-            progress=report,
-            stop=stop,
+        if target is None:
+            return plan_session(task, report, stop)
+        return _fewest(task, target, report, stop)
+
+
+def _fewest(task: Task, target: float, progress: Report, stop: Callable[[], bool]) -> Plan:
+    """Return the plan with the fewest images that reaches a target [m].
+
+    The error of a plan says how many images the next one needs; what limits plans of any size is
+    told where none reaches it.
+    """
+    n, least, best = max(_BEGIN, 2 * task.n_views), 0, None
+    for _ in range(_ROUNDS):
+        found = plan_session(replace(task, n_images=n), progress, stop)
+        if found.error is None:
+            raise UsageError(
+                f"--target could not be used: found that {task.machine.undetermined}, needed a "
+                "machine whose readings give the pose; give --images."
+            )
+        error = found.error.mean_displacement
+        if error <= target:
+            best = found if best is None or found.n_images < best.n_images else best
+        else:
+            least = max(least, n)
+        if stop():
+            return best or found
+        enough = _images_for(found, error, target)
+        if enough > MOST_IMAGES and best is None:
+            break
+        if best is not None:
+            enough = min(enough, int(_NEARLY * best.n_images))
+        wanted = max(enough, least + 1, 2 * task.n_views)
+        if wanted > MOST_IMAGES or (best is not None and wanted >= best.n_images):
+            break
+        n = wanted
+    if best is not None:
+        return best
+    raise NotIdentifiable(_unreached(task, found, target))
+
+
+def _images_for(found: Plan, error: float, target: float) -> int:
+    """Return with how many images an error goes down to a target, as the growth of a plan says."""
+    n, value = np.log(found.growth[np.isfinite(found.growth[:, 1])]).T
+    scaled = value + np.log(error) - value[n == np.log(found.n_images)][0]
+    if scaled.min() > np.log(target):
+        return 10 * MOST_IMAGES
+    k = int(np.argmax(scaled <= np.log(target)))
+    share = 1.0 if k == 0 else (scaled[k - 1] - np.log(target)) / (scaled[k - 1] - scaled[k])
+    return int(np.ceil(np.exp(n[k] if k == 0 else n[k - 1] + share * (n[k] - n[k - 1]))))
+
+
+def _unreached(task: Task, found: Plan, target: float) -> str:
+    """Return why no number of images reaches a target, and what limits it."""
+    without = min(found.limits, key=lambda what: found.limits[what], default="")
+    error = 0.0 if found.error is None else found.error.mean_displacement
+    limit = "the noise of single outlines"
+    if without and found.limits[without] < 0.8 * found.value:
+        share = error * found.limits[without] / found.value
+        limit = f"{without} (without them {1e3 * share:.3f} mm)"
+    return (
+        f"{task.machine.yaml_path}: the target of {1e3 * target:g} mm could not be planned: found "
+        f"{1e3 * error:.3f} mm with {found.n_images} images, limited by {limit}, needed fewer such "
+        "errors; use better light or a camera of a longer focal length, more --cameras, --board, "
+        "or a larger --target."
+    )
+
+
+def _n_views(cameras: int | None, n_places: int, *, hand_held: bool) -> int:
+    """Return the number of camera places."""
+    n = min(3, n_places) if cameras is None and n_places else (cameras or 3)
+    n = _whole("--cameras", n if cameras is None else cameras, 1, MOST_VIEWS)
+    if n_places and n > n_places:
+        raise UsageError(
+            f"The plan could not be made: found {n_places} places for {n} cameras, needed one for "
+            "each; add places or give fewer --cameras."
         )
+    if hand_held and cameras is not None and cameras > 1:
+        raise UsageError(
+            f"The plan could not be made: found --hand-held and {cameras} cameras, needed one of "
+            "the two, a camera in the hand takes every image from a place of its own; leave out "
+            "--cameras."
+        )
+    return 1 if hand_held else n
+
+
+def _n_images(images: int | None, per_view: int | None, n_views: int, target: float | None) -> int:
+    """Return the number of photographs of the session."""
+    if images is not None and per_view is not None:
+        raise UsageError(
+            f"The plan could not be made: found {images} images and {per_view} images per view, "
+            "needed one of the two; leave out --images-per-view, or --images."
+        )
+    if target is not None and (images is not None or per_view is not None):
+        raise UsageError(
+            "The plan could not be made: found a target and a number of images, needed one of the "
+            "two; leave out --target, or the number."
+        )
+    if per_view is not None:
+        return n_views * _whole("--images-per-view", per_view, 1, MOST_IMAGES // n_views)
+    n = 3 * IMAGES_PER_VIEW if images is None else _whole("--images", images, 1, MOST_IMAGES)
+    if n < n_views:
+        raise UsageError(
+            f"The plan could not be made: found {n} images for {n_views} cameras, needed one for "
+            f"each at least; give {n_views} --images or more, or fewer --cameras."
+        )
+    return n
+
+
+def _check(
+    criterion: str,
+    target: float | None,
+    bounds: Array | None,
+    places: Sequence[Place],
+    board: object,
+    hand_held: bool,
+    setting: Setting,
+    n_images: int,
+    n_views: int,
+) -> None:
+    """Refuse what contradicts itself."""
+    start, problems = "The plan could not be made: found", []
+    if criterion not in list(Goal):
+        problems.append(
+            f"{start} the criterion '{criterion}', needed {', '.join(Goal)}; choose one."
+        )
+    if target is not None and not 0.0 < target < 1.0:
+        problems.append(f"{start} a target of {target:g} m, needed 0 to 1 m; correct --target.")
+    if target is not None and criterion != Goal.MEAN:
+        problems.append(
+            f"{start} a target and the criterion '{criterion}', needed the mean error of the "
+            "platform, which the target is about; leave out --criterion."
+        )
+    if bounds is not None and places:
+        problems.append(
+            f"{start} bounds and a list of places, needed one of the two; leave out --bounds."
+        )
+    if hand_held and board is None:
+        problems.append(
+            f"{start} a camera in the hand without a board, needed a calibration board on the base "
+            "in every image, which alone tells where it was; describe it with --board."
+        )
+    if min(setting.shift, setting.turn, setting.length, setting.angle) < 0.0 or setting.draws < 1:
+        problems.append(
+            f"{start} a tolerance below zero or {setting.draws} draws, needed zero or more, and "
+            "one draw; correct it."
+        )
+    if problems:
+        raise UsageError(problems)
+
+
+def _shot(folder: Path) -> Dataset:
+    """Return a dataset, whose images are not looked at."""
+    return load_dataset(folder, check_images=False)
+
+
+def _given(machine: Machine, shot: Dataset) -> tuple[Candidates, ...]:
+    """Return views and poses of a dataset. Raises DatasetError if it is of another machine."""
+    m, other, found = shot.measurements, shot.machine, ""
+    both = other, machine
+    kinds = [[(leg.base_joint, leg.kind, leg.platform_joint) for leg in one.legs] for one in both]
+    if other.leg_names != machine.leg_names or kinds[0] != kinds[1]:
+        found = f"other legs ({other.name})"
+    else:
+        off = max(
+            float(np.abs(other.A_base - machine.A_base).max()),
+            float(np.abs(other.B_platform - machine.B_platform).max()),
+        )
+        if off > SAME_MACHINE:
+            found = f"joints up to {1e3 * off:.0f} mm from those of the model"
+    if found:
+        raise DatasetError(
+            f"{shot.folder}: the dataset could not be planned with: found {found}, needed images "
+            f"of {machine.name}; correct --given or MODEL."
+        )
+    missing = [view.name for view in m.views if view.T_base_camera is None]
+    if missing or not machine.is_determined:
+        what = f"no T_base_camera of view {missing[0]}" if missing else "readings without poses"
+        raise DatasetError(
+            f"{shot.folder}: the dataset could not be planned with: found {what}, needed where its "
+            "images were taken; write T_base_camera of a result into dataset.yaml."
+        )
+    found_views = []
+    for v, view in enumerate(m.views):
+        rows = np.flatnonzero(m.view == v)
+        if view.T_base_camera is None or not len(rows):
+            continue
+        place = Place(view.T_base_camera, view.name, fixed=True)
+        found_views.append(Candidates(place, _followed(machine, m.q[rows])))
+    return tuple(found_views)
+
+
+def _followed(machine: Machine, q: Array) -> Configurations:
+    """Return the poses at readings (n, n_legs), each followed from the nearest one."""
+    motors = list(machine.motors)
+    columns, reached = slider_columns(machine, motors)[0], [machine.home_configuration]
+    for row in q[:, motors]:
+        far = [float(np.abs(c[columns] - row).max()) for c in reached]
+        reached.append(follow(machine, reached[int(np.argmin(far))], row))
+    return poses_at(machine, reached[1:])
 
 
 def _whole(name: str, found: int, least: int, most: int) -> int:

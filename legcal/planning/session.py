@@ -26,11 +26,14 @@ from legcal.files import (
     result_folder,
 )
 from legcal.geometry import roll_pitch_yaw
-from legcal.machine import write_model
-from legcal.planning.planner import Plan
-from legcal.vision import camera_info
+from legcal.machine import DATASET_YAML, write_model
+from legcal.planning.order import HOME
+from legcal.planning.planned_session import Plan
+from legcal.vision import board_document, camera_info
 
 PLAN_NAME = "plan.json"
+CAMERA, MEASUREMENTS = "camera_info.yaml", "measurements.csv"
+HAND = "hand"  # the view of a camera in the hand
 PLANNED = OutputKind("session", PLAN_NAME, "legcal_plan")
 
 
@@ -67,9 +70,9 @@ def write_session(
     with result_folder(destination, PLANNED) as folder:
         yaml_path, _ = write_model(plan.machine, folder)
         texts = {
-            "camera_info.yaml": camera_info(plan.camera, "camera"),
-            "dataset.yaml": _dataset(plan, yaml_path.relative_to(folder).as_posix()),
-            "measurements.csv": _measurements(plan),
+            CAMERA: camera_info(plan.camera, "camera"),
+            DATASET_YAML: _dataset(plan, yaml_path.relative_to(folder).as_posix()),
+            MEASUREMENTS: _measurements(plan),
             "poses.csv": _poses(plan),
             PLAN_NAME: json.dumps(plan.document(), indent=1, allow_nan=False) + "\n",
             **(pictures or {}),
@@ -82,41 +85,49 @@ def write_session(
 
 
 def images_of(plan: Plan) -> list[tuple[str, str, str, int, int]]:
-    """Return view, image, label of the pose, and the numbers of view and pose of every image."""
+    """Return view, image, label of the pose, and the numbers of view and pose of every image.
+
+    All images of a camera in the hand are of one view.
+    """
     width = max(2, len(str(plan.n_images)))
-    found, n = [], 0
+    found: list[tuple[str, str, str, int, int]] = []
     for v, view in enumerate(plan.views):
+        name = HAND if plan.hand_held else view.name
         for k in range(len(view.poses.poses)):
-            n += 1
-            label = f"p{n:0{width}d}"
-            found.append((view.name, f"images/{view.name}_{label}.jpg", label, v, k))
+            label = f"p{len(found) + 1:0{width}d}"
+            found.append((name, f"images/{name}_{label}.jpg", label, v, k))
     return found
 
 
 def _dataset(plan: Plan, model: str) -> str:
-    views = {}
+    """Return ``dataset.yaml``."""
+    views: dict[str, Any] = {}
     for view in plan.views:
+        entry: dict[str, Any] = {"camera": CAMERA}
+        if plan.hand_held:
+            views[HAND] = entry | {"hand_held": True}
+            continue
         motion = motion_to_xyz_quat(view.T_base_camera)
-        entry: dict[str, Any] = {"camera": "camera_info.yaml"}
         entry["T_base_camera"] = {key: [round(x, 5) for x in motion[key]] for key in motion}
         shown = np.asarray(view.shows.any(axis=0))
         if not shown.all():
             names = plan.machine.leg_names
-            entry["legs"] = [
-                name for name, is_seen in zip(names, shown.tolist(), strict=True) if is_seen
-            ]
+            entry["legs"] = [names[j] for j in np.flatnonzero(shown).tolist()]
         views[view.name] = entry
-    document = {
+    document: dict[str, Any] = {
         "legcal_dataset": 1,
         "mechanism": model,
-        "measurements": "measurements.csv",
+        "measurements": MEASUREMENTS,
         "encoder_sigma": plan.sigma_q,
         "views": views,
     }
+    if plan.board is not None:
+        document["board"] = board_document(plan.board)
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
 
 
 def _measurements(plan: Plan) -> str:
+    """Return ``measurements.csv``: the planned readings, to be replaced by what encoders say."""
     motors = list(plan.machine.motors)
     rows = [
         [name, image, label, *plan.views[v].poses.readings[k, motors].tolist()]
@@ -127,13 +138,20 @@ def _measurements(plan: Plan) -> str:
 
 
 def _poses(plan: Plan) -> str:
+    """Return ``poses.csv``."""
     motors, rows = list(plan.machine.motors), []
     for name, image, label, v, k in images_of(plan):
         view = plan.views[v]
-        T = view.poses.poses[k]
+        T, via = view.poses.poses[k], view.via[k]
+        if via and via != HOME:  # an earlier pose of the view, by its number
+            via = images_of(plan)[sum(len(w.poses.poses) for w in plan.views[:v]) + int(via) - 1][2]
         angles = np.degrees(roll_pitch_yaw(T.rotation.as_matrix()))
         numbers = [*(1e3 * view.poses.readings[k, motors]), *(1e3 * T.translation), *angles]
-        rows.append([name, label, image, view.via[k], *(f"{x:z.4f}" for x in numbers)])
+        where = 1e3 * view.T_base_camera.translation
+        rows.append([name, label, image, via, *(f"{x:z.4f}" for x in numbers),
+                     *(f"{x:z.0f}" for x in where)])  # fmt: skip
     joints = [f"{column.name} [mm]" for column in reading_columns(plan.machine.legs)]
     pose = [*(f"{x} [mm]" for x in "xyz"), *(f"{x} [deg]" for x in ("roll", "pitch", "yaw"))]
-    return format_table(["view", "pose", "image", "on the way", *joints, *pose], rows)
+    camera = [f"camera {x} [mm]" for x in "xyz"]
+    header = ["view", "pose", "image", "on the way", *joints, *pose, *camera]
+    return format_table(header, rows)

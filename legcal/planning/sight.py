@@ -57,6 +57,18 @@ class Seen:
             source=("detected",) * (2 * n),
         )
 
+    def only(self, image: int) -> Seen:
+        """Return what one image shows."""
+        own = np.flatnonzero(self.image == image)
+        return Seen(
+            np.zeros(len(own), dtype=np.intp),
+            self.leg[own],
+            tuple(self.part[i] for i in own),
+            self.h[own],
+            self.ends[own],
+            self.length_px[own],
+        )
+
     def legs_in(self, n_images: int, n_legs: int) -> BoolArray:
         """Return which legs each image shows, (n_images, n_legs)."""
         shown = np.zeros((n_images, n_legs), dtype=np.bool_)

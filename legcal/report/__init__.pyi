@@ -22,6 +22,7 @@ from .page.verdicts import identify_verdict as identify_verdict
 from .page.writing import PAGE as PAGE
 from .page.writing import write_page as write_page
 from .page.writing import write_report as write_report
+from .plan import plan_files as plan_files
 from .plan import plan_table as plan_table
 from .render import report as report
 from .render import table as table

@@ -1,51 +1,254 @@
-"""What is said of a plan: camera places, images, expected accuracy."""
+"""What is said and drawn of a plan: places, images, expected accuracy, and what to look after."""
 
 from __future__ import annotations
 
+import base64
+import io
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 from rich.console import RenderableType
 
 from legcal.errors import printable
-from legcal.planning import Plan
+from legcal.figures import new_figure, plain
+from legcal.geometry import Array
+from legcal.machine import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR
+from legcal.pages import Drawing, Items, Picture, Row, page_html
+from legcal.planning import Plan, views_in_words
+from legcal.report.page.text_page import text_page
 from legcal.report.render import heading, report, table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+PLACES, GROWTH, CHECKLIST, PAGE_NAME = "places.svg", "growth.svg", "checklist.txt", "plan.html"
+_CAMERA_COLOUR = "#b45309"
+_WORST = 12  # parameters that are told
+_PANEL = (6.0, 5.6)  # [inch]
 
 
 def plan_table(plan: Plan, output: Path) -> RenderableType:
-    """Return what a plan is and what it is expected to give."""
-    rows = []
-    for view in plan.views:
-        x, y, z = view.T_base_camera.translation
-        seen = ", ".join(
-            f"{name} {n}"
-            for name, n in zip(plan.machine.leg_names, view.shows.sum(axis=0), strict=True)
+    """Return what a plan is, and what is expected of it."""
+    names = plan.machine.leg_names
+    views = [
+        (
+            view.name,
+            str(len(view.poses.poses)),
+            *(f"{x:.2f}" for x in view.T_base_camera.translation),
+            " ".join(str(n) for n in view.shows.sum(axis=0).tolist()),
         )
-        rows.append(
-            (view.name, str(len(view.poses.poses)), f"{x:.3f}", f"{y:.3f}", f"{z:.3f}", seen)
-        )
+        for view in plan.views
+    ]
+    worst = np.argsort(-np.nan_to_num(plan.sigma), kind="stable")[:_WORST]
+    unit = {"m": (1e3, "mm"), "rad": (float(np.degrees(1.0)), "deg")}
+    parameters = [
+        (plan.names[i], f"{unit[plan.units[i]][0] * plan.sigma[i]:.4f}", unit[plan.units[i]][1])
+        for i in worst.tolist()
+    ]
+    growth = [(f"{n:.0f}", _shown(plan, value)) for n, value in _told(plan)]
+    distances = [
+        (name, *(f"{1e3 * x:.0f}" for x in row)) for name, row in camera_distances(plan).items()
+    ]
+    legs = ", ".join(names)
     return report(
-        heading(
-            printable(plan.machine.name),
-            f": a session of {plan.n_images} photographs from {len(plan.views)} places",
+        heading(printable(plan.machine.name), f": {views_in_words(plan.views)}"),
+        table(
+            "view", ">images", ">x [m]", ">y [m]", ">z [m]", f"images of {printable(legs)}",
+            rows=[tuple(map(printable, row)) for row in views],
         ),
         table(
-            "view", ">images", ">x [m]", ">y [m]", ">z [m]", "images of each leg",
-            rows=[tuple(map(printable, row)) for row in rows],
+            "lens of", *(f">to A{j + 1} [mm]" for j in _measured(plan)), ">above these [mm]",
+            rows=[tuple(map(printable, row)) for row in distances],
+            title="Distances to measure, from the middle of the lens to joints of the base",
         ),
-        [expectation(plan), *map(printable, plan.notes)],
+        table("parameter", ">sigma", "unit", rows=parameters, title="Known worst"),
+        table(">images", ">expected", rows=growth, title="With other numbers of images"),
+        [plan.sentence, *map(printable, plan.notes)],
         [printable(f"written: {output}"), printable(f"calibrate with: legcal calibrate {output}")],
     )  # fmt: skip
 
 
-def expectation(plan: Plan) -> str:
-    """Return the accuracy that is expected, as a sentence."""
-    if plan.error is None:
-        return "The error of the platform is not predicted: readings do not give its pose."
-    return (
-        f"Expected: predicted error {1e3 * plan.error.mean_displacement:.3f} mm / "
-        f"{np.degrees(plan.error.mean_rotation):.4f} deg (1 sigma) over the workspace, the mean of "
-        f"{plan.setting.draws} sessions with tripods {1e2 * plan.setting.shift:g} cm and "
-        f"{np.degrees(plan.setting.turn):g} deg off and the machine "
-        f"{1e3 * plan.setting.length:g} mm."
+def _told(plan: Plan) -> list[tuple[float, float]]:
+    """Return numbers of images and the criterion, a few of them."""
+    n = plan.n_images
+    told = {
+        max(n // 3, 1),
+        max(2 * n // 3, 1),
+        n,
+        *(k for k in plan.growth[:, 0] if n < k <= 4 * n),
+    }
+    return [(k, value) for k, value in plan.growth.tolist() if k in told]
+
+
+def _shown(plan: Plan, value: float) -> str:
+    """Return the criterion with another number of images as the error that is expected then."""
+    if plan.error is None or plan.goal not in ("mean", "worst"):
+        return f"{value / plan.value:.2f} of that planned"
+    return f"{1e3 * plan.error.mean_displacement * value / plan.value:.3f} mm"
+
+
+def _measured(plan: Plan) -> tuple[int, ...]:
+    """Return the joints of the base that distances are measured to."""
+    return plan.machine.frame_legs
+
+
+def camera_distances(plan: Plan) -> dict[str, list[float]]:
+    """Return for each view how far the lens is from joints of the base, and how high [m]."""
+    A = plan.machine.A_base[list(_measured(plan))]
+    found = {}
+    for view in plan.views:
+        where = view.T_base_camera.translation
+        found[view.name] = [
+            *np.linalg.norm(A - where, axis=1).tolist(),
+            float(where[2] - A[:, 2].mean()),
+        ]
+    return found
+
+
+def checklist(plan: Plan) -> list[str]:
+    """Return what to look after before and while photographs are taken."""
+    held = plan.hand_held
+    first = f"Put the file of the calibrated camera in place of camera_info.yaml: it was planned \
+with {plan.camera.width} x {plan.camera.height} px and a focal length of \
+{plan.camera.K[0, 0]:.0f} px."
+    cm, deg = 1e2 * plan.setting.shift, np.degrees(plan.setting.turn)
+    place = (
+        "Take each image from where poses.csv says, about; the whole board must be in it."
+        if held
+        else f"Set the tripod to {cm:g} cm and {deg:g} deg: measure the distances from the lens, "
+        "then turn the camera until the picture looks as its preview."
     )
+    items = [
+        first,
+        place,
+        "Focus by hand at the middle of the legs, then leave focus, zoom and aperture; no "
+        "autofocus, no stabiliser, no portrait mode.",
+        "An aperture of f/8 or so: the nearest and the farthest leg must both be sharp. Look at "
+        "both ends of the legs at full size.",
+        "Light from two sides through paper, or an overcast window; nothing clipped, neither legs "
+        "nor background.",
+        "A background that differs from the legs in brightness along their whole length.",
+        "A remote release or two seconds of delay; lossless files, or JPEG of quality 95.",
+        "Lead the machine as poses.csv says, in its order, by way of what stands in 'on the way'.",
+        "Wait until it rests; write what the encoders say, not the command, into measurements.csv.",
+        "Save each photograph under its name in measurements.csv.",
+    ]
+    if plan.board is not None:
+        items.insert(1, "Fix the board to the base, where every image shows it; it must not move.")
+    return items
+
+
+def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[str, str | bytes]:
+    """Return the pictures, the checklist and the page of a session, by their names."""
+    places, growth = _svg(_draw_places(plan)), _svg(_draw_growth(plan))
+    images = [
+        Picture(
+            Markup(f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"),
+            f"{name}: as the first image should look",
+        )
+        for name, data in previews.items()
+    ]
+    blocks: list[Any] = [
+        Drawing(Markup(places), "Camera places from above and from the side."),
+        Drawing(Markup(growth), "How the criterion falls with the number of images."),
+        Row(images),
+        Items(checklist(plan), ordered=True, title="Checklist"),
+    ]
+    text = plan_table(plan, Path("."))
+    page = text_page(
+        f"Plan of a session: {plan.machine.name}", text, blocks=blocks, command=command
+    )
+    listed = "".join(f"[ ] {item}\n" for item in checklist(plan))
+    return {
+        PLACES: places,
+        GROWTH: growth,
+        CHECKLIST: listed,
+        PAGE_NAME: page_html(page),
+        **{f"previews/{name}.jpg": data for name, data in previews.items()},
+    }
+
+
+def _draw_places(plan: Plan) -> Figure:
+    """Return a figure of machine and cameras from above and from the side, with distances."""
+    machine = plan.machine
+    A, B = machine.A_base, np.asarray(machine.home.apply(machine.B_platform))
+    with new_figure(2, 2, _PANEL) as (figure, axes):
+        for ax, (i, j), title in zip(
+            axes, ((0, 1), (0, 2)), ("from above: x, y [mm]", "from the side: x, z [mm]"),
+            strict=True,
+        ):  # fmt: skip
+            _draw_panel(ax, plan, A, B, i, j)
+            ax.set_title(title, fontsize="medium")
+    return figure
+
+
+def _draw_panel(ax: Axes, plan: Plan, A: Array, B: Array, i: int, j: int) -> None:
+    """Draw one panel: coordinates i and j."""
+    for a, b in zip(1e3 * A, 1e3 * B, strict=True):
+        ax.plot([a[i], b[i]], [a[j], b[j]], color=LEG_COLOUR, linewidth=2.0)
+    for letter, joints, colour in (("A", A, BASE_COLOUR), ("B", B, PLATFORM_COLOUR)):
+        ax.scatter(1e3 * joints[:, i], 1e3 * joints[:, j], s=16.0, color=colour, zorder=3)
+        for k, joint in enumerate(1e3 * joints):
+            if letter == "A":
+                ax.annotate(f"A{k + 1}", (joint[i], joint[j]), (5.0, 5.0), color=colour,
+                            textcoords="offset points", fontsize="small")  # fmt: skip
+    for view in plan.views:
+        where = 1e3 * view.T_base_camera.translation
+        sight = view.T_base_camera.rotation.as_matrix()[:, 2]
+        far = np.linalg.norm(A - view.T_base_camera.translation, axis=1)
+        tip = where + 250.0 * sight
+        arrow = {"arrowstyle": "->", "color": _CAMERA_COLOUR}
+        ax.annotate("", (tip[i], tip[j]), (where[i], where[j]), arrowprops=arrow)
+        ax.scatter(where[i], where[j], marker="s", s=40.0, color=_CAMERA_COLOUR, zorder=4)
+        ax.annotate(
+            plain(view.name), (where[i], where[j]), (7.0, 7.0), color=_CAMERA_COLOUR,
+            textcoords="offset points",
+        )  # fmt: skip
+        for k in () if plan.hand_held else _measured(plan):
+            joint = 1e3 * A[k]
+            ax.plot([where[i], joint[i]], [where[j], joint[j]], color=_CAMERA_COLOUR,
+                    linewidth=0.6, linestyle=":")  # fmt: skip
+            middle = 0.62 * where + 0.38 * joint
+            ax.annotate(f"{1e3 * far[k]:.0f}", (middle[i], middle[j]), fontsize="x-small",
+                        color=_CAMERA_COLOUR, ha="center")  # fmt: skip
+    ax.set_aspect("equal")
+    ax.margins(0.1)
+    ax.grid(alpha=0.2)
+
+
+def _draw_growth(plan: Plan) -> Figure:
+    """Return a figure of the criterion over the number of images."""
+    planned = plan.growth[:, 0] <= plan.n_images
+    known = np.isfinite(plan.growth[:, 1]) & (plan.growth[:, 0] >= min(6, plan.n_images))
+    scale, unit = (1e3, "mm") if plan.goal in ("mean", "worst", "parameters") else (1.0, "-")
+    with new_figure(1, 1, _PANEL) as (figure, (ax,)):
+        for chosen, style, label in (
+            (known & planned, "-o", "planned"),
+            (
+                known & (~planned | (plan.growth[:, 0] == plan.n_images)),
+                "--o",
+                "more of their kind",
+            ),
+        ):
+            n, value = plan.growth[chosen].T
+            ax.loglog(n, scale * value, style, markersize=3.0, label=label)
+        ax.set_xlabel("images")
+        ax.set_ylabel(f"criterion: {plan.goal.value} [{unit}]")
+        ax.grid(which="both", alpha=0.2)
+        ax.legend()
+    return figure
+
+
+def _svg(figure: Figure) -> str:
+    """Return a figure as SVG, the same at every call."""
+    import matplotlib as mpl
+
+    text = io.StringIO()
+    with mpl.rc_context({"svg.hashsalt": "legcal", "svg.fonttype": "none"}):
+        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": "legcal plan"})
+    whole = text.getvalue()
+    return whole[whole.index("<svg") :]

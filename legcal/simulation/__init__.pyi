@@ -31,6 +31,7 @@ from .paper import nominal_of as nominal_of
 from .paper import platform_errors as platform_errors
 from .poses import commanded_poses as commanded_poses
 from .poses import draw_poses as draw_poses
+from .previews import preview as preview
 from .rendering.appearance import Appearance as Appearance
 from .rendering.appearance import Light as Light
 from .rendering.scene import prepare_view as prepare_view

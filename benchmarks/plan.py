@@ -1,0 +1,223 @@
+"""Planned sessions beside random ones: predicted and found errors of the platform.
+
+For each machine a session of ``--images`` photographs from ``--cameras`` places is planned, and
+``--random`` sessions are drawn: extreme poses, cameras in sectors around the machine at a height by
+chance, at the least distance from which all legs are in the picture with the same tolerance. All
+are judged by the same draws of tripods and machines. ``--runs`` simulated calibrations of the
+planned session from outlines compare the error that is predicted with the one that is found, and
+``--rendered`` from photographs. A table says how the criteria of the literature rank the random
+sessions: the rank correlation (Spearman) of each with the predicted error of the platform, and the
+error that is predicted for the session that it takes for the best, over that of the best.
+
+    python benchmarks/plan.py --machines hexapod 3-rpr --random 50 --runs 20
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from scipy.stats import spearmanr
+
+import legcal
+from legcal.errors import LegcalError, NotIdentifiable
+from legcal.geometry import Array
+from legcal.machine import Machine, feasible_poses, load_mechanism, poses_at
+from legcal.planning import (
+    DEFAULT_NOISE,
+    WHITE,
+    Candidates,
+    Goal,
+    Place,
+    Plan,
+    Predictor,
+    Scene,
+    Task,
+    all_points,
+    criterion_of,
+    default_camera,
+    direction,
+    drawn_covariance,
+    places_along,
+    surely_reached,
+    upward,
+    workspace_of,
+    write_session,
+)
+from legcal.simulation import Level, SimulationSettings, simulate
+
+MACHINES = ("hexapod", "3-upu-tilted", "3-rpr", "3-rps", "tricept")
+_LIFTS = {True: (0.1, 0.7), False: (0.8, 1.3)}  # [rad] of random places; planar machines: False
+
+
+def random_session(
+    scene: Scene, n_images: int, n_views: int, rng: np.random.Generator
+) -> list[Candidates]:
+    """Return a session of random extreme poses and random sensible places."""
+    task = scene.task
+    machine, camera = task.machine, task.predictor.camera
+    configurations: list[Array] = []
+    while len(configurations) < n_images:
+        drawn = feasible_poses(machine, n_images, rng, extreme=True)
+        kept = surely_reached(machine, task.predictor.legs, task.setting, drawn)
+        configurations += [drawn.configurations[k] for k in np.flatnonzero(kept)]
+    poses = poses_at(machine, configurations[:n_images])
+    points, up = all_points(machine, poses.poses), upward(machine)
+    first, places = rng.uniform(0.0, 2.0 * np.pi), list[Place]()
+    while len(places) < n_views:
+        turn = first + 2.0 * np.pi * (len(places) + rng.uniform(-0.3, 0.3)) / n_views
+        toward = direction(up, turn, rng.uniform(*_LIFTS[machine.spatial]))
+        places += places_along(toward, up, points, camera, task.setting)[:1]
+    parts = np.array_split(np.arange(n_images), n_views)
+    return [
+        Candidates(place, poses_at(machine, [poses.configurations[k] for k in part]))
+        for place, part in zip(places, parts, strict=True)
+    ]
+
+
+def indices(covariance: Array, unit: Array) -> dict[str, float]:
+    """Return the criteria of the literature, each so that less is better.
+
+    Of the singular values s_1 >= ... >= s_m of the whitened Jacobian of the machine (angles at the
+    mean leg length) and n images' rows: O1 (Borm and Menq) their geometric mean, O2 (Driels and
+    Pathre) s_m / s_1, O3 (Nahvi) s_m, O4 the noise amplification s_m^2 / s_1 (Nahvi and
+    Hollerbach), O5 (Sun and Hollerbach) 1 / sum of 1 / s.
+    """
+    variance = np.linalg.eigvalsh(covariance / unit[:, None] / unit)
+    variance = variance[variance > 1e-14 * variance[-1]]
+    s = 1.0 / np.sqrt(variance[::-1])
+    return {
+        "O1 geometric mean": float(-np.log(s).mean()),
+        "O2 inverse condition": -float(s[-1] / s[0]),
+        "O3 minimum singular value": -float(s[-1]),
+        "O4 noise amplification": -float(s[-1] ** 2 / s[0]),
+        "O5 harmonic": -float(1.0 / np.sum(1.0 / s)),
+    }
+
+
+def judged(scene: Scene, session: list[Candidates], draws: int) -> Array:
+    """Return the mean covariance of the parameters over the same draws."""
+    rng = np.random.default_rng(1)
+    return np.asarray(
+        np.mean([drawn_covariance(scene.task, session, rng) for _ in range(draws)], axis=0)
+    )
+
+
+def main() -> None:
+    """Run."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--machines", nargs="+", default=list(MACHINES))
+    parser.add_argument("--images", type=int, default=45)
+    parser.add_argument("--cameras", type=int, default=3)
+    parser.add_argument("--random", type=int, default=50)
+    parser.add_argument("--draws", type=int, default=3, help="of each random session")
+    parser.add_argument("--runs", type=int, default=0, help="calibrations from outlines")
+    parser.add_argument("--rendered", type=int, default=0, help="calibrations from photographs")
+    parser.add_argument("--record", type=Path)
+    args = parser.parse_args()
+    for name in args.machines:
+        found = compare(name, args)
+        print(json.dumps(found, indent=1), flush=True)
+        if args.record is not None:
+            with args.record.open("a") as file:
+                file.write(json.dumps(found) + "\n")
+
+
+def compare(name: str, args: argparse.Namespace) -> dict[str, object]:
+    """Return the figures of one machine."""
+    machine = load_mechanism(name)
+    predictor = Predictor(machine, default_camera(), DEFAULT_NOISE, 2e-6)
+    scene = Scene.nominal(Task(predictor, args.images, args.cameras))
+    work = workspace_of(machine, predictor.legs)
+    if work is None:
+        raise NotIdentifiable(f"{name}: readings do not give the pose, needed another machine.")
+    start = time.perf_counter()
+    plan = legcal.plan(machine, images=args.images, cameras=args.cameras)
+    seconds = time.perf_counter() - start
+    session = [Candidates(Place(v.T_base_camera), v.poses) for v in plan.views]
+    planned = work.error(judged(scene, session, args.draws)).mean_displacement
+    criterion = criterion_of(Goal.MEAN, work, predictor.legs, np.eye(len(plan.names)))
+    unit = np.array([1.0 if u == "m" else 1.0 / machine.q0.mean() for u in plan.units])
+    rng, errors, ranked, values = np.random.default_rng(7), [], [], []
+    for _ in range(args.random):
+        covariance = judged(
+            scene, random_session(scene, args.images, args.cameras, rng), args.draws
+        )
+        errors.append(work.error(covariance).mean_displacement)
+        values.append(float(criterion(covariance[None])[0]))
+        free = np.diagonal(covariance) > 0.0
+        ranked.append(indices(covariance[np.ix_(free, free)], unit[free]))
+    table = {}
+    for key in ranked[0]:
+        scores = [one[key] for one in ranked]
+        table[key] = {
+            "spearman": float(spearmanr(scores, errors)[0]),
+            "best": errors[int(np.argmin(scores))] / min(errors),
+        }
+    found: dict[str, object] = {
+        "machine": name,
+        "seconds": seconds,
+        "planned_mm": 1e3 * planned,
+        "random_median_mm": 1e3 * float(np.median(errors)),
+        "random_best_mm": 1e3 * min(errors),
+        "ratio": planned / float(np.median(errors)),
+        "indices": table,
+    }
+    with TemporaryDirectory() as folder:
+        if args.runs:
+            white = legcal.plan(machine, images=args.images, cameras=args.cameras, noise=WHITE)
+            write_session(white, Path(folder) / "white")
+            found["outlines"] = shot(
+                machine, white, Path(folder) / "white", Level.OUTLINES, args.runs
+            )
+        if args.rendered:
+            write_session(plan, Path(folder) / "plan")
+            found["photographs"] = shot(
+                machine, plan, Path(folder) / "plan", Level.PHOTOGRAPHS, args.rendered
+            )
+    return found
+
+
+def shot(machine: Machine, plan: Plan, session: Path, level: Level, runs: int) -> dict[str, object]:
+    """Return errors of simulated calibrations of a planned session, beside what was predicted."""
+    dX, dE, stated, failed = [], [], [], []
+    for seed in range(runs):
+        folder, out = session.parent / f"shot{seed}", session.parent / f"out{seed}"
+        try:
+            made = simulate(
+                machine, folder, SimulationSettings(plan=session, level=level, seed=seed)
+            )
+            result = legcal.calibrate(folder, output=out)
+        except LegcalError as error:
+            failed.append(str(error))
+            continue
+        of = legcal.evaluate(out / "calibrated.yaml", made.truth_path)
+        dX.append(of.displacement)
+        dE.append(of.rotation)
+        if result.platform is not None and result.platform.workspace is not None:
+            stated.append(result.platform.workspace.displacement)
+    expected = plan.error
+    if expected is None:
+        raise NotIdentifiable("Readings do not give the pose, needed another machine.")
+    rms = {
+        key: float(np.sqrt(np.mean(np.square(np.array(x)))))
+        for key, x in (("found", dX), ("stated", stated), ("expected", expected.displacement))
+    }
+    return {
+        "runs": runs,
+        "failed": failed,
+        "predicted_mm": 1e3 * expected.mean_displacement,
+        "mean_mm": 1e3 * float(np.mean(dX)),
+        "mean_deg": float(np.degrees(np.mean(dE))),
+        "worst_mm": 1e3 * max(float(x.mean()) for x in dX),
+        "found_over_predicted": rms["found"] / rms["expected"],
+        "stated_over_predicted": rms["stated"] / rms["expected"],
+    }
+
+
+if __name__ == "__main__":
+    main()

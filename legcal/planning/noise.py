@@ -1,0 +1,71 @@
+"""The errors of outlines that a plan counts on, from what was measured before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from legcal.calibration import KINDS
+from legcal.data import OBSERVATIONS_NAME, OUTLINE_COLUMNS
+from legcal.errors import DatasetError, UsageError
+from legcal.files import read_json, read_table
+from legcal.planning.information import DEFAULT_NOISE, PredictedNoise
+
+_USUAL_LENGTH = 200.0  # [px] of an outline, where a document does not say
+
+
+def read_noise(path: Path) -> PredictedNoise:
+    """Return the noise that an earlier result or a document of ``legcal noise --json`` shows.
+
+    A result is given by its folder or its ``result.json``.
+    """
+    file = path / "result.json" if path.is_dir() else path
+    try:
+        found = read_json(file)
+        if "legcal_result" in found:
+            return _of_result(found, file)
+        if "legcal_noise" in found:
+            return _of_repeats(found, file)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, DatasetError) as error:
+        raise _useless(path, f"'{error}'" if str(error) else "another file") from error
+    raise _useless(path, "another document")
+
+
+def _useless(path: Path, found: str) -> UsageError:
+    return UsageError(
+        f"{path}: the noise could not be used: found {found}, needed an earlier result, its "
+        "result.json, or what legcal noise --json prints; correct --noise, or leave it out."
+    )
+
+
+def _of_result(found: dict[str, Any], file: Path) -> PredictedNoise:
+    """Return the noise of a result: what its outlines claim, times what its residuals show."""
+    residuals = found["residuals"]
+    scale, common = float(residuals["noise"]["scale"]), residuals["shared_px"]
+    sigma, correlation = DEFAULT_NOISE.sigma_px, DEFAULT_NOISE.correlation
+    table = file.parent / OBSERVATIONS_NAME
+    if table.is_file():
+        rows = read_table(table, "table", "outline", OUTLINE_COLUMNS)
+        used = np.array([verdict == "used" for verdict in rows.text("verdict")])
+        s00, s01, s11 = (rows.number(name)[used] for name in ("s00", "s01", "s11"))
+        ends = np.stack([rows.number(n)[used] for n in ("u0", "v0", "u1", "v1")], axis=-1)
+        length = np.linalg.norm(ends[:, 2:] - ends[:, :2], axis=1)
+        if len(length):
+            variance = 0.5 * (s00 + s11)
+            sigma = scale * float(np.median(np.sqrt(variance * length / 4.0)))
+            correlation = float(np.median(s01 / variance))
+    shared = tuple(float(common.get(kind, 0.0)) for kind in KINDS)
+    gamma = 0.0 if not any(shared) else DEFAULT_NOISE.gamma_px
+    return PredictedNoise(sigma, max(min(correlation, 0.9), -0.9), shared, gamma, str(file))
+
+
+def _of_repeats(found: dict[str, Any], file: Path) -> PredictedNoise:
+    """Return the noise of repeated images: their scatter; what they share does not show in it."""
+    spread = found["methods"]["detector"]["all"]["outline"]
+    sigma = float(spread["sd"])
+    sigma *= float(np.sqrt(_USUAL_LENGTH / 2.0))
+    return PredictedNoise(
+        sigma, DEFAULT_NOISE.correlation, DEFAULT_NOISE.common_px, DEFAULT_NOISE.gamma_px, str(file)
+    )

@@ -1,0 +1,168 @@
+"""A planned session: what is to be shot, and what to expect of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.brief import brief
+from legcal.calibration import KINDS, PlatformError
+from legcal.files import motion_to_xyz_quat
+from legcal.geometry import Array, BoolArray
+from legcal.machine import Configurations, Machine
+from legcal.planning.goals import Goal
+from legcal.planning.information import PredictedNoise
+from legcal.planning.places import Setting
+from legcal.planning.sight import Seen
+from legcal.version import __version__
+from legcal.vision import Board, Camera
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedView:
+    """A camera place and the images that are to be taken from it."""
+
+    name: str
+    T_base_camera: RigidTransform
+    poses: Configurations  # in the order in which they are to be taken
+    via: tuple[str, ...]  # where to go before each pose: "" straight there, else home or a pose
+    seen: Seen  # of the nominal machine, from the very place
+
+    @property
+    def shows(self) -> BoolArray:
+        """Which legs each image shows, (n_images, n_legs)."""
+        return self.seen.legs_in(len(self.poses.poses), self.poses.readings.shape[1])
+
+
+@brief
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A planned session.
+
+    Attributes
+    ----------
+    machine : Machine
+        The nominal model.
+    camera : Camera
+        The camera that was planned with.
+    views : tuple of PlannedView
+        Camera places, each with its poses. Of a camera in the hand every image is a view.
+    goal : Goal
+        What was made small.
+    value : float
+        The criterion of the session as planned [m; the determinant's root without a unit].
+    error : PlatformError or None
+        Expected error of the platform over the workspace, one standard deviation: the root mean
+        square over the draws; None where readings do not give its pose.
+    sigma : (p,) array
+        Expected standard deviation of each kinematic parameter [m, rad].
+    growth : (n, 2) array
+        Numbers of images, and the criterion with so many, in the order in which they help most;
+        beyond those planned as it goes on if more of their kind are taken.
+    limits : dict
+        By what errors a plan of any size is limited: the criterion [m] if each were not there.
+    """
+
+    machine: Machine
+    camera: Camera
+    setting: Setting
+    noise: PredictedNoise
+    sigma_q: float  # [m] of a reading
+    goal: Goal
+    views: tuple[PlannedView, ...]
+    value: float
+    error: PlatformError | None
+    sigma: Array
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    growth: Array
+    limits: dict[str, float]
+    seed: int = 0
+    board: Board | None = None  # on the base, in every image
+    hand_held: bool = False
+    given: str = ""  # the dataset that it adds to
+    notes: tuple[str, ...] = ()
+
+    @property
+    def n_images(self) -> int:
+        """Number of photographs."""
+        return sum(len(view.poses.poses) for view in self.views)
+
+    @property
+    def sentence(self) -> str:
+        """What is expected, in words."""
+        if self.error is None:
+            return "The error of the platform is not predicted: readings do not give its pose."
+        return (
+            f"Expected of {self.n_images} photographs: predicted error "
+            f"{1e3 * self.error.mean_displacement:.3f} mm / "
+            f"{np.degrees(self.error.mean_rotation):.4f} deg (1 sigma) over the workspace, the "
+            f"mean of {self.setting.draws} sessions with tripods up to "
+            f"{1e2 * self.setting.shift:g} cm and {np.degrees(self.setting.turn):g} deg off and "
+            f"the machine {1e3 * self.setting.length:g} mm."
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return the document of ``legcal plan --json``, which ``plan.json`` holds."""
+        error, names = self.error, self.machine.leg_names
+        return {
+            "legcal_plan": 1,
+            "legcal": __version__,
+            "mechanism": self.machine.name,
+            "images": self.n_images,
+            "seed": self.seed,
+            "criterion": self.goal.value,
+            "value": self.value,
+            "expected": None
+            if error is None
+            else {
+                "dX_m": error.mean_displacement,
+                "dE_rad": error.mean_rotation,
+                "dX_max_m": error.max_displacement,
+                "dE_max_rad": error.max_rotation,
+            },
+            "tolerance": {
+                "camera_m": self.setting.shift,
+                "camera_rad": self.setting.turn,
+                "machine_m": self.setting.length,
+                "machine_rad": self.setting.angle,
+                "draws": self.setting.draws,
+            },
+            "noise": {
+                "sigma_px": self.noise.sigma_px,
+                "correlation": self.noise.correlation,
+                "common_px": dict(zip(KINDS, self.noise.common_px, strict=True)),
+                "gamma_px": self.noise.gamma_px,
+                "source": self.noise.source,
+            },
+            "board": self.board is not None,
+            "hand_held": self.hand_held,
+            "given": self.given or None,
+            "views": {
+                view.name: {
+                    "T_base_camera": motion_to_xyz_quat(view.T_base_camera),
+                    "images": len(view.poses.poses),
+                    "legs": dict(zip(names, view.shows.sum(axis=0).tolist(), strict=True)),
+                }
+                for view in self.views
+            },
+            "parameters": [
+                {"name": name, "sigma": sigma, "unit": unit}
+                for name, sigma, unit in zip(
+                    self.names, self.sigma.tolist(), self.units, strict=True
+                )
+            ],
+            "growth": [{"images": int(n), "value": float(x)} for n, x in self.growth],
+            "limits": self.limits,
+            "notes": list(self.notes),
+        }
+
+
+def views_in_words(views: Sequence[PlannedView]) -> str:
+    """Return how many images from how many places, in words."""
+    n = sum(len(view.poses.poses) for view in views)
+    return f"{n} photographs from {len(views)} place{'s' * (len(views) != 1)}"

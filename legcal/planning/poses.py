@@ -1,0 +1,132 @@
+"""Poses that a session may use: the machine can take them, however far it is off its model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from legcal.calibration import FittedLegs, poses_at_readings
+from legcal.errors import DidNotConverge
+from legcal.estimation import Frames
+from legcal.geometry import Array, BoolArray
+from legcal.machine import (
+    Configurations,
+    Feasibility,
+    Leg,
+    LegKind,
+    Machine,
+    feasible_poses,
+    follow,
+    motor_travel,
+    moved_legs,
+    platforms_in_base,
+    poses_at,
+    slider_columns,
+)
+from legcal.planning.places import Setting
+from legcal.progress import Report, no_progress
+
+N_REACHING = 10  # machines that must reach a pose
+N_NEAR = 3  # poses that are tried near each
+_MIN_SHARE = 0.2  # of the poses that are drawn, to be of use
+_MOST_MOVED = 0.1  # of the length of a leg, by which errors of the machine move a pose
+_CLOSED = 1e-7  # [m]
+_HALF_WAY = 0.5  # least step to a pose nearby
+
+
+def candidate_poses(
+    machine: Machine,
+    legs: FittedLegs,
+    setting: Setting,
+    n: int,
+    rng: np.random.Generator,
+    progress: Report = no_progress,
+) -> Configurations:
+    """Return poses that the machine can take, half of them extreme.
+
+    Raises DidNotConverge if there are too few.
+    """
+    found: list[Array] = []
+    for extreme in (True, False):
+        drawn = feasible_poses(machine, n // 2, rng, extreme=extreme, progress=progress)
+        kept = surely_reached(machine, legs, setting, drawn)
+        found += [drawn.configurations[k] for k in np.flatnonzero(kept)]
+    if len(found) < max(_MIN_SHARE * n, 1):
+        raise DidNotConverge(
+            f"{machine.yaml_path}: no session could be planned: found {len(found)} of {n} poses "
+            "that the machine still reaches at the same readings if its joints are "
+            f"{1e3 * setting.length:g} mm off, needed {_MIN_SHARE * n:.0f}; check legcal.home and "
+            "the limits of the joints, or say with --model-error that it is known better."
+        )
+    return poses_at(machine, found)
+
+
+def surely_reached(
+    machine: Machine, legs: FittedLegs, setting: Setting, poses: Configurations
+) -> BoolArray:
+    """Return which poses machines reach, at the same readings, that are as far off as they may be.
+
+    Beside a singularity, or at the border of what legs can do, small errors decide that.
+    """
+    reached = np.ones(len(poses.poses), dtype=np.bool_)
+    if not machine.is_determined or not len(reached):
+        return reached
+    rng, nearby = np.random.default_rng(0), platforms_in_base(machine, poses.poses)
+    measured = [j for j, leg in enumerate(machine.legs) if leg.kind is not LegKind.PASSIVE]
+    t_nearby = Frames.of(nearby).t
+    for _ in range(N_REACHING):
+        drawn = drawn_legs(legs, setting, rng)
+        R, t = Frames.of(poses_at_readings(machine, drawn, poses.readings, nearby))
+        ends = np.swapaxes(R @ np.array([leg.B for leg in drawn]).T, 1, 2) + t[:, None]
+        length = np.linalg.norm(ends - np.array([leg.A for leg in drawn]), axis=2)
+        wanted = machine.sign * poses.readings + [leg.q0 for leg in drawn]
+        off = np.abs(length - wanted)[:, measured].max(axis=1)
+        moved = np.linalg.norm(t - t_nearby, axis=1)
+        reached &= (off < _CLOSED) & (moved < _MOST_MOVED * length.mean())
+    return reached
+
+
+def drawn_legs(legs: FittedLegs, setting: Setting, rng: np.random.Generator) -> tuple[Leg, ...]:
+    """Return legs as they may be, within the prior errors of the machine."""
+    found = legs.parametrization
+    size = np.where([unit == "m" for unit in found.units], setting.length, setting.angle)
+    size = size * np.array([not name.endswith(".twist") for name in found.names])
+    return moved_legs(legs.nominal, found.place, size * rng.uniform(-1.0, 1.0, len(size)))
+
+
+def poses_near(
+    machine: Machine,
+    legs: FittedLegs,
+    setting: Setting,
+    poses: Configurations,
+    step: float,  # of the travel
+    rng: np.random.Generator,
+) -> Configurations:
+    """Return poses, and others a little beside them that the machine can take."""
+    feasibility = Feasibility(machine)
+    columns = slider_columns(machine, machine.motors)[0]
+    lower, upper = motor_travel(machine)
+    found: list[Array] = []
+    for configuration in poses.configurations:
+        for _ in range(N_NEAR if machine.is_determined else 0):
+            q = configuration[columns] + step * (upper - lower) * rng.normal(size=len(columns))
+            q = np.clip(q, lower, upper)
+            try:
+                there = follow(machine, configuration, q, min_step=_HALF_WAY)
+            except DidNotConverge:
+                continue
+            if feasibility.problem(there, of_motors=False) is None:
+                found.append(there)
+    if not found:
+        return poses
+    kept = surely_reached(machine, legs, setting, poses_at(machine, found))
+    more = [found[k] for k in np.flatnonzero(kept)]
+    return poses_at(machine, [*poses.configurations, *more])
+
+
+def some_of(poses: Configurations, which: Sequence[int]) -> Configurations:
+    """Return some of the poses, in that order."""
+    index = np.array(which, dtype=np.intp)
+    chosen = [poses.poses[i] for i in which]
+    return Configurations(poses.configurations[index], poses.readings[index], chosen)

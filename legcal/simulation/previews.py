@@ -1,0 +1,37 @@
+"""A small photograph of a machine as a camera will see it, before anybody takes one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.machine import Configurations, Machine
+from legcal.simulation.rendering.appearance import Appearance
+from legcal.simulation.rendering.scene import prepare_view
+from legcal.simulation.solids import dressed, pose_machine
+from legcal.vision import Camera
+
+_WIDTH = 400  # [px]
+
+
+def preview(
+    machine: Machine,
+    camera: Camera,
+    T_base_camera: RigidTransform,
+    poses: Configurations,
+) -> bytes:
+    """Return a JPEG of a machine in the first of some poses, without noise and clutter."""
+    scale = min(_WIDTH / camera.width, 1.0)
+    K = camera.K * [[scale], [scale], [1.0]]
+    small = replace(
+        camera, K=K, width=round(camera.width * scale), height=round(camera.height * scale)
+    )
+    first = Configurations(poses.configurations[:1], poses.readings[:1], poses.poses[:1])
+    (posed,) = pose_machine(machine, dressed(machine), first)
+    rng = np.random.default_rng(0)
+    look = replace(Appearance(), clutter=0)
+    image = prepare_view(posed.solids, small, T_base_camera, look, rng).render(posed.solids, rng)
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
