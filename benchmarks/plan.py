@@ -204,15 +204,15 @@ def shot(machine: Machine, plan: Plan, session: Path, level: Level, runs: int) -
     if expected is None:
         raise NotIdentifiable("Readings do not give the pose, needed another machine.")
     rms = {
-        key: float(np.sqrt(np.mean(np.square(np.array(x)))))
-        for key, x in (("found", dX), ("stated", stated), ("expected", expected.displacement))
+        key: float(np.sqrt(np.mean(np.square(np.concatenate(x)))))
+        for key, x in (("found", dX), ("stated", stated), ("expected", [expected.displacement]))
     }
     return {
         "runs": runs,
         "failed": failed,
         "predicted_mm": 1e3 * expected.mean_displacement,
-        "mean_mm": 1e3 * float(np.mean(dX)),
-        "mean_deg": float(np.degrees(np.mean(dE))),
+        "mean_mm": 1e3 * float(np.mean(np.concatenate(dX))),
+        "mean_deg": float(np.degrees(np.mean(np.concatenate(dE)))),
         "worst_mm": 1e3 * max(float(x.mean()) for x in dX),
         "found_over_predicted": rms["found"] / rms["expected"],
         "stated_over_predicted": rms["stated"] / rms["expected"],

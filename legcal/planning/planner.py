@@ -47,7 +47,7 @@ ROUNDS = 2  # of polishing, each with half the steps of the one before
 POSE_STEP = 0.08  # of the travel
 PLACE_STEP = 0.06  # of the distance
 N_NEAR_PLACES = 8
-_NOTHING_KNOWN = 0.1  # of a length, from which on a direction counts as not determined
+_LEAST_ERROR = 1e-3  # [m]: a session that leaves more, and more than the model, is refused
 _CONTINUED = (1.5, 2.0, 3.0, 4.0, 8.0, 16.0)  # times the planned images
 _MOST_NEEDED = 100  # images that are looked at to say how many would do
 
@@ -444,8 +444,7 @@ def _refuse_undetermined(
     basis: Array,
 ) -> None:
     """Refuse a session that leaves a direction open that matters, and say how many images do."""
-    joints = np.array([leg.A for leg in task.predictor.legs.nominal])
-    most = _NOTHING_KNOWN * float(np.linalg.norm(joints, axis=1).mean())
+    most = max(task.setting.length, _LEAST_ERROR)
 
     def off(S: Array) -> Array:
         """Return the error of the platform, or the criterion where readings give no pose."""
@@ -465,7 +464,7 @@ def _refuse_undetermined(
         _MOST_NEEDED,
         is_enough=lambda error: error < most,
     )
-    n = len(more.images)
+    n = max(len(more.images), task.n_images + 1)
     places = f"{task.n_views} place{'s' * (task.n_views != 1)}"
     remedy = (
         f"plan {n} --images or more" if more.value < most else "plan more --cameras, or --board"
@@ -473,7 +472,8 @@ def _refuse_undetermined(
     needed = f"at least {n}" if more.value < most else "more places"
     raise NotIdentifiable(
         f"{task.machine.yaml_path}: no session could be planned: found that {task.n_images} "
-        f"images from {places} leave the machine undetermined, needed {needed}; {remedy}."
+        f"images from {places} tell less of the machine than its model does, needed {needed}; "
+        f"{remedy}."
     )
 
 
