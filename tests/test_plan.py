@@ -1,17 +1,29 @@
 """Planned sessions: what they hold, what they promise, and what is refused."""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 import legcal
 from legcal import planning
 from legcal.data import load_dataset
-from legcal.machine import inverse_kinematics, load_mechanism
+from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
+from legcal.machine import (
+    Feasibility,
+    follow,
+    inverse_kinematics,
+    load_mechanism,
+    slider_columns,
+)
 from legcal.planning import Setting
-from legcal.simulation import Level, SimulationSettings, simulate
+from legcal.planning.exchange import Session
+from legcal.planning.planner import Scene, Task
+from legcal.simulation import Level, ParameterErrors, SimulationSettings, simulate
 
 FEW = Setting(draws=4)
 
@@ -19,7 +31,10 @@ FEW = Setting(draws=4)
 @pytest.fixture(scope="module")
 def planned() -> planning.Plan:
     """A plan for outlines with white noise."""
-    return legcal.plan("3-rpr", images=6, cameras=2, seed=3, noise=planning.WHITE, setting=FEW)
+    bounds = planning.parse_bounds("0m:2m,-2m:2m,0.5m:2m")
+    return legcal.plan(
+        "3-rpr", images=6, cameras=2, seed=3, noise=planning.WHITE, setting=FEW, bounds=bounds
+    )
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +42,7 @@ def shot(planned: planning.Plan, tmp_path_factory: pytest.TempPathFactory) -> Pa
     """A simulated session of it, beside the plan."""
     folder = tmp_path_factory.mktemp("planned")
     planning.write_session(planned, folder / "session")
-    settings = replace(SimulationSettings(seed=5), plan=folder / "session", level=Level.OUTLINES)
+    settings = SimulationSettings(seed=5, plan=folder / "session", level=Level.OUTLINES)
     simulate(load_mechanism("3-rpr"), folder / "shot", settings)
     return folder
 
@@ -47,10 +62,168 @@ def test_a_planned_session_is_a_dataset_and_simulation_shoots_it(
     assert taken.view.tolist() == m.view.tolist()
 
 
-def test_the_expected_error_is_that_of_a_calibration(planned: planning.Plan, shot: Path) -> None:
+def test_the_expected_error_is_that_of_a_calibration_which_says_so(
+    planned: planning.Plan, shot: Path
+) -> None:
     found = legcal.calibrate(shot / "shot", output=shot / "out")
     assert found.platform is not None
     assert found.platform.workspace is not None
     assert planned.error is not None
     stated = found.platform.workspace.mean_displacement
     assert planned.error.mean_displacement == pytest.approx(stated, rel=0.25)
+    assert any("times the plan" in note for note in found.notes)
+
+
+def places(folder: Path, **more: Any) -> Path:
+    """Write a list of four places around the 3-RPR that look at it, and others."""
+    around = {f"t{k}": {"xyz": [np.cos(k), np.sin(k), 1.4]} for k in range(0, 8, 2)}
+    text = {"places": {k: {"xyz": [float(x) for x in v["xyz"]]} for k, v in around.items()} | more}
+    (folder / "places.yaml").write_text(yaml.safe_dump(text))
+    return folder / "places.yaml"
+
+
+def test_places_of_a_list_are_chosen_the_same_for_the_same_seed(tmp_path: Path) -> None:
+    plans = [
+        legcal.plan("3-rpr", images=4, cameras=2, places=places(tmp_path), setting=FEW, seed=1)
+        for _ in range(2)
+    ]
+    assert plans[0].document() == plans[1].document()
+    chosen = {view.name: view.T_base_camera.translation for view in plans[0].views}
+    assert len(chosen) == 2
+    for name, where in chosen.items():
+        k = int(name[1:])
+        np.testing.assert_allclose(where, [np.cos(k), np.sin(k), 1.4])
+
+
+def test_a_better_known_machine_is_what_more_images_and_a_given_session_make(
+    planned: planning.Plan, shot: Path, tmp_path: Path
+) -> None:
+    assert np.all(np.diff(planned.growth[:, 1]) < 0.0)
+    more = legcal.plan(
+        "3-rpr", images=2, cameras=1, places=places(tmp_path), given=shot / "session",
+        noise=planning.WHITE, setting=FEW,
+    )  # fmt: skip
+    assert more.error is not None
+    assert planned.error is not None
+    assert more.error.mean_displacement < planned.error.mean_displacement
+    assert not {view.name for view in more.views} & {view.name for view in planned.views}
+
+
+def test_what_is_seen_is_what_the_simulation_shows(planned: planning.Plan, tmp_path: Path) -> None:
+    """By another code, which casts rays at solids and draws silhouettes by their tangents."""
+    exact = replace(planned, setting=replace(FEW, shift=0.0, turn=0.0))
+    planning.write_session(exact, tmp_path / "session")
+    settings = SimulationSettings(
+        errors=ParameterErrors(), plan=tmp_path / "session", level=Level.OUTLINES, sigma_px=0.0
+    )
+    simulate(load_mechanism("3-rpr"), tmp_path / "shot", settings)
+    found = load_dataset(tmp_path / "shot").observations
+    assert found is not None
+    both = zip(found.row_keys(), found.h, found.ends, strict=True)
+    lines = {key: (h, ends) for key, h, ends in both}
+    row, agreeing, missing = 0, 0, 0
+    for view in planned.views:
+        of_view = view.seen.outlines(0.1, row + np.arange(len(view.poses.poses)))
+        for key, h, ends in zip(of_view.row_keys(), of_view.h, of_view.ends, strict=True):
+            if key not in lines:
+                missing += 1
+                continue
+            agreeing += 1
+            np.testing.assert_allclose(lines[key][0], h, atol=2e-5)
+            shown = np.linalg.norm(ends[1] - ends[0])
+            assert np.linalg.norm(lines[key][1][1] - lines[key][1][0]) > 0.6 * shown
+        row += len(view.poses.poses)
+    assert missing <= 0.1 * agreeing
+
+
+def test_the_way_between_planned_poses_is_free(planned: planning.Plan) -> None:
+    machine = planned.machine
+    feasibility, columns = Feasibility(machine), slider_columns(machine, machine.motors)[0]
+    for view in planned.views:
+        stations = [machine.home_configuration, *view.poses.configurations]
+        for k, via in enumerate(view.via):
+            stops = [stations[k]]
+            if via:
+                stops.append(stations[0 if via == "home" else int(via)])
+            stops.append(stations[k + 1])
+            for here, there in pairwise(stops):
+                for part in np.linspace(0.1, 1.0, 10):
+                    q = here[columns] + part * (there - here)[columns]
+                    at = follow(machine, here, q)
+                    assert feasibility.problem(at, of_motors=False) is None
+
+
+def test_updates_of_the_covariance_are_those_of_the_information(planned: planning.Plan) -> None:
+    task = Task(
+        planning.Predictor(planned.machine, planned.camera, planning.DEFAULT_NOISE, 2e-6), 6, 1
+    )
+    view = planned.views[0]
+    candidates = planning.Candidates(planning.Place(view.T_base_camera), view.poses)
+    found = Scene.nominal(task).of(candidates)
+    assert found is not None
+    session = Session([found])
+    one_more = session.with_one_more(0, np.array([0, 1]))
+    session.changed(0, 1, 1.0)
+    np.testing.assert_allclose(session.machine, one_more[1], rtol=1e-6, atol=1e-15)
+    updated = session.covariance.copy()
+    session.renewed()
+    sigma = np.sqrt(np.diagonal(session.covariance))
+    assert np.abs((updated - session.covariance) / np.outer(sigma, sigma)).max() < 1e-6
+
+
+REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
+    ({"images": 0}, UsageError, "--images 0"),
+    ({"images": 401}, UsageError, "1 to 400"),
+    ({"images": 9, "images_per_view": 3}, UsageError, "images per view"),
+    ({"images": 9, "target": 1e-4}, UsageError, "--target"),
+    ({"images": 2, "cameras": 3}, UsageError, "3 --images"),
+    ({"cameras": 0}, UsageError, "--cameras 0"),
+    ({"criterion": "best"}, UsageError, "mean, worst, d, parameters"),
+    ({"criterion": "d", "target": 1e-4}, UsageError, "leave out --criterion"),
+    ({"target": -1.0}, UsageError, "0 to 1 m"),
+    ({"hand_held": True, "cameras": None}, UsageError, "--board"),
+    ({"hand_held": True, "board": "chessboard:9x6:25mm", "cameras": 2}, UsageError, "--cameras"),
+    ({"board": "chessbord:9x6"}, UsageError, "chessbord"),
+    ({"given": "nowhere"}, DatasetError, "nowhere"),
+    ({"noise": "nowhere"}, UsageError, "--noise"),
+    ({"places": "nowhere.yaml"}, DatasetError, "nowhere.yaml"),
+    ({"setting": Setting(draws=0)}, UsageError, "one draw"),
+    ({"setting": Setting(length=0.5), "images": 4}, DidNotConverge, "--model-error"),
+    ({"bounds": np.array([[5.0, 6.0]] * 3), "images": 4}, NotVisible, "wider bounds"),
+]
+
+
+@pytest.mark.parametrize(("asked", "error", "named"), REFUSED, ids=lambda x: str(x)[:40])
+def test_what_cannot_be_planned_is_refused(
+    asked: dict[str, Any], error: type[legcal.LegcalError], named: str
+) -> None:
+    with pytest.raises(error) as refusal:
+        legcal.plan("3-rpr", **({"cameras": 2} | asked))
+    assert len(refusal.value.problems) == 1
+    assert named in str(refusal.value)
+
+
+def test_what_else_is_in_the_way_is_refused(
+    planned: planning.Plan, shot: Path, tmp_path: Path
+) -> None:
+    def refused(error: type[legcal.LegcalError], named: str, **asked: Any) -> None:
+        of: dict[str, Any] = {"model": "3-rpr", "images": 4, "cameras": 1, "setting": FEW}
+        with pytest.raises(error, match=named):
+            legcal.plan(**(of | asked))
+
+    away = {"xyz": [0.0, 0.0, 3.0], "quat_xyzw": [0.0, 0.0, 0.0, 1.0]}
+    (tmp_path / "away.yaml").write_text(yaml.safe_dump({"places": {"a": away}}))
+    refused(NotVisible, "0 of 1 camera places", places=tmp_path / "away.yaml")
+    refused(UsageError, "found 1 places for 2", places=tmp_path / "away.yaml", cameras=2)
+    refused(UsageError, "leg9.base.x", criterion="parameters", parameters=["leg9.base.x"],
+            places=places(tmp_path))  # fmt: skip
+    refused(NotIdentifiable, "plan .* --images or more", images=1, places=places(tmp_path))
+    refused(DatasetError, "needed images of 3-rps", model="3-rps", given=shot / "session")
+    with pytest.raises(UsageError, match="--force"):
+        planning.write_session(planned, shot / "session")
+    for text in ("1m", "0m:1m,0m:1m,1m:0m", "0m:1m,0m:1m,0m:1kg"):
+        with pytest.raises(UsageError, match="--bounds"):
+            planning.parse_bounds(text)
+    (shot / "session" / "images").mkdir()
+    with pytest.raises(UsageError, match="photographs"):
+        planning.write_session(planned, shot / "session", force=True)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from legcal.calibration.closeness import closeness
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit import (
@@ -65,7 +66,7 @@ def judge(
         steps,
         platform,
         verdict,
-        tuple(notes),
+        (*notes, *closeness(dataset.folder, measurements.n_rows, platform)),
         held_out,
         corners,
         tuple(diagnosis),

@@ -178,7 +178,8 @@ class Predictor:
         if problem.parameters.n_tied:
             untied = null_space(problem.parameters.tie_rows(state.legs)[1])
         basis = np.zeros((len(problem.free), untied.shape[1]))
-        basis[problem.free] = untied
+        # Steps of an axis count in its tangent plane, parameters as angles from the nominal one.
+        basis[problem.free] = problem.parameters.jacobian(state.legs) @ untied
         rows = np.concatenate([kept[..., :k] @ untied, kept[..., k:]], axis=2)
         whole = block_diag(untied.T @ prior[:k, :k] @ untied, prior[k:, k:])
         named = *(f"{KINEMATIC} {i}" for i in range(untied.shape[1])), *names[k:]

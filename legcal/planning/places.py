@@ -17,7 +17,16 @@ from pydantic import Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import NotVisible, UsageError
-from legcal.files import FileSchema, PlainName, Quaternion, Vector, read_yaml, validate
+from legcal.files import (
+    LENGTH,
+    FileSchema,
+    PlainName,
+    Quaternion,
+    Vector,
+    parse_quantity,
+    read_yaml,
+    validate,
+)
 from legcal.geometry import Array, cross, motion_of, normal_basis
 from legcal.machine import Machine
 from legcal.vision import Camera, in_picture
@@ -191,21 +200,25 @@ def places_along(
 
 def parse_bounds(text: str) -> Array:
     """Return bounds (3, 2) [m] of a text ``-2:2,-2:2,0:1.5``."""
-    from legcal.files import LENGTH, parse_quantity
-
     parts = [part.split(":") for part in text.split(",")]
     if len(parts) != 3 or any(len(part) != 2 for part in parts):
         raise UsageError(
             f"--bounds could not be used: found '{text}', needed lowest and highest x, y and z of "
             "the camera in the base link; write them like -2m:2m,-2m:2m,0m:1.5m."
         )
-    found = np.array([[parse_quantity(x, LENGTH, "--bounds") for x in part] for part in parts])
+    found = np.array([[_coordinate(x.strip()) for x in part] for part in parts])
     if np.any(found[:, 0] >= found[:, 1]):
         raise UsageError(
             f"--bounds could not be used: found '{text}', needed the lower number first in each "
             "pair; exchange them."
         )
     return found
+
+
+def _coordinate(text: str) -> float:
+    """Return a coordinate [m], which may be negative."""
+    size = parse_quantity(text.removeprefix("-"), LENGTH, "--bounds")
+    return -size if text.startswith("-") else size
 
 
 def near(place: Place, target: Array, up: Array, step: float, rng: np.random.Generator) -> Place:

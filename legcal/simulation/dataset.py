@@ -20,7 +20,7 @@ from legcal.data import (
     write_observations,
 )
 from legcal.errors import UsageError
-from legcal.files import output_path
+from legcal.files import MAX_DOCUMENT, output_path, read_bytes
 from legcal.geometry import Array
 from legcal.machine import Machine, load_mechanism, write_model
 from legcal.progress import Progress, Report, shown_progress
@@ -36,6 +36,7 @@ from legcal.simulation.folder import (
     write_truth,
 )
 from legcal.simulation.observe import corners_in_images
+from legcal.simulation.planned import PLAN
 from legcal.simulation.poses import are_extreme
 from legcal.simulation.request import Level
 from legcal.simulation.session import (
@@ -161,6 +162,8 @@ def simulate(
             write_corners(folder / CORNERS_NAME, session.corners, m)
         if settings.level is Level.PHOTOGRAPHS:
             _write_photographs(folder, session, settings, rngs, workers, report)
+        if settings.plan is not None:
+            (folder / PLAN).write_bytes(read_bytes(settings.plan / PLAN, MAX_DOCUMENT))
         files = [*files_in(folder), TRUTH_NAME]
         write_truth(folder / TRUTH_NAME, session, settings, files)
     seen = [[leg.is_seen for leg in shown] for shown in session.scene.images.shown]

@@ -42,6 +42,7 @@ from legcal.files import (
 )
 from legcal.machine import LegKind, Machine, main_cylinders
 from legcal.simulation.board import documents
+from legcal.simulation.planned import PLAN
 from legcal.simulation.session import SimulatedSession
 from legcal.simulation.settings import SimulationSettings
 from legcal.version import __version__
@@ -51,7 +52,7 @@ TRUTH = "truth"
 TRUTH_NAME = f"{TRUTH}/truth.json"
 _FOLDERS = ("images", "models", "urdf", TRUTH)
 _TABLES = ("measurements.csv", OBSERVATIONS_NAME, AXES_NAME, CORNERS_NAME)
-_FILES = ("dataset.yaml", *_TABLES, "camera_info*.yaml")
+_FILES = ("dataset.yaml", *_TABLES, "camera_info*.yaml", PLAN)
 SIMULATED = OutputKind("dataset", TRUTH_NAME, "legcal_truth")
 
 

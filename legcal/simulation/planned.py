@@ -14,7 +14,7 @@ from legcal.files import read_json
 from legcal.machine import Configurations, Machine, follow, poses_at, slider_columns
 from legcal.simulation.visibility import Viewpoint
 
-_PLAN = "plan.json"
+PLAN = "plan.json"  # of the session that is shot
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +72,11 @@ class PlannedSession:
 def read_plan(folder: Path, nominal: Machine) -> PlannedSession:
     """Return a planned session of a machine. Raises UsageError if it is none, or of another one."""
     try:
-        tolerance = read_json(folder / _PLAN)["tolerance"]
+        tolerance = read_json(folder / PLAN)["tolerance"]
         shift, turn = float(tolerance["camera_m"]), float(tolerance["camera_rad"])
     except (OSError, ValueError, KeyError, TypeError, DatasetError) as error:
         raise UsageError(
-            f"{folder}: the plan could not be shot: found no {_PLAN} of legcal in it, needed the "
+            f"{folder}: the plan could not be shot: found no {PLAN} of legcal in it, needed the "
             "folder that legcal plan wrote; correct --plan."
         ) from error
     dataset = load_dataset(folder, check_images=False)

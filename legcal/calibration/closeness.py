@@ -1,0 +1,39 @@
+"""How close a calibration came to what `legcal plan` expected of its session."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from legcal.calibration.joint_fit import PlatformAccuracy
+from legcal.errors import DatasetError
+from legcal.files import read_json
+
+PLAN_NAME = "plan.json"
+AS_PLANNED = 1.3  # times the error that was expected: no more needs no remark on light
+
+
+def closeness(folder: Path, n_images: int, platform: PlatformAccuracy | None) -> tuple[str, ...]:
+    """Return a sentence on a planned session; nothing where a dataset was not planned."""
+    try:
+        plan = read_json(folder / PLAN_NAME)
+        planned, expected = int(plan["images"]), plan["expected"]
+        dX, dE = float(expected["dX_m"]), float(expected["dE_rad"])
+    except (OSError, ValueError, KeyError, TypeError, DatasetError):
+        return ()
+    if platform is None or platform.workspace is None or not dX > 0.0:
+        return ()
+    found = platform.workspace
+    ratio = found.mean_displacement / dX
+    sentence = (
+        f"Planned was {1e3 * dX:.3f} mm / {np.degrees(dE):.4f} deg over the workspace with "
+        f"{planned} images; {n_images} images came to {1e3 * found.mean_displacement:.3f} mm / "
+        f"{np.degrees(found.mean_rotation):.4f} deg, {ratio:.2f} times the plan."
+    )
+    if ratio > AS_PLANNED:
+        sentence += (
+            " Images that are missing or show fewer legs, or edges that are noisier than planned, "
+            "make the difference: see legcal detect, and plan with --noise of this result."
+        )
+    return (sentence,)
