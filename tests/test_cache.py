@@ -226,6 +226,19 @@ def test_rows_of_a_removed_image_do_not_matter(folder: Folder) -> None:
     assert len(plan.keep) == 0
 
 
+def test_a_table_of_edited_rows_alone_does_not_stand_for_all_that_was_found(
+    folder: Folder,
+) -> None:
+    dataset = _store(folder)
+    edited = _edited(_hexapod_outlines(rows=(1,)))
+    names = dataset.machine.leg_names
+    write_observations(folder.path / OBSERVATIONS_NAME, edited, dataset.measurements, names)
+    plan = _plan(folder)
+    assert plan.detect.tolist() == list(ALL)
+    assert plan.keep.row_keys() == edited.row_keys()
+    assert is_edited(plan.keep).all()
+
+
 def test_given_rows_are_remembered_by_their_image(folder: Folder) -> None:
     _give(folder, (0, 2))
     dataset, plan = load_dataset(folder.path), _plan(folder)
@@ -294,6 +307,7 @@ def test_the_file_is_as_documented(folder: Folder) -> None:
         "fingerprint": "abc",
         "given": [["c1", "images/c1_1.png"]],
         "notes": ["view c1: a note."],
+        "outlines": len(_hexapod_outlines()),
     }
     again = load_dataset(folder.path)
     assert plan_dataset(again, "abc").notes == ("view c1: a note.",)

@@ -40,6 +40,7 @@ class CacheEntry(FileSchema):
     fingerprint: str  # of all that the detected outlines in the table came from
     given: list[tuple[str, str]]  # the images whose outlines the user gave; they are never detected
     notes: tuple[str, ...] = ()  # what was to be said of the images
+    outlines: int = 0  # rows of the table: one that has fewer is another, as that of edited rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +90,8 @@ def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
     given_names = set(entry.given) if entry else set()
     given = np.array([name in given_names for name in places(dataset.measurements)], dtype=np.bool_)
     recorded = entry.fingerprint if entry else None  # the format is part of the fingerprint
+    if entry and dataset.observations is not None and len(dataset.observations) < entry.outlines:
+        recorded = _INCOMPLETE
     plan = plan_detection(dataset.observations, has_image, recorded, current, given)
     if entry is None or recorded != current or len(plan.detect):
         return plan
@@ -173,6 +176,7 @@ def store_outlines(
         "fingerprint": _INCOMPLETE,
         "given": sorted(list(name) for name, is_given in names if is_given),
         "notes": list(notes),
+        "outlines": len(outlines),
     }
     path = dataset.folder / OBSERVATIONS_NAME
     try:
