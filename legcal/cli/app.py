@@ -81,6 +81,7 @@ for command in (
     calibrate,
     evaluate,
     locate,
+    view,
     export,
     new,
     init,
@@ -89,7 +90,6 @@ for command in (
     simulate,
     example,
     schema,
-    view,
 ):
     app.command()(command)
 app.command("import")(import_)

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from legcal.cli.options import loading, print_table
+from legcal.errors import printable
 from legcal.signals import forget_stop
 
 
@@ -37,13 +38,16 @@ def view(
 ) -> None:
     """Show a machine in the browser, moved by sliders: readings, pose, photographs, uncertainty."""
     with loading():
+        from rich.text import Text
+
         from legcal import viewer
 
         viewer.require_viser()
     address = viewer.Address(host, port)
     viewer.check_address(address)
     window = viewer.Window(viewer.open_source(source, dataset), address)
-    print_table(f"{window.source.name} is shown at {window.address}; Ctrl-C ends it.")
+    name = printable(window.source.name)
+    print_table(Text(f"{window.address} shows {name}; Ctrl-C ends it.", overflow="fold"))
     if browser and _has_screen():
         import webbrowser
 

@@ -17,7 +17,7 @@ from legcal.geometry import Array, BoolArray
 from legcal.viewer.source import Source
 from legcal.vision import Camera
 
-MAX_CAMERAS = 60
+MAX_CAMERAS = 200
 _SIDE = 720  # longer side of a photograph as it is shown [px]
 _RIM = 17  # points along each side of an image
 _WIDEST = 3.0  # tangent of half the field of view that is shown at most

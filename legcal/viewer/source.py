@@ -10,7 +10,7 @@ from legcal.calibration import EarlierResult
 from legcal.data import OBSERVATIONS_NAME, Dataset, load_dataset, read_outlines
 from legcal.errors import UsageError
 from legcal.exports import load_subject
-from legcal.machine import DATASET_YAML, Machine
+from legcal.machine import DATASET_YAML, Machine, shipped_names
 
 _MARKERS = (DATASET_YAML, "result.json", "calibrated.yaml", "robot.yaml")
 
@@ -43,11 +43,17 @@ def open_source(given: str | Path, dataset: str | Path | None = None) -> Source:
     Raises
     ------
     UsageError
-        If it is a folder that is none of the three, or a dataset is given beside another.
+        If it is not there, or a folder that is none of the three, or two datasets are given.
     DatasetError, ModelError, OutOfClass
         If its files cannot be used.
     """
     path = Path(given)
+    if not os.path.exists(path) and str(given) not in shipped_names():
+        raise UsageError(
+            f"{path}: nothing could be shown: found no such file or folder and no shipped model of "
+            "that name, needed a dataset, a result of legcal calibrate, a model, or one of "
+            f"{', '.join(shipped_names())}; check the path."
+        )
     if os.path.isdir(path) and not any(os.path.exists(path / name) for name in _MARKERS):
         raise UsageError(
             f"{path}: nothing could be shown: found a folder without {', '.join(_MARKERS[:-1])} or "
