@@ -5,9 +5,10 @@
 
 Images are those of the example, searched for edge pairs again and again; runs are those of ``legcal
 study paper``. Scheduler and workers are processes of their own over TCP on this machine, so that
-the scheduler takes its time from the same cores. Both ways take turns; the shortest times are
-compared. ``--send`` has the images sent, as where workers do not share the file system. Bytes are
-those of results and tasks as pickled, without what TCP and Dask add.
+the scheduler takes its time from the same cores. Both ways take turns, each in a process of its
+own; the shortest times are compared, without imports. ``--send`` has the images sent, as where
+workers do not share the file system. Bytes are those of results and tasks as pickled, without what
+TCP and Dask add.
 """
 
 import argparse
@@ -19,7 +20,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import partial
 from pathlib import Path
 from shutil import copytree
 
@@ -77,15 +77,25 @@ def _search(folder: Path) -> tuple[Callable[[int], object], list[int]]:
     return task, list(range(data.measurements.n_rows))
 
 
-def run_paper(n: int, workers: Workers) -> None:
+def run_paper(_folder: Path, n: int, workers: Workers) -> None:
     """Run the paper's study."""
     run_study(PaperStudy(), n, workers=workers)
 
 
-def _timed(work: Callable[[Workers], None], workers: Workers) -> float:
+WORKS = {"images": search_images, "runs": run_paper}
+
+
+def _timed(*words: object) -> float:
+    """Return the time of some work in a process of its own, without that of its imports [s]."""
+    command = [sys.executable, __file__, "--only", *map(str, words)]
+    found = subprocess.run(command, stdout=subprocess.PIPE, check=True)
+    return float(found.stdout)
+
+
+def _only(what: str, folder: str, n: str, workers: str) -> None:
     begin = time.perf_counter()
-    work(workers)
-    return time.perf_counter() - begin
+    WORKS[what](Path(folder), int(n), int(workers) if workers.isdecimal() else workers)
+    print(time.perf_counter() - begin)
 
 
 def main() -> None:
@@ -96,7 +106,11 @@ def main() -> None:
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--send", action="store_true")
+    parser.add_argument("--only", nargs=4, help="print the time of some work, without the rest")
     asked = parser.parse_args()
+    if asked.only:
+        _only(*asked.only)
+        return
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         data = copytree(EXAMPLE, folder / "own" / "data")
@@ -108,28 +122,28 @@ def main() -> None:
         size = np.mean([path.stat().st_size for path in (data / "images").iterdir()])
         print(f"image: task {len(pickle.dumps(task)) / 1e3:.0f} kB once for each worker, "
               f"result {result / 1e3:.1f} kB, file {size / 1e3:.0f} kB")  # fmt: skip
-        works = {
-            f"{asked.images} images": partial(search_images, data, asked.images),
-            f"{asked.runs} runs": partial(run_paper, asked.runs),
-        }
-        print(f"{'work':14s} workers  local/s  cluster/s  ratio  scheduler/s  scheduler/MB  own/MB")
+        print(
+            f"{'work':14s} workers  local/s  cluster/s  ratio  scheduler/s  scheduler/MB  worker/MB"
+        )
         for n_workers in asked.workers:
             with cluster(n_workers, folder) as (address, processes):
-                for what, work in works.items():
-                    run_paper(n_workers, address)  # libraries load
+                for what, n in (("images", asked.images), ("runs", asked.runs)):
+                    if not n:
+                        continue
+                    _timed(what, data, 20, address)  # libraries load
                     scheduler = processes[0]
                     busy = sum(scheduler.cpu_times()[:2])
                     times = np.array(
                         [
-                            [_timed(work, n_workers), _timed(work, address)]
+                            [_timed(what, data, n, k) for k in (n_workers, address)]
                             for _ in range(asked.repeat)
                         ]
                     )
                     local, there = times.min(axis=0)
                     busy = (sum(scheduler.cpu_times()[:2]) - busy) / asked.repeat
-                    memory = [p.memory_info().rss / 2**20 for p in (scheduler, psutil.Process())]
-                    print(f"{what:14s} {n_workers:7d} {local:8.1f} {there:10.1f} "
-                          f"{there / local:6.2f} {busy:12.1f} {memory[0]:13.0f} {memory[1]:7.0f}",
+                    memory = [p.memory_info().rss / 2**20 for p in processes[:2]]
+                    print(f"{n:7d} {what:6s} {n_workers:7d} {local:8.1f} {there:10.1f} "
+                          f"{there / local:6.2f} {busy:12.2f} {memory[0]:13.0f} {memory[1]:10.0f}",
                           flush=True)  # fmt: skip
 
 

@@ -29,6 +29,9 @@ MIN_SLOPE = (24.0, 80.0)  # of an edge, by the noise [8 levels/px of the stretch
 NOISE_LEVELS = 2.5  # this many times the median slope is no noise
 STRONG = 2.0  # slope with which an edge begins, in the least one with which it goes on
 STRIDE = 4  # every such row and column is enough for a median
+# Of a sector: borders lie beside multiples of 45 deg, which whole grey levels often give, and where
+# rounding, which is not the same on every CPU, would decide.
+_ASIDE = 1e-3
 N_SECTORS = 8  # of directions in which light changes along one edge
 MIN_PIXELS = 6  # of a piece
 MAX_SUBPIXEL = 0.6  # of the middle of an edge from that of its pixel [reduced px]
@@ -123,7 +126,7 @@ def _chains(at: IntArray, gradient: Samples, shape: tuple[int, ...]) -> IntArray
     i, j = links // len(neighbours), other.take(links).astype(np.intp)
     angle = np.arctan2(gradient[1], gradient[0]) * np.float32(0.5 * N_SECTORS / np.pi)
     begins, stops = [], []
-    for lay, shift in enumerate((0.0, 0.5)):
+    for lay, shift in enumerate((_ASIDE, 0.5 + _ASIDE)):
         sector = np.floor(angle + np.float32(shift)).astype(np.int8) % N_SECTORS
         same = np.flatnonzero(sector.take(i) == sector.take(j))
         begins.append(i.take(same) + lay * n)

@@ -54,7 +54,7 @@ from legcal.progress import Report
 from legcal.vision import look_alike, shared_cameras
 from legcal.workers import Run
 
-DETECTOR_VERSION = 6  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 7  # raise it whenever outlines or notes that are kept come out differently
 MEASURING = "Measuring outlines"  # a stage of progress
 TOO_SHORT = "px in the image"  # end of the reason for parts that are not looked for
 MIN_VIEWS = 2  # in which a part must show another radius than the model's
