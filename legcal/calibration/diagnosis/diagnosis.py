@@ -47,9 +47,9 @@ STAGE = "Trying common mistakes"
 _AGREE_ALREADY = 0.9  # of the images: then nothing common is wrong
 _MIN_IMAGES = 3  # of a group of views
 _FEW = 6  # images, at least, that say which mistakes are worth a closer look
-_ROUNDS = 2  # of such images, until they suit a mistake
 _SUITS = 0.5  # of the legs that they should show
-_STARTS, _FEW_STARTS = (1, 1, 2), (1,)  # images that suggest cameras, of all and of a few
+_STARTS = 1, 1, 2  # images that suggest cameras, of all
+_FEW_STARTS = (1,), (1, 1)  # of the first few, and of the next few if these suit no mistake
 _POOL = 3  # cameras of other mistakes that are tried
 _FINALISTS = 6  # mistakes that all images judge
 _NEAR_BEST = 0.5  # of the gain of the best, which few images gave, that all images judge as well
@@ -244,23 +244,20 @@ class _Judge:
         missing = [float((one.expected - one.support).sum()) for one in self.of_groups]
         left = np.argsort(-np.array(missing), kind="stable").tolist()
         gain, seen = np.zeros(len(tried)), list[Agreement]()
-        chosen = list(range(len(tried)))
-        done, total = 0, _ROUNDS * len(tried)
-        for _ in range(_ROUNDS):
+        done, total = 0, len(_FEW_STARTS) * len(tried)
+        for starts in _FEW_STARTS:
             n_images = 0
             while left and n_images < _FEW:
                 g = left.pop(0)
                 some = self.groups[g].some
                 seen.append(self.of_groups[g].at(some))
                 n_images += len(some)
-                gain += self._gains(tried, chosen, g)
-                done += len(chosen)
+                gain += self._gains(tried, g, starts)
+                done += len(tried)
                 self.data.progress(STAGE, min(done, total - 1), total)
             own = Agreement.joined(seen)
             if not left or _suits(gain.max() + own.support.sum(), own):
                 break
-            best_first = np.argsort(-gain, kind="stable")
-            chosen = np.sort(best_first[: max(len(chosen) // 2, _FINALISTS)]).tolist()
         found, amounts = list[int](), set[str]()
         left_for = {True: _FINALISTS, False: _FINALISTS // 2}  # whether of all views, or of some
         for k in np.argsort(-gain, kind="stable").tolist():
@@ -273,14 +270,18 @@ class _Judge:
                 amounts |= {tried[k].amount_of} - {""}
         return found
 
-    def _gains(self, tried: Sequence[Mistake], chosen: Sequence[int], g: int) -> Array:
-        """Return how many more legs a few images of a group show without some mistakes.
+    def _gains(self, tried: Sequence[Mistake], g: int, starts: Sequence[int]) -> Array:
+        """Return how many more legs a few images of a group show without each mistake.
 
         Cameras are tried where they are known roughly, and searched for where that suits none.
         """
         group, found = self.groups[g], np.zeros(len(tried))
         before = self.of_groups[g].at(group.some)
-        some = [k for k in chosen if not tried[k].true.is_as(self.given, group.rows, group.views)]
+        some = [
+            k
+            for k, one in enumerate(tried)
+            if not one.true.is_as(self.given, group.rows, group.views)
+        ]
         found[some] = -float(before.support.sum())
         support = np.zeros(len(tried))
 
@@ -298,10 +299,11 @@ class _Judge:
         cameras: dict[int, RigidTransform | None] = {}
         look(some, ())
         if not _suits(support.max(), before):
-            look([k for k in some if not tried[k].is_small], _FEW_STARTS)
+            look([k for k in some if not tried[k].is_small], starts)
             look([k for k in some if tried[k].is_small], ())
         best = int(np.argmax(support))
-        if _suits(support.max(), before) and (T_best := cameras[best]) is not None:
+        is_better = support[best] >= float(before.support.sum()) + _MIN_GAIN * before.expected.sum()
+        if is_better and (T_best := cameras[best]) is not None:
             worse = [k for k in some if support[k] < _ALIKE * support[best]]
             look([k for k in worse if not tried[k].is_small], (), self._alike(T_best))
         return found + support
