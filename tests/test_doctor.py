@@ -36,6 +36,8 @@ def test_nothing_stands_against_the_example(tmp_path: Path) -> None:
     assert found.is_ready
     assert found.is_usable
     assert {one.severity for one in found.findings} == {"note"}
+    (untried,) = found_of(found, "mistakes", "note")
+    assert "found at most 2 images of a view, needed 3 or more" in untried.what
     assert [one.name for one in found.checks] == list(CHECKS)
     assert {one.state for one in found.checks} <= {"ok", "note"}
     assert [one.images for one in found.views] == [2, 2, 2]

@@ -17,12 +17,14 @@ import legcal
 from legcal.calibration import joints_in_links
 from legcal.calibration.change_detection import possible_changes
 from legcal.calibration.documents import Kinematic, ParameterRow
+from legcal.calibration.link_joints import weak_in_links
 from legcal.geometry import Array
 from legcal.machine import (
     Machine,
     geometries,
     load_mechanism,
     moved_legs,
+    nominal_axes,
     parametrization_of,
     vector_of,
     write_calibrated_yaml,
@@ -72,7 +74,7 @@ def test_earlier_results_get_their_joints_on_loading(example_run: Run, tmp_path:
             assert one["status"] == other["status"]
 
 
-@pytest.mark.parametrize("model", [OBLIQUE, "3-rpr"])
+@pytest.mark.parametrize("model", [OBLIQUE, "3-rpr", "3-upu-tilted"])
 def test_covariance_is_that_of_joints_of_written_models(model: str, tmp_path: Path) -> None:
     """Each parameter is moved in the URDF: the joints that are loaded give the derivatives."""
     machine = load_mechanism(model)
@@ -91,7 +93,8 @@ def test_covariance_is_that_of_joints_of_written_models(model: str, tmp_path: Pa
         for k, (name, unit, value) in enumerate(zip(found.names, found.units, values, strict=True))
     ]  # fmt: skip
     kinematic = Kinematic(names=list(found.names), covariance=covariance.tolist(), held=[])
-    blocks = joints_in_links(machine, rows, kinematic)
+    axes = nominal_axes(machine.leg_names, legs)
+    blocks = joints_in_links(machine, rows, kinematic, axes)
 
     def joints_with(step: Array) -> Array:
         """Return all base joints and all platform joints in their links (2, n_legs, 3)."""
@@ -116,11 +119,37 @@ def test_covariance_is_that_of_joints_of_written_models(model: str, tmp_path: Pa
                 assert (sigma is not None) == (status == "estimated") == (variance > 1e-18)
                 assert sigma is None or sigma**2 == pytest.approx(variance)
 
+    def axes_with(side: str, step: Array) -> dict[str, Array]:
+        """Return the axes of a side in its link by leg."""
+        frame = machine.T_base_Rb if side == "base" else machine.T_platform_Re
+        moved = zip(machine.leg_names, moved_legs(legs, found.place, step), strict=True)
+        own = ((name, getattr(leg, f"{side}_axis")) for name, leg in moved)
+        return {name: frame.rotation.apply(axis) for name, axis in own if axis is not None}
+
+    for side in LINKS:
+        assert [one.leg for one in blocks[side].axes] == list(axes[side])
+        for one in blocks[side].axes:
+            ends = [[axes_with(side, h * e)[one.leg] for e in np.eye(n)] for h in (1e-4, -1e-4)]
+            turn = np.cross(one.direction, (np.array(ends[0]) - ends[1]) / 2e-4)  # (n, 3)
+            expected = np.einsum("ki,kl,li->i", turn, covariance, turn)
+            np.testing.assert_allclose(np.square(one.sigma or []), expected, rtol=1e-5, atol=1e-18)
+
     # and the URDF has them there
     write_urdf(machine, moved_legs(legs, found.place, 1e-3 * np.eye(n)[1]), tmp_path / "m.urdf")
     write_calibrated_yaml(machine, tmp_path / "m.yaml", "m.urdf")
     written = load_mechanism(tmp_path / "m.yaml")
     np.testing.assert_allclose(written.A_base, joints_with(1e-3 * np.eye(n)[1])[0], atol=1e-12)
+
+
+def test_a_combination_of_parameters_is_told_along_the_axes_of_the_links() -> None:
+    machine = load_mechanism(OBLIQUE)
+    leg, by = machine.leg_names[5], np.array([0.0, 1.0, 0.0])  # along y of the base link
+    in_frame = machine.T_base_Rb.inv().rotation.apply(by)
+    parts = [(f"{leg}.base.{axis}", float(x)) for axis, x in zip("xyz", in_frame, strict=True)]
+    found = weak_in_links(machine, [*parts, (f"{leg}.offset", 0.5)])
+    assert found.parameters == [f"{leg}.base.y", f"{leg}.offset"]
+    np.testing.assert_allclose(found.components, [1.0, 0.5], atol=1e-12)
+    assert found.direction == "y of base joint 6 and offset of leg 6 together"
 
 
 @pytest.mark.parametrize("model", [OBLIQUE, "3-upu-tilted", "3-rpr"])

@@ -172,6 +172,10 @@ def test_photographs_do_not_depend_on_the_number_of_processes(tmp_path: Path) ->
     assert f"calibrate with: legcal calibrate {one.folder} -o OUT\n" in printed
     assert f"measure noise with: legcal noise {one.folder}\n" in printed
     assert f"judge with: legcal evaluate OUT/calibrated.yaml {one.truth_path}\n" in printed
+    document = summary_document(one)
+    document["views"]["c1"]["legs"]["leg2"] = 0
+    console.print(simulation_table(document, repeated=True))
+    assert "Few of the 2 images show these legs: leg2 in 0." in console.export_text()
 
 
 def test_given_cameras_lenses_and_poses_are_used(tmp_path: Path) -> None:

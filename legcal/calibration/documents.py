@@ -102,12 +102,23 @@ class JointInLink(Document):
     defines: FrameMark | None  # a joint on which the frame is built
 
 
+class AxisInLink(Document):
+    """An axis of the joint of a leg, in the link of base or platform."""
+
+    leg: str
+    direction: Triple  # calibrated, a unit vector
+    nominal: Triple
+    turn: Triple  # rotation vector from the nominal one [rad]
+    sigma: list[NotNegative] | None  # of the turn about x, y and z [rad]; None if not estimated
+
+
 class LinkBlock(Document):
     """The joints on base or platform, in the link."""
 
     link: str
     T_link_frame: Pose  # where R_b or R_e is in it
     joints: list[JointInLink]
+    axes: list[AxisInLink] = Field(default_factory=list)  # left out by earlier versions
 
 
 class Distance(Document):
@@ -143,6 +154,20 @@ class WeakCombination(Document):
     parameters: list[str]
     components: list[Number]
     sigma_m: Number
+    links: WeakInLinks | None = None  # left out by earlier versions
+
+    @property
+    def in_words(self) -> str:
+        """What changes, along the axes of the links where they are known."""
+        return self.direction if self.links is None else self.links.direction
+
+
+class WeakInLinks(Document):
+    """The same combination with coordinates of joints and axes along the axes of the links."""
+
+    direction: str
+    parameters: list[str]
+    components: list[Number]
 
 
 class ViewPose(Document):

@@ -18,7 +18,7 @@ import numpy as np
 
 from legcal.brief import brief
 from legcal.calibration.detection import Detection
-from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose
+from legcal.calibration.diagnosis.diagnosis import MIN_IMAGES, Diagnosis, diagnose, notes_beside
 from legcal.calibration.documents import DiagnosisBlock
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit import Choices
@@ -491,6 +491,16 @@ def _diagnose(found: _Found, data: OrderedDataset) -> None:
     found.checks["mistakes"] = (
         "one explains the images better" if found.diagnosis else "none explains the images better"
     )
+    most = int(np.bincount(data.measurements.view).max())
+    if most < MIN_IMAGES and not found.diagnosis and data.dataset.board_on("base") is None:
+        found.checks["mistakes"] = "not tried: too few images of each view"
+        found.add(
+            "mistakes",
+            "note",
+            f"Mistakes in readings, model and images could not be looked for: found at most {most} "
+            f"image{'s' * (most > 1)} of a view, needed {MIN_IMAGES} or more, since some camera "
+            "pose suits fewer whatever is wrong; photograph more poses from one place.",
+        )
     for one in found.diagnosis:
         found.add("mistakes", "error", one.sentence)
 
@@ -517,16 +527,8 @@ def _look_at_legs(found: _Found, data: OrderedDataset, choices: Choices) -> Dete
         found.add("legs", "error", what)
     said = {one.what for one in found.findings}
     odd = [one for one in seen.image_notes if one not in said]
-    if odd and found.diagnosis:  # most likely its consequences, which would accuse others
-        found.add(
-            "legs",
-            "note",
-            f"{len(odd)} more thing{'s' * (len(odd) != 1)} that images contradict may come from "
-            "what looks wrong above: mend that, then run legcal doctor again.",
-        )
-        odd = []
-    for what in odd:
-        found.add("legs", "warning", what)
+    for what in notes_beside(found.diagnosis, odd, "legcal doctor"):
+        found.add("legs", "note" if found.diagnosis else "warning", what)
     for what in seen.notes:
         if what not in (*dataset.notes, *seen.image_notes):
             found.add("legs", "note", what)

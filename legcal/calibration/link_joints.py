@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.documents import (
+    AxisInLink,
     ComparedJoint,
     ComparedLink,
     CoordinateStatus,
@@ -26,12 +27,15 @@ from legcal.calibration.documents import (
     LinkBlock,
     ParameterRow,
     Pose,
+    WeakInLinks,
 )
 from legcal.files import motion_to_xyz_quat
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray, normal_basis, turned_axis
 from legcal.machine import (
+    SHOWN,
     LegColumns,
     Machine,
+    describe_direction,
     free_coordinates,
     geometries,
     parametrization_of,
@@ -57,6 +61,8 @@ class _LinkFrame:
     legs: tuple[str, ...]
     frame_legs: tuple[int, ...]
     zero: BoolArray  # (n_legs, 3) zero by the definition of the frame
+    axes: tuple[Array | None, ...]  # of the joints of the legs in the frame, where they have one
+    turns: IntArray  # (n_legs, 2) of the turns of these axes among all kinematic parameters, or -1
 
     @classmethod
     def of(cls, machine: Machine, side: Link) -> _LinkFrame:
@@ -76,6 +82,8 @@ class _LinkFrame:
             machine.leg_names,
             machine.frame_legs,
             zero,
+            tuple(leg.base_axis if is_base else leg.platform_axis for leg in legs),
+            found.place[:, LegColumns.BASE_AXIS if is_base else LegColumns.PLATFORM_AXIS],
         )
 
     @property
@@ -95,6 +103,15 @@ class _LinkFrame:
         """Return what of the frame a joint defines."""
         return _MARKS[self.frame_legs.index(leg)] if leg in self.frame_legs else None
 
+    def named(self, of: IntArray) -> list[str]:
+        """Return the names of parameters, "" where there is none."""
+        return [self.names[k] if k >= 0 else "" for k in of.tolist()]
+
+    def turned(self, leg: int, w: Array) -> Array:
+        """Return two turns of an axis (2,) as a rotation vector in the link [rad]."""
+        axis = self.axes[leg]
+        return np.zeros(3) if axis is None else np.asarray(self.R @ (w @ normal_basis(axis)))
+
     def statuses(self, leg: int, status: Mapping[str, str]) -> list[CoordinateStatus]:
         """Return what each coordinate of a joint in the link is, by that of its parameters."""
         found: list[CoordinateStatus] = []
@@ -109,7 +126,10 @@ class _LinkFrame:
 
 
 def joints_in_links(
-    machine: Machine, parameters: Sequence[ParameterRow], kinematic: Kinematic
+    machine: Machine,
+    parameters: Sequence[ParameterRow],
+    kinematic: Kinematic,
+    axes: Mapping[str, Mapping[str, Sequence[float]]] | None = None,
 ) -> dict[Link, LinkBlock]:
     """Return the joints of a calibration in the links of base and platform.
 
@@ -121,6 +141,8 @@ def joints_in_links(
         Those of ``result.json``, in R_b and R_e [m].
     kinematic : Kinematic
         The covariance of all kinematic parameters by name, zero where they are fixed or held.
+    axes : mapping, optional
+        The nominal axes by side and leg, in R_b and R_e; without them none are told.
 
     Returns
     -------
@@ -138,7 +160,7 @@ def joints_in_links(
         calibrated = frame.points_with({name: row.value for name, row in rows.items()})
         joints = []
         for j, leg in enumerate(frame.legs):
-            names = [frame.names[k] if k >= 0 else "" for k in frame.place[j].tolist()]
+            names = frame.named(frame.place[j])
             known = [i for i, name in enumerate(names) if name in number]
             at = [number[names[i]] for i in known]
             C = np.zeros((3, 3))
@@ -164,8 +186,70 @@ def joints_in_links(
             link=frame.link,
             T_link_frame=Pose(**motion_to_xyz_quat(frame.T_link_frame)),
             joints=joints,
+            axes=_axes_in_link(frame, (axes or {}).get(side, {}), rows, number, everything),
         )
     return blocks
+
+
+def _axes_in_link(
+    frame: _LinkFrame,
+    nominal: Mapping[str, Sequence[float]],
+    rows: Mapping[str, ParameterRow],
+    number: Mapping[str, int],
+    C: Array,
+) -> list[AxisInLink]:
+    """Return the axes of joints, with C the covariance of the numbered parameters."""
+    found = []
+    for j, leg in enumerate(frame.legs):
+        names = frame.named(frame.turns[j])
+        if leg not in nominal or not all(names):
+            continue
+        axis = np.array(nominal[leg])
+        turns = normal_basis(axis) @ frame.R.T  # (2, 3) unit turns in the link
+        w = np.array([rows[name].value if name in rows else 0.0 for name in names])
+        sigma = None
+        if all(name in rows and rows[name].status == "estimated" for name in names):
+            at = [number[name] for name in names]
+            variance = np.einsum("ki,kl,li->i", turns, C[np.ix_(at, at)], turns)
+            sigma = np.sqrt(np.maximum(variance, 0.0)).tolist()
+        found.append(
+            AxisInLink(
+                leg=leg,
+                direction=(frame.R @ turned_axis(axis, w)).tolist(),
+                nominal=(frame.R @ axis).tolist(),
+                turn=(w @ turns).tolist(),
+                sigma=sigma,
+            )
+        )
+    return found
+
+
+def weak_in_links(machine: Machine, parts: Sequence[tuple[str, float]]) -> WeakInLinks:
+    """Return a combination of parameters with joints and axes along the axes of their links.
+
+    ``parts`` are names and components of a vector in R_b and R_e; what is no joint or axis stays.
+    """
+    component, found = dict(parts), dict[str, float]()
+    for side in LINKS:
+        frame = _LinkFrame.of(machine, side)
+        for j, leg in enumerate(frame.legs):
+            for kind, names in (
+                (side, frame.named(frame.place[j])),
+                (f"{side}_axis", frame.named(frame.turns[j])),
+            ):
+                own = np.array([component.pop(name, 0.0) for name in names])
+                v = frame.R @ own if kind == side else frame.turned(j, own)
+                found |= {
+                    f"{leg}.{kind}.{axis}": float(x) for axis, x in zip("xyz", v, strict=True)
+                }
+    found |= component
+    largest = max(map(abs, found.values()), default=0.0)
+    shown = {name: x for name, x in found.items() if abs(x) > SHOWN * largest}
+    return WeakInLinks(
+        direction=describe_direction(list(shown), machine.leg_names),
+        parameters=list(shown),
+        components=list(shown.values()),
+    )
 
 
 def compared_joints(machine: Machine, reference: Machine) -> dict[Link, ComparedLink]:

@@ -26,7 +26,7 @@ import numpy as np
 
 from legcal.calibration.board import BoardViews, base_of_board, board_notes, observe_board
 from legcal.calibration.compression import compression_effect
-from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose
+from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose, notes_beside
 from legcal.calibration.fit_overlays import check_overlays, with_overlays
 from legcal.calibration.four_steps import Steps, four_steps, starts
 from legcal.calibration.identify.identifiability import check_identifiable
@@ -228,8 +228,7 @@ def calibrate(
     notes = [
         *(one.sentence for one in found.diagnosis),
         *dataset.notes,
-        *found.image_notes,
-        *found.fit_notes,
+        *notes_beside(found.diagnosis, (*found.image_notes, *found.fit_notes), "legcal calibrate"),
         *choices.notes,
         *identify_notes,
         *cache_notes,

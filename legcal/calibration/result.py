@@ -47,7 +47,7 @@ from legcal.calibration.joint_fit import (
     known_parameters,
     poses_at_readings,
 )
-from legcal.calibration.link_joints import joints_in_links
+from legcal.calibration.link_joints import joints_in_links, weak_in_links
 from legcal.calibration.plots import plot_residuals
 from legcal.calibration.residuals import OutlineResiduals, outline_residuals
 from legcal.calibration.summary import Summarised, few_lines
@@ -156,6 +156,7 @@ def _result_of(calibration: Calibration) -> Result:
         held=solution.held_basis.tolist(),
     )
     on_base, on_platform = (_board(calibration, link) for link in LINKS)
+    turned_from = nominal_axes(names, geometries(machine))
     return Result(
         legcal_result=1,
         status="converged",
@@ -163,17 +164,18 @@ def _result_of(calibration: Calibration) -> Result:
         trustworthy=calibration.verdict.trustworthy,
         legs=list(names),
         **_legs(names, solution.legs),
-        nominal_axes=nominal_axes(names, geometries(machine)),
+        nominal_axes=turned_from,
         parameters=parameters,
         covariance=solution.covariance.tolist(),
         kinematic=kinematic,
-        links=joints_in_links(machine, parameters, kinematic),
+        links=joints_in_links(machine, parameters, kinematic, turned_from),
         weakest=[
             WeakCombination(
                 direction=describe_direction([name for name, _ in weak.parts], names),
                 parameters=[name for name, _ in weak.parts],
                 components=[component for _, component in weak.parts],
                 sigma_m=weak.sigma,
+                links=weak_in_links(machine, weak.parts),
             )
             for weak in solution.weak
         ],

@@ -229,7 +229,9 @@ def load_result(given: str | Path) -> EarlierResult:
     kept = [i for i, name in enumerate(known.names) if name not in fixed]
     turns = turns_between(known, legs, nominal_legs)
     if document.links is None:
-        links = joints_in_links(machine, document.parameters, document.kinematic)
+        links = joints_in_links(
+            machine, document.parameters, document.kinematic, document.nominal_axes
+        )
         document = document.model_copy(update={"links": links})
     return EarlierResult(
         folder=path.parent,

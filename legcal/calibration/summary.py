@@ -89,6 +89,29 @@ class ParameterTable:
         columns = ("leg", "joint", "axis", "link", *_CALIBRATED, "unit", "in_frame", "status")
         return cls(columns, tuple(rows), (UNITS["m"][2],) * len(rows))
 
+    @classmethod
+    def of_axes(cls, result: Result) -> ParameterTable:
+        """Return the turns of the axes of joints from the nominal ones, about x, y, z of links."""
+        _, unit, digits = UNITS["rad"]
+        rows = [
+            (
+                one.leg,
+                f"{side} axis",
+                axis,
+                block.link,
+                0.0,
+                *(np.degrees([one.turn[k], one.turn[k]]).tolist()),
+                None if one.sigma is None else float(np.degrees(one.sigma[k])),
+                unit,
+                "fixed" if one.sigma is None else "estimated",
+            )
+            for side, block in (result.links or {}).items()
+            for one in block.axes
+            for k, axis in enumerate("xyz")
+        ]
+        columns = ("leg", "joint", "axis", "link", *_CALIBRATED, "unit", "status")
+        return cls(columns, tuple(rows), (digits,) * len(rows))
+
     def without(self, *columns: str) -> ParameterTable:
         """Return the table without some columns."""
         kept = [k for k, name in enumerate(self.columns) if name not in columns]
@@ -187,6 +210,9 @@ def tables(result: Result) -> list[tuple[str, ParameterTable]]:
                 replace(joints, columns=columns),
             )
         )
+    if len(axes := ParameterTable.of_axes(result)):
+        without = axes.without("nominal", "calibrated", "unit")
+        found.append(("Turns of axes about x, y and z of their links [deg]", without))
     return [*found, ("Other parameters", ParameterTable.of(result, joints=False))]
 
 
@@ -367,8 +393,9 @@ def _fit_line(result: Result) -> str:
 
 def _direction_lines(result: Result) -> list[str]:
     """Return which combinations of parameters are least certain, and which are held."""
-    worst = [f"{weak.direction} ({1e3 * weak.sigma_m:.3f} mm)" for weak in result.weakest]
-    told = f"Least certain combinations (1 sigma, in R_b and R_e): {'; '.join(worst)}."
+    worst = [f"{weak.in_words} ({1e3 * weak.sigma_m:.3f} mm)" for weak in result.weakest]
+    where = "in R_b and R_e" if any(one.links is None for one in result.weakest) else "in the links"
+    told = f"Least certain combinations (1 sigma, {where}): {'; '.join(worst)}."
     lines = [told] if worst else []
     if result.held:
         lines.append(

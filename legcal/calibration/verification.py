@@ -17,6 +17,7 @@ from legcal.calibration.change_detection import (
     noise_dof,
     possible_changes,
 )
+from legcal.calibration.diagnosis.diagnosis import notes_beside
 from legcal.calibration.documents import (
     CheckDocument,
     ExplanationBlock,
@@ -203,7 +204,9 @@ def check(
     solution = found.in_file_order().solution
     tested = _compare(dataset, earlier, solution, prior, significance)
     wrong = (one.sentence for one in found.diagnosis)
-    notes = (*wrong, *dataset.notes, *found.image_notes, *found.fit_notes, *solution.notes)
+    on_images = (*found.image_notes, *found.fit_notes)
+    told = notes_beside(found.diagnosis, on_images, "legcal calibrate --check")
+    notes = (*wrong, *dataset.notes, *told, *solution.notes)
     return replace(tested, notes=tuple(dict.fromkeys(notes)))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from rich.text import Text
 from legcal.calibration import DETECTION_PAGE, CameraCalibration, Detection
 from legcal.report.render import heading, report, table
 from legcal.vision import intrinsic_unit
+
+_OFTEN = 0.5  # of the images, in which a leg should be seen
 
 
 def camera_table(found: CameraCalibration, output: Path) -> RenderableType:
@@ -122,6 +125,7 @@ def simulation_table(document: dict[str, Any], *, repeated: bool) -> RenderableT
         [
             "Images of each view that show 40 % of a leg or more in one piece.",
             _left_out(left_out) if left_out else "",
+            _hidden(views.values(), n_images),
             f"{document['extreme_poses']} of {n_poses} poses have every motor near an end of its "
             "travel.",
         ],
@@ -135,6 +139,21 @@ def simulation_table(document: dict[str, Any], *, repeated: bool) -> RenderableT
                 *([f"measure noise with: legcal noise {folder}"] * is_noise),
             )
         ],
+    )
+
+
+def _hidden(views: Iterable[dict[str, Any]], of: int) -> str:
+    """Return which legs few images show, in words; nothing if there are none."""
+    images = Counter[str]()
+    for view in views:
+        images.update(view["legs"])
+    few = {name: n for name, n in images.items() if n < _OFTEN * of}
+    if not few:
+        return ""
+    legs = ", ".join(f"{name} in {n}" for name, n in few.items())
+    return (
+        f"Few of the {of} images show these legs: {legs}. Other parts or a board stand before "
+        "them, or they are outside; take other or more --views, or a smaller board."
     )
 
 

@@ -56,7 +56,7 @@ def directions(
                 per = length if parameters.units[i] == "rad" else 1.0
                 step[i] = weak.sigma_m * component / per
         if np.any(step):
-            found.append((f"1 sigma along: {weak.direction}", step))
+            found.append((f"1 sigma along: {weak.in_words}", step))
     order = [result.kinematic.names.index(name) for name in names]
     for words, row in zip(result.held, result.kinematic.held, strict=False):
         found.append((f"1 mm along what is held: {words}", _HELD * np.array(row)[order]))

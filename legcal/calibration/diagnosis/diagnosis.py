@@ -45,7 +45,7 @@ from legcal.perception import (
 STAGE = "Trying common mistakes"
 
 _AGREE_ALREADY = 0.9  # of the images: then nothing common is wrong
-_MIN_IMAGES = 3  # of a group of views
+MIN_IMAGES = 3  # of a group of views
 _FEW = 6  # images, at least, that say which mistakes are worth a closer look
 _SUITS = 0.5  # of the legs that they should show
 _STARTS = 1, 1, 2  # images that suggest cameras, of all
@@ -164,6 +164,19 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     return (_diagnosis(first, found[alike[0]][1], judge.own, by_hints=by_hints),)
 
 
+def notes_beside(diagnosis: Sequence[Diagnosis], notes: Sequence[str], job: str) -> list[str]:
+    """Return notes on images; only how many there are beside a diagnosis, of which most follow.
+
+    They would accuse others. *job* is what to run again: ``legcal doctor``.
+    """
+    if not (diagnosis and notes):
+        return list(notes)
+    return [
+        f"{len(notes)} more thing{'s' * (len(notes) != 1)} that images contradict may come from "
+        f"what looks wrong above: mend that, then run {job} again."
+    ]
+
+
 def _rows_seen(data: OrderedDataset) -> IntArray:
     """Return the rows of photographs or given outlines, without those of views that name no leg.
 
@@ -190,7 +203,7 @@ def _groups(data: OrderedDataset, rows: IntArray) -> list[Group]:
     hints = [view.T_base_camera for view in data.measurements.views]
     joined = None if board is None else board.T_board_camera
     groups = group_views(data.measurements, rows, hints, joined)
-    return [group for group in groups if len(group.rows) >= _MIN_IMAGES]
+    return [group for group in groups if len(group.rows) >= MIN_IMAGES]
 
 
 class _Judge:
@@ -227,13 +240,13 @@ class _Judge:
         for g, group in enumerate(self.groups):
             for v, k in product(group.views, _ONE_ROW):
                 order = [row for row in of_views[v].tolist() if row in group.rows]
-                if len(order) < 2 * _MIN_IMAGES:
+                if len(order) < 2 * MIN_IMAGES:
                     continue
                 late = shifted_from(self.data, v, 0, k).true
                 now, then = self.of_groups[g], self._compare([late], g, group.rows, ())[0]
                 gain = dict(zip(now.row.tolist(), then.support - now.support, strict=True))
                 from_on = np.cumsum([gain[row] for row in order][::-1])[::-1]
-                first = int(np.argmax(from_on[_MIN_IMAGES : 1 - _MIN_IMAGES])) + _MIN_IMAGES
+                first = int(np.argmax(from_on[MIN_IMAGES : 1 - MIN_IMAGES])) + MIN_IMAGES
                 if from_on[first] > 0.0:
                     place = of_views[v].tolist().index(order[first])
                     found.append(shifted_from(self.data, v, place, k))

@@ -74,8 +74,9 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
             Table(("rank before any image was searched", ">rank", ">of", ""), ranks),
         ]
     weak: list[list[Cell]] = [
-        [row.direction, number(1e3 * row.sigma_m, 4), _parts(row.parameters, row.components)]
+        [row.in_words, number(1e3 * row.sigma_m, 4), _parts(one.parameters, one.components)]
         for row in result.weakest
+        for one in (row.links or row,)
     ]
     if weak:
         columns = ("known worst", ">1 sigma [mm]", "as a unit vector")

@@ -89,7 +89,7 @@ def next_steps(calibration: Calibration, folder: str) -> list[str]:
             f"moved: legcal calibrate NEW --check {out}."
         )
     elif not result.diagnosis:
-        weak = f" What is known worst: {result.weakest[0].direction}." if result.weakest else ""
+        weak = f" What is known worst: {result.weakest[0].in_words}." if result.weakest else ""
         steps.append(f"Take more images, at poses further apart and from other places.{weak}")
         steps.append(
             "Look at the worst outlines below: blur, reflections and wrong edges show there."
