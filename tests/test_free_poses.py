@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dataset_folder import Folder, folder
-from fit_sessions import machine_session
+from fit_sessions import machine_session, with_boards
 from layouts import Layout, LegLayout, MachineSpec, write_machine
 from leg_pictures import clutter, edges, segments
 from machines import SHIPPED_URDF, SHIPPED_YAML, of_types
@@ -296,3 +296,15 @@ def test_a_fit_that_fails_without_any_length_says_what_to_measure(
         refine(session.legs, session.measurements, some, session.start)
     first = refusal.value.problems[0]
     assert ("no measured length" in first and "board on the platform" in first) == says
+
+
+def test_legs_and_a_board_on_the_platform_calibrate_what_is_moved_by_hand(tmp_path: Path) -> None:
+    """No length is measured: squares of the board give the scale, and each pose."""
+    path = write_machine(tmp_path, drawn("6-UPS by hand"), Layout())
+    session = machine_session(str(path), n_poses=8)
+    seen, start = with_boards(session, base=False)
+    found = refine(session.legs, session.measurements, session.outlines, start, board=seen)
+    off = session.legs.vector(session.start.legs) - session.legs.vector(session.truth.legs)
+    left = session.legs.vector(found.legs) - session.legs.vector(session.truth.legs)
+    assert np.abs(off).max() > 2e-3
+    assert np.abs(left).max() < 1e-9
