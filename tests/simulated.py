@@ -41,9 +41,9 @@ def simulated(folder: Path, model: str, *, views: int = 2, **changes: object) ->
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
-    """Return all files of a folder with their content."""
+    """Return all files of a folder with their content, but schemas for editors."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file()
+        if path.is_file() and path.parent.name != ".schemas"
     }

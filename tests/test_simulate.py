@@ -404,8 +404,7 @@ def test_force_replaces_a_simulated_dataset_and_keeps_what_is_not_its_own(tmp_pa
     assert "axes.csv" in files
     gone = {"observations.csv", ".legcal-cache.json", "models/hexapod.yaml", "urdf/hexapod.urdf"}
     assert not gone & set(files)
-    named = {name for name in files if ".schemas/" not in name}
-    assert set(json.loads(files[TRUTH_NAME])["files"]) == named - {"notes.txt"}
+    assert set(json.loads(files[TRUTH_NAME])["files"]) == set(files) - {"notes.txt"}
     write(tmp_path, {"images/c1_p01.png": "mine"})  # into a set without photographs
     with pytest.raises(UsageError, match=r"images/c1_p01\.png, which an earlier simulation did"):
         simulate("hexapod", tmp_path, FEW, force=True)

@@ -42,10 +42,10 @@ def schemas_beside(path: Path, content: bytes) -> dict[Path, bytes]:
 
 def write_schemas(path: Path) -> None:
     """Write the schema that a YAML names beside it, or nothing where there is no place for it."""
-    with path.open("rb") as file:
-        named = schemas_beside(path, file.readline())
-    for place, content in named.items():
-        with suppress(OSError):  # it only helps editors
+    with suppress(OSError):  # it only helps editors
+        with path.open("rb") as file:
+            named = schemas_beside(path, file.readline())
+        for place, content in named.items():
             if not place.is_symlink() and not place.parent.is_symlink():
                 place.parent.mkdir(exist_ok=True)
                 place.write_bytes(content)
