@@ -91,7 +91,10 @@ def test_the_version_stands_in_one_place() -> None:
         if f'"{legcal.__version__}"' in path.read_text()
     ]
     assert hits == [ROOT / "legcal/version.py"]
-    assert f"## {legcal.__version__}" in (ROOT / "CHANGELOG.md").read_text()
+    notes = (ROOT / "CHANGELOG.md").read_text()
+    assert f"## {legcal.__version__}" in notes
+    entries = [line for line in notes.splitlines() if line.startswith("- ")]
+    assert len(entries) == len(set(entries))
 
 
 def test_the_python_snippet_of_the_readme_runs(
