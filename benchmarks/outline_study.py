@@ -203,6 +203,7 @@ def run(kind: type[OutlineStudy], description: str | None) -> int:
     parser.add_argument("--machine", action="append", metavar="NAME", default=[])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=processors())
+    parser.add_argument("--cluster", help="address of a Dask scheduler, in place of processes")
     parser.add_argument("-o", "--output", type=Path, help="folder; a study goes on from there")
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
@@ -212,7 +213,7 @@ def run(kind: type[OutlineStudy], description: str | None) -> int:
             study,
             asked.runs,
             seed=asked.seed,
-            workers=asked.workers,
+            workers=asked.cluster or asked.workers,
             output=asked.output,
             progress=lambda stage, done, total: print(
                 f"\r{stage}: {done}/{total}", end="\n" * (done == total), file=sys.stderr
