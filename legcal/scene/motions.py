@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration import Result, poses_at_readings
 from legcal.geometry import Array, components
 from legcal.machine import Leg, Machine, Parametrization
+
+if TYPE_CHECKING:
+    from legcal.calibration import Result
 
 FACTORS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000, 50000)
 _SHOWN = 0.12  # of the size of the machine: how far the largest change is drawn at first
@@ -29,7 +32,11 @@ def joints_at(
     Legs are in R_b and R_e, poses T_Rb_Re are looked for *near* others; the platform stays at
     these where it is not placed *by_readings* q (k, n).
     """
-    poses = poses_at_readings(machine, legs, q, near) if by_readings else near
+    poses = near
+    if by_readings:
+        from legcal.calibration import poses_at_readings  # which a model alone does not need
+
+        poses = poses_at_readings(machine, legs, q, near)
     frame = machine.T_base_Rb
     A = frame.apply(np.array([leg.A for leg in legs]))
     B = np.array([leg.B for leg in legs])

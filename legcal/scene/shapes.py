@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration import Result
 from legcal.geometry import Array
-from legcal.vision import Camera
+
+if TYPE_CHECKING:
+    from legcal.calibration import Result
+    from legcal.vision import Camera
 
 _STRAIGHT = 1e-9  # of the squared size: a bend that is none
 

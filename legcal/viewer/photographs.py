@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration import EarlierResult
-from legcal.data import Dataset, row_names
 from legcal.errors import LegcalError
 from legcal.files import motion_from_xyz_quat
 from legcal.geometry import Array, BoolArray
 from legcal.viewer.source import Source
-from legcal.vision import Camera
+
+if TYPE_CHECKING:
+    from legcal.calibration import EarlierResult
+    from legcal.data import Dataset
+    from legcal.vision import Camera
 
 MAX_CAMERAS = 200
 _SIDE = 720  # longer side of a photograph as it is shown [px]
@@ -54,6 +56,8 @@ class Photographs:
     ----------
     places : tuple of Place
         The cameras that stand somewhere: as calibrated, else as the dataset says.
+    names : tuple of str
+        What the images are called, by row.
     poses : tuple of str
         What the poses of the session are called, by images.
     q : (n_poses, n_legs) array
@@ -64,14 +68,17 @@ class Photographs:
         self._dataset = source.dataset
         self._maps: dict[int, NDArray[np.float32]] = {}
         self.places: tuple[Place, ...] = ()
+        self.names: tuple[str, ...] = ()
         self.poses: tuple[str, ...] = ()
         self.q = np.zeros((0, source.machine.n_legs))
         if source.dataset is None:
             return
+        from legcal.data import row_names
+
         measurements = source.dataset.measurements
         self.places = _places(source.dataset, source.result)
-        names = row_names(measurements)
-        self.poses = tuple(names[row] for row in measurements.first_rows.tolist())
+        self.names = row_names(measurements)
+        self.poses = tuple(self.names[row] for row in measurements.first_rows.tolist())
         self.q = measurements.q[measurements.first_rows]
 
     @property
@@ -89,7 +96,7 @@ class Photographs:
 
     def name(self, row: int) -> str:
         """Return the name of the image of a row."""
-        return "" if self._dataset is None else row_names(self._dataset.measurements)[row]
+        return self.names[row]
 
     def picture(self, place: Place, row: int) -> tuple[Picture | None, str]:
         """Return the photograph of a row as a pinhole takes it (h, w, 3), or why there is none."""
@@ -100,6 +107,8 @@ class Photographs:
         except LegcalError as error:
             return None, str(error)
         at = self._map(place)
+        import cv2
+
         shown = cv2.remap(grey, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=_EMPTY)
         levels = np.clip(np.rint(shown), 0, 255).astype(np.uint8)
         return np.repeat(levels[..., None], 3, axis=2), ""

@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from legcal.calibration import EarlierResult
-from legcal.data import OBSERVATIONS_NAME, Dataset, load_dataset, read_outlines
 from legcal.errors import UsageError
 from legcal.exports import load_subject
 from legcal.machine import DATASET_YAML, Machine, shipped_names
+
+if TYPE_CHECKING:
+    from legcal.calibration import EarlierResult
+    from legcal.data import Dataset
 
 _MARKERS = (DATASET_YAML, "result.json", "calibrated.yaml", "robot.yaml")
 
@@ -67,17 +70,26 @@ def open_source(given: str | Path, dataset: str | Path | None = None) -> Source:
                 f"--dataset could not be used: found the dataset {path} beside it, needed a result "
                 "or a model; leave one of them out."
             )
+        from legcal.data import load_dataset
+
         found = load_dataset(path, check_images=False)
         return Source(found.machine, dataset=found)
     subject = load_subject(given)
     if dataset is None:
         return Source(subject.machine, subject.nominal, subject.result)
-    session = _session(subject.machine, load_dataset(dataset, check_images=False), subject.result)
-    return Source(subject.machine, subject.nominal, subject.result, session)
+    return Source(
+        subject.machine,
+        subject.nominal,
+        subject.result,
+        _session(subject.machine, dataset, subject.result),
+    )
 
 
-def _session(machine: Machine, dataset: Dataset, result: EarlierResult | None) -> Dataset:
+def _session(machine: Machine, given: str | Path, result: EarlierResult | None) -> Dataset:
     """Return the session of a machine, with the outlines that its calibration used."""
+    from legcal.data import OBSERVATIONS_NAME, load_dataset, read_outlines
+
+    dataset = load_dataset(given, check_images=False)
     names = dataset.machine.leg_names
     if sorted(names) != sorted(machine.leg_names):
         raise UsageError(
