@@ -39,11 +39,11 @@ from legcal.planning.sight import Seen, what_is_seen
 from legcal.progress import Report, no_progress
 from legcal.vision import Board
 
-MIN_POSES, POSES_EACH, MOST_POSES = 20, 4, 240  # candidates, by images
+MIN_POSES, POSES_EACH, MOST_POSES = 20, 6, 320  # candidates, by images
 N_PROBES = 12  # poses by which places are compared
 N_HANDS = 10  # places that a camera in the hand chooses from
 MIN_SHARE = 0.5  # of its equal share that each view has of the images, at least
-ROUNDS = 2  # of polishing, each with half the steps of the one before
+ROUNDS = 3  # of polishing, each with half the steps of the one before
 POSE_STEP = 0.08  # of the travel
 PLACE_STEP = 0.06  # of the distance
 N_NEAR_PLACES = 8
