@@ -80,6 +80,7 @@ class Window:
         self.motion, self.stage = Motion(source.machine), Stage(source)
         self.photographs = Photographs(source)
         self._changed = threading.Condition()
+        self._drawing = threading.Lock()  # nothing is sent once the server has stopped
         self._wanted: dict[Any, Callable[[], object]] = {}
         self._is_over = False
         self._shown_motion: int | None = None
@@ -104,23 +105,27 @@ class Window:
                     self._changed.wait(1.0 / FRAMES if self._is_playing else None)
                 wanted, self._wanted = self._wanted, {}
             started = time.monotonic()
-            for do in wanted.values():
-                do()
-            if self._is_playing:
-                turn = 2.0 * np.pi * (started - self._started) / _PERIOD
-                self._phase = float(np.sin(turn))
-            if self._is_over:
-                return
-            with self._server.atomic():
-                self._draw()
+            with self._drawing:
+                if self._is_over:
+                    return
+                self._step(wanted, started)
             time.sleep(max(0.0, 1.0 / FRAMES - (time.monotonic() - started)))
+
+    def _step(self, wanted: dict[Any, Callable[[], object]], now: float) -> None:
+        """Do what is wanted, and send what is seen then."""
+        for do in wanted.values():
+            do()
+        if self._is_playing:
+            self._phase = float(np.sin(2.0 * np.pi * (now - self._started) / _PERIOD))
+        with self._server.atomic():
+            self._draw()
 
     def close(self) -> None:
         """Stop serving."""
         self._is_over = True
         with self._changed:
             self._changed.notify_all()
-        with redirect_stdout(io.StringIO()):
+        with self._drawing, redirect_stdout(io.StringIO()):
             self._server.stop()
 
     # What is drawn
