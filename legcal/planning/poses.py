@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,7 +28,8 @@ from legcal.machine import (
 from legcal.planning.places import Setting
 from legcal.progress import Report, no_progress
 
-N_REACHING = 10  # machines that must reach a pose
+N_REACHING = 10  # machines that must reach a pose,
+_WIDER = 1.5  # times as far off as machines may be
 N_NEAR = 3  # poses that are tried near each
 _MIN_SHARE = 0.2  # of the poses that are drawn, to be of use
 _MOST_MOVED = 0.1  # of the length of a leg, by which errors of the machine move a pose
@@ -75,8 +77,9 @@ def surely_reached(
     rng, nearby = np.random.default_rng(0), platforms_in_base(machine, poses.poses)
     measured = [j for j, leg in enumerate(machine.legs) if leg.kind is not LegKind.PASSIVE]
     t_nearby = Frames.of(nearby).t
+    wider = replace(setting, length=_WIDER * setting.length, angle=_WIDER * setting.angle)
     for _ in range(N_REACHING):
-        drawn = drawn_legs(legs, setting, rng)
+        drawn = drawn_legs(legs, wider, rng)
         R, t = Frames.of(poses_at_readings(machine, drawn, poses.readings, nearby))
         ends = np.swapaxes(R @ np.array([leg.B for leg in drawn]).T, 1, 2) + t[:, None]
         length = np.linalg.norm(ends - np.array([leg.A for leg in drawn]), axis=2)
