@@ -54,8 +54,8 @@ def test_failures_are_named_and_do_not_stop_the_others(tmp_path: Path, good: Pat
     assert fine.drift_dX_m is not None
     assert fine.drift_sigma_dX_m is not None
     assert fine.drift_dX_m < 1e-3 * fine.drift_sigma_dX_m
-    assert json.loads((out / "fleet.json").read_text()) == found.document()
-    with (out / "fleet.csv").open(newline="") as file:
+    assert json.loads((out / "summary.json").read_text()) == found.document()
+    with (out / "summary.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["status"] for row in rows] == ["failed", fine.status]
     assert float(rows[1]["sigma_mm"]) == pytest.approx(1e3 * fine.sigma_dX_m, rel=1e-5)
@@ -111,7 +111,7 @@ def test_lists_and_words_that_make_no_fleet_are_refused(
     for text, named in (
         ("dataset,name\na,\na,\n", "2 machines of the name 'a'"),
         ("dataset,name\na,x/y\n", "the name 'x/y'"),
-        ("dataset,name\na,fleet.json\n", "the name 'fleet.json'"),
+        ("dataset,name\na,summary.json\n", "the name 'summary.json'"),
         ("dataset,mane\na,b\n", "unknown column 'mane'"),
         ("dataset\n", "no row"),
     ):

@@ -40,8 +40,8 @@ from legcal.files import (
 from legcal.progress import Progress, shown_progress
 from legcal.workers import Workers, worker_pool
 
-FLEET = OutputKind("fleet", "fleet.json", "legcal_fleet")
-TABLE_NAME = "fleet.csv"
+FLEET = OutputKind("fleet", "summary.json", "legcal_fleet")
+TABLE_NAME = "summary.csv"
 STAGE = "Calibrating machines"
 
 

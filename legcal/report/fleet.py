@@ -26,5 +26,5 @@ def fleet_table(document: FleetDocument, output: Path) -> RenderableType:
     lines += [f"{row.name}: no drift. {row.drift_note}" for row in first if row.drift_note]
     lines += [f"Note: {note}" for note in document.notes]
     counts = ", ".join(f"{n} {status}" for status, n in sorted(document.counts.items()))
-    lines.append(f"{len(document.machines)} machines: {counts}. All of it: {output}/fleet.csv.")
+    lines.append(f"{len(document.machines)} machines: {counts}. All of it: {output}/summary.csv.")
     return report(table(*headings, rows=rows), [Text(line, overflow="ignore") for line in lines])
