@@ -72,14 +72,27 @@ def test_sliders_move_the_machine(page: Any) -> None:
         return page.execute_script(
             """const form = document.querySelector("form[data-for=machine-scene]");
             form.elements[arguments[0]].value = arguments[1];
-            form.dispatchEvent(new Event("input", {bubbles: true}));
+            form.elements[arguments[0]].dispatchEvent(new Event("input", {bubbles: true}));
             return document.getElementById("machine-scene").data.slice(0, 2).map((t) => t.x);""",
             name,
             value,
         )
 
+    def trace(number: int, key: str) -> Any:
+        return page.execute_script(
+            "return document.getElementById('machine-scene').data[arguments[0]][arguments[1]]",
+            number,
+            key,
+        )
+
+    def largest_ring() -> float:
+        heights = np.array(trace(6, "z"), float)
+        rings = np.split(heights, np.flatnonzero(np.isnan(heights)))
+        return float(max(np.ptp(ring[1:]) for ring in rings if len(ring) > 1))
+
     nominal, calibrated = moved("factor", 0)
     assert calibrated == nominal
+    largest = largest_ring()
     nominal, calibrated = moved("factor", 1)
     apart = [abs(a - b) for a, b in zip(nominal, calibrated, strict=True) if a is not None]
     assert 1e-4 < max(apart) < 1e-2
@@ -92,8 +105,14 @@ def test_sliders_move_the_machine(page: Any) -> None:
         )
         < 1e-9
     )
+    assert largest > 0.0
+    assert largest_ring() == pytest.approx(largest, rel=1e-6)  # as its legend says
     assert moved("pose", 7)[0] != nominal
-    assert moved("mode", 1)[1] != ten_times
+    assert [trace(k, "name") for k in (0, 1)] == ["nominal", "calibrated"]
+    grey, blue = moved("mode", 1)
+    apart = [abs(a - b) for a, b in zip(grey, blue, strict=True) if a is not None]
+    assert 0.01 < max(apart) < 0.1  # m: a deviation of 0.1 mm is seen without the slider
+    assert trace(0, "name") == "calibrated"
     assert _errors(page) == []
 
 

@@ -89,7 +89,7 @@
       });
       const [A, B] = parts[1];
       const rings = (centres, shapes) => centres.flatMap((c, j) =>
-        shapes[j].flatMap((ring) => [...ring.map((p) => p.map((v, k) => c[k] + factor * v)), null]));
+        shapes[j].flatMap((ring) => [...ring.map((p) => p.map((v, k) => c[k] + v)), null]));
       if (extra.rings) {
         const R = extra.turns[pose];
         const turned = extra.rings.platform.map((rs) => rs.map((ring) => ring.map((p) =>
@@ -97,7 +97,11 @@
         put(extra.traces.rings, [...rings(A, extra.rings.base), ...rings(B, turned)]);
       }
       Plotly.restyle(div, { x: x[0], y: x[1], z: x[2] }, which);
+      Plotly.restyle(div, { name: mode.legend }, extra.traces.legs);
     };
+    elements.mode.addEventListener("input", () => {
+      elements.factor.value = extra.modes[Number(elements.mode.value)].step;
+    });
     form.addEventListener("input", show);
     form.addEventListener("submit", (event) => event.preventDefault());
     show();

@@ -28,7 +28,7 @@ from legcal.scene import (
 MAX_POSES = 60  # of the slider
 MAX_CAMERAS = 60
 _ROOM = 0.8  # of the size of the machine: about it
-_RING = 0.02  # of it: the median ellipsoid
+_RING = 0.06  # of it: the median ellipsoid
 _EYE = np.array([1.3, -1.5, 0.8])  # where it is looked at from, in its size
 _N_RING = 20  # points of a ring
 _GREY, _BLUE, _AMBER, _GREEN = "#9aa1ab", "#1f5fa8", "#b26a00", "#1e7d46"
@@ -53,14 +53,15 @@ def machine_scene(calibration: Calibration) -> Plot:
 
     found = placed(solution.legs, fitted)
     size = float(np.ptp(np.concatenate([found[0], found[1][0]]), axis=0).max())
-    modes = [
-        _mode("what the calibration changed", placed(geometries(machine), fitted), found, size)
-    ]
+    nominal = placed(geometries(machine), fitted)
+    legend = ("nominal", "calibrated")
+    modes = [_mode("what the calibration changed", legend, nominal, found, size)]
     parameters = solution.parametrization
     length = float(np.mean(np.linalg.norm(found[1][0] - found[0], axis=1)))
     for what, step in directions(calibration.result, parameters, length):
         legs = moved_legs(solution.legs, parameters.place, step)
-        modes.append(_mode(what, found, placed(legs, fitted), size))
+        legend = ("calibrated", "moved along the direction")
+        modes.append(_mode(what, legend, found, placed(legs, fitted), size))
     rings, ring_factor = _rings(calibration, size)
     images = row_names(measurements)
     extra = {
@@ -107,7 +108,8 @@ def machine_scene(calibration: Calibration) -> Plot:
     left_out = f" {len(chosen)} of {n} poses are shown." if len(chosen) < n else ""
     caption = (
         "Drag to turn, scroll to zoom. Grey is the nominal model, blue the calibrated one at the "
-        "same readings; the slider exaggerates the difference. Rings are ellipsoids of one "
+        "same readings, or grey the calibrated one and blue where a direction would move it; the "
+        "slider exaggerates the difference. Rings are ellipsoids of one "
         "standard deviation at the joints: those that define R_b and R_e have flat ones or none."
         f"{left_out}"
     )
@@ -135,12 +137,17 @@ def _view(machine: Array, cameras: Array, size: float) -> dict[str, Any]:
 
 
 def _mode(
-    name: str, before: tuple[Array, Array], after: tuple[Array, Array], size: float
+    name: str,
+    legend: tuple[str, str],
+    before: tuple[Array, Array],
+    after: tuple[Array, Array],
+    size: float,
 ) -> dict[str, Any]:
     """Return what is shown of a difference, exaggerated at first so that it is seen."""
     moved = max(float(np.abs(b - a).max()) for a, b in zip(before, after, strict=True))
     return {
         "name": name,
+        "legend": legend,
         "step": step_shown(moved, size),
         "base": [_rounded(before[0], 7), _rounded(after[0], 7)],
         "platform": [
