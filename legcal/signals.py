@@ -97,8 +97,11 @@ def _raise_again(_number: int, _frame: FrameType | None) -> None:
 
 
 def raise_if_stopped() -> None:
-    """Raise KeyboardInterrupt if a signal was heard: before anything is recorded."""
-    if _SignalState.stopped:
+    """Raise KeyboardInterrupt if a signal was heard, before anything is recorded.
+
+    Signals that are held back wait.
+    """
+    if _SignalState.stopped and not _SignalState.holding:
         raise KeyboardInterrupt
 
 

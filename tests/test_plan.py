@@ -1,6 +1,11 @@
 """Planned sessions: what they hold, what they promise, and what is refused."""
 
 import json
+import os
+import pickle
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -22,8 +27,9 @@ from legcal.machine import (
     load_mechanism,
     slider_columns,
 )
-from legcal.planning import Setting
-from legcal.planning.exchange import Session
+from legcal.planning import Setting, planner
+from legcal.planning import places as camera_places
+from legcal.planning.exchange import Session, choose
 from legcal.planning.planner import Scene, Task
 from legcal.simulation import Level, ParameterErrors, SimulationSettings, simulate
 
@@ -31,13 +37,37 @@ FEW = Setting(draws=3)
 BOUNDS = "0m:2m,-2m:2m,0.5m:2m"  # of cameras
 
 
+WORDS = ["plan", "3-rpr", "--images", "6", "--cameras", "2", "--seed", "3", "--bounds", BOUNDS]
+
+
+class Elsewhere:
+    """An executor whose work comes and goes as to and from another process."""
+
+    def submit(self, work: Callable[..., Any], /, *arguments: Any) -> Future[Any]:
+        work, arguments = pickle.loads(pickle.dumps((work, arguments)))
+        done = Future[Any]()
+        done.set_result(pickle.loads(pickle.dumps(work(*arguments))))
+        return done
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_search() -> Iterator[None]:
+    """Fewer candidates: what is found is not as good, but found in the same way."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(planner, "MIN_POSES", 8)
+        patch.setattr(planner, "POSES_EACH", 2)
+        patch.setattr(planner, "ROUNDS", 1)
+        patch.setattr(camera_places, "_TURNS", 6)
+        yield
+
+
 @pytest.fixture(scope="module")
-def planned() -> planning.Plan:
-    """A plan for outlines with white noise."""
-    bounds = planning.parse_bounds(BOUNDS)
+def planned(small_search: None) -> planning.Plan:
+    """A plan for outlines with white noise, its work done elsewhere."""
     return legcal.plan(
-        "3-rpr", images=6, cameras=2, seed=3, noise=planning.WHITE, setting=FEW, bounds=bounds
-    )
+        "3-rpr", images=6, cameras=2, seed=3, noise=planning.WHITE, setting=FEW,
+        bounds=planning.parse_bounds(BOUNDS), workers=Elsewhere(),
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -91,25 +121,16 @@ def test_the_command_writes_what_python_plans(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """With the same seed it is the same, to the last bit."""
+    """With the same seed it is the same, to the last bit, wherever work is done."""
     monkeypatch.setattr(planning, "USUAL", FEW)
     monkeypatch.setattr(planning, "DEFAULT_NOISE", planning.WHITE)
     session = tmp_path / "session"
-    words = [
-        "plan",
-        "3-rpr",
-        "--images",
-        "6",
-        "--cameras",
-        "2",
-        "--seed",
-        "3",
-        "--json",
-        "--bounds",
-    ]
-    assert run(monkeypatch, *words, BOUNDS, "-o", session) == 0
+    assert run(monkeypatch, *WORDS, "--json", "-o", session) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed == planned.document() == json.loads((session / "plan.json").read_text())
+    header = (session / "dataset.yaml").read_text().partition("\n")[0]
+    assert (session / header.rpartition("=")[2]).name == "dataset.json"
+    assert (session / header.rpartition("=")[2]).is_file()
     for view in planned.views:
         assert (session / "previews" / f"{view.name}.jpg").read_bytes().startswith(b"\xff\xd8")
         assert view.name in (session / "places.svg").read_text()
@@ -119,6 +140,33 @@ def test_the_command_writes_what_python_plans(
     assert "Distances to measure" in page
     assert "Checklist" in page
     assert len((session / "poses.csv").read_text().splitlines()) == 1 + 6
+
+
+def test_a_search_that_is_stopped_writes_its_best_and_says_so(
+    planned: planning.Plan,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+
+    def stopped(*found: Any, **more: Any) -> Any:
+        monkeypatch.setattr(planner, "choose", choose)
+        os.kill(os.getpid(), signal.SIGTERM)
+        return choose(*found, **more)
+
+    monkeypatch.setattr(planner, "choose", stopped)
+    monkeypatch.setattr("legcal.cli.plan._previews", lambda _: {})
+    monkeypatch.setattr("legcal.report.plan_files", lambda *_: {})
+    monkeypatch.setattr(planning, "USUAL", FEW)
+    monkeypatch.setattr(planning, "DEFAULT_NOISE", planning.WHITE)
+    assert run(monkeypatch, *WORDS, "--json", "-o", tmp_path / "session") == 130
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["error"]["kind"] == "Interrupted"
+    assert f"written to {tmp_path / 'session'}, with the best plan" in printed.err
+    document = json.loads((tmp_path / "session" / "plan.json").read_text())
+    assert document["images"] == 6
+    assert planned.value < document["value"] < planned.growth[1, 1]
+    assert any("stopped" in note for note in document["notes"])
 
 
 def test_a_better_known_machine_is_what_more_images_and_a_given_session_make(

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from legcal.cli.options import JsonOption, ModelArgument, QuietOption, command_line, show
+from legcal.cli.options import (
+    ClusterOption,
+    JsonOption,
+    ModelArgument,
+    QuietOption,
+    WorkersOption,
+    command_line,
+    image_workers,
+    show,
+)
+from legcal.errors import printable
 
 if TYPE_CHECKING:
     from legcal.planning import Plan
@@ -94,6 +105,8 @@ def plan(
         str | None, typer.Option(help="Sigma of a reading; 2um.", show_default=False)
     ] = None,
     seed: Annotated[int, typer.Option(help="Of all that is drawn.")] = 0,
+    workers: WorkersOption = None,
+    cluster: ClusterOption = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier plan there.")] = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
@@ -127,11 +140,15 @@ def plan(
             hand_held=hand_held,
             setting=replace(planning.USUAL, length=error),
             seed=seed,
+            workers=image_workers(cluster, workers),
             progress=not quiet,
             stop=is_waiting,
         )
         pictures = report.plan_files(found, _previews(found), command_line())
         planning.write_session(found, output, force=force, pictures=pictures)
+        if is_waiting() and sys.stderr is not None:
+            text = f"The session was written to {output}, with the best plan found before the stop."
+            sys.stderr.write(f"legcal: {printable(text)}\n")
     show(as_json, found.document, lambda: report.plan_table(found, output))
 
 

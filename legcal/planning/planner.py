@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -38,6 +39,7 @@ from legcal.planning.poses import candidate_poses, drawn_legs, poses_near, some_
 from legcal.planning.sight import Seen, what_is_seen
 from legcal.progress import Report, no_progress
 from legcal.vision import Board
+from legcal.workers import Run, in_turn
 
 MIN_POSES, POSES_EACH, MOST_POSES = 20, 6, 320  # candidates, by images
 N_PROBES = 12  # poses by which places are compared
@@ -156,9 +158,15 @@ def _tied_by_board(found: Contributions, T_base_camera: RigidTransform) -> Contr
 
 
 def plan_session(
-    task: Task, progress: Report = no_progress, stop: Callable[[], bool] = lambda: False
+    task: Task,
+    progress: Report = no_progress,
+    stop: Callable[[], bool] = lambda: False,
+    run: Run = in_turn,
 ) -> Plan:
     """Return the plan of a session.
+
+    What places show, and the draws by which it is judged, are worked out by *run*; plans do not
+    depend on it.
 
     Raises DidNotConverge, NotVisible or NotIdentifiable if there are no poses, no places, or too
     few images.
@@ -168,7 +176,7 @@ def plan_session(
     n_poses = min(MOST_POSES, MIN_POSES + POSES_EACH * task.n_images)
     poses = candidate_poses(machine, legs, task.setting, n_poses, rng, progress)
     places = _places(task, poses)
-    shown = _probed(scene, places, poses, rng, progress)
+    shown = _probed(scene, places, poses, rng, progress, run)
     given = [found for found in map(scene.of, task.given) if found is not None]
     work = workspace_of(machine, legs)
     criterion = criterion_of(task.goal, work, legs, shown[0][1].basis, task.named)
@@ -176,7 +184,7 @@ def plan_session(
     chosen = choose_places([c for _, c in shown], n_places, task.n_images, criterion, given)
     current = [Candidates(shown[i][0], poses) for i in chosen]
     least = 0 if task.hand_held else max(1, int(MIN_SHARE * task.n_images / task.n_views))
-    session = Session(_required(scene, current), given)
+    session = Session(_required(scene, current, run), given)
     images = choose(session, task.n_images, criterion, rng, least, task.n_images, progress=progress)
     images = exchange(
         session, images, criterion, rng, least, task.n_images, progress=progress, stop=stop
@@ -186,14 +194,15 @@ def plan_session(
     value = images.value
     target = all_points(machine, poses.poses)
     middle = 0.5 * (target.min(axis=0) + target.max(axis=0))
+    notes = []
     for turn in range(ROUNDS):
         if stop():
+            notes.append("The search was stopped: this is the best plan that it had found.")
             break
         current = _better_places(scene, current, given, criterion, rng, 0.5**turn, middle)
-        current, value = _better_poses(scene, current, given, criterion, rng, 0.5**turn, least)
+        current, value = _better_poses(scene, current, given, criterion, rng, 0.5**turn, least, run)
         progress("Polishing", turn + 1, ROUNDS)
-    progress("Polishing", ROUNDS, ROUNDS)
-    return _judged(scene, current, given, criterion, work, value, progress)
+    return _judged(scene, current, given, criterion, work, value, notes, progress, run)
 
 
 def _places(task: Task, poses: Configurations) -> list[Place]:
@@ -210,13 +219,16 @@ def _probed(
     poses: Configurations,
     rng: np.random.Generator,
     progress: Report,
+    run: Run,
 ) -> list[tuple[Place, Contributions]]:
     """Return the places that see legs, with what they show of some poses."""
     machine, found = scene.task.machine, []
     probes = np.sort(rng.permutation(len(poses.poses))[:N_PROBES]).tolist()
     in_Rb = platforms_in_base(machine, [poses.poses[i] for i in probes])
-    for k, place in enumerate(places):
-        contributions = scene.contributions(place.T_base_camera, in_Rb)
+    of_places = run(
+        partial(scene.contributions, poses=in_Rb), [place.T_base_camera for place in places]
+    )
+    for k, (place, contributions) in enumerate(zip(places, of_places, strict=True)):
         if contributions is not None:
             found.append((place, contributions))
         progress("Camera places", k + 1, len(places))
@@ -232,10 +244,11 @@ def _probed(
     return found
 
 
-def _required(scene: Scene, candidates: Sequence[Candidates]) -> list[Contributions]:
+def _required(
+    scene: Scene, candidates: Sequence[Candidates], run: Run = in_turn
+) -> list[Contributions]:
     """Return what images of candidates add, all of which see legs."""
-    found = [scene.of(one) for one in candidates]
-    return [one for one in found if one is not None]
+    return [one for one in run(scene.of, candidates) if one is not None]
 
 
 def choose_places(
@@ -338,6 +351,7 @@ def _better_poses(
     rng: np.random.Generator,
     step: float,
     least: int,
+    run: Run,
 ) -> tuple[list[Candidates], float]:
     """Return places and poses after exchanges with poses nearby, and the criterion."""
     task = scene.task
@@ -350,7 +364,7 @@ def _better_poses(
         )
         for own in current
     ]
-    session = Session(_required(scene, widened), given)
+    session = Session(_required(scene, widened, run), given)
     images = [(v, k) for v, own in enumerate(current) for k in range(len(own.poses.poses))]
     for slot, image in images:
         session.changed(slot, image, 1.0)
@@ -366,16 +380,19 @@ def _judged(
     criterion: Criterion,
     work: Workspace | None,
     value: float,
+    notes: list[str],
     progress: Report,
+    run: Run,
 ) -> Plan:
     """Return the plan with what sessions as they will be are expected to give."""
     task, predictor, machine = scene.task, scene.task.predictor, scene.task.machine
     legs, found = predictor.legs, _required(scene, current)
     session = _with_all(found, given)
-    rng, covariances = np.random.default_rng(task.seed + 1), []
-    for draw in range(task.setting.draws):
-        covariances.append(drawn_covariance(task, current, rng))
-        progress("Draws", draw + 1, task.setting.draws)
+    n, covariances = task.setting.draws, []
+    rngs = np.random.default_rng(task.seed + 1).spawn(n)
+    for drawn in run(partial(drawn_covariance, task, current), rngs):
+        covariances.append(drawn)
+        progress("Draws", len(covariances), n)
     covariance = np.mean(covariances, axis=0)
     views, blocked = [], 0
     for own in current:
@@ -385,7 +402,6 @@ def _judged(
         blocked += missing
         T, in_Rb = own.place.T_base_camera, platforms_in_base(machine, poses.poses)
         views.append(PlannedView(own.place.name, T, poses, via, scene.seen(T, in_Rb, surely=False)))
-    notes = []
     if blocked:
         notes.append(
             f"No free way was found to {blocked} of the poses, not even by home: lead the machine "

@@ -20,6 +20,7 @@ from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Task, plan_session
 from legcal.progress import Progress, Report, shown_progress
 from legcal.vision import Board, Camera, board_of, read_camera
+from legcal.workers import Run, Workers, worker_pool
 
 SIGMA_Q = 2e-6  # [m] of a reading, where nobody says
 IMAGES_PER_VIEW = 15
@@ -55,6 +56,7 @@ def plan(
     hand_held: bool = False,
     setting: Setting = USUAL,
     seed: int = 0,
+    workers: Workers = 1,
     progress: Progress = False,
     stop: Callable[[], bool] = lambda: False,
 ) -> Plan:
@@ -97,6 +99,10 @@ def plan(
         How well tripods are set, and what is known of the machine before.
     seed : int
         Of everything that is drawn: the same gives the same plan.
+    workers : int, str or executor
+        Work in that many processes; with more than one, the program that calls this must be safe
+        to import (``if __name__ == "__main__":``). Or on a Dask cluster: the address of its
+        scheduler, a client, or another object with ``submit``, as executors have it.
     progress : bool or callable
         True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
     stop : callable
@@ -115,6 +121,8 @@ def plan(
     DidNotConverge, NotVisible, NotIdentifiable
         If there are no poses, no places that show legs, too few images, or a target that no number
         of images reaches.
+    OutOfResources
+        If one of the processes is ended from outside, or the cluster lost.
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
     listed = () if places is None else tuple(read_places(Path(places), machine))
@@ -145,13 +153,18 @@ def plan(
         hand_held,
         seed,
     )
-    with shown_progress(progress) as report:
+    pool = worker_pool(workers, "The session could not be planned")
+    with shown_progress(progress) as report, pool as run:
         if target is None:
-            return plan_session(task, report, stop)
-        return _fewest(task, target, report, stop)
+            found = plan_session(task, report, stop, run)
+        else:
+            found = _fewest(task, target, report, stop, run)
+        return replace(found, notes=(*found.notes, *run.notes))
 
 
-def _fewest(task: Task, target: float, progress: Report, stop: Callable[[], bool]) -> Plan:
+def _fewest(
+    task: Task, target: float, progress: Report, stop: Callable[[], bool], run: Run
+) -> Plan:
     """Return the plan with the fewest images that reaches a target [m].
 
     The error of a plan says how many images the next one needs; what limits plans of any size is
@@ -159,7 +172,7 @@ def _fewest(task: Task, target: float, progress: Report, stop: Callable[[], bool
     """
     n, least, best = max(_BEGIN, 2 * task.n_views), 0, None
     for _ in range(_ROUNDS):
-        found = plan_session(replace(task, n_images=n), progress, stop)
+        found = plan_session(replace(task, n_images=n), progress, stop, run)
         if found.error is None:
             raise UsageError(
                 f"--target could not be used: found that {task.machine.undetermined}, needed a "

@@ -24,6 +24,7 @@ from legcal.files import (
     motion_to_xyz_quat,
     output_path,
     result_folder,
+    with_schema,
 )
 from legcal.geometry import roll_pitch_yaw
 from legcal.machine import DATASET_YAML, write_model
@@ -123,7 +124,8 @@ def _dataset(plan: Plan, model: str) -> str:
     }
     if plan.board is not None:
         document["board"] = board_document(plan.board)
-    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
+    return with_schema("dataset", text)
 
 
 def _measurements(plan: Plan) -> str:
