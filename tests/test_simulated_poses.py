@@ -149,6 +149,7 @@ def test_a_machine_that_cannot_move_inside_its_limits_says_what_stands_in_the_wa
         _drawn(stiff, 8)
     (problem,) = caught.value.problems
     assert "8 poses could not be drawn: found 0 that the machine reaches in 300 draws" in problem
+    assert "300 times by the limits of joints" in problem
     assert "times joint 'leg3_b" in problem
     assert "outside its limits of -0.0 to 0.0 deg" in problem
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from enum import StrEnum
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -46,6 +47,26 @@ _SHORTEST = 0.25  # least step of such a part; what is harder to reach is drawn 
 _MAX_FAILED_POSES = 5  # one after the other
 
 
+class Cause(StrEnum):
+    """What keeps a machine from a pose."""
+
+    LIMITS = "the limits of joints"
+    LENGTHS = "legs that cannot have such lengths at the same time"
+    SINGULARITY = "the mechanism near a singularity"
+    COLLISION = "collisions of legs"
+
+
+Obstacle = tuple[Cause, str]
+"""A cause, and what it is in detail."""
+
+_REMEDIES = {
+    Cause.LIMITS: "check legcal.home and the limits of the joints",
+    Cause.LENGTHS: "check legcal.home and the travel of the motors",
+    Cause.SINGULARITY: "check legcal.home, and choose one away from singularities",
+    Cause.COLLISION: "check radii and ends of the cylinders of the legs in the model",
+}
+
+
 def near_ends(end: IntArray, draws: Array) -> Array:
     """Return places in the travel, 0 the shortest and 1 the longest, near given ends of it."""
     return np.asarray(np.abs(end - JITTER * draws))
@@ -69,11 +90,11 @@ def feasible_poses(
 
     Raises DidNotConverge if too few are found, and ModelError if home is beyond a limit.
     """
-    problems: Counter[str] = Counter()
+    obstacles: Counter[Obstacle] = Counter()
     draws = (
-        _followed(machine, rng, problems, extreme=extreme)
+        _followed(machine, rng, obstacles, extreme=extreme)
         if machine.is_determined
-        else _walked(machine, rng, problems)
+        else _walked(machine, rng, obstacles)
     )
     found: list[Array] = []
     failed = 0
@@ -87,14 +108,24 @@ def feasible_poses(
             found.append(configuration)
             progress("Poses", len(found), n_poses)
     if len(found) < n_poses:
-        common = ", ".join(f"{count} times {what}" for what, count in problems.most_common(3))
+        causes: Counter[Cause] = Counter()
+        for (cause, _), count in obstacles.items():
+            causes[cause] += count
+        (main, _), *_others = causes.most_common()
+        what = ", ".join(_counted(cause, n, obstacles) for cause, n in causes.most_common())
         raise DidNotConverge(
             f"{machine.yaml_path}: {n_poses} poses could not be drawn: found {len(found)} that "
-            f"the machine reaches in {problems.total() + len(found)} draws "
-            f"({common}), needed all; check legcal.home and the limits of the joints, or "
-            "give poses."
+            f"the machine reaches in {obstacles.total() + len(found)} draws, others excluded "
+            f"{what}, needed all; {_REMEDIES[main]}, or give poses."
         )
     return poses_at(machine, found)
+
+
+def _counted(cause: Cause, n: int, obstacles: Counter[Obstacle]) -> str:
+    """Return how often a cause excluded a draw, and what it most often was in detail."""
+    most = max((count, detail) for (one, detail), count in obstacles.items() if one is cause)
+    detail = f" ({most[0]} times {most[1]})" if most[1] != cause else ""
+    return f"{n} times by {cause}{detail}"
 
 
 class Feasibility:
@@ -130,26 +161,32 @@ class Feasibility:
             )
 
     def problem(self, configuration: Array, *, of_motors: bool = True) -> str | None:
-        """Return what makes a closed configuration infeasible, None if nothing does.
+        """Return what makes a closed configuration infeasible, in words, None if nothing does.
 
         The travel of motors is left out where their readings have been checked already.
         """
+        found = self.obstacle(configuration, of_motors=of_motors)
+        return None if found is None else found[1]
+
+    def obstacle(self, configuration: Array, *, of_motors: bool = True) -> Obstacle | None:
+        """Return the same with its cause."""
         machine = self._machine
         outside = beyond_travel(machine, configuration)
         if not of_motors:
             outside[list(machine.motors)] = False
         beyond = np.flatnonzero(outside)
         if len(beyond):
-            return f"leg '{machine.leg_names[beyond[0]]}' outside its travel"
+            return Cause.LIMITS, f"leg '{machine.leg_names[beyond[0]]}' outside its travel"
         problem = self._beyond_limits(configuration)
         if problem is not None:
-            return problem
+            return Cause.LIMITS, problem
         T = platform_pose(machine, configuration)
         if singularity(machine, T) < self._min_singularity:
-            return "the mechanism near a singularity"
+            return Cause.SINGULARITY, Cause.SINGULARITY.value
         collision = self.collision(T)
         if collision is not None:
-            return f"legs '{collision[0]}' and '{collision[1]}' run through each other"
+            one, two = collision
+            return Cause.COLLISION, f"legs '{one}' and '{two}' run through each other"
         return None
 
     def collision(self, T_base_platform: RigidTransform) -> tuple[str, str] | None:
@@ -186,7 +223,7 @@ class Feasibility:
 
 
 def _followed(
-    machine: Machine, rng: np.random.Generator, problems: Counter[str], *, extreme: bool
+    machine: Machine, rng: np.random.Generator, obstacles: Counter[Obstacle], *, extreme: bool
 ) -> Iterator[Array | None]:
     """Yield configurations that are followed from home to drawn readings; None after many failures.
 
@@ -205,7 +242,7 @@ def _followed(
         q = consistent_readings(machine, (lower + part * (upper - lower))[None])[0]
         return np.asarray(q if shrink == 1.0 else np.clip(home + shrink * (q - home), lower, upper))
 
-    def reached(readings: Array) -> Array | str:
+    def reached(readings: Array) -> Array | Obstacle:
         """Return the configuration, or what is in the way."""
         configuration = machine.home_configuration
         for part in _WAY:
@@ -215,10 +252,10 @@ def _followed(
                     machine, configuration, q, min_step=_SHORTEST, on_the_chain=True
                 )
             except DidNotConverge:
-                return "legs that cannot have such lengths at the same time"
-            problem = feasibility.problem(configuration, of_motors=part == 1.0)
-            if problem is not None:
-                return problem
+                return Cause.LENGTHS, Cause.LENGTHS.value
+            obstacle = feasibility.obstacle(configuration, of_motors=part == 1.0)
+            if obstacle is not None:
+                return obstacle
         return configuration
 
     while True:
@@ -226,30 +263,30 @@ def _followed(
         for draw in range(first, first + _MAX_DRAWS):
             full = _FULL_EXTREME if extreme else _FULL
             found = reached(drawn(_NEARER ** max(0, draw + 1 - full)))
-            if not isinstance(found, str):
+            if not isinstance(found, tuple):
                 last = draw
                 yield found
                 break
-            problems[found] += 1
+            obstacles[found] += 1
         else:
             yield None
 
 
 def _walked(
-    machine: Machine, rng: np.random.Generator, problems: Counter[str]
+    machine: Machine, rng: np.random.Generator, obstacles: Counter[Obstacle]
 ) -> Iterator[Array | None]:
     """Yield configurations of a random walk on the closed chain; None after many failures."""
     feasibility, here = Feasibility(machine), machine.home_configuration
     while True:
         for _ in range(_MAX_DRAWS):
             there = random_walk(machine, here, rng)
-            problem = feasibility.problem(there)
-            if problem is None or beyond_travel(machine, there).any():
+            obstacle = feasibility.obstacle(there)
+            if obstacle is None or beyond_travel(machine, there).any():
                 here = there  # walks never lead further out of the travel
-            if problem is None:
+            if obstacle is None:
                 yield there
                 break
-            problems[problem] += 1
+            obstacles[obstacle] += 1
         else:
             yield None
 
