@@ -93,6 +93,8 @@ def _timed(*words: object) -> float:
 
 
 def _only(what: str, folder: str, n: str, workers: str) -> None:
+    if not workers.isdecimal():
+        import distributed  # noqa: F401
     begin = time.perf_counter()
     WORKS[what](Path(folder), int(n), int(workers) if workers.isdecimal() else workers)
     print(time.perf_counter() - begin)

@@ -16,8 +16,8 @@ import pickle
 import platform
 import time
 import warnings
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections import OrderedDict, deque
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import CancelledError, Future
 from contextlib import closing, contextmanager, suppress
 from functools import cache, partial
@@ -25,6 +25,8 @@ from importlib import metadata
 from pathlib import Path
 from threading import Event, RLock, Thread
 from typing import Any, Protocol
+
+from numpy.typing import NDArray
 
 from legcal.errors import LegcalError, OutOfResources, UsageError
 from legcal.processors import processors
@@ -35,6 +37,7 @@ CONNECTING = 10.0  # [s] in which a scheduler must answer and have a worker
 _CHECKING = 1.0  # [s] between two looks at the workers
 _NO_WORKER = 60.0  # [s] without any worker until work is given up: they may be started again
 _NAMED = 5  # workers in a message
+_MOST_KEPT = 128 * 2**20  # of arrays that a worker has made of files [bytes]
 _WHEELS = ("numpy", "scipy", "opencv-python-headless", "casadi", "pin", "distributed")
 
 Stamp = tuple[int, int]
@@ -141,7 +144,7 @@ class Cluster:
     """The workers of a Dask scheduler; notes say what differs between them and this process."""
 
     patience = _CHECKING
-    most_rows = 10  # of a task: what a worker that dies loses
+    most_rows = 25  # of a task: what a worker that dies loses
 
     def __init__(self, client: Any, failure: str) -> None:
         self._client = client
@@ -182,7 +185,8 @@ class Cluster:
         more = f" and {len(lines) - _NAMED} more" if len(lines) > _NAMED else ""
         return (
             f"Some workers of the cluster differ from this process: {'; '.join(lines[:_NAMED])}"
-            f"{more}; results agree with those of equal workers to 1e-6 sigma, not bit by bit.",
+            f"{more}; results are not those of equal workers bit by bit: they agree to about 1e-6 "
+            "sigma where only CPU features differ, and it is not known how far for other versions.",
         )
 
     def submitter(self, work: Work) -> Callable[[Sequence[Any]], Future[list[Any]]]:
@@ -364,6 +368,34 @@ def file_of_task(path: Path) -> bytes | None:
         files.read[name] = None
         raise _FileNeeded(name)
     return content
+
+
+_kept = OrderedDict[tuple[str, Stamp, Hashable], NDArray[Any]]()  # by file; last used last
+
+
+def made_of_file(path: Path, kind: Hashable, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+    """Return the array that is made of a file; on a worker once, until the file changes there.
+
+    What was used last is kept. Other processes, and a worker that a file was sent to, make it anew.
+    """
+    files, name = _Files.current, str(path)
+    if files is None or name in files.sent:
+        return make()
+    here = os.path.join(files.folder, name)
+    stamp = stamp_of(here)
+    if stamp is None:
+        return make()
+    key = (here, stamp, kind)
+    if (values := _kept.get(key)) is not None:
+        _kept.move_to_end(key)
+        files.read[name] = stamp
+        return values.copy()
+    values = make()
+    if files.read.get(name) == stamp:
+        _kept[key] = values.copy()
+        while sum(one.nbytes for one in _kept.values()) > _MOST_KEPT:
+            _kept.popitem(last=False)
+    return values
 
 
 def _held(content: bytes) -> bytes:

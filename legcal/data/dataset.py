@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from legcal.brief import brief
+from legcal.cluster import made_of_file
 from legcal.data.axes import LegAxes, read_axes
 from legcal.data.corners import Corners, read_corners
 from legcal.data.dataset_file import (
@@ -120,7 +121,9 @@ class ImageReader:
             )
         levels = self.kept.get(k)
         if levels is None:
-            levels = decode_image(path, self.cameras[k], self.places[k])
+            camera, place = self.cameras[k], self.places[k]
+            size = (camera.width, camera.height)
+            levels = made_of_file(path, size, lambda: decode_image(path, camera, place))
             self.kept.keep(k, levels)
         return np.asarray(levels, dtype=np.float32)
 
