@@ -520,7 +520,7 @@ def test_places_and_options_that_cannot_be_used_are_refused_and_nothing_is_writt
         ("hexapod", "urdf", tmp_path / "a", ExportOptions(nodes=3), UsageError, "correction"),
         ("hexapod", "matlab", tmp_path / "1-a.m", ExportOptions(), UsageError, "m_1_a.m"),
         (result, "correction", out, ExportOptions(nodes=1), UsageError, "2 to 8"),
-        (other, "csv", tmp_path / "a", ExportOptions(), DatasetError, "legcal_result"),
+        (other, "csv", tmp_path / "a", ExportOptions(), DatasetError, "the legcal that wrote it"),
         (tmp_path / "no/result.json", "csv", out, ExportOptions(), DatasetError, "result"),
         ("no-such-model", "csv", tmp_path / "a", ExportOptions(), ModelError, "no-such-model"),
     ]  # fmt: skip

@@ -89,14 +89,19 @@ def plain_name(name: object) -> object:
     return name
 
 
-def _no_truth(value: object) -> object:
-    """Refuse true, which Python takes for one."""
+def _version(value: object) -> object:
+    """Refuse true, which Python takes for one, and the formats of later versions."""
     if isinstance(value, bool):
         raise ValueError(f"found {str(value).lower()}, needed 1; correct the value.")
+    if isinstance(value, int) and value > 1:
+        raise ValueError(
+            f"found {describe(value)}, needed version 1; use the legcal that wrote it, or write "
+            "the file as version 1."
+        )
     return value
 
 
-Version = Annotated[Literal[1], BeforeValidator(_no_truth)]
+Version = Annotated[Literal[1], BeforeValidator(_version)]
 Name = Annotated[str, AfterValidator(_one_plain_line)]
 PlainName = Annotated[str, BeforeValidator(plain_name)]
 Number = Annotated[float, Strict()]  # true is not one, nor is text
