@@ -6,7 +6,8 @@
 Images are those of the example, searched for edge pairs again and again; runs are those of ``legcal
 study paper``. Scheduler and workers are processes of their own over TCP on this machine, so that
 the scheduler takes its time from the same cores. Both ways take turns, each in a process of its
-own; the shortest times are compared, without imports. ``--send`` has the images sent, as where
+own; the shortest times are compared, without imports. Workers keep images that they decoded in an
+earlier turn, local processes decode each once. ``--send`` has the images sent, as where
 workers do not share the file system. Bytes are those of results and tasks as pickled, without what
 TCP and Dask add.
 """
