@@ -70,7 +70,14 @@ def test_nothing_is_wrong_with_a_session_that_is_right(tmp_path: Path) -> None:
     assert diagnose(data) == ()
 
 
-@pytest.mark.parametrize("model", ["3-rpr", "3-upu-tilted", "tricept", "hexapod-strut"])
+@pytest.mark.parametrize(
+    "model",
+    [
+        "3-rpr",
+        "tricept",
+        *(pytest.param(m, marks=pytest.mark.slow) for m in ("3-upu-tilted", "hexapod-strut")),
+    ],
+)
 def test_every_mistake_can_be_tried_on_every_kind_of_machine(model: str, tmp_path: Path) -> None:
     """Legs of other types, constant and passive ones, a plane: joints are known or left out."""
     dataset = load_dataset(simulated(tmp_path / "set", model).folder)

@@ -23,7 +23,7 @@ from fuzzing.kills import (
 pytestmark = pytest.mark.skipif(
     not Path("/proc/self/environ").exists(), reason="looks at processes in /proc"
 )
-PER_TEST = 15  # undisturbed runs, which tests in several processes repeat, take as long
+PER_TEST = 10  # undisturbed runs, which tests in several processes repeat, take as long
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -86,5 +86,5 @@ def test_nothing_that_takes_time_is_loaded_before_signals_are_answered() -> None
 
 @pytest.mark.system
 @pytest.mark.parametrize("part", range(4))
-def test_sixty_kills_of_all_commands_lose_and_falsify_nothing(part: int) -> None:
+def test_forty_kills_of_all_commands_lose_and_falsify_nothing(part: int) -> None:
     assert _faults(drawn_kills(4 * PER_TEST, 1)[part::4]) == []
