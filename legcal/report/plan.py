@@ -84,11 +84,19 @@ def _told(plan: Plan) -> list[tuple[float, float]]:
     return [(k, value) for k, value in plan.growth.tolist() if k in told]
 
 
-def _shown(plan: Plan, value: float) -> str:
-    """Return the criterion with another number of images as the error that is expected then."""
+def _scaled(plan: Plan, value: float) -> tuple[float, str]:
+    """Return what is expected where the criterion has another value, and its unit."""
+    ratio = value / plan.value
     if plan.error is None or plan.goal not in ("mean", "worst"):
-        return f"{value / plan.value:.2f} of that planned"
-    return f"{1e3 * plan.error.mean_displacement * value / plan.value:.3f} mm"
+        return ratio, "of that planned"
+    error, is_worst = plan.error, plan.goal == "worst"
+    return 1e3 * ratio * (error.max_displacement if is_worst else error.mean_displacement), "mm"
+
+
+def _shown(plan: Plan, value: float) -> str:
+    """Return the same in words."""
+    expected, unit = _scaled(plan, value)
+    return f"{expected:.{3 if unit == 'mm' else 2}f} {unit}"
 
 
 def _measured(plan: Plan) -> tuple[int, ...]:
@@ -154,7 +162,7 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
     ]
     blocks: list[Any] = [
         Drawing(Markup(places), "Camera places from above and from the side."),
-        Drawing(Markup(growth), "How the criterion falls with the number of images."),
+        Drawing(Markup(growth), "What is expected of other numbers of images."),
         Row(images),
         Items(checklist(plan), ordered=True, title="Checklist"),
     ]
@@ -221,10 +229,11 @@ def _draw_panel(ax: Axes, plan: Plan, A: Array, B: Array, i: int, j: int) -> Non
 
 
 def _draw_growth(plan: Plan) -> Figure:
-    """Return a figure of the criterion over the number of images."""
+    """Return a figure of what is expected over the number of images."""
     planned = plan.growth[:, 0] <= plan.n_images
     known = np.isfinite(plan.growth[:, 1]) & (plan.growth[:, 0] >= min(6, plan.n_images))
-    scale, unit = (1e3, "mm") if plan.goal in ("mean", "worst", "parameters") else (1.0, "-")
+    scale, unit = _scaled(plan, 1.0)
+    what = f"expected, {plan.goal.value}" if unit == "mm" else f"criterion: {plan.goal.value}"
     with new_figure(1, 1, _PANEL) as (figure, (ax,)):
         for chosen, style, label in (
             (known & planned, "-o", "planned"),
@@ -237,7 +246,7 @@ def _draw_growth(plan: Plan) -> Figure:
             n, value = plan.growth[chosen].T
             ax.loglog(n, scale * value, style, markersize=3.0, label=label)
         ax.set_xlabel("images")
-        ax.set_ylabel(f"criterion: {plan.goal.value} [{unit}]")
+        ax.set_ylabel(f"{what} [{unit}]")
         ax.grid(which="both", alpha=0.2)
         ax.legend()
     return figure
