@@ -43,6 +43,7 @@ from legcal.recordings.stillness import (
     reading_speeds,
     still_frames,
 )
+from legcal.vision import read_camera
 
 LEAST_STILL = 0.3  # [s]
 ONE_CLOCK = 2.0  # [s] that frames and readings in one bag are apart at most
@@ -201,6 +202,10 @@ def plan_import(
             f"The recordings could not be imported: found an offset of {offset:g} s between the "
             "clocks, needed a finite number; correct --offset."
         )
+    for text in cameras:  # before minutes of looking at frames
+        read_camera(
+            Path(text if "=" not in text or os.path.isfile(text) else text.split("=", 1)[1])
+        )
     tables = {path: read_series(path, machine, unit, lengths) for path in dict.fromkeys(readings)}
     views = []
     for k, (name, recording) in enumerate(zip(names, recordings, strict=True)):
@@ -285,6 +290,7 @@ def _view(
                 "with pauses of different length; give the right table, or how far the clock of "
                 "the camera is ahead, --offset SECONDS."
             ) from error
+    _check_overlap(times - apart.seconds, series, start)
     stills, kept = still_frames(times, frames_move, series.times, moves, apart, still)
     if not kept:
         found = few([f"{s.why_not} from {s.begin:.1f} s" for s in stills]) or "no rest"
@@ -301,6 +307,17 @@ def _view(
         readings=q, scatter=scatter, series=series,
         notes=(*recording.notes(), *series.notes),
     )  # fmt: skip
+
+
+def _check_overlap(times: Array, series: Series, start: str) -> None:
+    """Refuse frames at *times* of the readings' clock [s], none of which have any."""
+    first, last = float(series.times.min()), float(series.times.max())
+    if times[0] > last or times[-1] < first:
+        raise DatasetError(
+            f"{start} found its frames from {times[0]:.1f} to {times[-1]:.1f} s by the clock of "
+            f"the readings, and these from {first:.1f} to {last:.1f} s ({series.source}), needed "
+            "times that overlap; give the right table, or correct --offset SECONDS."
+        )
 
 
 def _changes(recording: Recording, progress: Report, name: str) -> tuple[Array, Array]:
