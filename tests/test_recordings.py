@@ -242,6 +242,8 @@ REFUSALS: dict[str, tuple[Callable[[Motion, Path], tuple[object, ...]], str]] = 
                      "needed the readings of the same time"),
     "no such topic": (lambda m, t: (_bag(m, t), "--image-topic", "/other"),
                       "found no topic '/other'"),
+    "a topic of a video": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t),
+                                         "--image-topic", "/a"), "found a topic and no bag"),
     "two topics": (lambda m, t: (_bag(m, t, second="/second"),), "name it with --image-topic"),
     "rests too short": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t), "--still", "60"),
                         "needed rests of 60 s"),

@@ -161,16 +161,22 @@ def test_it_prints_on_a4(page: Any) -> None:
     assert all(abs(w - 595) <= 1 and abs(h - 842) <= 1 for w, h in sizes)
 
 
-def test_scenes_are_there_for_the_printer_and_no_longer_than_that(page: Any) -> None:
+def test_scenes_and_folded_tables_are_there_for_the_printer_alone(
+    page: Any,
+) -> None:
     _draw_all(page)
     copies = """dispatchEvent(new Event(arguments[0]));
         return [...document.querySelectorAll("#machine-scene canvas, #platform-space canvas")]
             .filter((one) => one.className === "copy").map((one) => new Set(
                 one.getContext("2d").getImageData(0, 0, one.width, one.height).data).size);"""
+    folded = "return document.querySelectorAll('details:not([open])').length"
+    n_folded = page.execute_script(folded)
     colours = page.execute_script(copies, "beforeprint")
+    assert page.execute_script(folded) == 0 < n_folded
     assert len(colours) == 2
     assert min(colours) > 50
     assert page.execute_script(copies, "afterprint") == []
+    assert page.execute_script(folded) == n_folded
 
 
 def test_it_is_interactive_within_two_seconds(example_run: Run, browser: Any) -> None:

@@ -13,7 +13,8 @@ from legcal.errors import UsageError
 
 def schema(
     name: Annotated[
-        str | None, typer.Argument(help="The format; without it their names are listed.")
+        str | None,
+        typer.Argument(metavar="[NAME]", help="The format; without it their names are listed."),
     ] = None,
 ) -> None:
     """Print the JSON Schema of a file or document, for editors and programs that check them."""

@@ -180,6 +180,11 @@ def plan_import(
     """
     machine, destination = load_mechanism(model), Path(destination)
     recordings = [open_recording(Path(path), machine, image_topic, joint_topic) for path in sources]
+    if (image_topic or joint_topic) and not any(isinstance(one, Bag) for one in recordings):
+        raise UsageError(
+            "The recordings could not be imported: found a topic and no bag, needed a bag (.bag, "
+            ".mcap, or the folder of a ROS 2 bag); leave --image-topic and --joint-topic out."
+        )
     names = [_view_name(recording.path, destination) for recording in recordings]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:

@@ -50,6 +50,10 @@
 
   // Printers get none of what WebGL drew once it is shown: scenes are copied while it is there.
   addEventListener("beforeprint", () => {
+    for (const part of document.querySelectorAll("details:not([open])")) {
+      part.open = true;
+      part.dataset.folded = ""; // until it is printed
+    }
     for (const div of [...waiting.keys()]) draw(div);
     for (const div of document.querySelectorAll(".plot")) {
       const scene = div._fullLayout?.scene?._scene;
@@ -61,7 +65,13 @@
       drawn.after(copy);
     }
   });
-  addEventListener("afterprint", () => { for (const copy of document.querySelectorAll(".plot .copy")) copy.remove(); });
+  addEventListener("afterprint", () => {
+    for (const copy of document.querySelectorAll(".plot .copy")) copy.remove();
+    for (const part of document.querySelectorAll("details[data-folded]")) {
+      part.open = false;
+      delete part.dataset.folded;
+    }
+  });
 
   // A scene: legs from A to B of a model and of another one, whose difference is exaggerated.
   const control = (div, { extra }) => {
