@@ -25,7 +25,7 @@ from scipy.stats import spearmanr
 
 import legcal
 from legcal.errors import LegcalError, NotIdentifiable
-from legcal.geometry import Array
+from legcal.geometry import Array, direction_above
 from legcal.machine import Machine, feasible_poses, load_mechanism, poses_at
 from legcal.planning import (
     DEFAULT_NOISE,
@@ -40,11 +40,9 @@ from legcal.planning import (
     all_points,
     criterion_of,
     default_camera,
-    direction,
     drawn_covariance,
     places_along,
     surely_reached,
-    upward,
     workspace_of,
     write_session,
 )
@@ -66,11 +64,11 @@ def random_session(
         kept = surely_reached(machine, task.predictor.legs, task.setting, drawn)
         configurations += [drawn.configurations[k] for k in np.flatnonzero(kept)]
     poses = poses_at(machine, configurations[:n_images])
-    points, up = all_points(machine, poses.poses), upward(machine)
+    points, up = all_points(machine, poses.poses), machine.upward
     first, places = rng.uniform(0.0, 2.0 * np.pi), list[Place]()
     while len(places) < n_views:
         turn = first + 2.0 * np.pi * (len(places) + rng.uniform(-0.3, 0.3)) / n_views
-        toward = direction(up, turn, rng.uniform(*_LIFTS[machine.spatial]))
+        toward = direction_above(up, turn, rng.uniform(*_LIFTS[machine.spatial]))
         places += places_along(toward, up, points, camera, task.setting)[:1]
     parts = np.array_split(np.arange(n_images), n_views)
     return [

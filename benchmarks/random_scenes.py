@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.ordered_dataset import nominal_poses
 from legcal.data.measurements import Measurements, View
+from legcal.geometry import look_at
 from legcal.geometry.types import Array, BoolArray, Image
 from legcal.machine import Cylinder as Visible
 from legcal.machine import LegKind, Machine, load_mechanism
@@ -26,7 +27,6 @@ from legcal.simulation import (
     commanded_poses,
     dressed,
     legs_in_image,
-    look_at,
     pose_machine,
     prepare_view,
     write_true_model,

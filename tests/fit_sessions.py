@@ -20,7 +20,7 @@ from legcal.calibration.joint_fit.variables import FittedLegs, Start, fitted_leg
 from legcal.data import LegAxes, Measurements, Outlines, View
 from legcal.data.axes import axes_of_table
 from legcal.data.corners import Corners, found_corners
-from legcal.geometry import Array, components, motions_of
+from legcal.geometry import Array, components, look_at, motions_of
 from legcal.machine import (
     KinematicParameters,
     Leg,
@@ -43,7 +43,6 @@ from legcal.simulation import (
     TableNoise,
     Viewpoint,
     hexapod_cameras,
-    look_at,
     moved_outlines,
     outlines_of,
     paper_hexapod,

@@ -17,13 +17,12 @@ import legcal
 from legcal.calibration import refine
 from legcal.data import Measurements, View
 from legcal.errors import LegcalError, NotIdentifiable, UsageError
-from legcal.geometry import Array
+from legcal.geometry import Array, look_at
 from legcal.machine import Machine, load_mechanism
 from legcal.perception.candidate_pairs import find_candidate_pairs
 from legcal.perception.free_poses import find_free_poses
 from legcal.perception.pair_matching import leg_segments
 from legcal.perception.placement import Search
-from legcal.simulation import look_at
 from legcal.vision import Camera, outlines_of_axis
 from legcal.workers import in_turn
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge
+from legcal.geometry import look_at
 from legcal.machine import JITTER, load_mechanism, to_vector
 from legcal.simulation import (
     OutlineNoise,
@@ -16,7 +17,6 @@ from legcal.simulation import (
     extreme_poses,
     hexapod_cameras,
     hexapod_session,
-    look_at,
     paper_hexapod,
     perturb,
 )

@@ -11,14 +11,13 @@ from thinned import thinned
 
 import legcal
 from legcal.errors import NotVisible
-from legcal.geometry import Array
+from legcal.geometry import Array, look_at
 from legcal.machine import Configurations, Machine
 from legcal.simulation import (
     LegView,
     cameras_around,
     dressed,
     legs_in_image,
-    look_at,
     pose_machine,
     sample_camera,
     silhouette,

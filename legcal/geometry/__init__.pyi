@@ -3,6 +3,7 @@ from .axes import axis_angles_slope as axis_angles_slope
 from .axes import turned_axis as turned_axis
 from .covariances import whitener as whitener
 from .lines import cross as cross
+from .lines import direction_above as direction_above
 from .lines import distance_to_line as distance_to_line
 from .lines import moment as moment
 from .lines import nearest_point_to_line as nearest_point_to_line
@@ -11,6 +12,7 @@ from .lines import normal_basis as normal_basis
 from .lines import segment_distance as segment_distance
 from .motions import components as components
 from .motions import frame_on_points as frame_on_points
+from .motions import look_at as look_at
 from .motions import matrix_applied as matrix_applied
 from .motions import matrix_inverse as matrix_inverse
 from .motions import matrix_of as matrix_of

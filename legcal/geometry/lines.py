@@ -65,6 +65,13 @@ def normal_basis(
     return basis
 
 
+def direction_above(up: Array, turn: float, lift: float) -> Array:
+    """Return the unit direction (3,) at an angle around *up* and a height above its plane [rad]."""
+    x, y = normal_basis(up)
+    level = np.cos(turn) * x + np.sin(turn) * y
+    return np.asarray(np.cos(lift) * level + np.sin(lift) * up)
+
+
 def nearest_point_to_line(u: Array, M: Array, d: Array, P: Array) -> Array:
     """Return the point of each line (u, M) that is nearest to a line along d through P.
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.lines import cross
+from legcal.geometry.lines import cross, normal_basis
 from legcal.geometry.rotations import nearest_rotation, orthogonal, rotation_matrices
 from legcal.geometry.types import Array, IntArray
 
@@ -35,6 +35,22 @@ def frame_on_points(
     x = x / np.linalg.norm(x)
     z = z / np.linalg.norm(z)
     return motion_of(np.column_stack([x, cross(z, x), z]), points[0])
+
+
+def look_at(
+    position: Array,  # (3,) [m]
+    target: Array,  # (3,) [m]
+    roll: float = 0.0,  # about its view [rad]
+    *,
+    up: Array | Sequence[float] = (0.0, 0.0, 1.0),
+) -> RigidTransform:
+    """Return the pose of a camera that looks at a point, with its y axis down before it rolls."""
+    z = (target - position) / np.linalg.norm(target - position)
+    x = cross(z, np.asarray(up))
+    size = np.linalg.norm(x)
+    x = x / size if size >= 1e-6 else normal_basis(z)[0]  # it looks along *up*
+    upright = np.column_stack([x, cross(z, x), z])
+    return motion_of(upright @ Rotation.from_euler("z", roll).as_matrix(), position)
 
 
 def motion_of(

@@ -55,6 +55,16 @@ class Machine:
     platform_normal: Array | None = None  # platform, the same way up; None in space
 
     @property
+    def upward(self) -> Array:
+        """The direction (3,) from base to platform at home, or the normal of a plane of motion."""
+        if self.base_normal is not None:
+            return self.base_normal
+        across = (self.home.apply(self.B_platform) - self.A_base).mean(axis=0)
+        size = float(np.linalg.norm(across))
+        reach = float(np.ptp(self.A_base, axis=0).max())
+        return np.asarray(across / size) if size > 1e-3 * reach else np.array([0.0, 0.0, 1.0])
+
+    @property
     def n_legs(self) -> int:
         """Number of legs."""
         return len(self.legs)

@@ -10,10 +10,8 @@ from .places import USUAL as USUAL
 from .places import Place as Place
 from .places import Setting as Setting
 from .places import all_points as all_points
-from .places import direction as direction
 from .places import parse_bounds as parse_bounds
 from .places import places_along as places_along
-from .places import upward as upward
 from .planned_session import Plan as Plan
 from .planned_session import PlannedView as PlannedView
 from .planned_session import views_in_words as views_in_words

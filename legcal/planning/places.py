@@ -27,11 +27,9 @@ from legcal.files import (
     read_yaml,
     validate,
 )
-from legcal.geometry import Array, cross, motion_of, normal_basis
+from legcal.geometry import Array, direction_above, look_at
 from legcal.machine import Machine
 from legcal.vision import Camera, in_picture
-
-UP = np.array([0.0, 0.0, 1.0])
 
 _TURNS = 16  # directions around the machine
 _LIFTS = (0.1, 0.4, 0.75, 1.15)  # [rad] above the plane across the machine
@@ -109,33 +107,14 @@ class Place:
         return bool(np.all((x >= bounds[:, 0] - _ROUNDING) & (x <= bounds[:, 1] + _ROUNDING)))
 
 
-def upward(machine: Machine) -> Array:
-    """Return the direction from base to platform at home, or the normal of the plane of motion."""
-    if machine.base_normal is not None:
-        return machine.base_normal
-    A, B = machine.A_base, machine.home.apply(machine.B_platform)
-    across = (B - A).mean(axis=0)
-    size = float(np.linalg.norm(across))
-    return np.asarray(across / size) if size > 1e-3 * np.ptp(A, axis=0).max() else UP
-
-
-def look_at(position: Array, target: Array, up: Array) -> RigidTransform:
-    """Return the pose of a camera that looks at a point, with its y axis down."""
-    z = (target - position) / np.linalg.norm(target - position)
-    x = cross(z, up)
-    if np.linalg.norm(x) < 1e-6:  # it looks along *up*
-        x = normal_basis(z)[0]
-    x /= np.linalg.norm(x)
-    return motion_of(np.column_stack([x, cross(z, x), z]), position)
-
-
 def read_places(path: Path, machine: Machine) -> list[Place]:
     """Return the places of a list; without an orientation cameras look at the machine at home."""
     entry = validate(PlacesEntry, read_yaml(path, "places file"), path)
     points, found = all_points(machine, [machine.home]), []
     for name, place in entry.places.items():
         position = np.array(place.xyz)
-        T = look_at(position, 0.5 * (points.min(axis=0) + points.max(axis=0)), upward(machine))
+        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        T = look_at(position, middle, up=machine.upward)
         if place.quat_xyzw is not None:
             turned = Rotation.from_quat(place.quat_xyzw)
             T = RigidTransform.from_components(position, turned)
@@ -151,10 +130,10 @@ def places_around(
     bounds: Array | None,  # (3, 2) lowest and highest coordinates in the base link [m]
 ) -> list[Place]:
     """Return places all around a machine. Raises NotVisible if there are none."""
-    up, found = upward(machine), []
+    up, found = machine.upward, []
     for lift in _LIFTS if machine.spatial else _LIFTS_PLANAR:
         for turn in np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False):
-            found += places_along(direction(up, turn, lift), up, points, camera, setting)
+            found += places_along(direction_above(up, turn, lift), up, points, camera, setting)
     inside = [place for place in found if place.is_inside(bounds)]
     if not inside:
         near = min(float(np.linalg.norm(p.T_base_camera.translation)) for p in found or [_NOWHERE])
@@ -169,13 +148,6 @@ def places_around(
 _NOWHERE = Place(RigidTransform.identity())
 
 
-def direction(up: Array, turn: float, lift: float) -> Array:
-    """Return the unit direction at an angle around *up* and a height [rad]."""
-    x, y = normal_basis(up)
-    level = np.cos(turn) * x + np.sin(turn) * y
-    return np.asarray(np.cos(lift) * level + np.sin(lift) * up)
-
-
 def places_along(
     toward: Array, up: Array, points: Array, camera: Camera, setting: Setting
 ) -> list[Place]:
@@ -187,11 +159,11 @@ def places_along(
         nearest = distance - reach
         if nearest < _CLEARANCE * size:
             continue
-        T = look_at(target + distance * toward, target, up)
+        T = look_at(target + distance * toward, target, up=up)
         P = T.inv().apply(points)
         if in_picture(camera, P, 0.0, setting.margin(camera, nearest)).all():
             return [
-                Place(look_at(target + d * toward, target, up))
+                Place(look_at(target + d * toward, target, up=up))
                 for d in distance * np.array(_NEARER)
                 if d - reach >= _CLEARANCE * size
             ]
@@ -227,7 +199,7 @@ def near(place: Place, target: Array, up: Array, step: float, rng: np.random.Gen
         return place
     position = place.T_base_camera.translation
     away = np.linalg.norm(position - target)
-    return Place(look_at(position + step * away * rng.normal(size=3), target, up))
+    return Place(look_at(position + step * away * rng.normal(size=3), target, up=up))
 
 
 def all_points(machine: Machine, poses: Sequence[RigidTransform]) -> Array:

@@ -32,7 +32,6 @@ from legcal.planning.places import (
     all_points,
     near,
     places_around,
-    upward,
 )
 from legcal.planning.planned_session import Plan, PlannedView
 from legcal.planning.poses import candidate_poses, drawn_legs, poses_near, some_of
@@ -326,7 +325,7 @@ def _better_places(
     target: Array,
 ) -> list[Candidates]:
     """Return the same poses seen from places nearby, where that is better."""
-    task, up = scene.task, upward(scene.task.machine)
+    task, up = scene.task, scene.task.machine.upward
     current, known = list(current), _required(scene, current)
     value = float(criterion(_with_all(known, given).machine[None])[0])
     for v, own in enumerate(current):

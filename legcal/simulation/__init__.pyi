@@ -1,6 +1,5 @@
 from .board import PlacedBoard as PlacedBoard
 from .cameras import cameras_around as cameras_around
-from .cameras import look_at as look_at
 from .cameras import mild_lens as mild_lens
 from .cameras import sample_camera as sample_camera
 from .checkpoint import has_keys as has_keys

@@ -20,7 +20,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DatasetError, NotVisible
 from legcal.files import FileSchema, MotionEntry, PlainName, read_yaml, validate
-from legcal.geometry import Array, cross, motion_of, normal_basis
+from legcal.geometry import Array, cross, direction_above, look_at, normal_basis
 from legcal.machine import Machine
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard
@@ -33,8 +33,6 @@ from legcal.simulation.visibility import (
     longest_in_images,
 )
 from legcal.vision import Board, Camera, Link, read_camera
-
-UP = np.array([0.0, 0.0, 1.0])
 
 _MAX_SHIFT = 0.015  # [m]; a dataset may be off by 2 cm and 2 degrees
 _MAX_TURN = float(np.deg2rad(1.5))
@@ -76,15 +74,6 @@ def mild_lens() -> Camera:
     """Return the camera of :func:`sample_camera` behind a lens that distorts a little."""
     pinhole = sample_camera()
     return replace(pinhole, distortion=np.array([-0.1, 0.03, 2e-4, -1e-4, 0.0]))
-
-
-def look_at(position: Array, target: Array, roll: float = 0.0, *, up: Array = UP) -> RigidTransform:
-    """Return the pose of a camera that looks at a point, with its y axis down."""
-    z = (target - position) / np.linalg.norm(target - position)
-    x = cross(z, up)
-    x /= np.linalg.norm(x)
-    upright = np.column_stack([x, cross(z, x), z])
-    return motion_of(upright @ Rotation.from_euler("z", roll).as_matrix(), position)
 
 
 def rough_pose(T_base_camera: RigidTransform, rng: np.random.Generator) -> RigidTransform:
@@ -152,7 +141,7 @@ def cameras_around(
     That is the least mean length of the legs in the images of a view [px], zero if a camera does
     not see a board.
     """
-    reached, tried, up = _reached(posed_machines), _some(posed_machines), _upward(machine)
+    reached, tried, up = _reached(posed_machines), _some(posed_machines), machine.upward
     sector = 2.0 * np.pi / len(cameras)
     first = rng.uniform(0.0, 2.0 * np.pi)
     lifts = _LIFTS if machine.spatial else _LIFTS_PLANAR
@@ -162,7 +151,12 @@ def cameras_around(
         roll, further = rng.uniform(-_ROLL, _ROLL), 1.0 + _EXTRA_DISTANCE * rng.random()
         candidates = [
             _before(
-                _direction(up, first + v * sector + turn, lift), up, roll, further, reached, camera
+                direction_above(up, first + v * sector + turn, lift),
+                up,
+                roll,
+                further,
+                reached,
+                camera,
             )
             for turn in min(sector, 0.5 * np.pi) * np.array(_TURNS)
             for lift in lifts
@@ -181,11 +175,13 @@ def camera_in_hand(
     rng: np.random.Generator,
 ) -> RigidTransform | None:
     """Return T_base_camera that shows boards and legs, the best of a few; None if there is none."""
-    up, reached = _upward(machine), _reached([posed])
+    up, reached = machine.upward, _reached([posed])
     lifts = _LIFTS if machine.spatial else _LIFTS_PLANAR
     good = []
     for _ in range(MAX_HAND_DRAWS):
-        toward = _direction(up, rng.uniform(0.0, 2.0 * np.pi), rng.uniform(lifts[0], lifts[-1]))
+        toward = direction_above(
+            up, rng.uniform(0.0, 2.0 * np.pi), rng.uniform(lifts[0], lifts[-1])
+        )
         roll, further = (
             rng.uniform(-_HAND_ROLL, _HAND_ROLL),
             1.0 + _HAND_EXTRA_DISTANCE * rng.random(),
@@ -253,7 +249,7 @@ def board_on_platform(
 ) -> RigidTransform:
     """Return T_platform_board of a board on top of the platform, free of the machine."""
     home = machine.home
-    up = home.rotation.inv().apply(_upward(machine))
+    up = home.rotation.inv().apply(machine.upward)
     middle = machine.B_platform.mean(axis=0)
     size = float(np.linalg.norm(np.ptp(_joints(posed_machines), axis=0)))
     side = normal_basis(up)[0]
@@ -290,24 +286,6 @@ def board_on_platform(
     if best is None or most < _MIN_BOARD_SHARE:
         raise _nowhere(board, "the cameras", "use a smaller board, or other cameras", "platform")
     return best
-
-
-def _upward(machine: Machine) -> Array:
-    """Return the direction from base to platform at home, or the normal of the plane of motion."""
-    if machine.base_normal is not None:
-        return machine.base_normal
-    A, B = machine.A_base, machine.home.apply(machine.B_platform)
-    across = (B - A).mean(axis=0)
-    size = float(np.linalg.norm(across))
-    reach = float(np.ptp(A, axis=0).max())
-    return np.asarray(across / size) if size > 1e-3 * reach else UP
-
-
-def _direction(up: Array, turn: float, lift: float) -> Array:
-    """Return the unit direction at an angle around *up* and a height [rad]."""
-    x, y = normal_basis(up)
-    level = np.cos(turn) * x + np.sin(turn) * y
-    return np.asarray(np.cos(lift) * level + np.sin(lift) * up)
 
 
 def _some(posed_machines: Sequence[PosedMachine]) -> list[PosedMachine]:
@@ -424,7 +402,7 @@ def _lying(
     towards: Array | None = None,
 ) -> Iterator[PlacedBoard]:
     """Yield places near the base that the machine leaves free, also tilted towards a point."""
-    up, A = _upward(machine), machine.A_base
+    up, A = machine.upward, machine.A_base
     middle = A.mean(axis=0)
     size = float(np.linalg.norm(np.ptp(_joints(posed_machines), axis=0)))
     flat = A - middle - ((A - middle) @ up)[:, None] * up

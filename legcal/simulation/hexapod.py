@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data import LegAxes, Measurements, Outlines, View, axes_from_outlines, axes_of_table
 from legcal.errors import DidNotConverge
-from legcal.geometry import Array, BoolArray, IntArray, frame_on_points
+from legcal.geometry import Array, BoolArray, IntArray, frame_on_points, look_at
 from legcal.machine import (
     KinematicParameters,
     from_vector,
@@ -23,7 +23,7 @@ from legcal.machine import (
     solve_poses,
     to_vector,
 )
-from legcal.simulation.cameras import look_at, rough_pose, sample_camera
+from legcal.simulation.cameras import rough_pose, sample_camera
 from legcal.simulation.observe import (
     OutlineNoise,
     Scene,
