@@ -17,7 +17,14 @@ from scipy.spatial.transform import RigidTransform
 from legcal.data import Outlines
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Cylinder
-from legcal.vision import EPSILON, Camera, in_picture, outlines_of_axis, visible_segments
+from legcal.vision import (
+    EPSILON,
+    Camera,
+    in_picture,
+    outlines_of_axis,
+    rays_past_axes,
+    visible_segments,
+)
 
 N_SAMPLES = 24  # points along a part that are tested
 MIN_LENGTH_PX = 20.0  # of a stretch that is measured
@@ -164,16 +171,8 @@ def _behind_legs(
     of_leg: Array,  # (n_legs,) the largest radius
 ) -> BoolArray:
     """Return which points have another leg in front of them, wholly or in part."""
-    distance = np.linalg.norm(P, axis=-1)
-    ray = P / distance[..., None]
-    shape = (len(u), 1, 1, len(A))
-    c = np.einsum("kpmx,klx->kpml", ray, u)
-    to_A = ray @ A.T
-    from_foot = np.sum(u * A, axis=-1)
-    along = (c * to_A - from_foot.reshape(shape)) / np.maximum(1.0 - c**2, 1e-12)
-    along = np.clip(along, 0.0, length.reshape(shape))
-    depth = to_A + along * c
-    square = np.sum(A * A, axis=-1) + along * (along + 2.0 * from_foot.reshape(shape)) - depth**2
+    rays = rays_past_axes(P.reshape(len(P), -1, 3), A, u, length)
+    distance, depth, square = (x.reshape(*P.shape[:-1], *x.shape[2:]) for x in rays)
     # A ray to the edge of the leg itself passes at its radius, as far as the other leg is nearer.
     beside = radius[:, None, None] * depth / distance[..., None]
     hides = (square < (of_leg + beside) ** 2) & (depth > 0.0) & (depth < distance[..., None])

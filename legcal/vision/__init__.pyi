@@ -63,4 +63,5 @@ from .visibility import hidden_by as hidden_by
 from .visibility import in_picture as in_picture
 from .visibility import look_alike as look_alike
 from .visibility import predict_legs as predict_legs
+from .visibility import rays_past_axes as rays_past_axes
 from .visibility import visible_segments as visible_segments

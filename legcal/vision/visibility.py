@@ -253,6 +253,27 @@ def predict_legs(
     ]
 
 
+def rays_past_axes(
+    P_camera: Array,  # (..., n, 3) points that are looked at [m]
+    A: Array,  # (..., n_legs, 3) one end of the axis of each leg [m]
+    u: Array,  # (..., n_legs, 3) its unit direction
+    length: Array,  # (..., n_legs) [m]
+) -> tuple[Array, Array, Array]:
+    """Return how far points are (..., n), and where their rays come nearest to the axes of legs.
+
+    That is the depth along the ray and the square of the gap, (..., n, n_legs) each [m, m^2].
+    """
+    distance = np.linalg.norm(P_camera, axis=-1)
+    ray = P_camera / distance[..., None]
+    c, to_A = ray @ np.swapaxes(u, -1, -2), ray @ np.swapaxes(A, -1, -2)
+    sine2 = np.maximum(1.0 - c**2, 1e-12)
+    from_foot = np.sum(u * A, axis=-1)[..., None, :]
+    along = np.clip((c * to_A - from_foot) / sine2, 0.0, length[..., None, :])
+    depth = to_A + along * c
+    of_A = np.sum(A * A, axis=-1)[..., None, :]
+    return distance, depth, of_A + along * (along + 2.0 * from_foot) - depth**2
+
+
 def hidden_by(
     legs: Sequence[PredictedLeg],
     own: IntArray,  # (n,) the leg to whose outline each point belongs
@@ -260,20 +281,12 @@ def hidden_by(
     margin: Array,  # (n,) points this near to another leg's outline count as hidden
 ) -> IntArray:
     """Return which other leg stands in front of points of legs, (n,)."""
-    distance = np.linalg.norm(P_camera, axis=1)
-    ray = P_camera / distance[:, None]
     u, A, B = (
         np.array(x) for x in zip(*((o.u, o.A_camera, o.B_camera) for o in legs), strict=True)
     )
     length = np.linalg.norm(B - A, axis=1)
     radius = np.array([max(segment.radius for segment in other.segments) for other in legs])
-    # The points of the legs' axes nearest to the viewing rays, and the rays' nearest points.
-    c, to_A = ray @ u.T, ray @ A.T  # (n, n_legs)
-    sine2 = np.maximum(1.0 - c**2, 1e-12)
-    from_foot = np.sum(u * A, axis=1)
-    along = np.clip((c * to_A - from_foot) / sine2, 0.0, length)
-    depth = to_A + along * c
-    square = np.sum(A * A, axis=1) + along * (along + 2.0 * from_foot) - depth**2  # of the gap
+    distance, depth, square = rays_past_axes(P_camera, A, u, length)
     reach = radius + margin[:, None] * depth
     hides = (reach > 0.0) & (square < reach**2) & (depth < distance[:, None])
     front = np.full(len(P_camera), -1, dtype=np.intp)
