@@ -31,15 +31,12 @@ from legcal.planning import (
     DEFAULT_NOISE,
     WHITE,
     Candidates,
-    Goal,
     Place,
     Plan,
     Predictor,
     Scene,
     Task,
     all_points,
-    criterion_of,
-    default_camera,
     drawn_covariance,
     places_along,
     surely_reached,
@@ -47,6 +44,7 @@ from legcal.planning import (
     write_session,
 )
 from legcal.simulation import Level, SimulationSettings, simulate
+from legcal.vision import sample_camera
 
 MACHINES = ("hexapod", "3-upu-tilted", "3-rpr", "3-rps", "tricept")
 _LIFTS = {True: (0.1, 0.7), False: (0.8, 1.3)}  # [rad] of random places; planar machines: False
@@ -111,7 +109,8 @@ def main() -> None:
     parser.add_argument("--machines", nargs="+", default=list(MACHINES))
     parser.add_argument("--images", type=int, default=45)
     parser.add_argument("--cameras", type=int, default=3)
-    parser.add_argument("--random", type=int, default=50)
+    parser.add_argument("--random", type=int, default=50, help="random sessions; 0 for none")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first calibration")
     parser.add_argument("--draws", type=int, default=3, help="of each random session")
     parser.add_argument("--runs", type=int, default=0, help="calibrations from outlines")
     parser.add_argument("--rendered", type=int, default=0, help="calibrations from photographs")
@@ -128,7 +127,7 @@ def main() -> None:
 def compare(name: str, args: argparse.Namespace) -> dict[str, object]:
     """Return the figures of one machine."""
     machine = load_mechanism(name)
-    predictor = Predictor(machine, default_camera(), DEFAULT_NOISE, 2e-6)
+    predictor = Predictor(machine, sample_camera(), DEFAULT_NOISE, 2e-6)
     scene = Scene.nominal(Task(predictor, args.images, args.cameras))
     work = workspace_of(machine, predictor.legs)
     if work is None:
@@ -138,19 +137,17 @@ def compare(name: str, args: argparse.Namespace) -> dict[str, object]:
     seconds = time.perf_counter() - start
     session = [Candidates(Place(v.T_base_camera), v.poses) for v in plan.views]
     planned = work.error(judged(scene, session, args.draws)).mean_displacement
-    criterion = criterion_of(Goal.MEAN, work, predictor.legs, np.eye(len(plan.names)))
     unit = np.array([1.0 if u == "m" else 1.0 / machine.q0.mean() for u in plan.units])
-    rng, errors, ranked, values = np.random.default_rng(7), [], [], []
+    rng, errors, ranked = np.random.default_rng(7), [], []
     for _ in range(args.random):
         covariance = judged(
             scene, random_session(scene, args.images, args.cameras, rng), args.draws
         )
         errors.append(work.error(covariance).mean_displacement)
-        values.append(float(criterion(covariance[None])[0]))
         free = np.diagonal(covariance) > 0.0
         ranked.append(indices(covariance[np.ix_(free, free)], unit[free]))
     table = {}
-    for key in ranked[0]:
+    for key in ranked[0] if ranked else ():
         scores = [one[key] for one in ranked]
         table[key] = {
             "spearman": float(spearmanr(scores, errors)[0]),
@@ -160,30 +157,38 @@ def compare(name: str, args: argparse.Namespace) -> dict[str, object]:
         "machine": name,
         "seconds": seconds,
         "planned_mm": 1e3 * planned,
-        "random_median_mm": 1e3 * float(np.median(errors)),
-        "random_best_mm": 1e3 * min(errors),
-        "ratio": planned / float(np.median(errors)),
-        "indices": table,
     }
+    if errors:
+        found |= {
+            "random_median_mm": 1e3 * float(np.median(errors)),
+            "random_best_mm": 1e3 * min(errors),
+            "ratio": planned / float(np.median(errors)),
+            "indices": table,
+        }
     with TemporaryDirectory() as folder:
         if args.runs:
             white = legcal.plan(machine, images=args.images, cameras=args.cameras, noise=WHITE)
             write_session(white, Path(folder) / "white")
             found["outlines"] = shot(
-                machine, white, Path(folder) / "white", Level.OUTLINES, args.runs
+                machine, white, Path(folder) / "white", Level.OUTLINES, args.first, args.runs
             )
         if args.rendered:
             write_session(plan, Path(folder) / "plan")
             found["photographs"] = shot(
-                machine, plan, Path(folder) / "plan", Level.PHOTOGRAPHS, args.rendered
+                machine, plan, Path(folder) / "plan", Level.PHOTOGRAPHS, args.first, args.rendered
             )
     return found
 
 
-def shot(machine: Machine, plan: Plan, session: Path, level: Level, runs: int) -> dict[str, object]:
-    """Return errors of simulated calibrations of a planned session, beside what was predicted."""
+def shot(
+    machine: Machine, plan: Plan, session: Path, level: Level, first: int, runs: int
+) -> dict[str, object]:
+    """Return errors of simulated calibrations of a planned session, beside what was predicted.
+
+    The standard error of their ratio is that of the mean square of the runs.
+    """
     dX, dE, stated, failed = [], [], [], []
-    for seed in range(runs):
+    for seed in range(first, first + runs):
         folder, out = session.parent / f"shot{seed}", session.parent / f"out{seed}"
         try:
             made = simulate(
@@ -205,15 +210,20 @@ def shot(machine: Machine, plan: Plan, session: Path, level: Level, runs: int) -
         key: float(np.sqrt(np.mean(np.square(np.concatenate(x)))))
         for key, x in (("found", dX), ("stated", stated), ("expected", [expected.displacement]))
     }
+    square = np.array([float(np.mean(np.square(x))) for x in dX])
+    spread = float(square.std(ddof=1)) if len(square) > 1 else 0.0
     return {
         "runs": runs,
+        "first": first,
         "failed": failed,
         "predicted_mm": 1e3 * expected.mean_displacement,
         "mean_mm": 1e3 * float(np.mean(np.concatenate(dX))),
         "mean_deg": float(np.degrees(np.mean(np.concatenate(dE)))),
         "worst_mm": 1e3 * max(float(x.mean()) for x in dX),
         "found_over_predicted": rms["found"] / rms["expected"],
+        "found_error": 0.5 * spread / len(square) ** 0.5 / rms["found"] / rms["expected"],
         "stated_over_predicted": rms["stated"] / rms["expected"],
+        "found_mm": (1e3 * np.sqrt(square)).tolist(),
     }
 
 

@@ -18,10 +18,9 @@ from legcal.simulation import (
     hexapod_session,
     paper_hexapod,
     perturb,
-    sample_camera,
     shifted_outlines,
 )
-from legcal.vision import Camera
+from legcal.vision import Camera, sample_camera
 
 LENS = replace(sample_camera(), distortion=np.array([-0.2, 0.1, 0.001, -0.002, 0.0]))
 

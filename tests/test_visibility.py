@@ -19,13 +19,12 @@ from legcal.simulation import (
     dressed,
     legs_in_image,
     pose_machine,
-    sample_camera,
     silhouette,
     take_images,
 )
 from legcal.simulation.solids import Box, PosedMachine, Solid, solids_of
 from legcal.simulation.visibility import MIN_SHARE, contact_offsets
-from legcal.vision import Camera, outlines_of_axis
+from legcal.vision import Camera, outlines_of_axis, sample_camera
 from legcal.vision.distortion import DistortionModel
 from legcal.vision.visibility import in_picture, pixels_inside
 

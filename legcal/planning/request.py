@@ -19,7 +19,7 @@ from legcal.planning.places import USUAL, Place, Setting, read_places
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Task, plan_session
 from legcal.progress import Progress, Report, shown_progress
-from legcal.vision import Board, Camera, board_of, read_camera
+from legcal.vision import Board, Camera, board_of, read_camera, sample_camera
 from legcal.workers import Run, Workers, worker_pool
 
 SIGMA_Q = 2e-6  # [m] of a reading, where nobody says
@@ -29,12 +29,6 @@ SAME_MACHINE = 0.01  # [m] between joints of the model and of a dataset that was
 _ROUNDS = 5  # plans, until the fewest images are found that reach a target
 _BEGIN = 24  # images of the first of them
 _NEARLY = 0.9  # of the images of a plan that reaches it: another with so many is tried
-
-
-def default_camera() -> Camera:
-    """Return a camera of 1024 x 768 pixels that sees 43 degrees, as long as none is chosen."""
-    K = np.array([[1290.0, 0.0, 511.5], [0.0, 1290.0, 383.5], [0.0, 0.0, 1.0]])
-    return Camera(K, 1024, 768)
 
 
 def plan(
@@ -132,7 +126,7 @@ def plan(
     shot = given if isinstance(given, Dataset) or given is None else _shot(Path(given))
     before = () if shot is None else _given(machine, shot)
     if camera is None:
-        chosen = default_camera() if shot is None else shot.measurements.views[0].camera
+        chosen = sample_camera() if shot is None else shot.measurements.views[0].camera
     else:
         chosen = camera if isinstance(camera, Camera) else read_camera(Path(camera))
     if encoder_sigma is None:

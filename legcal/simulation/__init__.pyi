@@ -1,7 +1,6 @@
 from .board import PlacedBoard as PlacedBoard
 from .cameras import cameras_around as cameras_around
 from .cameras import mild_lens as mild_lens
-from .cameras import sample_camera as sample_camera
 from .checkpoint import has_keys as has_keys
 from .checkpoint import is_failure as is_failure
 from .checkpoint import is_number as is_number

@@ -32,7 +32,7 @@ from legcal.simulation.visibility import (
     legs_in_image,
     longest_in_images,
 )
-from legcal.vision import Board, Camera, Link, read_camera
+from legcal.vision import Board, Camera, Link, read_camera, sample_camera
 
 _MAX_SHIFT = 0.015  # [m]; a dataset may be off by 2 cm and 2 degrees
 _MAX_TURN = float(np.deg2rad(1.5))
@@ -64,14 +64,8 @@ _TILTS = (0.0, 0.6, 1.1)  # [rad] from lying flat, towards cameras with given pl
 _MIN_LEGS_SHARE = 0.9  # of what is seen of the legs that must stay seen
 
 
-def sample_camera() -> Camera:
-    """Return a camera of 1024 x 768 pixels without distortion, as of the example hexapod."""
-    K = np.array([[1290.3, 0.0, 518.3], [0.0, 1290.3, 379.6], [0.0, 0.0, 1.0]])
-    return Camera(K, 1024, 768)
-
-
 def mild_lens() -> Camera:
-    """Return the camera of :func:`sample_camera` behind a lens that distorts a little."""
+    """Return the camera of ``vision.sample_camera`` behind a lens that distorts a little."""
     pinhole = sample_camera()
     return replace(pinhole, distortion=np.array([-0.1, 0.03, 2e-4, -1e-4, 0.0]))
 

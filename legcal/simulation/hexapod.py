@@ -23,7 +23,7 @@ from legcal.machine import (
     solve_poses,
     to_vector,
 )
-from legcal.simulation.cameras import rough_pose, sample_camera
+from legcal.simulation.cameras import rough_pose
 from legcal.simulation.observe import (
     OutlineNoise,
     Scene,
@@ -33,7 +33,7 @@ from legcal.simulation.observe import (
     plain_scene,
 )
 from legcal.simulation.visibility import Viewpoint
-from legcal.vision import Camera
+from legcal.vision import Camera, sample_camera
 
 PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs seen at a time
 RAISED = 0.030  # [m] out of the plane of the others

@@ -20,6 +20,7 @@ from .camera import distort_derivatives as distort_derivatives
 from .camera import intrinsic_names as intrinsic_names
 from .camera import intrinsic_unit as intrinsic_unit
 from .camera import intrinsic_values as intrinsic_values
+from .camera import sample_camera as sample_camera
 from .camera import shared_cameras as shared_cameras
 from .camera import stated_covariances as stated_covariances
 from .camera import undistort_with_derivatives as undistort_with_derivatives

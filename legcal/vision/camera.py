@@ -208,6 +208,12 @@ class Camera:
 _PINHOLE = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}  # places in K
 
 
+def sample_camera() -> Camera:
+    """Return a camera of 1024 x 768 pixels without distortion, 43 degrees wide: the example's."""
+    K = np.array([[1290.3, 0.0, 518.3], [0.0, 1290.3, 379.6], [0.0, 0.0, 1.0]])
+    return Camera(K, 1024, 768)
+
+
 def _coefficients(camera: Camera) -> tuple[str, ...]:
     return DISTORTION_MODELS[camera.model].coefficients
 
