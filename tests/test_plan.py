@@ -314,6 +314,8 @@ def test_what_else_is_in_the_way_is_refused(
     (tmp_path / "away.yaml").write_text(yaml.safe_dump({"places": {"a": away}}))
     refused(NotVisible, "0 of 1 camera places", places=tmp_path / "away.yaml")
     refused(UsageError, "found 1 places for 2", places=tmp_path / "away.yaml", cameras=2)
+    for name in ("dataset.yaml", "plan.json"):  # their views are places too
+        refused(UsageError, "found 2 places for 3", places=shot / "session" / name, cameras=3)
     refused(UsageError, "leg9.base.x", criterion="parameters", parameters=["leg9.base.x"],
             places=places(tmp_path))  # fmt: skip
     refused(NotIdentifiable, "plan .* --images or more", images=1, places=places(tmp_path))

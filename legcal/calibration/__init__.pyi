@@ -1,6 +1,7 @@
 from .camera_calibration.calibration import calibrate_camera as calibrate_camera
 from .camera_calibration.document import CameraCalibration as CameraCalibration
 from .change_detection import Explanation as Explanation
+from .closeness import PLAN_NAME as PLAN_NAME
 from .detection import DETECTION_PAGE as DETECTION_PAGE
 from .detection import Detection as Detection
 from .documents import JointInLink as JointInLink

@@ -79,8 +79,9 @@ def plan(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Places of tripods to choose from, a YAML with places: {NAME: {xyz, quat_xyzw}}; "
-            "without quat_xyzw the camera is turned to the machine.",
+            help="Places of tripods to choose from, a YAML with places: {NAME: {xyz, quat_xyzw}}, "
+            "without quat_xyzw turned to the machine; or the views of a cameras file, dataset, "
+            "result or plan.",
         ),
     ] = None,
     given: Annotated[

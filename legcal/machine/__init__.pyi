@@ -55,6 +55,7 @@ from .kinematics import consistent_readings as consistent_readings
 from .kinematics import contradiction as contradiction
 from .kinematics import equations_of_readings as equations_of_readings
 from .kinematics import follow as follow
+from .kinematics import follow_each as follow_each
 from .kinematics import follow_poses as follow_poses
 from .kinematics import followed_poses as followed_poses
 from .kinematics import forward_kinematics as forward_kinematics

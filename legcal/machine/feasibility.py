@@ -9,7 +9,7 @@ readings.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from enum import StrEnum
 
 import numpy as np
@@ -43,7 +43,7 @@ _FULL_EXTREME, _FULL = 12, 2  # draws over all of the travel; the next are neare
 _NEARER = 0.85  # each
 _BEFORE_LAST = 6  # draws before the one that reached the last pose; extremes begin at the first
 _WAY = (0.25, 0.5, 0.75, 1.0)  # parts of the way from home at which the pose must be feasible
-_SHORTEST = 0.25  # least step of such a part; what is harder to reach is drawn again
+_SHORTEST = 0.25  # least step of a part of a way; what is harder to reach does not count
 _MAX_FAILED_POSES = 5  # one after the other
 
 
@@ -189,6 +189,26 @@ class Feasibility:
             return Cause.COLLISION, f"legs '{one}' and '{two}' run through each other"
         return None
 
+    def led(
+        self, here: Array, readings: Array, parts: Sequence[float], *, on_the_chain: bool = False
+    ) -> Array | Obstacle:
+        """Return the configuration at readings (n_motors,) after a straight way, or its obstacle.
+
+        The machine is looked at in *parts* of the way from configuration *here*, the last of
+        which is 1; *on_the_chain* is that of :func:`follow`.
+        """
+        first = here[slider_columns(self._machine, self._machine.motors)[0]]
+        for part in parts:
+            q = readings if part == 1.0 else first + part * (readings - first)
+            try:
+                here = follow(self._machine, here, q, min_step=_SHORTEST, on_the_chain=on_the_chain)
+            except DidNotConverge:
+                return Cause.LENGTHS, Cause.LENGTHS.value
+            obstacle = self.obstacle(here, of_motors=part == 1.0)
+            if obstacle is not None:
+                return obstacle
+        return here
+
     def collision(self, T_base_platform: RigidTransform) -> tuple[str, str] | None:
         """Return the first two legs that run through each other at a pose, None if none do."""
         touching = np.flatnonzero(self._touching(T_base_platform))
@@ -242,27 +262,13 @@ def _followed(
         q = consistent_readings(machine, (lower + part * (upper - lower))[None])[0]
         return np.asarray(q if shrink == 1.0 else np.clip(home + shrink * (q - home), lower, upper))
 
-    def reached(readings: Array) -> Array | Obstacle:
-        """Return the configuration, or what is in the way."""
-        configuration = machine.home_configuration
-        for part in _WAY:
-            q = readings if part == 1.0 else home + part * (readings - home)
-            try:
-                configuration = follow(
-                    machine, configuration, q, min_step=_SHORTEST, on_the_chain=True
-                )
-            except DidNotConverge:
-                return Cause.LENGTHS, Cause.LENGTHS.value
-            obstacle = feasibility.obstacle(configuration, of_motors=part == 1.0)
-            if obstacle is not None:
-                return obstacle
-        return configuration
-
     while True:
         first = 0 if extreme else max(0, last - _BEFORE_LAST)
         for draw in range(first, first + _MAX_DRAWS):
             full = _FULL_EXTREME if extreme else _FULL
-            found = reached(drawn(_NEARER ** max(0, draw + 1 - full)))
+            readings = drawn(_NEARER ** max(0, draw + 1 - full))
+            start = machine.home_configuration
+            found = feasibility.led(start, readings, _WAY, on_the_chain=True)
             if not isinstance(found, tuple):
                 last = draw
                 yield found

@@ -228,6 +228,19 @@ def followed_poses(
         yield T, contradicted
 
 
+def follow_each(machine: Machine, readings: Array) -> Iterator[Array]:
+    """Yield the closed configuration at each of readings (n, n_motors).
+
+    Each is followed from the nearest one that is reached already, or from home. Raises
+    DidNotConverge at the first that is not reached.
+    """
+    columns, reached = slider_columns(machine, machine.motors)[0], [machine.home_configuration]
+    for row in readings:
+        far = [float(np.abs(c[columns] - row).max()) for c in reached]
+        reached.append(follow(machine, reached[int(np.argmin(far))], row))
+        yield reached[-1]
+
+
 def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the joint value of every leg at a pose, ``q = sign (|AB| - q0)``.
 

@@ -22,7 +22,6 @@ from .planner import drawn_covariance as drawn_covariance
 from .planner import plan_session as plan_session
 from .poses import surely_reached as surely_reached
 from .request import plan as plan
-from .session import PLAN_NAME as PLAN_NAME
 from .session import check_session as check_session
 from .session import images_of as images_of
 from .session import write_session as write_session

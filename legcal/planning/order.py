@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from legcal.errors import DidNotConverge
 from legcal.geometry import Array
 from legcal.machine import (
     Configurations,
     Feasibility,
     Machine,
-    follow,
     motor_travel,
+    platform_pose,
     slider_columns,
 )
 
 HOME = "home"
-_STOPS = np.linspace(0.2, 1.0, 5)  # parts of a way that are looked at
+_STOPS = (0.2, 0.4, 0.6, 0.8, 1.0)  # parts of a way that are looked at
+_SAME = 1e-6  # [m], and entries of rotations
 _ROUNDS = 20  # of exchanges for a shorter way
 
 
@@ -82,13 +82,9 @@ def ways(machine: Machine, poses: Configurations) -> tuple[tuple[str, ...], int]
 
 def _is_free(machine: Machine, feasibility: Feasibility, first: Array, last: Array) -> bool:
     """Say whether the machine can go straight from one configuration to another."""
-    columns = slider_columns(machine, machine.motors)[0]
-    here, start = first, first[columns]
-    try:
-        for part in _STOPS:
-            here = follow(machine, here, start + part * (last[columns] - start), min_step=0.25)
-            if feasibility.problem(here, of_motors=False) is not None:
-                return False
-    except DidNotConverge:
+    readings = last[slider_columns(machine, machine.motors)[0]]
+    there = feasibility.led(first, readings, _STOPS)
+    if isinstance(there, tuple):
         return False
-    return bool(np.abs(here - last)[columns].max() < 1e-9)
+    T, wanted = platform_pose(machine, there), platform_pose(machine, last)
+    return bool(np.abs(T.as_matrix() - wanted.as_matrix()).max() < _SAME)  # not a mirrored one

@@ -10,20 +10,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import ConfigDict, Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import NotVisible, UsageError
 from legcal.files import (
     LENGTH,
     FileSchema,
+    MotionEntry,
     PlainName,
     Quaternion,
     Vector,
     parse_quantity,
+    read_json,
     read_yaml,
     validate,
 )
@@ -91,6 +93,22 @@ class PlacesEntry(FileSchema):
     places: Annotated[dict[PlainName, PlaceEntry], Field(min_length=1)]
 
 
+class ViewEntry(FileSchema):
+    """Where a camera of another file stands; what else is said of it does not matter."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    T_base_camera: MotionEntry
+
+
+class ViewsEntry(FileSchema):
+    """A file that has views: of cameras to simulate, a dataset, a result, a plan."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    views: Annotated[dict[PlainName, ViewEntry], Field(min_length=1)]
+
+
 @dataclass(frozen=True, eq=False)
 class Place:
     """A place of a camera."""
@@ -108,8 +126,15 @@ class Place:
 
 
 def read_places(path: Path, machine: Machine) -> list[Place]:
-    """Return the places of a list; without an orientation cameras look at the machine at home."""
-    entry = validate(PlacesEntry, read_yaml(path, "places file"), path)
+    """Return the places of a list; without an orientation cameras look at the machine at home.
+
+    In place of a list, those of the views of any file that has some.
+    """
+    document = _document(path)
+    if "views" in document and "places" not in document:
+        views = validate(ViewsEntry, document, path).views
+        return [Place(v.T_base_camera.motion(), name, fixed=True) for name, v in views.items()]
+    entry = validate(PlacesEntry, document, path)
     points, found = all_points(machine, [machine.home]), []
     for name, place in entry.places.items():
         position = np.array(place.xyz)
@@ -120,6 +145,15 @@ def read_places(path: Path, machine: Machine) -> list[Place]:
             T = RigidTransform.from_components(position, turned)
         found.append(Place(T, name, fixed=True))
     return found
+
+
+def _document(path: Path) -> dict[str, Any]:
+    """Return what a YAML or JSON file holds."""
+    try:
+        found = read_json(path)  # a result is JSON, and long
+    except (OSError, ValueError):
+        found = None
+    return found if isinstance(found, dict) else read_yaml(path, "places file")
 
 
 def places_around(

@@ -11,7 +11,7 @@ import numpy as np
 from legcal.data import Dataset, load_dataset
 from legcal.errors import DatasetError, NotIdentifiable, UsageError
 from legcal.geometry import Array
-from legcal.machine import Configurations, Machine, follow, load_mechanism, poses_at, slider_columns
+from legcal.machine import Machine, follow_each, load_mechanism, poses_at
 from legcal.planning.goals import Goal
 from legcal.planning.information import DEFAULT_NOISE, PredictedNoise, Predictor
 from legcal.planning.noise import read_noise
@@ -340,18 +340,9 @@ def _given(machine: Machine, shot: Dataset) -> tuple[Candidates, ...]:
         if view.T_base_camera is None or not len(rows):
             continue
         place = Place(view.T_base_camera, view.name, fixed=True)
-        found_views.append(Candidates(place, _followed(machine, m.q[rows])))
+        configurations = list(follow_each(machine, m.q[rows][:, list(machine.motors)]))
+        found_views.append(Candidates(place, poses_at(machine, configurations)))
     return tuple(found_views)
-
-
-def _followed(machine: Machine, q: Array) -> Configurations:
-    """Return the poses at readings (n, n_legs), each followed from the nearest one."""
-    motors = list(machine.motors)
-    columns, reached = slider_columns(machine, motors)[0], [machine.home_configuration]
-    for row in q[:, motors]:
-        far = [float(np.abs(c[columns] - row).max()) for c in reached]
-        reached.append(follow(machine, reached[int(np.argmin(far))], row))
-    return poses_at(machine, reached[1:])
 
 
 def _whole(name: str, found: int, least: int, most: int) -> int:

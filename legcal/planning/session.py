@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from legcal.calibration import PLAN_NAME
 from legcal.data import reading_columns
 from legcal.errors import UsageError
 from legcal.files import (
@@ -32,7 +33,6 @@ from legcal.planning.order import HOME
 from legcal.planning.planned_session import Plan
 from legcal.vision import board_document, camera_info
 
-PLAN_NAME = "plan.json"
 CAMERA, MEASUREMENTS = "camera_info.yaml", "measurements.csv"
 HAND = "hand"  # the view of a camera in the hand
 PLANNED = OutputKind("session", PLAN_NAME, "legcal_plan")

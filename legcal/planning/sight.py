@@ -21,6 +21,7 @@ from legcal.vision import (
     EPSILON,
     Camera,
     in_picture,
+    longest_runs,
     outlines_of_axis,
     rays_past_axes,
     visible_segments,
@@ -111,7 +112,7 @@ def what_is_seen(
     thick = _IN_PLATE * float(of_leg.max(initial=0.0))
     seen &= ~_behind_plate(P, np.broadcast_to(A, B.shape), thick)
     seen &= ~_behind_plate(P, B, thick)
-    first, last = _longest_runs(seen)
+    first, last = longest_runs(seen)
     image, part = np.nonzero(last > first)
     begin, finish = (s[image, part, k[image, part]] for k in (first, last))
     u_seen, M = u_part[image, part], A[leg[part]]
@@ -206,13 +207,3 @@ def _behind_plate(P: Array, joints: Array, thick: float) -> BoolArray:
             return np.zeros(P.shape[:-1], dtype=np.bool_)
         inside[k] = np.all(at[k] @ sides[:, :2].T + sides[:, 2] < 0.0, axis=-1)
     return np.asarray(before & inside)
-
-
-def _longest_runs(flags: BoolArray) -> tuple[IntArray, IntArray]:
-    """Return first and last index (...) of the longest run of true values of flags (..., m)."""
-    run = best = last = np.zeros(flags.shape[:-1], dtype=np.intp)
-    for i in range(flags.shape[-1]):
-        run = (run + 1) * flags[..., i]
-        last = np.where(run > best, i, last)
-        best = np.maximum(run, best)
-    return last - np.maximum(best - 1, 0), last

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from legcal.brief import brief
+from legcal.calibration import PLAN_NAME
 from legcal.data import (
     AXES_NAME,
     CORNERS_NAME,
@@ -36,7 +37,6 @@ from legcal.simulation.folder import (
     write_truth,
 )
 from legcal.simulation.observe import corners_in_images
-from legcal.simulation.planned import PLAN
 from legcal.simulation.poses import are_extreme
 from legcal.simulation.request import Level
 from legcal.simulation.session import (
@@ -163,7 +163,7 @@ def simulate(
         if settings.level is Level.PHOTOGRAPHS:
             _write_photographs(folder, session, settings, rngs, workers, report)
         if settings.plan is not None:
-            (folder / PLAN).write_bytes(read_bytes(settings.plan / PLAN, MAX_DOCUMENT))
+            (folder / PLAN_NAME).write_bytes(read_bytes(settings.plan / PLAN_NAME, MAX_DOCUMENT))
         files = [*files_in(folder), TRUTH_NAME]
         write_truth(folder / TRUTH_NAME, session, settings, files)
     seen = [[leg.is_seen for leg in shown] for shown in session.scene.images.shown]

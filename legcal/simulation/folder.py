@@ -17,6 +17,7 @@ from typing import Any
 
 import yaml
 
+from legcal.calibration import PLAN_NAME
 from legcal.data import (
     AXES_NAME,
     CACHE_NAME,
@@ -42,7 +43,6 @@ from legcal.files import (
 )
 from legcal.machine import LegKind, Machine, main_cylinders
 from legcal.simulation.board import documents
-from legcal.simulation.planned import PLAN
 from legcal.simulation.session import SimulatedSession
 from legcal.simulation.settings import SimulationSettings
 from legcal.version import __version__
@@ -52,7 +52,7 @@ TRUTH = "truth"
 TRUTH_NAME = f"{TRUTH}/truth.json"
 _FOLDERS = ("images", "models", "urdf", TRUTH)
 _TABLES = ("measurements.csv", OBSERVATIONS_NAME, AXES_NAME, CORNERS_NAME)
-_FILES = ("dataset.yaml", *_TABLES, "camera_info*.yaml", PLAN)
+_FILES = ("dataset.yaml", *_TABLES, "camera_info*.yaml", PLAN_NAME)
 SIMULATED = OutputKind("dataset", TRUTH_NAME, "legcal_truth")
 
 

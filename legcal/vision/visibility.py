@@ -133,8 +133,9 @@ def bands_of_legs(
     first, last = np.zeros((2, len(axis)), dtype=np.intp)
     n_inside = np.count_nonzero(inside, axis=1)
     last[n_inside == N_SAMPLES] = N_SAMPLES - 1
-    for leg in np.flatnonzero((n_inside > 1) & (n_inside < N_SAMPLES)).tolist():
-        first[leg], last[leg] = longest_run(inside[leg])
+    cut = np.flatnonzero((n_inside > 1) & (n_inside < N_SAMPLES))
+    if len(cut):
+        first[cut], last[cut] = longest_runs(inside[cut])
     legs = np.arange(len(axis))
     shown = last > first
     ends = np.stack([axis[legs, first], axis[legs, last]], axis=1)
@@ -179,12 +180,15 @@ def pixels_inside(camera: Camera, pixels: Array, margin: float = 0.0) -> BoolArr
     return np.asarray(inside & (y >= margin) & (y <= camera.height - 1.0 - margin))
 
 
-def longest_run(flags: BoolArray) -> tuple[int, int]:
-    """Return the first and the last index of the longest run of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    starts, stops = edges[::2], edges[1::2]
-    longest = int(np.argmax(stops - starts))
-    return int(starts[longest]), int(stops[longest]) - 1
+def longest_runs(flags: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return first and last index (...) of the longest run of true values of flags (..., m).
+
+    Both are zero where none is true.
+    """
+    place = np.arange(flags.shape[-1])
+    run = place - np.maximum.accumulate(np.where(flags, -1, place), axis=-1)
+    last = np.argmax(run, axis=-1)
+    return last - np.maximum(run.max(axis=-1) - 1, 0), last
 
 
 @dataclass(frozen=True, eq=False)
