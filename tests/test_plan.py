@@ -186,6 +186,34 @@ def test_a_better_known_machine_is_what_more_images_and_a_given_session_make(
     np.testing.assert_allclose(view.T_base_camera.translation, [np.cos(k), np.sin(k), 1.4])
 
 
+def test_a_session_by_hand_is_shot_with_its_board_where_the_plan_lays_it(
+    small_search: None, tmp_path: Path
+) -> None:
+    """Every image shows the board, also by rays at the solids of the simulation."""
+    high = {f"t{k}": {"xyz": [float(np.cos(k)), float(np.sin(k)), 3.2]} for k in range(0, 8, 2)}
+    (tmp_path / "high.yaml").write_text(yaml.safe_dump({"places": high}))
+    held = legcal.plan(
+        "3-rpr", images=4, board="chessboard:6x5:15mm", hand_held=True, noise=planning.WHITE,
+        setting=FEW, places=tmp_path / "high.yaml",
+    )  # fmt: skip
+    assert held.board is not None
+    planning.write_session(held, tmp_path / "session")
+    settings = SimulationSettings(plan=tmp_path / "session", level=Level.OUTLINES)
+    simulate(load_mechanism("3-rpr"), tmp_path / "shot", settings)
+    shot = load_dataset(tmp_path / "shot")
+    truth = json.loads((tmp_path / "shot" / "truth" / "truth.json").read_text())
+    where = truth["board"]["T_base_board"]["xyz"]
+    np.testing.assert_allclose(where, held.board.T_base_board.translation, atol=1e-9)
+    assert all(view.hand_held for view in shot.measurements.views)
+    assert shot.corners is not None
+    assert len(shot.corners.row) == 4 * held.board.board.n_corners
+    (tmp_path / "session" / "plan.json").write_text(
+        json.dumps(held.document() | {"T_base_board": None})
+    )
+    with pytest.raises(UsageError, match="no place of the board"):
+        simulate(load_mechanism("3-rpr"), tmp_path / "again", settings)
+
+
 def test_what_is_seen_is_what_the_simulation_shows(planned: planning.Plan, tmp_path: Path) -> None:
     """By another code, which casts rays at solids and draws silhouettes by their tangents."""
     exact = replace(planned, setting=replace(FEW, shift=0.0, turn=0.0))
@@ -260,6 +288,7 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"target": -1.0}, UsageError, "0 to 1 m"),
     ({"hand_held": True, "cameras": None}, UsageError, "--board"),
     ({"hand_held": True, "board": "chessboard:9x6:25mm", "cameras": 2}, UsageError, "--cameras"),
+    ({"board": "chessboard:7x5:25mm"}, DatasetError, "after half a turn"),
     ({"board": "chessbord:9x6"}, UsageError, "chessbord"),
     ({"given": "nowhere"}, DatasetError, "nowhere"),
     ({"noise": "nowhere"}, UsageError, "--noise"),

@@ -92,7 +92,8 @@ def plan(
         str | None,
         typer.Option(
             metavar="SPEC",
-            help="A calibration board on the base in every image, as for legcal camera.",
+            help="A calibration board on the base in every image, as for legcal camera; the plan "
+            "says where it lies.",
         ),
     ] = None,
     hand_held: Annotated[
@@ -159,6 +160,6 @@ def _previews(plan: Plan) -> dict[str, bytes]:
 
     views = plan.views[:1] if plan.hand_held else plan.views
     return {
-        view.name: preview(plan.machine, plan.camera, view.T_base_camera, view.poses)
+        view.name: preview(plan.machine, plan.camera, view.T_base_camera, view.poses, plan.board)
         for view in views
     }

@@ -14,6 +14,7 @@ ends on it: "a better selection of the end-effector poses".
 ``exchange``         greedy choice and exchanges by low-rank updates of the covariance
 ``goals``            what is made small
 ``order``            the order of poses and the ways between them
+``laid_board``       where a board lies, and which images show it
 ``noise``            errors of outlines from earlier results
 ``planned_session``  the plan and its document
 ``session``          its folder

@@ -5,6 +5,8 @@ from .information import DEFAULT_NOISE as DEFAULT_NOISE
 from .information import WHITE as WHITE
 from .information import PredictedNoise as PredictedNoise
 from .information import Predictor as Predictor
+from .laid_board import LaidBoard as LaidBoard
+from .laid_board import feet as feet
 from .noise import read_noise as read_noise
 from .places import USUAL as USUAL
 from .places import Place as Place

@@ -16,10 +16,11 @@ from legcal.geometry import Array, BoolArray
 from legcal.machine import Configurations, Machine
 from legcal.planning.goals import Goal
 from legcal.planning.information import PredictedNoise
+from legcal.planning.laid_board import LaidBoard
 from legcal.planning.places import Setting
 from legcal.planning.sight import Seen
 from legcal.version import __version__
-from legcal.vision import Board, Camera
+from legcal.vision import Camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ class Plan:
     growth: Array
     limits: dict[str, float]
     seed: int = 0
-    board: Board | None = None  # on the base, in every image
+    board: LaidBoard | None = None  # on the base, in every image
     hand_held: bool = False
     given: str = ""  # the dataset that it adds to
     notes: tuple[str, ...] = ()
@@ -140,6 +141,9 @@ class Plan:
                 "source": self.noise.source,
             },
             "board": self.board is not None,
+            "T_base_board": None
+            if self.board is None
+            else motion_to_xyz_quat(self.board.T_base_board),
             "hand_held": self.hand_held,
             "given": self.given or None,
             "views": {

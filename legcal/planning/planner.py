@@ -19,11 +19,12 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration import poses_at_readings
 from legcal.errors import NotIdentifiable, NotVisible
 from legcal.estimation import Frames
-from legcal.geometry import Array
+from legcal.geometry import Array, BoolArray, look_at
 from legcal.machine import Configurations, Leg, Machine, platforms_in_base
 from legcal.planning.exchange import Chosen, Criterion, Session, choose, exchange
 from legcal.planning.goals import Goal, Workspace, criterion_of, workspace_of
 from legcal.planning.information import Contributions, Predictor
+from legcal.planning.laid_board import LaidBoard, lying
 from legcal.planning.order import in_short_order, ways
 from legcal.planning.places import (
     USUAL,
@@ -42,6 +43,8 @@ from legcal.workers import Run, in_turn
 
 MIN_POSES, POSES_EACH, MOST_POSES = 20, 6, 320  # candidates, by images
 N_PROBES = 12  # poses by which places are compared
+N_BOARD_PROBES = 4  # poses by which places of a board are compared
+FAR = 3.0  # sizes of the machine, from where that is looked at
 N_HANDS = 10  # places that a camera in the hand chooses from
 MIN_SHARE = 0.5  # of its equal share that each view has of the images, at least
 ROUNDS = 3  # of polishing, each with half the steps of the one before
@@ -78,6 +81,7 @@ class Task:
     board: Board | None = None
     hand_held: bool = False
     seed: int = 0
+    laid: LaidBoard | None = None  # the board in its place, once that is chosen
 
     @property
     def machine(self) -> Machine:
@@ -106,6 +110,24 @@ class Scene:
 
     def seen(self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool) -> Seen:
         """Return what a camera sees at poses T_Rb_Re; *surely*: wherever the tripod is set."""
+        B, margin = self._before(T, poses, surely=surely)
+        cylinders = [leg.cylinders for leg in self.task.machine.legs]
+        return what_is_seen(self.task.predictor.camera, T, self.A, B, cylinders, margin)
+
+    def board_is_shown(
+        self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool
+    ) -> BoolArray:
+        """Return which images show the board, (n_images,); all of them where there is none."""
+        if self.task.laid is None:
+            return np.ones(len(poses), dtype=np.bool_)
+        B, margin = self._before(T, poses, surely=surely)
+        cylinders = [leg.cylinders for leg in self.task.machine.legs]
+        return self.task.laid.is_shown(self.task.predictor.camera, T, self.A, B, cylinders, margin)
+
+    def _before(
+        self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool
+    ) -> tuple[Array, float]:
+        """Return platform joints (n, n_legs, 3) in the base link, and the margin [px]."""
         machine, camera = self.task.machine, self.task.predictor.camera
         R, t = Frames.of(poses)
         in_Rb = np.swapaxes(R @ np.array([leg.B for leg in self.legs]).T, 1, 2) + t[:, None]
@@ -115,28 +137,38 @@ class Scene:
             joints = np.concatenate([self.A, B.reshape(-1, 3)])
             nearest = float(T.inv().apply(joints)[:, 2].min())
             margin = self.task.setting.margin(camera, max(nearest, 0.1))
-        return what_is_seen(camera, T, self.A, B, [leg.cylinders for leg in machine.legs], margin)
+        return B, margin
 
     def contributions(
-        self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool = True
+        self,
+        T: RigidTransform,
+        poses: Sequence[RigidTransform],
+        *,
+        surely: bool = True,
+        is_shot: bool = False,
     ) -> Contributions | None:
-        """Return what images of poses T_Rb_Re add; None if they show nothing."""
+        """Return what images of poses T_Rb_Re add; None if they show nothing.
+
+        An image without the board adds nothing, unless it was shot already.
+        """
         seen, n = self.seen(T, poses, surely=surely), len(poses)
-        if not len(seen.leg):
+        with_board = is_shot or self.board_is_shown(T, poses, surely=surely)
+        if not len(seen.leg) or not np.any(with_board):
             return None
         outlines = seen.outlines(1.0, np.arange(n, dtype=np.intp))
         view = np.zeros(n, dtype=np.intp)
         found = self.task.predictor.contributions({"here": T}, view, poses, outlines, self.legs)
         if self.task.board is not None:
             found = _tied_by_board(found, T)
+            found = replace(found, rows=found.rows * np.reshape(with_board, (-1, 1, 1)))
         if self.task.hand_held:  # one series of images of one camera
             found = replace(found, names=tuple(n.replace("here: ", "hand ") for n in found.names))
         return found
 
-    def of(self, candidates: Candidates) -> Contributions | None:
+    def of(self, candidates: Candidates, *, is_shot: bool = False) -> Contributions | None:
         """Return what images of candidates add."""
         poses = platforms_in_base(self.task.machine, candidates.poses.poses)
-        return self.contributions(candidates.place.T_base_camera, poses)
+        return self.contributions(candidates.place.T_base_camera, poses, is_shot=is_shot)
 
 
 def _tied_by_board(found: Contributions, T_base_camera: RigidTransform) -> Contributions:
@@ -171,12 +203,14 @@ def plan_session(
     few images.
     """
     predictor, machine, rng = task.predictor, task.machine, np.random.default_rng(task.seed)
-    legs, scene = predictor.legs, Scene.nominal(task)
+    legs = predictor.legs
     n_poses = min(MOST_POSES, MIN_POSES + POSES_EACH * task.n_images)
     poses = candidate_poses(machine, legs, task.setting, n_poses, rng, progress)
-    places = _places(task, poses)
+    task = _with_laid_board(task, poses)
+    scene, places = Scene.nominal(task), _places(task, poses)
     shown = _probed(scene, places, poses, rng, progress, run)
-    given = [found for found in map(scene.of, task.given) if found is not None]
+    before = [scene.of(one, is_shot=True) for one in task.given]
+    given = [found for found in before if found is not None]
     work = workspace_of(machine, legs)
     criterion = criterion_of(task.goal, work, legs, shown[0][1].basis, task.named)
     n_places = min(N_HANDS, len(shown)) if task.hand_held else task.n_views
@@ -191,7 +225,7 @@ def plan_session(
     _refuse_undetermined(task, session, criterion, given, work, shown[0][1].basis)
     current = _of_images(current, images)
     value = images.value
-    target = all_points(machine, poses.poses)
+    target = _framed(task, poses)
     middle = 0.5 * (target.min(axis=0) + target.max(axis=0))
     notes = []
     for turn in range(ROUNDS):
@@ -208,8 +242,47 @@ def _places(task: Task, poses: Configurations) -> list[Place]:
     """Return the places that cameras may take."""
     if task.places:
         return list(task.places)
-    points = all_points(task.machine, poses.poses)
+    points = _framed(task, poses)
     return places_around(task.machine, points, task.predictor.camera, task.setting, task.bounds)
+
+
+def _framed(task: Task, poses: Configurations) -> Array:
+    """Return what pictures are to show, (n, 3) in the base link [m]: joints, and the board."""
+    points = all_points(task.machine, poses.poses)
+    return points if task.laid is None else np.concatenate([points, task.laid.corners])
+
+
+def _with_laid_board(task: Task, poses: Configurations) -> Task:
+    """Return the task with its board where most places around the machine see it.
+
+    Raises NotVisible if none does.
+    """
+    if task.board is None:
+        return task
+    some = np.linspace(0, len(poses.poses) - 1, min(N_BOARD_PROBES, len(poses.poses))).astype(int)
+    in_Rb = platforms_in_base(task.machine, [poses.poses[i] for i in some])
+    places = [place.T_base_camera for place in _places(task, poses)]
+    if not task.places:  # wherever the board is, they can go back until it is in the picture
+        points = all_points(task.machine, poses.poses)
+        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        away = np.array([T.translation - middle for T in places])
+        away = np.unique((away / np.linalg.norm(away, axis=1)[:, None]).round(6), axis=0)
+        away *= FAR * float(np.linalg.norm(np.ptp(points, axis=0)))
+        places = [look_at(middle + step, middle, up=task.machine.upward) for step in away]
+    best, most = task, 0.0
+    for laid in lying(task.board, task.machine):
+        trial = replace(task, laid=laid)
+        scene = Scene.nominal(trial)
+        share = np.mean([scene.board_is_shown(T, in_Rb, surely=False) for T in places])
+        if share > most:
+            best, most = trial, float(share)
+    if not most:
+        raise NotVisible(
+            f"{task.machine.yaml_path}: no session could be planned: found no place of the board "
+            "flat on the base that a camera sees beside the legs wherever it is set, needed one; "
+            "use a smaller board, higher --places, wider --bounds, or a camera with a wider view."
+        )
+    return best
 
 
 def _probed(
@@ -232,10 +305,11 @@ def _probed(
             found.append((place, contributions))
         progress("Camera places", k + 1, len(places))
     needed = 1 if scene.task.hand_held else scene.task.n_views
+    board = " and the board" if scene.task.board is not None else ""
     if not found or (scene.task.places and len(found) < needed):
         raise NotVisible(
             f"{machine.yaml_path}: no session could be planned: found {len(found)} of "
-            f"{len(places)} camera places that see legs wherever the tripod is set within "
+            f"{len(places)} camera places that see legs{board} wherever the tripod is set within "
             f"{1e2 * scene.task.setting.shift:g} cm and "
             f"{np.degrees(scene.task.setting.turn):g} deg, needed {needed}; move the places "
             "further away or turn them to the machine, or use a camera with a wider view."
@@ -424,7 +498,7 @@ def _judged(
         growth=_growth(found, given, criterion),
         limits=_limits(session, criterion),
         seed=task.seed,
-        board=task.board,
+        board=task.laid,
         hand_held=task.hand_held,
         given=task.given_name,
         notes=tuple(notes),
@@ -502,7 +576,7 @@ def drawn_covariance(task: Task, current: Sequence[Candidates], rng: np.random.G
             poses = poses_at_readings(machine, there.legs, own.poses.readings, nearby)
         T = own.place.T_base_camera
         T = T if is_set else task.setting.camera_elsewhere(T, rng)
-        found = there.contributions(T, poses, surely=False)
+        found = there.contributions(T, poses, surely=False, is_shot=is_set)
         if found is not None:
             parts.append(found)
     session = Session([], parts)

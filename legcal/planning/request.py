@@ -19,7 +19,15 @@ from legcal.planning.places import USUAL, Place, Setting, read_places
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Task, plan_session
 from legcal.progress import Progress, Report, shown_progress
-from legcal.vision import Board, Camera, board_of, read_camera, sample_camera
+from legcal.vision import (
+    Board,
+    Camera,
+    board_document,
+    board_of,
+    parse_board,
+    read_camera,
+    sample_camera,
+)
 from legcal.workers import Run, Workers, worker_pool
 
 SIGMA_Q = 2e-6  # [m] of a reading, where nobody says
@@ -143,7 +151,7 @@ def plan(
         listed,
         before,
         "" if shot is None else str(shot.folder),
-        None if board is None else board_of(board),
+        None if board is None else _on_base(board),
         hand_held,
         seed,
     )
@@ -301,6 +309,13 @@ def _check(
         )
     if problems:
         raise UsageError(problems)
+
+
+def _on_base(board: str | Path | Board) -> Board:
+    """Return a board. Raises DatasetError if a dataset could not use it."""
+    found = board_of(board)
+    parse_board(board_document(found), Path("--board"))
+    return found
 
 
 def _shot(folder: Path) -> Dataset:

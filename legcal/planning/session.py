@@ -123,7 +123,7 @@ def _dataset(plan: Plan, model: str) -> str:
         "views": views,
     }
     if plan.board is not None:
-        document["board"] = board_document(plan.board)
+        document["board"] = board_document(plan.board.board)
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
     return with_schema("dataset", text)
 

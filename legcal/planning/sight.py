@@ -110,8 +110,8 @@ def what_is_seen(
     np.maximum.at(of_leg, leg, radius)
     seen &= ~_behind_legs(P, leg, radius, A, u, length, of_leg)
     thick = _IN_PLATE * float(of_leg.max(initial=0.0))
-    seen &= ~_behind_plate(P, np.broadcast_to(A, B.shape), thick)
-    seen &= ~_behind_plate(P, B, thick)
+    seen &= ~behind_plate(P, np.broadcast_to(A, B.shape), thick)
+    seen &= ~behind_plate(P, B, thick)
     first, last = longest_runs(seen)
     image, part = np.nonzero(last > first)
     begin, finish = (s[image, part, k[image, part]] for k in (first, last))
@@ -181,7 +181,7 @@ def _behind_legs(
     return np.asarray(hides.any(axis=-1))
 
 
-def _behind_plate(P: Array, joints: Array, thick: float) -> BoolArray:
+def behind_plate(P: Array, joints: Array, thick: float) -> BoolArray:
     """Return which points (k, n, m, 3) have the plate between joints (k, n_legs, 3) before them.
 
     Points in the plate are not behind it, by its thickness [m]: so are legs of a planar machine.

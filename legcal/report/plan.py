@@ -17,7 +17,7 @@ from legcal.figures import new_figure, plain
 from legcal.geometry import Array
 from legcal.machine import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR
 from legcal.pages import Drawing, Items, Picture, Row, page_html
-from legcal.planning import Plan, views_in_words
+from legcal.planning import LaidBoard, Plan, views_in_words
 from legcal.report.page.text_page import text_page
 from legcal.report.render import heading, report, table
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PLACES, GROWTH, CHECKLIST, PAGE_NAME = "places.svg", "growth.svg", "checklist.txt", "plan.html"
-_CAMERA_COLOUR = "#b45309"
+_CAMERA_COLOUR, _BOARD_COLOUR = "#b45309", "#15803d"
 _WORST = 12  # parameters that are told
 _PANEL = (6.0, 5.6)  # [inch]
 
@@ -146,8 +146,23 @@ with {plan.camera.width} x {plan.camera.height} px and a focal length of \
         "Save each photograph under its name in measurements.csv.",
     ]
     if plan.board is not None:
-        items.insert(1, "Fix the board to the base, where every image shows it; it must not move.")
+        items.insert(1, _board_in_words(plan, plan.board))
     return items
+
+
+def _board_in_words(plan: Plan, board: LaidBoard) -> str:
+    """Return where the board is to lie."""
+    A = plan.machine.A_base[list(_measured(plan))]
+    far = 1e3 * np.linalg.norm(A - board.middle, axis=1)
+    x, y, z = 1e3 * board.middle
+    joints = ", ".join(
+        f"{d:.0f} mm from A{j + 1}" for d, j in zip(far, _measured(plan), strict=True)
+    )
+    return (
+        "Fix the board to the base, flat at the level of its joints, print up, as places.svg shows "
+        f"it: its middle about {joints}, at x {x:.0f}, y {y:.0f}, z {z:.0f} mm in the base link. "
+        "It must not move, and be whole in every image."
+    )
 
 
 def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[str, str | bytes]:
@@ -204,6 +219,11 @@ def _draw_panel(ax: Axes, plan: Plan, A: Array, B: Array, i: int, j: int) -> Non
             if letter == "A":
                 ax.annotate(f"A{k + 1}", (joint[i], joint[j]), (5.0, 5.0), color=colour,
                             textcoords="offset points", fontsize="small")  # fmt: skip
+    if plan.board is not None:
+        outer = 1e3 * plan.board.corners[[0, 1, 2, 3, 0]]
+        ax.plot(outer[:, i], outer[:, j], color=_BOARD_COLOUR, linewidth=1.5)
+        ax.annotate("board", (outer[0, i], outer[0, j]), (3.0, 3.0), color=_BOARD_COLOUR,
+                    textcoords="offset points", fontsize="small")  # fmt: skip
     for view in plan.views:
         where = 1e3 * view.T_base_camera.translation
         sight = view.T_base_camera.rotation.as_matrix()[:, 2]

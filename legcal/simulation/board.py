@@ -134,11 +134,6 @@ class PlacedBoard:
     T_base_board: RigidTransform  # its pose in the base link
     first: int = 0  # the number of its first corner
 
-    @property
-    def towards_viewer(self) -> float:
-        """Return 1 where the z axis of the board comes out of its print, else -1."""
-        return 1.0 if self.board.kind == "aprilgrid" else -1.0
-
     @cached_property
     def plate_size(self) -> tuple[float, float, float]:
         """Width, height and thickness of the plate [m]."""
@@ -151,9 +146,10 @@ class PlacedBoard:
     def plate(self) -> PlacedSolid:
         """The plate that the board is printed on."""
         low, high = self.board.extent.min(axis=0), self.board.extent.max(axis=0)
-        middle = 0.5 * (low + high) - [0.0, 0.0, 0.5 * self.towards_viewer * self.plate_size[2]]
+        below = 0.5 * self.board.towards_viewer * self.plate_size[2]
+        middle = 0.5 * (low + high) - [0.0, 0.0, below]
         T_board_plate = RigidTransform.from_translation(middle)
-        face = 5 if self.towards_viewer > 0.0 else 2
+        face = 5 if self.board.towards_viewer > 0.0 else 2
         sheet = BoardPrint.of(self.board, face, middle[:2])
         material = Material(albedo=0.8, specular=0.0, shininess=10.0, limb=0.0, sheet=sheet)
         T = self.T_base_board * T_board_plate
@@ -184,7 +180,7 @@ class PlacedBoard:
                     ]
                 )
                 plane = np.vstack([corner, far]) * half[:2]
-                z = self.towards_viewer * height * half[2]
+                z = self.board.towards_viewer * height * half[2]
                 points = self.plate.T_base_solid.apply(
                     np.column_stack([plane, np.full(len(plane), z)])
                 )
@@ -195,7 +191,8 @@ class PlacedBoard:
     def is_covered(self, posed: PosedMachine) -> bool:
         """Say whether something of a machine lies over the print, as seen from straight above."""
         x, y, _ = self.board.extent.mean(axis=0).tolist()
-        eye = self.T_base_board.apply([x, y, self.towards_viewer * 3.0 * max(self.plate_size)])
+        above = self.board.towards_viewer * 3.0 * max(self.plate_size)
+        eye = self.T_base_board.apply([x, y, above])
         points = self.T_base_board.apply(self.board.points)
         return bool(posed.hidden(eye, points, np.zeros(len(points))).any())
 
@@ -206,7 +203,7 @@ class PlacedBoard:
         centre = T_base_camera.translation
         eye = self.T_base_board.inv().apply(centre)
         sight = eye - points
-        cosine = self.towards_viewer * sight[..., 2] / np.linalg.norm(sight, axis=-1)
+        cosine = self.board.towards_viewer * sight[..., 2] / np.linalg.norm(sight, axis=-1)
         _, inside = pixels_in_image(camera, T_base_camera.inv().apply(base))
         free = (inside & (cosine.ravel() > _MIN_COSINE)).copy()
         margin = np.full(int(free.sum()), _IN_FRONT * self.plate_size[2])

@@ -20,8 +20,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DatasetError, NotVisible
 from legcal.files import FileSchema, MotionEntry, PlainName, read_yaml, validate
-from legcal.geometry import Array, cross, direction_above, look_at, normal_basis
+from legcal.geometry import Array, direction_above, look_at, normal_basis
 from legcal.machine import Machine
+from legcal.planning import feet
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard
 from legcal.simulation.rendering.rays import in_view, surrounding_points
@@ -32,7 +33,7 @@ from legcal.simulation.visibility import (
     legs_in_image,
     longest_in_images,
 )
-from legcal.vision import Board, Camera, Link, read_camera, sample_camera
+from legcal.vision import Board, Camera, Link, facing_board, read_camera, sample_camera
 
 _MAX_SHIFT = 0.015  # [m]; a dataset may be off by 2 cm and 2 degrees
 _MAX_TURN = float(np.deg2rad(1.5))
@@ -56,8 +57,6 @@ _MIN_BOARD_SHARE = 0.75  # of the poses in which a camera must see the board
 _MIN_DISTANCE = 0.3  # machine sizes that lie between the camera and the machine, at least
 
 _N_BOARD_CANDIDATES = 2  # places of a board with cameras, of which the better is taken
-_SIDES = 4  # directions beside the machine
-_BOARD_DISTANCE = 1.05  # half diagonals of the board beyond the base joints
 _LEVELS = (0.0, -0.08, 0.25)  # of the size of the machine, above the base joints
 _PLATFORM_LEVELS = (0.02, 0.05, 0.1, 0.2, 0.3)  # the same above the joints of the platform
 _TILTS = (0.0, 0.6, 1.1)  # [rad] from lying flat, towards cameras with given places
@@ -256,7 +255,7 @@ def board_on_platform(
     for tilt in _TILTS if views else _TILTS[:1]:
         for level in _PLATFORM_LEVELS:
             place = middle + level * size * up
-            T = _facing(board, place, _tilted(up, towards, place, tilt), side)
+            T = facing_board(board, place, _tilted(up, towards, place, tilt), side)
             placed = [PlacedBoard(board, T_base_platform[k] * T) for k in some]
             bodies = [posed_machines[k] for k in some]
             if any(
@@ -399,15 +398,9 @@ def _lying(
     up, A = machine.upward, machine.A_base
     middle = A.mean(axis=0)
     size = float(np.linalg.norm(np.ptp(_joints(posed_machines), axis=0)))
-    flat = A - middle - ((A - middle) @ up)[:, None] * up
-    reach = float(np.linalg.norm(flat, axis=1).max())
-    half = 0.5 * float(np.linalg.norm(np.ptp(board.extent, axis=0)))
-    x, y = normal_basis(up)
-    around = [np.cos(t) * x + np.sin(t) * y for t in 2.0 * np.pi * np.arange(_SIDES) / _SIDES]
-    feet = [(np.zeros(3), x), *(((reach + _BOARD_DISTANCE * half) * side, side) for side in around)]
-    for foot, side in feet:
+    for foot, side in feet(board, A, up):
         places = (
-            PlacedBoard(board, _facing(board, place, _tilted(up, towards, place, tilt), side))
+            PlacedBoard(board, facing_board(board, place, _tilted(up, towards, place, tilt), side))
             for place in (middle + foot + level * size * up for level in _LEVELS)
             for tilt in (_TILTS if towards is not None else _TILTS[:1])
         )
@@ -426,17 +419,6 @@ def _tilted(up: Array, towards: Array | None, place: Array, tilt: float) -> Arra
     if length < 1e-9:
         return up
     return np.asarray(np.cos(tilt) * up + np.sin(tilt) * level / length)
-
-
-def _facing(board: Board, place: Array, normal: Array, side: Array) -> RigidTransform:
-    """Return T_base_board with the middle of the print at a place and its face along a normal."""
-    z = normal if board.kind == "aprilgrid" else -normal
-    y = side - (side @ z) * z
-    if np.linalg.norm(y) < 1e-6:
-        y = normal_basis(z)[0]
-    y = y / np.linalg.norm(y)
-    turn = Rotation.from_matrix(np.column_stack([cross(y, z), y, z]))
-    return RigidTransform.from_components(place - turn.apply(board.extent.mean(axis=0)), turn)
 
 
 def _share(placed: PlacedBoard, together: Sequence[PosedMachine], view: Viewpoint) -> float:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from legcal.calibration import PLAN_NAME
 from legcal.data import Measurements, load_dataset
-from legcal.errors import DatasetError, DidNotConverge, UsageError
-from legcal.files import read_json
+from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
+from legcal.files import MotionEntry, read_json
 from legcal.geometry import Array
 from legcal.machine import Configurations, Machine, follow_each, poses_at
 from legcal.planning import Setting
+from legcal.simulation.board import PlacedBoard
+from legcal.simulation.cameras import MAX_HAND_DRAWS
+from legcal.simulation.solids import PosedMachine
 from legcal.simulation.visibility import Viewpoint
 
 
@@ -23,6 +27,8 @@ class PlannedSession:
 
     measurements: Measurements  # one row an image, with views where they should stand
     setting: Setting  # how far tripods may be off
+    board: PlacedBoard | None  # on the base
+    hand: str  # the view of a camera in the hand; empty if cameras stand
 
     @property
     def poses_of(self) -> list[list[int]]:
@@ -30,17 +36,35 @@ class PlannedSession:
         m = self.measurements
         return [m.pose[m.view == v].tolist() for v in range(len(m.views))]
 
-    def viewpoints(self, rng: np.random.Generator) -> tuple[Viewpoint, ...]:
-        """Return the views as tripods are set: elsewhere by the tolerance of the plan at most."""
+    def viewpoints(
+        self,
+        rng: np.random.Generator,
+        posed_machines: Sequence[PosedMachine],  # in all poses, with the board
+    ) -> tuple[Viewpoint, ...]:
+        """Return the views as cameras are set: elsewhere by the tolerance of the plan at most.
+
+        A camera in the hand is moved until it shows the board. Raises NotVisible if it never does.
+        """
         found = []
-        for view in self.measurements.views:
+        for view, poses in zip(self.measurements.views, self.poses_of, strict=True):
             T = view.T_base_camera
             if T is None:
                 raise UsageError(
                     f"The plan could not be shot: found no T_base_camera of view {view.name}, "
                     "needed where its camera stands; write it into dataset.yaml, or plan again."
                 )
-            moved = self.setting.camera_elsewhere(T, rng)
+            for _ in range(MAX_HAND_DRAWS if self.hand else 1):
+                moved, board = self.setting.camera_elsewhere(T, rng), self.board
+                if not self.hand or board is None:
+                    break
+                if board.is_enough(board.seen(posed_machines[poses[0]], view.camera, moved)):
+                    break
+            else:
+                raise NotVisible(
+                    f"The plan could not be shot: found that image {view.name} shows the board "
+                    f"from none of {MAX_HAND_DRAWS} places near that of the plan, needed all of "
+                    "it; plan with a smaller board."
+                )
             found.append(Viewpoint(view.name, view.camera, moved))
         return tuple(found)
 
@@ -62,10 +86,13 @@ class PlannedSession:
 def read_plan(folder: Path, nominal: Machine) -> PlannedSession:
     """Return a planned session of a machine. Raises UsageError if it is none, or of another one."""
     try:
-        tolerance = read_json(folder / PLAN_NAME)["tolerance"]
+        plan = read_json(folder / PLAN_NAME)
+        tolerance, pose = plan["tolerance"], plan.get("T_base_board")
+        places = [MotionEntry(**e["T_base_camera"]).motion() for e in plan["views"].values()]
+        laid = None if pose is None else MotionEntry(**pose).motion()
         shift, turn = float(tolerance["camera_m"]), float(tolerance["camera_rad"])
         setting = Setting(shift, turn)
-    except (OSError, ValueError, KeyError, TypeError, DatasetError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, DatasetError) as error:
         raise UsageError(
             f"{folder}: the plan could not be shot: found no {PLAN_NAME} of legcal in it, needed "
             "the folder that legcal plan wrote; correct --plan."
@@ -83,4 +110,17 @@ def read_plan(folder: Path, nominal: Machine) -> PlannedSession:
             f"{folder}: the plan could not be shot: found a machine whose readings do not tell its "
             "pose, needed one whose do; simulate it without --plan."
         )
-    return PlannedSession(dataset.measurements, setting)
+    m, on_base, hand = dataset.measurements, dataset.board_on("base"), ""
+    board = None if on_base is None or laid is None else PlacedBoard(on_base.board, laid)
+    if any(view.hand_held for view in m.views):
+        if board is None or len(places) != len(m.views):
+            raise UsageError(
+                f"{folder}: the plan could not be shot: found {len(places)} camera places and "
+                f"{'no' if board is None else 'a'} place of the board for {len(m.views)} images of "
+                f"a camera in the hand, needed one for each image and that of the board in "
+                f"{PLAN_NAME}; plan again."
+            )
+        hand = m.views[0].name.rpartition("-")[0]
+        both = zip(m.views, places, strict=True)
+        m = replace(m, views=tuple(replace(view, T_base_camera=T) for view, T in both))
+    return PlannedSession(m, setting, board, hand)

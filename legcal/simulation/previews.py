@@ -9,6 +9,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.machine import Configurations, Machine
+from legcal.planning import LaidBoard
+from legcal.simulation.board import PlacedBoard
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.scene import prepare_view
 from legcal.simulation.solids import dressed, pose_machine
@@ -22,6 +24,7 @@ def preview(
     camera: Camera,
     T_base_camera: RigidTransform,
     poses: Configurations,
+    board: LaidBoard | None = None,
 ) -> bytes:
     """Return a JPEG of a machine in the first of some poses, without noise and clutter."""
     scale = min(_WIDTH / camera.width, 1.0)
@@ -31,6 +34,8 @@ def preview(
     )
     first = Configurations(poses.configurations[:1], poses.readings[:1], poses.poses[:1])
     (posed,) = pose_machine(machine, dressed(machine), first)
+    if board is not None:
+        posed = PlacedBoard(board.board, board.T_base_board).beside(posed)
     rng = np.random.default_rng(0)
     look = replace(Appearance(), clutter=0)
     image = prepare_view(posed.solids, small, T_base_camera, look, rng).render(posed.solids, rng)

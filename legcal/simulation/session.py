@@ -14,10 +14,10 @@ from uuid import uuid4
 import numpy as np
 
 from legcal.data import Corners, Measurements, Outlines, View
-from legcal.errors import NotVisible
+from legcal.errors import NotVisible, UsageError
 from legcal.machine import Configurations, Machine
 from legcal.progress import Report, no_progress
-from legcal.simulation.board import PlacedBoard, chosen_board, placed_at
+from legcal.simulation.board import chosen_board, placed_at
 from legcal.simulation.cameras import (
     MAX_HAND_DRAWS,
     board_and_cameras,
@@ -95,8 +95,7 @@ def simulate_session(
     planned = None if settings.plan is None else read_plan(settings.plan, nominal)
     cameras, given = _cameras(settings)
     if planned is not None:
-        given = planned.viewpoints(rngs["cameras"])
-        cameras = {view.name: view.camera for view in given}
+        cameras = {view.name: view.camera for view in planned.measurements.views}
     shared = settings.shared_poses or not isinstance(settings.poses, int)
     n_sets = 1 if shared else len(cameras)
     if planned is not None:
@@ -110,6 +109,16 @@ def simulate_session(
     # Meshes lie beside the nominal URDF, of which that of the true machine is a copy.
     shown = replace(truth, urdf=replace(truth.urdf, path=nominal.urdf.path))
     posed_machines = pose_machine(truth, dressed(shown), poses)
+    placed = None if planned is None else planned.board
+    if placed is not None and settings.board is not None:
+        raise UsageError(
+            "The plan could not be shot: found --board and a plan with a board, needed one of "
+            "them; leave out --board."
+        )
+    if planned is not None:
+        if placed is not None:
+            posed_machines = tuple(placed.beside(posed) for posed in posed_machines)
+        given = planned.viewpoints(rngs["cameras"], posed_machines)
     board = chosen_board(settings.board, posed_machines)
     on_platform = chosen_board(settings.platform_board, posed_machines, "platform")
     boards: tuple[FixedBoard, ...] = ()
@@ -121,8 +130,7 @@ def simulate_session(
             placed_at(boards[0], T).beside(posed)
             for T, posed in zip(poses.poses, posed_machines, strict=True)
         )
-    placed: PlacedBoard | None = None
-    groups: tuple[str, ...] = ()
+    groups = () if planned is None or not planned.hand else (planned.hand,) * len(given)
     if board is None:
         views = given
         if not given:
@@ -144,7 +152,8 @@ def simulate_session(
         bodies = in_turn if settings.hand_held else posed_machines
         placed, views = board_and_cameras(board, truth, bodies, cameras, rngs["cameras"], progress)
     if placed is not None:
-        posed_machines = tuple(placed.beside(posed) for posed in posed_machines)
+        if board is not None:
+            posed_machines = tuple(placed.beside(posed) for posed in posed_machines)
         boards = (FixedBoard(placed.board, "base", placed.T_base_board), *boards)
     if placed is not None and settings.hand_held:
         views, groups = _in_hand(truth, posed_machines, n_sets, cameras, rngs, progress)
@@ -178,7 +187,9 @@ def simulate_session(
     measurements = _recorded(
         truth, poses, labels, scene, settings, rngs, hints=settings.hints and not groups
     )
-    if planned is not None and settings.hints:  # they are where the tripods should stand
+    if (
+        planned is not None and settings.hints and not groups
+    ):  # they are where the tripods should stand
         both = zip(measurements.views, planned.measurements.views, strict=True)
         hinted = tuple(replace(view, T_base_camera=p.T_base_camera) for view, p in both)
         measurements = replace(measurements, views=hinted)

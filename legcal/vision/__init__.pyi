@@ -8,6 +8,7 @@ from .board import Link as Link
 from .board import board_name as board_name
 from .board import charuco_board as charuco_board
 from .board import dictionary as dictionary
+from .board import facing_board as facing_board
 from .board_file import board_document as board_document
 from .board_file import board_of as board_of
 from .board_file import parse_board as parse_board

@@ -8,9 +8,9 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
 
 BoardKind = Literal["chessboard", "charuco", "aprilgrid"]
 
@@ -34,6 +34,11 @@ class Board:
         if self.kind == "aprilgrid":
             return 2 * self.columns, 2 * self.rows
         return self.columns - 1, self.rows - 1
+
+    @property
+    def towards_viewer(self) -> float:
+        """1 where the z axis of the board comes out of its print, else -1."""
+        return 1.0 if self.kind == "aprilgrid" else -1.0
 
     @property
     def n_corners(self) -> int:
@@ -72,6 +77,20 @@ class Board:
         if self.kind == "aprilgrid":
             return np.asarray(self.side * ((1.0 + self.spacing) * (k // 2) + k % 2))
         return np.asarray(self.side * (k + (self.kind == "charuco")))
+
+
+def facing_board(board: Board, place: Array, normal: Array, side: Array) -> RigidTransform:
+    """Return T_base_board with the middle of the print at a place and its face along a normal.
+
+    The y axis of the board is along *side*, as far as that is across the normal.
+    """
+    z = board.towards_viewer * normal
+    y = side - (side @ z) * z
+    if np.linalg.norm(y) < 1e-6:
+        y = normal_basis(z)[0]
+    y = y / np.linalg.norm(y)
+    turn = Rotation.from_matrix(np.column_stack([cross(y, z), y, z]))
+    return RigidTransform.from_components(place - turn.apply(board.extent.mean(axis=0)), turn)
 
 
 Link = Literal["base", "platform"]

@@ -1,0 +1,96 @@
+"""Where a calibration board lies on the base, and which images show it.
+
+It lies flat at the level of the base joints, in their middle or beside them, its print up: there
+most places see it. An image shows it if all of its corners are in the picture, seen from above by
+enough, and behind neither a leg nor the plate of the platform.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.geometry import Array, BoolArray, normal_basis
+from legcal.machine import Cylinder, Machine
+from legcal.planning.sight import behind_plate
+from legcal.vision import Board, Camera, facing_board, in_picture, rays_past_axes
+
+_SIDES = 4  # directions beside the machine
+_DISTANCE = 1.05  # half diagonals of the board beyond the base joints
+_MIN_COSINE = 0.45  # between the normal of the print and the line of sight
+_NEAREST = 0.1  # [m] before the camera
+
+
+@dataclass(frozen=True, eq=False)
+class LaidBoard:
+    """A board in its place."""
+
+    board: Board
+    T_base_board: RigidTransform
+
+    @property
+    def corners(self) -> Array:
+        """The outer corners of the print in the base link, (4, 3) [m]."""
+        return np.asarray(self.T_base_board.apply(self.board.extent))
+
+    @property
+    def middle(self) -> Array:
+        """The middle of the print in the base link, (3,) [m]."""
+        return np.asarray(self.corners.mean(axis=0))
+
+    def is_shown(
+        self,
+        camera: Camera,
+        T_base_camera: RigidTransform,
+        A: Array,  # (n_legs, 3) in the base link [m]
+        B: Array,  # (n_images, n_legs, 3) the same
+        cylinders: Sequence[Sequence[Cylinder]],  # of each leg
+        margin_px: float = 0.0,
+    ) -> BoolArray:
+        """Return which images of one camera show it, (n_images,)."""
+        n = len(B)
+        outer, eye = self.corners, T_base_camera.translation
+        P = T_base_camera.inv().apply(outer)
+        normal = self.T_base_board.rotation.as_matrix()[:, 2] * self.board.towards_viewer
+        sight = eye - outer
+        cosine = sight @ normal / np.linalg.norm(sight, axis=1)
+        if cosine.min() < _MIN_COSINE or not in_picture(camera, P, _NEAREST, margin_px).all():
+            return np.zeros(n, dtype=np.bool_)
+        points = np.concatenate([outer, self.T_base_board.apply(self.board.points)])
+        T = T_base_camera.inv()
+        P = np.broadcast_to(T.apply(points), (n, len(points), 3))
+        A, B = T.apply(A), T.apply(B.reshape(-1, 3)).reshape(B.shape)
+        length = np.linalg.norm(B - A, axis=-1)
+        u = (B - A) / length[..., None]
+        radius = np.array([max((c.radius for c in some), default=0.0) for some in cylinders])
+        distance, depth, square = rays_past_axes(P, np.broadcast_to(A, B.shape), u, length)
+        aside = radius + self.board.side * depth / distance[..., None]
+        hidden = (square < aside**2) & (depth > 0.0) & (depth < distance[..., None])
+        hidden = hidden.any(axis=-1) | behind_plate(P[:, None], B, 0.0)[:, 0]
+        return ~np.asarray(hidden.any(axis=1))
+
+
+def feet(board: Board, A: Array, up: Array) -> list[tuple[Array, Array]]:
+    """Return where a board may lie: from the middle of base joints (n, 3), and its side, (3,) each.
+
+    That is in their middle, and beyond all of them in a few directions across *up* [m].
+    """
+    flat = A - A.mean(axis=0)
+    flat = flat - (flat @ up)[:, None] * up
+    reach = float(np.linalg.norm(flat, axis=1).max())
+    half = 0.5 * float(np.linalg.norm(np.ptp(board.extent, axis=0)))
+    x, y = normal_basis(up)
+    around = [np.cos(t) * x + np.sin(t) * y for t in 2.0 * np.pi * np.arange(_SIDES) / _SIDES]
+    return [(np.zeros(3), x), *(((reach + _DISTANCE * half) * side, side) for side in around)]
+
+
+def lying(board: Board, machine: Machine) -> list[LaidBoard]:
+    """Return the places of a board on the base."""
+    up, middle = machine.upward, machine.A_base.mean(axis=0)
+    return [
+        LaidBoard(board, facing_board(board, middle + foot, up, side))
+        for foot, side in feet(board, machine.A_base, up)
+    ]
