@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 from legcal.errors import DidNotConverge
 from legcal.estimation import (
@@ -17,6 +18,7 @@ from legcal.estimation import (
     Variables,
     all_free,
     estimate_variances,
+    expected_variances,
     information,
     linearize,
     minimise,
@@ -249,6 +251,41 @@ def test_white_residuals_have_no_effects_at_all() -> None:
         variances, gain = estimate_variances(random_effects(rng, (0.0, 0.0)), LEAST_GAIN)
         assert not variances.any()
         assert gain < LEAST_GAIN
+
+
+def test_expected_variances_of_few_groups_make_covariances_hold() -> None:
+    # Six means of groups of ten, and what they have in common: its error is mostly theirs.
+    rng, n_groups, n_each, sigma = np.random.default_rng(5), 6, 10, 0.4
+    B = np.kron(np.eye(n_groups), np.ones((n_each, 1)))
+    left = B - B.mean(axis=0)
+    kind = np.zeros(n_groups, dtype=np.intp)
+    squares = []
+    for _ in range(200):
+        y = B @ (sigma * rng.standard_normal(n_groups)) + rng.standard_normal(n_groups * n_each)
+        effects = Effects(left.T @ y, left.T @ B, kind)
+        likeliest = estimate_variances(effects, 0.0)[0]
+        expected = expected_variances(effects, likeliest, [0])
+        of_mean = (np.array([likeliest[0], expected[0]]) + 1.0 / n_each) / n_groups
+        squares.append(y.mean() ** 2 / of_mean)
+    plain, honest = np.mean(squares, axis=0)
+    assert plain > 1.4
+    assert 0.9 < honest < 1.3
+
+
+def test_expected_variances_are_means_of_their_distribution() -> None:
+    n, k = 5, 4.0
+    z = np.array([3.0, -5.0, 1.0, 7.0, -2.0])
+    effects = Effects(z, k * np.eye(n), np.zeros(n, dtype=np.intp))
+
+    def density(s: float, power: int) -> float:
+        spread = k + (k * s) ** 2
+        likelihood = spread ** (-0.5 * n) * np.exp(-0.5 * float(z @ z) / spread)
+        return float(s**power * likelihood / (1.0 + k * s**2))
+
+    second, mass = (quad(density, 0.0, np.inf, args=(power,))[0] for power in (2, 0))
+    found = expected_variances(effects, np.ones(1), [0])
+    assert found[0] == pytest.approx(second / mass, rel=2e-3)
+    assert expected_variances(effects, np.ones(1), []) == 1.0  # known ones stay
 
 
 def test_scores_of_a_fit_far_from_its_minimum_give_finite_variances() -> None:

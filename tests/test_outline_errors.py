@@ -264,11 +264,11 @@ def biases_of(session: HexapodSession) -> EdgeBiases:
 
 
 def shared_errors(
-    session: HexapodSession, rng: np.random.Generator, level: float, slope: float
+    session: HexapodSession, rng: np.random.Generator, level: float, slope: float, many: float = 0.0
 ) -> Outlines:
     """Return outlines whose edges err alike in all images of a view, and change with place."""
     possible = biases_of(session)
-    sigma = np.array([0.0, 0.0, level, level, slope, slope])
+    sigma = np.array([many, 0.0, level, level, slope, slope])
     values = sigma[possible.kind] * rng.standard_normal(len(possible))
     observed = observed_outlines(session.outlines, session.measurements, session.legs)
     shift = np.zeros((len(observed), 2))
@@ -359,6 +359,15 @@ def test_shared_errors_are_found_and_weighed(session: HexapodSession) -> None:
         assert {"bias", "tilt", "bias_x"} <= {name.rsplit(".", 1)[1] for name in found.biases}
     assert np.mean(sizes) == pytest.approx(1.0, abs=0.1)
     assert 0.7 < np.mean(normalised) < 1.5
+
+
+def test_edges_that_lie_inwards_together_are_noted(session: HexapodSession) -> None:
+    rng = np.random.default_rng(7)
+    outlines = shared_errors(session, rng, 0.0, 0.0, many=0.4)
+    found = refine(session.legs, noisy_readings(session, rng), outlines, disturbed_start(session))
+    (note,) = found.notes
+    assert "inwards or outwards together by 0." in note
+    assert found.shared_px["bias of many edges"] == pytest.approx(0.4, rel=0.6)
 
 
 def test_independent_errors_are_hardly_taken_for_shared_ones(session: HexapodSession) -> None:

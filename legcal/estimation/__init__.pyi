@@ -39,3 +39,4 @@ from .uncertainty import scores_of_block as scores_of_block
 from .uncertainty import worst_directions as worst_directions
 from .variances import Effects as Effects
 from .variances import estimate_variances as estimate_variances
+from .variances import expected_variances as expected_variances

@@ -9,10 +9,15 @@ M B. If b has the covariance D, z has K + K D K, and the logarithm of the likeli
 
 Its slope and its expected curvature are sums of squares of y = (1 + K D)^-1 z and of
 (1 + K D)^-1 K. At D = 0 they are Rao's score test, and the first step are moments.
+
+Few effects leave their variance uncertain, and a covariance with the likeliest variances in place
+of the true ones is too small on average. :func:`expected_variances` are the means of all that the
+residuals allow.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +28,9 @@ from legcal.geometry import Array, BoolArray, IntArray
 _CONVERGED = 1e-4  # change of the log-likelihood
 _MAX_STEPS = 50
 _HALVINGS = 30
+_NODES = np.geomspace(1e-3, 1e4, 512)  # of integrals over standard deviations, in their scale
+_EXPECTED, _MAX_ROUNDS = 0.02, 10  # relative change of expected variances, and rounds over kinds
+_SEEN = 1e-9  # of the largest eigenvalue of K: effects that the residuals show at all
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +144,59 @@ def estimate_variances(
             break
     gain = 2.0 * best.log_likelihood
     return (variances if gain > least_gain else np.zeros_like(variances)), gain
+
+
+def expected_variances(effects: Effects, variances: Array, kinds: Sequence[int]) -> Array:
+    """Return the variances of some kinds of random effects that are expected, given residuals.
+
+    Each is the mean over its distribution given the others, in turn until they agree. Before the
+    residuals are seen a standard deviation s has the density 1 / (1 + (s / s0)^2), with s0 as small
+    as the residuals show a typical effect of its kind: even below that, and with a mean for any
+    number of effects from two on.
+
+    Parameters
+    ----------
+    effects : Effects
+    variances : (n_kinds,) array
+        Nearby, such as the likeliest ones; those of other kinds are known.
+    kinds : sequence of int
+        Those to estimate; one that residuals do not show keeps its variance.
+
+    Returns
+    -------
+    (n_kinds,) array
+        In the squared unit of the effects.
+
+    Notes
+    -----
+    Half-Cauchy distributions of standard deviations: A. Gelman, Prior distributions for variance
+    parameters in hierarchical models, Bayesian Analysis 1 (2006).
+    """
+    found = variances.copy()
+    beforehand = _NODES / (1.0 + _NODES**2)  # by the logarithm
+    for _ in range(_MAX_ROUNDS):
+        before = found.copy()
+        for kind in kinds:
+            own = effects.kind == kind
+            others = _at(effects, np.where(np.arange(len(found)) == kind, 0.0, found))
+            if others is None:
+                return before
+            seen = others.root[:, None] * effects.K[np.ix_(others.some, own)]
+            seen = solve_triangular(others.L, seen, lower=True, check_finite=False)
+            eigenvalues, vectors = np.linalg.eigh(effects.K[np.ix_(own, own)] - seen.T @ seen)
+            known = eigenvalues > _SEEN * np.abs(effects.K).max()
+            if np.count_nonzero(known) < 2:
+                continue
+            k = eigenvalues[known, None]
+            squares = (vectors[:, known].T @ (effects.z[own] - seen.T @ others.y))[:, None] ** 2
+            v = _NODES**2 / k.mean()
+            spread = 1.0 + k * v
+            likelihood = 0.5 * np.sum(squares * v / spread - np.log(spread), axis=0)
+            weight = beforehand * np.exp(likelihood - likelihood.max())
+            found[kind] = weight @ v / weight.sum()
+        if np.all(np.abs(found - before) <= _EXPECTED * found.max()):
+            break
+    return found
 
 
 def _at(effects: Effects, variances: Array) -> EffectsAt | None:

@@ -30,7 +30,7 @@ import numpy as np
 
 from legcal.calibration.joint_fit.factors import ObservedOutlines
 from legcal.data import few_views
-from legcal.estimation import Effects, estimate_variances
+from legcal.estimation import Effects, estimate_variances, expected_variances
 from legcal.geometry import Array, BoolArray, IntArray, whitener
 
 _SUM = np.array([1.0, 1.0])
@@ -314,6 +314,11 @@ class EdgeBiases:
         return np.asarray(self.sigma[self.kind])
 
     @property
+    def are_shown(self) -> bool:
+        """Whether the residuals show any."""
+        return self.shown is not None and bool(self.shown.any())
+
+    @property
     def units(self) -> tuple[str, ...]:
         """The unit of each, ``px`` or none, b of them."""
         return tuple("" if kind == GAMMA else "px" for kind in self.kind.tolist())
@@ -419,6 +424,39 @@ def estimated_biases(
     variances, _ = estimate_variances(Effects(z, K, possible.kind), _MIN_BIAS_GAIN, start)
     sigma[: len(variances)] = np.sqrt(variances)
     return replace(possible.of_sizes(with_gamma(np.maximum(sigma, least))), shown=variances)
+
+
+def expected_biases(
+    possible: EdgeBiases, z: Array, K: Array, biases: EdgeBiases, least: Array
+) -> EdgeBiases:
+    """Return estimated biases with the standard deviations that are expected, given the residuals.
+
+    As for :func:`estimated_biases`, which says how large they are most likely: few groups of
+    outlines leave that uncertain, and what residuals hardly show may be there.
+    """
+    kinds = range(len(KINDS))
+    found = expected_variances(Effects(z, K, possible.kind), biases.sigma**2, kinds)
+    return replace(possible.of_sizes(np.maximum(np.sqrt(found), least)), shown=biases.shown)
+
+
+def notes_on_blur(biases: EdgeBiases, claimed: Array) -> tuple[str, ...]:
+    """Return a note where edges lie inwards or outwards together by more than each is uncertain.
+
+    With the biases of a fit and the claimed covariances (n, 2, 2) of the outlines that it used
+    [px^2]: that is what a blur does which images leave open.
+    """
+    if biases.shown is None or not len(claimed):
+        return ()
+    together = float(np.sqrt(biases.shown[KINDS.index("bias of many edges")]))
+    each = float(np.median(np.sqrt(claimed.sum(axis=(1, 2))))) / 2.0
+    if together <= each:
+        return ()
+    return (
+        f"Outlines of many legs lie inwards or outwards together by {together:.2f} px (1 sigma), "
+        f"more than single ones are uncertain ({each:.2f} px), as where sharpening or noise "
+        "reduction by the camera leaves the blur of edges undecided, or light at the limb does; "
+        "the stated uncertainty holds it; switch the processing off, or light the legs evenly.",
+    )
 
 
 def with_gamma(sigma: Array) -> Array:

@@ -2,7 +2,8 @@
 
 Rounds reject outliers until the set of inliers stays the same. Then the noise of outlines and the
 variances of common-mode edge biases are estimated by restricted maximum likelihood and all is
-fitted again, until these converge.
+fitted again, until these converge. The last fit has the variances that are expected in place of
+the likeliest ones, which are too small on average.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from legcal.calibration.joint_fit.outline_errors import (
     NoiseModel,
     estimate_noise,
     estimated_biases,
+    expected_biases,
     noise_of_the_median,
     possible_biases,
     with_gamma,
@@ -142,6 +144,12 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
         problem = _with_judged_corners(problem, minimum.state, settings)
         minimum = _passed(problem, minimum, settings, _REJECTION_TOLERANCE)
     with_possible, changes, are_white = problem.with_biases(possible), NO_CHANGES, False
+
+    def scores_of_biases() -> tuple[Array, Array]:
+        state = minimum.state
+        there = replace(state, biases=_values(problem, state, possible))
+        return scores_of_block(with_possible.weighted(noise, accepted), there, "biases")
+
     linear = linearize(problem, minimum.state)
     for _ in range(settings.noise_rounds if len(claimed) else 1):
         errors_before, accepted_before = _sizes(noise, biases), accepted
@@ -155,11 +163,9 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
             break
         if accepted.any():
             # Scores take the step to the minimum with this noise into account.
-            state = minimum.state
-            there = replace(state, biases=_values(problem, state, possible))
-            scores = scores_of_block(with_possible.weighted(noise, accepted), there, "biases")
+            scores = scores_of_biases()
             biases = estimated_biases(possible, *scores, least, near=biases)
-            are_white = not len(biases) and not len(state.biases)
+            are_white = not len(biases) and not len(minimum.state.biases)
             if not are_white:
                 problem, minimum = _with_edge_biases(problem, minimum, biases)
         minimum = _passed(problem, minimum, settings)
@@ -169,7 +175,11 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
         changes = replace(changes, after=_sizes(noise, biases))
         if changes.converged(settings):
             break
-    minimum = _solved(problem, minimum, settings, known=linear.rows)
+    known: Mapping[str, Residuals] | None = linear.rows
+    if biases.are_shown:
+        biases, known = expected_biases(possible, *scores_of_biases(), biases, least), None
+        problem, minimum = _with_edge_biases(problem, minimum, biases)
+    minimum = _solved(problem, minimum, settings, known=known)
     state = minimum.state
     _refuse_disagreement(problem.offsets(state), accepted, settings)
     wrong = int(np.sum(minimum.linear["axes"].squared_norms > settings.axis_disagreement**2))

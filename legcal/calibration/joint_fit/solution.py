@@ -22,6 +22,7 @@ from legcal.calibration.joint_fit.outline_errors import (
     GAMMA_SUFFIX,
     EstimatedGamma,
     NoiseModel,
+    notes_on_blur,
 )
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.problem import FitProblem
@@ -243,6 +244,7 @@ def assemble_solution(
             *rejected_notes(problem, fit.accepted),
             *corner_notes(problem),
             *map(str, gammas),
+            *notes_on_blur(fit.edge_biases, problem.outlines.covariance[fit.accepted]),
             *(scale or contradicted_radii(problem, state, normal)),
             *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
             *map(str, disagreeing),
