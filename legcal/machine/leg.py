@@ -18,6 +18,7 @@ import numpy as np
 
 from legcal.brief import brief
 from legcal.geometry import Array, BoolArray, distance_to_line, matrix_inverse
+from legcal.machine.actuator import Actuator
 from legcal.machine.bodies import Connection
 
 TRAVEL_MARGIN = 0.05  # of the travel: as good as inside
@@ -31,7 +32,8 @@ class LegColumns:
 
     A, B, LENGTH = slice(0, 3), slice(3, 6), 6
     BASE_AXIS, PLATFORM_AXIS, TWIST = slice(7, 9), slice(9, 11), 11
-    COUNT = 12
+    OWN = 12  # the leg's own; those of its actuator follow (ActuatorColumns)
+    COUNT = 17
 
 
 class LegKind(StrEnum):
@@ -258,24 +260,39 @@ class Leg:
     base_joint: JointType
     platform_joint: JointType
     kind: LegKind
-    A: Array  # (3,) base joint centre [m]
+    A: Array  # (3,) base joint centre [m]; on an actuator that at reading 0
     B: Array  # (3,) platform joint centre [m]
-    q0: float  # length at reading zero [m], L = sign q + q0; the length of a constant leg
+    q0: float  # length at reading zero [m], L = sign q + q0; the length of a rod
     base_axis: Array | None = None  # (3,) unit axis; in links its last nonzero component is > 0
     platform_axis: Array | None = None  # (3,)
     twist: float | None = None  # [rad], in (-pi/2, pi/2]
     name: str = ""
-    prismatic: str | None = None  # the URDF joint of the slider
-    sign: int = 1  # -1 where the leg shrinks with the joint value
-    travel: tuple[float, float] = (0.0, 0.0)  # joint limits of the slider [m]
+    prismatic: str | None = None  # the URDF joint of the slider, or of what the rod hangs on
+    sign: int = 1  # -1 where the leg shrinks with the joint value; of a rod its working mode
+    travel: tuple[float, float] = (0.0, 0.0)  # joint limits of slider or actuator [m or rad]
     cylinders: tuple[Cylinder, ...] = ()  # what a camera can see of it
     chain: LegChain | None = None  # its joints in the URDF; None where no file describes it
+    actuator: Actuator | None = None  # what a rod hangs on whose joint at A moves
+
+    @property
+    def is_motor(self) -> bool:
+        """Whether a motor moves it: its slider, or what it hangs on."""
+        return self.kind is LegKind.ACTUATED or self.actuator is not None
+
+    @property
+    def has_value(self) -> bool:
+        """Whether it has a joint value: of its slider, or of what it hangs on."""
+        return self.kind is not LegKind.CONSTANT or self.actuator is not None
 
     @property
     def type(self) -> str:
-        """The leg's joints from base to platform, such as ``SPU``; ``UP`` if fixed there."""
+        """The leg's joints from base to platform, such as ``SPU``; ``UP`` if fixed there.
+
+        Of a rod that hangs on an actuator this comes first: ``PSS``, ``RSS``.
+        """
+        first = "" if self.actuator is None else "R" if self.actuator.turns else "P"
         slider = "" if self.kind is LegKind.CONSTANT else "P"
-        return f"{self.base_joint}{slider}{self.platform_joint}"
+        return f"{first}{self.base_joint}{slider}{self.platform_joint}"
 
     @property
     def radius_of_part(self) -> dict[str, float]:
