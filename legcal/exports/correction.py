@@ -90,7 +90,7 @@ class _Model:
         machine, scale = self.machine, leg_scale(self.machine, self.machine.home)
         motors = list(machine.motors)
         found = solve(
-            equations_of_readings(machine, machine.sign[motors] * q[:, motors]),
+            equations_of_readings(machine, q[:, motors]),
             poses_after,
             near,
             tolerance=1e-14 * scale,

@@ -55,6 +55,7 @@ class JointMotion(NamedTuple):
     by_point: Array  # (k, 3, 2) by displacements of a revolute's axis along its normal_basis
     by_gain: Array  # (k, 3)
     by_q: Array  # (k, 3) by the reading [1, or m/rad]
+    angle: Array  # (k,) by which a revolute has turned [rad]; zero of a prismatic
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +109,7 @@ class Actuator:
                 np.zeros((k, 3, 2)),
                 q[:, None] * self.axis,
                 np.broadcast_to(self.gain * self.axis, (k, 3)),
+                np.zeros(k),
             )
         R, arm = self.rotations(q), A - self.point
         turned = R @ arm
@@ -120,6 +122,7 @@ class Actuator:
             (np.eye(3) - R) @ basis.T,
             q[:, None] * by_angle,
             self.gain * by_angle,
+            self.gain * q,
         )
 
     def moved(self, step: Array) -> Actuator:
@@ -212,7 +215,7 @@ def joints_at(legs: Sequence[Leg], q: Array) -> Array:
 def reading_of_rod(leg: Leg, B: Array, near: Array | None = None) -> Array:
     """Return the readings (k,) at which a rod reaches points B (k, 3) in the frame of the base.
 
-    |A(q) - B| = l has two solutions; the one is taken in whose mode the rod is (``Leg.sign``), or
+    |A(q) - B| = l has two solutions; the one is taken in whose mode the rod is (``Leg.mode``), or
     without *near* [the same unit], where the axis turns, that nearest to it in whole turns. Where
     the rod does not reach B it is the reading at which it comes nearest.
     """
@@ -224,7 +227,7 @@ def reading_of_rod(leg: Leg, B: Array, near: Array | None = None) -> Array:
         across = np.sum((B - leg.A) ** 2, axis=1) - along**2
         half = np.sqrt(np.maximum(leg.q0**2 - across, 0.0))
         # d|AB|/dq = -u.d has the sign of the mode
-        return np.asarray((along + leg.sign * half) / actuator.gain)
+        return np.asarray((along + leg.mode * half) / actuator.gain)
     w, arm, to_B = actuator.axis, leg.A - actuator.point, B - actuator.point
     height, radial = arm @ w, arm - (arm @ w) * w
     e1 = radial / np.linalg.norm(radial)
@@ -234,7 +237,7 @@ def reading_of_rod(leg: Leg, B: Array, near: Array | None = None) -> Array:
     size = np.hypot(x, y)
     cosine = (size**2 + radius**2 + z**2 - leg.q0**2) / np.maximum(2.0 * radius * size, 1e-300)
     # |AB|^2 = r^2 + size^2 + z^2 - 2 r size cos(angle - towards): grows beyond the direction of B
-    angle = np.arctan2(y, x) + leg.sign * np.arccos(np.clip(cosine, -1.0, 1.0))
+    angle = np.arctan2(y, x) + leg.mode * np.arccos(np.clip(cosine, -1.0, 1.0))
     middle = 0.5 * sum(actuator.travel) if near is None else near
     q = angle / actuator.gain
     turn = 2.0 * np.pi / actuator.gain
@@ -247,7 +250,7 @@ def rod_mode(leg: Leg, q: float, B: Array) -> int:
     It is the sign of d|AB|/dq: of the two readings at which a rod reaches B, the larger or smaller.
     """
     if leg.actuator is None:
-        return leg.sign
+        return leg.mode
     motion = leg.actuator.motion(leg.A, np.array([q]))
     return 1 if float((motion.A[0] - B) @ motion.by_q[0]) > 0.0 else -1
 

@@ -23,14 +23,20 @@ from legcal.geometry import (
     matrix_product,
     normal_basis,
 )
+from legcal.machine.actuator import Actuator, ActuatorKind
 from legcal.machine.leg import Axis, JointType, Leg, LegChain, LegKind, Pivot, Step
 
 CONCURRENT = 10e-6  # [m]
 PERPENDICULAR = 1e-3  # [rad]
 
 
-def classify_leg(steps: Sequence[Step], platform_origin: Array, path: Path) -> LegChain:
+def classify_leg(
+    steps: Sequence[Step], platform_origin: Array, path: Path, motors: Sequence[str] = ()
+) -> LegChain:
     """Return a leg from its joints; the origin of the platform link is one in the platform's body.
+
+    Where the first of its joints is one of the *motors* and the others make a rod with a joint at
+    each end, the rod hangs on what this motor moves.
 
     Raises
     ------
@@ -47,7 +53,14 @@ def classify_leg(steps: Sequence[Step], platform_origin: Array, path: Path) -> L
         poses.append(matrix_product(T, matrix_inverse(T_far)))
     sliders = [i for i, s in enumerate(steps) if s.connection.type == "prismatic"]
     leg = next((s.connection.joint for s in steps if s.connection.joint), "") or ""
+    hangs = is_actuator(steps[0], motors) and len(steps) > 2
     try:
+        if hangs:
+            _check_rod_alone(steps, motors, leg)
+            slider, (n_lower, ends) = None, _rod(axes[1:], leg, on=axes[0].name)
+            chain = LegChain(tuple(steps), tuple(poses), n_lower + 1, slider, *ends, steps[0])
+            _check_moves(chain, axes[0])
+            return chain
         if len(sliders) > 1 or 0 in sliders:
             found = (
                 f"{len(sliders)} sliders"
@@ -70,6 +83,77 @@ def classify_leg(steps: Sequence[Step], platform_origin: Array, path: Path) -> L
     return LegChain(tuple(steps), tuple(poses), n_lower, slider, *ends)
 
 
+def is_actuator(step: Step, motors: Sequence[str]) -> bool:
+    """Say whether a joint on the base is a motor that may carry joints at A."""
+    return step.connection.joint in motors and step.connection.type in ("prismatic", "revolute")
+
+
+def _check_rod_alone(steps: Sequence[Step], motors: Sequence[str], leg: str) -> None:
+    """Check that nothing but a rod hangs on an actuator.
+
+    Raises
+    ------
+    OutOfClass
+        If another motor or a slider follows.
+    """
+    onward = [step.connection for step in steps[1:]]
+    second = next((c.joint for c in onward if c.joint in motors), None)
+    if second is not None:
+        raise OutOfClass(
+            f"the leg of joint '{leg}' is outside the method: found a second motor '{second}' "
+            f"beyond the motor '{leg}' on the base, needed one motor for each leg; remove it from "
+            "name_mot if it has none, otherwise this machine cannot be calibrated this way."
+        )
+    slider = next((c.joint for c in onward if c.type == "prismatic"), None)
+    if slider is not None:
+        raise OutOfClass(
+            f"the leg of joint '{leg}' is outside the method: found the slider '{slider}' beyond "
+            f"the motor '{leg}' on the base, needed a rod of constant length there; this machine "
+            "cannot be calibrated this way."
+        )
+
+
+def _check_moves(chain: LegChain, axis: Axis) -> None:
+    """Check that an actuator that turns moves the joint at A.
+
+    Raises
+    ------
+    OutOfClass
+        If A is on its axis.
+    """
+    turns = chain.steps[0].connection.type == "revolute"
+    if turns and axis.distance(chain.A) < CONCURRENT:
+        raise OutOfClass(
+            f"the leg of motor '{axis.name}' is outside the method: found the joint at A on the "
+            "axis of the motor, which turns the rod and does not move its joint, needed an arm "
+            "between them; remove it from name_mot if it has no motor, otherwise this machine "
+            "cannot be calibrated this way."
+        )
+
+
+def actuator_of(
+    chain: LegChain, T_base: Array, travel: tuple[float, float], link: str
+) -> Actuator | None:
+    """Return what the rod of a chain hangs on, in the base link at T_base in its body."""
+    step = chain.actuator
+    if step is None:
+        return None
+    inverse = matrix_inverse(T_base)
+    point, axis = step.line(step.near)
+    sign = 1.0 if step.near == 0 else -1.0  # a joint moves its child
+    A, at = matrix_applied(inverse, chain.A), matrix_applied(inverse, point)
+    direction = sign * (inverse[:3, :3] @ axis)
+    turns = step.connection.type == "revolute"
+    return Actuator(
+        joint=str(step.connection.joint),
+        kind=ActuatorKind.REVOLUTE if turns else ActuatorKind.PRISMATIC,
+        axis=direction,
+        point=at + ((A - at) @ direction) * direction if turns else at,
+        travel=travel,
+        link=link,
+    )
+
+
 def leg_of(
     name: str,
     chain: LegChain,
@@ -79,6 +163,7 @@ def leg_of(
     actuated: bool,
     spatial: bool,
     home: RigidTransform | None,
+    actuator: Actuator | None = None,
 ) -> Leg:
     """Return a leg in the links of base and platform, which stand at T_body_link in their bodies.
 
@@ -114,6 +199,7 @@ def leg_of(
         sign=sign,
         travel=travel,
         chain=chain,
+        actuator=actuator,
     )
 
 
@@ -327,11 +413,11 @@ def _check_axes(base: Pivot, platform: Pivot, u: Array, leg: str) -> None:
                 )
 
 
-def _rod(axes: Sequence[Axis], leg: str) -> tuple[int, LegEnds]:
+def _rod(axes: Sequence[Axis], leg: str, on: str | None = None) -> tuple[int, LegEnds]:
     """Return how many joints of a leg without slider are at the base, and its ends.
 
     A revolute along the rod passes through both centres, and may belong to either joint: the one
-    that its origin is nearer to.
+    that its origin is nearer to. *on* names the motor on whose carriage or arm it hangs.
 
     Raises
     ------
@@ -358,10 +444,16 @@ def _rod(axes: Sequence[Axis], leg: str) -> tuple[int, LegEnds]:
         raise problems[len(places[0])]
     what = (
         f"no slider and {len(places)} joints in different places, so that the rod hangs on a "
-        "moving arm and the joint at A moves"
+        "moving arm that no motor of name_mot moves"
         if len(places) > 2
         else "no slider and all joints in one place"
     )
+    if on is not None:
+        raise OutOfClass(
+            f"the leg of motor '{on}' is outside the method: found {what.split(',')[0]} beyond it, "
+            "needed a rod of constant length with a joint at each end; this machine cannot be "
+            "calibrated this way."
+        )
     raise OutOfClass(
         f"the leg of joint '{leg}' is outside the method: found {what}, needed a joint whose "
         "centre is fixed in the base, then a slider or a rod of constant length, and a joint whose "

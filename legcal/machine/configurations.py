@@ -31,6 +31,7 @@ from legcal.machine.model import (
     Machine,
     joint_values,
     platform_pose,
+    readings_at_poses,
     slider_columns,
 )
 from legcal.machine.solver import RANK, poses_after
@@ -276,11 +277,10 @@ def _reached(machine: Machine, q: Array) -> Iterator[tuple[Array, Array, bool]]:
     motors = list(machine.motors)
     home = machine.home_configuration[slider_columns(machine, motors)[0]]
     poses, part = follow_poses(machine, machine.home, home, q, MIN_STEP)
-    arms = machine.B_platform @ np.swapaxes(poses[:, :, :3], 1, 2)
-    lengths = np.linalg.norm(arms + poses[:, None, :, 3] - machine.A_base, axis=2)
-    readings = machine.sign * (lengths - machine.q0)
-    readings[:, [leg.kind is LegKind.CONSTANT for leg in machine.legs]] = 0.0
-    readings[:, motors] = q
+    readings = readings_at_poses(machine, poses)
+    readings[:, [not leg.has_value for leg in machine.legs]] = 0.0
+    read = [leg.is_motor for leg in machine.legs]
+    readings[:, read] = machine.at_readings(q)[:, read]
     least = MIN_SINGULARITY * singularity(machine, machine.home)
     usable = (part == 1.0) & ~_outside(machine, readings).any(axis=1)
     usable &= singularities(machine, poses) >= least

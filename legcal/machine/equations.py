@@ -7,6 +7,10 @@ the base. The rows of :func:`leg_equations` are those of the paper; :func:`pose_
 multiplies rows without a unit by the leg length, so that all are lengths. Which equations a leg has
 follows from its joints (:class:`legcal.machine.leg.JointType`); each is one function here, which
 gives the residual and its gradients by the vector from A to B and by the axes.
+
+The joint at A of a rod on an actuator moves with its reading, and with it all equations of the rod
+(:func:`pose_equations` with ``q``). Where no reading is given these are eliminated: one combination
+of the equations of all rods on an actuator tells its reading, the others are constraints.
 """
 
 from __future__ import annotations
@@ -21,6 +25,13 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
+from legcal.machine.actuator import (
+    ActuatorColumns,
+    JointMotion,
+    actuator_index,
+    actuators_of,
+    reading_of_rod,
+)
 from legcal.machine.leg import EquationKind, JointType, Leg, LegColumns, LegKind
 from legcal.machine.model import Machine
 from legcal.machine.parameters import Parametrization
@@ -32,11 +43,12 @@ class PoseEquations:
 
     values: Array  # (k, m) residuals [m]; |AB| - q0 for a length, to equal s q
     by_pose: Array  # (k, m, 6) derivative by rotation [rad] and displacement [m]
-    by_local: Array  # (k, m, 12) by the numbers of the row's leg (LegColumns), axes by turns about
+    by_local: Array  # (k, m, 17) by the numbers of the row's leg (LegColumns), axes by turns about
     # their normal_basis, exact where residuals are zero; or (k, m, 0)
     leg: IntArray  # (m,) the leg of each row, -1 for the plane
     kinds: tuple[EquationKind, ...]  # (m,) what each row is about
     measured: BoolArray  # (m,) rows of readings; the others are constraints
+    by_q: Array  # (k, m, n) by the readings of actuators; or (k, m, 0)
 
     def of(self, rows: BoolArray) -> PoseEquations:
         """Return some of the rows."""
@@ -47,6 +59,7 @@ class PoseEquations:
             self.leg[rows],
             tuple(kind for kind, is_in in zip(self.kinds, rows, strict=True) if is_in),
             self.measured[rows],
+            self.by_q[:, rows],
         )
 
     def by_parameters(self, parametrization: Parametrization) -> Array:
@@ -60,17 +73,32 @@ class PoseEquations:
 
 
 def pose_equations(
-    legs: Sequence[Leg], R: Array, t: Array, *, by_local: bool = True
+    legs: Sequence[Leg], R: Array, t: Array, *, by_local: bool = True, q: Array | None = None
 ) -> PoseEquations:
     """Return the equations of legs at poses R (k, 3, 3), t (k, 3) [m]; all rows are lengths.
 
-    Without *by_local* these derivatives have no columns, which takes two thirds of the time.
+    *q* (k, n) are the readings of actuators [m, rad], in the order of
+    :func:`~legcal.machine.actuator.actuators_of`; all rows of their rods then count as measured:
+    they hold at these readings. Without *q* they are at the readings at which rods reach the
+    platform, one row for each actuator measured and the others constraints, and derivatives by
+    parameters are not to be had. Without *by_local* these have no columns, which takes two thirds
+    of the time.
     """
-    if all(leg.kind is not LegKind.PASSIVE and len(leg.equations) == 1 for leg in legs):
+    on = actuator_index(legs)
+    hangs = max(on, default=-1) >= 0
+    if q is None and hangs:
+        return _without_readings(legs, R, t)
+    if not hangs and all(
+        leg.kind is not LegKind.PASSIVE and len(leg.equations) == 1 for leg in legs
+    ):
         return _lengths(legs, R, t, by_local)
     parts = []
     for j, leg in enumerate(legs):
-        found = leg_equations(leg, R, t, by_local=by_local)
+        at = None if q is None or on[j] < 0 else q[:, on[j]]
+        found = leg_equations(leg, R, t, by_local=by_local, q=at)
+        by_q = np.zeros((*found.values.shape, 0 if q is None else q.shape[1]))
+        if at is not None:
+            by_q[:, :, on[j]] = found.by_q[:, :, 0]
         rows = np.array([leg.kind is not LegKind.PASSIVE] + [True] * (len(leg.equations) - 1))
         is_length = np.array([kind is EquationKind.LENGTH for kind in found.kinds])
         arm = np.where(is_length, 1.0, found.values[:, :1] + leg.q0)
@@ -82,45 +110,156 @@ def pose_equations(
                 np.full(len(rows), j),
                 found.kinds,
                 found.measured,
+                arm[..., None] * by_q,
             ).of(rows)
         )
     return _stacked(parts)
 
 
-def leg_equations(leg: Leg, R: Array, t: Array, *, by_local: bool = True) -> PoseEquations:
+def readings_of_rods(legs: Sequence[Leg], R: Array, t: Array) -> Array:
+    """Return the readings of actuators (k, n) at poses R, t: those of the first rod on each."""
+    q = np.zeros((len(t), len(actuators_of(legs))))
+    known: set[int] = set()
+    for leg, a in zip(legs, actuator_index(legs), strict=True):
+        if a >= 0 and a not in known:
+            known.add(a)
+            q[:, a] = reading_of_rod(leg, R @ leg.B + t)
+    return q
+
+
+def n_pose_constraints(legs: Sequence[Leg]) -> int:
+    """Return how many equations of legs hold whatever the readings are."""
+    return sum(leg.n_constraints for leg in legs) - len(actuators_of(legs))
+
+
+def _without_readings(legs: Sequence[Leg], R: Array, t: Array) -> PoseEquations:
+    """Return the equations of legs with the readings of actuators eliminated.
+
+    The rows of the rods on an actuator are turned (by a reflection) so that the reading stands in
+    the first of them only.
+    """
+    found = pose_equations(legs, R, t, by_local=False, q=readings_of_rods(legs, R, t))
+    values, by_pose, measured = found.values.copy(), found.by_pose.copy(), found.measured.copy()
+    on = np.array(actuator_index(legs))[found.leg]
+    for a in range(found.by_q.shape[2]):
+        rows = np.flatnonzero(on == a)
+        measured[rows[1:]] = False
+        if len(rows) == 1:
+            continue
+        g = found.by_q[:, rows, a]
+        size = np.linalg.norm(g, axis=1, keepdims=True)
+        e1 = np.eye(len(rows))[0]
+        g = np.where(size > 0.0, g / np.where(size > 0.0, size, 1.0), e1)
+        v = g + np.where(g[:, :1] < 0.0, -1.0, 1.0) * e1  # the reflection takes g to e1 or -e1
+        scale = 2.0 / np.sum(v * v, axis=1)
+        along = scale[:, None] * np.einsum("kr,krc->kc", v, by_pose[:, rows])
+        by_pose[:, rows] -= v[:, :, None] * along[:, None]
+        values[:, rows] -= v * (scale * np.einsum("kr,kr->k", v, values[:, rows]))[:, None]
+    none = np.zeros((*values.shape, 0))
+    return PoseEquations(values, by_pose, none, found.leg, found.kinds, measured, none)
+
+
+def equations_at_readings(
+    legs: Sequence[Leg], R: Array, t: Array, lengthening: Array
+) -> PoseEquations:
+    """Return what legs miss at poses and readings, without derivatives by parameters.
+
+    *lengthening* (k, n_legs) is s q of actuated legs [m] and q of rods on actuators [m, rad]; rows
+    of readings that are not known (NaN) are zero.
+    """
+    on = actuator_index(legs)
+    rods = [on.index(a) for a in range(max(on, default=-1) + 1)]
+    q = np.nan_to_num(lengthening[:, rods]) if rods else None
+    found = pose_equations(legs, R, t, by_local=False, q=q)
+    wanted = np.where(found.measured, lengthening[:, found.leg], 0.0)
+    known = np.isfinite(wanted)
+    hangs = np.array(on)[found.leg] >= 0
+    return PoseEquations(
+        np.where(known, found.values - np.where(hangs, 0.0, wanted), 0.0),
+        found.by_pose * known[..., None],
+        found.by_local,
+        found.leg,
+        found.kinds,
+        found.measured,
+        found.by_q,
+    )
+
+
+def leg_equations(
+    leg: Leg, R: Array, t: Array, *, by_local: bool = True, q: Array | None = None
+) -> PoseEquations:
     """Return all equations of one leg at poses R (k, 3, 3), t (k, 3) [m], as the paper has them.
 
-    Rows but that of the length have no unit; a passive leg has the row of its length too.
+    Rows but that of the length have no unit; a passive leg has the row of its length too. Of a rod
+    on an actuator *q* (k,) are its readings, zero if they are not given.
     """
     arm = R @ leg.B
-    vector = arm + t - leg.A
+    moved = None
+    if leg.actuator is not None:
+        moved = leg.actuator.motion(leg.A, np.zeros(len(t)) if q is None else q)
+    vector = arm + t - (leg.A if moved is None else moved.A)
     length = np.linalg.norm(vector, axis=1)
-    at = _Placed(leg, R, length, vector / length[:, None])
+    at = _Placed(leg, R, length, vector / length[:, None], moved)
     kinds = leg.equations
     values, by_pose = np.empty((len(t), len(kinds))), np.empty((len(t), len(kinds), 6))
     local = np.zeros((len(t), len(kinds), LegColumns.COUNT if by_local else 0))
+    by_q = np.zeros((len(t), len(kinds), 0 if moved is None else 1))
     for i, kind in enumerate(kinds):
         row = _RESIDUALS[kind](at)
         values[:, i] = row.value
         by_pose[:, i, :3], by_pose[:, i, 3:] = cross(arm, row.by_leg), row.by_leg
         if row.by_tied is not None:
             by_pose[:, i, :3] += cross(at.in_base(row.tied), row.by_tied)
+        if moved is not None:
+            by_q[:, i, 0] = _by_actuator(leg, moved, row, local[:, i])
         if by_local:
-            local[:, i, LegColumns.A] = -row.by_leg
+            local[:, i, LegColumns.A] = -_back(moved, row.by_leg)
             local[:, i, LegColumns.B] = _in_platform(R, row.by_leg)
             local[:, i, LegColumns.LENGTH] = row.by_q0
             local[:, i, LegColumns.TWIST] = row.by_twist
             if row.by_base_axis is not None:
                 e1, e2 = _basis(_given(leg.base_axis))
-                turns = np.stack([-row.by_base_axis @ e2, row.by_base_axis @ e1], axis=1)
+                by_axis = _back(moved, row.by_base_axis)
+                turns = np.stack([-by_axis @ e2, by_axis @ e1], axis=1)
                 local[:, i, LegColumns.BASE_AXIS] = turns
             if row.by_tied is not None:
                 turns = cross(_basis(_given(leg.platform_axis)), row.tied)
                 local[:, i, LegColumns.PLATFORM_AXIS] = _in_platform(R, row.by_tied) @ turns.T
-    measured = [kind is EquationKind.LENGTH and leg.kind is LegKind.ACTUATED for kind in kinds]
-    return PoseEquations(
-        values, by_pose, local, np.zeros(len(kinds), dtype=np.intp), kinds, np.array(measured)
-    )
+    measured = [
+        moved is not None or (kind is EquationKind.LENGTH and leg.kind is LegKind.ACTUATED)
+        for kind in kinds
+    ]
+    owner = np.zeros(len(kinds), dtype=np.intp)
+    return PoseEquations(values, by_pose, local, owner, kinds, np.array(measured), by_q)
+
+
+def _back(moved: JointMotion | None, vectors: Array) -> Array:
+    """Return gradients (k, 3) by what is fixed in the base by what is at reading 0."""
+    return vectors if moved is None else np.einsum("kij,ki->kj", moved.by_A, vectors)
+
+
+def _by_actuator(leg: Leg, moved: JointMotion, row: _EquationRow, local: Array) -> Array:
+    """Return the derivative (k,) of a row by the reading; write those by the actuator's numbers.
+
+    They go into *local* (k, 17), which may have no columns.
+    """
+    by_q = -_dot(moved.by_q, row.by_leg)
+    columns = ActuatorColumns
+    if local.shape[1]:
+        local[:, columns.AXIS] = -np.einsum("kij,ki->kj", moved.by_axis, row.by_leg)
+        local[:, columns.POINT] = -np.einsum("kij,ki->kj", moved.by_point, row.by_leg)
+        local[:, columns.GAIN] = -_dot(moved.by_gain, row.by_leg)
+    actuator = leg.actuator
+    if row.by_base_axis is None or actuator is None or not actuator.turns:
+        return by_q
+    v = moved.by_A @ _given(leg.base_axis)  # it turns with the arm
+    by_angle = _dot(cross(actuator.axis, v), row.by_base_axis)
+    if local.shape[1]:
+        for k, e in enumerate(_basis(actuator.axis)):
+            turned = cross(e, v) - moved.by_A @ cross(e, _given(leg.base_axis))
+            local[:, columns.AXIS.start + k] += _dot(turned, row.by_base_axis)
+        local[:, columns.GAIN] += by_angle * moved.angle / actuator.gain
+    return by_q + actuator.gain * by_angle
 
 
 def least_squares_equations(found: PoseEquations) -> tuple[Array, Array]:
@@ -147,6 +286,13 @@ def machine_equations(machine: Machine, R: Array, t: Array) -> PoseEquations:
     return found if machine.spatial else _stacked([found, _plane(machine, R, t)])
 
 
+def machine_equations_at(machine: Machine, R: Array, t: Array, readings: Array) -> PoseEquations:
+    """Return what they miss at readings of the motors (k, n_motors) [m or rad]."""
+    motors = machine.sign * machine.at_readings(readings)
+    found = equations_at_readings(machine.legs, R, t, motors)
+    return found if machine.spatial else _stacked([found, _plane(machine, R, t)])
+
+
 def equations_at(machine: Machine, T_base_platform: RigidTransform) -> PoseEquations:
     """Return the same at one pose."""
     matrix = T_base_platform.as_matrix()[None]
@@ -161,7 +307,7 @@ def constraints_at(machine: Machine, T_base_platform: RigidTransform) -> PoseEqu
 
 def is_constrained(machine: Machine) -> bool:
     """Say whether the machine itself forbids some poses, whatever the lengths of its sliders."""
-    return not machine.spatial or any(leg.n_constraints for leg in machine.legs)
+    return not machine.spatial or n_pose_constraints(machine.legs) > 0
 
 
 def freedoms(frame_legs: Sequence[int]) -> tuple[int, ...]:
@@ -191,7 +337,7 @@ def pose_sensitivity(
     NotIdentifiable
         If readings and legs do not determine a pose.
     """
-    equations = pose_equations(legs, R, t)
+    equations = pose_equations(legs, R, t, q=readings_of_rods(legs, R, t))
     columns = list(freedoms(frame_legs))
     F = equations.by_pose[:, :, columns]
     singular = np.linalg.svd(F, compute_uv=False)
@@ -286,6 +432,7 @@ def _lengths(legs: Sequence[Leg], R: Array, t: Array, by_local: bool) -> PoseEqu
         np.arange(len(legs)),
         (EquationKind.LENGTH,) * len(legs),
         np.array([leg.kind is LegKind.ACTUATED for leg in legs], dtype=np.bool_),
+        np.zeros((*lengths.shape, 0)),
     )
 
 
@@ -305,7 +452,8 @@ def _plane(machine: Machine, R: Array, t: Array) -> PoseEquations:
         by_pose[:, row, :3] = scale[:, None] * cross(carried, e)
     none = np.zeros((len(t), 3, 0))
     is_read = np.zeros(3, dtype=np.bool_)
-    return PoseEquations(values, by_pose, none, np.full(3, -1), (EquationKind.PLANE,) * 3, is_read)
+    kinds = (EquationKind.PLANE,) * 3
+    return PoseEquations(values, by_pose, none, np.full(3, -1), kinds, is_read, none)
 
 
 def _stacked(parts: Sequence[PoseEquations]) -> PoseEquations:
@@ -317,6 +465,7 @@ def _stacked(parts: Sequence[PoseEquations]) -> PoseEquations:
         np.concatenate([part.leg for part in parts]),
         tuple(kind for part in parts for kind in part.kinds),
         np.concatenate([part.measured for part in parts]),
+        np.concatenate([part.by_q for part in parts], axis=1),
     )
 
 
@@ -347,6 +496,13 @@ class _Placed(NamedTuple):
     R: Array  # (k, 3, 3)
     length: Array  # (k,) [m]
     u: Array  # (k, 3)
+    moved: JointMotion | None = None  # of the joint at A, on an actuator
+
+    @property
+    def base_axis(self) -> Array:
+        """The axis of the joint at A, (k, 3)."""
+        v = np.broadcast_to(_given(self.leg.base_axis), self.u.shape)
+        return v if self.moved is None else np.asarray((self.moved.by_A @ v[..., None])[..., 0])
 
     def in_base(self, vector: Array) -> Array:
         """Return a direction of the platform in the frame of the base, (k, 3)."""
@@ -380,7 +536,7 @@ def _length(at: _Placed) -> _EquationRow:
 
 def _base_axis(at: _Placed) -> _EquationRow:
     """Return v . u of eq (7) at the base."""
-    v = np.broadcast_to(_given(at.leg.base_axis), at.u.shape)
+    v = at.base_axis
     return _EquationRow(_dot(v, at.u), at.by_leg(v), by_base_axis=at.u)
 
 
@@ -400,7 +556,7 @@ def _twist(at: _Placed) -> _EquationRow:
     leg, u, tau = at.leg, at.u, float(at.leg.twist or 0.0)
     b = _given(leg.platform_axis)
     tied = _basis(b)[0] if leg.is_fixed_to_platform else b
-    outer = np.broadcast_to(_given(leg.base_axis), u.shape), at.in_base(tied)
+    outer = at.base_axis, at.in_base(tied)
     joints = leg.base_joint, leg.platform_joint
     p, w = (axis_in_leg(*end, u, _ROWS) for end in zip(joints, outer, strict=True))
     c, s = np.cos(tau), np.sin(tau)

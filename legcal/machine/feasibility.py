@@ -173,7 +173,7 @@ class Feasibility:
         machine = self._machine
         outside = beyond_travel(machine, configuration)
         if not of_motors:
-            outside[list(machine.motors)] = False
+            outside[[leg.is_motor for leg in machine.legs]] = False
         beyond = np.flatnonzero(outside)
         if len(beyond):
             return Cause.LIMITS, f"leg '{machine.leg_names[beyond[0]]}' outside its travel"
@@ -223,7 +223,8 @@ class Feasibility:
         lengths = np.linalg.norm(vectors, axis=1)
         u = (vectors / lengths[:, None])[self._leg]
         along = self._ends + np.where(self._on_platform, lengths[self._leg], 0.0)[:, None]
-        start = self._machine.A_base[self._leg] + along[:, :1] * u
+        B = T_base_platform.apply(self._machine.B_platform)
+        start = (B - vectors)[self._leg] + along[:, :1] * u
         one, two = self._pairs
         span = np.diff(along, axis=1) * u
         distance = segment_distance(start[one], span[one], start[two], span[two])

@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry import Array, motion_of
 from legcal.machine.closing import close_at
-from legcal.machine.equations import is_constrained, machine_equations
+from legcal.machine.equations import is_constrained, machine_equations_at
 from legcal.machine.kinematics import project_pose
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine, platform_pose, readings_at
@@ -80,12 +80,11 @@ def home_at_mid_travel(machine: Machine) -> RigidTransform:
         If none is found.
     """
     middle = np.array([0.5 * sum(leg.travel) for leg in machine.legs])
-    wanted = machine.sign * middle
-    actuated = np.array([leg.kind is LegKind.ACTUATED for leg in machine.legs])
     rng = np.random.default_rng(1965)
-    centre = machine.A_base.mean(axis=0)
-    level = level_rotation(machine.A_base, machine.B_platform)
-    reach = float(np.abs(wanted + machine.q0).mean())
+    A = machine.A_at(middle)
+    centre = A.mean(axis=0)
+    level = level_rotation(A, machine.B_platform)
+    reach = float(np.abs(machine.lengths_at(middle)).mean())
     best: tuple[float, RigidTransform] | None = None
     for first in range(0, TRIALS, BATCH):
         trials = np.arange(first, min(first + BATCH, TRIALS))
@@ -94,7 +93,7 @@ def home_at_mid_travel(machine: Machine) -> RigidTransform:
             for trial in trials
         ]
         starts = [(t, (level * Rotation.from_rotvec(turn)).as_rotvec()) for t, turn in starts]
-        found = _with_lengths(machine, starts, wanted[actuated], reach)
+        found = _at_readings(machine, starts, middle[list(machine.motors)], reach)
         for trial, T in zip(trials, found, strict=True):
             if T is None:
                 continue
@@ -127,6 +126,7 @@ def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> Rig
             base_axis=wanted.base_axis,
             platform_axis=wanted.platform_axis,
             twist=wanted.twist,
+            actuator=wanted.actuator,
         )
         for leg, wanted in zip(machine.legs, legs_in_links(machine, legs), strict=True)
     )
@@ -134,16 +134,15 @@ def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> Rig
     return None if problem is not None else home
 
 
-def _with_lengths(
-    machine: Machine, starts: Sequence[tuple[Array, Array]], lengths: Array, reach: float
+def _at_readings(
+    machine: Machine, starts: Sequence[tuple[Array, Array]], readings: Array, reach: float
 ) -> list[RigidTransform | None]:
-    """Return the poses, found from places and turns, with those lengths of the actuated legs."""
+    """Return the poses, found from places and turns, at readings (n_motors,) of the motors."""
     t, turns = (np.array(part) for part in zip(*starts, strict=True))
     poses = np.concatenate([Rotation.from_rotvec(turns).as_matrix(), t[..., None]], axis=2)
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
-        found.values[:, found.measured] -= lengths
+        found = machine_equations_at(machine, poses[:, :, :3], poses[:, :, 3], readings[None])
         return found.values, found.by_pose
 
     unit = np.array([1.0 / reach] * 3 + [1.0] * 3)

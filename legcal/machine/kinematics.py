@@ -21,11 +21,13 @@ from legcal.machine.equations import (
     constraints_at,
     describe_worst,
     equations_at,
+    equations_at_readings,
     freedoms,
     is_constrained,
     is_overdetermined,
     least_squares_equations,
     machine_equations,
+    machine_equations_at,
     pose_equations,
     violated_constraint,
 )
@@ -41,6 +43,7 @@ from legcal.machine.model import (
     Machine,
     platform_pose,
     readings_at,
+    readings_at_poses,
     slider_columns,
 )
 from legcal.machine.solver import Equations, newton, poses_after, solve, walk_in_steps
@@ -70,7 +73,8 @@ def forward_kinematics(
     mechanism : Machine
         The machine.
     q : (n_legs,) array
-        Readings [m]; those of legs without a motor are ignored and may be NaN.
+        Readings [m, rad]; those of legs without a motor are ignored and may be NaN. Of rods on
+        one actuator that of the first counts.
     start : RigidTransform, optional
         T_base_platform of a pose in the wanted assembly mode; ``mechanism.home`` without it.
 
@@ -244,6 +248,8 @@ def follow_each(machine: Machine, readings: Array) -> Iterator[Array]:
 def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the joint value of every leg at a pose, ``q = sign (|AB| - q0)``.
 
+    Of a rod it is the reading of the actuator that it hangs on, with |A(q) - B| = l.
+
     A length is a distance, so that no leg is ever flipped. Values outside the travel are
     returned as they are.
 
@@ -257,7 +263,7 @@ def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> A
     Returns
     -------
     (n_legs,) array
-        Joint values [m]; zero for a leg of constant length.
+        Joint values [m, rad]; zero for a leg of constant length that hangs on no actuator.
 
     Raises
     ------
@@ -272,7 +278,7 @@ def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> A
             "allows; choose one that keeps it."
         )
     q = readings_at(mechanism, T_base_platform)
-    q[[leg.kind is LegKind.CONSTANT for leg in mechanism.legs]] = 0.0
+    q[[not leg.has_value for leg in mechanism.legs]] = 0.0
     return q
 
 
@@ -367,7 +373,7 @@ def _readings(machine: Machine, q: Array) -> Array:
     _check_determined(machine)
     readings = q[:, list(machine.motors)]
     lengths = machine.lengths_at(readings, machine.motors)
-    wrong = np.argwhere(~((lengths > 0.0) & np.isfinite(lengths)))
+    wrong = np.argwhere(~((lengths > 0.0) & np.isfinite(lengths) & np.isfinite(readings)))
     if len(wrong):
         row, column = wrong[0]
         name = machine.leg_names[machine.motors[column]]
@@ -443,7 +449,8 @@ def solve_poses(
 ) -> SolvedPoses:
     """Return the poses near R, t of R_e in R_b where the equations of legs hold at readings.
 
-    *lengthening* (k, n_legs) is s q of actuated legs [m], NaN where unknown; without it poses move
+    *lengthening* (k, n_legs) is s q of actuated legs [m] and q of rods on actuators [m, rad], NaN
+    where unknown; without it poses move
     to the nearest at which the constraints hold. Where no pose meets all (parameters far from the
     truth) the one with least squares is found; of redundant motors that with least squares of the
     lengths, the constraints exact. After few *steps* poses are only nearer.
@@ -452,17 +459,14 @@ def solve_poses(
     fixed[list(freedoms(frame_legs))] = False
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        found = pose_equations(legs, poses[:, :, :3], poses[:, :, 3], by_local=False)
         if lengthening is None:
+            found = pose_equations(legs, poses[:, :, :3], poses[:, :, 3], by_local=False)
             found = found.of(~found.measured)
-            values, jacobian = found.values, found.by_pose.copy()
         else:
-            wanted = np.where(found.measured, lengthening[:, found.leg], 0.0)
-            known = np.isfinite(wanted)
-            values = np.where(known, found.values - wanted, 0.0)
-            jacobian = found.by_pose * known[..., None]
+            found = equations_at_readings(legs, poses[:, :, :3], poses[:, :, 3], lengthening)
+        jacobian = found.by_pose.copy()
         jacobian[:, :, fixed] = 0.0
-        return values, jacobian
+        return found.values, jacobian
 
     poses = np.concatenate([R, t[..., None]], axis=2)
     found = solve(equations, poses_after, poses, tolerance=1e-15, rank=DEPENDENT, steps=steps)
@@ -471,8 +475,7 @@ def solve_poses(
         return SolvedPoses(poses[:, :, :3], poses[:, :, 3], missed, size)
 
     def with_known(poses: Array) -> PoseEquations:
-        found = pose_equations(legs, poses[:, :, :3], poses[:, :, 3], by_local=False)
-        found.values[:, found.measured] -= lengthening[:, found.leg[found.measured]]
+        found = equations_at_readings(legs, poses[:, :, :3], poses[:, :, 3], lengthening)
         found.by_pose[:, :, fixed] = 0.0
         return found.of(~found.measured | np.isfinite(lengthening[0, found.leg]))
 
@@ -598,17 +601,16 @@ def follow(
 
 def _nearest(machine: Machine, T: RigidTransform, readings: Array) -> RigidTransform:
     """Return the pose near T_base_platform at which readings (n_motors,) miss least."""
-    equations = equations_of_readings(machine, machine.sign[list(machine.motors)] * readings)
+    equations = equations_of_readings(machine, readings[None])
     found = solve(equations, poses_after, T.as_matrix()[None, :3], tolerance=1e-15)
     return motion_of(found.points[0, :, :3], found.points[0, :, 3])
 
 
-def equations_of_readings(machine: Machine, lengthening: Array) -> Equations:
-    """Return what poses must satisfy at s q of the motors (k, n_motors) [m]."""
+def equations_of_readings(machine: Machine, readings: Array) -> Equations:
+    """Return what poses must satisfy at readings of the motors (k, n_motors) [m, rad]."""
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
-        found.values[:, found.measured] -= lengthening
+        found = machine_equations_at(machine, poses[:, :, :3], poses[:, :, 3], readings)
         if machine.is_redundant:
             return least_squares_equations(found)
         return found.values, found.by_pose
@@ -634,14 +636,13 @@ def follow_poses(
         if len(rows) == 0:
             return poses, done
         part = np.minimum(done[rows] + step[rows], 1.0)
-        lengthening = machine.sign[motors] * (first + part[:, None] * (last[rows] - first))
+        readings = first + part[:, None] * (last[rows] - first)
         if machine.is_redundant:  # from where motors are: readings between need not agree
-            here = machine_equations(machine, poses[rows, :, :3], poses[rows, :, 3])
-            now = here.values[:, here.measured]
+            now = readings_at_poses(machine, poses[rows])[:, motors]
             share = ((part - done[rows]) / (1.0 - done[rows]))[:, None]
-            lengthening = now + share * (machine.sign[motors] * last[rows] - now)
+            readings = now + share * (last[rows] - now)
         found = newton(
-            equations_of_readings(machine, lengthening),
+            equations_of_readings(machine, readings),
             poses_after,
             poses[rows],
             tolerance=TOLERANCE * scale,

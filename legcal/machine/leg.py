@@ -204,7 +204,7 @@ class LegChain:
 
     steps: tuple[Step, ...]  # from base to platform
     poses: tuple[Array, ...]  # (4, 4) of the base body, the bodies of the leg, the platform's
-    n_lower: int  # joints on the base side of the slider, or of the rod
+    n_lower: int  # joints on the base side of the slider, or of the rod, with its actuator
     slider: Step | None  # None for a leg of constant length
     base: Pivot
     platform: Pivot
@@ -212,6 +212,7 @@ class LegChain:
     B: Array  # (3,) [m]
     u: Array  # (3,) in which a slider moves the platform end; else from A to B
     idle_spins: int  # freedoms that turn nothing but the leg about itself
+    actuator: Step | None = None  # the first of the steps, where a rod hangs on what it moves
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -225,8 +226,9 @@ class LegChain:
 
     @property
     def motor(self) -> str | None:
-        """The slider's joint, None for a rod."""
-        return None if self.slider is None else self.slider.connection.joint
+        """The joint of the slider, or of what a rod hangs on; None for other rods."""
+        moving = self.slider or self.actuator
+        return None if moving is None else moving.connection.joint
 
     @property
     def reach(self) -> float:
@@ -268,11 +270,12 @@ class Leg:
     twist: float | None = None  # [rad], in (-pi/2, pi/2]
     name: str = ""
     prismatic: str | None = None  # the URDF joint of the slider, or of what the rod hangs on
-    sign: int = 1  # -1 where the leg shrinks with the joint value; of a rod its working mode
+    sign: int = 1  # -1 where the leg shrinks with the joint value
     travel: tuple[float, float] = (0.0, 0.0)  # joint limits of slider or actuator [m or rad]
     cylinders: tuple[Cylinder, ...] = ()  # what a camera can see of it
     chain: LegChain | None = None  # its joints in the URDF; None where no file describes it
     actuator: Actuator | None = None  # what a rod hangs on whose joint at A moves
+    mode: int = 1  # of such a rod, the sign of d|AB|/dq: which of two readings reaches B
 
     @property
     def is_motor(self) -> bool:
@@ -349,7 +352,7 @@ class Leg:
 
     @property
     def n_constraints(self) -> int:
-        """How many equations hold without a reading."""
+        """How many equations hold without a reading; of a rod at that of its actuator."""
         return len(self.equations) - (self.kind is not LegKind.CONSTANT)
 
 

@@ -6,7 +6,7 @@ platform are classified as legs, and a closed pose is found; every check below n
 with the file.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,14 +16,15 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import LegcalError, ModelError, OutOfClass
 from legcal.files import MotionEntry, closest, motion_to_xyz_quat
 from legcal.geometry import Array
+from legcal.machine.actuator import reading_of_rod, rod_mode
 from legcal.machine.bodies import Bodies, rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
-from legcal.machine.classification import CONCURRENT, PERPENDICULAR, leg_of
+from legcal.machine.classification import CONCURRENT, PERPENDICULAR, actuator_of, leg_of
 from legcal.machine.cylinders import at_visible_heights, visual_cylinders, with_cylinders
 from legcal.machine.diagnostics import mechanism_notes, proposal_notes
-from legcal.machine.equations import constraints_at, leg_equations
+from legcal.machine.equations import constraints_at, leg_equations, n_pose_constraints
 from legcal.machine.formats import read_source
-from legcal.machine.home import check_home_travel, closed_home
+from legcal.machine.home import check_home_travel, closed_home, home_at_mid_travel
 from legcal.machine.kinematics import MAX_POSE_ERROR
 from legcal.machine.leg import (
     MAX_LEGS,
@@ -34,7 +35,6 @@ from legcal.machine.leg import (
     EquationKind,
     JointType,
     LegChain,
-    LegKind,
 )
 from legcal.machine.mobility import (
     CONFIGURATIONS,
@@ -119,7 +119,13 @@ def _load(source: Source) -> Machine:
     given = machine.home if block.home is not None else None
     if given is None:
         _check_spread(machine)  # before a home of kilometres is looked for
+        if machine.actuators:
+            given = home_at_mid_travel(machine)
+            machine = _in_modes(machine, given, [0.5 * sum(leg.travel) for leg in machine.legs])
     else:
+        if machine.actuators:
+            q = _readings_at_home(machine, block.home_readings or {})
+            machine = _in_modes(machine, machine.home, q)
         _check_unit(machine)  # before lengths of hundreds of metres fail to close
     if file.legcal is not None and file.legcal.home is not None:  # a drawing may be anywhere
         check_home_travel(machine)
@@ -153,7 +159,11 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     check_type(block, urdf, yaml_path)
     bodies = rigid_bodies(urdf, closures, block.platform_joint)
     chains = _legs_in_order(
-        find_chains(bodies, urdf, block.base, block.platform), bodies, urdf, block, yaml_path
+        find_chains(bodies, urdf, block.base, block.platform, file.name_mot),
+        bodies,
+        urdf,
+        block,
+        yaml_path,
     )
     _check_motors(file, chains, urdf, yaml_path)
     check_bodies(block, bodies, urdf, yaml_path)
@@ -176,6 +186,13 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     except ModelError as error:
         raise ModelError([f"{urdf.path}: {problem}" for problem in error.problems]) from error
     home = None if block.home is None else block.home.motion()
+    actuators = {
+        chain.motor: actuator_of(
+            chain, ends[0], _travel(chain, urdf), urdf.joints[str(chain.motor)].child
+        )
+        for chain in reversed(chains)  # its point is where the first leg has it
+        if chain.actuator is not None
+    }
     legs = tuple(
         leg_of(
             name,
@@ -185,6 +202,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
             actuated=leg_chain.motor in file.name_mot,
             spatial=normals is None,
             home=home,
+            actuator=actuators.get(leg_chain.motor),
         )
         for name, leg_chain in zip(block.legs, chains, strict=True)
     )
@@ -213,9 +231,61 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
 
 
 def _travel(chain: LegChain, urdf: Urdf) -> tuple[float, float]:
-    """Return the limits of a leg's slider [m], zero for a rod."""
+    """Return the limits of a leg's slider or actuator [m or rad], zero for a rod."""
     limits = None if chain.motor is None else urdf.joints[chain.motor].limits
     return (0.0, 0.0) if limits is None else limits
+
+
+def _in_modes(machine: Machine, T_base_platform: RigidTransform, q: Sequence[float]) -> Machine:
+    """Return the machine with its rods on actuators in the mode of a pose and joint values."""
+    B = T_base_platform.apply(machine.B_platform)
+    legs = tuple(
+        leg if leg.actuator is None else replace(leg, mode=rod_mode(leg, float(q_j), B_j))
+        for leg, q_j, B_j in zip(machine.legs, q, B, strict=True)
+    )
+    return replace(machine, legs=legs)
+
+
+def _readings_at_home(machine: Machine, given: Mapping[str, float]) -> list[float]:
+    """Return the joint values at home: as *given* for actuators, else the one inside the travel.
+
+    Raises
+    ------
+    ModelError
+        If both readings at which a rod reaches the platform at home are inside the travel, or a
+        reading is given of a joint that is no actuator.
+    """
+    path, known = machine.yaml_path, {actuator.joint for actuator in machine.actuators}
+    for name in given:
+        if name not in known:
+            raise ModelError(
+                f"{path}: legcal.home_readings.{name} could not be used: found no actuator of that "
+                f"name, needed one of {', '.join(sorted(known))}; {closest(name, sorted(known))}"
+            )
+    B = machine.home.apply(machine.B_platform)
+    q = [0.0] * machine.n_legs
+    for j, leg in enumerate(machine.legs):
+        if leg.actuator is None:
+            continue
+        both = [float(reading_of_rod(replace(leg, mode=m), B[j : j + 1])[0]) for m in (1, -1)]
+        if leg.actuator.joint in given:
+            wanted = given[leg.actuator.joint]
+            q[j] = min(both, key=lambda x: abs(x - wanted))
+            continue
+        inside = [bool(leg.in_travel(np.array([x]))[0]) for x in both]
+        scale = 1e-6 * max(1.0, float(np.ptp(leg.travel)))
+        if all(inside) and abs(both[0] - both[1]) > scale:
+            size, unit = (180.0 / np.pi, "deg") if leg.actuator.turns else (1e3, "mm")
+            raise ModelError(
+                f"{path}: the assembly of leg '{leg.name}' at home is ambiguous: found that its "
+                f"rod reaches the platform at the readings {size * both[0]:.1f} and "
+                f"{size * both[1]:.1f} {unit} of '{leg.actuator.joint}', both inside its travel, "
+                "needed one; write legcal.home_readings with the reading of each actuator at "
+                "home, or narrow the limits of the joint."
+            )
+        middle = 0.5 * sum(leg.travel)
+        q[j] = both[inside.index(True)] if any(inside) else min(both, key=lambda x: abs(x - middle))
+    return q
 
 
 def _legs_in_order(
@@ -344,24 +414,31 @@ def _check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> No
 
 
 def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, path: Path) -> None:
-    """Check that every motor is the slider of a leg.
+    """Check that every motor is the slider of a leg, or carries rods.
 
     Raises
     ------
     OutOfClass
         With one sentence for each motor that is not.
     """
-    sliders = {c.slider.connection.joint for c in chains if c.slider is not None}
+    moving = {chain.motor for chain in chains}
     problems = []
     for motor in file.name_mot:
         kind = urdf.joints[motor].type
-        if kind != "prismatic":
+        if kind == "continuous" and motor in moving:
+            problems.append(
+                f"{path}: the motor '{motor}' could not be used: found a continuous joint, needed "
+                "one with the limits of its readings; write its type as revolute, with <limit>."
+            )
+        elif kind != "prismatic" and motor not in moving:
             problems.append(
                 f"{path}: the motor '{motor}' is outside the method: found a {kind} joint in "
-                "name_mot, needed prismatic joints, whose readings are leg lengths; this machine "
-                "cannot be calibrated this way."
+                "name_mot that does not stand between the base and an arm with rods, needed "
+                "sliders of legs, or joints on the base that carry the joints of rods; remove it "
+                "from name_mot if it has no motor, otherwise this machine cannot be calibrated "
+                "this way."
             )
-        elif motor not in sliders:
+        elif motor not in moving:
             problems.append(
                 f"{path}: the motor '{motor}' is outside the method: found it on no leg, needed "
                 "the slider of a leg; remove it from name_mot."
@@ -460,7 +537,8 @@ def _check_unit(machine: Machine) -> None:
         )
     for leg in machine.legs:
         reach = leg.travel[1] - leg.travel[0]
-        if leg.kind is LegKind.ACTUATED and reach > MAX_LENGTH:
+        turns = leg.actuator is not None and leg.actuator.turns
+        if leg.is_motor and not turns and reach > MAX_LENGTH:
             raise ModelError(
                 f"{machine.urdf_path}: the travel of leg '{leg.name}' could not be used: found "
                 f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m, needed at most 20 m; write the "
@@ -488,7 +566,7 @@ def _check_dependence(machine: Machine, *, closes: bool = True) -> None:
     nearly = n_nearly_dependent(machine)
     # At a home that alone is special, constraints depend exactly and around it nearly.
     if nearly > (n_dependent_at_home(machine) if closes else 0):
-        n = sum(leg.n_constraints for leg in machine.legs)
+        n = n_pose_constraints(machine.legs)
         raise OutOfClass(
             f"{machine.yaml_path}: the mechanism '{machine.name}' could not be used: found that "
             f"{nearly} of the {n} constraints of its joints follow from the others to 1 mrad but "
@@ -505,7 +583,14 @@ def _check_ties(machine: Machine) -> None:
     OutOfClass
         If errors that its constraints allow one by one destroy it together.
     """
-    ties, n = machine_ties(machine), sum(leg.n_constraints for leg in machine.legs)
+    ties, n = machine_ties(machine), n_pose_constraints(machine.legs)
+    if machine.actuators and n_dependent_at_home(machine):
+        raise OutOfClass(
+            f"{machine.yaml_path}: the mechanism '{machine.name}' is outside the method: found it "
+            f"overconstrained ({n_dependent_at_home(machine)} of the {n} constraints of its joints "
+            "follow from the others) with joints at A that move, needed none that follow; give "
+            "its rods spherical joints."
+        )
     if not is_tied(geometries(machine), ties, parametrization_of(machine, twists=True)):
         raise OutOfClass(
             f"{machine.yaml_path}: the mechanism '{machine.name}' is outside the method: found it "
@@ -559,9 +644,10 @@ def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
     q = np.array([joint_values(machine, c) for c in configurations])
     of_legs = []
     for j, leg in enumerate(machine.legs):
-        equations = leg_equations(leg, R, t, by_local=False)
+        equations = leg_equations(leg, R, t, by_local=False, q=q[:, j])
         values = equations.values.copy()
-        values[:, 0] -= leg.sign * q[:, j]
+        if leg.actuator is None:
+            values[:, 0] -= leg.sign * q[:, j]
         of_legs.append((leg.name, equations.kinds, np.abs(values)))
     problems: dict[str, str] = {}
     for k in range(len(configurations)):

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array, cross
 from legcal.machine.equations import is_constrained, machine_equations
-from legcal.machine.model import Machine, slider_columns, vectors_A_to_B
+from legcal.machine.model import Machine, slider_columns, vectors_A_to_B, vectors_at
 from legcal.machine.solver import solve
 
 CLOSED = 1e-12  # [m], and [rad] for frames
@@ -175,7 +175,7 @@ def dimensionless(machine: Machine, poses: Array) -> Array:
     """
     R, t = poses[:, :3, :3], poses[:, :3, 3]
     turned = machine.B_platform @ np.swapaxes(R, 1, 2)
-    vectors = turned + t[:, None] - machine.A_base
+    vectors = vectors_at(machine, poses)
     lengths = np.linalg.norm(vectors, axis=2)
     scale = lengths.mean(axis=1)[:, None, None]
     centre = turned.mean(axis=1, keepdims=True)
@@ -183,7 +183,7 @@ def dimensionless(machine: Machine, poses: Array) -> Array:
         jacobian = machine_equations(machine, R, t).by_pose
         gradient, moment = jacobian[:, :, 3:], jacobian[:, :, :3]
         return np.concatenate([(moment - cross(centre, gradient)) / scale, gradient], axis=2)
-    motors = list(machine.motors)  # lines alone
+    motors = list(machine.motors)  # lines alone; of rods one hangs on each
     u = (vectors / lengths[..., None])[:, motors]
     return np.concatenate([cross((turned - centre)[:, motors] / scale, u), u], axis=2)
 

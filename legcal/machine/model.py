@@ -13,6 +13,7 @@ from legcal.brief import brief
 from legcal.errors import UsageError
 from legcal.files import motion_to_xyz_quat
 from legcal.geometry import Array, frame_on_points
+from legcal.machine.actuator import Actuator, actuators_of, reading_of_rod
 from legcal.machine.chain import ClosedChain
 from legcal.machine.drawing import Sketch
 from legcal.machine.leg import (
@@ -76,8 +77,27 @@ class Machine:
 
     @cached_property
     def motors(self) -> tuple[int, ...]:
-        """Indices of the actuated legs."""
-        return tuple(j for j, leg in enumerate(self.legs) if leg.kind is LegKind.ACTUATED)
+        """Indices of the legs with a motor; of rods on one actuator that of the first."""
+        return tuple(j for j, leg in enumerate(self.legs) if leg.is_motor and self.reads[j] == j)
+
+    @cached_property
+    def reads(self) -> tuple[int, ...]:
+        """The leg whose motor moves each leg: its own, or the first on the same actuator."""
+        first: dict[str | None, int] = {}
+        return tuple(
+            j if leg.actuator is None else first.setdefault(leg.actuator.joint, j)
+            for j, leg in enumerate(self.legs)
+        )
+
+    @cached_property
+    def actuators(self) -> tuple[Actuator, ...]:
+        """What moves joints at A, each once, in the base link."""
+        return actuators_of(self.legs)
+
+    @cached_property
+    def motor_names(self) -> tuple[str, ...]:
+        """The URDF joints of the motors."""
+        return tuple(str(self.legs[j].prismatic) for j in self.motors)
 
     @property
     def is_determined(self) -> bool:
@@ -101,8 +121,31 @@ class Machine:
 
     @property
     def A_base(self) -> Array:
-        """Base joint centres in the base link, (n_legs, 3) [m]."""
+        """Base joint centres in the base link, (n_legs, 3) [m]; on actuators at reading 0."""
         return self._arrays[0].copy()
+
+    def A_at(self, q: Array) -> Array:
+        """Return the base joint centres (..., n_legs, 3) [m] at joint values q (..., n_legs)."""
+        q = np.asarray(q, dtype=np.float64)
+        A = np.broadcast_to(self._arrays[0], (*q.shape, 3))
+        if not self.actuators:
+            return A
+        A, rows = A.copy(), q.reshape(-1, self.n_legs)
+        flat = A.reshape(-1, self.n_legs, 3)
+        for j, leg in enumerate(self.legs):
+            if leg.actuator is not None:
+                flat[:, j] = leg.actuator.at(leg.A, rows[:, j])
+        return A
+
+    def at_readings(self, readings: Array) -> Array:
+        """Return joint values (..., n_legs) with those of motors (..., n_motors); others are 0."""
+        readings = np.asarray(readings)
+        number = {j: i for i, j in enumerate(self.motors)}
+        q = np.zeros((*readings.shape[:-1], self.n_legs))
+        for j, motor in enumerate(self.reads):
+            if motor in number:
+                q[..., j] = readings[..., number[motor]]
+        return q
 
     @property
     def B_platform(self) -> Array:
@@ -132,7 +175,8 @@ class Machine:
     def lengths_at(self, q: Array, legs: Sequence[int] | None = None) -> Array:
         """Return the lengths of some legs, or all, at readings (..., n): :meth:`Leg.length_at`."""
         chosen = slice(None) if legs is None else list(legs)
-        return np.asarray(self.sign[chosen] * q + self.q0[chosen])
+        moves = np.array([leg.actuator is None for leg in self.legs])[chosen]
+        return np.asarray(np.where(moves, self.sign[chosen] * q, 0.0) + self.q0[chosen])
 
     @cached_property
     def legs_of_frames(self) -> tuple[Leg, ...]:
@@ -174,12 +218,13 @@ class Machine:
     def sketch(self) -> Sketch:
         """What pictures of the machine at home show."""
         B = np.asarray(self.home.apply(self.B_platform))
+        A = B - vectors_A_to_B(self, self.home)
         return Sketch.of(
             self.name,
             self.leg_names,
             self.frame_legs,
             tuple(max([c.radius for c in leg.cylinders], default=0.0) for leg in self.legs),
-            (self.A_base, B),
+            (A, B),
             (("R_b", self.T_base_Rb), ("R_e", self.home * self.T_platform_Re)),
             spatial=self.spatial,
         )
@@ -216,13 +261,44 @@ class Machine:
 def vectors_A_to_B(machine: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the vectors from base to platform joint of every leg, (n_legs, 3), base link [m]."""
     matrix = T_base_platform.as_matrix()  # RigidTransform.apply is slow on few points
-    return np.asarray(machine.B_platform @ matrix[:3, :3].T + matrix[:3, 3] - machine.A_base)
+    return vectors_at(machine, matrix[None])[0]
+
+
+def vectors_at(machine: Machine, poses: Array) -> Array:
+    """Return the same at poses T_base_platform (k, 3 or 4, 4), (k, n_legs, 3) [m].
+
+    Joints at A that move are where the first rod on their actuator reaches the platform.
+    """
+    B = machine.B_platform @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    A = machine.A_at(_of_actuators(machine, B)) if machine.actuators else machine.A_base
+    return np.asarray(B - A)
+
+
+def _of_actuators(machine: Machine, B: Array) -> Array:
+    """Return the joint values (k, n_legs) of actuators whose rods reach B (k, n_legs, 3)."""
+    q = np.zeros(B.shape[:2])
+    for j, first in enumerate(machine.reads):
+        if machine.legs[j].actuator is not None:
+            q[:, j] = q[:, first] if first < j else reading_of_rod(machine.legs[j], B[:, j])
+    return q
+
+
+def readings_at_poses(machine: Machine, poses: Array) -> Array:
+    """Return the joint values (k, n_legs) at poses T_base_platform (k, 3 or 4, 4) [m or rad].
+
+    q = sign (|AB| - q0); of a rod the reading of its actuator at which the first of its rods
+    reaches the platform.
+    """
+    B = machine.B_platform @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    lengths = np.linalg.norm(B - machine.A_base, axis=2)
+    hangs = np.array([leg.actuator is not None for leg in machine.legs])
+    own = machine.sign * (lengths - machine.q0)
+    return np.asarray(np.where(hangs, _of_actuators(machine, B), own))
 
 
 def readings_at(machine: Machine, T_base_platform: RigidTransform) -> Array:
-    """Return the joint value of every leg at a pose, q = sign (|AB| - q0), (n_legs,) [m]."""
-    lengths = np.linalg.norm(vectors_A_to_B(machine, T_base_platform), axis=1)
-    return np.asarray(machine.sign * (lengths - machine.q0))
+    """Return the same at one pose, (n_legs,)."""
+    return np.asarray(readings_at_poses(machine, T_base_platform.as_matrix()[None])[0])
 
 
 def platform_pose(machine: Machine, configuration: Array) -> RigidTransform:
@@ -239,9 +315,12 @@ def slider_columns(machine: Machine, legs: Sequence[int]) -> tuple[list[int], li
 
 
 def joint_values(machine: Machine, configuration: Array) -> Array:
-    """Return the joint value of every leg at a configuration, zero for rods, (n_legs,) [m]."""
+    """Return the joint value of every leg at a configuration, (n_legs,) [m or rad].
+
+    It is that of its slider, or of what it hangs on, and zero for other rods.
+    """
     values = np.zeros(machine.n_legs)
-    sliding = [j for j, leg in enumerate(machine.legs) if leg.kind is not LegKind.CONSTANT]
+    sliding = [j for j, leg in enumerate(machine.legs) if leg.has_value]
     values[sliding] = configuration[slider_columns(machine, sliding)[0]]
     return values
 
@@ -249,8 +328,9 @@ def joint_values(machine: Machine, configuration: Array) -> Array:
 def machine_document(machine: Machine) -> dict[str, Any]:
     """Return the document of ``legcal inspect --json``: legs with types, frames, mobility.
 
-    A is in the base link and B in the platform link [m], twist in [rad]; ``travel`` [m] is null for
-    legs of constant length, ``q_home`` the reading at ``home`` (T_base_platform) [m]; ``n_d`` is
+    A is in the base link and B in the platform link [m], twist in [rad]; ``travel`` [m, or rad of
+    what turns] is null for legs that no slider or actuator moves, ``q_home`` the reading at
+    ``home`` (T_base_platform). ``actuators`` are in the base link, with A at reading 0. ``n_d`` is
     the number of legs that define the frames, ``r`` that of R joints on the base, ``n_ac`` that of
     legs that are actuated or of constant length, ``motor_rank`` that of the freedoms of the
     platform that motors hold, ``idle_spins`` that of those that only turn a leg about itself.
@@ -273,17 +353,22 @@ def machine_document(machine: Machine) -> dict[str, Any]:
             _leg(leg, float(q))
             for leg, q in zip(machine.legs, readings_at(machine, machine.home), strict=True)
         ],
+        **(
+            {"actuators": {a.joint: a.document() for a in machine.actuators}}
+            if machine.actuators
+            else {}
+        ),
         "diagnostics": list(machine.diagnostics),
     }
 
 
 def _leg(leg: Leg, q_home: float) -> dict[str, Any]:
     """Return one leg of the document."""
-    has_travel = leg.kind is not LegKind.CONSTANT and bool(np.isfinite(leg.travel).all())
+    has_travel = leg.has_value and bool(np.isfinite(leg.travel).all())
     return {
         "name": leg.name,
         "type": leg.type,
-        "actuated": leg.kind.value == "actuated",
+        "actuated": leg.is_motor,
         "kind": leg.kind.value,
         "A": [float(x) for x in leg.A],
         "B": [float(x) for x in leg.B],
@@ -297,4 +382,5 @@ def _leg(leg: Leg, q_home: float) -> dict[str, Any]:
         ),
         "twist": leg.twist,
         "cylinders": [{"link": c.link, "radius": c.radius} for c in leg.cylinders],
+        **({} if leg.actuator is None else {"actuator": leg.actuator.joint}),
     }

@@ -24,6 +24,7 @@ from legcal.geometry import (
     rotation_between,
     turned_axis,
 )
+from legcal.machine.actuator import Actuator, ActuatorColumns, actuators_of
 from legcal.machine.leg import (
     KinematicParameters,
     Leg,
@@ -34,7 +35,8 @@ from legcal.machine.leg import (
 from legcal.machine.model import Machine
 
 _STEP = 1e-6  # [m or rad], of numerical derivatives
-_BLOCKS = (range(3), range(3, 6), (6,), (7, 8), (9, 10), (11,))  # of LegColumns, in this order
+# Of LegColumns, in this order
+_BLOCKS = (range(3), range(3, 6), (6,), (7, 8), (9, 10), (11,), (12, 13), (14, 15), (16,))
 _LOCAL_NAMES = (
     *(f"{side}.{axis}" for side in ("base", "platform") for axis in "xyz"),
     "offset",
@@ -49,13 +51,15 @@ class Parametrization:
 
     names: tuple[str, ...]  # leg2.base.x, leg1.offset, leg1.length, leg1.base_axis.1, leg1.twist
     units: tuple[str, ...]  # m or rad
-    place: IntArray  # (n_legs, 12) of each leg's numbers (LegColumns); -1 for no parameter
+    # (n_legs, 17) of each leg's numbers (LegColumns); -1 for no parameter. Those of an actuator are
+    # shared by all legs on it
+    place: IntArray
 
     def __len__(self) -> int:
         return len(self.names)
 
     def scatter(self, by_local: Array, leg: int) -> Array:
-        """Return derivatives (..., 12) by a leg's numbers as derivatives by all parameters."""
+        """Return derivatives (..., 17) by a leg's numbers as derivatives by all parameters."""
         place = self.place[leg]
         wide = np.zeros((*by_local.shape[:-1], len(self)))
         wide[..., place[place >= 0]] = by_local[..., place >= 0]
@@ -65,7 +69,10 @@ class Parametrization:
 def parametrize(
     names: Sequence[str], legs: Sequence[Leg], frame_legs: Sequence[int], *, twists: bool = False
 ) -> Parametrization:
-    """Return the parameters of legs in R_b and R_e; without *twists* these are fixed."""
+    """Return the parameters of legs in R_b and R_e.
+
+    Without *twists* these are fixed, and so are the gains of actuators.
+    """
     columns = LegColumns
     free = np.zeros((len(legs), columns.COUNT), dtype=np.bool_)
     free[:, columns.A] = free[:, columns.B] = free_coordinates(len(legs), frame_legs)
@@ -74,6 +81,10 @@ def parametrize(
         free[j, columns.BASE_AXIS] = leg.base_axis is not None
         free[j, columns.PLATFORM_AXIS] = leg.platform_axis is not None
         free[j, columns.TWIST] = twists and leg.twist is not None
+        if leg.actuator is not None:
+            free[j, ActuatorColumns.AXIS] = True
+            free[j, ActuatorColumns.POINT] = leg.actuator.turns
+            free[j, ActuatorColumns.GAIN] = twists
         if j not in frame_legs and leg.is_fixed_to_platform and leg.platform_axis is not None:
             # B is anywhere on the line
             free[j, columns.B.start + int(np.argmax(np.abs(leg.platform_axis)))] = False
@@ -82,13 +93,42 @@ def parametrize(
     for block in _BLOCKS:
         for j, leg in enumerate(legs):
             for column in block:
-                if free[j, column]:
-                    place[j, column] = len(found)
-                    name = _LOCAL_NAMES[column]
-                    if column == columns.LENGTH and leg.kind is LegKind.CONSTANT:
-                        name = "length"
-                    found.append((f"{names[j]}.{name}", "m" if column <= columns.LENGTH else "rad"))
+                if not free[j, column]:
+                    continue
+                if column < columns.OWN:
+                    name, unit = f"{names[j]}.{_local_name(leg, column)}", _unit(column)
+                else:
+                    name, unit = _name_of_actuator(leg.actuator, column)
+                    shared = next((i for i, (n, _) in enumerate(found) if n == name), None)
+                    if shared is not None:
+                        place[j, column] = shared
+                        continue
+                place[j, column] = len(found)
+                found.append((name, unit))
     return Parametrization(tuple(n for n, _ in found), tuple(u for _, u in found), place)
+
+
+def _local_name(leg: Leg, column: int) -> str:
+    """Return the name of one of a leg's own numbers."""
+    is_length = column == LegColumns.LENGTH and leg.kind is LegKind.CONSTANT
+    return "length" if is_length else _LOCAL_NAMES[column]
+
+
+def _unit(column: int) -> str:
+    """Return its unit."""
+    return "m" if column <= LegColumns.LENGTH else "rad"
+
+
+def _name_of_actuator(actuator: Actuator | None, column: int) -> tuple[str, str]:
+    """Return the name and the unit of a number of an actuator."""
+    if actuator is None:
+        raise ValueError("a leg that hangs on no actuator has no numbers of one")
+    if column == ActuatorColumns.GAIN:
+        return f"{actuator.joint}.gain", ""
+    if column >= ActuatorColumns.POINT.start:
+        return f"{actuator.joint}.axis_point.{column - ActuatorColumns.POINT.start + 1}", "m"
+    what = "axis" if actuator.turns else "direction"
+    return f"{actuator.joint}.{what}.{column - ActuatorColumns.AXIS.start + 1}", "rad"
 
 
 def parametrization_of(machine: Machine, *, twists: bool = False) -> Parametrization:
@@ -139,6 +179,7 @@ def _in_frames(
     def turned(matrix: Array, axis: Array | None) -> Array | None:
         return None if axis is None else matrix[:3, :3] @ axis
 
+    moved = {actuator.joint: actuator.in_frame(base) for actuator in actuators_of(legs)}
     return tuple(
         replace(
             leg,
@@ -147,6 +188,7 @@ def _in_frames(
             base_axis=turned(base, leg.base_axis),
             platform_axis=turned(platform, leg.platform_axis),
             twist=twist_after(leg, turn),
+            actuator=None if leg.actuator is None else moved[leg.actuator.joint],
         )
         for leg in legs
     )
@@ -179,7 +221,7 @@ def vector_of(
 
 
 def numbers_of(legs: Sequence[Leg], nominal: Sequence[Leg]) -> Array:
-    """Return the numbers of legs, (n_legs, 12), in the order of :class:`LegColumns` [m, rad].
+    """Return the numbers of legs, (n_legs, 17), in the order of :class:`LegColumns` [m, rad].
 
     Axes are :func:`~legcal.geometry.axis_angles` from the nominal ones, zero for legs without one.
     """
@@ -191,13 +233,15 @@ def numbers_of(legs: Sequence[Leg], nominal: Sequence[Leg]) -> Array:
         if leg.platform_axis is not None and start.platform_axis is not None:
             row[LegColumns.PLATFORM_AXIS] = axis_angles(leg.platform_axis, start.platform_axis)
         row[LegColumns.TWIST] = _twist(leg, start)
+        if leg.actuator is not None and start.actuator is not None:
+            row[LegColumns.OWN :] = leg.actuator.numbers(start.actuator)
     return numbers
 
 
 def with_numbers(
     legs: Sequence[Leg], nominal: Sequence[Leg], numbers: Array, given: BoolArray
 ) -> tuple[Leg, ...]:
-    """Return legs of which some numbers, *given* (n_legs, 12), are those of :func:`numbers_of`.
+    """Return legs of which some numbers, *given* (n_legs, 17), are those of :func:`numbers_of`.
 
     Where an axis at the platform or a twist is given the leg has its twist as given.
     """
@@ -225,6 +269,10 @@ def with_numbers(
         )
         if leg.twist is not None and own[LegColumns.PLATFORM_AXIS.start :].any():
             moved = replace(moved, twist=tied_twist(moved, start, float(row[LegColumns.TWIST])))
+        if leg.actuator is not None and start.actuator is not None and own[LegColumns.OWN :].any():
+            numbers_there = leg.actuator.numbers(start.actuator)
+            wanted = np.where(own[LegColumns.OWN :], row[LegColumns.OWN :], numbers_there)
+            moved = replace(moved, actuator=leg.actuator.with_numbers(start.actuator, wanted))
         found.append(moved)
     return tuple(found)
 
@@ -250,6 +298,9 @@ def moved_legs(legs: Sequence[Leg], place: IntArray, step: Array) -> tuple[Leg, 
                 base_axis=base_axis,
                 platform_axis=platform_axis,
                 twist=None if twist is None else twist + float(local[columns.TWIST]),
+                actuator=(
+                    None if leg.actuator is None else leg.actuator.moved(local[columns.OWN :])
+                ),
             )
         )
     return tuple(moved)

@@ -37,6 +37,7 @@ class LegcalBlock(FileSchema):
     platform_joint: str | None = None
     base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
     home: MotionEntry | None = None
+    home_readings: dict[str, float] | None = None  # of actuators at home [m or rad]
     legs: Annotated[dict[PlainName, str], Field(min_length=1)]
 
     @field_validator("base_frame")

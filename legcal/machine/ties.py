@@ -23,7 +23,7 @@ import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
 from legcal.machine.directions import SHOWN, describe_direction, sparse_basis
-from legcal.machine.equations import PoseEquations, pose_equations
+from legcal.machine.equations import PoseEquations, n_pose_constraints, pose_equations
 from legcal.machine.leg import Leg, LegColumns, frame_point
 from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine
@@ -241,12 +241,19 @@ def _constraints(legs: Sequence[Leg], R: Array, t: Array) -> PoseEquations:
 
 def _length(legs: Sequence[Leg], R: Array, t: Array) -> float:
     """Return the mean length of legs at a pose [m]."""
-    return float(np.mean([np.linalg.norm(R @ leg.B + t - leg.A) for leg in legs]))
+    return float(
+        np.mean(
+            [
+                leg.q0 if leg.actuator is not None else np.linalg.norm(R @ leg.B + t - leg.A)
+                for leg in legs
+            ]
+        )
+    )
 
 
 def _n_dependent(legs: Sequence[Leg], home: Array, least: float = _RANK) -> int:
     """Return how many constraints follow from the others at home and at poses around it."""
-    n = sum(leg.n_constraints for leg in legs)
+    n = n_pose_constraints(legs)
     dependent = _n_dependent_at(legs, home, least)
     if dependent == 0:
         return 0
@@ -260,7 +267,7 @@ def _n_dependent(legs: Sequence[Leg], home: Array, least: float = _RANK) -> int:
 
 def _n_dependent_at(legs: Sequence[Leg], home: Array, least: float) -> int:
     """Return how many constraints follow from the others at one pose (3, 4)."""
-    n = sum(leg.n_constraints for leg in legs)
+    n = n_pose_constraints(legs)
     if n < 2:
         return 0
     here = _constraints(legs, home[None, :, :3], home[None, :, 3]).by_pose[0]

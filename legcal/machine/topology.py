@@ -23,6 +23,7 @@ from legcal.machine.chain import Closure
 from legcal.machine.classification import (
     CONCURRENT,
     classify_leg,
+    is_actuator,
     nearest,
     off_square,
     parallel,
@@ -42,8 +43,12 @@ TIE = 1e-6  # of the largest triangle
 MAX_JOINTS_OF_LEG = 12  # a sphere written as three revolutes at each end, and a slider, are seven
 
 
-def find_chains(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[LegChain]:
-    """Return the legs between two links, each classified as joint, slider, joint.
+def find_chains(
+    bodies: Bodies, urdf: Urdf, base: str, platform: str, motors: Sequence[str]
+) -> list[LegChain]:
+    """Return the legs between two links, each classified as joint, slider or rod, joint.
+
+    Several rods may hang on what one of the *motors* on the base moves.
 
     Raises
     ------
@@ -58,10 +63,15 @@ def find_chains(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[Le
             "legcal.platform."
         )
     origin = bodies.T_body_link[platform][:3, 3]
-    return [classify_leg(steps, origin, urdf.path) for steps in _paths(bodies, urdf, *ends)]
+    return [
+        classify_leg(steps, origin, urdf.path, motors)
+        for steps in _paths(bodies, urdf, *ends, motors)
+    ]
 
 
-def _paths(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[list[Step]]:
+def _paths(
+    bodies: Bodies, urdf: Urdf, base: str, platform: str, motors: Sequence[str]
+) -> list[list[Step]]:
     """Return the joints of every leg from base to platform."""
     _refuse_second_mechanism(bodies, urdf, base, platform)
     at: dict[str, list[Connection]] = {}
@@ -69,9 +79,18 @@ def _paths(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[list[St
         _refuse_unsupported(connection, urdf, base, platform)
         for body in connection.bodies:
             at.setdefault(body, []).append(connection)
-    paths, used = [], set[int]()
+    begun: list[tuple[str, list[Step], Connection]] = []
+    used = set[int]()
     for first in at.get(base, []):
-        body, steps, connection = base, list[Step](), first
+        step = _step(first, first.bodies.index(base), urdf)
+        body = first.bodies[step.far]
+        if body not in (base, platform) and is_actuator(step, motors) and len(at[body]) > 2:
+            used.add(id(first))
+            begun += [(body, [step], onward) for onward in at[body] if onward is not first]
+        else:
+            begun.append((base, [], first))
+    paths = []
+    for body, steps, connection in begun:
         while True:
             used.add(id(connection))
             near = connection.bodies.index(body)
@@ -114,14 +133,14 @@ def propose_block(
     base = bodies.body_of[urdf.root]
     real = replace(bodies, connections=_without_virtual(bodies, urdf))
     carried = [bodies.body_of[j.child] for j in virtual]
-    platform = _platform_body(real, base, carried, urdf, path)
+    platform = _platform_body(real, base, carried, urdf, path, motors)
     carrier = [j for j in virtual if {bodies.body_of[j.parent], bodies.body_of[j.child]} == {
         base, platform}]  # fmt: skip
     joint = carrier[0].name if carrier else None
     link = carrier[0].child if carrier else _main_link(urdf, closures, bodies, platform)
     bodies = rigid_bodies(urdf, closures, joint)
-    chains = in_order(find_chains(bodies, urdf, urdf.root, link), motors, urdf)
-    joints = [any_joint(chain) for chain in chains]
+    chains = in_order(find_chains(bodies, urdf, urdf.root, link, motors), motors, urdf)
+    joints = [own_joint(chain) for chain in chains]
     names = _leg_names(joints)
     block = LegcalBlock(
         version=1,
@@ -146,6 +165,11 @@ def propose_frame(names: Sequence[str], chains: Sequence[LegChain]) -> list[str]
     if normals is not None:
         ends = _flat(ends[0], normals[0]), _flat(ends[1], normals[1])
     chosen = list(combinations(range(len(names)), count))
+    of_motors = [
+        [chains[j].motor if chains[j].actuator is not None else names[j] for j in c] for c in chosen
+    ]
+    most = max(len(set(of_legs)) for of_legs in of_motors)  # one of each actuator, where possible
+    chosen = [c for c, m in zip(chosen, of_motors, strict=True) if len(set(m)) == most]
     spans = np.array([_span(ends[0][list(c)]) * _span(ends[1][list(c)]) for c in chosen])
     first = int(np.argmax(spans >= spans.max() * (1.0 - TIE)))
     return [names[j] for j in chosen[first]]
@@ -165,6 +189,14 @@ def in_order(chains: Sequence[LegChain], motors: Sequence[str], urdf: Urdf) -> l
     rank = {name: i for i, name in enumerate([*urdf.joints, *motors])}
     rank |= {name: i - len(motors) for i, name in enumerate(motors)}
     return sorted(chains, key=lambda chain: rank[any_joint(chain)])
+
+
+def own_joint(chain: LegChain) -> str:
+    """Return a joint that names one leg only: on an actuator not that of the motor."""
+    if chain.actuator is None:
+        return any_joint(chain)
+    named = [s.connection.joint for s in chain.steps[1:] if s.connection.joint]
+    return named[0] if named else any_joint(chain)
 
 
 def any_joint(chain: LegChain) -> str:
@@ -419,7 +451,7 @@ def _without_virtual(bodies: Bodies, urdf: Urdf) -> tuple[Connection, ...]:
 
 
 def _platform_body(
-    bodies: Bodies, base: str, carried: Sequence[str], urdf: Urdf, path: Path
+    bodies: Bodies, base: str, carried: Sequence[str], urdf: Urdf, path: Path, motors: Sequence[str]
 ) -> str:
     """Return the body where the legs end: every chain from the base to it is a leg of the class."""
     at: dict[str, list[str]] = {}
@@ -441,7 +473,7 @@ def _platform_body(
     found, reasons = [], list[OutOfClass]()
     for body in candidates:
         try:
-            find_chains(bodies, urdf, urdf.root, body)
+            find_chains(bodies, urdf, urdf.root, body, motors)
         except OutOfClass as error:
             reasons.append(error)
         else:
