@@ -18,6 +18,7 @@ from legcal.machine import (
     EquationKind,
     JointType,
     Leg,
+    LegColumns,
     LegKind,
     Parametrization,
     geometries,
@@ -61,7 +62,7 @@ def test_equations_of_a_leg_are_met_where_it_closes_and_have_their_derivatives(
     np.testing.assert_allclose(found.by_pose[0], difference, atol=1e-6, rtol=1e-5)
     if joints[1:] == "":
         return  # the axis at the platform carries the reference of the twist along, see below
-    for column, step in enumerate(STEP * np.eye(12)):
+    for column, step in enumerate(STEP * np.eye(LegColumns.COUNT)[: LegColumns.OWN]):
         one, other = (
             leg_equations(changed(leg, s * step), R[None], t[None]).values[0] for s in (1.0, -1.0)
         )
@@ -202,7 +203,7 @@ def test_a_vector_says_how_far_each_axis_is_turned(seed: int) -> None:
     rng = np.random.default_rng(seed)
     found = parametrized(legs, twists=True)
     start = vector_of(found, legs, legs)
-    steps = 0.1 * rng.normal(size=(4, 12))
+    steps = 0.1 * rng.normal(size=(4, LegColumns.COUNT))
     steps[found.place < 0] = 0.0
     moved = [changed(leg, step) for leg, step in zip(legs, steps, strict=True)]
     expected = np.zeros(len(found))

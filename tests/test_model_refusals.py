@@ -507,10 +507,10 @@ class Drawing:
             f'<child link="{name}"/><origin xyz="{words}"/>{moving}</joint>'
         )
 
-    def write(self, folder: Path, *, block: bool = True) -> Path:
-        """Write the files, with or without a block legcal."""
+    def write(self, folder: Path, *, block: bool = True, driven: bool = True) -> Path:
+        """Write the files, with or without a block legcal, and with motors if they are driven."""
         document: dict[str, object] = {
-            "closed_loop": self.loops, "type": self.kinds, "name_mot": list(self.legs.values()),
+            "closed_loop": self.loops, "type": self.kinds, "name_mot": list(self.legs.values()) if driven else [],
         }  # fmt: skip
         if block:
             document["legcal"] = {
@@ -602,7 +602,7 @@ def test_machines_outside_the_method_are_refused_with_the_true_reason(
     name: str, tmp_path: Path
 ) -> None:
     draw, block, named = DRAWN[name]
-    (problem,) = refused(draw().write(tmp_path, block=block), OutOfClass)
+    (problem,) = refused(draw().write(tmp_path, block=block, driven=False), OutOfClass)
     assert all(word in problem for word in named), problem
 
 
@@ -619,7 +619,7 @@ def test_chains_without_a_platform_on_legs_are_refused(tmp_path: Path) -> None:
     )
     joints += '<joint name="seat" type="fixed"><parent link="e"/><child link="end"/></joint>'
     (tmp_path / "r.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
-    (tmp_path / "r.yaml").write_text("closed_loop: [[end, base]]\ntype: ['6d']\nname_mot: [j0]\n")
+    (tmp_path / "r.yaml").write_text("closed_loop: [[end, base]]\ntype: ['6d']\nname_mot: []\n")
     (problem,) = refused(tmp_path / "r.yaml", OutOfClass)
     assert "one closed chain in which no link is a platform on legs" in problem
 
@@ -716,7 +716,12 @@ def test_motors_that_turn_are_refused(tmp_path: Path) -> None:
     path = write_machine(tmp_path, planar(), Layout())
     path.write_text(path.read_text().replace("- leg2_slider\n", "- leg2_a1\n", 1))
     (problem,) = refused(path, OutOfClass)
-    assert "the motor 'leg2_a1' is outside the method: found a revolute joint" in problem
+    assert "found the slider 'leg2_slider' beyond the motor 'leg2_a1' on the base" in problem
+
+
+def test_planar_machines_whose_joints_at_A_move_are_refused(tmp_path: Path) -> None:
+    (problem,) = refused(_planar_arms(3).write(tmp_path), OutOfClass)
+    assert "found a planar machine whose joints at A move" in problem
 
 
 @pytest.mark.parametrize("virtual", ["floating", "planar"])

@@ -14,6 +14,7 @@ from legcal.cluster import made_of_file
 from legcal.data.axes import LegAxes, read_axes
 from legcal.data.corners import Corners, read_corners
 from legcal.data.dataset_file import (
+    ENCODER_SIGMAS,
     ViewEntry,
     find_dataset_file,
     read_dataset_file,
@@ -128,6 +129,43 @@ class ImageReader:
         return np.asarray(levels, dtype=np.float32)
 
 
+def _encoder_sigmas(
+    path: Path, machine: Machine, stated: float | Mapping[str, float]
+) -> tuple[float, dict[str, float]]:
+    """Return the standard deviation of readings in metres, and those by joint [m or rad].
+
+    Raises
+    ------
+    DatasetError
+        If one number is stated and a motor turns, or joints are not those of the motors.
+    """
+    turning = [a.joint for a in machine.actuators if a.turns]
+    if not isinstance(stated, Mapping):
+        if turning:
+            every = ", ".join(f"{name}: 0.0001" for name in machine.motor_names)
+            raise DatasetError(
+                f"{path}: encoder_sigma could not be used: found one number [m], but the motor "
+                f"'{turning[0]}' turns, needed one for each motor in its unit; write "
+                f"encoder_sigma: {{{every}}}, with your values."
+            )
+        return stated, {}
+    motors = machine.motor_names
+    for name in stated:
+        if name not in motors:
+            raise DatasetError(
+                f"{path}: encoder_sigma.{name} could not be used: found no motor of that name, "
+                f"needed each of {', '.join(motors)}; {closest(name, motors)}"
+            )
+    missing = [name for name in motors if name not in stated]
+    if missing:
+        raise DatasetError(
+            f"{path}: encoder_sigma is incomplete: found none for {', '.join(missing)}, needed one "
+            "for each motor in its unit (m or rad); add it."
+        )
+    linear = [sigma for name, sigma in stated.items() if name not in turning]
+    return min(linear, default=ENCODER_SIGMAS[0]), dict(stated)
+
+
 def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     """Read a dataset and check everything in it that can be checked without decoding images.
 
@@ -172,7 +210,8 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         for (name, view), path in zip(entry.views.items(), camera_paths, strict=True)
     )
     table_path = folder / entry.measurements
-    rows, notes = read_measurements(table_path, folder, views, machine.legs, entry.encoder_sigma)
+    sigma_q, by_joint = _encoder_sigmas(yaml_path, machine, entry.encoder_sigma)
+    rows, notes = read_measurements(table_path, folder, views, machine.legs, sigma_q, by_joint)
     measurements, origin, problems = expand_hand_held(yaml_path, rows, entry.views)
     if problems:
         raise DatasetError(problems)

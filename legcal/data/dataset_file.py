@@ -97,17 +97,22 @@ class DatasetEntry(FileSchema):
     legcal_dataset: Version
     mechanism: str
     measurements: str
-    encoder_sigma: Annotated[
-        Number, Field(gt=0.0, json_schema_extra=dict(zip(_BOUNDS, ENCODER_SIGMAS, strict=True)))
-    ]
+    encoder_sigma: (
+        Annotated[
+            Number, Field(gt=0.0, json_schema_extra=dict(zip(_BOUNDS, ENCODER_SIGMAS, strict=True)))
+        ]
+        | Annotated[dict[str, Annotated[Number, Field(gt=0.0)]], Field(min_length=1)]
+    )
     views: Annotated[dict[Name, ViewEntry], Field(min_length=1)]
     parameters: ParametersEntry = Field(default_factory=ParametersEntry)
     board: dict[str, Any] | list[Any] | None = None  # read by their kinds
 
     @field_validator("encoder_sigma")
     @classmethod
-    def _is_that_of_an_encoder(cls, sigma: float) -> float:
+    def _is_that_of_an_encoder(cls, sigma: float | dict[str, float]) -> float | dict[str, float]:
         least, most = ENCODER_SIGMAS
+        if isinstance(sigma, dict):
+            return sigma
         if not least <= sigma <= most:
             raise ValueError(
                 f"found {sigma:g} m, needed {least:g} to {most:g} m; give one standard deviation "

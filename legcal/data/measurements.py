@@ -9,9 +9,10 @@ show name their rows by view and image, see :func:`row_names`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -28,7 +29,7 @@ from legcal.files import (
     read_table,
 )
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import TRAVEL_MARGIN, Leg, LegKind
+from legcal.machine import TRAVEL_MARGIN, Leg
 from legcal.vision import Camera
 
 MAX_NAMED = 5  # views or other things, in one sentence
@@ -60,9 +61,12 @@ class Measurements:
     image: tuple[str, ...]  # relative to the dataset; "" where only outlines are given
     view: IntArray  # (n_rows,) index into views
     pose: IntArray  # (n_rows,) 0 to n_poses - 1, numbered as they first appear
-    q: Array  # (n_rows, n_legs) readings [m]; zero for constant-length legs, NaN for passive ones
+    # (n_rows, n_legs) readings [m], of rods on actuators those of the actuator [m or rad]; zero for
+    # other constant-length legs, NaN for passive ones
+    q: Array
     sigma_q: float  # of a reading [m]
     pose_labels: tuple[str, ...] = ()  # of each pose, "" without; empty without that column
+    sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
 
     @property
     def n_rows(self) -> int:
@@ -78,6 +82,20 @@ class Measurements:
     def n_poses(self) -> int:
         """Number of different platform poses."""
         return int(self.pose.max()) + 1 if len(self.pose) else 0
+
+    def sigma_of(self, legs: Sequence[Leg]) -> Array:
+        """Return the standard deviation of the reading of each leg, (n_legs,) [m or rad]."""
+        return np.array(
+            [
+                self.sigma_by_joint.get(
+                    str(leg.prismatic),
+                    SIGMA_ANGLE
+                    if leg.actuator is not None and leg.actuator.turns
+                    else self.sigma_q,
+                )
+                for leg in legs
+            ]
+        )
 
 
 def row_names(measurements: Measurements) -> tuple[str, ...]:
@@ -152,21 +170,37 @@ def few_views(names: Sequence[str]) -> str:
     return f"view{'s' * (len(names) > 1)} {few(names)}"
 
 
+SIGMA_ANGLE = 1e-4  # [rad], of a reading of a motor that turns, where none is stated
+
+
+def legs_with_readings(legs: Sequence[Leg]) -> list[Leg]:
+    """Return the legs of which a table has readings: of rods on one actuator the first."""
+    found: dict[str, Leg] = {}
+    for leg in legs:
+        if leg.is_motor:
+            found.setdefault(str(leg.prismatic), leg)
+    return list(found.values())
+
+
+def turns(leg: Leg) -> bool:
+    """Say whether the readings of a leg are angles."""
+    return leg.actuator is not None and leg.actuator.turns
+
+
 def reading_columns(legs: Sequence[Leg]) -> list[Column]:
-    """Return the columns of readings of the actuated legs, in the order of the legs."""
+    """Return the columns of readings of the motors, in the order of the legs."""
     return [
-        Column(str(leg.prismatic), what="reading", unit="metres")
-        for leg in legs
-        if leg.kind is LegKind.ACTUATED
+        Column(str(leg.prismatic), what="reading", unit="radians" if turns(leg) else "metres")
+        for leg in legs_with_readings(legs)
     ]
 
 
 def readings_in(table: Table, legs: Sequence[Leg]) -> tuple[Array, tuple[str, ...]]:
-    """Return the readings in a table (n_rows, n_actuated) [m], and notes on odd ones.
+    """Return the readings in a table (n_rows, n_motors) [m or rad], and notes on odd ones.
 
     Readings outside their travel by more than 5 % of it are refused, others are noted.
     """
-    actuated = [leg for leg in legs if leg.kind is LegKind.ACTUATED]
+    actuated = legs_with_readings(legs)
     readings = table.numbers(str(leg.prismatic) for leg in actuated)
     notes = []
     beyond: list[tuple[str, str, bool]] = []  # column, what was found of it, whether of most rows
@@ -176,15 +210,16 @@ def readings_in(table: Table, legs: Sequence[Leg]) -> tuple[Array, tuple[str, ..
             continue
         outside = (column < lower) | (column > upper)
         far = outside & ~leg.in_travel(column)
-        travel = f"{lower:g} to {upper:g} m (the joint limits of the model)"
+        unit = "rad" if turns(leg) else "m"
+        travel = f"{lower:g} to {upper:g} {unit} (the joint limits of the model)"
         if np.any(far):
-            found = f"found {_some(table, column, far)}, needed {travel} with a margin of "
+            found = f"found {_some(table, column, far, unit)}, needed {travel} with a margin of "
             found += f"{TRAVEL_MARGIN:.0%}"
             beyond.append((str(leg.prismatic), found, 2 * np.sum(far) >= len(column)))
         elif np.any(outside):
             notes.append(
                 f"{table.path}, column {leg.prismatic}: readings are a little outside the travel "
-                f"{travel}: {_some(table, column, outside)}."
+                f"{travel}: {_some(table, column, outside, unit)}."
             )
     cause = _likely_cause(readings, actuated) if any(most for *_, most in beyond) else ""
     alike = [name for name, _, most in beyond if most and cause]
@@ -207,9 +242,16 @@ def _likely_cause(readings: Array, legs: Sequence[Leg]) -> str:
 
     Of what would bring all of them into their travel, that with which they move in it most.
     """
+    rotary = np.array([turns(leg) for leg in legs], dtype=np.bool_)
+    if rotary.any() and not rotary.all():
+        for some in (np.flatnonzero(rotary).tolist(), np.flatnonzero(~rotary).tolist()):
+            cause = _likely_cause(readings[:, some], [legs[j] for j in some])
+            if cause:
+                return cause
+        return ""
     width = np.ptp([leg.travel for leg in legs], axis=1)
     whole = "subtract the leg lengths at reading zero (legcal inspect tells them)"
-    tried = (
+    tried: tuple[tuple[Array, str], ...] = (
         (LENGTH["mm"] * readings, "millimetres: divide them by 1000"),
         (readings_of_lengths(readings, legs), f"whole leg lengths: {whole}"),
         (
@@ -220,6 +262,13 @@ def _likely_cause(readings: Array, legs: Sequence[Leg]) -> str:
         (INCH * readings, "inches: multiply them by 0.0254"),
         (-readings, "readings with the opposite sign: reverse them"),
     )
+    if rotary.all():
+        tried = (
+            (np.radians(readings), "degrees: multiply them by pi/180"),
+            (np.radians(-readings), "degrees with the opposite sign: multiply them by -pi/180"),
+            (np.degrees(readings), "radians divided by 180/pi once too often: multiply by 180/pi"),
+            (-readings, "readings with the opposite sign: reverse them"),
+        )
     found, most = "", 0.0
     for meant, what in tried:
         moved = float(np.mean(np.ptp(meant, axis=0) / width))
@@ -240,15 +289,22 @@ def in_travel(readings: Array, legs: Sequence[Leg]) -> BoolArray:
     return np.array([leg.in_travel(column) for leg, column in each], dtype=np.bool_).T
 
 
-def _some(table: Table, column: Array, chosen: BoolArray) -> str:
+def _some(table: Table, column: Array, chosen: BoolArray, unit: str) -> str:
     """Return the first of some readings with their rows, and how many more there are."""
     index = np.flatnonzero(chosen).tolist()
-    shown = ", ".join(f"{column[i]:g} m in {place_in(table.where[i])}" for i in index[:_MAX_SHOWN])
+    shown = ", ".join(
+        f"{column[i]:g} {unit} in {place_in(table.where[i])}" for i in index[:_MAX_SHOWN]
+    )
     return shown + (f" and {len(index) - _MAX_SHOWN} more" if len(index) > _MAX_SHOWN else "")
 
 
 def read_measurements(
-    path: Path, folder: Path, views: Sequence[View], legs: Sequence[Leg], sigma_q: float
+    path: Path,
+    folder: Path,
+    views: Sequence[View],
+    legs: Sequence[Leg],
+    sigma_q: float,
+    sigma_by_joint: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[Measurements, tuple[str, ...]]:
     """Return the table ``measurements.csv`` in the order of the file, and notes on odd readings.
 
@@ -277,20 +333,24 @@ def read_measurements(
     readings, notes = readings_in(table, legs)
     pose, labels = _poses(table.text("pose"))
     q = np.full((len(table), len(legs)), math.nan)
-    q[:, [leg.kind is LegKind.CONSTANT for leg in legs]] = 0.0
-    q[:, [leg.kind is LegKind.ACTUATED for leg in legs]] = _shared_readings(
-        table, legs, pose, readings, sigma_q
-    )
-    table.check()
+    q[:, [not leg.has_value for leg in legs]] = 0.0
     measurements = Measurements(
         views=tuple(views),
         image=images,
-        view=np.array([view_index[name] for name in view_names], dtype=np.intp),
+        view=np.array([view_index.get(name, 0) for name in view_names], dtype=np.intp),
         pose=pose,
         q=q,
         sigma_q=sigma_q,
         pose_labels=labels if "pose" in table else (),
+        sigma_by_joint=sigma_by_joint,
     )
+    motors = legs_with_readings(legs)
+    shared = _shared_readings(table, legs, pose, readings, measurements.sigma_of(motors))
+    column = {leg.prismatic: i for i, leg in enumerate(motors)}
+    for j, leg in enumerate(legs):
+        if leg.is_motor:
+            q[:, j] = shared[:, column[leg.prismatic]]
+    table.check()
     return measurements, notes
 
 
@@ -330,10 +390,11 @@ def _poses(names: Sequence[str]) -> tuple[IntArray, tuple[str, ...]]:
 
 
 def _shared_readings(
-    table: Table, legs: Sequence[Leg], pose: IntArray, readings: Array, sigma_q: float
+    table: Table, legs: Sequence[Leg], pose: IntArray, readings: Array, sigma_q: Array
 ) -> Array:
     """Return the readings with those of one pose replaced by their mean."""
     joints = [column.name for column in reading_columns(legs)]
+    units = ["rad" if turns(leg) else "m" for leg in legs_with_readings(legs)]
     labels = table.text("pose")
     shared = readings.copy()
     for p in np.unique(pose):
@@ -346,8 +407,9 @@ def _shared_readings(
             most = MAX_READING_SPREAD
             table.refuse(
                 first,
-                f"readings of its {len(members)} rows that differ by {spread[j]:.3g} m",
-                f"one reading within {most:g} sigma ({most * sigma_q:.3g} m); give rows of "
+                f"readings of its {len(members)} rows that differ by {spread[j]:.3g} {units[j]}",
+                f"one reading within {most:g} sigma ({most * sigma_q[j]:.3g} {units[j]}); give "
+                "rows of "
                 "different poses different labels",
                 joints[j],
                 what=f"pose {labels[first]}",

@@ -10,6 +10,7 @@ from .problem import Linearization as Linearization
 from .problem import Problem as Problem
 from .problem import Residuals as Residuals
 from .problem import Tangent as Tangent
+from .problem import Touch as Touch
 from .problem import Variables as Variables
 from .problem import all_free as all_free
 from .problem import fixed_at_start as fixed_at_start

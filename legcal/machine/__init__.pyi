@@ -1,3 +1,7 @@
+from .actuator import Actuator as Actuator
+from .actuator import ActuatorColumns as ActuatorColumns
+from .actuator import ActuatorKind as ActuatorKind
+from .actuator import JointMotion as JointMotion
 from .configurations import MIN_SINGULARITY as MIN_SINGULARITY
 from .configurations import TRAVEL_TOLERANCE as TRAVEL_TOLERANCE
 from .configurations import WORKSPACE_POSES as WORKSPACE_POSES
@@ -34,8 +38,11 @@ from .equations import freedoms as freedoms
 from .equations import is_constrained as is_constrained
 from .equations import leg_equations as leg_equations
 from .equations import machine_equations as machine_equations
+from .equations import n_pose_constraints as n_pose_constraints
 from .equations import pose_equations as pose_equations
 from .equations import pose_sensitivity as pose_sensitivity
+from .equations import posture_constraints as posture_constraints
+from .equations import readings_of_rods as readings_of_rods
 from .equations import twist_residual as twist_residual
 from .family import description_of as description_of
 from .feasibility import JITTER as JITTER
@@ -66,6 +73,7 @@ from .kinematics import platforms_in_base as platforms_in_base
 from .kinematics import pose_differences as pose_differences
 from .kinematics import reading_residuals as reading_residuals
 from .kinematics import solve_poses as solve_poses
+from .kinematics import solve_postures as solve_postures
 from .leg import TRAVEL_MARGIN as TRAVEL_MARGIN
 from .leg import Cylinder as Cylinder
 from .leg import EquationKind as EquationKind
@@ -87,8 +95,10 @@ from .model import joint_values as joint_values
 from .model import machine_document as machine_document
 from .model import platform_pose as platform_pose
 from .model import readings_at as readings_at
+from .model import readings_at_poses as readings_at_poses
 from .model import slider_columns as slider_columns
 from .model import vectors_A_to_B as vectors_A_to_B
+from .model import vectors_at as vectors_at
 from .model_builder import create_model as create_model
 from .model_writer import check_closes as check_closes
 from .model_writer import mechanism_text as mechanism_text
@@ -117,6 +127,8 @@ from .parameters import turns_between as turns_between
 from .parameters import twist_after as twist_after
 from .parameters import vector_of as vector_of
 from .parameters import with_numbers as with_numbers
+from .rods import actuator_index as actuator_index
+from .rods import actuators_of as actuators_of
 from .solver import poses_after as poses_after
 from .solver import solve as solve
 from .table_template import write_template as write_template

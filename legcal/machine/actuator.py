@@ -11,13 +11,11 @@ a is A at reading 0, and the gain g is 1 unless it is estimated. Several rods ma
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry import (
     Array,
@@ -28,9 +26,6 @@ from legcal.geometry import (
     normal_basis,
     turned_axis,
 )
-
-if TYPE_CHECKING:
-    from legcal.machine.leg import Leg
 
 
 class ActuatorKind(StrEnum):
@@ -187,81 +182,3 @@ class Actuator:
                 "axis": self.axis.tolist(),
             }
         return {"kind": self.kind.value, "direction": self.axis.tolist()}
-
-
-def actuators_of(legs: Sequence[Leg]) -> tuple[Actuator, ...]:
-    """Return the actuators of legs, each once, in the order of their first legs."""
-    found: dict[str, Actuator] = {}
-    for leg in legs:
-        if leg.actuator is not None:
-            found.setdefault(leg.actuator.joint, leg.actuator)
-    return tuple(found.values())
-
-
-def actuator_index(legs: Sequence[Leg]) -> list[int]:
-    """Return which of :func:`actuators_of` each leg hangs on, -1 for none."""
-    number = {actuator.joint: i for i, actuator in enumerate(actuators_of(legs))}
-    return [-1 if leg.actuator is None else number[leg.actuator.joint] for leg in legs]
-
-
-def joints_at(legs: Sequence[Leg], q: Array) -> Array:
-    """Return the joints A of legs (k, n_legs, 3) [m] at readings of actuators (k, n_actuators)."""
-    A = np.empty((len(q), len(legs), 3))
-    for j, (leg, a) in enumerate(zip(legs, actuator_index(legs), strict=True)):
-        A[:, j] = leg.A if leg.actuator is None else leg.actuator.at(leg.A, q[:, a])
-    return A
-
-
-def reading_of_rod(leg: Leg, B: Array, near: Array | None = None) -> Array:
-    """Return the readings (k,) at which a rod reaches points B (k, 3) in the frame of the base.
-
-    |A(q) - B| = l has two solutions; the one is taken in whose mode the rod is (``Leg.mode``), or
-    without *near* [the same unit], where the axis turns, that nearest to it in whole turns. Where
-    the rod does not reach B it is the reading at which it comes nearest.
-    """
-    actuator = leg.actuator
-    if actuator is None:
-        raise ValueError("a leg that hangs on no actuator has no reading of one")
-    if not actuator.turns:
-        along = (B - leg.A) @ actuator.axis
-        across = np.sum((B - leg.A) ** 2, axis=1) - along**2
-        half = np.sqrt(np.maximum(leg.q0**2 - across, 0.0))
-        # d|AB|/dq = -u.d has the sign of the mode
-        return np.asarray((along + leg.mode * half) / actuator.gain)
-    w, arm, to_B = actuator.axis, leg.A - actuator.point, B - actuator.point
-    height, radial = arm @ w, arm - (arm @ w) * w
-    e1 = radial / np.linalg.norm(radial)
-    e2 = cross(w, e1)
-    radius = float(np.linalg.norm(radial))
-    x, y, z = to_B @ e1, to_B @ e2, to_B @ w - height
-    size = np.hypot(x, y)
-    cosine = (size**2 + radius**2 + z**2 - leg.q0**2) / np.maximum(2.0 * radius * size, 1e-300)
-    # |AB|^2 = r^2 + size^2 + z^2 - 2 r size cos(angle - towards): grows beyond the direction of B
-    angle = np.arctan2(y, x) + leg.mode * np.arccos(np.clip(cosine, -1.0, 1.0))
-    middle = 0.5 * sum(actuator.travel) if near is None else near
-    q = angle / actuator.gain
-    turn = 2.0 * np.pi / actuator.gain
-    return np.asarray(q - turn * np.round((q - middle) / turn))
-
-
-def rod_mode(leg: Leg, q: float, B: Array) -> int:
-    """Return the working mode of a rod at a reading, with B (3,) in the frame of the base.
-
-    It is the sign of d|AB|/dq: of the two readings at which a rod reaches B, the larger or smaller.
-    """
-    if leg.actuator is None:
-        return leg.mode
-    motion = leg.actuator.motion(leg.A, np.array([q]))
-    return 1 if float((motion.A[0] - B) @ motion.by_q[0]) > 0.0 else -1
-
-
-def actuators_in(legs: Sequence[Leg], T: RigidTransform) -> tuple[Actuator | None, ...]:
-    """Return the actuator of each leg in another frame of the base."""
-    matrix = T.as_matrix()
-    moved = {a.joint: a.in_frame(matrix) for a in actuators_of(legs)}
-    return tuple(None if leg.actuator is None else moved[leg.actuator.joint] for leg in legs)
-
-
-def arm_rotation(actuator: Actuator, q: float) -> Rotation:
-    """Return how what is fixed in the carriage or arm has turned at a reading."""
-    return Rotation.from_matrix(actuator.rotations(np.array([q]))[0])

@@ -70,7 +70,8 @@ def classify_leg(
             raise OutOfClass(
                 f"the leg of joint '{leg}' is outside the method: found {found}, needed a joint "
                 "whose centre is fixed in the base, at most one slider, and a joint whose centre "
-                "is fixed in the platform; this machine cannot be calibrated this way."
+                "is fixed in the platform, or a motor that moves the joint at A and then a rod; "
+                "name this motor in name_mot, otherwise the machine cannot be calibrated this way."
             )
         if sliders:
             origin = matrix_applied(poses[-1], platform_origin)
@@ -444,7 +445,7 @@ def _rod(axes: Sequence[Axis], leg: str, on: str | None = None) -> tuple[int, Le
         raise problems[len(places[0])]
     what = (
         f"no slider and {len(places)} joints in different places, so that the rod hangs on a "
-        "moving arm that no motor of name_mot moves"
+        "moving arm and the joint at A moves"
         if len(places) > 2
         else "no slider and all joints in one place"
     )
@@ -457,7 +458,8 @@ def _rod(axes: Sequence[Axis], leg: str, on: str | None = None) -> tuple[int, Le
     raise OutOfClass(
         f"the leg of joint '{leg}' is outside the method: found {what}, needed a joint whose "
         "centre is fixed in the base, then a slider or a rod of constant length, and a joint whose "
-        "centre is fixed in the platform; this machine cannot be calibrated this way."
+        "centre is fixed in the platform, or a motor that moves the joint at A; name this motor in "
+        "name_mot, otherwise the machine cannot be calibrated this way."
     )
 
 

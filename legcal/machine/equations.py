@@ -25,16 +25,11 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
-from legcal.machine.actuator import (
-    ActuatorColumns,
-    JointMotion,
-    actuator_index,
-    actuators_of,
-    reading_of_rod,
-)
+from legcal.machine.actuator import ActuatorColumns, JointMotion
 from legcal.machine.leg import EquationKind, JointType, Leg, LegColumns, LegKind
 from legcal.machine.model import Machine
 from legcal.machine.parameters import Parametrization
+from legcal.machine.rods import actuator_index, actuators_of, reading_of_rod
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +83,8 @@ def pose_equations(
     hangs = max(on, default=-1) >= 0
     if q is None and hangs:
         return _without_readings(legs, R, t)
-    if not hangs and all(
-        leg.kind is not LegKind.PASSIVE and len(leg.equations) == 1 for leg in legs
-    ):
-        return _lengths(legs, R, t, by_local)
+    if all(leg.kind is not LegKind.PASSIVE and len(leg.equations) == 1 for leg in legs):
+        return _lengths(legs, R, t, by_local, q)
     parts = []
     for j, leg in enumerate(legs):
         at = None if q is None or on[j] < 0 else q[:, on[j]]
@@ -157,6 +150,15 @@ def _without_readings(legs: Sequence[Leg], R: Array, t: Array) -> PoseEquations:
         values[:, rows] -= v * (scale * np.einsum("kr,kr->k", v, values[:, rows]))[:, None]
     none = np.zeros((*values.shape, 0))
     return PoseEquations(values, by_pose, none, found.leg, found.kinds, measured, none)
+
+
+def posture_constraints(
+    legs: Sequence[Leg], R: Array, t: Array, q: Array, *, by_local: bool = False
+) -> PoseEquations:
+    """Return what holds at poses and readings q (k, n) of actuators, whatever was measured."""
+    found = pose_equations(legs, R, t, by_local=by_local, q=q if q.shape[1] else None)
+    hangs = np.array([leg.actuator is not None for leg in legs], dtype=np.bool_)
+    return found.of(~found.measured | hangs[found.leg])
 
 
 def equations_at_readings(
@@ -238,17 +240,22 @@ def _back(moved: JointMotion | None, vectors: Array) -> Array:
     return vectors if moved is None else np.einsum("kij,ki->kj", moved.by_A, vectors)
 
 
+def _write_actuator(moved: JointMotion, by_leg: Array, local: Array) -> None:
+    """Write derivatives by the numbers of an actuator, through the joint at A, into (k, 17)."""
+    columns = ActuatorColumns
+    local[:, columns.AXIS] = -np.einsum("kij,ki->kj", moved.by_axis, by_leg)
+    local[:, columns.POINT] = -np.einsum("kij,ki->kj", moved.by_point, by_leg)
+    local[:, columns.GAIN] = -_dot(moved.by_gain, by_leg)
+
+
 def _by_actuator(leg: Leg, moved: JointMotion, row: _EquationRow, local: Array) -> Array:
     """Return the derivative (k,) of a row by the reading; write those by the actuator's numbers.
 
     They go into *local* (k, 17), which may have no columns.
     """
-    by_q = -_dot(moved.by_q, row.by_leg)
-    columns = ActuatorColumns
+    by_q, columns = -_dot(moved.by_q, row.by_leg), ActuatorColumns
     if local.shape[1]:
-        local[:, columns.AXIS] = -np.einsum("kij,ki->kj", moved.by_axis, row.by_leg)
-        local[:, columns.POINT] = -np.einsum("kij,ki->kj", moved.by_point, row.by_leg)
-        local[:, columns.GAIN] = -_dot(moved.by_gain, row.by_leg)
+        _write_actuator(moved, row.by_leg, local)
     actuator = leg.actuator
     if row.by_base_axis is None or actuator is None or not actuator.turns:
         return by_q
@@ -414,9 +421,18 @@ def violated_constraint(machine: Machine, T_base_platform: RigidTransform) -> st
     return describe_worst(machine, here, "would be")
 
 
-def _lengths(legs: Sequence[Leg], R: Array, t: Array, by_local: bool) -> PoseEquations:
+def _lengths(
+    legs: Sequence[Leg], R: Array, t: Array, by_local: bool, q: Array | None
+) -> PoseEquations:
     """Return the lengths of all legs at once."""
     A = np.array([leg.A for leg in legs]).reshape(-1, 3)
+    on, moved = actuator_index(legs), dict[int, JointMotion]()
+    if q is not None:
+        A = np.repeat(A[None], len(t), axis=0)
+        for j, leg in enumerate(legs):
+            if leg.actuator is not None:
+                moved[j] = leg.actuator.motion(leg.A, q[:, on[j]])
+                A[:, j] = moved[j].A
     arms = np.array([leg.B for leg in legs]).reshape(-1, 3) @ np.swapaxes(R, 1, 2)
     vectors = arms + t[:, None] - A
     lengths = np.sqrt(np.einsum("knx,knx->kn", vectors, vectors))
@@ -425,14 +441,20 @@ def _lengths(legs: Sequence[Leg], R: Array, t: Array, by_local: bool) -> PoseEqu
     if by_local:
         local[..., LegColumns.A], local[..., LegColumns.B] = -u, u @ R
         local[..., LegColumns.LENGTH] = -1.0
+    by_q = np.zeros((*lengths.shape, 0 if q is None else q.shape[1]))
+    for j, motion in moved.items():
+        by_q[:, j, on[j]] = -_dot(motion.by_q, u[:, j])
+        if by_local:
+            local[:, j, LegColumns.A] = -_back(motion, u[:, j])
+            _write_actuator(motion, u[:, j], local[:, j])
     return PoseEquations(
         lengths - np.array([leg.q0 for leg in legs]),
         np.concatenate([cross(arms, u), u], axis=2),
         local,
         np.arange(len(legs)),
         (EquationKind.LENGTH,) * len(legs),
-        np.array([leg.kind is LegKind.ACTUATED for leg in legs], dtype=np.bool_),
-        np.zeros((*lengths.shape, 0)),
+        np.array([leg.is_motor for leg in legs], dtype=np.bool_),
+        by_q,
     )
 
 

@@ -447,7 +447,8 @@ def _levelled(
     except OutOfClass:
         return configuration  # refused later
     bodies = rigid_bodies(urdf, closures, block.platform_joint)
-    chains = find_chains(bodies, urdf, block.base, block.platform)
+    motors = source.file.name_mot
+    chains = find_chains(bodies, urdf, block.base, block.platform, motors)
     A, B = (
         np.array(points) @ bodies.T_body_link[link][:3, :3]
         for link, points in (

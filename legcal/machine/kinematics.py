@@ -29,6 +29,7 @@ from legcal.machine.equations import (
     machine_equations,
     machine_equations_at,
     pose_equations,
+    posture_constraints,
     violated_constraint,
 )
 from legcal.machine.leg import Leg, LegKind
@@ -491,6 +492,35 @@ def solve_poses(
         poses, size = found.points, found.size
         missed = np.abs(equations(poses)[0]).max(axis=1, initial=0.0)
     return SolvedPoses(poses[:, :, :3], poses[:, :, 3], missed, size)
+
+
+def solve_postures(
+    legs: Sequence[Leg], frame_legs: Sequence[int], R: Array, t: Array, q: Array
+) -> tuple[SolvedPoses, Array]:
+    """Return the poses near R, t and readings near q (k, n) at which all constraints hold.
+
+    Both move together, as little as possible; q are those of actuators.
+    """
+    free = [*freedoms(frame_legs), *range(6, 6 + q.shape[1])]
+    fixed = np.setdiff1d(np.arange(6 + q.shape[1]), free)
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        poses = points[:, :12].reshape(-1, 3, 4)
+        found = posture_constraints(legs, poses[:, :, :3], poses[:, :, 3], points[:, 12:])
+        jacobian = np.concatenate([found.by_pose, found.by_q], axis=2)
+        jacobian[:, :, fixed] = 0.0
+        return found.values, jacobian
+
+    def retract(points: Array, step: Array) -> Array:
+        poses = poses_after(points[:, :12].reshape(-1, 3, 4), step[:, :6])
+        return np.concatenate([poses.reshape(-1, 12), points[:, 12:] + step[:, 6:]], axis=1)
+
+    points = np.concatenate([R, t[..., None]], axis=2).reshape(-1, 12)
+    points = np.concatenate([points, q], axis=1)
+    found = solve(equations, retract, points, tolerance=1e-15, rank=DEPENDENT)
+    poses = found.points[:, :12].reshape(-1, 3, 4)
+    solved = SolvedPoses(poses[:, :, :3], poses[:, :, 3], found.worst, found.size)
+    return solved, found.points[:, 12:]
 
 
 def project_pose(

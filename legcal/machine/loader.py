@@ -16,7 +16,6 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import LegcalError, ModelError, OutOfClass
 from legcal.files import MotionEntry, closest, motion_to_xyz_quat
 from legcal.geometry import Array
-from legcal.machine.actuator import reading_of_rod, rod_mode
 from legcal.machine.bodies import Bodies, rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.classification import CONCURRENT, PERPENDICULAR, actuator_of, leg_of
@@ -46,6 +45,7 @@ from legcal.machine.mobility import (
 from legcal.machine.model import Machine, joint_values, vectors_A_to_B
 from legcal.machine.origins import with_own_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
+from legcal.machine.rods import reading_of_rod, rod_mode
 from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.spanning_tree import Source
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
@@ -57,6 +57,7 @@ from legcal.machine.topology import (
     find_chains,
     normals_in_links,
     normals_of_closures,
+    own_joint,
     plane_of_motion,
     propose_block,
     propose_frame,
@@ -170,6 +171,12 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     ends = bodies.T_body_link[block.base], bodies.T_body_link[block.platform]
     normals = plane_of_motion(chains)
     _check_count(chains, spatial=normals is None, path=yaml_path)
+    if normals is not None and any(chain.actuator is not None for chain in chains):
+        raise OutOfClass(
+            f"{yaml_path}: this mechanism is outside the method: found a planar machine whose "
+            "joints at A move on carriages or arms, needed a machine in space, or sliders along "
+            "the legs; this machine cannot be calibrated this way."
+        )
     if block.platform_joint is not None:
         virtual = urdf.joints[block.platform_joint]
         turn = bodies.T_body_link[virtual.parent][:3, :3].T
@@ -318,7 +325,7 @@ def _legs_in_order(
             ordered.append(found[0])
     problems += [
         f"{path}: legcal.legs is incomplete: found no name for the leg with joint "
-        f"'{any_joint(chain)}', needed every leg; add a line for it."
+        f"'{own_joint(chain)}', needed every leg; add a line for it."
         for chain in chains
         if id(chain) not in owner and not problems
     ]

@@ -13,7 +13,7 @@ from legcal.brief import brief
 from legcal.errors import UsageError
 from legcal.files import motion_to_xyz_quat
 from legcal.geometry import Array, frame_on_points
-from legcal.machine.actuator import Actuator, actuators_of, reading_of_rod
+from legcal.machine.actuator import Actuator
 from legcal.machine.chain import ClosedChain
 from legcal.machine.drawing import Sketch
 from legcal.machine.leg import (
@@ -25,6 +25,7 @@ from legcal.machine.leg import (
     parameters_of_legs,
     with_platform_points,
 )
+from legcal.machine.rods import actuators_of, reading_of_rod
 from legcal.machine.urdf import Urdf
 
 if TYPE_CHECKING:
@@ -261,7 +262,7 @@ class Machine:
 def vectors_A_to_B(machine: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the vectors from base to platform joint of every leg, (n_legs, 3), base link [m]."""
     matrix = T_base_platform.as_matrix()  # RigidTransform.apply is slow on few points
-    return vectors_at(machine, matrix[None])[0]
+    return np.asarray(vectors_at(machine, matrix[None])[0])
 
 
 def vectors_at(machine: Machine, poses: Array) -> Array:

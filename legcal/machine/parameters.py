@@ -24,7 +24,7 @@ from legcal.geometry import (
     rotation_between,
     turned_axis,
 )
-from legcal.machine.actuator import Actuator, ActuatorColumns, actuators_of
+from legcal.machine.actuator import Actuator, ActuatorColumns
 from legcal.machine.leg import (
     KinematicParameters,
     Leg,
@@ -33,6 +33,7 @@ from legcal.machine.leg import (
     with_platform_points,
 )
 from legcal.machine.model import Machine
+from legcal.machine.rods import actuators_of
 
 _STEP = 1e-6  # [m or rad], of numerical derivatives
 # Of LegColumns, in this order
@@ -267,7 +268,7 @@ def with_numbers(
             base_axis=axes[0],
             platform_axis=axes[1],
         )
-        if leg.twist is not None and own[LegColumns.PLATFORM_AXIS.start :].any():
+        if leg.twist is not None and own[LegColumns.PLATFORM_AXIS.start : LegColumns.OWN].any():
             moved = replace(moved, twist=tied_twist(moved, start, float(row[LegColumns.TWIST])))
         if leg.actuator is not None and start.actuator is not None and own[LegColumns.OWN :].any():
             numbers_there = leg.actuator.numbers(start.actuator)

@@ -404,7 +404,10 @@ def _not_a_chain(urdf: Urdf, steps: list[Step], body: str, base: str, n_onward: 
         found = f"ends at link '{body}' without reaching the platform"
     elif n_onward > 1 and _is_an_arm(steps):
         found = f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
-        needed = "needed joints whose centres are fixed in the base"
+        needed = (
+            "needed joints whose centres are fixed in the base, or a motor in name_mot that moves "
+            "this link"
+        )
     else:
         found = f"shares link '{body}' with another leg or branches there"
     return (

@@ -86,7 +86,7 @@ def locate_platform_joints(
     problem = build_rigid_platform(rigid)
     n, terms = len(unknowns), problem.terms
     twisting = [leg.twist is not None for leg in machine.legs]
-    turns = unknowns.place[twisting, LegColumns.BASE_AXIS.start :]
+    turns = unknowns.place[twisting, LegColumns.BASE_AXIS.start : LegColumns.OWN]
     prior = nominal_prior(np.unique(turns[turns >= 0]))
     solution = solve_least_squares(replace(problem, terms=(*terms, *prior)))
     legs = unknowns.legs(solution.x, machine.legs)
@@ -156,7 +156,7 @@ class RigidProblem:
         free = np.arange(6) if self.machine.spatial else _IN_PLANE
         first = len(self.unknowns) + (free.max() + 1) * self.poses.pose[rows, None]
         steps = np.where(free >= 0, first + free, -1)
-        of_leg = self.unknowns.place[self.directions.leg[rows], LegColumns.B.start :]
+        of_leg = self.unknowns.place[self.directions.leg[rows], LegColumns.B.start : LegColumns.OWN]
         return np.hstack([of_leg, steps])
 
     def known(self, rows: IntArray) -> tuple[Array, Array, Array, Array]:

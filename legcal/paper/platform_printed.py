@@ -259,7 +259,7 @@ def _close_legs(
     """
     twisting = np.array([leg.twist is not None for leg in unknowns.start])
     known_axis = np.array([leg.platform_joint is not JointType.UNIVERSAL for leg in unknowns.start])
-    turns = unknowns.place[twisting, LegColumns.BASE_AXIS.start :]
+    turns = unknowns.place[twisting, LegColumns.BASE_AXIS.start : LegColumns.OWN]
     wanted = np.setdiff1d(turns[turns >= 0], unknowns.place[known_axis, LegColumns.PLATFORM_AXIS])
     if not len(wanted):
         return legs, ()
@@ -312,7 +312,11 @@ def _build_closure(
             np.full(len(rows), _SIGMA_CLOSURE / np.sqrt(n_rows)),
         )
         terms.append(
-            Term(closure_of_leg(*joints), place[leg, LegColumns.BASE_AXIS.start :], observed)
+            Term(
+                closure_of_leg(*joints),
+                place[leg, LegColumns.BASE_AXIS.start : LegColumns.OWN],
+                observed,
+            )
         )
     return LeastSquares("The universal axes (step 4)", tuple(terms), np.zeros(len(wanted)))
 

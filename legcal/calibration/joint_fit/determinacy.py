@@ -177,7 +177,7 @@ def _motion(problem: FitProblem, state: State, unit: Array) -> Array | None:
     legs, n = problem.legs, problem.n_kinematic
     try:
         by = pose_sensitivity(
-            state.legs, legs.parametrization, legs.frame_legs, *state.platform_pose
+            state.legs, legs.parametrization, legs.frame_legs, *state.platform_pose.frames
         )
     except NotIdentifiable:
         return None

@@ -21,9 +21,9 @@ import numpy as np
 from legcal.calibration.joint_fit.variables import FittedLegs, State
 from legcal.data import Corners, LegAxes, Measurements, Outlines, join_axes
 from legcal.errors import DatasetError
-from legcal.estimation import Factor, Residuals
+from legcal.estimation import Factor, Residuals, Touch
 from legcal.geometry import Array, BoolArray, IntArray, cross, whitener
-from legcal.machine import LegKind
+from legcal.machine import LegColumns, LegKind, actuator_index
 from legcal.vision import (
     EPSILON,
     LINKS,
@@ -37,6 +37,7 @@ from legcal.vision import (
 
 _SAME_GAMMA = 1e-6  # relative difference of gammas that count as one
 _SIX, _ALL, _ONE = slice(0, 6), slice(None), slice(0, 1)
+_OF_ACTUATOR = slice(LegColumns.OWN, LegColumns.COUNT)
 
 
 class Observed(NamedTuple):
@@ -44,6 +45,7 @@ class Observed(NamedTuple):
 
     outlines: ObservedOutlines
     readings: Readings
+    actuator_readings: ActuatorReadings
     axes: ObservedAxes
     corners: ObservedCorners  # of the board on the base
     platform_corners: ObservedCorners
@@ -92,6 +94,7 @@ def observed_arrays(
     return Observed(
         found,
         observed_readings(measurements, legs),
+        observed_actuator_readings(measurements, legs),
         observed_axes(axes, measurements, legs),
         *observed_corners(board, measurements, given if cameras is None else cameras),
     )
@@ -146,6 +149,7 @@ class ObservedOutlines:
     # same camera, as one that is held in the hand does; else itself
     series: IntArray
     cameras: tuple[str, ...]  # the view that stands for the camera of each view
+    on_actuators: bool = False  # whether some joints at A move
     memory: Memory = field(default_factory=Memory, repr=False)  # of the predicted offsets
 
     @property
@@ -159,7 +163,7 @@ class ObservedOutlines:
     def at(self, which: IntArray) -> ObservedOutlines:
         """Return some of the outlines, by index, without biases."""
         bare = self.without_biases()
-        shared = ("parts", "views", "series", "cameras", "memory")
+        shared = ("parts", "views", "series", "cameras", "on_actuators", "memory")
         chosen = {
             f.name: getattr(bare, f.name)[which] for f in fields(self) if f.name not in shared
         }
@@ -250,13 +254,15 @@ class ObservedOutlines:
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor of outlines, whitened with their claimed covariances."""
-        touches = (
+        touches: tuple[Touch, ...] = (
             ("legs", self.leg, _SIX),
             ("camera_pose", self.view, _ALL),
             ("radii", self.radius, _ONE),
             ("biases", self.bias_index, _ONE),
             ("cameras", self.view, _ALL),
         )
+        if self.on_actuators:
+            touches = (*touches, ("legs", self.leg, _OF_ACTUATOR))
         whitening = whitener(self.covariance)
 
         def rows(state: State) -> Residuals:
@@ -327,6 +333,7 @@ def observed_outlines(
         tuple(v.name for v in measurements.views),
         _series(measurements),
         cameras,
+        legs.n_actuators > 0,
     )
 
 
@@ -439,14 +446,14 @@ class Readings:
         R_pose = _by_measurement(state.platform_pose.R, self.pose)
         along = end - state.A.T[:, self.leg]
         length = np.sqrt(np.einsum("in,in->n", along, along))
-        slope = np.empty((7, 1, len(self)))
+        slope, n_q = np.empty((7, 1, len(self))), state.platform_pose.q.shape[1]
         np.divide(along, length, out=slope[3:6, 0])
         slope[:3], slope[6] = -slope[3:6], -1.0
 
         def chain(slope: Array) -> tuple[Array, Array]:
             by_length = slope.T
-            b, J = by_length[3:6], np.empty((13, *by_length.shape[1:]))
-            J[:3], J[6], J[10:] = by_length[:3], by_length[6], b
+            b, J = by_length[3:6], np.zeros((13 + n_q, *by_length.shape[1:]))
+            J[:3], J[6], J[10:13] = by_length[:3], by_length[6], b
             np.einsum("jin,jqn->iqn", R_pose, b, out=J[3:6])
             J[7:10] = _cross(arm[:, None], b)
             return J[:7].T, J[7:].T
@@ -475,6 +482,43 @@ def observed_readings(measurements: Measurements, legs: FittedLegs) -> Readings:
     return Readings(leg, pose, length[pose, leg], measurements.sigma_q, legs.n_legs)
 
 
+@dataclass(frozen=True, eq=False)
+class ActuatorReadings:
+    """The readings of actuators that enter the fit, n of them."""
+
+    actuator: IntArray  # (n,) indices
+    pose: IntArray  # (n,) indices
+    reading: Array  # (n,) [m or rad]
+    sigma: Array  # (n,) standard deviations in the same unit
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+    def rows(self, state: State) -> Residuals:
+        """Return how far readings are from those of the state, (n, 1), with their derivatives."""
+        q = state.platform_pose.q
+        by_posture = np.zeros((len(self), 1, 6 + q.shape[1]))
+        by_posture[np.arange(len(self)), 0, 6 + self.actuator] = 1.0
+        r = q[self.pose, self.actuator] - self.reading
+        return Residuals.of(r[:, None], np.zeros((len(self), 1, 0)), by_posture)
+
+    def factor(self, keys: tuple[str, ...]) -> Factor[State]:
+        """Return the factor of these readings; nothing but a posture matters to them."""
+        del keys
+        whitening = 1.0 / self.sigma[:, None, None]
+        return Factor("actuator_readings", self.rows, (), len(self), 1, self.pose, whitening)
+
+
+def observed_actuator_readings(measurements: Measurements, legs: FittedLegs) -> ActuatorReadings:
+    """Return the readings of actuators, one row of them for each platform pose."""
+    on = actuator_index(legs.nominal)
+    first = [on.index(a) for a in range(legs.n_actuators)]
+    q = measurements.q[measurements.first_rows][:, first]
+    actuator, pose = np.nonzero(np.isfinite(q).T)
+    sigma = measurements.sigma_of(legs.nominal)[first]
+    return ActuatorReadings(actuator, pose, q[pose, actuator], sigma[actuator])
+
+
 # ----------------------------------------------------------------------------------------- axes
 
 
@@ -490,6 +534,7 @@ class ObservedAxes:
     # (n, 4, 4) Lower triangular T with T C T^T = 1, C being the claimed covariance of (alpha1,
     # alpha2, beta1, beta2) [1/rad, 1/m]
     whitening: Array
+    on_actuators: bool = False  # whether some joints at A move
 
     def __len__(self) -> int:
         return len(self.leg)
@@ -503,7 +548,9 @@ class ObservedAxes:
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor of measured axes, which contain cameras already."""
         del keys
-        touches = (("legs", self.leg, _SIX), ("camera_pose", self.view, _ALL))
+        touches: tuple[Touch, ...] = (("legs", self.leg, _SIX), ("camera_pose", self.view, _ALL))
+        if self.on_actuators:
+            touches = (*touches, ("legs", self.leg, _OF_ACTUATOR))
         n, whitening = len(self), self.whitening
         return Factor("axes", self.rows, touches, n, 4, self.pose, whitening, robust=True)
 
@@ -521,7 +568,13 @@ def observed_axes(
     if axes is None or len(axes) == 0:
         none = np.zeros(0, dtype=np.intp)
         return ObservedAxes(
-            none, none, none, np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros((0, 4, 4))
+            none,
+            none,
+            none,
+            np.zeros((0, 3)),
+            np.zeros((0, 2, 3)),
+            np.zeros((0, 4, 4)),
+            legs.n_actuators > 0,
         )
     scale = np.sqrt(np.abs(np.einsum("nii->ni", axes.covariance)))
     scale = np.where(scale > 0.0, scale, 1.0)  # rad and m side by side
@@ -538,7 +591,8 @@ def observed_axes(
         raise DatasetError(problems)
     whitening = whitener(correlation) / scale[:, None, :]
     view, pose = measurements.view[axes.row], measurements.pose[axes.row]
-    return ObservedAxes(axes.leg, view, pose, axes.M, axes.basis, whitening)
+    moves = legs.n_actuators > 0
+    return ObservedAxes(axes.leg, view, pose, axes.M, axes.basis, whitening, moves)
 
 
 def average_images(axes: LegAxes, measurements: Measurements) -> LegAxes:
@@ -624,7 +678,8 @@ class ObservedCorners:
             if moves:
                 in_link = in_base @ R_link
                 turn = cross(carried[:, None], in_base)
-                by_pose = np.concatenate([turn, in_base], axis=-1)
+                none = np.zeros((*slope.shape[:2], state.platform_pose.q.shape[1]))
+                by_pose = np.concatenate([turn, in_base, none], axis=-1)
             J = [
                 cross(turned[:, None], in_camera),
                 in_camera,
@@ -834,37 +889,81 @@ class _EndsInCamera:
     arm: Array  # (3, n) from the origin of R_e to B, in R_b
     R_camera: Array  # (3, 3, n)
     R_pose: Array
+    moved: _Moved | None  # where joints at A move
 
     def chain(self, slope: Array) -> tuple[Array, Array]:
         """Return derivatives by A, B, camera and others, and by the pose, from those by both ends.
 
         *slope* (n, q, l) has after these six numbers those of the others: radius, biases and
-        intrinsics.
+        intrinsics. Those by the numbers of actuators come after them.
         """
-        by_ends = slope.T
-        by_A, by_B, m = by_ends[:3], by_ends[3:6], 6 + len(by_ends)
-        J = np.empty((m + 6, *by_ends.shape[1:]))
-        b = J[m + 3 :]
+        by_ends, moved = slope.T, self.moved
+        n_own, n_q = (0, 0) if moved is None else (5, moved.n_q)
+        by_A, by_B, others = by_ends[:3], by_ends[3:6], 6 + len(by_ends)
+        m = others + n_own
+        J = np.empty((m + 6 + n_q, *by_ends.shape[1:]))
+        b = J[m + 3 : m + 6]
         np.einsum("jin,jqn->iqn", self.R_camera, by_A, out=J[:3])
+        if moved is not None:
+            a = J[:3].copy()
+            np.einsum("jin,jqn->iqn", moved.by_A, a, out=J[:3])
+            np.einsum("jin,jqn->iqn", moved.by_numbers, a, out=J[others:m])
+            np.einsum("jin,jqn->iqn", moved.by_q, a, out=J[m + 6 :])
         np.einsum("jin,jqn->iqn", self.R_camera, by_B, out=b)
         np.einsum("jin,jqn->iqn", self.R_pose, b, out=J[3:6])
         J[6:9] = _cross(self.A_turned[:, None], by_A)
         J[6:9] += _cross(self.B_turned[:, None], by_B)
         np.add(by_A, by_B, out=J[9:12])
-        J[12:m] = by_ends[6:]
+        J[12:others] = by_ends[6:]
         J[m : m + 3] = _cross(self.arm[:, None], b)
         return J[:m].T, J[m:].T
+
+
+@dataclass(frozen=True, eq=False)
+class _Moved:
+    """How the joints at A of measurements move with numbers of actuators and with readings."""
+
+    by_A: Array  # (3, 3, n) by A at reading 0
+    by_numbers: Array  # (3, 5, n) by the numbers of the actuator
+    by_q: Array  # (3, n_actuators, n)
+
+    @property
+    def n_q(self) -> int:
+        """Number of readings in a posture."""
+        return int(self.by_q.shape[1])
+
+
+def _moved(state: State, leg: IntArray, pose: IntArray) -> _Moved | None:
+    """Return how the joints at A of legs at poses move, None where no actuator carries any."""
+    n_poses, n_q = state.platform_pose.q.shape
+    if not n_q:
+        return None
+    shape = len(state.legs), n_poses
+    by_A = np.broadcast_to(np.eye(3), (*shape, 3, 3)).copy()
+    by_numbers, by_q = np.zeros((*shape, 3, 5)), np.zeros((*shape, 3, n_q))
+    on = actuator_index(state.legs)
+    for j, motion in state.actuated.items():
+        by_A[j] = motion.by_A
+        by_numbers[j, :, :, :2], by_numbers[j, :, :, 2:4] = motion.by_axis, motion.by_point
+        by_numbers[j, :, :, 4], by_q[j, :, :, on[j]] = motion.by_gain, motion.by_q
+    tables = (np.moveaxis(table[leg, pose], 0, -1) for table in (by_A, by_numbers, by_q))
+    return _Moved(*(np.ascontiguousarray(table) for table in tables))
 
 
 def _ends_in_camera(state: State, leg: IntArray, view: IntArray, pose: IntArray) -> _EndsInCamera:
     """Return both ends of legs in the camera frames of views at poses."""
     n_legs = len(state.A)
     R_camera, t = _by_measurement(state.camera_pose.R, view), state.camera_pose.t.T[:, view]
-    of_views = (state.camera_pose.R.transpose(1, 0, 2) @ state.A.T).reshape(3, -1)
+    moved = _moved(state, leg, pose)
+    if moved is None:
+        of_views = (state.camera_pose.R.transpose(1, 0, 2) @ state.A.T).reshape(3, -1)
+        A = of_views[:, view * n_legs + leg]
+    else:
+        A = np.einsum("ijn,nj->in", R_camera, state.A_at_poses[pose, leg])
     arm, end = (table[:, pose * n_legs + leg] for table in state.ends_at_poses)
-    A, B = of_views[:, view * n_legs + leg], np.einsum("ijn,jn->in", R_camera, end)
+    B = np.einsum("ijn,jn->in", R_camera, end)
     R_pose = _by_measurement(state.platform_pose.R, pose)
-    return _EndsInCamera(A + t, B + t, A, B, arm, R_camera, R_pose)
+    return _EndsInCamera(A + t, B + t, A, B, arm, R_camera, R_pose, moved)
 
 
 def _by_measurement(R: Array, which: IntArray) -> Array:

@@ -39,7 +39,8 @@ _BETTER = 0.5  # of the cost of a pose, below which another one is better
 def are_free(problem: FitProblem, state: State) -> bool:
     """Say whether readings and legs leave platform poses open."""
     columns = list(freedoms(problem.legs.frame_legs))
-    rows = pose_equations(state.legs, *(x[:1] for x in state.platform_pose), by_local=False)
+    R, t, q = (x[:1] for x in state.platform_pose)
+    rows = pose_equations(state.legs, R, t, by_local=False, q=q if q.shape[1] else None)
     by_pose = rows.by_pose[0][:, columns] / np.where(np.array(columns) < 3, state.mean_length, 1.0)
     return len(by_pose) == 0 or int(np.linalg.matrix_rank(by_pose, tol=_RANK)) < len(columns)
 

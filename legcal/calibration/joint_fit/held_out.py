@@ -15,11 +15,10 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration.joint_fit.factors import observed_outlines
 from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel, possible_biases
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.variables import State
+from legcal.calibration.joint_fit.variables import Postures, State, postures
 from legcal.data import Measurements, Outlines
 from legcal.errors import NotIdentifiable, NotVisible
 from legcal.estimation import (
-    Frames,
     Linearization,
     NormalEquations,
     explained_share,
@@ -70,7 +69,7 @@ class Posterior:
                 state,
                 radii=np.append(state.radii, others),
                 biases=np.array([values.get(name, 0.0) for name in shifts.names]),
-                platform_pose=Frames.of(T_Rb_Re),
+                platform_pose=postures(state.legs, T_Rb_Re),
             ),
             self._covariance_of(problem, shifts),
         )
@@ -169,7 +168,9 @@ def _moved(
     Those that are not are back at the first ones, and so are those that put a camera into a leg.
     """
     problem, begin = predicted.problem, predicted.state
-    unit, first = np.repeat([1.0, length], 3), begin.platform_pose
+    first = begin.platform_pose
+    unit = np.ones(problem.d_element)
+    unit[3:6] = length
     reach = np.linalg.norm(change / unit, axis=1, keepdims=True)
     change = change * np.minimum(1.0, _MAX_STEP / np.maximum(reach, 1e-300))
     moved = state.platform_pose.moved(change)
@@ -182,11 +183,9 @@ def _moved(
     return _with_poses(trial, first, is_near, trial.platform_pose), is_near
 
 
-def _with_poses(state: State, first: Frames, chosen: BoolArray, poses: Frames) -> State:
+def _with_poses(state: State, first: Postures, chosen: BoolArray, poses: Postures) -> State:
     """Return a state with some new poses, the others the first ones."""
-    R = np.where(chosen[:, None, None], poses.R, first.R)
-    t = np.where(chosen[:, None], poses.t, first.t)
-    return replace(state, platform_pose=Frames(R, t))
+    return replace(state, platform_pose=first.where(chosen, poses))
 
 
 def _is_known(normal: NormalEquations, length: float) -> BoolArray:

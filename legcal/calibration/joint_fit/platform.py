@@ -178,6 +178,9 @@ def _workspace_poses(machine: Machine, legs: Sequence[Leg]) -> Sequence[RigidTra
             length = np.linalg.norm(R @ leg.B + t - leg.A, axis=1)
             most = _REACHED_BY_ALL * length if machine.is_redundant else _REACHED
             reached &= np.abs(length - (leg.sign * q + leg.q0)) < most
+        elif leg.actuator is not None:
+            length = np.linalg.norm(R @ leg.B + t - leg.actuator.at(leg.A, q), axis=1)
+            reached &= np.abs(length - leg.q0) < _REACHED
     return [poses[k] for k in np.flatnonzero(reached)] or None
 
 
@@ -188,5 +191,6 @@ def poses_at_readings(
     nearby: Sequence[RigidTransform],
 ) -> tuple[RigidTransform, ...]:
     """Return T_Rb_Re of legs at readings (n_poses, n_legs), near known poses."""
-    q0 = [np.nan if leg.kind is LegKind.PASSIVE else leg.q0 for leg in legs]
-    return platform_poses(legs, machine.sign * q + q0, nearby, machine.frame_legs)
+    read = np.array([leg.is_motor for leg in legs], dtype=np.bool_)
+    lengthening = np.where(read, machine.sign * q, np.nan)
+    return platform_poses(legs, lengthening, nearby, machine.frame_legs)

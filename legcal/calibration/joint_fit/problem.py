@@ -23,6 +23,7 @@ from legcal.calibration.joint_fit.factors import (
     ObservedCorners,
     ObservedOutlines,
     Readings,
+    observed_actuator_readings,
     observed_arrays,
     observed_axes,
     observed_corners,
@@ -40,11 +41,13 @@ from legcal.calibration.joint_fit.variables import (
     FittedLegs,
     LegConstraints,
     LegParameters,
+    Postures,
     RefinementSettings,
     Start,
     State,
     changed_cameras,
     intrinsic_of,
+    postures,
 )
 from legcal.data import LegAxes, Measurements, Outlines, row_names
 from legcal.errors import NotIdentifiable
@@ -133,11 +136,12 @@ class FitProblem(Problem[State]):
     @property
     def n_unknowns(self) -> int:
         """Number of unknowns; a pose counts with the freedoms that its constraints leave."""
+        d = self.d_element
         bound = 6 - len(freedoms(self.legs.frame_legs))
         bound += sum(leg.n_constraints for leg in self.legs.nominal)
         bound -= self.legs.ties.n_dependent
         n_tied = self.parameters.n_tied
-        return self.n_kept - n_tied + max(6 - bound, 0) * self.n_elements
+        return self.n_kept - n_tied + max(d - bound, 0) * self.n_elements
 
     @property
     def n_equations(self) -> int:
@@ -154,7 +158,7 @@ class FitProblem(Problem[State]):
             np.zeros(self.block("biases").n_unknowns),
             Frames.of(start.T_camera_Rb),
             Frames.of([start.T_Rb_board, start.T_Re_board]),
-            Frames.of(start.T_Rb_Re),
+            postures(start.legs, start.T_Rb_Re),
         )
 
     def offsets(self, state: State) -> Array:
@@ -194,6 +198,7 @@ class FitProblem(Problem[State]):
         observed = Observed(
             replace(outlines, bias_index=biases.index, bias_shift=biases.shift),
             observed_readings(measurements, self.legs),
+            observed_actuator_readings(measurements, self.legs),
             observed_axes(None, measurements, self.legs),
             *observed_corners(None, measurements, ()),
         )
@@ -205,7 +210,7 @@ class FitProblem(Problem[State]):
             self,
             observed=observed,
             variables=tuple(blocks.get(block.name, block) for block in self.variables),
-            eliminated=_poses(measurements.n_poses),
+            eliminated=_poses(measurements.n_poses, self.legs.n_actuators),
             factors=observed.factors(self.keys),
         )
 
@@ -320,7 +325,8 @@ def _built(
     parametrization = legs.parametrization
     names, units = parametrization.names, parametrization.units
     free = np.array(
-        [not choices.holds(n, by_default=n.endswith(".twist")) for n in names], dtype=np.bool_
+        [not choices.holds(n, by_default=n.endswith((".twist", ".gain"))) for n in names],
+        dtype=np.bool_,
     )
     parameters = LegParameters(legs, free, choices.values)
     if parameters.n_tied:
@@ -357,7 +363,7 @@ def _built(
     )
     return FitProblem(
         variables=tuple(_stated(block, choices) for block in blocks),
-        eliminated=_poses(n_poses),
+        eliminated=_poses(n_poses, legs.n_actuators),
         factors=observed.factors(keys),
         constraint=LegConstraints(parameters),
         name="joint fit",
@@ -377,8 +383,10 @@ def _built(
     )
 
 
-def _poses(n_poses: int) -> Variables:
-    return Variables("platform_pose", all_free(n_poses, 6), Frames.moved, max_step=_MAX_STEP)
+def _poses(n_poses: int, n_actuators: int) -> Variables:
+    max_step = (*_MAX_STEP, *(0.3,) * n_actuators)
+    free = all_free(n_poses, len(max_step))
+    return Variables("platform_pose", free, Postures.moved, max_step=max_step)
 
 
 def _scalars(

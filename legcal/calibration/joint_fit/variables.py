@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -19,19 +20,24 @@ from legcal.errors import DatasetError, DidNotConverge
 from legcal.estimation import Frames, Problem, Tangent
 from legcal.geometry import Array, BoolArray, IntArray, axis_angles_slope
 from legcal.machine import (
+    JointMotion,
     Leg,
     LegColumns,
     Machine,
     Parametrization,
     PoseEquations,
     Ties,
+    actuator_index,
+    actuators_of,
     freedoms,
     geometries,
     independent,
     moved_legs,
     parametrize,
-    pose_equations,
+    posture_constraints,
+    readings_of_rods,
     solve_poses,
+    solve_postures,
     tied_twist,
     tied_twist_slope,
     ties_of,
@@ -78,6 +84,47 @@ class Start:
     T_Re_board: RigidTransform = field(default_factory=RigidTransform.identity)
 
 
+def postures(legs: Sequence[Leg], T_Rb_Re: Sequence[RigidTransform]) -> Postures:
+    """Return postures at poses, the readings of actuators those at which rods reach them.
+
+    Such a reading is a start only: where a rod stands square to the motion of its joint at A it has
+    no derivative, and beyond it is that of the nearest point.
+    """
+    R, t = Frames.of(T_Rb_Re)
+    return Postures(R, t, readings_of_rods(legs, R, t))
+
+
+class Postures(NamedTuple):
+    """Platform poses T_Rb_Re with the readings of actuators, which are unknowns beside each.
+
+    They move by 6 + n numbers each: those of :class:`legcal.estimation.Frames`, then readings.
+    """
+
+    R: Array  # (n_poses, 3, 3)
+    t: Array  # (n_poses, 3) [m]
+    q: Array  # (n_poses, n_actuators) [m or rad]; no column where no joint at A moves
+
+    @property
+    def frames(self) -> Frames:
+        """The poses alone."""
+        return Frames(self.R, self.t)
+
+    @property
+    def motions(self) -> tuple[RigidTransform, ...]:
+        """The same as rigid motions."""
+        return self.frames.motions
+
+    def moved(self, change: Array) -> Postures:
+        """Return them after changes (n_poses, 6 + n)."""
+        return Postures(*self.frames.moved(change[:, :6]), self.q + change[:, 6:])
+
+    def where(self, chosen: BoolArray, other: Postures) -> Postures:
+        """Return them with the chosen ones (n_poses,) of others."""
+        R = np.where(chosen[:, None, None], other.R, self.R)
+        t = np.where(chosen[:, None], other.t, self.t)
+        return Postures(R, t, np.where(chosen[:, None], other.q, self.q))
+
+
 @dataclass(frozen=True, eq=False)
 class State:
     """Values of all blocks of variables of the joint fit, by their names."""
@@ -89,12 +136,30 @@ class State:
     biases: Array  # (n_biases,) common-mode edge biases [px] and logarithms of gammas
     camera_pose: Frames  # T_camera_Rb, one a view
     board_pose: Frames  # T_Rb_board and T_Re_board; of no meaning where no image shows one
-    platform_pose: Frames  # T_Rb_Re, one a pose
+    platform_pose: Postures  # T_Rb_Re, one a pose
 
     @cached_property
     def A(self) -> Array:
-        """Base joint centres in R_b, (n_legs, 3) [m]."""
+        """Base joint centres in R_b, (n_legs, 3) [m]; on actuators at reading 0."""
         return np.array([leg.A for leg in self.legs])
+
+    @cached_property
+    def actuated(self) -> dict[int, JointMotion]:
+        """How the joint at A of each leg on an actuator moves at all poses."""
+        on, q = actuator_index(self.legs), self.platform_pose.q
+        return {
+            j: leg.actuator.motion(leg.A, q[:, on[j]])
+            for j, leg in enumerate(self.legs)
+            if leg.actuator is not None
+        }
+
+    @cached_property
+    def A_at_poses(self) -> Array:
+        """Base joint centres in R_b at all poses, (n_poses, n_legs, 3) [m]."""
+        A = np.repeat(self.A[None], len(self.platform_pose.t), axis=0)
+        for j, motion in self.actuated.items():
+            A[:, j] = motion.A
+        return A
 
     @cached_property
     def B(self) -> Array:
@@ -119,17 +184,15 @@ class State:
         ends = arms + self.platform_pose.t.T[..., None]
         return arms.reshape(3, -1), ends.reshape(3, -1)
 
-    def with_chosen(self, chosen: BoolArray, poses: Frames) -> State:
+    def with_chosen(self, chosen: BoolArray, poses: Postures) -> State:
         """Return the state with the chosen ones (n_poses,) of other poses."""
-        (R, t), (R_other, t_other) = self.platform_pose, poses
-        R = np.where(chosen[:, None, None], R_other, R)
-        return replace(self, platform_pose=Frames(R, np.where(chosen[:, None], t_other, t)))
+        return replace(self, platform_pose=self.platform_pose.where(chosen, poses))
 
     @property
     def mean_length(self) -> float:
         """Mean distance of the joints of a leg over the poses [m]."""
         ends = self.arms + self.platform_pose.t[:, None]
-        return float(np.linalg.norm(ends - self.A, axis=-1).mean())
+        return float(np.linalg.norm(ends - self.A_at_poses, axis=-1).mean())
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +217,11 @@ class FittedLegs:
         return len(self.frame_legs) == 3
 
     @cached_property
+    def n_actuators(self) -> int:
+        """Number of actuators on which rods hang."""
+        return len(actuators_of(self.nominal))
+
+    @cached_property
     def parametrization(self) -> Parametrization:
         """The kinematic parameters, twists among them."""
         return parametrize(self.names, self.nominal, self.frame_legs, twists=True)
@@ -161,7 +229,8 @@ class FittedLegs:
     @cached_property
     def ties(self) -> Ties:
         """What ties the parameters to each other."""
-        home = None if self.home is None else self.home.as_matrix()[:3]
+        tied = self.home is not None and not self.n_actuators
+        home = self.home.as_matrix()[:3] if tied and self.home is not None else None
         return ties_of(self.nominal, self.frame_legs, home)
 
     def vector(self, legs: tuple[Leg, ...]) -> Array:
@@ -196,7 +265,7 @@ class LegParameters:
 
     @cached_property
     def unknown(self) -> IntArray:
-        """The unknown that moves each of the twelve numbers of each leg, -1 for none."""
+        """The unknown that moves each of the numbers of each leg, -1 for none."""
         number = np.append(np.where(self.free, np.cumsum(self.free) - 1, -1), -1)
         return np.asarray(number[self.legs.parametrization.place], dtype=np.intp)
 
@@ -211,7 +280,8 @@ class LegParameters:
     @cached_property
     def turns(self) -> bool:
         """Whether an axis is free, whose angles from nominal are not just added up."""
-        return bool(np.any(self.unknown[:, LegColumns.BASE_AXIS.start : LegColumns.TWIST] >= 0))
+        axes = self.unknown[:, LegColumns.BASE_AXIS.start : LegColumns.TWIST]
+        return bool(np.any(axes >= 0) or np.any(self.unknown[:, LegColumns.OWN :] >= 0))
 
     @cached_property
     def _half_fixed(self) -> dict[int, float]:
@@ -223,6 +293,10 @@ class LegParameters:
                 if is_fixed.sum() == 1:
                     number = int(own[axis][is_fixed][0])
                     found[number] = self.fixed[number]
+            line = slice(LegColumns.OWN, LegColumns.COUNT - 1)
+            is_fixed = (own[line] >= 0) & (unknown[line] < 0)
+            if np.any(unknown[line] >= 0):
+                found |= {int(i): self.fixed[int(i)] for i in own[line][is_fixed]}
         return found
 
     def at_fixed(self, geometry: tuple[Leg, ...]) -> tuple[Leg, ...]:
@@ -230,7 +304,7 @@ class LegParameters:
         return self.tied(with_values(geometry, self.legs, self.fixed))
 
     def retract(self, geometry: tuple[Leg, ...], change: Array) -> tuple[Leg, ...]:
-        """Return legs after a change (n_legs, 12) of their numbers."""
+        """Return legs after a change (n_legs, 17) of their numbers."""
         place = np.arange(change.size, dtype=np.intp).reshape(change.shape)
         return self.tied(moved_legs(geometry, place, change.ravel()))
 
@@ -317,6 +391,13 @@ class LegParameters:
                 for x, column in zip(unknown[columns], by.T, strict=True):
                     if x >= 0:
                         J[:, x] = column[self.free]
+            if leg.actuator is not None and nominal.actuator is not None:
+                slope, own = leg.actuator.numbers_slope(nominal.actuator), number[LegColumns.OWN :]
+                for x, column in zip(unknown[LegColumns.OWN :], slope.T, strict=True):
+                    if x >= 0:
+                        turned = np.zeros(len(self.free))
+                        turned[own[own >= 0]] = column[own >= 0]
+                        J[:, x] = turned[self.free]
         return J
 
 
@@ -348,10 +429,10 @@ def changed_cameras(
     return tuple(changed)
 
 
-def _binding(legs: Sequence[Leg], poses: Frames) -> PoseEquations:
-    """Return the equations that hold without a reading."""
-    rows = pose_equations(legs, *poses)
-    return rows.of(~rows.measured)
+def _binding(legs: Sequence[Leg], poses: Postures) -> tuple[PoseEquations, Array]:
+    """Return what holds whatever was measured, and its derivatives (k, m, 6 + n) by postures."""
+    rows = posture_constraints(legs, *poses, by_local=True)
+    return rows, np.concatenate([rows.by_pose, rows.by_q], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -387,9 +468,10 @@ class LegConstraints:
             "to 5 mm, axes to 3 deg)."
         )
 
-    def with_poses(self, state: State, poses: Frames) -> State:
+    def with_poses(self, state: State, poses: Postures) -> State:
         """Return the state with the poses (n_poses,) that can be projected; others stay."""
         finite: BoolArray = np.isfinite(poses.t + poses.R.sum(axis=2)).all(axis=1)
+        finite &= np.isfinite(poses.q).all(axis=1)
         there, step = self._closed(state.with_chosen(finite, poses))
         return state.with_chosen(finite & (step < _STEP_TOLERANCE), there.platform_pose)
 
@@ -398,32 +480,42 @@ class LegConstraints:
         if not self.binds:
             return state, np.zeros(len(state.platform_pose.t))
         state = replace(state, legs=self.parameters.on_ties(state.legs))
-        found = solve_poses(state.legs, self.legs.frame_legs, *state.platform_pose)
+        frame_legs, (R, t, q) = self.legs.frame_legs, state.platform_pose
+        if self.legs.n_actuators:
+            found, q = solve_postures(state.legs, frame_legs, R, t, q)
+        else:
+            found = solve_poses(state.legs, frame_legs, R, t)
         # The last step to where they hold may be long.
         step = np.where(found.missed < _MET, 0.0, found.size)
-        return replace(state, platform_pose=Frames(found.R, found.t)), step
+        return replace(state, platform_pose=Postures(found.R, found.t, q)), step
+
+    @cached_property
+    def _free(self) -> list[int]:
+        """The numbers of a posture that move."""
+        d = 6 + self.legs.n_actuators
+        return [*freedoms(self.legs.frame_legs), *range(6, d)]
 
     def tangent(self, problem: Problem[State], state: State) -> Tangent | None:
         """Return the motions of poses that the constraints leave; None where all are free."""
         if self.legs.spatial and not self.binds:
             return None
-        free = list(freedoms(self.legs.frame_legs))
+        free, d = self._free, problem.d_element
         n_poses, n_kept = problem.n_elements, problem.n_kept
-        rows = _binding(state.legs, state.platform_pose)
-        Q = np.zeros((n_kept + 1, n_poses, 6))
+        rows, by_posture = _binding(state.legs, state.platform_pose)
+        Q = np.zeros((n_kept + 1, n_poses, d))
         if len(rows.leg) == 0:
-            Z = np.broadcast_to(np.eye(6)[:, free], (n_poses, 6, len(free))).copy()
+            Z = np.broadcast_to(np.eye(d)[:, free], (n_poses, d, len(free))).copy()
             return Tangent(Z, Q[:-1])
-        _, s, vt = np.linalg.svd(rows.by_pose[:, :, free])
+        _, s, vt = np.linalg.svd(by_posture[:, :, free])
         n = s.shape[1]
         binding = s > _RANK * s[:, :1]
         least = int(binding.sum(axis=1).min(initial=n))
         basis = np.swapaxes(vt, -1, -2)[:, :, least:].copy()
         basis[:, :, : n - least] *= ~binding[:, None, least:]
-        Z = np.zeros((n_poses, 6, basis.shape[2]))
+        Z = np.zeros((n_poses, d, basis.shape[2]))
         Z[:, free] = basis
-        inverse = np.zeros((n_poses, 6, len(rows.leg)))
-        inverse[:, free] = np.linalg.pinv(rows.by_pose[:, :, free], rcond=_RANK)
+        inverse = np.zeros((n_poses, d, len(rows.leg)))
+        inverse[:, free] = np.linalg.pinv(by_posture[:, :, free], rcond=_RANK)
         for i, leg in enumerate(rows.leg):
             place = problem.place["legs"][leg]
             by_local = rows.by_local[:, i]
@@ -439,12 +531,12 @@ class LegConstraints:
         return Tangent(Z, Q[:-1], ties)
 
     def following(self, state: State, leg: int, column: int) -> Array:
-        """Return how poses (n_poses, 6) follow one of the numbers of a leg, all else at rest."""
-        free = list(freedoms(self.legs.frame_legs))
-        rows = _binding(state.legs, state.platform_pose)
-        inverse = np.linalg.pinv(rows.by_pose[:, :, free], rcond=_RANK)
+        """Return how postures (n_poses, 6 + n) follow a number of a leg, all else at rest."""
+        free = self._free
+        rows, by_posture = _binding(state.legs, state.platform_pose)
+        inverse = np.linalg.pinv(by_posture[:, :, free], rcond=_RANK)
         by_number = np.where(rows.leg == leg, rows.by_local[:, :, column], 0.0)
-        motion = np.zeros((len(state.platform_pose.t), 6))
+        motion = np.zeros((len(state.platform_pose.t), by_posture.shape[2]))
         motion[:, free] = -np.einsum("kfm,km->kf", inverse, by_number)
         return motion
 
@@ -462,9 +554,8 @@ def start_from(
     *T_Rb_Re* has a pose nearby for each, in the right assembly mode: the nominal forward
     kinematics.
     """
-    q0 = np.array([leg.q0 for leg in geometry])
-    lengths = legs.sign * measurements.q[measurements.first_rows] + q0
-    poses = platform_poses(geometry, lengths, T_Rb_Re, legs.frame_legs)
+    lengthening = legs.sign * measurements.q[measurements.first_rows]
+    poses = platform_poses(geometry, lengthening, T_Rb_Re, legs.frame_legs)
     return Start(tuple(geometry), tuple(T_camera_Rb), poses, label)
 
 
@@ -493,26 +584,26 @@ def cameras_from_hints(
 
 def platform_poses(
     geometry: Sequence[Leg],
-    lengths: Array,
+    lengthening: Array,
     T_Rb_Re: Sequence[RigidTransform],
     frame_legs: Sequence[int],
 ) -> tuple[RigidTransform, ...]:
-    """Return the platform poses at which the legs have given lengths, all at once.
+    """Return the platform poses at which the legs have given readings, all at once.
 
-    Where no pose has these lengths (parameters far from the truth) the pose with the least
+    Where no pose has these (parameters far from the truth) the pose with the least
     squares of the residuals of legs is returned: a fit can still start there.
 
     Parameters
     ----------
     geometry : sequence of Leg
         The legs in R_b and R_e.
-    lengths : (n_poses, n_legs) array
-        Leg lengths [m] of actuated legs; NaN where unknown. Others are ignored.
+    lengthening : (n_poses, n_legs) array
+        s q of actuated legs [m], and q of rods on actuators [m, rad]; NaN where unknown. Others are
+        ignored.
     T_Rb_Re : sequence of RigidTransform
         Poses nearby, in the right assembly mode.
     frame_legs : sequence of int
         The legs that define R_b and R_e.
     """
-    lengthening = lengths - np.array([leg.q0 for leg in geometry])
     found = solve_poses(geometry, frame_legs, *Frames.of(T_Rb_Re), lengthening)
     return Frames(found.R, found.t).motions
