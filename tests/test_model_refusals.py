@@ -510,7 +510,8 @@ class Drawing:
     def write(self, folder: Path, *, block: bool = True, driven: bool = True) -> Path:
         """Write the files, with or without a block legcal, and with motors if they are driven."""
         document: dict[str, object] = {
-            "closed_loop": self.loops, "type": self.kinds, "name_mot": list(self.legs.values()) if driven else [],
+            "closed_loop": self.loops, "type": self.kinds,
+            "name_mot": list(self.legs.values()) if driven else [],
         }  # fmt: skip
         if block:
             document["legcal"] = {
