@@ -141,7 +141,7 @@ class PlainFit:
             self.start.lengths + offsets,
             self.start.radii + radii,
             _moved(*self.start.camera_pose, cameras),
-            _moved(*self.start.platform_pose, poses),
+            _moved(*self.start.platform_pose.frames, poses),
         )
 
 

@@ -11,7 +11,7 @@ from scipy.linalg import null_space
 from legcal.calibration.joint_fit import FitProblem, State
 from legcal.estimation import Linearization, Problem, linearize
 from legcal.geometry import Array
-from legcal.machine import pose_equations
+from legcal.machine import posture_constraints
 
 STEP = 1e-6
 
@@ -70,8 +70,7 @@ def by_differences(
 
 def violations(problem: FitProblem, state: State) -> Array:
     """Return the residuals of joints, constant lengths and the plane at all poses [m or rad]."""
-    rows = pose_equations(state.legs, *state.platform_pose)
-    found = rows.values[:, ~rows.measured].ravel()
+    found = posture_constraints(state.legs, *state.platform_pose).values.ravel()
     if problem.legs.spatial:
         return found
     pose = state.platform_pose

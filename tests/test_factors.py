@@ -428,7 +428,7 @@ def test_poses_go_back_to_their_constraints_the_shortest_way() -> None:
     back = problem.projected(problem.moved(state, x))
     done = x[problem.n_kept :].reshape(-1, 6)
     there, here = back.platform_pose, state.platform_pose
-    left = np.concatenate([_turn(there, here), there.t - here.t], axis=1) - done
+    left = np.concatenate([_turn(there.frames, here.frames), there.t - here.t], axis=1) - done
     # What was taken back is normal to what the constraints leave.
     N = allowed(problem, state)[problem.n_kept :]
     of_poses = N[:, np.abs(N).max(axis=0) > 0.0]

@@ -175,7 +175,7 @@ def test_free_poses_that_the_legs_cannot_follow_stay(tmp_path: Path) -> None:
     state = problem.projected(problem.begin(session.truth))
     t = state.platform_pose.t.copy()
     t[0], t[1, 0], t[2] = np.inf, 1e3, t[2] + 0.01
-    there = LegConstraints(problem.parameters).with_poses(state, Frames(state.platform_pose.R, t))
+    there = LegConstraints(problem.parameters).with_poses(state, state.platform_pose._replace(t=t))
     moved = np.linalg.norm(there.platform_pose.t - state.platform_pose.t, axis=1)
     assert moved[0] == 0.0
     assert moved[2] > 1e-3
