@@ -3,15 +3,19 @@
 import os
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import one_thread  # noqa: F401
 import pytest
+import typer.main
 from hexapod_example import Run, copy_of_the_example
 
 from legcal import calibrate
 from legcal.machine import Machine, loader
 from legcal.machine.files import find_model
+from legcal.machine.formats import read_source
 from legcal.machine.spanning_tree import Source
 
 # Plugins that other packages bring into Hypothesis (trio's, with selenium) warn when they load.
@@ -22,21 +26,44 @@ STAGES = "stages.txt"
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _shipped_models_are_loaded_once() -> Iterator[None]:
-    """Load each shipped model once a process: hundreds of tests start with one."""
-    folder, load = find_model("hexapod").parent, loader._load
+def _commands_and_shipped_models_are_read_once() -> Iterator[None]:
+    """Read the signatures of commands, and each shipped model or copy of one, once a process."""
+    read, load = read_source, loader._load
+    shipped = {path.read_bytes(): path for path in find_model("hexapod").parent.glob("*.yaml")}
+    sources: dict[Path, Source] = {}
     machines: dict[tuple[Path, str, str], Machine] = {}
 
-    def loaded(source: Source) -> Machine:
-        if source.path.parent != folder:
+    def original_of(model: str | Path) -> Source | None:
+        """Return the shipped model that a file is a copy of, if it is, its URDF beside it."""
+        path = Path(model)
+        if path.suffix != ".yaml" or not path.is_file() or path.read_bytes() not in shipped:
+            return None
+        original = shipped[path.read_bytes()]
+        if original not in sources:
+            sources[original] = read(original)
+        source = sources[original]
+        urdf = path.parent / os.path.relpath(source.urdf.path, original.parent)
+        if not urdf.is_file() or urdf.read_bytes() != source.urdf.content:
+            return None
+        return replace(source, path=path, urdf=replace(source.urdf, path=urdf))
+
+    def read_once(model: str | Path) -> Source:
+        return original_of(find_model(model)) or read(model)
+
+    def load_once(source: Source) -> Machine:
+        original = original_of(source.path)
+        if original is None or original.urdf.path != source.urdf.path:
             return load(source)
-        key = (source.path, source.file.model_dump_json(), source.urdf.text)
+        key = (shipped[source.path.read_bytes()], source.file.model_dump_json(), source.urdf.text)
         if key not in machines:
-            machines[key] = load(source)
-        return machines[key]
+            machines[key] = load(replace(sources[key[0]], file=source.file))
+        found = machines[key]
+        return replace(found, yaml_path=source.path, urdf_path=source.urdf.path, urdf=source.urdf)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loader, "_load", loaded)
+        patch.setattr(typer.main, "get_command", cache(typer.main.get_command))
+        patch.setattr(loader, "read_source", read_once)
+        patch.setattr(loader, "_load", load_once)
         yield
 
 

@@ -17,11 +17,16 @@ from legcal.errors import ModelError, NotVisible
     ("words", "heavy", "printed"),
     [
         (["--help"], {"numpy", "scipy", "pinocchio", "pydantic"}, "calibrate"),
-        (["inspect", "hexapod"], {"casadi", "cv2", "trimesh", "yourdfpy", "scipy.stats"}, "SPU"),
-        (
+        pytest.param(
+            *(["inspect", "hexapod"], {"casadi", "cv2", "trimesh", "yourdfpy", "scipy.stats"}),
+            "SPU",
+            marks=pytest.mark.system,
+        ),
+        pytest.param(
             ["export", "hexapod", "--to", "correction", "-o", "missing.csv", "--json"],
             {"casadi", "cv2", "trimesh", "scipy.stats", "jinja2", "plotly", "matplotlib"},
             "needed a result",
+            marks=pytest.mark.system,
         ),
         (
             ["calibrate", "missing", "-o", "out", "--json"],

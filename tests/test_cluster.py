@@ -34,7 +34,9 @@ from legcal.simulation.checkpoint import CHECKPOINT_NAME
 from legcal.workers import Workers, worker_pool
 
 
-@pytest.fixture(scope="module", params=["1", "2", "threads"])
+@pytest.fixture(
+    scope="module", params=["1", pytest.param("2", marks=pytest.mark.system), "threads"]
+)
 def workers(request: pytest.FixtureRequest) -> Iterator[int | Executor]:
     if request.param != "threads":
         yield int(request.param)

@@ -131,8 +131,15 @@ def outlines(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     [
         (_exchanged, "columns leg3_prismatic and leg4_prismatic look exchanged", "legs leg3 and"),
         (_another_zero, "column leg2_prismatic looks as if it had another zero: about 38 mm", ""),
-        (_late_in_one_view, "the readings of view c2 look as if they stood 1 row too late", ""),
-        (_left_handed, "the joints of the model look mirrored", "the outlines look mirrored"),
+        pytest.param(
+            *(_late_in_one_view, "the readings of view c2 look as if they stood 1 row too late"),
+            "",
+            marks=pytest.mark.system,
+        ),
+        pytest.param(
+            *(_left_handed, "the joints of the model look mirrored", "the outlines look mirrored"),
+            marks=pytest.mark.system,
+        ),
         (_thick, "the radii of the legs in the model look twice as large as they are", ""),
     ],
 )

@@ -266,6 +266,7 @@ def test_what_a_process_keeps_others_find_while_there_is_room() -> None:
     assert program.stdout.split() == ["0", "8", "True"]
 
 
+@pytest.mark.system
 def test_processes_do_not_finish_work_that_is_not_wanted_any_more() -> None:
     def stop_after_the_first() -> None:
         with worker_pool(2) as run:
@@ -289,7 +290,10 @@ def test_a_result_on_a_full_disk_is_refused_and_leaves_nothing(tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("words", "stdout"), [("", "> /dev/full"), ("--json", ">&-")])
+@pytest.mark.parametrize(
+    ("words", "stdout"),
+    [("", "> /dev/full"), pytest.param("--json", ">&-", marks=pytest.mark.system)],
+)
 def test_output_that_cannot_be_printed_is_said_on_stderr(words: str, stdout: str) -> None:
     if "/dev" in stdout and not Path("/dev/full").exists():
         pytest.skip("there is no device that is always full")

@@ -88,6 +88,7 @@ def test_a_fleet_that_is_resumed_takes_results_that_are_newer_than_their_dataset
     assert calibrated == ["own", "bad", "own"]
 
 
+@pytest.mark.system
 def test_machines_that_workers_do_not_see_are_sent_and_their_results_sent_back(
     tmp_path: Path, good: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

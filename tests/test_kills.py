@@ -36,6 +36,7 @@ def _faults(kills: list[Kill]) -> list[str]:
     return [f"{kill}: {fault}" for kill in kills for fault in faults_of(kill)]
 
 
+@pytest.mark.system
 def test_a_kill_by_each_signal_leaves_no_half_result() -> None:
     kills = [drawn_kills(6, 0, QUICK)[k] for k in (0, 1, 3)]  # calibrate once: it takes longest
     assert [kill.number for kill in kills] == list(SIGNALS)

@@ -84,12 +84,13 @@ def test_a_study_of_failures_only_says_why() -> None:
         run_study(Draws(fails_above=-np.inf), 5)
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.system)])
 def test_a_mistake_in_a_study_is_no_failed_run(workers: int) -> None:
     with pytest.raises(ZeroDivisionError):
         run_study(Mistaken(), 4, workers=workers)
 
 
+@pytest.mark.system
 def test_a_process_that_is_ended_from_outside_is_told_and_what_was_done_is_kept(
     tmp_path: Path,
 ) -> None:
@@ -252,6 +253,7 @@ def test_numbers_that_make_no_sense_are_refused() -> None:
     run_study(Draws(), 1, workers=10**11)  # more than are of use are not started
 
 
+@pytest.mark.system
 def test_a_full_disk_without_a_folder_promises_nothing_and_warns_of_nothing(
     recwarn: pytest.WarningsRecorder,
 ) -> None:
@@ -314,6 +316,7 @@ def test_a_killed_study_leaves_no_process_and_is_continued(tmp_path: Path) -> No
     assert run_study(Draws(), 400, output=tmp_path).document() == run_study(Draws(), 400).document()
 
 
+@pytest.mark.system
 def test_ctrl_c_stops_all_processes_without_a_word_of_theirs(tmp_path: Path) -> None:
     with _running(tmp_path) as process:
         os.killpg(process.pid, signal.SIGINT)

@@ -41,6 +41,7 @@ class Case:
     input: str = ""
     files: tuple[tuple[str, str], ...] = ()  # written first: name, text
     slow: bool = False
+    system: bool = False  # run by -m system; README.md says why of these and of slow ones
 
     @property
     def is_rough(self) -> bool:
@@ -107,10 +108,8 @@ class Places(Case):
         return {"views": facts(views)}
 
 
-QUICK_CHAINS = {  # why the others are slow is said in README.md
-    *("3-rpr-outlines", "hexapod-outlines", "hexapod-strut-outlines"),
-    *("3-rpr-axes", "3-rps-axes", "3-upu-axes", "tricept-axes"),
-}
+QUICK_CHAINS = {"3-rpr-outlines", "hexapod-outlines", "3-upu-axes"}
+SYSTEM_CHAINS = {"hexapod-strut-outlines", "3-rpr-axes", "3-rps-axes", "tricept-axes"}
 QUICK = "--level outlines --poses 1 --views 1 --seed 3 --json"
 SMALL = (
     "image_width: 200\nimage_height: 150\ncamera_name: tiny\n"
@@ -131,7 +130,9 @@ def _chains() -> Iterable[Case]:
                 Step("inspect {out}/calibrated.yaml --json"),
             )
             name = f"{machine}-{level}"
-            yield Chain(name, steps, input=name, slow=name not in QUICK_CHAINS)
+            system = name in SYSTEM_CHAINS
+            slow = not system and name not in QUICK_CHAINS
+            yield Chain(name, steps, input=name, slow=slow, system=system)
 
 
 def _models() -> Iterable[Case]:
@@ -221,14 +222,22 @@ def _identify() -> Iterable[Case]:
 
 
 def _calibrate() -> Iterable[Case]:
-    def case(name: str, words: str, given: str = "3-rpr-outlines", slow: bool = False) -> Case:
+    def case(
+        name: str,
+        words: str,
+        given: str = "3-rpr-outlines",
+        slow: bool = False,
+        system: bool = False,
+    ) -> Case:
         command = f"calibrate {{in}} -o {{out}} {words} --json"
-        return Case(f"calibrate-{name}", (Step(command, folder="{out}"),), given, slow=slow)
+        return Case(
+            f"calibrate-{name}", (Step(command, folder="{out}"),), given, slow=slow, system=system
+        )
 
     yield case("literal", "--criteria literal")
     yield case("literal-hexapod", "--criteria literal", "hexapod-axes", slow=True)
-    yield case("points", "--criteria literal --transformation points")
-    yield case("cross-product", "--criteria default --transformation cross_product")
+    yield case("points", "--criteria literal --transformation points", system=True)
+    yield case("cross-product", "--criteria default --transformation cross_product", system=True)
     prior = "--prior leg1.offset=231+-0.5mm --prior '*.radius.leg2_rod=8±0.1mm'"
     yield case("by-name", f"{prior} --fix leg2.offset --fix leg3.offset=0.23075 --free 'c1.f?'")
     yield case("contradicted", "--fix 'leg2.base.*'", "hexapod-outlines")
@@ -308,6 +317,7 @@ def _images() -> Iterable[Case]:
             Step(f"{camera} --output {{out}} --model equidistant --picture {{here}}/field.png"),
         ),
         input="boards",
+        system=True,
     )
     yield Case(
         "board",
@@ -409,7 +419,8 @@ def _studies() -> Iterable[Case]:
     ):
         runs = "1" if name == "paper" else "2"
         command = f"study {name} --runs {runs} --seed 5 --workers 1 {words} --output {{out}} --json"
-        yield Case(f"study-{name}", (Step(command, folder=folder),), slow=name != "classes")
+        system = name == "classes"
+        yield Case(f"study-{name}", (Step(command, folder=folder),), slow=not system, system=system)
     resumed = f"study convergence --runs {{}} --seed 5 --workers 2 {machine} -o {{{{out}}}} --json"
     yield Case(
         "study-resumed",

@@ -44,7 +44,8 @@ def _inputs() -> Iterator[None]:
 
 
 def _marked(case: Case) -> Any:
-    return pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.slow else [])
+    marks = [pytest.mark.slow] * case.slow + [pytest.mark.system] * case.system
+    return pytest.param(case, id=case.name, marks=marks)
 
 
 @pytest.mark.parametrize("case", [_marked(case) for case in CASES])

@@ -19,21 +19,18 @@ DETECT = "detect {in} -o {out}"
 CALIBRATE = "calibrate {in} -o {out}"
 
 
-def harmful_files(*, largest: bool) -> Iterator[tuple[str, Case, str]]:
-    """Yield a name, the file, and a word of the refusal.
-
-    The largest are as large as is read: each takes seconds. Others say the same of smaller ones.
-    """
-    for name, text, word in _yaml(*((1_900_000, 900_000) if largest else (400_000, 110_000))):
+def harmful_files() -> Iterator[tuple[str, Case, str]]:
+    """Yield a name, the file, and a word of the refusal; some are as large as is read."""
+    for name, text, word in _yaml(1_900_000, 900_000):
         for file in ("small:dataset.yaml", "small:camera_info.yaml")[: 1 + (len(text) < 10_000)]:
             yield f"{name} as {file}", Case(_NAMED[file], made=text), word
     for name, file, made, word in (
         *_names(),
-        *_tables(40_000 if largest else 4_000),
+        *_tables(40_000),
         *_outlines(),
         *_results(),
-        *_models(*((900, 199) if largest else (300, 99))),
-        *_images(10_000 if largest else 3_000),
+        *_models(900, 199),
+        *_images(10_000),
     ):
         yield f"{name} as {file}", Case(_NAMED[file], made=made), word
 
