@@ -264,6 +264,8 @@ def _in_frames_of_joints(legs: Sequence[Leg], frame_legs: Sequence[int]) -> tupl
     base = frame_on_points(np.array([leg.A for leg in legs])[frames]).inv()
     platform = frame_on_points(np.array([leg.B for leg in legs])[frames]).inv()
 
+    turn_base, turn_platform = base.rotation, platform.rotation
+
     def turned(T: Rotation, axis: Array | None) -> Array | None:
         return None if axis is None else T.apply(axis)
 
@@ -272,9 +274,9 @@ def _in_frames_of_joints(legs: Sequence[Leg], frame_legs: Sequence[int]) -> tupl
             leg,
             A=base.apply(leg.A),
             B=platform.apply(leg.B),
-            base_axis=turned(base.rotation, leg.base_axis),
-            platform_axis=turned(platform.rotation, leg.platform_axis),
-            twist=twist_after(leg, platform.rotation),
+            base_axis=turned(turn_base, leg.base_axis),
+            platform_axis=turned(turn_platform, leg.platform_axis),
+            twist=twist_after(leg, turn_platform),
         )
         for leg in legs
     )

@@ -120,7 +120,7 @@ class OrderedDataset:
     def T_base_platform(self) -> list[RigidTransform]:
         """The same between the links."""
         back = self.machine.T_platform_Re.inv()
-        return [self.machine.T_base_Rb * T * back for T in self.T_Rb_Re]
+        return [product(self.machine.T_base_Rb, T, back) for T in self.T_Rb_Re]
 
     def unreached_notes(self) -> list[str]:
         """Return a note on the poses that the nominal model does not reach, if there are any."""

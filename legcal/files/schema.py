@@ -32,7 +32,7 @@ _MAX_WHOLE = 10**308  # whole numbers of files have any length; floats end here
 _MOST_NAMES = 10  # that a hint lists
 _LONGEST_WORD = 100  # for which one that is like it is looked for
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
-_PLAIN_TEXT = re.compile(rb"[\w\n .,:;#'\"/()+\[\]{}-]*")  # of which all parsers think the same
+_PLAIN_TEXT = re.compile(rb"[\w\n .,:;#'\"/()+\[\]{}$=-]*")  # of which all parsers think the same
 
 _NEEDED = {
     "float_type": "a number",

@@ -6,6 +6,8 @@ from scipy.spatial.transform import Rotation
 from legcal.geometry.lines import cross, normal_basis
 from legcal.geometry.types import Array
 
+_HALF_MORE = 1.5 * np.eye(3)
+
 
 def cross_matrices(v: Array) -> Array:
     """Return the matrices (..., 3, 3) of w -> v x w."""
@@ -39,7 +41,7 @@ def turned(R: Array, w: Array) -> Array:
 
 def orthogonal(R: Array) -> Array:
     """Return rotation matrices (..., 3, 3) without the rounding that made them less than that."""
-    return np.asarray(R @ (1.5 * np.eye(3) - 0.5 * (np.swapaxes(R, -1, -2) @ R)))
+    return np.asarray(R @ (_HALF_MORE - 0.5 * (np.swapaxes(R, -1, -2) @ R)))
 
 
 def nearest_rotation(matrix: Array) -> Array:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -155,6 +156,7 @@ def free_coordinates(n_legs: int, frame_legs: Sequence[int]) -> BoolArray:
     return free
 
 
+@lru_cache(maxsize=8)  # a job asks dozens of times about one or two machines
 def geometries(machine: Machine) -> tuple[Leg, ...]:
     """Return the legs of a mechanism in its joint frames: A and axes in R_b, B and axes in R_e."""
     parameters = machine.parameters

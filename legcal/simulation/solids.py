@@ -502,8 +502,9 @@ def _caster(posed: PosedMachine) -> Any:
     return RayMeshIntersector(trimesh.Trimesh(posed.vertices, posed.faces, process=False))
 
 
+@lru_cache(maxsize=256)  # links share shapes, and each camera looks at all
 def triangles(shape: Shape) -> Any:
-    """Return a shape as triangles."""
+    """Return a shape as triangles, which nobody may change."""
     import trimesh
 
     if isinstance(shape, SolidCylinder):

@@ -117,7 +117,7 @@ class Camera:
     # What the files of the photographs said that it was calibrated from, where that is recorded
     photographs: Mapping[str, Sequence[Any]] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def has_distortion(self) -> bool:
         """Whether any distortion coefficient differs from zero."""
         return bool(np.any(self.distortion != 0.0)) or DISTORTION_MODELS[self.model].is_fisheye
@@ -185,8 +185,8 @@ class Camera:
         if not self.has_distortion:
             return np.broadcast_to(self.K[:2, :2], (*xy.shape[:-1], 2, 2)).copy()
         steps = _STEP * np.eye(2)
-        columns = [(self.distort(xy + s) - self.distort(xy - s)) / (2.0 * _STEP) for s in steps]
-        return np.stack(columns, axis=-1)
+        around = self.distort(np.stack([xy + sign * step for sign in (1, -1) for step in steps]))
+        return np.stack(list((around[:2] - around[2:]) / (2.0 * _STEP)), axis=-1)
 
     def line_offset(
         self,
