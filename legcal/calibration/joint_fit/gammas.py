@@ -20,6 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from legcal.calibration.joint_fit.outline_errors import GAMMA_SIGMA
+from legcal.calibration.joint_fit.rounds import with_edge_biases
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.data import Outlines, few_views
 from legcal.estimation import minimise, restricted_log_likelihood
@@ -179,8 +180,8 @@ def _in_order(log_gamma: Array, merit: Array) -> tuple[Array, Array, int]:
 def log_likelihoods(solutions: Sequence[Solution], cameras: Sequence[Views]) -> Array:
     """Return logarithms of the restricted likelihood (n_solutions, n_cameras) of the same outlines.
 
-    Of all that are used in all solutions, as noise and biases of each have them. Every camera has
-    its outlines, and of what they have in common its part.
+    Of all that are used in all solutions, with noise and biases as they are most likely for each.
+    Every camera has its outlines, and of what they have in common its part.
     """
     same = set.intersection(*(solution.outlines.used_keys() for solution in solutions))
     found = np.zeros((len(solutions), len(cameras)))
@@ -188,8 +189,9 @@ def log_likelihoods(solutions: Sequence[Solution], cameras: Sequence[Views]) -> 
         fit, of = solution.posterior, solution.outlines.row_keys()
         o = fit.problem.outlines
         kept = np.array([of[k] in same for k in o.index.tolist()], dtype=np.bool_)
-        problem = fit.problem.weighted(fit.noise, kept)
-        minimum = minimise(problem, fit.state, is_near=True)
+        problem, state = with_edge_biases(fit.problem, fit.state, fit.edge_biases.likeliest)
+        problem = problem.weighted(fit.noise, kept)
+        minimum = minimise(problem, state, is_near=True)
         norms = minimum.linear["outlines"].squared_norms
         widths = np.linalg.slogdet(fit.noise.covariance(o.covariance))[1]
         own = -0.5 * (norms + widths) * kept

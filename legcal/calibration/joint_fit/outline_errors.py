@@ -306,6 +306,7 @@ class EdgeBiases:
     index: IntArray  # (n, c) which of them each outline has a part in
     shift: Array  # (n, c, 2) how one unit of each moves both ends along the line's normal [px]
     shown: Array | None = None  # (n_kinds,) variances that residuals show by themselves
+    likeliest_sigma: Array | None = None  # (N_KINDS,) where those above are expected ones
     parts: dict[bytes, EdgeBiases] = field(default_factory=dict, repr=False)  # chosen before
 
     @property
@@ -317,6 +318,11 @@ class EdgeBiases:
     def are_shown(self) -> bool:
         """Whether the residuals show any."""
         return self.shown is not None and bool(self.shown.any())
+
+    @property
+    def likeliest(self) -> EdgeBiases:
+        """Those with the standard deviations that are most likely."""
+        return self if self.likeliest_sigma is None else self.of_sizes(self.likeliest_sigma)
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -436,7 +442,8 @@ def expected_biases(
     """
     kinds = range(len(KINDS))
     found = expected_variances(Effects(z, K, possible.kind), biases.sigma**2, kinds)
-    return replace(possible.of_sizes(np.maximum(np.sqrt(found), least)), shown=biases.shown)
+    expected = possible.of_sizes(np.maximum(np.sqrt(found), least))
+    return replace(expected, shown=biases.shown, likeliest_sigma=biases.sigma)
 
 
 def notes_on_blur(biases: EdgeBiases, claimed: Array) -> tuple[str, ...]:
