@@ -116,7 +116,7 @@ def feasible_poses(
         raise DidNotConverge(
             f"{machine.yaml_path}: {n_poses} poses could not be drawn: found {len(found)} that "
             f"the machine reaches in {obstacles.total() + len(found)} draws, others excluded "
-            f"{what}, needed all; {_REMEDIES[main]}, or give poses."
+            f"{what}, needed all; {_REMEDIES[main]}."
         )
     return poses_at(machine, found)
 

@@ -134,9 +134,9 @@ def exchange(
     found.value = float(criterion(session.machine[None])[0])
     for turn in range(_MAX_PASSES):
         before = found.value
-        if stop():
-            break
         for i, (slot, image) in enumerate(list(found.images)):
+            if stop():
+                break
             others = [pair for k, pair in enumerate(found.images) if k != i]
             count = [sum(s == other for s, _ in others) for other in range(len(session.slots))]
             open_slots = [s for s in range(len(count)) if count[s] < most]

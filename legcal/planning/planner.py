@@ -230,11 +230,15 @@ def plan_session(
     notes = []
     for turn in range(ROUNDS):
         if stop():
-            notes.append("The search was stopped: this is the best plan that it had found.")
             break
-        current = _better_places(scene, current, given, criterion, rng, 0.5**turn, middle)
-        current, value = _better_poses(scene, current, given, criterion, rng, 0.5**turn, least, run)
+        step = 0.5**turn
+        current = _better_places(scene, current, given, criterion, rng, step, middle, stop)
+        current, value = _better_poses(
+            scene, current, given, criterion, rng, step, least, run, stop
+        )
         progress("Polishing", turn + 1, ROUNDS)
+    if stop():
+        notes.append("The search was stopped: this is the best plan that it had found.")
     return _judged(scene, current, given, criterion, work, value, notes, progress, run)
 
 
@@ -397,6 +401,7 @@ def _better_places(
     rng: np.random.Generator,
     step: float,
     target: Array,
+    stop: Callable[[], bool],
 ) -> list[Candidates]:
     """Return the same poses seen from places nearby, where that is better."""
     task, up = scene.task, scene.task.machine.upward
@@ -404,6 +409,8 @@ def _better_places(
     value = float(criterion(_with_all(known, given).machine[None])[0])
     for v, own in enumerate(current):
         for _ in range(0 if own.place.fixed else N_NEAR_PLACES):
+            if stop():
+                break
             place = near(current[v].place, target, up, PLACE_STEP * step, rng)
             trial = replace(own, place=place)
             found = scene.of(trial) if place.is_inside(task.bounds) else None
@@ -425,24 +432,22 @@ def _better_poses(
     step: float,
     least: int,
     run: Run,
+    stop: Callable[[], bool],
 ) -> tuple[list[Candidates], float]:
     """Return places and poses after exchanges with poses nearby, and the criterion."""
-    task = scene.task
-    widened = [
-        replace(
-            own,
-            poses=poses_near(
-                task.machine, task.predictor.legs, task.setting, own.poses, POSE_STEP * step, rng
-            ),
-        )
-        for own in current
-    ]
+    task, far = scene.task, POSE_STEP * step
+    widened = []
+    for own in current:
+        poses = own.poses
+        if not stop():
+            poses = poses_near(task.machine, task.predictor.legs, task.setting, poses, far, rng)
+        widened.append(replace(own, poses=poses))
     session = Session(_required(scene, widened, run), given)
     images = [(v, k) for v, own in enumerate(current) for k in range(len(own.poses.poses))]
     for slot, image in images:
         session.changed(slot, image, 1.0)
     session.renewed()
-    better = exchange(session, Chosen(images), criterion, rng, least, len(images))
+    better = exchange(session, Chosen(images), criterion, rng, least, len(images), stop=stop)
     return _of_images(widened, better), better.value
 
 
