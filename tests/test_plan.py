@@ -349,6 +349,12 @@ def test_what_else_is_in_the_way_is_refused(
             places=places(tmp_path))  # fmt: skip
     refused(NotIdentifiable, "plan .* --images or more", images=1, places=places(tmp_path))
     refused(DatasetError, "needed images of 3-rps", model="3-rps", given=shot / "session")
+    upright, tilted = map(load_mechanism, ("3-upu", "3-upu-tilted"))
+    assert (
+        planning.difference(upright, tilted)
+        == "axes of joints up to 15 deg from those of the model"
+    )
+    assert not planning.difference(tilted, tilted)
     with pytest.raises(UsageError, match="--force"):
         planning.write_session(planned, shot / "session")
     for text in ("1m", "0m:1m,0m:1m,1m:0m", "0m:1m,0m:1m,0m:1kg"):

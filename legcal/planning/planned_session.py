@@ -98,11 +98,12 @@ class Plan:
         """What is expected, in words."""
         if self.error is None:
             return "The error of the platform is not predicted: readings do not give its pose."
+        most = f", at most {1e3 * self.error.max_displacement:.3f} mm" * (self.goal is Goal.WORST)
         return (
             f"Expected of {self.n_images} photographs: predicted error "
             f"{1e3 * self.error.mean_displacement:.3f} mm / "
-            f"{np.degrees(self.error.mean_rotation):.4f} deg (1 sigma) over the workspace, the "
-            f"mean of {self.setting.draws} sessions with tripods up to "
+            f"{np.degrees(self.error.mean_rotation):.4f} deg (1 sigma) over the workspace{most}, "
+            f"the mean of {self.setting.draws} sessions with tripods up to "
             f"{1e2 * self.setting.shift:g} cm and {np.degrees(self.setting.turn):g} deg off and "
             f"the machine {1e3 * self.setting.length:g} mm."
         )

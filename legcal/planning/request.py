@@ -34,6 +34,7 @@ SIGMA_Q = 2e-6  # [m] of a reading, where nobody says
 IMAGES_PER_VIEW = 15
 MOST_IMAGES, MOST_VIEWS = 400, 12
 SAME_MACHINE = 0.01  # [m] between joints of the model and of a dataset that was shot of it
+SAME_AXES = 5.0  # [deg] the same between their axes
 _ROUNDS = 5  # plans, until the fewest images are found that reach a target
 _BEGIN = 24  # images of the first of them
 _NEARLY = 0.9  # of the images of a plan that reaches it: another with so many is tried
@@ -323,20 +324,36 @@ def _shot(folder: Path) -> Dataset:
     return load_dataset(folder, check_images=False)
 
 
+def difference(machine: Machine, other: Machine) -> str:
+    """Return in words by what another model is of another machine; nothing if it may be the same.
+
+    Models before and after a calibration are of the same machine.
+    """
+    kinds = [
+        [(leg.base_joint, leg.kind, leg.platform_joint) for leg in one.legs]
+        for one in (machine, other)
+    ]
+    if other.leg_names != machine.leg_names or kinds[0] != kinds[1]:
+        return f"other legs ({other.name})"
+    both = list(zip(machine.legs, other.legs, strict=True))
+    off = max(max(np.abs(a.A - b.A).max(), np.abs(a.B - b.B).max()) for a, b in both)
+    if off > SAME_MACHINE:
+        return f"joints up to {1e3 * off:.0f} mm from those of the model"
+    aligned = [
+        abs(float(x @ y))
+        for a, b in both
+        for x, y in ((a.base_axis, b.base_axis), (a.platform_axis, b.platform_axis))
+        if x is not None and y is not None
+    ]
+    turned = float(np.degrees(np.arccos(min([*aligned, 1.0]))))
+    if turned > SAME_AXES:
+        return f"axes of joints up to {turned:.0f} deg from those of the model"
+    return ""
+
+
 def _given(machine: Machine, shot: Dataset) -> tuple[Candidates, ...]:
     """Return views and poses of a dataset. Raises DatasetError if it is of another machine."""
-    m, other, found = shot.measurements, shot.machine, ""
-    both = other, machine
-    kinds = [[(leg.base_joint, leg.kind, leg.platform_joint) for leg in one.legs] for one in both]
-    if other.leg_names != machine.leg_names or kinds[0] != kinds[1]:
-        found = f"other legs ({other.name})"
-    else:
-        off = max(
-            float(np.abs(other.A_base - machine.A_base).max()),
-            float(np.abs(other.B_platform - machine.B_platform).max()),
-        )
-        if off > SAME_MACHINE:
-            found = f"joints up to {1e3 * off:.0f} mm from those of the model"
+    m, found = shot.measurements, difference(machine, shot.machine)
     if found:
         raise DatasetError(
             f"{shot.folder}: the dataset could not be planned with: found {found}, needed images "

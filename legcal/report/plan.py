@@ -31,8 +31,8 @@ _WORST = 12  # parameters that are told
 _PANEL = (6.0, 5.6)  # [inch]
 
 
-def plan_table(plan: Plan, output: Path) -> RenderableType:
-    """Return what a plan is, and what is expected of it."""
+def plan_table(plan: Plan, output: Path | None) -> RenderableType:
+    """Return what a plan is, what is expected of it, and where it is written, if that is told."""
     names = plan.machine.leg_names
     views = [
         (
@@ -66,9 +66,15 @@ def plan_table(plan: Plan, output: Path) -> RenderableType:
             title="Distances to measure, from the middle of the lens to joints of the base",
         ),
         table("parameter", ">sigma", "unit", rows=parameters, title="Known worst"),
-        table(">images", ">expected", rows=growth, title="With other numbers of images"),
+        table(
+            ">images", f">expected, {plan.goal.value}", rows=growth,
+            title="With other numbers of images",
+        ),
         [plan.sentence, *map(printable, plan.notes)],
-        [printable(f"written: {output}"), printable(f"calibrate with: legcal calibrate {output}")],
+        [] if output is None else [
+            printable(f"written: {output}"),
+            printable(f"calibrate with: legcal calibrate {output} -o OUT"),
+        ],
     )  # fmt: skip
 
 
@@ -181,7 +187,7 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
         Row(images),
         Items(checklist(plan), ordered=True, title="Checklist"),
     ]
-    text = plan_table(plan, Path("."))
+    text = plan_table(plan, None)
     page = text_page(
         f"Plan of a session: {plan.machine.name}", text, blocks=blocks, command=command
     )
@@ -254,6 +260,8 @@ def _draw_growth(plan: Plan) -> Figure:
     known = np.isfinite(plan.growth[:, 1]) & (plan.growth[:, 0] >= min(6, plan.n_images))
     scale, unit = _scaled(plan, 1.0)
     what = f"expected, {plan.goal.value}" if unit == "mm" else f"criterion: {plan.goal.value}"
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     with new_figure(1, 1, _PANEL) as (figure, (ax,)):
         for chosen, style, label in (
             (known & planned, "-o", "planned"),
@@ -265,6 +273,10 @@ def _draw_growth(plan: Plan) -> Figure:
         ):
             n, value = plan.growth[chosen].T
             ax.loglog(n, scale * value, style, markersize=3.0, label=label)
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter(NullFormatter())
         ax.set_xlabel("images")
         ax.set_ylabel(f"{what} [{unit}]")
         ax.grid(which="both", alpha=0.2)

@@ -14,7 +14,7 @@ from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
 from legcal.files import MotionEntry, read_json
 from legcal.geometry import Array
 from legcal.machine import Configurations, Machine, follow_each, poses_at
-from legcal.planning import Setting
+from legcal.planning import Setting, difference
 from legcal.simulation.board import PlacedBoard
 from legcal.simulation.cameras import MAX_HAND_DRAWS
 from legcal.simulation.solids import PosedMachine
@@ -98,12 +98,10 @@ def read_plan(folder: Path, nominal: Machine) -> PlannedSession:
             "the folder that legcal plan wrote; correct --plan."
         ) from error
     dataset = load_dataset(folder, check_images=False)
-    if dataset.machine.leg_names != nominal.leg_names or not np.allclose(
-        dataset.machine.A_base, nominal.A_base
-    ):
+    if other := difference(nominal, dataset.machine):
         raise UsageError(
-            f"{folder}: the plan could not be shot: found that it is of another machine "
-            f"({dataset.machine.name}), needed one of {nominal.name}; correct MODEL or --plan."
+            f"{folder}: the plan could not be shot: found {other}, needed a plan of "
+            f"{nominal.name}; correct MODEL or --plan."
         )
     if not nominal.is_determined:
         raise UsageError(
