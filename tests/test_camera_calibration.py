@@ -19,6 +19,7 @@ from camera_sessions import (
     seen_corners,
     together,
 )
+from thinned import thinned
 
 from legcal import calibrate_camera
 from legcal.calibration import CameraCalibration
@@ -178,11 +179,15 @@ def rolled(seen: BoardImages) -> BoardImages:
 
 @pytest.mark.parametrize(
     ("others", "why"),
-    [
-        (seen_corners(ZOOMED, 5, 8, sheet=SHEET), "focal length about 4 % longer"),
-        (seen_corners(TRUTH, 5, 8, sheet=SHEET + np.array([4e-3, 0, 0, 0])), "bent otherwise"),
-        (rolled(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "moved while its rows were read out"),
-    ],
+    thinned(
+        [
+            (seen_corners(ZOOMED, 5, 8, sheet=SHEET), "focal length about 4 % longer"),
+            (seen_corners(TRUTH, 5, 8, sheet=SHEET + np.array([4e-3, 0, 0, 0])), "bent otherwise"),
+            (rolled(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "moved while its rows were read out"),
+        ],
+        lambda others, why: why.startswith("moved"),
+        "system",
+    ),
 )
 def test_a_third_of_the_images_wrong_alike_is_named_and_moves_nothing(
     others: BoardImages, why: str

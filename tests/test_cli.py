@@ -165,7 +165,7 @@ def test_help_names_the_unit_of_the_tool_position(
 def test_progress_is_shown_unless_somebody_wants_quiet(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["simulate", "3-rpr", "--level", "axes", "--poses", "5"]
+    words = ["simulate", "3-rpr", "--level", "axes", "--poses", "4", "--views", "1"]
     assert run(monkeypatch, *words, "-o", tmp_path / "shown") == 0
     shown = capsys.readouterr()
     assert run(monkeypatch, *words, "-o", tmp_path / "quiet", "--quiet") == 0

@@ -85,7 +85,7 @@ def with_pose(folder: Path, machine: Machine, last: Any) -> Path:
             ([20, -10, 0], 65),
             marks=pytest.mark.slow,
         ),
-        (LINE, SHORT_LINE, ([20, 330, 0], 10)),
+        pytest.param(LINE, SHORT_LINE, ([20, 330, 0], 10), marks=pytest.mark.system),
     ],
     ids=["base", "platform", "both"],
 )
@@ -104,6 +104,7 @@ def test_collinear_joints_of_a_3_rpr_are_found(
     assert before > 10.0 * after
 
 
+@pytest.mark.system
 def test_a_reading_that_the_nominal_model_does_not_reach_is_used_and_told(tmp_path: Path) -> None:
     """Legs that are all 6 mm shorter in the model than on the machine, which nearly meet there."""
     model = legcal.load_mechanism("3-rpr")

@@ -199,6 +199,7 @@ def _of_few_poses(d: Dataset) -> Dataset:
     return dataset_at(d, np.flatnonzero(d.measurements.pose % 10 < 7))
 
 
+@pytest.mark.system
 def test_mirrored_outlines_of_one_view_lose_to_no_mistake_of_all_views(
     of_symmetric_machine: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -123,6 +123,7 @@ def test_what_photographs_say_of_camera_and_compression_is_told(tmp_path: Path) 
     assert found.is_usable
 
 
+@pytest.mark.system
 def test_blurred_and_bright_views_are_named(tmp_path: Path) -> None:
     session = made(tmp_path)
     for k in range(2):

@@ -25,6 +25,7 @@ from layouts import Layout, write_machine
 from lxml import etree
 from machines import planar
 from scipy.spatial.transform import RigidTransform, Rotation
+from thinned import thinned
 
 import legcal
 from legcal import load_mechanism
@@ -89,7 +90,7 @@ def module_at(path: Path) -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("name", KINEMATICS)
+@pytest.mark.parametrize("name", thinned(KINEMATICS, ["3-rpr", "3-upu", "tricept"], "system"))
 def test_kinematics_in_python_are_those_of_the_model(
     name: str, calibrated: Callable[[str], Subject], tmp_path: Path
 ) -> None:
@@ -334,7 +335,7 @@ def test_genhexkins_has_the_readings_of_the_model(
         assert (joints >= limits).all()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", thinned(NAMES, ["3-rpr", "3-upu"], "system"))
 def test_corrected_commands_bring_the_machine_where_it_should_be(
     name: str, calibrated: Callable[[str], Subject], tmp_path: Path
 ) -> None:

@@ -152,6 +152,7 @@ def test_a_signal_that_was_ignored_stays_so(name: str) -> None:
         assert signal.getsignal(number) is signal.SIG_IGN
 
 
+@pytest.mark.system
 def test_processes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     script = tmp_path / "pool.py"
     script.write_text(POOL)
@@ -179,6 +180,7 @@ def test_a_process_that_is_ended_from_outside_is_said_in_one_sentence() -> None:
         list(run(os._exit, [1, 1]))
 
 
+@pytest.mark.system
 def test_a_pool_that_is_left_in_the_middle_of_its_work_ends_at_once() -> None:
     with suppress(KeyboardInterrupt), worker_pool(2) as run:
         results = iter(run(time.sleep, 40 * [0.0] + 200 * [1.0]))

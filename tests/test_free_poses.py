@@ -230,6 +230,7 @@ def test_poses_are_found_near_rough_cameras(n_motors: int, tmp_path: Path) -> No
     assert min(off_at_home) > 40.0
 
 
+@pytest.mark.system
 def test_poses_between_which_few_lines_leave_a_choice_are_found_by_the_fit(tmp_path: Path) -> None:
     """Four legs and three readings an image allow several poses."""
     path = write_machine(tmp_path, drawn("3-SPS + passive UPS"), Layout())

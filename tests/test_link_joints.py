@@ -171,6 +171,7 @@ def test_what_may_have_moved_counts_along_the_links(model: str) -> None:
             assert set(change.links) == {getattr(machine, side)}
 
 
+@pytest.mark.system
 def test_a_joint_that_was_moved_is_reported_in_its_link(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -350,7 +350,7 @@ def test_what_a_fit_starts_from_is_as_wrong_as_is_said(errors: StartErrors, leas
         assert np.max(found) <= most * size * (1.0 + 1e-9)
 
 
-@pytest.mark.parametrize("machine", ["6-spu-noncoplanar", "3-upu-tilted"])
+@pytest.mark.parametrize("machine", ["6-spu-coplanar", "3-upu-tilted"])
 def test_the_start_is_the_nominal_model_at_the_readings(machine: str) -> None:
     design, session = _design(machine), _session(machine)
     nominal = session.legs.nominal

@@ -15,7 +15,6 @@ from outline_sessions import made
 from parameter_steps import written_with
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings
-from thinned import thinned
 
 import legcal
 from legcal.calibration.joint_fit.platform import platform_by_parameters
@@ -156,7 +155,12 @@ def test_poses_are_those_of_least_squares(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", thinned(["7-UPS", "4-RPR", "2-RPS + 2-SPS + rod"], ["4-RPR", "2-RPS + 2-SPS + rod"])
+    "name",
+    [
+        pytest.param("7-UPS", marks=pytest.mark.slow),
+        "4-RPR",
+        pytest.param("2-RPS + 2-SPS + rod", marks=pytest.mark.system),
+    ],
 )
 def test_predicted_errors_are_those_of_written_models(name: str, tmp_path: Path) -> None:
     machine = machine_of(name)

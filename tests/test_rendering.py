@@ -1,6 +1,7 @@
 """Photographs: exact outlines, light as it falls, every mechanism, the same bits every time."""
 
 import math
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -125,8 +126,12 @@ def clean(placed: list[PlacedSolid], **changes: Any) -> Array:
     return np.asarray(image / (2.0**looks.bits - 1.0))
 
 
-@pytest.mark.parametrize("lens", LENSES)
-@pytest.mark.parametrize("radius", [0.02, 0.12])
+@pytest.mark.parametrize(
+    ("lens", "radius"),
+    thinned(
+        product(LENSES, [0.02, 0.12]), [("pinhole", 0.02), ("barrel", 0.02), ("fisheye", 0.12)]
+    ),
+)
 def test_outlines_are_where_the_tangent_planes_are(lens: str, radius: float) -> None:
     camera = LENSES[lens]
     worst = []

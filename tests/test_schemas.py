@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ SHIPPED = [
 HEADER = re.compile(r"# yaml-language-server: \$schema=(\.schemas/([\w-]+)\.json)\n")
 
 
+@cache
 def _validator(name: str) -> Any:
     schema = json.loads((FOLDER / f"{name}.json").read_text())
     jsonschema.Draft202012Validator.check_schema(schema)

@@ -154,14 +154,24 @@ def test_photographs_are_those_of_the_kind_of_camera_and_its_file(tmp_path: Path
     assert (grey.camera, grey.jpeg, grey.colour) == ("phone", None, False)
 
 
-def test_photographs_do_not_depend_on_the_number_of_processes(tmp_path: Path) -> None:
+def _few_photographs(folder: Path, workers: int) -> SimulatedDataset:
+    """Photograph one pose twice."""
     look = legcal.Appearance(gamma=1.8, clutter=0, samples=13)
     few = settings(
-        level=Level.PHOTOGRAPHS, poses=1, views=1, images=2, camera=small_camera(tmp_path),
+        level=Level.PHOTOGRAPHS, poses=1, views=1, images=2, camera=small_camera(folder),
         appearance=look,
     )  # fmt: skip
-    one, two = (simulate("3-rps", tmp_path / str(n), few, workers=n) for n in (1, 2))
-    assert files_of(one.folder) == files_of(two.folder)
+    return simulate("3-rps", folder / str(workers), few, workers=workers)
+
+
+@pytest.mark.system
+def test_photographs_do_not_depend_on_the_number_of_processes(tmp_path: Path) -> None:
+    one, two = (files_of(_few_photographs(tmp_path, n).folder) for n in (1, 2))
+    assert one == two
+
+
+def test_repeated_photographs_differ_and_what_to_do_with_them_is_said(tmp_path: Path) -> None:
+    one = _few_photographs(tmp_path, 1)
     images = [x for name, x in files_of(one.folder).items() if name.endswith(".png")]
     assert len(set(images)) == 2  # repeated images differ by the noise of the sensor
     (view,) = load_dataset(one.folder).measurements.views

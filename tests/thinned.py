@@ -6,8 +6,10 @@ from typing import Any
 import pytest
 
 
-def thinned(values: Iterable[Any], usual: Callable[..., bool] | Iterable[Any]) -> list[Any]:
-    """Return parameters with those marked slow that are not among the usual ones.
+def thinned(
+    values: Iterable[Any], usual: Callable[..., bool] | Iterable[Any], mark: str = "slow"
+) -> list[Any]:
+    """Return parameters with those marked slow, or system, that are not among the usual ones.
 
     Tuples are the parameters of several names; *usual* may be a question that takes them.
     """
@@ -15,7 +17,7 @@ def thinned(values: Iterable[Any], usual: Callable[..., bool] | Iterable[Any]) -
     found = []
     for value in values:
         several = value if isinstance(value, tuple) else (value,)
-        marks = () if kept(*several) else (pytest.mark.slow,)
+        marks = () if kept(*several) else (getattr(pytest.mark, mark),)
         found.append(pytest.param(*several, marks=marks))
     return found
 
