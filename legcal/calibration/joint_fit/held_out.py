@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration.joint_fit.factors import observed_outlines
 from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel, possible_biases
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.variables import Postures, State, postures
+from legcal.calibration.joint_fit.variables import Postures, State
 from legcal.data import Measurements, Outlines
 from legcal.errors import NotIdentifiable, NotVisible
 from legcal.estimation import (
@@ -69,7 +69,7 @@ class Posterior:
                 state,
                 radii=np.append(state.radii, others),
                 biases=np.array([values.get(name, 0.0) for name in shifts.names]),
-                platform_pose=postures(state.legs, T_Rb_Re),
+                platform_pose=problem.postures(state.legs, T_Rb_Re),
             ),
             self._covariance_of(problem, shifts),
         )

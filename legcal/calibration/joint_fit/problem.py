@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.joint_fit.factors import (
     BoardCorners,
@@ -47,7 +48,6 @@ from legcal.calibration.joint_fit.variables import (
     State,
     changed_cameras,
     intrinsic_of,
-    postures,
 )
 from legcal.data import LegAxes, Measurements, Outlines, row_names
 from legcal.errors import NotIdentifiable
@@ -61,7 +61,7 @@ from legcal.estimation import (
     fixed_at_start,
 )
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import freedoms, radius_name, wholly_tied
+from legcal.machine import Leg, freedoms, radius_name, readings_of_rods, wholly_tied
 from legcal.vision import (
     LINKS,
     Camera,
@@ -158,8 +158,19 @@ class FitProblem(Problem[State]):
             np.zeros(self.block("biases").n_unknowns),
             Frames.of(start.T_camera_Rb),
             Frames.of([start.T_Rb_board, start.T_Re_board]),
-            postures(start.legs, start.T_Rb_Re),
+            self.postures(start.legs, start.T_Rb_Re),
         )
+
+    def postures(self, legs: Sequence[Leg], T_Rb_Re: Sequence[RigidTransform]) -> Postures:
+        """Return postures at poses, with what was read of actuators where it was.
+
+        Elsewhere a reading is that at which rods reach the pose: a start only, since where a rod
+        stands square to the motion of its joint at A it has no derivative.
+        """
+        R, t = Frames.of(T_Rb_Re)
+        q, read = readings_of_rods(legs, R, t), self.observed.actuator_readings
+        q[read.pose, read.actuator] = read.reading
+        return Postures(R, t, q)
 
     def offsets(self, state: State) -> Array:
         """Return the distances of both ends of outlines from predicted ones, (n, 2) [px]."""

@@ -35,7 +35,6 @@ from legcal.machine import (
     moved_legs,
     parametrize,
     posture_constraints,
-    readings_of_rods,
     solve_poses,
     solve_postures,
     tied_twist,
@@ -82,16 +81,6 @@ class Start:
     # Of the calibration boards on base and platform
     T_Rb_board: RigidTransform = field(default_factory=RigidTransform.identity)
     T_Re_board: RigidTransform = field(default_factory=RigidTransform.identity)
-
-
-def postures(legs: Sequence[Leg], T_Rb_Re: Sequence[RigidTransform]) -> Postures:
-    """Return postures at poses, the readings of actuators those at which rods reach them.
-
-    Such a reading is a start only: where a rod stands square to the motion of its joint at A it has
-    no derivative, and beyond it is that of the nearest point.
-    """
-    R, t = Frames.of(T_Rb_Re)
-    return Postures(R, t, readings_of_rods(legs, R, t))
 
 
 class Postures(NamedTuple):
