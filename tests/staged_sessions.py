@@ -122,8 +122,13 @@ def _observed(session: MachineSession) -> Observed:
     )
 
 
-def planned(session: PredictedObservations, sign: Array) -> Observed:
-    """Return exactly what a planned session will show, nominal legs being 3 mm and 1 deg off."""
+def planned(
+    session: PredictedObservations, sign: Array, *, noise: float = 0.0, seed: int = 0
+) -> Observed:
+    """Return what a planned session will show, nominal legs being 3 mm and 1 deg off.
+
+    The noise counts in the standard deviations of the session; without it all is exact.
+    """
     row, leg = np.nonzero(session.seen[session.view])
     pose = session.pose[row]
     u, length = session.u[pose, leg], session.length[pose, leg][:, None, None]
@@ -135,9 +140,28 @@ def planned(session: PredictedObservations, sign: Array) -> Observed:
     rows = np.zeros((len(row), 4, 4))  # by alpha and beta at A
     rows[:, :2, 2:], rows[:, 2:, 2:], rows[:, 2:, :2] = at_A, at_B, length * at_B
     covariance = np.asarray(np.linalg.inv(np.swapaxes(rows, 1, 2) @ rows), dtype=np.float64)
-    M = session.A[leg] - session.camera[session.view[row]]
+    M = session.A_at[pose, leg] - session.camera[session.view[row]]
     actuated = np.array([leg.kind is LegKind.ACTUATED for leg in session.legs])
     q = np.where(actuated, sign * (session.length - [leg.q0 for leg in session.legs]), np.nan)
+    carried = session.carried_by >= 0
+    q[:, carried] = session.q[:, session.carried_by[carried]]
+    if noise > 0.0:
+        rng = np.random.default_rng(seed)
+        covariance *= noise**2
+        errors = np.einsum(
+            "nij,nj->ni", np.linalg.cholesky(covariance), rng.standard_normal((len(row), 4))
+        )
+        u, M = (
+            x + np.einsum("nia,ni->na", E, e) for x, e in ((u, errors[:, :2]), (M, errors[:, 2:]))
+        )
+        u /= np.linalg.norm(u, axis=1, keepdims=True)
+        E = E - u[:, None] * np.einsum("nia,na->ni", E, u)[..., None]
+        E /= np.linalg.norm(E, axis=2, keepdims=True)
+        sigma = np.full(session.n_legs, session.sigma_q)
+        sigma[carried] = session.sigma_of_q[session.carried_by[carried]]
+        read = rng.standard_normal((len(q), session.n_legs))
+        same = session.carried_by[:, None] == session.carried_by
+        q = q + sigma * read[:, np.where(carried, same.argmax(axis=1), np.arange(len(same)))]
     units = np.array(session.parametrization.units)
     step = np.where(units == "m", 0.003, np.deg2rad(1.0) / np.sqrt(2.0))
     step *= np.random.default_rng(0).choice([-1.0, 1.0], len(step))

@@ -253,6 +253,8 @@ def located(
         np.zeros((n, 2, 3)),
         np.zeros((n, 2, 2)),
         np.zeros(n),
+        np.zeros(n),
+        np.tile(np.eye(3), (n, 1, 1)),
     )
     return locate_platform(
         directions,
@@ -440,7 +442,7 @@ def test_equations_of_a_leg_and_their_derivatives_are_those_of_the_machine(
         if met:
             slope = ca.Function("slope", [x], [ca.jacobian(function(x, *arguments), x)])
             J, by_pose = slope(local).full(), expected.by_pose[0, rows]
-            np.testing.assert_allclose(J[:, :9], expected.by_local[0, rows, 3:], atol=1e-9)
+            np.testing.assert_allclose(J[:, :9], expected.by_local[0, rows, 3:12], atol=1e-9)
             # A step is a displacement, then a Gibbs vector: half a rotation.
             np.testing.assert_allclose(J[:, 9:12], by_pose[:, 3:], atol=1e-9)
             np.testing.assert_allclose(J[:, 12:], 2.0 * by_pose[:, :3], atol=1e-9)

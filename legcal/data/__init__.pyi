@@ -34,6 +34,7 @@ from .image_tables import inverse as inverse
 from .image_tables import measurements_at as measurements_at
 from .image_tables import reorder_measurements as reorder_measurements
 from .measurements import INCH as INCH
+from .measurements import SIGMA_ANGLE as SIGMA_ANGLE
 from .measurements import Measurements as Measurements
 from .measurements import View as View
 from .measurements import few as few

@@ -129,6 +129,7 @@ from .parameters import vector_of as vector_of
 from .parameters import with_numbers as with_numbers
 from .rods import actuator_index as actuator_index
 from .rods import actuators_of as actuators_of
+from .rods import rod_mode as rod_mode
 from .solver import poses_after as poses_after
 from .solver import solve as solve
 from .table_template import write_template as write_template

@@ -17,7 +17,13 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge
 from legcal.geometry import Array, BoolArray, motions_of
-from legcal.machine.equations import PoseEquations, freedoms, pose_equations
+from legcal.machine.equations import (
+    PoseEquations,
+    equations_at_readings,
+    freedoms,
+    pose_equations,
+    readings_of_rods,
+)
 from legcal.machine.kinematics import (
     consistent_readings,
     follow,
@@ -34,6 +40,7 @@ from legcal.machine.model import (
     readings_at_poses,
     slider_columns,
 )
+from legcal.machine.rods import actuator_index
 from legcal.machine.solver import RANK, poses_after
 
 MAX_DRAWS = 40  # draws for each configuration
@@ -335,7 +342,8 @@ def random_poses_of_legs(
 
     They are those of legs in R_b and R_e that no file describes: many at once, without a chain.
     *home* is T_Rb_Re near a closed pose of the wanted assembly mode, *travel* (n_legs, 2) the
-    shortest and longest length of each leg [m], equal for legs of constant length.
+    shortest and longest length of each leg [m], equal for legs of constant length; of rods on
+    actuators the least and largest reading of these [m or rad].
 
     Raises
     ------
@@ -344,25 +352,25 @@ def random_poses_of_legs(
     """
     start = solve_poses(legs, frame_legs, home.rotation.as_matrix()[None], home.translation[None])
     drive = _Drive(legs, frame_legs, start.R, start.t)
-    home_lengths = drive.lengths(start.R, start.t)[0]
+    at_home = drive.values(start.R, start.t)[0]
     slack = 1e-6 + 0.05 * (travel[:, 1] - travel[:, 0])
-    low = np.minimum(travel[:, 0], home_lengths) - slack  # home counts as inside
-    high = np.maximum(travel[:, 1], home_lengths) + slack
+    low = np.minimum(travel[:, 0], at_home) - slack  # home counts as inside
+    high = np.maximum(travel[:, 1], at_home) + slack
     found_R, found_t = np.zeros((0, 3, 3)), np.zeros((0, 3))
     share, tried, near_singular = 1.0, 0, 0
     for _ in range(ATTEMPTS):
         n = 2 * (count - len(found_t)) + 10
-        wanted = rng.uniform(travel[:, 0], travel[:, 1], (n, len(legs)))
-        wanted = home_lengths + share * (wanted - home_lengths)
+        wanted = rng.uniform(travel[:, 0], travel[:, 1], (n, len(legs)))[:, drive.first]
+        wanted = at_home + share * (wanted - at_home)
         R, t = drive.wandered(n, share, rng)
-        first, good = drive.lengths(R, t), np.ones(n, dtype=np.bool_)
+        first, good = drive.values(R, t), np.ones(n, dtype=np.bool_)
         for part in np.linspace(0.0, 1.0, PARTS + 1)[1:]:
             R, t = drive.closed(R, t, first + part * (wanted - first), STEPS)
             good &= drive.is_regular(R, t)
         tried, near_singular = tried + n, near_singular + int(np.sum(~good))
         R, t = drive.closed(R, t, wanted, LAST_STEPS)
-        lengths = drive.lengths(R, t)
-        good &= drive.is_closed(R, t, wanted) & np.all((lengths >= low) & (lengths <= high), axis=1)
+        values = drive.values(R, t)
+        good &= drive.is_closed(R, t, wanted) & np.all((values >= low) & (values <= high), axis=1)
         found_R, found_t = np.concatenate([found_R, R[good]]), np.concatenate([found_t, t[good]])
         if len(found_t) >= count:
             return found_R[:count], found_t[:count]
@@ -381,16 +389,23 @@ def random_poses_of_legs(
 
 
 class _Drive:
-    """Legs whose motors draw their lengths at many poses; of redundant motors as many as needed.
+    """Legs whose motors draw their values at many poses; of redundant motors as many as needed.
 
-    Those are taken that say most beside each other, of what the constraints leave open.
+    Those are taken that say most beside each other, of what the constraints leave open. The value
+    of a leg is its length, that of a rod on an actuator the reading of this.
     """
 
     def __init__(self, legs: Sequence[Leg], frame_legs: Sequence[int], R: Array, t: Array) -> None:
         self.legs, self.frame_legs, self.R, self.t = tuple(legs), frame_legs, R, t
         self.columns = list(freedoms(frame_legs))
-        self.q0 = np.array([leg.q0 for leg in legs])
-        motors = [j for j, leg in enumerate(legs) if leg.kind is LegKind.ACTUATED]
+        self.on = np.array(actuator_index(legs), dtype=np.intp)
+        each = np.arange(len(legs))
+        # The leg whose value each has: of rods on one actuator the first
+        self.first = np.array(
+            [j if a < 0 else int(np.argmax(self.on == a)) for j, a in enumerate(self.on.tolist())]
+        )
+        self.zero = np.where(self.on < 0, [leg.q0 for leg in legs], 0.0)
+        motors = [j for j in each.tolist() if legs[j].is_motor and self.first[j] == j]
         self.driven = np.array([], dtype=np.intp)
         constrained = self.slopes(R, t)[0]
         self.driven = np.array(motors, dtype=np.intp)
@@ -413,7 +428,21 @@ class _Drive:
     def lengths(self, R: Array, t: Array) -> Array:
         """Return the leg lengths, (k, n_legs) [m]."""
         A, B = np.array([leg.A for leg in self.legs]), np.array([leg.B for leg in self.legs])
-        return np.asarray(np.linalg.norm(B @ np.swapaxes(R, 1, 2) + t[:, None] - A, axis=2))
+        lengths = np.linalg.norm(B @ np.swapaxes(R, 1, 2) + t[:, None] - A, axis=2)
+        return np.asarray(np.where(self.on < 0, lengths, [leg.q0 for leg in self.legs]))
+
+    def values(self, R: Array, t: Array) -> Array:
+        """Return the values of legs, (k, n_legs) [m or rad]."""
+        values = self.lengths(R, t)
+        if self.on.max(initial=-1) >= 0:
+            carried = self.on >= 0
+            values[:, carried] = readings_of_rods(self.legs, R, t)[:, self.on[carried]]
+        return values
+
+    def lengthening(self, wanted: Array) -> Array:
+        """Return s q, or q of actuators, at wanted values (k, n_legs) of driven motors, or NaN."""
+        driven = np.isin(self.first, self.driven)
+        return np.asarray(np.where(driven, wanted - self.zero, np.nan))
 
     def equations(self, R: Array, t: Array) -> PoseEquations:
         """Return what poses must satisfy: the constraints, and the lengths of driven motors."""
@@ -431,9 +460,8 @@ class _Drive:
         return float(np.linalg.svd(slopes, compute_uv=False)[-1]) if slopes.size else 0.0
 
     def closed(self, R: Array, t: Array, wanted: Array, steps: int) -> tuple[Array, Array]:
-        """Return poses nearer to wanted lengths (k, n_legs) of driven motors."""
-        lengthening = np.full_like(wanted, np.nan)
-        lengthening[:, self.driven] = (wanted - self.q0)[:, self.driven]
+        """Return poses nearer to wanted values (k, n_legs) of driven motors."""
+        lengthening = self.lengthening(wanted)
         found = solve_poses(self.legs, self.frame_legs, R, t, lengthening, steps)
         return found.R, found.t
 
@@ -453,12 +481,11 @@ class _Drive:
         return poses[:, :, :3], poses[:, :, 3]
 
     def is_closed(self, R: Array, t: Array, wanted: Array) -> BoolArray:
-        """Return at which poses the equations of legs and lengths hold."""
-        found = self.equations(R, t)
-        goal = np.where(found.measured, (wanted - self.q0)[:, found.leg], 0.0)
-        redundant = len(found.leg) > len(self.columns)
+        """Return at which poses the equations of legs hold with the wanted values."""
+        redundant = len(self.equations(R[:1], t[:1]).leg) > len(self.columns)
         limit = (NEARLY_CLOSED if redundant else CLOSED) * self.lengths(R, t).mean(axis=1)
-        return np.asarray(np.abs(found.values - goal).max(axis=1, initial=0.0) <= limit)
+        missed = equations_at_readings(self.legs, R, t, self.lengthening(wanted)).values
+        return np.asarray(np.abs(missed).max(axis=1, initial=0.0) <= limit)
 
     def is_regular(self, R: Array, t: Array) -> BoolArray:
         """Return which poses are as far from singular as a share of home is, on the same side."""

@@ -1,5 +1,8 @@
+from .carriers import Carrier as Carrier
+from .carriers import CarrierColumns as CarrierColumns
 from .conditions import Condition as Condition
 from .conditions import count_conditions as count_conditions
+from .conditions import enough_readings as enough_readings
 from .conditions import three_legs_at_once as three_legs_at_once
 from .conditions import two_directions as two_directions
 from .criteria import Criteria as Criteria

@@ -3,18 +3,24 @@
 They count equations and unknowns. Counts are neither sufficient (n points carry at most
 3n - 6 distances, however often they are seen) nor necessary (everything at once knows more
 than the steps): ranks decide.
+
+The paper has no joints at A that move. Where actuators carry them the counts are made by analogy
+and marked as ours: (12) counts the axis of every actuator among the revolute axes, with four
+unknowns of an arm and two of a carriage, and the middle of the circle of every rod on an arm as a
+further point; (6') asks for three readings of a carriage, or five of an arm, in one view.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import comb
 
 import numpy as np
 
 from legcal.geometry import Array, IntArray
 from legcal.machine import EquationKind, Leg, LegKind, n_frame_legs
+from legcal.paper.carriers import MIN_IMAGES
 
 _SAME_DIRECTION = 1e-9  # of the normalised information of eq (6)
 _AT_ONCE = 3  # legs that give the pose of the platform in the camera frame, eq (18)
@@ -30,6 +36,7 @@ class Condition:
     unknowns: int | None = None
     legs: tuple[int, ...] = ()  # for which it does not hold
     needed: bool = True  # (12) is not, where a calibration board ties the cameras to each other
+    by_analogy: bool = False  # ours and not the paper's: joints at A move
 
     @property
     def fails(self) -> bool:
@@ -45,25 +52,35 @@ def count_conditions(
     revolute: Collection[int] = (),
     passive: Collection[int] = (),
     board: bool = False,
+    actuators: Sequence[tuple[Collection[int], bool]] = (),
 ) -> tuple[Condition, ...]:
     """Return (12), (15), (17) and "every leg seen" from the legs that each camera position shows.
 
     As printed. Of E = l + 2(n - N_d) the first term is read as 1; passive legs count in E
-    although (19) finds them. ``revolute`` are the legs with a revolute joint at the base.
+    although (19) finds them. ``revolute`` are the legs with a revolute joint at the base,
+    ``actuators`` those on each actuator that moves joints at A, and whether it turns.
     """
     n_d = n_frame_legs(spatial=spatial)  # N_d: joint centres that define a frame
     joints_base = 3 + 3 * (n_legs - n_d) + 2 * len(revolute) if spatial else 2 + 2 * (n_legs - n_d)
+    joints_base += sum(4 if turns else 2 for _, turns in actuators)
     joints_platform = 3 + 3 * (n_legs - n_d) if spatial else 1 + 2 * (n_legs - n_d)
     products = distances = 0
     for legs in views:
         n, r = len(set(legs)), len(set(legs) & set(revolute))
-        products += comb(r, 2) + comb(n, 2) + r * (n - 1)
+        middles = sum(len(set(legs) & set(on)) for on, turns in actuators if turns)
+        r += sum(not set(legs).isdisjoint(on) for on, _ in actuators)
+        n += middles
+        # The arm of a rod is square to the axis of its actuator, which says nothing
+        products += comb(r, 2) + comb(n, 2) + r * max(n - 1, 0) - middles
         distances += comb(len(set(legs) - set(passive)), 2)
-    n_offsets = n_legs - len(set(passive))
-    return (
+    n_offsets, ours = n_legs - len(set(passive)), bool(actuators)
+    counts = (
         Condition("eq12", products >= joints_base, products, joints_base, needed=not board),
         Condition("eq15", distances >= n_offsets, distances, n_offsets),
         Condition("eq17", distances >= joints_platform, distances, joints_platform),
+    )
+    return (
+        *(replace(count, by_analogy=ours) for count in counts),
         _without("every_leg_seen", set(range(n_legs)).difference(*views)),
     )
 
@@ -82,6 +99,25 @@ def two_directions(view: IntArray, leg: IntArray, u: Array, n_legs: int) -> Cond
     smallest = np.linalg.eigvalsh(information)[..., 0]
     found = ((number > 0) & (smallest > _SAME_DIRECTION * number)).any(axis=0)
     return _without("two_directions", set(np.flatnonzero(~found).tolist()))
+
+
+def enough_readings(
+    view: IntArray, leg: IntArray, q: Array, legs: Sequence[Leg]
+) -> tuple[Condition, ...]:
+    """Return whether each rod on an actuator is seen at enough readings from one position, (6').
+
+    ``q`` (k,) are the readings of observed rods ``leg`` (k,). None where no joint at A moves.
+    """
+    carried = {j: leg.actuator for j, leg in enumerate(legs) if leg.actuator is not None}
+    if not carried:
+        return ()
+    missing = set()
+    for j, actuator in carried.items():
+        here = leg == j
+        seen = [len(np.unique(q[here & (view == v)])) for v in np.unique(view[here])]
+        if max(seen, default=0) < MIN_IMAGES[actuator.turns]:
+            missing.add(j)
+    return (replace(_without("enough_readings", missing), by_analogy=True),)
 
 
 def three_legs_at_once(

@@ -10,11 +10,15 @@ Scalar products are even in a coordinate normal to coplanar joints, and equal fo
 (9) decides neither z nor the handedness. The camera frames hold points and directions with both,
 so the default lays them on each other, rigidly and weighted by their covariances, with one camera
 pose a view. A view of two joints whose axes do not fix the camera gives their distance only.
+
+Where actuators move joints at A (ours, not the paper's) these count at reading 0, and what carries
+them is laid on each other with them. As printed (8', 9'), V has also the axis of every actuator of
+the view, and the arm from that of a revolute to the joint.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from itertools import combinations, combinations_with_replacement, product
@@ -26,7 +30,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, components, whitener
-from legcal.machine import LegColumns
+from legcal.machine import ActuatorColumns, LegColumns
 from legcal.paper.camera_poses import candidate_camera_poses, signs_seen
 from legcal.paper.criteria import Criteria
 from legcal.paper.gibbs import (
@@ -37,7 +41,7 @@ from legcal.paper.gibbs import (
     turned_frame,
     turned_points,
 )
-from legcal.paper.joints_in_camera import JointsInCamera, with_signs
+from legcal.paper.joints_in_camera import JointsInCamera, points_in_both, with_signs
 from legcal.paper.least_squares import IpoptSolution, LeastSquares, Term, solve_least_squares
 from legcal.paper.nominal import NominalMachine
 from legcal.paper.unknowns import Unknowns
@@ -54,7 +58,8 @@ _MIN_DIFFERENCE = 4.5  # of the cost: three standard deviations decide between t
 class JointsInBase:
     """Base joint centres and revolute axes in R_b, and the cameras."""
 
-    machine: NominalMachine  # with A and the revolute axes at the base as they were located
+    # with A, the revolute axes at the base and actuators as they were located
+    machine: NominalMachine
     T_Rb_camera: tuple[RigidTransform | None, ...]  # None for a view whose joints do not fix it
     in_cameras: JointsInCamera  # what they were located from
     axis_covariance: Array  # (n_legs, 3, 3) of the axes [rad^2]; zero without one, and literal
@@ -113,34 +118,66 @@ def build_scalar_products(machine: NominalMachine, joints: JointsInCamera) -> Le
     legs = tuple(tuple(np.flatnonzero(located).tolist()) for located in joints.located)
     revolute = joints.axis_located & machine.revolute
     axes = tuple(tuple(np.flatnonzero(located).tolist()) for located in revolute)
-    seen = [
-        product
-        for view in zip(joints.A_camera, joints.v_camera, legs, axes, strict=True)
-        for product in _products(*view)
-    ]
+    carried = tuple(
+        tuple(j for j in of_view if (v, j) in joints.carriers) for v, of_view in enumerate(legs)
+    )
+    turning = tuple(
+        j for j, leg in enumerate(machine.legs) if leg.actuator is not None and leg.actuator.turns
+    )
+    seen = list[float]()
+    for v, of_view in enumerate(zip(legs, axes, carried, strict=True)):
+        w, c = np.zeros((2, machine.n_legs, 3))
+        for j in carried[v]:
+            actuator = joints.carriers[v, j].actuator
+            w[j], c[j] = actuator.axis, actuator.point
+        seen += _products(joints.A_camera[v], joints.v_camera[v], w, c, *of_view, turning)
     places = tuple(
         tuple(unknowns.place[:, columns].ravel().tolist())
-        for columns in (LegColumns.A, LegColumns.BASE_AXIS)
+        for columns in (
+            LegColumns.A,
+            LegColumns.BASE_AXIS,
+            ActuatorColumns.AXIS,
+            ActuatorColumns.POINT,
+        )
     )
     n_legs = machine.n_legs
     observed = (
         np.array(seen)[None, :],
         unknowns.known_A.T.reshape(1, 3, n_legs),
         np.hstack(list(unknowns.base_frames)).reshape(1, 3, 3 * n_legs),
+        np.hstack(list(unknowns.actuator_frames)).reshape(1, 3, 3 * n_legs),
+        unknowns.actuator_points.T.reshape(1, 3, n_legs),
     )
     index = np.arange(len(unknowns))[None, :]
     return LeastSquares(
         "The base joints in the base frame (eq 9)",
-        (Term(_product_differences(places, legs, axes), index, observed),),
+        (Term(_product_differences(places, legs, axes, carried, turning), index, observed),),
         unknowns.vector(machine.legs),
         exact_hessian=True,
     )
 
 
-def _products(A: Any, v: Any, legs: Sequence[int], axes: Sequence[int]) -> list[Any]:
-    """Return the products of pairs of the set V of (8) in one view, but the squares of axes."""
-    vectors = [A[g] - A[j] for j, g in combinations(legs, 2)] + [v[j] for j in axes]
-    n_joints = len(vectors) - len(axes)
+def _products(
+    A: Any,
+    v: Any,
+    w: Any,
+    c: Any,
+    legs: Sequence[int],
+    axes: Sequence[int],
+    carried: Sequence[int],
+    turning: Sequence[int],
+) -> list[Any]:
+    """Return the products of pairs of the set V of (8) in one view, but the squares of axes.
+
+    w and c are the axes of actuators and points of them, of the legs that are *carried*.
+    """
+    vectors = [A[g] - A[j] for j, g in combinations(legs, 2)]
+    for j in carried:
+        if j in turning:
+            arm = A[j] - c[j]
+            vectors.append(arm - (arm.T @ w[j]) * w[j])
+    n_joints = len(vectors)
+    vectors += [v[j] for j in axes] + [w[j] for j in carried]
     return [
         vectors[p].T @ vectors[q]
         for p, q in combinations_with_replacement(range(len(vectors)), 2)
@@ -152,23 +189,33 @@ _Places = tuple[tuple[int, ...], ...]
 
 
 @lru_cache(maxsize=4)
-def _product_differences(places: _Places, legs: _Places, axes: _Places) -> ca.Function:
-    """Return (A, turns of v; products, known, frames) -> products of all views, less observed."""
+def _product_differences(
+    places: _Places, legs: _Places, axes: _Places, carried: _Places, turning: tuple[int, ...]
+) -> ca.Function:
+    """Return (unknowns of step 2; products, known A, frames of v, of w, points of w) -> residuals.
+
+    They are the products of all views, less those observed.
+    """
     n_legs = len(places[0]) // 3
-    x = ca.SX.sym("x", max(*places[0], *places[1]) + 1)
+    x = ca.SX.sym("x", max(max(place) for place in places) + 1)
     known, frames = ca.SX.sym("known", 3, n_legs), ca.SX.sym("frames", 3, 3 * n_legs)
+    of_actuators, points = ca.SX.sym("of_actuators", 3, 3 * n_legs), ca.SX.sym("points", 3, n_legs)
     padded = ca.vertcat(x, 0.0)
     A = ca.reshape(padded[list(places[0])], 3, n_legs) + known
-    turns = ca.reshape(padded[list(places[1])], 2, n_legs)
+    turns, of_w, shifts = (ca.reshape(padded[list(p)], 2, n_legs) for p in places[1:])
+    each = [slice(3 * j, 3 * j + 3) for j in range(n_legs)]
     joints = [A[:, j] for j in range(n_legs)]
-    turned = [turned_frame(turns[:, j], frames[:, 3 * j : 3 * j + 3])[:, 0] for j in range(n_legs)]
+    v = [turned_frame(turns[:, j], frames[:, each[j]])[:, 0] for j in range(n_legs)]
+    w = [turned_frame(of_w[:, j], of_actuators[:, each[j]])[:, 0] for j in range(n_legs)]
+    c = [points[:, j] + of_actuators[:, each[j]][:, 1:] @ shifts[:, j] for j in range(n_legs)]
     products = [
         product
-        for of_view, with_axis in zip(legs, axes, strict=True)
-        for product in _products(joints, turned, of_view, with_axis)
+        for of_view in zip(legs, axes, carried, strict=True)
+        for product in _products(joints, v, w, c, *of_view, turning)
     ]
     seen = ca.SX.sym("seen", len(products))
-    return ca.Function("products", [x, seen, known, frames], [ca.vertcat(*products) - seen])
+    observed = [seen, known, frames, of_actuators, points]
+    return ca.Function("products", [x, *observed], [ca.vertcat(*products) - seen])
 
 
 def register_views(
@@ -183,12 +230,12 @@ def _candidates(
     machine: NominalMachine, joints: JointsInCamera, view: int
 ) -> tuple[list[RigidTransform], bool]:
     """Return the candidate poses of the camera of a view, and whether there are no others."""
-    A_Rb, v_Rb = machine.parameters.base_joints, machine.base_normals
-    located, with_axis = joints.located[view], joints.axis_located[view]
+    A_Rb, A_camera = points_in_both(machine, joints, view)
+    with_axis = joints.axis_located[view]
     return candidate_camera_poses(
-        A_Rb[located],
-        v_Rb[with_axis],
-        joints.A_camera[view, located],
+        A_Rb,
+        machine.base_normals[with_axis],
+        A_camera,
         joints.v_camera[view, with_axis],
         signed=bool(joints.sided[view]),
     )
@@ -275,7 +322,12 @@ def build_rigid_base(
     def steps(view: IntArray) -> IntArray:
         return n_shared + 6 * number[view][:, None] + np.arange(6)
 
-    for chosen, kind in ((seen & ~with_axis, "point"), (with_axis, "axis")):
+    carried = seen & machine.carried
+    terms += _carried_terms(unknowns, joints, carried, (R, t), steps, number)
+    for chosen, kind in (
+        (seen & ~with_axis & ~carried, "point"),
+        (with_axis & ~carried, "axis"),
+    ):
         view, leg = np.nonzero(chosen)
         C, v = joints.covariance[view, leg], joints.v_camera[view, leg]
         index = np.hstack([unknowns.place[leg, LegColumns.A], steps(view)])
@@ -300,6 +352,82 @@ def build_rigid_base(
     return LeastSquares(
         "The base joints in the base frame (step 2)", tuple(terms), start_x, n_shared=n_shared
     )
+
+
+def _carried_terms(
+    unknowns: Unknowns,
+    joints: JointsInCamera,
+    carried: BoolArray,
+    cameras: tuple[Array, Array],
+    steps: Callable[[IntArray], IntArray],
+    number: IntArray,
+) -> list[Term]:
+    """Return the residuals of joints that actuators move, *carried* (n_views, n_legs)."""
+    (R, t), terms = cameras, []
+    kinds: dict[tuple[bool, bool], list[tuple[int, int]]] = {}
+    for v, j in np.argwhere(carried).tolist():
+        carrier = joints.carriers[v, j]
+        with_axis = bool(joints.axis_located[v, j])
+        kinds.setdefault((with_axis, carrier.actuator.turns), []).append((v, j))
+    for (with_axis, turns), places in sorted(kinds.items()):
+        view, leg = np.array(places, dtype=np.intp).T
+        found = [joints.carriers[at] for at in places]
+        place = unknowns.place[leg]
+        index = [place[:, LegColumns.A], steps(view), place[:, ActuatorColumns.AXIS]]
+        columns = [0, 1, 2, 5, 6]
+        axis, point = (
+            np.array([getattr(carrier.actuator, name) for carrier in found])
+            for name in ("axis", "point")
+        )
+        frames, camera = unknowns.actuator_frames[leg], number[view]
+        A = np.array([carrier.A for carrier in found])
+        observed = [unknowns.known_A[leg], R[camera], t[camera], A, frames, axis_frames(axis)]
+        if turns:
+            index.append(place[:, ActuatorColumns.POINT])
+            columns += [7, 8]
+            observed += [unknowns.actuator_points[leg], point]
+        if with_axis:
+            index.append(place[:, LegColumns.BASE_AXIS])
+            columns += [3, 4]
+            own = np.array([carrier.v for carrier in found])
+            observed += [unknowns.base_frames[leg], axis_frames(own)]
+        C = np.array([carrier.covariance[np.ix_(columns, columns)] for carrier in found])
+        observed.append(whitener(C))
+        function = _carried_joint(turns=turns, with_axis=with_axis)
+        terms.append(Term(function, np.hstack(index), tuple(observed)))
+    return terms
+
+
+@cache
+def _carried_joint(*, turns: bool, with_axis: bool) -> ca.Function:
+    """Return (A, step, turns of w, place of w, turns of v; observed) -> whitened errors.
+
+    They are those of A at reading 0 in the camera, of the turns of the actuator's axis w about its
+    normal basis, of a revolute the place where w crosses the plane across the seen one at its
+    point, and, of a revolute joint at A, the turns of v.
+    """
+    local, given, error = _centre_residual(11 + 2 * turns + 2 * with_axis)
+    _, R, t, _ = given
+    step = local[3:9]
+    frame, w_camera = ca.SX.sym("frame", 3, 3), ca.SX.sym("w_camera", 3, 3)
+    w = turned_frame(local[9:11], frame)[:, 0]
+    observed, errors = [*given, frame, w_camera], [error, _turns_in_camera(step, R, w, w_camera)]
+    if turns:
+        point, point_camera = ca.SX.sym("point", 3), ca.SX.sym("point_camera", 3)
+        place = point + frame[:, 1:] @ local[11:13]
+        apart = moved_points(step, R, t, place) - point_camera
+        along = turned_points(step[3:], R @ w)
+        seen = w_camera[:, 0]
+        crossing = apart - ca.dot(apart, seen) / ca.dot(along, seen) * along
+        errors.append(w_camera[:, 1:].T @ crossing)
+        observed += [point, point_camera]
+    if with_axis:
+        base, v_camera = ca.SX.sym("base", 3, 3), ca.SX.sym("v_camera", 3, 3)
+        v = turned_frame(local[-2:], base)[:, 0]
+        errors.append(_turns_in_camera(step, R, v, v_camera))
+        observed += [base, v_camera]
+    W = ca.SX.sym("W", 5 + 2 * turns + 2 * with_axis, 5 + 2 * turns + 2 * with_axis)
+    return ca.Function("carried", [local, *observed, W], [W @ ca.vertcat(*errors)])
 
 
 def _distances(
@@ -436,6 +564,13 @@ def _check_identifiable(
     names = np.array(machine.leg_names)
     moving = names[loose[unknowns.place[:, LegColumns.A]].any(axis=1)]
     turning = names[loose[unknowns.place[:, LegColumns.BASE_AXIS]].any(axis=1)]
+    carried = loose[unknowns.place[:, LegColumns.OWN :]].any(axis=1)
+    if not len(moving) and carried.any():
+        raise NotIdentifiable(
+            f"The actuators at the base could not be located: those of {', '.join(names[carried])} "
+            "can move without any view noticing; needed views that show each of them together "
+            "with three other joints; turn a camera so that it shows more legs at once."
+        )
     if not len(moving) and not len(turning):
         return
     what = "base joints" if len(moving) else "revolute axes at the base"

@@ -5,25 +5,45 @@ normal to the revolute axis v of that joint:
 
     (M - A) x u = 0   (6)        v . u = 0   (7)
 
-In a planar machine the axes v of a view are one common normal. ``literal`` solves (6), then
+In a planar machine the axes v of a view are one common normal. Of rods on an actuator A moves with
+its reading, (6') of :mod:`legcal.paper.carriers`. ``literal`` solves (6), then
 (7), every equation with the same weight. What an image knows badly is the tilt of a leg towards
 the camera: the default weights both by the covariances of the axes, robustly.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data import LegAxes, Measurements
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, BoolArray, IntArray, normal_basis, turned_axis
+from legcal.geometry import (
+    Array,
+    BoolArray,
+    IntArray,
+    cross,
+    normal_basis,
+    register_points,
+    turned_axis,
+)
+from legcal.machine import Actuator
 from legcal.paper.camera_poses import candidate_camera_poses, side_of_plane, signs_seen
+from legcal.paper.carriers import (
+    MIN_IMAGES,
+    Carrier,
+    CarrierColumns,
+    linear_motion,
+    points_on,
+)
 from legcal.paper.criteria import Criteria
 from legcal.paper.nominal import NominalMachine
 
+_WRONG_SCALE = 0.02  # of the motion of a carriage: as wrong as radii may be
+_SURE = 5.0  # standard deviations
 _SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
 _MAX_SIGMA_CENTRE = 0.1  # of the distance to the camera
 _MAX_SIGMA_TURN = 1.0  # [rad] of an axis; beyond, nothing is known of it
@@ -33,13 +53,14 @@ _CONVERGED = 1e-6  # standard deviations: smaller steps no longer matter
 _OUTLIER = 3.0  # an axis with a residual of this many times the median has half its weight
 _MIN_THRESHOLD = 1e-3  # standard deviations: smaller residuals are rounding
 _MAX_STEP = 0.2  # [rad] of an axis, and in its distance of a centre
+_LINEAR = 5  # weighted solutions of (6') before its condition is kept exactly
 
 
 @dataclass(frozen=True, eq=False)
 class JointsInCamera:
     """Base joint centres and revolute axes in the frame of each view; zero where not located."""
 
-    A_camera: Array  # (n_views, n_legs, 3) [m]
+    A_camera: Array  # (n_views, n_legs, 3) [m]; on actuators at reading 0
     located: BoolArray  # (n_views, n_legs)
     v_camera: Array  # (n_views, n_legs, 3); the common normal in a plane; signs: :func:`oriented`
     axis_located: BoolArray  # (n_views, n_legs)
@@ -50,6 +71,32 @@ class JointsInCamera:
     # (n_views,), planar machines: lengths of legs decide from which side the camera sees the plane,
     # so that the sign of the normal is known
     sided: BoolArray
+    # by view and leg, of located joints that actuators move: what carries them
+    carriers: Mapping[tuple[int, int], Carrier] = field(default_factory=dict)
+
+    def A_at(self, view: IntArray, leg: IntArray, q: Array) -> Array:
+        """Return A in the cameras of views (k,) of legs (k,) at readings (k,), (k, 3) [m]."""
+        A = self.A_camera[view, leg]
+        for here, carrier in self.carried(view, leg):
+            A[here] = carrier.at(q[here])[0]
+        return A
+
+    def v_at(self, view: IntArray, leg: IntArray, q: Array) -> Array:
+        """Return the revolute axes in the same way, (k, 3)."""
+        v = self.v_camera[view, leg]
+        for here, carrier in self.carried(view, leg):
+            v[here] = np.where(
+                np.any(v[here], axis=1, keepdims=True), carrier.axis_at(q[here])[0], 0.0
+            )
+        return v
+
+    def carried(self, view: IntArray, leg: IntArray) -> list[tuple[IntArray, Carrier]]:
+        """Return which of some views and legs (k,) each carrier is that of."""
+        found = [
+            (np.flatnonzero((view == v) & (leg == j)), carrier)
+            for (v, j), carrier in self.carriers.items()
+        ]
+        return [(here, carrier) for here, carrier in found if len(here)]
 
 
 def locate_joints_in_cameras(
@@ -61,24 +108,46 @@ def locate_joints_in_cameras(
 ) -> JointsInCamera:
     """Locate base joint centres and revolute axes in each camera frame, eqs (6) and (7).
 
-    Raises NotIdentifiable if some leg has two different directions in no view.
+    Raises NotIdentifiable if some leg has two different directions in no view, or a rod on an
+    actuator too few in all.
     """
     names, n_legs = machine.leg_names, machine.n_legs
+    if not machine.spatial and machine.carried.any():
+        raise NotIdentifiable(
+            "The four steps could not be run: found joints at the base that actuators move in a "
+            "machine that moves in a plane, needed a machine that moves in space; use the joint "
+            "fit alone."
+        )
     key = measurements.view[axes.row] * n_legs + axes.leg
     views, legs = np.divmod(np.unique(key), n_legs)
     bundles = Bundles.of(key)
     information, _ = _plain_equations(axes, bundles)
     reasons = [
-        _no_single_point(*each) for each in zip(information, bundles.counts.tolist(), strict=True)
+        "" if moves else _no_single_point(F, n)
+        for F, n, moves in zip(
+            information, bundles.counts.tolist(), machine.carried[legs].tolist(), strict=True
+        )
+    ]
+    rods = {
+        (int(views[i]), int(legs[i])): bundles.rows[bundles.bundle == i]
+        for i in np.flatnonzero(machine.carried[legs]).tolist()
+    }
+    carriers, why_not, scales = _carried_joints(machine, axes, measurements, rods, criteria)
+    reasons = [
+        why_not.get(place, reason)
+        for place, reason in zip(
+            zip(views.tolist(), legs.tolist(), strict=True), reasons, strict=True
+        )
     ]
     clear = np.array([not reason for reason in reasons], dtype=np.bool_)
     at = views[clear], legs[clear]
-    A, v, C = _estimate(machine, axes, bundles.some(clear), *at, criteria)
+    A, v, C = _estimate(machine, axes, bundles.some(clear), *at, carriers, criteria)
     has_axis = np.any(v != 0.0, axis=1)
     axis_reasons = [""] * len(A)
     if criteria == "default":
         for k, i in enumerate(np.flatnonzero(clear)):
-            reasons[i] = _uncertain_centre(A[k], C[k, :3, :3])
+            if not machine.carried[legs[i]]:
+                reasons[i] = _uncertain_centre(A[k], C[k, :3, :3])
             if has_axis[k] and not reasons[i]:
                 axis_reasons[k] = _uncertain_axis(C[k, 3:, 3:])
     good = np.array([not reason for reason in reasons], dtype=np.bool_)[clear]
@@ -93,16 +162,17 @@ def locate_joints_in_cameras(
         for view, leg, reason in zip(*(place.tolist() for place in places), said, strict=True)
         if reason
     )
+    diagnostics += scales
     shape = (len(measurements.views), n_legs)
     located, axis_located = np.zeros((2, *shape), dtype=np.bool_)
     located[at], axis_located[at] = good, good_axis
-    missing = [names[j] for j in np.flatnonzero(~located.any(axis=0))]
+    missing = [(j, names[j]) for j in np.flatnonzero(~located.any(axis=0)).tolist()]
     if missing:
         raise NotIdentifiable(
             [
                 f"The base joint of leg {name} could not be located: found no view that shows the "
-                "leg in two different directions, needed one; add images in which it is visible."
-                for name in missing
+                f"{_needed(machine, j)}, needed one; add images in which it is visible."
+                for j, name in missing
             ]
             + list(diagnostics)
         )
@@ -113,7 +183,16 @@ def locate_joints_in_cameras(
     unsided = np.zeros(len(located), dtype=np.bool_)
     found = oriented(
         machine,
-        JointsInCamera(A_camera, located, v_camera, axis_located, covariance, diagnostics, unsided),
+        JointsInCamera(
+            A_camera,
+            located,
+            v_camera,
+            axis_located,
+            covariance,
+            diagnostics,
+            unsided,
+            {at: carrier for at, carrier in carriers.items() if located[at]},
+        ),
     )
     return found if machine.spatial else _sided(machine, axes, measurements, found)
 
@@ -125,6 +204,14 @@ def _no_single_point(information: Array, n_images: int) -> str:
     if n_images == 1:
         return "it was found in one image, and at least two different directions are needed"
     return f"its direction is the same in all {n_images} images, and two are needed"
+
+
+def _needed(machine: NominalMachine, leg: int) -> str:
+    """Return in what a view must show a leg for its joint to be located."""
+    actuator = machine.legs[leg].actuator
+    if actuator is None:
+        return "leg in two different directions"
+    return f"leg at {MIN_IMAGES[actuator.turns]} different readings of {actuator.joint}"
 
 
 def _uncertain_centre(A: Array, covariance: Array) -> str:
@@ -162,16 +249,35 @@ def oriented(machine: NominalMachine, joints: JointsInCamera) -> JointsInCamera:
     sign remains a matter of choice: step 2 by default tries both. That of an axis whose joint is
     alone in its view does not matter. In a planar machine lengths of legs decide afterwards.
     """
-    nominal, A_Rb = machine.base_normals, machine.parameters.base_joints
+    nominal = machine.base_normals
     signs = np.ones(joints.located.shape)
-    for v, (located, with_axis) in enumerate(zip(joints.located, joints.axis_located, strict=True)):
+    for v, with_axis in enumerate(joints.axis_located):
         seen = joints.v_camera[v, with_axis]
-        poses, _ = candidate_camera_poses(
-            A_Rb[located], nominal[with_axis], joints.A_camera[v, located], seen
-        )
+        A_Rb, A_camera = points_in_both(machine, joints, v)
+        poses, _ = candidate_camera_poses(A_Rb, nominal[with_axis], A_camera, seen)
         if poses:
             signs[v, with_axis] = signs_seen(nominal[with_axis], seen, poses[0])
     return with_signs(joints, signs)
+
+
+def points_in_both(
+    machine: NominalMachine, joints: JointsInCamera, view: int
+) -> tuple[Array, Array]:
+    """Return points of the base (n, 3) that a view locates, in R_b and in the camera [m].
+
+    They are the joints, and of those that actuators move three places along the travel.
+    """
+    A_Rb, A_camera = list[Array](), list[Array]()
+    for j in np.flatnonzero(joints.located[view]).tolist():
+        leg, carrier = machine.legs[j], joints.carriers.get((view, j))
+        if leg.actuator is None or carrier is None:
+            A_Rb.append(leg.A[None])
+            A_camera.append(joints.A_camera[view, j][None])
+        else:
+            A_Rb.append(points_on(leg.actuator, leg.A))
+            A_camera.append(points_on(carrier.actuator, carrier.A))
+    none = np.zeros((0, 3))
+    return np.concatenate([none, *A_Rb]), np.concatenate([none, *A_camera])
 
 
 def _sided(
@@ -196,8 +302,14 @@ def with_signs(joints: JointsInCamera, signs: Array) -> JointsInCamera:
     turned_round = (signs < 0.0)[..., None]
     e2 = np.array([1.0, 1.0, 1.0, 1.0, -1.0])  # of the normal basis changes its sign with v
     flipped = joints.covariance * np.outer(e2, e2)
+    carriers = dict(joints.carriers)
+    for at in [at for at in carriers if signs[at] < 0.0]:
+        sign = np.append(e2, np.ones(CarrierColumns.COUNT - len(e2)))
+        covariance = carriers[at].covariance * np.outer(sign, sign)
+        carriers[at] = replace(carriers[at], v=-carriers[at].v, covariance=covariance)
     return replace(
         joints,
+        carriers=carriers,
         v_camera=np.where(turned_round, -joints.v_camera, joints.v_camera),
         covariance=np.where(turned_round[..., None], flipped, joints.covariance),
     )
@@ -247,16 +359,26 @@ def _estimate(
     bundles: Bundles,
     views: IntArray,
     legs: IntArray,
+    carriers: Mapping[tuple[int, int], Carrier],
     criteria: Criteria,
 ) -> tuple[Array, Array, Array]:
-    """Return A (n, 3), v (n, 3), zero where there is none, and covariances (n, 5, 5) of bundles."""
-    A, C_A = _nearest_points(*_plain_equations(axes, bundles))
-    v, C = np.zeros((len(A), 3)), np.zeros((len(A), 5, 5))
-    C[:, :3, :3] = C_A
-    revolute = machine.revolute[legs] | (not machine.spatial)
-    if criteria == "default" and not revolute.all():
-        some = bundles.some(~revolute)
-        A[~revolute], C[~revolute, :3, :3] = _weighted_points(axes, some, A[~revolute])
+    """Return A (n, 3), v (n, 3), zero where there is none, and covariances (n, 5, 5) of bundles.
+
+    Those that actuators move are those of *carriers*.
+    """
+    A, v = np.zeros((2, len(legs), 3))
+    C, carried = np.zeros((len(legs), 5, 5)), machine.carried[legs]
+    for k in np.flatnonzero(carried).tolist():
+        carrier = carriers[int(views[k]), int(legs[k])]
+        A[k], v[k], C[k] = carrier.A, carrier.v, carrier.covariance[:5, :5]
+    A[~carried], C[~carried, :3, :3] = _nearest_points(
+        *_plain_equations(axes, bundles.some(~carried))
+    )
+    revolute = ~carried & (machine.revolute[legs] | (not machine.spatial))
+    points = ~carried & ~revolute
+    if criteria == "default" and points.any():
+        some = bundles.some(points)
+        A[points], C[points, :3, :3] = _weighted_points(axes, some, A[points])
     if revolute.any():
         # Bundles of one pool share v: each its own, or all of a view in a plane.
         some, pool = bundles.some(revolute), np.arange(int(revolute.sum()))
@@ -349,6 +471,201 @@ def _weighted_joints(
 
     _until_converged(update, A, C, pool)
     return A, v, C
+
+
+# Joints that actuators move
+
+
+_Place = tuple[int, int]  # view and leg
+
+
+def _carried_joints(
+    machine: NominalMachine,
+    axes: LegAxes,
+    measurements: Measurements,
+    rods: Mapping[_Place, IntArray],
+    criteria: Criteria,
+) -> tuple[dict[_Place, Carrier], dict[_Place, str], tuple[str, ...]]:
+    """Return what carries joints, from the axes of each rod in a view, or why not, (6') and (7).
+
+    The weighted criterion starts from the linear solution, and from the nominal machine where all
+    rods of the view have it; the better end is kept. Last come scales that disagree.
+    """
+    found, why_not = dict[_Place, Carrier](), dict[_Place, str]()
+    q = {place: measurements.q[axes.row[rows], place[1]] for place, rows in rods.items()}
+    for place, rows in rods.items():
+        carrier = _linear_carrier(machine, axes, rows, q[place], place[1], criteria)
+        if isinstance(carrier, str):
+            why_not[place] = carrier
+        else:
+            found[place] = carrier
+    if criteria == "literal":
+        return found, why_not, ()
+    starts = _nominal_carriers(machine, axes, rods, q, found)
+    scales = dict[str, list[float]]()
+    for place in list(found):
+        ends = [
+            _weighted_carrier(axes, rods[place], q[place], start)
+            for start in (found.pop(place), starts[place])
+        ]
+        carrier, _, scale = min(ends, key=lambda end: end[1])
+        why_not[place] = _uncertain_carrier(carrier, q[place])
+        if not why_not[place]:
+            found[place] = carrier
+            if scale:
+                scales.setdefault(carrier.actuator.joint, []).append(scale)
+    wrong = tuple(
+        f"The outlines show '{joint}' moving {np.median(scale):.2f} mm where its readings say "
+        "1 mm; check the unit of the readings, the radii of the rods, and the camera."
+        for joint, scale in scales.items()
+    )
+    return found, why_not, wrong
+
+
+def _linear_carrier(
+    machine: NominalMachine,
+    axes: LegAxes,
+    rows: IntArray,
+    q: Array,
+    leg: int,
+    criteria: Criteria,
+) -> Carrier | str:
+    """Return a joint by (6'), linear, and (7) in the carriage or arm; or why there is none."""
+    nominal = machine.legs[leg].actuator
+    if nominal is None:
+        raise ValueError("a leg that hangs on no actuator")
+    n, least = len(np.unique(q)), MIN_IMAGES[nominal.turns]
+    if n < least:
+        return f"it was found at {n} readings of {nominal.joint}, and {least} are needed"
+    u, M, E = axes.u[rows], axes.M[rows], axes.basis[rows]
+    one, nowhere = Bundles(rows, np.array([len(rows)])), np.zeros((len(rows), 3))
+    normal = np.eye(3) - u[:, :, None] * u[:, None, :]
+    for _ in range(1 + (_LINEAR if criteria == "default" else 0)):
+        start = linear_motion(nominal, q, normal, M)
+        if start is None:
+            return (
+                f"its directions at {n} readings of {nominal.joint} do not determine how the joint "
+                "moves"
+            )
+        A, actuator = start
+        residual, spread, _ = joint_residuals(axes, rows, actuator.at(A, q), nowhere)
+        weight = _robust_weights(one, residual[:, :2], spread[:, :2, :2])
+        normal = np.swapaxes(E, -1, -2) @ weight @ E
+    v = np.zeros(3)
+    if machine.revolute[leg]:
+        there = np.einsum("kji,kj->ki", actuator.rotations(q), u)
+        v = np.linalg.eigh(there.T @ there)[1][:, 0]
+    return Carrier(A, v, actuator, np.zeros((CarrierColumns.COUNT,) * 2))
+
+
+def _nominal_carriers(
+    machine: NominalMachine,
+    axes: LegAxes,
+    rods: Mapping[_Place, IntArray],
+    q: Mapping[_Place, Array],
+    found: Mapping[_Place, Carrier],
+) -> dict[_Place, Carrier]:
+    """Return the nominal joints, laid on the axes of each view as one rigid body."""
+    laid = dict[_Place, Carrier]()
+    for view in sorted({v for v, _ in found}):
+        places = [place for place in found if place[0] == view]
+        rows = np.concatenate([rods[place] for place in places])
+        leg = np.concatenate([np.full(len(q[place]), place[1]) for place in places])
+        readings = np.concatenate([q[place] for place in places])
+        A_Rb = machine.A_at(leg, readings)
+        seen = np.concatenate([found[place].at(q[place])[0] for place in places])
+        T = register_points(A_Rb, seen)
+        one, nowhere = Bundles(rows, np.array([len(rows)])), np.zeros_like(A_Rb)
+        for _ in range(_MIN_REWEIGHTINGS):
+            A, E = T.apply(A_Rb), axes.basis[rows]
+            residual, spread, _ = joint_residuals(axes, rows, A, nowhere)
+            weight = _robust_weights(one, residual[:, :2], spread[:, :2, :2])
+            J = np.concatenate([cross(A[:, None], E), E], axis=2)
+            back = np.swapaxes(J, 1, 2) @ weight
+            F, right = (back @ J).sum(axis=0), (back @ residual[:, :2, None]).sum(axis=0)[:, 0]
+            step = -np.linalg.pinv(F, rcond=1e-12, hermitian=True) @ right
+            step /= max(float(np.linalg.norm(step[:3])) / _MAX_STEP, 1.0)
+            turn = Rotation.from_rotvec(step[:3])
+            T = RigidTransform.from_components(step[3:], turn) * T
+        for place in places:
+            own = machine.legs[place[1]]
+            if own.actuator is not None:
+                v = found[place].v
+                if v.any() and own.base_axis is not None:
+                    v = T.rotation.apply(own.base_axis)
+                actuator = own.actuator.in_frame(T.as_matrix())
+                laid[place] = replace(found[place], A=T.apply(own.A), v=v, actuator=actuator)
+    return laid
+
+
+def _weighted_carrier(
+    axes: LegAxes, rows: IntArray, q: Array, carrier: Carrier
+) -> tuple[Carrier, float, float]:
+    """Return the joint with (6') and (7) weighted together, as :func:`_weighted_joints`.
+
+    Returns its robust cost too, and the length of its d where that is surely wrong, else 0.
+    """
+    columns, one = carrier.columns, Bundles(rows, np.array([len(rows)]))
+    kept, u, E = slice(0, 3 if carrier.v.any() else 2), axes.u[rows], axes.basis[rows]
+    carrier = carrier.moved(np.zeros(CarrierColumns.COUNT))
+    for k in range(MAX_REWEIGHTINGS):
+        (A, by_A), (v, by_v) = carrier.at(q), carrier.axis_at(q)
+        residual, spread, tilt = joint_residuals(axes, rows, A, v)
+        residual, spread, tilt = residual[:, kept], spread[:, kept, kept], tilt[:, :, kept]
+        weight = _robust_weights(one, residual, spread)
+        alpha = (tilt @ np.linalg.solve(spread, residual[..., None]))[..., 0]
+        across = E - alpha[:, :, None] * u[:, None]
+        better = u + np.einsum("kia,ki->ka", E, alpha)
+        J = np.empty((len(rows), 3, CarrierColumns.COUNT))
+        J[:, :2], J[:, 2] = across @ by_A, -np.einsum("ka,kac->kc", better, by_v)
+        J = J[:, kept][..., columns]
+        back = np.swapaxes(J, 1, 2) @ weight
+        F, right = (back @ J).sum(axis=0), (back @ residual[..., None]).sum(axis=0)[:, 0]
+        C = np.linalg.pinv(F, rcond=1e-14, hermitian=True)
+        step = np.zeros(CarrierColumns.COUNT)
+        step[columns] = -C @ right
+        far = np.linalg.norm(step[[0, 1, 2, 7, 8]]) / np.linalg.norm(A, axis=1).mean()
+        size = max(float(far), float(np.linalg.norm(step[3:7])))
+        if k >= _MIN_REWEIGHTINGS and np.all(step[columns] ** 2 <= _CONVERGED**2 * np.diag(C)):
+            break
+        carrier = carrier.moved(step / max(size / _MAX_STEP, 1.0))
+    covariance = np.zeros_like(carrier.covariance)
+    covariance[np.ix_(columns, columns)] = C
+    chi = np.einsum("ki,kij,kj->k", residual, np.linalg.inv(spread), residual)
+    by_gain = np.zeros((len(rows), 3))
+    by_gain[:, :2] = np.einsum("kia,ka->ki", across, carrier.actuator.motion(carrier.A, q).by_gain)
+    wrong = _wrong_scale(carrier.actuator, J, weight, residual, C, by_gain[:, kept])
+    return replace(carrier, covariance=covariance), float(np.log1p(chi).sum()), wrong
+
+
+def _wrong_scale(
+    actuator: Actuator, J: Array, weight: Array, residual: Array, C: Array, by_gain: Array
+) -> float:
+    """Return the |d| of readings and outlines where it is surely not 1, else 0."""
+    weighted = np.einsum("kij,kj->ki", weight, by_gain)
+    mixed = np.einsum("kic,ki->c", J, weighted)
+    information = float(np.sum(by_gain * weighted) - mixed @ C @ mixed)
+    if actuator.turns or information <= 0.0:
+        return 0.0
+    change = -float(np.sum(residual * weighted)) / information
+    return 0.0 if abs(change) < max(_WRONG_SCALE, _SURE / np.sqrt(information)) else 1.0 + change
+
+
+def _uncertain_carrier(carrier: Carrier, q: Array) -> str:
+    """Return why a joint that an actuator moves is not determined, or an empty string."""
+    A, by_A = carrier.at(np.array([np.median(q)]))
+    reason = _uncertain_centre(A[0], by_A[0] @ carrier.covariance @ by_A[0].T)
+    of_axis = carrier.covariance[CarrierColumns.AXIS, CarrierColumns.AXIS]
+    sigma = float(np.sqrt(np.linalg.eigvalsh(of_axis)[-1]))
+    if reason or sigma <= _MAX_SIGMA_TURN:
+        return reason
+    return (
+        f"its directions do not say how {carrier.actuator.joint} moves it "
+        f"(sigma of the axis {np.degrees(sigma):.0f} deg)"
+    )
+
+
+# Weights and residuals
 
 
 def _until_converged(

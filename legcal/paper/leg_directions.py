@@ -30,11 +30,13 @@ class LegDirections:
     group: IntArray  # (n,): legs of one group belong to one platform pose, in one frame
     view: IntArray  # (n,) of the first image of each
     leg: IntArray  # (n,)
-    A: Array  # (n, 3): base joint centres in the frame of the group [m]
+    A: Array  # (n, 3): base joint centres in the frame of the group [m], at the readings
     u: Array  # (n, 3): unit directions from base to platform
     basis: Array  # (n, 2, 3): e1, e2 normal to u
     covariance: Array  # (n, 2, 2) of u along e1 and e2 [rad^2]
     reading: Array  # (n,) sign * q [m], length less offset; zero if constant, NaN if passive
+    q: Array  # (n,) readings as they are [m, or rad of an arm]
+    turn: Array  # (n, 3, 3): how what is fixed in the carriage or arm has turned in R_b
 
     def __len__(self) -> int:
         return len(self.leg)
@@ -61,15 +63,18 @@ def observed_directions(
     np.add.at(total, which.ravel(), axes.u)
     u = total / np.linalg.norm(total, axis=1, keepdims=True)
     v, k, j = distinct.T
+    q = measurements.q[axes.row[first], j]
     return LegDirections(
         group=v * measurements.n_poses + k,
         view=v,
         leg=j,
-        A=joints.A_camera[v, j],
+        A=joints.A_at(v, j, q),
         u=u,
         basis=normal_basis(u),
         covariance=axes.covariance[first, :2, :2],
-        reading=_readings(machine, measurements, axes.row[first], j),
+        reading=_readings(machine, q, j),
+        q=q,
+        turn=machine.turns_at(j, q),
     )
 
 
@@ -100,8 +105,9 @@ def directions_through_joints(
     axes = join_axes(replace(axes, u=u, M=M, basis=basis), group)
     view, pose = measurements.view[axes.row], measurements.pose[axes.row]
     frame = np.where(in_base[view], 0, 1 + view)
-    A = np.where(in_base[view][:, None], base.A_Rb[axes.leg], joints.A_camera[view, axes.leg])
-    normals = _known_normals(base, view, axes.leg)
+    q = measurements.q[axes.row, axes.leg]
+    A = np.where(in_base[view][:, None], machine.A_at(axes.leg, q), joints.A_at(view, axes.leg, q))
+    normals = _known_normals(base, view, axes.leg, q)
     u, basis, covariance = _conditioned(axes, A, *normals)
     return LegDirections(
         group=frame * measurements.n_poses + pose,
@@ -111,7 +117,9 @@ def directions_through_joints(
         u=u,
         basis=basis,
         covariance=covariance,
-        reading=_readings(machine, measurements, axes.row, axes.leg),
+        reading=_readings(machine, q, axes.leg),
+        q=q,
+        turn=machine.turns_at(axes.leg, q),
     )
 
 
@@ -123,20 +131,26 @@ def find_outliers(axes: LegAxes, measurements: Measurements, base: JointsInBase)
     """
     joints = base.in_cameras
     view = measurements.view[axes.row]
-    A = joints.A_camera[view, axes.leg]
+    q = measurements.q[axes.row, axes.leg]
+    A, A_Rb = joints.A_at(view, axes.leg, q), base.machine.A_at(axes.leg, q)
     known = joints.located[view, axes.leg]
     for i, T in enumerate(base.T_Rb_camera):
         if T is not None:
-            A[view == i] = T.inv().apply(base.A_Rb[axes.leg[view == i]])
+            A[view == i] = T.inv().apply(A_Rb[view == i])
             known |= view == i
-    here, v = np.arange(len(axes)), joints.v_camera[view, axes.leg]
+    here, v = np.arange(len(axes)), joints.v_at(view, axes.leg, q)
     residual, spread, _ = joint_residuals(axes, here, A, v)
     with_axis = joints.axis_located[view, axes.leg]
     slope = np.zeros((len(axes), 3, 5))
     slope[:, :2, :3] = axes.basis
     at_observed = np.zeros((int(with_axis.sum()), 2))
     slope[with_axis] = residual_jacobian(axes, here[with_axis], v[with_axis], at_observed)
-    spread = spread + slope @ joints.covariance[view, axes.leg] @ np.swapaxes(slope, 1, 2)
+    C = joints.covariance[view, axes.leg].copy()
+    for of_carrier, carrier in joints.carried(view, axes.leg):
+        by_unknowns = carrier.at(q[of_carrier])[1]
+        C[of_carrier, :3, :3] = by_unknowns @ carrier.covariance @ np.swapaxes(by_unknowns, 1, 2)
+        C[of_carrier, :3, 3:] = C[of_carrier, 3:, :3] = 0.0
+    spread = spread + slope @ C @ np.swapaxes(slope, 1, 2)
     spread[~with_axis, 2, 2] = 1.0  # of nothing: the residual is zero
     chi = np.sqrt(np.einsum("ni,nij,nj->n", residual, np.linalg.inv(spread), residual))
     return np.asarray(known & (chi > _OUTLIER * max(1.0, float(np.median(chi[known])))))
@@ -173,14 +187,16 @@ def _positive(covariance: Array, least: Array) -> Array:
     return covariance
 
 
-def _known_normals(base: JointsInBase, view: IntArray, leg: IntArray) -> tuple[Array, Array]:
+def _known_normals(
+    base: JointsInBase, view: IntArray, leg: IntArray, q: Array
+) -> tuple[Array, Array]:
     """Return what legs are normal to (n, 3), zero if nothing, and its covariance (n, 3, 3) [rad^2].
 
     In R_b, where the view is placed there, this is the axis of step 2; in a planar machine z,
     which is as uncertain as the camera of the view is about it. Otherwise it is that of step 1.
     """
     machine, joints = base.machine, base.in_cameras
-    v, C = joints.v_camera[view, leg].copy(), np.zeros((len(leg), 3, 3))
+    v, C = joints.v_at(view, leg, q), np.zeros((len(leg), 3, 3))
     seen = joints.axis_located[view, leg]
     N = normal_basis(v[seen])
     C[seen] = np.swapaxes(N, 1, 2) @ joints.covariance[view, leg, 3:, 3:][seen] @ N
@@ -200,13 +216,11 @@ def _known_normals(base: JointsInBase, view: IntArray, leg: IntArray) -> tuple[A
                 of_normal = N.T @ joints.covariance[i, legs[0], 3:, 3:] @ N
             with_axis &= len(legs) > 0
             C[here] = of_normal
-        v[here] = np.where(with_axis[:, None], in_base[leg[here]], 0.0)
+        turned = np.einsum("kij,kj->ki", machine.turns_at(leg[here], q[here]), in_base[leg[here]])
+        v[here] = np.where(with_axis[:, None], turned, 0.0)
     return v, C
 
 
-def _readings(
-    machine: NominalMachine, measurements: Measurements, row: IntArray, leg: IntArray
-) -> Array:
+def _readings(machine: NominalMachine, q: Array, leg: IntArray) -> Array:
     """Return sign * q of legs in images [m]; a leg of constant length reads zero, as in (14)."""
-    q = np.where(machine.constant[leg], 0.0, measurements.q[row, leg])
-    return np.asarray(machine.sign[leg] * q)
+    return np.asarray(machine.sign[leg] * np.where(machine.constant[leg], 0.0, q))

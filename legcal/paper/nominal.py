@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from legcal.geometry import Array, BoolArray
+from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
+    Actuator,
     EquationKind,
     KinematicParameters,
     Leg,
@@ -62,6 +63,11 @@ class NominalMachine:
         return np.array([leg.kind is LegKind.CONSTANT for leg in self.legs], dtype=np.bool_)
 
     @cached_property
+    def carried(self) -> BoolArray:
+        """Which legs are rods on an actuator, so that A moves, (n_legs,)."""
+        return np.array([leg.actuator is not None for leg in self.legs], dtype=np.bool_)
+
+    @cached_property
     def on_platform(self) -> BoolArray:
         """Which legs are fixed to the platform, (n_legs,)."""
         return np.array([leg.is_fixed_to_platform for leg in self.legs], dtype=np.bool_)
@@ -84,6 +90,28 @@ class NominalMachine:
     def base_normals(self) -> Array:
         """:attr:`base_axes`; in a planar machine z for all, where it is no parameter."""
         return self.base_axes if self.spatial else np.tile([0.0, 0.0, 1.0], (self.n_legs, 1))
+
+    def A_at(self, leg: IntArray, q: Array) -> Array:
+        """Return A of legs (k,) in R_b at readings (k,), (k, 3) [m]."""
+        A = self.parameters.base_joints[leg]
+        for here, actuator in self._carried(leg):
+            A[here] = actuator.at(A[here[0]], q[here])
+        return A
+
+    def turns_at(self, leg: IntArray, q: Array) -> Array:
+        """Return how what carries legs (k,) has turned in R_b at readings (k,), (k, 3, 3)."""
+        R = np.tile(np.eye(3), (len(leg), 1, 1))
+        for here, actuator in self._carried(leg):
+            R[here] = actuator.rotations(q[here])
+        return R
+
+    def _carried(self, leg: IntArray) -> list[tuple[IntArray, Actuator]]:
+        """Return which of legs (k,) each actuator moves, leg by leg."""
+        return [
+            (np.flatnonzero(leg == j), own.actuator)
+            for j, own in enumerate(self.legs)
+            if own.actuator is not None and np.any(leg == j)
+        ]
 
 
 def nominal_machine(machine: Machine) -> NominalMachine:

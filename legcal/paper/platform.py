@@ -27,9 +27,10 @@ import numpy as np
 
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, whitener
-from legcal.machine import EquationKind, JointType, LegColumns, leg_equations
+from legcal.machine import EquationKind, JointType, Leg, LegColumns, leg_equations
 from legcal.paper.criteria import Criteria, Transformation
 from legcal.paper.joints_in_base import JointsInBase
+from legcal.paper.joints_in_camera import JointsInCamera
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
 from legcal.paper.leg_equations import constraint_of_leg, direction_of_leg, length_of_leg
@@ -171,11 +172,12 @@ class RigidProblem:
         changes the length and the direction of the leg by far more than a reading is wrong.
         """
         directions, variance = self.directions, np.zeros(len(rows))
+        legs = self.machine.legs
         key = np.column_stack([directions.leg[rows], directions.A[rows]])
         _, first, which = np.unique(key, axis=0, return_index=True, return_inverse=True)
         for k, i in enumerate(first):
             here = np.flatnonzero(which.ravel() == k)
-            leg = replace(self.machine.legs[directions.leg[rows[i]]], A=directions.A[rows[i]])
+            leg = _standing(legs[directions.leg[rows[i]]], directions, rows[i])
             pose = self.poses.pose[rows[here]]
             linear = leg_equations(leg, self.poses.R[pose], self.poses.t[pose])
             by_A = linear.by_local[:, linear.kinds.index(about), :3]
@@ -192,22 +194,40 @@ class RigidProblem:
         return self.poses.stepped(steps, numbers[numbers >= 0])
 
 
+def _standing(leg: Leg, directions: LegDirections, i: int) -> Leg:
+    """Return a leg with its joint at A where one of the directions begins."""
+    axis = leg.base_axis
+    if axis is not None and leg.actuator is not None:
+        axis = directions.turn[i] @ axis
+    return replace(leg, A=directions.A[i], base_axis=axis, actuator=None)
+
+
 def _covariance_of_A(directions: LegDirections, base: JointsInBase) -> Array:
     """Return the covariance of A of each leg in the frame of its group, (n, 3, 3) [m^2].
 
     Cameras that step 2 placed know A together; errors of their places are not counted.
     """
-    joints = base.in_cameras
-    together = np.zeros((joints.located.shape[1], 3, 3))
-    alone = joints.covariance[directions.view, directions.leg, :3, :3]
+    joints, leg = base.in_cameras, directions.leg
+    together = np.zeros((len(leg), 3, 3))
+    alone = _seen_covariance(joints, directions, directions.view)
     for v, T in enumerate(base.T_Rb_camera):
         if T is not None:
-            R, located = T.rotation.as_matrix(), joints.located[v]
-            together[located] += R @ np.linalg.inv(joints.covariance[v, located, :3, :3]) @ R.T
+            R, located = T.rotation.as_matrix(), joints.located[v, leg]
+            C = _seen_covariance(joints, directions, np.full(len(leg), v))[located]
+            together[located] += R @ np.linalg.inv(C) @ R.T
     placed = np.array([T is not None for T in base.T_Rb_camera])
     known = np.einsum("nii->n", together) > 0.0
     together[known] = np.linalg.inv(together[known])
-    return np.where(placed[directions.view, None, None], together[directions.leg], alone)
+    return np.where(placed[directions.view, None, None], together, alone)
+
+
+def _seen_covariance(joints: JointsInCamera, directions: LegDirections, view: IntArray) -> Array:
+    """Return the covariance of A of each leg as views (n,) show it, (n, 3, 3) [m^2]."""
+    C = joints.covariance[view, directions.leg, :3, :3]
+    for here, carrier in joints.carried(view, directions.leg):
+        by_unknowns = carrier.at(directions.q[here])[1]
+        C[here] = by_unknowns @ carrier.covariance @ np.swapaxes(by_unknowns, 1, 2)
+    return C
 
 
 def build_rigid_platform(rigid: RigidProblem) -> LeastSquares:
@@ -271,7 +291,7 @@ def _ends_and_joints() -> ca.Function:
 
 def _constraints(rigid: RigidProblem, rows: IntArray) -> list[Term]:
     """Return the residuals of constraints of legs at unknown poses, in standard deviations."""
-    legs, unknowns, terms = rigid.machine.legs, rigid.unknowns, []
+    legs, unknowns, directions, terms = rigid.machine.legs, rigid.unknowns, rigid.directions, []
     constrained: dict[tuple[EquationKind, JointType, JointType], list[int]] = {}
     for j, leg in enumerate(legs):
         for about in _OF_STEP_4.intersection(leg.equations):
@@ -283,7 +303,7 @@ def _constraints(rigid: RigidProblem, rows: IntArray) -> list[Term]:
             continue
         of_row = rigid.directions.leg[here]
         observed = (
-            unknowns.base_frames[of_row],
+            directions.turn[here] @ unknowns.base_frames[of_row],
             unknowns.platform_frames[of_row],
             np.array([leg.twist or 0.0 for leg in legs])[of_row],
             rigid.sigma(here, kind[0], _MIN_SIGMA_CONSTRAINT),

@@ -137,8 +137,8 @@ def _in_base_frame(
         if T is None or not len(here):
             continue
         if transformation == "cross_product" and machine.spatial:
-            legs, first = np.unique(directions.leg[here], return_index=True)
-            T = register_by_rays(base.A_Rb[legs], directions.A[here[first]], T.inv()).inv()
+            legs = np.unique(directions.leg[here])
+            T = register_by_rays(base.A_Rb[legs], base.in_cameras.A_camera[v, legs], T.inv()).inv()
         A[here], u[here] = T.apply(A[here]), T.rotation.apply(u[here])
         basis[here] = T.rotation.apply(basis[here].reshape(-1, 3)).reshape(-1, 2, 3)
         centre[here], in_base[here] = T.translation, True

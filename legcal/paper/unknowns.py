@@ -1,7 +1,8 @@
 """The unknowns of a step: some of the kinematic parameters of the legs, counted from a start.
 
 Joint centres and lengths are unknown as they are [m], axes by two turns from where the step starts
-(:func:`~legcal.paper.gibbs.gibbs_of` the angles), twists by their change [rad].
+(:func:`~legcal.paper.gibbs.gibbs_of` the angles), twists by their change [rad]. Rods on the same
+actuator share its numbers; its gain is no unknown of the steps.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
+    ActuatorColumns,
     Leg,
     LegColumns,
     Parametrization,
@@ -23,6 +25,8 @@ from legcal.machine import (
 )
 from legcal.paper.gibbs import angles_of, axis_frames, gibbs_of
 from legcal.paper.nominal import NominalMachine
+
+_AXES = (LegColumns.BASE_AXIS, LegColumns.PLATFORM_AXIS, ActuatorColumns.AXIS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +39,11 @@ class Unknowns:
 
     @classmethod
     def of_base(cls, machine: NominalMachine) -> Unknowns:
-        """Return those of step 2: base joints, and revolute axes at the base."""
+        """Return those of step 2: base joints, revolute axes at the base, and actuators."""
         columns = np.zeros((machine.n_legs, LegColumns.COUNT), dtype=np.bool_)
         columns[:, LegColumns.A] = True
         columns[:, LegColumns.BASE_AXIS] = machine.revolute[:, None]
+        columns[:, ActuatorColumns.AXIS] = columns[:, ActuatorColumns.POINT] = True
         return cls._among(machine, columns)
 
     @classmethod
@@ -53,6 +58,7 @@ class Unknowns:
         """Return those of step 4: all that step 2 does not estimate; twists only if freed."""
         columns = np.ones((machine.n_legs, LegColumns.COUNT), dtype=np.bool_)
         columns[:, LegColumns.A] = False
+        columns[:, LegColumns.OWN :] = False
         columns[:, LegColumns.BASE_AXIS] = ~machine.revolute[:, None]
         return cls._among(machine, columns, free_twists=free_twists)
 
@@ -69,7 +75,7 @@ class Unknowns:
 
     @cached_property
     def place(self) -> IntArray:
-        """Where each leg's numbers (LegColumns) are among the unknowns, (n_legs, 12), or -1."""
+        """Where each leg's numbers (LegColumns) are among the unknowns, (n_legs, 17), or -1."""
         place = np.full(len(self.parametrization) + 1, -1, dtype=np.intp)
         place[self.parameters] = np.arange(len(self))
         return np.asarray(place[self.parametrization.place])
@@ -107,10 +113,22 @@ class Unknowns:
         """The same of axes at the platform."""
         return _frames([leg.platform_axis for leg in self.start])
 
+    @cached_property
+    def actuator_frames(self) -> Array:
+        """The same of the axes of actuators."""
+        return _frames([None if leg.actuator is None else leg.actuator.axis for leg in self.start])
+
+    @cached_property
+    def actuator_points(self) -> Array:
+        """The points of these axes from which their places count, (n_legs, 3) [m]."""
+        return np.array(
+            [np.zeros(3) if leg.actuator is None else leg.actuator.point for leg in self.start]
+        )
+
     def vector(self, legs: Sequence[Leg]) -> Array:
         """Return the unknowns of legs, (n,)."""
         local = numbers_of(legs, self.start)
-        for columns in (LegColumns.BASE_AXIS, LegColumns.PLATFORM_AXIS):
+        for columns in _AXES:
             local[:, columns] = gibbs_of(local[:, columns])
         local[:, LegColumns.TWIST] -= [leg.twist or 0.0 for leg in self.start]
         x = np.zeros(len(self))
@@ -120,7 +138,7 @@ class Unknowns:
     def legs(self, x: Array, legs: Sequence[Leg]) -> tuple[Leg, ...]:
         """Return legs with the unknowns at values of which these are the first."""
         local = np.append(x[: len(self)], 0.0)[self.place]
-        for columns in (LegColumns.BASE_AXIS, LegColumns.PLATFORM_AXIS):
+        for columns in _AXES:
             local[:, columns] = angles_of(local[:, columns])
         local[:, LegColumns.TWIST] += [leg.twist or 0.0 for leg in self.start]
         return with_numbers(legs, self.start, local, self.place >= 0)

@@ -29,6 +29,7 @@ CONDITIONS = {
     "eq17": "platform joints (17)",
     "every_leg_seen": "every leg seen",
     "two_directions": "two directions of every leg",
+    "enough_readings": "readings of every carried joint (6')",
     "three_legs_at_once": "three legs at once (18, 19)",
 }
 _STEPS = {
@@ -59,6 +60,7 @@ def identify_table(report: Identifiability) -> RenderableType:
         [_ranks(report), Text(_LEGEND, style="dim")],
         *(_weak(title, ranks) if ranks.weak else None for title, ranks in weak),
         _remedies(report) if report.remedies else None,
+        _scale(report) if report.scale else None,
         [*_boards(report), *(_intrinsics(one) for one in report.intrinsics)],
         _verdict(report),
     )
@@ -110,6 +112,7 @@ def _conditions(report: Identifiability) -> Table:
         legs = f": {legs_in_words(c.legs, report.legs)}" if c.legs else ""
         numbers = ("", "") if c.equations is None else (str(c.equations), str(c.unknowns))
         remark = "" if c.needed else ", not needed with the board"
+        remark += ", by analogy" if c.by_analogy else ""
         rows.append((CONDITIONS[c.name], *numbers, f"{'ok' if c.ok else 'fails'}{legs}{remark}"))
     return table("condition of the paper", ">equations", ">unknowns", "", rows=rows)
 
@@ -156,6 +159,20 @@ def _hidden(weak: WeakDirection) -> tuple[str, str]:
 def _two_digits(value: float) -> str:
     """Return a number with two digits, never with an exponent where it is large."""
     return f"{float(f'{value:.2g}'):.12g}"
+
+
+def _scale(report: Identifiability) -> list[str | RenderableType]:
+    """Return what would fix the scale, and how well."""
+    rows = []
+    for source in report.scale:
+        scale = "not fixed" if source.sigma is None else f"{100 * source.sigma:.2g} %"
+        motion = source.platform_sigma
+        rows.append((source.assumed, scale, "" if motion is None else f"{1e3 * motion.dX_m:.2g}"))
+    return [
+        "Readings of arms carry no length: the scale of the machine is that of the radii, unless "
+        "a length is measured or a board is seen.",
+        table("what fixes the scale", ">sigma of it", ">platform [mm]", rows=rows),
+    ]
 
 
 def _boards(report: Identifiability) -> list[str]:
@@ -237,6 +254,12 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
             "at both ends of a leg."
         )
         lines.append(Text(expected, style="dim"))
+        radii = next((s for s in report.scale if s.source == "radii"), None)
+        if radii is not None and radii.platform_sigma is not None:
+            lines.append(
+                f"With radii alone it is {_two_digits(1e3 * radii.platform_sigma.dX_m)} mm: the "
+                "scale is the largest part of it; calibrate with a measured length or a board."
+            )
     weak = (*report.staged.weak, *report.full.weak)
     if any(direction.dX_m is not None and not direction.harmless for direction in weak):
         hidden = "The platform error of a direction is that for 1 mm in its largest component."

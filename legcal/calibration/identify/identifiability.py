@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from legcal.calibration.identify.information import expected_intrinsics
 from legcal.calibration.identify.predicted_observations import (
     THIN,
@@ -25,6 +27,7 @@ from legcal.calibration.identify.remedies import (
     recommend,
 )
 from legcal.calibration.identify.report import Identifiability, Ranks, Recommendation
+from legcal.calibration.identify.scale import is_scale_open, scale_in_words, scale_sources
 from legcal.calibration.joint_fit import NO_CHOICES, Choices
 from legcal.data import Dataset
 from legcal.errors import NotIdentifiable, UsageError
@@ -40,7 +43,13 @@ from legcal.machine import (
     singularity_note,
     ties_in_words,
 )
-from legcal.paper import Condition, count_conditions, three_legs_at_once, two_directions
+from legcal.paper import (
+    Condition,
+    count_conditions,
+    enough_readings,
+    three_legs_at_once,
+    two_directions,
+)
 
 MOST_VIEWS = 50
 MOST_IMAGES = 2000  # of a session; more says nothing new and takes minutes
@@ -217,6 +226,11 @@ def check_identifiable(
     staged, full = analysis.staged, analysis.full
     if not full.complete:
         raise NotIdentifiable(_refusal(dataset, identifiability_of_dataset(dataset, choices)))
+    if analysis.predicted.actuators and is_scale_open(analysis):
+        raise NotIdentifiable(
+            f"{dataset.folder}: the parameters cannot be identified: "
+            f"{scale_in_words(scale_sources(analysis))}; state it with --prior."
+        )
     tied = ties_in_words(dataset.machine)
     notes = [] if tied is None else [tied]
     if any(not weak.harmless for weak in staged.weak):
@@ -296,6 +310,7 @@ def _judge(
         remedies=() if enough else find_remedies(analysis, replanning),
         recommendation=recommendation,
         notes=tuple(notes),
+        scale=scale_sources(analysis),
     )
 
 
@@ -338,15 +353,20 @@ def conditions_of(machine: Machine, predicted: PredictedObservations) -> tuple[C
         revolute=[j for j, x in enumerate(predicted.legs) if x.base_joint is JointType.REVOLUTE],
         passive=[j for j, has in enumerate(predicted.with_length) if not has],
         board=bool(predicted.board.all()),
+        actuators=predicted.on_actuators,
     )
+    frame, pose = predicted.frame[predicted.view[image]], predicted.pose[image]
+    moves = predicted.carried_by[leg] >= 0
+    still, rods = np.flatnonzero(~moves), np.flatnonzero(moves)
+    q = predicted.q[pose[rods], predicted.carried_by[leg[rods]]]
+    directions = two_directions(
+        frame[still], leg[still], predicted.u[pose[still], leg[still]], predicted.n_legs
+    )
+    standing = tuple(j for j in directions.legs if predicted.carried_by[j] < 0)
     return (
         *counts,
-        two_directions(
-            predicted.frame[predicted.view[image]],
-            leg,
-            predicted.u[predicted.pose[image], leg],
-            predicted.n_legs,
-        ),
+        replace(directions, ok=not standing, legs=standing),
+        *enough_readings(frame[rods], leg[rods], q, predicted.legs),
         three_legs_at_once(predicted.views, geometries(machine), spatial=predicted.spatial),
     )
 

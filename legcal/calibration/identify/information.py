@@ -33,7 +33,7 @@ from legcal.estimation import (
     information_rows,
     marginal_rows,
 )
-from legcal.geometry import Array, IntArray, cross, normal_basis
+from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
 from legcal.machine import EquationKind, freedoms, pose_equations
 
 SIGMA_EXACT = 1e-7  # [m]: of what the mechanism itself demands
@@ -60,11 +60,12 @@ class WhitenedEquations:
     """The whitened equations of all legs at the poses of a session."""
 
     # (k, m, f): by the possible motions of the platform: turns [m at the leg's length],
-    # displacements
+    # displacements; and by the readings of actuators, in metres
     by_pose: Array
     by_parameters: Array  # (k, m, p): by the parameters in metres
     leg: IntArray  # (m,): the leg of each row
     demand: tuple[EquationKind, ...]  # (m,): what it is about
+    reading: BoolArray  # (m,): rows of the readings of actuators, of the first leg on each
 
     def at(self, poses: IntArray) -> WhitenedEquations:
         """Return the equations at some of the poses, in that order."""
@@ -73,21 +74,35 @@ class WhitenedEquations:
 
 def whitened_leg_equations(predicted: PredictedObservations) -> WhitenedEquations:
     """Return what readings and legs demand of the poses of a session."""
-    equations = pose_equations(predicted.legs, predicted.R, predicted.t)
-    sigma = np.where(equations.measured, predicted.sigma_q, SIGMA_EXACT)[:, None]
+    actuators, n_poses = predicted.actuators, len(predicted.t)
+    q = predicted.q if actuators else None
+    equations = pose_equations(predicted.legs, predicted.R, predicted.t, q=q)
+    # The readings that move rods are rows of their own
+    read = equations.measured & (predicted.carried_by < 0)[equations.leg]
+    sigma = np.where(read, predicted.sigma_q, SIGMA_EXACT)[:, None]
     columns = list(freedoms(predicted.frame_legs))
-    return WhitenedEquations(
-        (equations.by_pose / sigma * pose_unit(predicted))[:, :, columns],
-        equations.by_parameters(predicted.parametrization) / sigma * predicted.unit,
-        equations.leg,
-        equations.kinds,
-    )
+    by_pose = (equations.by_pose / sigma * pose_unit(predicted))[:, :, columns]
+    by_parameters = equations.by_parameters(predicted.parametrization) / sigma * predicted.unit
+    leg, kinds = equations.leg, equations.kinds
+    if actuators:  # their readings are further unknowns of each pose, and measured
+        by_pose = np.concatenate([by_pose, equations.by_q / sigma * predicted.unit_of_q], axis=2)
+        n = len(actuators)
+        rows = np.zeros((n_poses, n, by_pose.shape[2]))
+        rows[:, :, -n:] = np.diag(predicted.unit_of_q / predicted.sigma_of_q)
+        by_pose = np.concatenate([by_pose, rows], axis=1)
+        none = np.zeros((n_poses, n, by_parameters.shape[2]))
+        by_parameters = np.concatenate([by_parameters, none], axis=1)
+        leg = np.append(leg, [int(np.argmax(predicted.carried_by == a)) for a in range(n)])
+        kinds = (*kinds, *[EquationKind.LENGTH] * n)
+    reading = np.arange(len(leg)) >= len(equations.leg)
+    return WhitenedEquations(by_pose, by_parameters, leg, kinds, reading)
 
 
 def image_rows(predicted: PredictedObservations) -> Array:
     """Return the whitened derivatives (n_images, n_legs, 4, f + 6 + p) of what images show.
 
-    They are derivatives by the motion of the platform, that of the camera, and the parameters.
+    They are derivatives by the motion of the platform and of what actuators move, that of the
+    camera, and the parameters.
     """
     base, platform = at_base_joints(predicted), at_platform_joints(predicted)
     turns = pose_unit(predicted)
@@ -97,11 +112,16 @@ def image_rows(predicted: PredictedObservations) -> Array:
     by_pose[:, :, 2:] = np.concatenate([turn, platform.gradient], axis=3) * turns
     scatter = predicted.local_to_parameters
     inside = platform.gradient @ predicted.R[predicted.pose][:, None]
-    by_parameters = np.concatenate(
-        [base.gradient @ scatter[:, :3], inside @ scatter[:, 3:6]], axis=2
-    )
+    of_A = base.gradient @ scatter[:, :3]
     columns = list(freedoms(predicted.frame_legs))
-    return np.concatenate([by_pose[..., columns], by_camera, by_parameters], axis=3)
+    by_pose = by_pose[..., columns]
+    if predicted.actuators:
+        of_A = base.gradient @ (predicted.A_by_local @ scatter)[predicted.pose]
+        by_q = np.zeros((*by_pose.shape[:3], len(predicted.actuators)))
+        by_q[:, :, :2] = base.gradient @ predicted.A_by_q[predicted.pose]
+        by_pose = np.concatenate([by_pose, by_q], axis=3)
+    by_parameters = np.concatenate([of_A, inside @ scatter[:, 3:6]], axis=2)
+    return np.concatenate([by_pose, by_camera, by_parameters], axis=3)
 
 
 def pose_unit(predicted: PredictedObservations) -> Array:
@@ -115,7 +135,7 @@ def prior_of(predicted: PredictedObservations, choices: Choices) -> GaussianPrio
     for i, name in enumerate(predicted.parametrization.names):
         if name in choices.priors:
             sigma[i] = choices.priors[name].sigma
-        elif choices.holds(name, by_default=name.endswith(".twist")):
+        elif choices.holds(name, by_default=name.endswith((".twist", ".gain"))):
             sigma[i] = SIGMA_EXACT * predicted.unit[i]
     known, values = np.array(list(sigma), dtype=np.intp), np.array(list(sigma.values()))
     return GaussianPrior(known, np.zeros(len(sigma)), values)
@@ -135,7 +155,7 @@ def problem_of(
     in each image depends on (n_images, n_legs), and the derivatives (n_images, n_legs, 4, d) of
     what it shows.
     """
-    n_f, n_p, n_poses = len(freedoms(predicted.frame_legs)), len(predicted.unit), len(predicted.t)
+    n_f, n_p, n_poses = predicted.n_motions, len(predicted.unit), len(predicted.t)
     n_images, n_legs = images.shape[:2]
     n, m, whole = n_images * n_legs, len(equations.leg), slice(None)
     J = np.concatenate([images[..., n_f:], *(by for _, _, by in more)], axis=3).reshape(n, 4, -1)
@@ -225,10 +245,11 @@ def _platform_board(predicted: PredictedObservations) -> tuple[Factor[_Nominal],
         return np.concatenate([cross(at[:, None], by), by], axis=2) * turns
 
     columns, one = list(freedoms(predicted.frame_legs)), np.zeros(len(place), dtype=np.intp)
+    none = np.zeros((*by_place.shape[:2], len(predicted.actuators)))
     shown = Residuals.of(
         np.zeros(by_place.shape[:2]),
         np.concatenate([moved(place, by_place), moved(y, by_y)], axis=2),
-        moved(arm, by_place)[..., columns],
+        np.concatenate([moved(arm, by_place)[..., columns], none], axis=2),
     )
     touches = (
         ("camera", predicted.frame[view], slice(None)),
@@ -304,6 +325,20 @@ def _radii_and_intrinsics(
     hidden = ~predicted.seen[predicted.view]
     by_radius[hidden] = by_intrinsics[hidden] = 0.0
     return by_radius, by_intrinsics
+
+
+def radius_rows(predicted: PredictedObservations) -> Array:
+    """Return the derivatives of what images show by the radius of each leg, (..., 4, 1) [1/m].
+
+    A thicker leg looks nearer, by as much as makes a scene that is larger in all, cameras and radii
+    included, look the same.
+    """
+    by_radius = np.zeros((len(predicted.view), predicted.n_legs, 4, 1))
+    for k, across in enumerate((at_base_joints(predicted), at_platform_joints(predicted))):
+        ray = across.point - predicted.camera[predicted.view][:, None]
+        towards = -np.sum(across.gradient[:, :, 1] * ray, axis=2)
+        by_radius[:, :, 2 * k + 1, 0] = towards / predicted.radius
+    return by_radius
 
 
 def intrinsics_changes(

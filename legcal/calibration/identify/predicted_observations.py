@@ -6,7 +6,7 @@ across each leg is given with the standard deviation of an outline.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -14,17 +14,22 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.ordered_dataset import nominal_poses
-from legcal.data import Dataset
+from legcal.data import SIGMA_ANGLE, Dataset
 from legcal.estimation import Frames
 from legcal.geometry import Array, BoolArray, IntArray, cross
 from legcal.machine import (
+    Actuator,
+    ActuatorColumns,
     Leg,
     LegColumns,
     LegKind,
     Machine,
     Parametrization,
     Ties,
+    actuator_index,
+    actuators_of,
     by_step,
+    freedoms,
     geometries,
     independent,
     leg_labels,
@@ -35,6 +40,7 @@ from legcal.machine import (
     on_ties,
     parametrization_of,
     random_poses_of_legs,
+    readings_of_rods,
     ties_of,
 )
 from legcal.vision import Link, shared_cameras
@@ -79,6 +85,7 @@ class PredictedObservations:
     # (n_images,): those that show a calibration board on the platform; none if it is empty
     platform_board: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     tied_by: Ties | None = None  # what ties these parameters; frames alone without it
+    sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
 
     @property
     def n_legs(self) -> int:
@@ -120,8 +127,91 @@ class PredictedObservations:
 
     @cached_property
     def A(self) -> Array:
-        """Base joint centres in R_b, (n_legs, 3) [m]."""
+        """Base joint centres in R_b, (n_legs, 3) [m]; on actuators at reading 0."""
         return np.array([leg.A for leg in self.legs])
+
+    @cached_property
+    def actuators(self) -> tuple[Actuator, ...]:
+        """What moves joints at A, each once."""
+        return actuators_of(self.legs)
+
+    @cached_property
+    def carried_by(self) -> IntArray:
+        """Which of the actuators moves A of each leg, (n_legs,); -1 for none."""
+        return np.array(actuator_index(self.legs), dtype=np.intp)
+
+    @cached_property
+    def q(self) -> Array:
+        """Readings of the actuators at every pose, (k, n_actuators) [m or rad]."""
+        return readings_of_rods(self.legs, self.R, self.t)
+
+    @cached_property
+    def A_at(self) -> Array:
+        """Base joint centres in R_b at every pose, (k, n_legs, 3) [m]."""
+        A = np.tile(self.A, (len(self.t), 1, 1))
+        for j, actuator, a in self._carried():
+            A[:, j] = actuator.at(self.legs[j].A, self.q[:, a])
+        return A
+
+    @cached_property
+    def A_by_local(self) -> Array:
+        """Their derivatives by the numbers of the legs (LegColumns), (k, n_legs, 3, 17)."""
+        found = np.zeros((len(self.t), self.n_legs, 3, LegColumns.COUNT))
+        found[..., LegColumns.A] = np.eye(3)
+        for j, actuator, a in self._carried():
+            motion = actuator.motion(self.legs[j].A, self.q[:, a])
+            found[:, j, :, LegColumns.A] = motion.by_A
+            found[:, j, :, ActuatorColumns.AXIS] = motion.by_axis
+            found[:, j, :, ActuatorColumns.POINT] = motion.by_point
+            found[:, j, :, ActuatorColumns.GAIN] = motion.by_gain
+        return found
+
+    @cached_property
+    def A_by_q(self) -> Array:
+        """Their derivatives by the readings of actuators in metres, (k, n_legs, 3, n_actuators)."""
+        found = np.zeros((len(self.t), self.n_legs, 3, len(self.actuators)))
+        for j, actuator, a in self._carried():
+            by_q = actuator.motion(self.legs[j].A, self.q[:, a]).by_q
+            found[:, j, :, a] = by_q * self.unit_of_q[a]
+        return found
+
+    @cached_property
+    def unit_of_q(self) -> Array:
+        """A metre of every actuator's reading in its own unit, (n_actuators,)."""
+        turns = np.array([actuator.turns for actuator in self.actuators], dtype=np.bool_)
+        return np.where(turns, 1.0 / self.mean_length, 1.0)
+
+    @property
+    def sigma_of_q(self) -> Array:
+        """Standard deviations of their readings, (n_actuators,) [m or rad]."""
+        by_default = (SIGMA_ANGLE if a.turns else self.sigma_q for a in self.actuators)
+        return np.array(
+            [
+                self.sigma_by_joint.get(a.joint, sigma)
+                for a, sigma in zip(self.actuators, by_default, strict=True)
+            ]
+        )
+
+    @property
+    def on_actuators(self) -> tuple[tuple[tuple[int, ...], bool], ...]:
+        """The legs on each actuator, and whether it turns."""
+        return tuple(
+            (tuple(np.flatnonzero(self.carried_by == a).tolist()), actuator.turns)
+            for a, actuator in enumerate(self.actuators)
+        )
+
+    @property
+    def n_motions(self) -> int:
+        """The unknowns of a pose: freedoms of the platform, and readings of actuators."""
+        return len(freedoms(self.frame_legs)) + len(self.actuators)
+
+    def _carried(self) -> list[tuple[int, Actuator, int]]:
+        """Return the legs whose joint at A moves, by what, and which actuator that is."""
+        return [
+            (j, leg.actuator, int(self.carried_by[j]))
+            for j, leg in enumerate(self.legs)
+            if leg.actuator is not None
+        ]
 
     @cached_property
     def arm(self) -> Array:
@@ -132,12 +222,12 @@ class PredictedObservations:
     @cached_property
     def length(self) -> Array:
         """Leg lengths at every pose, (k, n_legs) [m]."""
-        return np.asarray(np.linalg.norm(self.arm + self.t[:, None] - self.A, axis=2))
+        return np.asarray(np.linalg.norm(self.arm + self.t[:, None] - self.A_at, axis=2))
 
     @cached_property
     def u(self) -> Array:
         """Leg directions in R_b at every pose, (k, n_legs, 3)."""
-        return (self.arm + self.t[:, None] - self.A) / self.length[..., None]
+        return (self.arm + self.t[:, None] - self.A_at) / self.length[..., None]
 
     @cached_property
     def mean_length(self) -> float:
@@ -152,7 +242,7 @@ class PredictedObservations:
 
     @cached_property
     def local_to_parameters(self) -> Array:
-        """Derivative of each leg's twelve numbers by the parameters in metres, (n_legs, 12, p)."""
+        """Derivative of each leg's numbers by the parameters in metres, (n_legs, 17, p)."""
         n = LegColumns.COUNT
         scattered = [self.parametrization.scatter(np.eye(n), j) for j in range(self.n_legs)]
         return np.array(scattered).reshape(self.n_legs, n, len(self.unit)) * self.unit
@@ -200,8 +290,7 @@ class Across:
 
 def at_base_joints(predicted: PredictedObservations) -> Across:
     """Return what is seen at the base joint centres."""
-    images = len(predicted.view)
-    return _across(predicted, np.broadcast_to(predicted.A, (images, *predicted.A.shape)))
+    return _across(predicted, predicted.A_at[predicted.pose])
 
 
 def at_platform_joints(predicted: PredictedObservations) -> Across:
@@ -332,6 +421,7 @@ def recorded_observations(
         camera=camera,
         focal=np.array([_focal(view.camera.K) for view in views]),
         sigma_q=m.sigma_q,
+        sigma_by_joint=m.sigma_by_joint,
         board=np.isin(used, m.view[_showing(dataset, "base")]),
         platform_board=_showing(dataset, "platform"),
     )
@@ -359,7 +449,7 @@ def cameras_of(dataset: Dataset) -> tuple[str, ...]:
 
 def looking_at(predicted: PredictedObservations) -> Array:
     """Return orientations (n_views, 3, 3) of cameras that look at the legs of their views."""
-    middle = 0.5 * (predicted.A + (predicted.arm + predicted.t[:, None]).mean(axis=0))
+    middle = 0.5 * (predicted.A_at + predicted.arm + predicted.t[:, None]).mean(axis=0)
     orientations = []
     for place, shown in zip(predicted.camera, predicted.seen, strict=True):
         z = (middle[shown] if shown.any() else middle).mean(axis=0) - place
@@ -410,7 +500,7 @@ def cameras_for(predicted: PredictedObservations, views: Sequence[Sequence[int]]
     """Return where further cameras stand by default, (n_views, 3) in R_b [m]."""
     B = (predicted.arm + predicted.t[:, None]).mean(axis=0)
     rng = np.random.default_rng(_SEED + 1)
-    return default_cameras(predicted.A, B, views, predicted.spatial, rng)
+    return default_cameras(predicted.A_at.mean(axis=0), B, views, predicted.spatial, rng)
 
 
 def _axis(A: Array, B: Array) -> Array:
@@ -461,16 +551,28 @@ def radii(legs: Sequence[Leg], length: float) -> Array:
 def joints_at(legs: Sequence[Leg], T: RigidTransform) -> tuple[Array, Array]:
     """Return the joint centres A and B at a pose, in R_b."""
     A, B = np.array([leg.A for leg in legs]), np.array([leg.B for leg in legs])
+    matrix = T.as_matrix()[None]
+    q = readings_of_rods(legs, matrix[:, :3, :3], matrix[:, :3, 3])
+    for j, (leg, a) in enumerate(zip(legs, actuator_index(legs), strict=True)):
+        if leg.actuator is not None:
+            A[j] = leg.actuator.at(leg.A, q[:, a])[0]
     return A, np.asarray(T.apply(B))
 
 
 def travel_of(machine: Machine) -> Array:
-    """Return shortest and longest length of each leg, (n_legs, 2) [m]."""
-    lengths = []
+    """Return shortest and longest length of each leg, (n_legs, 2) [m].
+
+    Of rods on actuators it is the travel of these [m or rad].
+    """
+    found = []
     for leg in machine.legs:
-        ends = [leg.length_at(q) for q in leg.travel]
-        lengths.append([leg.q0, leg.q0] if leg.kind is LegKind.CONSTANT else sorted(ends))
-    return np.array(lengths)
+        if leg.actuator is not None:
+            found.append(list(leg.actuator.travel))
+        elif leg.kind is LegKind.CONSTANT:
+            found.append([leg.q0, leg.q0])
+        else:
+            found.append(sorted(leg.length_at(q) for q in leg.travel))
+    return np.array(found)
 
 
 def _showing(dataset: Dataset, link: Link) -> BoolArray:
@@ -492,9 +594,10 @@ def _focal(K: Array) -> float:
 
 def legs_around(predicted: PredictedObservations) -> list[int]:
     """Return the legs in their order around the base."""
-    points = predicted.A + (predicted.arm + predicted.t[:, None]).mean(axis=0)
+    A = predicted.A_at.mean(axis=0)
+    points = A + (predicted.arm + predicted.t[:, None]).mean(axis=0)
     centred = points - points.mean(axis=0)
-    _, _, basis = np.linalg.svd(predicted.A - predicted.A.mean(axis=0))
+    _, _, basis = np.linalg.svd(A - A.mean(axis=0))
     angle = np.arctan2(centred @ basis[1], centred @ basis[0])
     return [int(j) for j in np.argsort(angle, kind="stable")]
 

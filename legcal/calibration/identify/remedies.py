@@ -73,6 +73,8 @@ def recommend(
     found = list[Recommendation]()
     candidates = _Candidates(machine, images, board=board, platform_board=platform_board)
     most = machine.n_legs + 1
+    if machine.actuators:  # rods in parallel have no lengths that the steps could find
+        candidates.by_steps = candidates.best(_MOST_VIEWS, machine.n_legs) is not None
     for n_views in range(1, _MOST_VIEWS + 1):
         for size in range(1, most):
             best = candidates.best(n_views, size)
@@ -96,6 +98,7 @@ class _Candidates:
         self.motion = self.every.motion
         self.ring = legs_around(self.predicted)
         self.of_size: dict[int, list[Analysis]] = {}
+        self.by_steps = True  # whether the steps must determine everything too
 
     def best(self, n_views: int, size: int) -> Recommendation | None:
         """Return the best set of so many views of so many legs, or None if none suffices."""
@@ -134,6 +137,7 @@ class _Candidates:
             revolute=[j for j, leg in enumerate(s.legs) if leg.base_joint is JointType.REVOLUTE],
             passive=np.flatnonzero(~s.with_length).tolist(),
             board=bool(s.board.all()),
+            actuators=s.on_actuators,
         )
         at_once = three_legs_at_once(views, s.legs, spatial=s.spatial)
         return not any(c.fails for c in (*counts, at_once))
@@ -182,6 +186,8 @@ class _Candidates:
         predicted, n_p = self.predicted, len(self.predicted.unit)
         if missing(predicted, information, self.motion):
             return False
+        if not self.by_steps:
+            return True
         last = np.concatenate([a.default_steps[2].information for a in chosen])
         for k, rows in ((0, self.base_together(chosen)), (2, last)):
             step = replace(chosen[0].default_steps[k], information=rows)

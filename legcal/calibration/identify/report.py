@@ -98,6 +98,17 @@ class BoardReport:
 
 
 @dataclass(frozen=True)
+class ScaleSource:
+    """Something that fixes the scale of a machine whose readings carry no length."""
+
+    source: str  # ``length``, ``base_board``, ``platform_board`` or ``radii``
+    assumed: str  # what was taken to be known, in words
+    # standard deviation of the scale, as a part of it; None where this does not fix it
+    sigma: float | None
+    platform_sigma: RmsMotion | None  # that of the platform then; None where it is not determined
+
+
+@dataclass(frozen=True)
 class Remedy:
     """Something that would help, with the ranks that it gives."""
 
@@ -154,6 +165,8 @@ class Identifiability:
     notes: tuple[str, ...]  # what the reader should know
     # what the legs determine of the cameras of a dataset with images; empty without them
     intrinsics: tuple[CameraIntrinsics, ...] = ()
+    # what would fix the scale where radii alone do: where readings carry no length
+    scale: tuple[ScaleSource, ...] = ()
 
     @property
     def conditions_hold(self) -> bool:
@@ -165,6 +178,8 @@ class Identifiability:
         document = asdict(self)
         document["paper"] = {"ok": self.conditions_hold}
         document["conditions"] = [_condition(c, self.legs) for c in self.conditions]
+        if not self.scale:
+            del document["scale"]
         for board in ("board", "platform_board"):
             document[board]["with"] = document[board].pop("with_board")
         return {key: _plain(value) for key, value in document.items()}
@@ -175,6 +190,8 @@ def _condition(condition: Condition, legs: Sequence[str]) -> dict[str, Any]:
     document: dict[str, Any] = {"name": condition.name, "ok": condition.ok}
     if not condition.needed:
         document["needed"] = False
+    if condition.by_analogy:
+        document["by_analogy"] = True
     if condition.equations is not None:
         document |= {"equations": condition.equations, "unknowns": condition.unknowns}
     else:

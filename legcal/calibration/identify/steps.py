@@ -6,7 +6,7 @@ the platform (16) to (19): by the default criteria, and as printed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, combinations_with_replacement
 
 import numpy as np
@@ -20,7 +20,15 @@ from legcal.calibration.identify.predicted_observations import (
 )
 from legcal.estimation import compress, eliminate, grouped
 from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
-from legcal.machine import EquationKind, JointType, LegColumns, freedoms
+from legcal.machine import (
+    Actuator,
+    ActuatorColumns,
+    ActuatorKind,
+    EquationKind,
+    JointType,
+    LegColumns,
+)
+from legcal.paper import Carrier, CarrierColumns
 
 MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
 _MIN_DISTANCE = 1e-3  # mean leg lengths: nearer joints count as one
@@ -31,8 +39,9 @@ _MIN_VARIANCE = 1e-12  # of a variance [m^2]
 class Located:
     """Step 1: base joints and revolute axes in the frames of cameras, or of the board."""
 
-    # (n_frames, n_legs, r, 5): whitened rows by A along the axes of R_b [m] and the two turns of
-    # the axis [m at the leg's length]; zero where the leg is not seen
+    # (n_frames, n_legs, 9, 9): whitened rows by A along the axes of R_b [m], the two turns of the
+    # revolute axis [m at the leg's length], those of the axis of the actuator, and two
+    # displacements of this [m] (CarrierColumns); zero where the leg is not seen or has none
     information: Array
     # joint, axis: (n_frames, n_legs): which joints are located, and which revolute axes
     joint: BoolArray
@@ -54,21 +63,62 @@ def locate_joints(predicted: PredictedObservations) -> Located:
     """Return what step 1 says: all axes of a leg in a frame meet in A (6), and v . u = 0 (7)."""
     A, B = at_base_joints(predicted), at_platform_joints(predicted)
     revolute = revolute_axes(predicted)
-    found = np.zeros((predicted.n_frames, predicted.n_legs, 5, 5))
+    shape = predicted.n_frames, predicted.n_legs
+    found = np.zeros((*shape, CarrierColumns.COUNT, CarrierColumns.COUNT))
+    joint, axis = np.zeros((2, *shape), dtype=np.bool_)
+    limit = 1.0 / (MAX_SIGMA * predicted.mean_length)
     frame, wanted = predicted.frame[predicted.view], 0
     for f, legs in enumerate(predicted.frames):
         for j in legs:
             here = np.flatnonzero((frame == f) & predicted.seen[predicted.view, j])
-            wanted += 3 + 2 * int(revolute[j])
+            own = columns_of_joint(predicted, j)
+            rows = np.zeros((1, CarrierColumns.COUNT))
             if revolute[j]:
-                found[f, j] = compress(_joint_and_axis(predicted, A, B, here, j))
+                rows = _joint_and_axis(predicted, A, B, here, j)
             else:
-                found[f, j, :3, :3] = compress(A.gradient[here, j].reshape(-1, 3))
-    limit = 1.0 / (MAX_SIGMA * predicted.mean_length)
+                carrier = carrier_of(predicted, j)
+                by_unknowns = _by_unknowns(predicted, carrier, predicted.pose[here], j)[0]
+                rows = (A.gradient[here, j] @ by_unknowns).reshape(-1, CarrierColumns.COUNT)
+            found[f, j][np.ix_(own, own)] = compress(rows[:, own])
+            wanted += len(own)
+            place = np.setdiff1d(own, [3, 4])
+            singular = np.linalg.svd(found[f, j][:, place], compute_uv=False)[len(place) - 1]
+            joint[f, j] = singular > limit
+            smallest = np.linalg.svd(found[f, j][:, own], compute_uv=False)[len(own) - 1]
+            axis[f, j] = revolute[j] and joint[f, j] and smallest > limit
     singular = np.linalg.svd(found, compute_uv=False)
-    joint = np.linalg.svd(found[..., :3], compute_uv=False)[..., -1] > limit
-    axis = revolute & joint & (singular[..., -1] > limit)
     return Located(found, joint, axis, int(np.sum(singular > limit)), wanted)
+
+
+def carrier_of(predicted: PredictedObservations, j: int) -> Carrier:
+    """Return the joint at A of a leg with what moves it, as step 1 looks for it."""
+    leg = predicted.legs[j]
+    v = leg.base_axis if revolute_axes(predicted)[j] else None
+    actuator = leg.actuator
+    if actuator is None:  # it stands still
+        actuator = Actuator("", ActuatorKind.PRISMATIC, np.eye(3)[2], leg.A, (0.0, 0.0))
+    elif actuator.turns:  # known by its point beside A
+        along = float((leg.A - actuator.point) @ actuator.axis)
+        actuator = replace(actuator, point=actuator.point + along * actuator.axis)
+    none = np.zeros((CarrierColumns.COUNT, CarrierColumns.COUNT))
+    return Carrier(leg.A, np.zeros(3) if v is None else v, actuator, none)
+
+
+def columns_of_joint(predicted: PredictedObservations, j: int) -> IntArray:
+    """Return which of the unknowns (CarrierColumns) the joint at A of a leg has."""
+    own = carrier_of(predicted, j).columns
+    return own if predicted.carried_by[j] >= 0 else own[own < CarrierColumns.AXIS.start]
+
+
+def _by_unknowns(
+    predicted: PredictedObservations, carrier: Carrier, pose: IntArray, j: int
+) -> tuple[Array, Array]:
+    """Return derivatives (k, 3, 9) of A, and of the revolute axis, by the unknowns in metres."""
+    a = int(predicted.carried_by[j])
+    q = predicted.q[pose, a] if a >= 0 else np.zeros(len(pose))
+    unit = np.ones(CarrierColumns.COUNT)
+    unit[CarrierColumns.V] = unit[CarrierColumns.AXIS] = 1.0 / predicted.mean_length
+    return carrier.at(q)[1] * unit, carrier.axis_at(q)[1] * unit
 
 
 def identify_base(predicted: PredictedObservations, located: Located) -> StepInformation:
@@ -80,23 +130,45 @@ def identify_base(predicted: PredictedObservations, located: Located) -> StepInf
 def base_by_frames(predicted: PredictedObservations, located: Located) -> tuple[IntArray, Array]:
     """Return the parameters of step 2, and rows by each frame and all parameters, (k, r, 6 + p)."""
     columns = np.union1d(
-        predicted.columns(LegColumns.A),
+        predicted.columns(LegColumns.A, ActuatorColumns.AXIS, ActuatorColumns.POINT),
         predicted.columns(LegColumns.BASE_AXIS, legs=revolute_axes(predicted)),
     )
     pairs = np.argwhere(located.joint)
-    rows = np.zeros((len(pairs), 5, 6 + len(predicted.unit)))
+    n = CarrierColumns.COUNT
+    rows = np.zeros((len(pairs), n, 6 + len(predicted.unit)))
     for row, (f, j) in zip(rows, pairs, strict=True):
         F = located.information[f, j]
         if not located.axis[f, j]:  # what is known of A alone
+            rest = np.setdiff1d(np.arange(n), np.r_[CarrierColumns.V])
             F = np.zeros_like(F)
-            F[:3, :3] = compress(
-                eliminate(located.information[f, j][None][:, :, [3, 4, 0, 1, 2]], 2)
-            )[:3]
+            F[: len(rest), rest] = compress(
+                eliminate(located.information[f, j][None][:, :, [3, 4, *rest]], 2)
+            )
         row[:, :6] = _by_camera(predicted, j, F)
-        scatter = predicted.local_to_parameters[j]
-        row[:, 6:] = F[:, :3] @ scatter[LegColumns.A]
-        row[:, 6:] += F[:, 3:] @ scatter[LegColumns.BASE_AXIS] * predicted.mean_length
+        row[:, 6:] = F @ _unknowns_by_parameters(predicted, j)
     return columns, grouped(rows, pairs[:, 0], predicted.n_frames)
+
+
+def _unknowns_by_parameters(predicted: PredictedObservations, j: int) -> Array:
+    """Return the derivative (9, p) of the unknowns of a joint (CarrierColumns) by the parameters.
+
+    The point of an axis beside A stands where the numbers of the actuator have it moved along its
+    axis, which matters with turns of the axis.
+    """
+    scatter, length = predicted.local_to_parameters[j], predicted.mean_length
+    found = np.zeros((CarrierColumns.COUNT, scatter.shape[1]))
+    found[CarrierColumns.A] = scatter[LegColumns.A]
+    found[CarrierColumns.V] = length * scatter[LegColumns.BASE_AXIS]
+    found[CarrierColumns.AXIS] = length * scatter[ActuatorColumns.AXIS]
+    found[CarrierColumns.POINT] = scatter[ActuatorColumns.POINT]
+    leg = predicted.legs[j]
+    if leg.actuator is not None and leg.actuator.turns:
+        w, basis = leg.actuator.axis, normal_basis(leg.actuator.axis)
+        along = float((leg.A - leg.actuator.point) @ w)
+        found[CarrierColumns.POINT] += (
+            along * basis @ cross(basis, w).T @ scatter[ActuatorColumns.AXIS]
+        )
+    return found
 
 
 def distance_rows(
@@ -171,7 +243,7 @@ def identify_platform(
             ]
         )
     )
-    n_f, n_p = len(freedoms(predicted.frame_legs)), len(predicted.unit)
+    n_f, n_p = predicted.n_motions, len(predicted.unit)
     keep = np.concatenate([np.arange(n_f), n_f + columns])
     groups = _groups(predicted, located)
     seen = np.delete(images[:, :, 2:], np.s_[n_f : n_f + 6], axis=3)  # at B
@@ -191,24 +263,22 @@ def identify_platform(
 def scalar_products(predicted: PredictedObservations, located: Located) -> StepInformation:
     """Return what (9) says: all products of vectors A_j A_g and revolute axes of each frame."""
     columns = identify_base(predicted, located).columns
-    scatter = predicted.local_to_parameters
+    by_unknowns = np.concatenate(
+        [_unknowns_by_parameters(predicted, j) for j in range(predicted.n_legs)]
+    )
     rows = [np.zeros((0, len(predicted.unit)))]
     for f in range(predicted.n_frames):
-        vectors, slopes = _vectors_of(predicted, located, f)
+        vectors, slopes, is_unit = _vectors_of(predicted, located, f)
         pairs = [
             (p, q)
             for p, q in combinations_with_replacement(range(len(vectors)), 2)
-            if p != q or slopes[p][:, :3].any()  # v . v = 1 says nothing
+            if p != q or not is_unit[p]  # v . v = 1 says nothing
         ]
         if not pairs:
             continue
         G = np.array([vectors[p] @ slopes[q] + vectors[q] @ slopes[p] for p, q in pairs])
         variance = np.einsum("pi,ij,pj->p", G, _covariance(predicted, located, f), G)
-        turns = predicted.mean_length * scatter[:, LegColumns.BASE_AXIS]
-        by_local = np.concatenate([scatter[:, LegColumns.A], turns], axis=1)
-        rows.append(
-            G @ by_local.reshape(G.shape[1], -1) / np.sqrt(variance + _MIN_VARIANCE)[:, None]
-        )
+        rows.append(G @ by_unknowns / np.sqrt(variance + _MIN_VARIANCE)[:, None])
     return StepInformation("base_joints", columns, np.concatenate(rows)[:, columns])
 
 
@@ -266,29 +336,37 @@ def revolute_axes(predicted: PredictedObservations) -> BoolArray:
 def _joint_and_axis(
     predicted: PredictedObservations, A: Across, B: Across, here: IntArray, j: int
 ) -> Array:
-    """Return rows by A and the turns of the revolute axis, the leg's direction being free."""
-    axis = np.asarray(predicted.legs[j].base_axis)
-    pose = predicted.pose[here]
+    """Return rows by the unknowns of a joint with an axis, the leg's direction being free."""
+    carrier, pose = carrier_of(predicted, j), predicted.pose[here]
+    a = int(predicted.carried_by[j])
+    axis = carrier.axis_at(predicted.q[pose, a] if a >= 0 else np.zeros(len(pose)))[0]
+    by_A, by_v = _by_unknowns(predicted, carrier, pose, j)
     u, length = predicted.u[pose, j], predicted.length[pose, j]
     E = normal_basis(u)
-    rows = np.zeros((len(here), 5, 7))  # the end moves by e1, e2 of the direction; A; the axis
-    rows[:, :2, 2:5] = A.gradient[here, j]
+    # The end moves by e1, e2 of the direction; then the unknowns
+    rows = np.zeros((len(here), 5, 2 + CarrierColumns.COUNT))
+    rows[:, :2, 2:] = A.gradient[here, j] @ by_A
     rows[:, 2:4, :2] = B.gradient[here, j] @ np.swapaxes(E, 1, 2)
-    rows[:, 2:4, 2:5] = B.gradient[here, j]
-    rows[:, 4, :2] = (E @ axis) * (predicted.mean_length / length)[:, None]
-    rows[:, 4, 5:] = u @ cross(normal_basis(axis), axis).T
-    rows[:, 4] /= SIGMA_EXACT
+    rows[:, 2:4, 2:] = B.gradient[here, j] @ by_A
+    rows[:, 4, :2] = np.einsum("kia,ka->ki", E, axis) / length[:, None]
+    rows[:, 4, 2:] = np.einsum("ka,kac->kc", u, by_v)
+    rows[:, 4] *= predicted.mean_length / SIGMA_EXACT
     return eliminate(rows, 2)
 
 
 def _by_camera(predicted: PredictedObservations, j: int, F: Array) -> Array:
     """Return rows F by A and axis of a leg as rows by the turn and displacement of the camera."""
-    rows = np.zeros((len(F), 6))
-    rows[:, :3] = -cross(predicted.A[j], F[:, :3])
-    rows[:, 3:] = -F[:, :3]
-    axis = predicted.legs[j].base_axis
-    if axis is not None:
-        rows[:, :3] -= predicted.mean_length * F[:, 3:] @ normal_basis(axis)
+    columns, rows = CarrierColumns, np.zeros((len(F), 6))
+    rows[:, :3] = -cross(predicted.A[j], F[:, columns.A])
+    rows[:, 3:] = -F[:, columns.A]
+    carrier = carrier_of(predicted, j)
+    if carrier.v.any():
+        rows[:, :3] -= predicted.mean_length * F[:, columns.V] @ normal_basis(carrier.v)
+    basis = normal_basis(carrier.actuator.axis)
+    rows[:, :3] -= predicted.mean_length * F[:, columns.AXIS] @ basis
+    of_point = F[:, columns.POINT] @ basis
+    rows[:, :3] -= cross(carrier.actuator.point, of_point)
+    rows[:, 3:] -= of_point
     return rows * pose_unit(predicted)
 
 
@@ -337,40 +415,53 @@ def _step_4_equations(equations: WhitenedEquations, groups: _Groups) -> BoolArra
     length, base_axis, twist = (kinds == d for d in ("LENGTH", "BASE_AXIS", "TWIST"))
     others = ~length & ~base_axis & (~twist | groups.in_base[:, None])
     wanted = length | (others & groups.enough[:, None])
-    return np.asarray(wanted & groups.used[:, equations.leg])
+    return np.asarray((wanted & groups.used[:, equations.leg]) | equations.reading)
 
 
 def _vectors_of(
     predicted: PredictedObservations, located: Located, f: int
-) -> tuple[list[Array], list[Array]]:
-    """Return the set V of (8) and the derivative of each by A and axes of all legs, (3, 5 n)."""
-    vectors, slopes = [], []
-    eye = np.eye(3 * predicted.n_legs).reshape(predicted.n_legs, 3, -1)
-    n_axes = 2 * predicted.n_legs
+) -> tuple[list[Array], list[Array], list[bool]]:
+    """Return the set V of (8), the derivative of each by the unknowns of all legs, (3, 9 n).
+
+    And which are unit vectors.
+    """
+    vectors, slopes, is_unit = list[Array](), list[Array](), list[bool]()
+    columns, n = CarrierColumns, predicted.n_legs
+
+    def add(vector: Array, *parts: tuple[int, slice, Array], unit: bool) -> None:
+        slope = np.zeros((3, n, columns.COUNT))
+        for j, where, part in parts:
+            slope[:, j, where] = part
+        vectors.append(vector)
+        slopes.append(slope.reshape(3, -1))
+        is_unit.append(unit)
+
+    eye, turn = np.eye(3), 1.0 / predicted.mean_length
     for j, g in combinations(np.flatnonzero(located.joint[f]).tolist(), 2):
-        vectors.append(predicted.A[g] - predicted.A[j])
-        slopes.append(_by_leg(eye[g] - eye[j], np.zeros((3, n_axes))))
+        apart = predicted.A[g] - predicted.A[j]
+        add(apart, (j, columns.A, -eye), (g, columns.A, eye), unit=False)
+    for j in np.flatnonzero(located.joint[f] & (predicted.carried_by >= 0)).tolist():
+        carrier = carrier_of(predicted, j)
+        w = carrier.actuator.axis
+        basis = normal_basis(w)
+        add(w, (j, columns.AXIS, turn * cross(basis, w).T), unit=True)
+        if carrier.actuator.turns:  # across w: the point is beside A
+            arm, across = carrier.A - carrier.actuator.point, eye - np.outer(w, w)
+            of_axis = -turn * np.outer(w, cross(basis, w) @ arm)
+            parts = (columns.A, across), (columns.AXIS, of_axis), (columns.POINT, -basis.T)
+            add(arm, *((j, *part) for part in parts), unit=False)
     for j in np.flatnonzero(located.axis[f]).tolist():
-        axis = np.asarray(predicted.legs[j].base_axis)
-        turn = np.zeros((3, n_axes))
-        turn[:, 2 * j : 2 * j + 2] = cross(normal_basis(axis), axis).T / predicted.mean_length
-        vectors.append(axis)
-        slopes.append(_by_leg(np.zeros_like(eye[0]), turn))
-    return vectors, slopes
-
-
-def _by_leg(by_joints: Array, by_axes: Array) -> Array:
-    """Return derivatives by A and the axis of each leg in turn, (3, 5 n)."""
-    both = np.concatenate([by_joints.reshape(3, -1, 3), by_axes.reshape(3, -1, 2)], axis=2)
-    return both.reshape(3, -1)
+        v = carrier_of(predicted, j).v
+        add(v, (j, columns.V, turn * cross(normal_basis(v), v).T), unit=True)
+    return vectors, slopes, is_unit
 
 
 def _covariance(predicted: PredictedObservations, located: Located, f: int) -> Array:
-    """Return the covariance of A and axes of a frame as step 1 found them, (5 n, 5 n) [m^2]."""
-    n = predicted.n_legs
-    covariance = np.zeros((5 * n, 5 * n))
+    """Return the covariance of joints and axes of a frame after step 1, (9 n, 9 n) [m^2]."""
+    n = CarrierColumns.COUNT
+    covariance = np.zeros((n * predicted.n_legs,) * 2)
     for j in np.flatnonzero(located.joint[f]).tolist():
         F = located.information[f, j]
-        inverse = np.linalg.pinv(F.T @ F, hermitian=True)
-        covariance[5 * j : 5 * j + 5, 5 * j : 5 * j + 5] = inverse
+        here = slice(n * j, n * j + n)
+        covariance[here, here] = np.linalg.pinv(F.T @ F, hermitian=True)
     return covariance

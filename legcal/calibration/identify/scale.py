@@ -1,0 +1,129 @@
+"""What fixes the scale of a machine whose readings carry no length.
+
+Encoders of arms know angles: such a machine, twice as large with rods twice as thick and cameras
+twice as far, gives the same images and readings. A measured length, a board, or radii fix its
+scale; a prior on radii that nobody has stated must not do so silently.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from legcal.calibration.identify.information import problem_of, radius_rows
+from legcal.calibration.identify.ranks import Analysis, undetermined
+from legcal.calibration.identify.report import ScaleSource
+from legcal.calibration.joint_fit.variables import RefinementSettings
+from legcal.estimation import GaussianPrior, Variables, all_free, information_rows, marginal_rows
+from legcal.geometry import Array, IntArray
+from legcal.machine import LegColumns
+from legcal.vision import Link
+
+LENGTH_SIGMA = 5e-5  # [m] of a length that somebody measures
+_LINKS: tuple[Link, ...] = ("base", "platform")
+
+
+def scale_sources(analysis: Analysis) -> tuple[ScaleSource, ...]:
+    """Return what would fix the scale, and how well; nothing where readings or data do so."""
+    if not analysis.predicted.actuators or not is_scale_open(analysis):
+        return ()
+    names = analysis.predicted.parametrization.names
+    measured = analysis.predicted.columns(LegColumns.LENGTH)[:1]
+    length, radius = LENGTH_SIGMA, RefinementSettings.radius_sigma
+    row = np.zeros((1, len(names)))
+    row[0, measured] = 1.0 / length
+    with_length = np.concatenate([_information(analysis), row])
+    tried = (
+        ("length", f"{names[measured[0]]} measured to {1e3 * length:g} mm", with_length),
+        *(
+            (
+                f"{link}_board",
+                f"a calibration board on the {link} in every view",
+                _information(analysis.with_board(link=link)),
+            )
+            for link in _LINKS
+        ),
+        (
+            "radii",
+            f"radii known to {100 * radius:g} %, all wrong alike",
+            _information(analysis, common=radius),
+        ),
+    )
+    return tuple(_source(analysis, *each) for each in tried)
+
+
+def is_scale_open(analysis: Analysis) -> bool:
+    """Say whether radii alone fix something that they were taken to be known for.
+
+    Of radii those count as known that are fixed or have a stated prior.
+    """
+    found = _information(analysis, stated=True)
+    return len(undetermined(analysis.predicted, found)) > len(
+        undetermined(analysis.predicted, analysis.information)
+    )
+
+
+def _source(analysis: Analysis, name: str, words: str, information: Array) -> ScaleSource:
+    """Return what a source gives."""
+    predicted = analysis.predicted
+    if len(undetermined(predicted, information)) > len(
+        undetermined(predicted, analysis.information)
+    ):
+        return ScaleSource(name, words, None, None)
+    columns = predicted.columns(LegColumns.LENGTH)
+    lengths = np.array([leg.q0 for leg in predicted.legs])[: len(columns)]
+    mean = np.zeros(len(predicted.unit))  # of the relative errors of lengths
+    mean[columns] = 1.0 / (len(columns) * lengths)
+    _, singular, basis = np.linalg.svd(information, full_matrices=False)
+    sigma = float(np.linalg.norm(basis @ mean / singular))
+    return ScaleSource(name, words, sigma, analysis.motion.sigma(information))
+
+
+def _information(analysis: Analysis, *, common: float | None = None, stated: bool = False) -> Array:
+    """Return rows by the parameters with radii free, or wrong alike by *common* of their size."""
+    predicted = analysis.predicted
+    n_legs, by_radius = predicted.n_legs, radius_rows(predicted)
+    shape = by_radius.shape[:2]
+    own: tuple[Variables, IntArray, Array]
+    if common is not None:
+        known = GaussianPrior(np.zeros(1, dtype=np.intp), np.zeros(1), np.array([common]))
+        relative = by_radius * predicted.radius[:, None, None]
+        own = (
+            Variables("radius", all_free(1, 1), prior=known),
+            np.zeros(shape, dtype=np.intp),
+            relative,
+        )
+    else:
+        sigma = _stated_radii(analysis) if stated else np.full(n_legs, np.inf)
+        which = np.flatnonzero(np.isfinite(sigma))
+        prior = GaussianPrior(which, np.zeros(len(which)), sigma[which])
+        leg = np.broadcast_to(np.arange(n_legs), shape)
+        own = (Variables("radius", all_free(n_legs, 1), prior=prior), leg, by_radius)
+    problem, state = problem_of(
+        predicted, analysis.images, analysis.equations, analysis.prior, (own,)
+    )
+    return marginal_rows(information_rows(problem, state), problem.where("parameters"))
+
+
+def _stated_radii(analysis: Analysis) -> Array:
+    """Return the standard deviations of radii that were stated, infinite for the others [m]."""
+    choices, names = analysis.choices, analysis.predicted.leg_names
+
+    def sigma(leg: str) -> float:
+        first = f"{leg}.radius."
+        stated = [p.sigma for name, p in choices.priors.items() if name.startswith(first)]
+        if any(name.startswith(first) for name in choices.fixed):
+            stated.append(1e-9)
+        return min(stated, default=np.inf)
+
+    return np.array([sigma(name) for name in names])
+
+
+def scale_in_words(sources: Sequence[ScaleSource]) -> str:
+    """Return what is needed, as one sentence for a refusal."""
+    ways = ", or ".join(source.assumed for source in sources if source.sigma is not None)
+    return (
+        "found that readings of arms carry no length, so that machine, rods and cameras could all "
+        f"be larger alike, needed something that fixes the scale: {ways}"
+    )

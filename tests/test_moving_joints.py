@@ -1,0 +1,168 @@
+"""Joints at A that actuators move: the four steps by analogy, counts, ranks, and the scale."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from actuated_sessions import MACHINES, session
+from staged_sessions import Observed, planned
+
+from legcal.calibration.identify.predicted_observations import PredictedObservations
+from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.scale import is_scale_open, scale_sources
+from legcal.calibration.joint_fit import Choices, Prior
+from legcal.errors import NotIdentifiable
+from legcal.machine import parametrize
+from legcal.paper import count_conditions, enough_readings
+from legcal.paper.joints_in_camera import locate_joints_in_cameras
+
+RANKS = {"hexaglide": 42, "6-rss": 54, "linear-delta": 36, "delta": 42, "3-prs": 21}
+TURNING = ("6-rss", "delta")
+
+
+def seen(name: str, *, images: int = 6, noise: float = 0.0, seed: int = 0) -> Observed:
+    found = session(name, images=images)
+    return planned(found, np.ones(found.n_legs), noise=noise, seed=seed)
+
+
+# The four steps
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_exact_axes_give_the_machine_from_3_mm_and_1_degree(name: str) -> None:
+    observed = seen(name)
+    assert np.abs(observed.errors(observed.nominal.legs)).min() > 0.002
+    found = observed.run()
+    assert not any("moving" in text for text in found.diagnostics)
+    assert np.abs(observed.errors(found.legs)).max() < 1e-8
+    for T, true in zip(found.base.T_Rb_camera, observed.T_camera_Rb, strict=True):
+        assert T is not None
+        assert np.abs((T * true).as_matrix() - np.eye(4)).max() < 1e-8
+    shared = {leg.actuator.joint: leg.actuator for leg in found.legs if leg.actuator}
+    assert len(shared) == len({id(a) for a in shared.values()})
+    for leg in found.legs:  # rods on one arm keep one axis
+        assert leg.actuator is not None
+        assert np.allclose(leg.actuator.axis, shared[leg.actuator.joint].axis, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["delta", "3-prs"])
+def test_printed_steps_find_the_base_as_well(name: str) -> None:
+    """Scalar products of (9') with axes and arms; (16) is even in z of coplanar joints."""
+    observed = seen(name)
+    found = observed.run_base("literal").machine
+    for leg, true in zip(found.legs, observed.true_legs, strict=True):
+        assert leg.actuator is not None
+        assert true.actuator is not None
+        assert np.abs(leg.A - true.A).max() < 1e-6
+        assert np.abs(leg.actuator.axis - true.actuator.axis).max() < 1e-6
+        if true.actuator.turns:
+            assert np.abs(true.actuator.numbers(leg.actuator)[2:4]).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", ["delta", "3-prs"])
+def test_covariances_of_carried_joints_are_true(name: str) -> None:
+    """Normalised squared errors of A and of the actuator, by view and rod."""
+    normalised: list[float] = []
+    observed = seen(name, images=12, noise=0.1)
+    joints = locate_joints_in_cameras(observed.nominal, observed.axes, observed.measurements)
+    for (view, j), carrier in joints.carriers.items():
+        T, leg = observed.T_camera_Rb[view], observed.true_legs[j]
+        assert leg.actuator is not None
+        of_actuator = leg.actuator.in_frame(T.as_matrix()).numbers(carrier.actuator)[:4]
+        error = np.concatenate([T.apply(leg.A) - carrier.A, np.zeros(2), of_actuator])
+        columns = np.setdiff1d(carrier.columns, [3, 4])
+        C = carrier.covariance[np.ix_(columns, columns)]
+        normalised.append(error[columns] @ np.linalg.solve(C, error[columns]) / len(columns))
+    assert len(normalised) == 3 * len(observed.true_legs)
+    assert 0.6 < np.mean(normalised) < 1.5  # 1 by rights; outlier weights cost a little
+
+
+def test_too_few_readings_of_an_arm_are_refused_by_name() -> None:
+    observed = seen("delta")
+    m = observed.measurements
+    q = m.q.copy()
+    q[:, :2] = np.arange(m.n_rows)[:, None] % 4 * 0.1
+    few = replace(observed, measurements=replace(m, q=q))
+    with pytest.raises(NotIdentifiable, match=r"leg1 .* 5 different readings of motor1"):
+        few.run()
+
+
+def test_readings_and_outlines_that_disagree_on_lengths_are_told() -> None:
+    observed = seen("linear-delta", noise=0.01)
+    m = observed.measurements
+    wrong = replace(observed, measurements=replace(m, q=1.1 * m.q))
+    joints = locate_joints_in_cameras(wrong.nominal, wrong.axes, wrong.measurements)
+    assert len(joints.diagnostics) == 3
+    for k, text in enumerate(joints.diagnostics):
+        assert f"'motor{k + 1}' moving 0." in text
+        assert "check the unit of the readings" in text
+
+
+# Counts and ranks
+
+
+def test_counts_by_analogy_are_those_written_out() -> None:
+    """The base of a Delta whose one view shows two arms: 4 joints, 4 circles, 2 axes."""
+    on = [((0, 1), True), ((2, 3), True), ((4, 5), True)]
+    counts = count_conditions([(0, 1, 2, 3)], 6, actuators=on)
+    points, axes = 4 + 4, 2
+    products = points * (points - 1) // 2 + axes * (points - 1) + 1 - 4
+    assert (counts[0].equations, counts[0].unknowns) == (products, 3 + 9 + 3 * 4)
+    assert [c.by_analogy for c in counts] == [True, True, True, False]
+    carriages = [((0, 1), False), ((2, 3), False), ((4, 5), False)]
+    (eq12, *_) = count_conditions([(0, 1, 2, 3)], 6, actuators=carriages)
+    assert (eq12.equations, eq12.unknowns) == (6 + 2 * 3 + 1, 3 + 9 + 3 * 2)
+    legs = session("delta").legs
+    view, leg = np.repeat(0, 8), np.repeat([0, 1], 4)
+    (few,) = enough_readings(view, leg, np.tile([0.1, 0.2, 0.3, 0.3], 2), legs)
+    assert few.legs == tuple(range(6))
+    assert few.by_analogy
+    at_rest = [replace(leg, actuator=None) for leg in legs]
+    assert enough_readings(view, leg, np.zeros(8), at_rest) == ()
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_ranks_are_the_published_ones_and_radii_carry_the_scale_of_arms(name: str) -> None:
+    analysis = Analysis(session(name))
+    assert (analysis.full.rank, analysis.full.of) == (RANKS[name], RANKS[name])
+    assert analysis.staged.rank == RANKS[name]
+    found = scale_sources(analysis)
+    assert [s.source for s in found] == (
+        ["length", "base_board", "platform_board", "radii"] if name in TURNING else []
+    )
+    for source in found:
+        assert source.sigma is not None
+        assert source.platform_sigma is not None
+    if found:
+        assert found[3].sigma == pytest.approx(0.02, rel=0.01)
+        assert max(s.sigma or 1.0 for s in found[:3]) < 0.001
+        known = Choices(priors={"leg1.length": Prior(0.4, 5e-5)})
+        assert not is_scale_open(Analysis(session(name), known))
+        radius = Choices(priors={"leg1.radius.rod": Prior(0.008, 1e-5)})
+        assert not is_scale_open(Analysis(session(name), radius))
+
+
+def gained(name: str) -> PredictedObservations:
+    found = session(name)
+    names = parametrize(found.leg_names, found.legs, found.frame_legs, twists=True)
+    return replace(found, parametrization=names)
+
+
+def test_a_free_gain_of_every_carriage_loses_the_scale_too() -> None:
+    found = gained("hexaglide")
+    gains = frozenset(x for x in found.parametrization.names if x.endswith(".gain"))
+    assert len(gains) == 6
+    assert not is_scale_open(Analysis(found))
+    assert is_scale_open(Analysis(found, Choices(free=gains)))
+    assert not is_scale_open(Analysis(found, Choices(free=gains - {"motor1.gain"})))
+
+
+def test_a_rod_that_no_view_shows_leaves_a_direction_open_and_is_named() -> None:
+    unseen = np.arange(6) != 1
+    found = {
+        name: Analysis(replace(session(name), seen=session(name).seen & unseen)).full
+        for name in ("delta", "hexaglide")
+    }
+    assert found["hexaglide"].rank == 42  # its readings tell of it
+    (weak,) = found["delta"].weak
+    assert all("2" in name.partition(".")[0] for name in weak.parameters)
