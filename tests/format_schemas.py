@@ -13,6 +13,7 @@ from legcal.calibration.camera_calibration.document import CameraDocument
 from legcal.calibration.detection import DetectionDocument
 from legcal.calibration.documents import CheckDocument, EvaluationDocument, Result
 from legcal.calibration.examination import ExaminationDocument
+from legcal.calibration.fleet import FleetDocument
 from legcal.calibration.location.document import LocationFile
 from legcal.calibration.measurement_noise.document import NoiseDocument
 from legcal.data.dataset_file import DatasetEntry
@@ -42,6 +43,7 @@ DOCUMENTS: Mapping[str, type[BaseModel]] = {  # that legcal writes
     "result": Result,
     "check": CheckDocument,
     "evaluate": EvaluationDocument,
+    "fleet": FleetDocument,
     "detect": DetectionDocument,
     "doctor": ExaminationDocument,
     "camera-calibration": CameraDocument,

@@ -275,6 +275,7 @@ def test_axes_are_fitted_without_images(axes: tuple[SimulatedDataset, Path, Cali
     assert not [name for name in solution.values if "radius" in name]
 
 
+@pytest.mark.system
 def test_axes_with_too_small_sigmas_and_of_other_legs_are_found(
     axes: tuple[SimulatedDataset, Path, Calibration], tmp_path: Path
 ) -> None:
@@ -418,7 +419,7 @@ def test_a_wrong_pose_of_the_board_is_noted_and_changes_nothing(
 
 
 def test_corners_of_images_that_are_kept_aside_are_not_written(tmp_path: Path) -> None:
-    folder = _simulated(tmp_path, poses=8, views=1, board="charuco").folder
+    folder = _simulated(tmp_path, poses=5, views=1, board="charuco").folder
     calibrate(folder, output=tmp_path / "out", holdout=0.25)
     held_out = json.loads((tmp_path / "out/result.json").read_text())["holdout"]["images"]
     all_images, written = (

@@ -193,6 +193,7 @@ def halves(two_views: Path) -> Path:
     return folder
 
 
+@pytest.mark.system
 def test_views_that_share_no_leg_are_joined_by_the_readings(halves: Path, tmp_path: Path) -> None:
     calibration = calibrate(halves, output=tmp_path / "out")
     before, after = errors(calibration, halves, tmp_path / "out")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from characterisation.running import fits_schema
 from command_line import run as run_command
 from simulated import files_of, simulated
 
@@ -55,6 +56,7 @@ def test_failures_are_named_and_do_not_stop_the_others(tmp_path: Path, good: Pat
     assert fine.drift_sigma_dX_m is not None
     assert fine.drift_dX_m < 1e-3 * fine.drift_sigma_dX_m
     assert json.loads((out / "summary.json").read_text()) == found.document()
+    fits_schema(["fleet"], found.document())
     with (out / "summary.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["status"] for row in rows] == ["failed", fine.status]

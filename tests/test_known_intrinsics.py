@@ -75,7 +75,6 @@ def said_of_cameras(found: Solution) -> list[str]:
     return [note for note in found.notes if "agree" in note]
 
 
-@pytest.mark.system
 def test_errors_of_a_drawn_camera_are_those_that_the_fit_states() -> None:
     rng = np.random.default_rng(3)
     root = np.linalg.cholesky(COVARIANCE[:-1, :-1])

@@ -198,6 +198,7 @@ def test_readings_that_contradict_each_other_are_refused_with_the_motor(tmp_path
         given_poses(machine, path)
 
 
+@pytest.mark.system
 def test_a_redundant_machine_calibrates_and_a_wrong_reading_is_refused(tmp_path: Path) -> None:
     machine, folder = made("4-rpr", tmp_path), tmp_path / "dataset"
     simulate(machine.yaml_path, folder, settings(poses=6, shared_poses=True))

@@ -157,6 +157,7 @@ def test_files_that_were_exchanged_are_told_from_each_other(
         assert f"shows the reading given for image {given};" in _note(detected.notes, image)
 
 
+@pytest.mark.system
 def test_a_wrong_digit_is_no_exchange_with_an_image_that_shows_its_own_reading(
     tmp_path: Path,
 ) -> None:
@@ -255,6 +256,7 @@ def test_an_image_alone_in_its_view_is_judged_by_those_of_other_views(tmp_path: 
     assert "found 1 of 12 outlines where its reading has the legs, in other images most" in note
 
 
+@pytest.mark.system
 def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
     made = spoiled(tmp_path / "views", 3)
     for k in range(3):

@@ -108,8 +108,8 @@ class Places(Case):
         return {"views": facts(views)}
 
 
-QUICK_CHAINS = {"3-rpr-outlines", "hexapod-outlines", "3-upu-axes"}
-SYSTEM_CHAINS = {"hexapod-strut-outlines", "3-rpr-axes", "3-rps-axes", "tricept-axes"}
+QUICK_CHAINS = {"3-rpr-outlines", "hexapod-outlines", "3-upu-axes", "tricept-axes"}
+SYSTEM_CHAINS = {"hexapod-strut-outlines", "3-rpr-axes", "3-rps-axes"}
 QUICK = "--level outlines --poses 1 --views 1 --seed 3 --json"
 SMALL = (
     "image_width: 200\nimage_height: 150\ncamera_name: tiny\n"
