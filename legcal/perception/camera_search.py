@@ -146,14 +146,15 @@ def place_camera(
     """Return the camera poses on which most legs of all pictures of a view agree.
 
     Pictures are of one camera pose at different readings; ``starts`` says how many more of them
-    suggest poses, until one is clear. ``known`` are T_base_camera that are tried as well.
+    suggest poses, until one is clear. ``known`` are T_base_camera that are tried first; where most
+    legs agree with one of them, nothing else is.
     """
     merits = [float(p.pairs.merit[:8].sum()) if len(p.pairs) else 0.0 for p in pictures]
     best_first = [pictures[k] for k in np.argsort(-np.array(merits), kind="stable").tolist()]
     every = Pictures.of(pictures)
     best = _candidates(every, _near_known(every, known, n_legs))
     done = 0
-    for n in starts:
+    for n in starts if best.share < HINTED_SUPPORT else ():
         if done >= len(pictures) or (done and best.is_clear):
             break
         suggested = [_starts(picture, n_legs) for picture in best_first[done : done + n]]

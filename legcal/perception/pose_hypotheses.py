@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from legcal.geometry import Array, IntArray
+from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.pair_matching import (
     WIDTH_ERROR,
@@ -25,6 +25,7 @@ MAX_LENGTH_RATIO = 1.25, 3.0  # of a pair to the segment that it shows: factor, 
 CONE = 0.12  # error of the logarithm of the ratio of the widths at both ends
 MAX_WIDTH_SIGMAS = 2.5  # standard deviations of the width of the second pair
 PLACE_TOLERANCE = 0.2  # of the place along a segment, in its lengths
+HALF = 0.5 + 0.5 * PLACE_TOLERANCE  # of a segment, with half of that
 MAX_COSINE = 1.05  # how far from a solution pairs and legs may be that allow none, as a cosine
 MIN_CROSSING = 0.03  # sine between axes seen, below which the second pair does not fix the place
 MAX_POSES = 3000  # poses of a picture
@@ -63,7 +64,17 @@ def pose_hypotheses(picture: Picture, n_legs: int) -> CameraPoses:
     P_all = np.einsum("fxi,fx->fi", U_c, firsts.P)
     w_all = direction @ U_b  # (n_firsts, n_targets, 3)
     d_all = (middle[None] - middle[firsts.target][:, None]) @ U_b
-    f, k, m, cosine, sine = _turns(firsts, targets, n_all, w_all)
+    flat = np.linalg.norm(planes[:, :2], axis=1)
+    seen = pair_widths(pairs)
+    # The depth of the first leg is no better known.
+    sigma = MAX_WIDTH_SIGMAS * np.sqrt(2.0) * np.hypot(WIDTH_ERROR, pairs.pixel / seen)
+    # Depths (n_pairs, n_targets) where segments are as wide as pairs, and what second ones reach.
+    deep = 2.0 * targets.radius / (flat * seen)[:, None]
+    reach = np.linalg.norm(d_all, axis=2) + firsts.tolerance[:, None] + HALF * length
+    near, far = deep * np.exp(-sigma)[:, None], deep * np.exp(sigma)[:, None]
+    is_near = near <= (firsts.P[:, 2:] + reach)[:, None]
+    is_near &= far >= (firsts.P[:, 2:] - reach)[:, None]
+    f, k, m, cosine, sine = _turns(firsts, targets, n_all, w_all, is_near)
     n, P, d = n_all[f, k], P_all[f], _turned(d_all[f, m], cosine, sine)
     across = n[:, 0]
     place = -(_dot(n, d) + _dot(n, P)) / np.where(np.abs(across) < MIN_CROSSING, np.inf, across)
@@ -78,13 +89,8 @@ def pose_hypotheses(picture: Picture, n_legs: int) -> CameraPoses:
     across = vX * vr - Xr
     along = -(_dot(X, X) * vr - vX * Xr) / np.where(np.abs(across) < 1e-12, 1e-12, across)
     depth = _dot(U_c[f, 2], X + along[:, None] * v)
-    flat = np.linalg.norm(planes[k][:, :2], axis=1)
-    expected = 2.0 * targets.radius[m] / (np.where(depth > 0.0, depth, 1.0) * flat)
-    seen = pair_widths(pairs)[k]
-    # The depth of the first leg is no better known.
-    sigma = np.sqrt(2.0) * np.hypot(WIDTH_ERROR, pairs.pixel / seen)
-    off = np.abs(np.log(expected / seen)) / (MAX_WIDTH_SIGMAS * sigma)
-    good_along = np.abs(along) <= (0.5 + 0.5 * PLACE_TOLERANCE) * length[m]
+    off = np.abs(np.log(deep[k, m] / np.where(depth > 0.0, depth, 1.0))) / sigma[k]
+    good_along = np.abs(along) <= HALF * length[m]
     good = np.flatnonzero((off <= 1.0) & good_along & (depth > 0.0))
     merit = pairs.merit[k] + pairs.merit[firsts.pair[f]]
     good = good[np.argsort(-(merit * (1.0 - 0.5 * off**2))[good], kind="stable")[:MAX_POSES]]
@@ -96,28 +102,32 @@ def pose_hypotheses(picture: Picture, n_legs: int) -> CameraPoses:
 
 
 def _turns(
-    firsts: _Firsts, targets: LegSegments, n: Array, w: Array
+    firsts: _Firsts, targets: LegSegments, n: Array, w: Array, is_near: BoolArray
 ) -> tuple[IntArray, IntArray, IntArray, Array, Array]:
     """Return the turns about a first leg that lay a second one into the plane of a second pair.
 
     Indices of the first, the second pair and the second segment, and cosine and sine of the turn,
     from the normals n (n_firsts, n_pairs, 3) of the planes and the directions w (n_firsts,
-    n_targets, 3) of the segments.
+    n_targets, 3) of the segments; ``is_near`` (n_firsts, n_pairs, n_targets) says which come into
+    question.
     """
-    n, w = n[:, :, None, :].astype(np.float32), w[:, None, :, :].astype(np.float32)
-    c0 = n[..., 0] * w[..., 0]
-    c1 = n[..., 1] * w[..., 1] + n[..., 2] * w[..., 2]
-    c2 = n[..., 2] * w[..., 1] - n[..., 1] * w[..., 2]
-    good = c0**2 <= MAX_COSINE**2 * (c1**2 + c2**2)
-    good &= (np.arange(n.shape[1]) != firsts.pair[:, None])[:, :, None]
+    good = is_near & (np.arange(n.shape[1]) != firsts.pair[:, None])[:, :, None]
     good &= (targets.leg != targets.leg[firsts.target][:, None])[:, None, :]
     f, k, m = np.nonzero(good)
-    c0, c1, c2 = (c[good].astype(np.float64) for c in (c0, c1, c2))
-    step = np.arccos(np.clip(-c0 / np.maximum(np.hypot(c1, c2), 1e-12), -1.0, 1.0))
-    base = np.arctan2(c2, c1)
-    turn = np.concatenate([base + step, base - step])
+    one, other = n[f, k].astype(np.float32), w[f, m].astype(np.float32)
+    c0 = one[:, 0] * other[:, 0]
+    c1 = one[:, 1] * other[:, 1] + one[:, 2] * other[:, 2]
+    c2 = one[:, 2] * other[:, 1] - one[:, 1] * other[:, 2]
+    turns = np.flatnonzero(c0**2 <= MAX_COSINE**2 * (c1**2 + c2**2))
+    f, k, m = f[turns], k[turns], m[turns]
+    c0, c1, c2 = (c[turns].astype(np.float64) for c in (c0, c1, c2))
+    size = np.maximum(np.hypot(c1, c2), 1e-12)
+    along, c1, c2 = np.clip(-c0 / size, -1.0, 1.0), c1 / size, c2 / size
+    across = np.sqrt(1.0 - along**2)
+    cosine = np.concatenate([c1 * along - c2 * across, c1 * along + c2 * across])
+    sine = np.concatenate([c2 * along + c1 * across, c2 * along - c1 * across])
     f, k, m = (np.concatenate([x, x]) for x in (f, k, m))
-    return f, k, m, np.cos(turn), np.sin(turn)
+    return f, k, m, cosine, sine
 
 
 def _firsts(pairs: CandidatePairs, targets: LegSegments) -> _Firsts:

@@ -151,7 +151,7 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
         return ()
     tried = [*mistakes(data), *judge.shifted_from_a_row_on()]
     judged = judge.judged({k: tried[k] for k in judge.finalists(tried)})
-    found = {k: (what, one) for k, (what, one) in judged.items() if _explains(one, judge.own)}
+    found = {k: (what, one) for k, (what, one) in judged.items() if judge.is_explained(what, one)}
     data.progress(STAGE, 1, 1)
     if not found:
         return ()
@@ -271,10 +271,12 @@ class _Judge:
             own = Agreement.joined(seen)
             if not left or _suits(gain.max() + own.support.sum(), own):
                 break
+        # Less than this is gained by chance, also by what is wrong with the images of one group.
+        least = _SURE_GAIN * min(float(one.expected.sum()) for one in seen)
         found, amounts = list[int](), set[str]()
         left_for = {True: _FINALISTS, False: _FINALISTS // 2}  # whether of all views, or of some
         for k in np.argsort(-gain, kind="stable").tolist():
-            if gain[k] <= _NEAR_BEST * gain.max():
+            if gain[k] <= max(_NEAR_BEST * gain.max(), least):
                 break
             of_all = not any(tried[k].true.is_as(self.given, g.rows, g.views) for g in self.groups)
             if tried[k].amount_of not in amounts and left_for[of_all]:
@@ -286,7 +288,8 @@ class _Judge:
     def _gains(self, tried: Sequence[Mistake], g: int, starts: Sequence[int]) -> Array:
         """Return how many more legs a few images of a group show without each mistake.
 
-        Cameras are tried where they are known roughly, and searched for where that suits none.
+        Cameras are tried where they are known roughly, and searched for where that suits none and
+        where images do not agree with the one that things as they are have.
         """
         group, found = self.groups[g], np.zeros(len(tried))
         before = self.of_groups[g].at(group.some)
@@ -311,7 +314,10 @@ class _Judge:
 
         cameras: dict[int, RigidTransform | None] = {}
         look(some, ())
-        if not _suits(support.max(), before):
+        own = self.of_groups[g]
+        if own.mean >= _SUITS and (T_own := own.cameras[0]) is not None:
+            look(some, (), self._alike(T_own))  # cameras stand about there
+        elif not _suits(support.max(), before):
             look([k for k in some if not tried[k].is_small], starts)
             look([k for k in some if tried[k].is_small], ())
         best = int(np.argmax(support))
@@ -346,6 +352,22 @@ class _Judge:
                     break
         return what, one
 
+    def is_explained(self, what: Mistake, one: Agreement) -> bool:
+        """Say whether images agree so much better without a mistake that it is no chance.
+
+        Cameras at another place may nearly make up for one that has an opposite. Images agree
+        little better without it then, but worse with the opposite.
+        """
+        if _explains(one, self.own):
+            return True
+        gain = _signed_ranks(one.share - self.own.share)
+        if what.opposite is None or one.images <= self.own.images or gain < _MIN_SIGMAS:
+            return False
+        known = [[] if T is None else [T] for T in self.own.cameras]
+        contrast = one.share - self.all(what.opposite, (), known).share
+        is_sure = _signed_ranks(contrast) >= _SURE_SIGMAS
+        return is_sure and float(contrast.mean()) >= _SURE_GAIN
+
     def all(
         self,
         assumed: Assumed,
@@ -376,6 +398,16 @@ class _Judge:
                 ]
         return found
 
+    def _as_far(self, known: Sequence[RigidTransform], focal: float) -> list[RigidTransform]:
+        """Return cameras, and where others of another focal length see the same as large."""
+        if focal == 1.0:
+            return list(known)
+        machine = self.data.machine
+        middle = machine.A_base.mean(axis=0)
+        back = [(focal - 1.0) * float(T.inv().apply(middle)[2]) for T in known]
+        moves = [RigidTransform.from_translation([0.0, 0.0, -z]) for z in back]
+        return [*known, *(T * move for T, move in zip(known, moves, strict=True))]
+
     def hints_suited(self, one: Agreement) -> int:
         """Return how many rough camera poses suit the cameras that were found."""
         both = zip(self.groups, one.cameras, strict=True)
@@ -404,7 +436,7 @@ class _Judge:
                 self.groups[g],
                 rows,
                 starts,
-                known or self.pool[g],
+                self._as_far(known or self.pool[g], one.focal),
             )
             for one in assumed
         ]

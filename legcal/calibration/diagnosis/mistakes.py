@@ -93,6 +93,9 @@ class Mistake:
     amount_of: str = ""  # mistakes of one name differ by how much: the best stands for all
     # The same by more or less, in steps between those that are tried; None where it has no amount.
     finer: Callable[[float], Mistake] | None = None
+    # What is true if the same was done the other way: images suit that worse than things as they
+    # are, if they suit this better. None where it may well be as good.
+    opposite: Assumed | None = None
 
 
 def as_given(data: OrderedDataset) -> Assumed:
@@ -151,17 +154,17 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
             ("the legs look as if they were numbered backwards in the model",),
             _MOVE_ONE,
         )
-        for k in range(1, n):
-            yield Mistake(
-                "columns rotated",
-                f"the columns of readings look as if they began with another leg: what "
-                f"{names[0]} holds is of {names[(n - k) % n]}",
-                f"with them moved on by {k}",
-                "correct their headers",
-                with_columns([(j + k) % n for j in every]),
-                ("the legs look as if they were numbered from another one on in the model",),
-                _MOVE_ONE,
-            )
+    for k in range(1, n) if n > 2 else ():
+        yield Mistake(
+            "columns rotated",
+            f"the columns of readings look as if they began with another leg: what "
+            f"{names[0]} holds is of {names[(n - k) % n]}",
+            f"with them moved on by {k}",
+            "correct their headers",
+            with_columns([(j + k) % n for j in every]),
+            ("the legs look as if they were numbered from another one on in the model",),
+            _MOVE_ONE,
+        )
 
 
 def shifted_from(data: OrderedDataset, v: int, first: int, k: int) -> Mistake:
@@ -483,4 +486,5 @@ def _focal_length(given: Assumed, factor: float) -> Mistake:
         replace(given, focal=factor),
         amount_of="focal length",
         finer=lambda more: _focal_length(given, factor * _FOCAL_STEP**more),
+        opposite=replace(given, focal=1.0 / factor),
     )
