@@ -17,7 +17,8 @@ Right is the kind of mistake that was made, or one whose undoing gives the same 
 same places in all images, whatever their names and wherever the camera stands. That is computed
 for each diagnosis from the nominal model and the readings (a mirror-symmetric hexapod with reversed
 columns is one whose images are mirrored). Where what was done leaves the machine the same, as with
-columns of a threefold symmetric one that are moved on, nothing should be named.
+columns of a threefold symmetric one that are moved on, nothing should be named. Of two mistakes
+at once either one is right: mended, the other is found.
 """
 
 import argparse
@@ -39,7 +40,13 @@ from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.data import Dataset
 from legcal.geometry import Array
 from legcal.machine import Leg, LegKind, Machine
-from legcal.perception import LEFT_RIGHT, CandidatePairs, Placement, pairs_of_images
+from legcal.perception import (
+    LEFT_RIGHT,
+    UPSIDE_DOWN,
+    CandidatePairs,
+    Placement,
+    pairs_of_images,
+)
 from legcal.perception.agreement import as_if
 from legcal.perception.placement import sensor_extent
 from legcal.progress import no_progress
@@ -62,12 +69,14 @@ class Session:
     dataset: Dataset
     pairs: dict[str, CandidatePairs]
     flip: tuple[int, ...] = ()  # views whose images are mirrored
+    turned: tuple[str, ...] = ()  # images that are upside down
     focal: float = 1.0  # the right focal length as a part of the stated one
 
     def true(self, data: OrderedDataset) -> Assumed:
         """Return what is true of the session, by the data of one without the mistake."""
         given = as_given(data)
-        given.flip[list(self.flip)] = LEFT_RIGHT
+        given.flip[np.isin(data.measurements.view, self.flip)] = LEFT_RIGHT
+        given.flip[np.isin(data.measurements.image, self.turned)] = UPSIDE_DOWN
         return replace(given, focal=self.focal)
 
 
@@ -278,7 +287,21 @@ def mirrored_view(session: Session, rng: np.random.Generator) -> Session:
     return _mirrored(session, [int(rng.integers(len(session.dataset.measurements.views)))])
 
 
-MISTAKES: dict[str, tuple[Make, str]] = {  # with the kind of diagnosis that is right
+def turned(session: Session, rng: np.random.Generator) -> Session:
+    """Turn a third of the images of one view upside down."""
+    m, pairs = session.dataset.measurements, dict(session.pairs)
+    rows = np.flatnonzero(m.view == int(rng.integers(len(m.views))))
+    images = [m.image[row] for row in rng.choice(rows, len(rows) // 3, replace=False).tolist()]
+    corners = sensor_extent(m.views[m.view[rows[0]]].camera)
+    pairs |= {image: as_if(pairs[image], corners, UPSIDE_DOWN, 1.0) for image in images}
+    return replace(session, pairs=pairs, turned=tuple(images))
+
+
+def _and(one: Make, other: Make) -> Make:
+    return lambda session, rng: other(one(session, rng), rng)
+
+
+MISTAKES: dict[str, tuple[Make, str]] = {  # with the kinds of diagnosis that are right
     "exchanged": (exchanged, "columns exchanged"),
     "reversed": (reversed_columns, "columns reversed"),
     "rotated": (rotated, "columns rotated"),
@@ -297,6 +320,10 @@ MISTAKES: dict[str, tuple[Make, str]] = {  # with the kind of diagnosis that is 
     "focal length": (focal_length, "focal length"),
     "mirrored": (mirrored, "images mirrored"),
     "mirrored view": (mirrored_view, "images mirrored"),
+    "turned": (turned, "images upside down"),
+    "two, diameter": (_and(exchanged, diameter), "columns exchanged, diameter for radius"),
+    "two, focal": (_and(direction, focal_length), "direction of an encoder, focal length"),
+    "two, shifted": (_and(shifted, half_radius), "readings shifted, diameter for radius"),
 }
 
 
@@ -412,7 +439,7 @@ def judged(kind: str, spoiled: Session, true: Session, pool: Run) -> dict[str, o
     entry |= {"named": first.kind, "sentence": first.sentence}
     if not is_mistake:
         return entry | {"right": False}
-    is_kind = first.kind == MISTAKES[kind][1]
+    is_kind = first.kind in MISTAKES[kind][1].split(", ")
     mended = [one.true for one in mistakes(data) if one.what == first.what]
     right = is_kind or any(is_true(one) for one in mended)
     return entry | {"right": bool(right), "kind": is_kind}

@@ -74,7 +74,7 @@ class Assumption:
     """What should be seen in the images of a group of views."""
 
     search: Search  # with the edge pairs of all images
-    flip: Array  # (n_views, 2) of their images, as in :func:`as_if`
+    flip: Array  # (n_rows, 2) of images, as in :func:`as_if`
     focal: float  # focal lengths as a part of the stated ones
     group: Group
     rows: Sequence[int]  # of the images that are asked
@@ -176,7 +176,7 @@ def _picture(one: Assumption, row: int) -> Picture:
     search = one.search
     view = int(search.measurements.view[row])
     corners = sensor_extent(search.measurements.views[view].camera)
-    pairs = as_if(search.edge_pairs[row], corners, one.flip[view], one.focal)
+    pairs = as_if(search.edge_pairs[row], corners, one.flip[row], one.focal)
     return Picture(pairs, search.targets(row, view), corners / one.focal)
 
 

@@ -17,12 +17,14 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.board import observe_board
 from legcal.calibration.diagnosis.mistakes import (
+    TURNS,
     Assumed,
     Mistake,
     as_given,
     mistakes,
     rows_of_views,
     shifted_from,
+    turned_images,
 )
 from legcal.calibration.documents import DiagnosisBlock
 from legcal.calibration.ordered_dataset import OrderedDataset
@@ -149,7 +151,7 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     judge = _Judge(data, groups)
     if judge.own.images > _AGREE_ALREADY * len(judge.own.row):
         return ()
-    tried = [*mistakes(data), *judge.shifted_from_a_row_on()]
+    tried = [*mistakes(data), *judge.shifted_from_a_row_on(), *judge.turned_images()]
     judged = judge.judged({k: tried[k] for k in judge.finalists(tried)})
     found = {k: (what, one) for k, (what, one) in judged.items() if judge.is_explained(what, one)}
     data.progress(STAGE, 1, 1)
@@ -252,6 +254,23 @@ class _Judge:
                     found.append(shifted_from(self.data, v, place, k))
         return found
 
+    def turned_images(self) -> list[Mistake]:
+        """Return single images that may be turned over: they agree then with the camera of all."""
+        found = list[Mistake]()
+        for g, group in enumerate(self.groups):
+            own = self.of_groups[g]
+            T_own, left = own.cameras[0], own.row[~own.agrees].tolist()
+            for v, turn in product(group.views, TURNS) if T_own is not None else ():
+                rows = [row for row in left if group.view_of_row[row] == v]
+                for _ in range(2):  # all that do not agree, then those of them that do
+                    if MIN_IMAGES <= len(rows) < len(own.row):
+                        true = turned_images(self.data, rows, turn).true
+                        then = self._compare([true], g, rows, (), [T_own])[0]
+                        rows = then.row[then.agrees].tolist()
+                if len(rows) >= MIN_IMAGES:
+                    found.append(turned_images(self.data, rows, turn))
+        return found
+
     def finalists(self, tried: Sequence[Mistake]) -> list[int]:
         """Return the mistakes that a few images of the views that disagree most speak for."""
         missing = [float((one.expected - one.support).sum()) for one in self.of_groups]
@@ -278,7 +297,7 @@ class _Judge:
         for k in np.argsort(-gain, kind="stable").tolist():
             if gain[k] <= max(_NEAR_BEST * gain.max(), least):
                 break
-            of_all = not any(tried[k].true.is_as(self.given, g.rows, g.views) for g in self.groups)
+            of_all = not any(tried[k].true.is_as(self.given, g.rows) for g in self.groups)
             if tried[k].amount_of not in amounts and left_for[of_all]:
                 found.append(k)
                 left_for[of_all] -= 1
@@ -293,11 +312,7 @@ class _Judge:
         """
         group, found = self.groups[g], np.zeros(len(tried))
         before = self.of_groups[g].at(group.some)
-        some = [
-            k
-            for k, one in enumerate(tried)
-            if not one.true.is_as(self.given, group.rows, group.views)
-        ]
+        some = [k for k, one in enumerate(tried) if not one.true.is_as(self.given, group.rows)]
         found[some] = -float(before.support.sum())
         support = np.zeros(len(tried))
 
@@ -358,6 +373,10 @@ class _Judge:
         Cameras at another place may nearly make up for one that has an opposite. Images agree
         little better without it then, but worse with the opposite.
         """
+        if what.of_few:  # too few for signed ranks, and chosen by what they gain
+            some, before = one.at(what.of_few), self.own.at(what.of_few)
+            is_plain = float((some.share - before.share).mean()) >= _PLAIN_GAIN
+            return is_plain and one.images >= self.own.images + MIN_IMAGES
         if _explains(one, self.own):
             return True
         gain = _signed_ranks(one.share - self.own.share)
@@ -378,7 +397,7 @@ class _Judge:
         return Agreement.joined(
             [
                 self.of_groups[g]
-                if assumed.is_as(self.given, group.rows, group.views)
+                if assumed.is_as(self.given, group.rows)
                 else self._compare([assumed], g, group.rows, starts, known[g] if known else ())[0]
                 for g, group in enumerate(self.groups)
             ]

@@ -28,6 +28,11 @@ _STILL = 0.1  # of such a step: readings that move by less are of an encoder tha
 _SAME_RADIUS = 1e-3  # relative: parts that are equally thick are one kind
 
 
+TURNS = LEFT_RIGHT, UPSIDE_DOWN
+_TURNS_IN_WORDS = (
+    ("images mirrored", "mirrored"),
+    ("images upside down", "turned upside down"),
+)
 _MOVE_ONE = "move one leg alone and see which column changes, and which leg it is in a picture"
 _LETTERING = "look at lettering in a picture"
 
@@ -38,7 +43,7 @@ class Assumed:
 
     machine: Machine
     q: Array  # (n_rows, n_legs) readings [m]
-    flip: Array  # (n_views, 2) -1 along axes that images are turned over
+    flip: Array  # (n_rows, 2) -1 along axes that images are turned over
     focal: float = 1.0  # focal length as a part of the stated one
 
     def joints(self, rows: Sequence[int]) -> tuple[Array, Array]:
@@ -59,13 +64,13 @@ class Assumed:
         B[chosen] = found
         return np.broadcast_to(machine.A_base, B.shape), B
 
-    def is_as(self, other: Assumed, rows: Sequence[int], views: Sequence[int]) -> bool:
-        """Whether nothing differs from another in some rows and views."""
+    def is_as(self, other: Assumed, rows: Sequence[int]) -> bool:
+        """Whether nothing differs from another in some rows."""
         return (
             self.machine is other.machine
             and self.focal == other.focal
             and np.array_equal(self.q[rows], other.q[rows], equal_nan=True)
-            and np.array_equal(self.flip[views], other.flip[views])
+            and np.array_equal(self.flip[rows], other.flip[rows])
         )
 
     @property
@@ -90,6 +95,7 @@ class Mistake:
     same_as: tuple[str, ...] = ()  # clauses of what no image can tell from it
     test: str = ""  # what would decide whether it is this: "move one leg alone and ..."
     is_small: bool = False  # cameras stand about where images have them as things are
+    of_few: tuple[int, ...] = ()  # rows of single images that it is about
     amount_of: str = ""  # mistakes of one name differ by how much: the best stands for all
     # The same by more or less, in steps between those that are tried; None where it has no amount.
     finer: Callable[[float], Mistake] | None = None
@@ -100,7 +106,7 @@ class Mistake:
 
 def as_given(data: OrderedDataset) -> Assumed:
     """Return a session as its files have it."""
-    return Assumed(data.machine, data.measurements.q, np.ones((len(data.measurements.views), 2)))
+    return Assumed(data.machine, data.measurements.q, np.ones((data.measurements.n_rows, 2)))
 
 
 def mistakes(data: OrderedDataset) -> list[Mistake]:
@@ -340,31 +346,42 @@ def _zero_step(leg: Leg, q: Array) -> float:
 def _of_images(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
     """Yield images that are turned over, all or those of a view."""
     views = data.measurements.views
-    which = [(list(range(len(views))), "")]
-    for v, view in enumerate(views):
-        if len(views) > 1:
-            which.append(([v], f" of view {view.name}"))
-    for chosen, of_view in which:
-        for turn, kind, what in (
-            (LEFT_RIGHT, "images mirrored", "mirrored"),
-            (UPSIDE_DOWN, "images upside down", "turned upside down"),
-        ):
-            if of_view and turn is UPSIDE_DOWN:  # of one camera: it may be held so
-                continue
-            flip = given.flip.copy()
-            flip[chosen] = turn
-            things = "images"
-            remedy = "replace them by the originals"
-            if len(data.photographs.detect) == 0:
-                things, remedy = "outlines", "correct the direction of an axis of their table"
-            yield Mistake(
-                kind,
-                f"the {things}{of_view} look {what}",
-                "turned back",
-                remedy,
-                replace(given, flip=flip),
-                test=_LETTERING,
-            )
+    every = list(range(data.measurements.n_rows))
+    for turn in TURNS:
+        yield _turned_over(data, given, every, turn, "")
+    for v, view in enumerate(views) if len(views) > 1 else ():
+        # Not upside down: of one camera, it may be held so.
+        rows = np.flatnonzero(data.measurements.view == v).tolist()
+        yield _turned_over(data, given, rows, LEFT_RIGHT, f" of view {view.name}")
+
+
+def turned_images(data: OrderedDataset, rows: Sequence[int], turn: Array) -> Mistake:
+    """Return images of some rows of a view that are turned over, and others are not."""
+    m = data.measurements
+    names = row_names(data.dataset.measurements)
+    first = names[data.order.rows[rows[0]]]
+    which = f" {first} and {len(rows) - 1} more of view {m.views[m.view[rows[0]]].name}"
+    one = _turned_over(data, as_given(data), rows, turn, which)
+    return replace(one, of_few=tuple(rows), test="")
+
+
+def _turned_over(
+    data: OrderedDataset, given: Assumed, rows: Sequence[int], turn: Array, which: str
+) -> Mistake:
+    kind, what = _TURNS_IN_WORDS[turn is UPSIDE_DOWN]
+    flip = given.flip.copy()
+    flip[list(rows)] = turn
+    things, remedy = "images", "replace them by the originals"
+    if len(data.photographs.detect) == 0:
+        things, remedy = "outlines", "correct the direction of an axis of their table"
+    return Mistake(
+        kind,
+        f"the {things}{which} look {what}",
+        "turned back",
+        remedy,
+        replace(given, flip=flip),
+        test=_LETTERING,
+    )
 
 
 def _of_model(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
