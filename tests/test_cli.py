@@ -140,6 +140,27 @@ def test_without_a_command_the_help_is_shown(
     assert printed.err == "legcal: Nothing was done: found no command, needed one of those above.\n"
 
 
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (("doctor", "x", "--nonsense"), "--nonsense"),
+        (("simulate", "x", "--level", "nonsense"), "'nonsense' is not one of 'axes'"),
+        (("doctor",), "DATASET"),
+        (("study", "nonsense"), "'nonsense'"),
+    ],
+)
+def test_a_command_that_does_not_parse_is_told_with_where_its_options_are(
+    words: tuple[str, ...],
+    found: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(monkeypatch, *words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert found in line
+    assert f"; legcal {words[0]} --help lists" in line
+
+
 @pytest.mark.parametrize("workers", ["0", "-1", "257", "1000000"])
 @pytest.mark.parametrize("words", [("detect", "x", "-o", "y"), ("study", "paper", "-o", "y")])
 def test_impossible_numbers_of_processes_are_refused_before_any_is_started(

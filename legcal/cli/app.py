@@ -106,6 +106,18 @@ def _refuse_empty(words: Sequence[str]) -> None:
             )
 
 
+def _with_remedy(error: Exception) -> str:
+    """Return what typer says of options and arguments, and where the right ones are; or nothing."""
+    said = str(getattr(error, "format_message", error.__str__)()).replace("Value error, ", "")
+    if not said:
+        return ""
+    context = getattr(error, "ctx", None)
+    command = " ".join(["legcal", *context.command_path.split()[1:]]) if context else "legcal"
+    return (
+        f"The command could not be run: {said.rstrip('.')}; {command} --help lists what it takes."
+    )
+
+
 def _print_warning(message: Warning | str, *_others: object, **_more: object) -> None:
     """Say a warning on stderr in one line."""
     if sys.stderr is not None:
@@ -123,7 +135,7 @@ def run(*, as_json: bool) -> int:
     usage_error: type[Exception] = typer.BadParameter.__bases__[0]
     try:
         _refuse_empty(sys.argv[1:])
-        code = app(standalone_mode=False)
+        code = app(standalone_mode=False, prog_name="legcal")
     except typer.Abort as error:
         raise KeyboardInterrupt from error
     except Exception as error:  # the one place that may: the boundary to the shell
@@ -133,8 +145,7 @@ def run(*, as_json: bool) -> int:
             print_failure(kind, str(error), as_json=as_json, diagnosis=diagnosis)
             return error.exit_code
         if isinstance(error, usage_error):
-            message = getattr(error, "format_message", error.__str__)()
-            print_failure("UsageError", message or NO_COMMAND, as_json=as_json)
+            print_failure("UsageError", _with_remedy(error) or NO_COMMAND, as_json=as_json)
             return 2
         print(*map(printable, traceback.format_exc().split("\n")), sep="\n", file=sys.stderr)
         print_failure(

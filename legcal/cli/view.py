@@ -24,7 +24,7 @@ def view(
     ],
     dataset: Annotated[
         Path | None,
-        typer.Option(help="The dataset of a result, for its poses and photographs."),
+        typer.Option(help="The dataset of a result or a model, for its poses and photographs."),
     ] = None,
     host: Annotated[
         str, typer.Option(help="Who can look: 127.0.0.1 this machine alone, 0.0.0.0 everybody.")

@@ -162,13 +162,10 @@ def error_bars(
 
 
 def histogram(values: Array, label: str, n: int = 14) -> Markup:
-    """Return how many values lie where."""
+    """Return how many values, none below zero, lie where from zero on."""
     left, width, height, top, bottom = 34.0, 440.0, 210.0, 14.0, 40.0
     canvas = Canvas(width, height, label)
-    low, high = float(values.min()), float(values.max())
-    low, high = (0.0, high * 1.05) if low < 0.4 * high else (low, high)
-    if not high > low:
-        low, high = low - 0.5 * (abs(low) or 1.0), high + 0.5 * (abs(high) or 1.0)
+    low, high = 0.0, 1.05 * float(values.max()) or 1.0
     counts, edges = np.histogram(values, bins=min(n, max(4, len(values) // 2)), range=(low, high))
     most = max(int(counts.max()), 1)
     sx, sy = (width - left - 12.0) / (high - low), (height - top - bottom) / most

@@ -57,6 +57,15 @@ class Recording(Protocol):
         """Return the readings that the recording holds itself, if any."""
 
 
+def _reader() -> int:
+    """Return the number of FFmpeg where OpenCV has it.
+
+    Others, which OpenCV tries on what FFmpeg cannot read, write about damage to stderr.
+    """
+    has_ffmpeg = cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG)
+    return cv2.CAP_FFMPEG if has_ffmpeg else cv2.CAP_ANY
+
+
 class Video:
     """A video file that OpenCV reads."""
 
@@ -67,7 +76,7 @@ class Video:
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the frames; a video without any is refused."""
         with quiet_opencv():
-            video = cv2.VideoCapture(str(self.path))
+            video = cv2.VideoCapture(str(self.path), _reader())
             video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as its camera was calibrated
             promised = video.get(cv2.CAP_PROP_FRAME_COUNT) if video.isOpened() else 0
             rate = video.get(cv2.CAP_PROP_FPS) if video.isOpened() else 0

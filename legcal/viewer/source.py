@@ -41,7 +41,7 @@ def open_source(given: str | Path, dataset: str | Path | None = None) -> Source:
     given : str or Path
         A dataset folder, a result folder, or a mechanism.
     dataset : str or Path, optional
-        The dataset that a result was computed from, which a result does not name.
+        The dataset that a result was computed from, or one of the model, which do not name it.
 
     Raises
     ------
@@ -94,8 +94,8 @@ def _session(machine: Machine, given: str | Path, result: EarlierResult | None) 
     if sorted(names) != sorted(machine.leg_names):
         raise UsageError(
             f"--dataset could not be used: found one of a machine with the legs {', '.join(names)},"
-            f" needed those of {machine.name}: {', '.join(machine.leg_names)}; give the dataset "
-            "that the result was computed from."
+            f" needed those of {machine.name}: {', '.join(machine.leg_names)}; give a dataset of "
+            f"{'that model' if result is None else 'that result: the one it was computed from'}."
         )
     outlines = dataset.observations
     if result is not None and os.path.isfile(result.folder / OBSERVATIONS_NAME):
