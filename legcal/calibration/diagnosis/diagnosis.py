@@ -260,7 +260,9 @@ class _Judge:
         for g, group in enumerate(self.groups):
             own = self.of_groups[g]
             T_own, left = own.cameras[0], own.row[~own.agrees].tolist()
-            for v, turn in product(group.views, TURNS) if T_own is not None else ():
+            if T_own is None:
+                continue
+            for v, turn in product(group.views, TURNS):
                 rows = [row for row in left if group.view_of_row[row] == v]
                 for _ in range(2):  # all that do not agree, then those of them that do
                     if MIN_IMAGES <= len(rows) < len(own.row):
