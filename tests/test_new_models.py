@@ -31,16 +31,22 @@ TABLES = sorted((ROOT / "models" / "tables").glob("*.yaml"))
 REAL = ROOT / "tests" / "data" / "nategh-agheli-real"
 NUMBER = re.compile(r"(?<![\w.-])-?\d+\.\d+(?:e[-+]\d+)?")
 EXPECTED = {
+    "3-prs": ("PRS PRS PRS", 3),
     "3-rpr": ("RPR RPR RPR", 3),
     "3-rps": ("RPS RPS RPS", 3),
     "3-spr": ("SPR SPR SPR", 3),
     "3-upu": ("UPU UPU UPU", 3),
     "3-upu-tilted": ("UPU UPU UPU", 3),
     "6-sps": ("SPS SPS SPS SPS SPS SPS", 6),
+    "delta": ("RSS RSS RSS RSS RSS RSS", 3),
+    "hexaglide": ("PSS PSS PSS PSS PSS PSS", 6),
     "hexapod": ("SPU SPU SPU SPU SPU SPU", 6),
     "hexapod-rod": ("SPU SPU SPU SPU SPU SU", 5),
     "hexapod-strut": ("SPU SPU SPU SPU SPU SPU SPS", 6),
+    "linear-delta": ("PSS PSS PSS PSS PSS PSS", 3),
     "nategh-agheli": ("UPS UPS UPS UPS UPS UPS", 6),
+    "orthoglide": ("PSS PSS PSS PSS PSS PSS", 3),
+    "servo-hexapod": ("RSS RSS RSS RSS RSS RSS", 6),
     "tricept": ("SPS SPS SPS UP", 3),
 }
 
@@ -54,8 +60,7 @@ def check_same(machine: Machine, description: Any) -> None:
     assert machine.name == description.name
     assert machine.leg_names == tuple(leg.name for leg in description.legs)
     for leg, entry in zip(machine.legs, description.legs, strict=True):
-        slider = "P" if entry.type.has_slider else ""
-        assert leg.type == f"{entry.type.base}{slider}{entry.type.platform}"
+        assert leg.type == str(entry.type)
         assert leg.kind is entry.kind
         assert leg.sign == 1
         np.testing.assert_allclose(leg.A, entry.A_base, rtol=0, atol=1e-12)
@@ -63,6 +68,14 @@ def check_same(machine: Machine, description: Any) -> None:
             np.testing.assert_allclose(leg.B, entry.B_platform, rtol=0, atol=1e-12)
             if entry.offset is not None:
                 assert abs(leg.q0 - entry.offset) < 1e-12
+        if (motor := entry.actuator) is not None:
+            found = leg.actuator
+            assert found is not None
+            assert (found.joint, found.kind, found.link) == (motor.joint, motor.kind, motor.link)
+            np.testing.assert_allclose(found.axis, motor.axis, rtol=0, atol=1e-15)
+            np.testing.assert_allclose(found.travel, motor.travel, rtol=0, atol=1e-15)
+            off = np.cross(found.point - motor.point, motor.axis) if motor.turns else 0.0
+            assert np.linalg.norm(off) < 1e-12
         if entry.travel is not None:
             np.testing.assert_allclose(leg.travel, entry.travel, rtol=0, atol=1e-15)
         for axis, wanted in (

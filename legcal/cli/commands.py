@@ -353,7 +353,11 @@ def new(
         typer.Option("--output", "-o", metavar="DIR", help="The folder of models/ and urdf/."),
     ] = ...,  # type: ignore[assignment]
     family: Annotated[
-        str | None, typer.Option(help="Instead of a table: number and type of legs, 6-UPS.")
+        str | None,
+        typer.Option(
+            help="Instead of a table: number and type of legs, 6-UPS; or hexaglide, 3-prs, "
+            "linear-delta, orthoglide, delta or servo-hexapod, whose dimensions have defaults."
+        ),
     ] = None,
     unit: Annotated[str | None, typer.Option(help="Unit of all lengths: mm or m.")] = None,
     name: Annotated[str | None, typer.Option(help="Name of the model and its files.")] = None,
@@ -382,7 +386,8 @@ def new(
     ] = None,
     offset: Annotated[float | None, typer.Option(help="Leg length at reading zero.")] = None,
     travel: Annotated[
-        tuple[float, float] | None, typer.Option(help="Lowest and highest reading.")
+        tuple[float, float] | None,
+        typer.Option(help="Lowest and highest reading; degrees where motors turn."),
     ] = None,
     min_length: Annotated[
         float | None,
@@ -392,6 +397,15 @@ def new(
         float | None, typer.Option(help="Longest length of a leg, in place of --travel.")
     ] = None,
     leg_radius: Annotated[float | None, typer.Option(help="Radius of tube and rod.")] = None,
+    arm_length: Annotated[
+        float | None, typer.Option(help="Length of the arms of a delta, or horns of servos.")
+    ] = None,
+    rod_length: Annotated[
+        float | None, typer.Option(help="Length of rods on carriages or arms.")
+    ] = None,
+    rod_spacing: Annotated[
+        float | None, typer.Option(help="Distance of the two rods of a parallelogram.")
+    ] = None,
     type_of_legs: Annotated[
         str | None, typer.Option("--type", help="Type of the legs of a table that has none: UPS.")
     ] = None,
@@ -432,6 +446,9 @@ def new(
         "min_length": min_length,
         "max_length": max_length,
         "leg_radius": leg_radius,
+        "arm_length": arm_length,
+        "rod_length": rod_length,
+        "rod_spacing": rod_spacing,
         "type": type_of_legs,
         "platform_in": platform_in,
         "tilt": tilt,

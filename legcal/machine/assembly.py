@@ -1,7 +1,7 @@
 """A described machine put together: a pose in which it closes, lengths and axes of all legs."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -9,18 +9,27 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError
 from legcal.files import motion_to_xyz_quat
-from legcal.geometry import Array, cross, cross_matrices, frame_on_points, motion_of
+from legcal.geometry import (
+    Array,
+    cross,
+    cross_matrices,
+    frame_on_points,
+    motion_of,
+    normal_basis,
+)
+from legcal.machine.actuator import Actuator, actuator_index, actuators_of, reading_of_rod
 from legcal.machine.description import (
     Description,
     Home,
     LegEntry,
     LegType,
+    legs_in_words,
     wrong_axes,
     wrong_lengths,
     wrong_sizes,
 )
 from legcal.machine.equations import pose_equations
-from legcal.machine.leg import EquationKind, Leg, LegKind
+from legcal.machine.leg import EquationKind, Leg, LegColumns, LegKind
 from legcal.machine.solver import poses_after, solve
 
 TRIALS = 40
@@ -38,15 +47,17 @@ class AssembledLeg:
     name: str
     type: LegType
     kind: LegKind
-    A_base: Array  # (3,) joint centre in the base link [m]
+    A_base: Array  # (3,) joint centre in the base link [m]; on a motor that at reading 0
     B_platform: Array  # (3,) joint centre in the platform link [m]
     u: Array  # (3,) direction from A to B at home, in the base link
     q0: float  # length at reading zero, or of a constant leg [m]
     travel: tuple[float, float]  # lowest and highest reading [m]; (0, 0) for a constant leg
     tube: float | None  # radius of the half at the base [m]
     rod: float | None  # radius of the half at the platform [m]
-    base_axis: Array  # (3,) of an R, or the outer one of a U, in the base link
+    base_axis: Array  # (3,) of an R, or the outer one of a U, in the base link at home
     platform_axis: Array  # (3,) of an R, or the outer one of a U, in the base link at home
+    actuator: Actuator | None = None  # what its joint at A rides on, in the base link
+    q_home: float = 0.0  # the reading of that motor at home [m or rad]
 
     @property
     def shortest_shown(self) -> float:
@@ -75,7 +86,8 @@ def assemble(described: Description) -> Assembled:
     _refuse(wrong_sizes(described))
     home = home_of_description(described)
     T = home.motion()
-    A = np.array([leg.A_base for leg in described.legs])
+    readings = _readings_at_home(described, T)
+    A = np.array([_at(leg, readings) for leg in described.legs])
     B = T.apply(np.array([leg.B_platform for leg in described.legs]))
     lengths = np.linalg.norm(B - A, axis=1)
     _refuse(wrong_lengths(described, lengths))
@@ -85,13 +97,14 @@ def assemble(described: Description) -> Assembled:
         tangents[:] = [0.0, 0.0, 1.0]
     legs, problems = [], []
     for j, entry in enumerate(described.legs):
-        axes = _axes(entry, tangents[j], T)
+        q = 0.0 if entry.actuator is None else readings[entry.actuator.joint]
+        axes = _axes(entry, tangents[j], T, q)
         problems += wrong_axes(described, entry, u[j], axes)
         q0, travel = _law(entry, float(lengths[j]))
         legs.append(
             AssembledLeg(
                 entry.name, entry.type, entry.kind, entry.A_base, entry.B_platform, u[j], q0,
-                travel, entry.tube, entry.rod, *axes,
+                travel, entry.tube, entry.rod, *axes, entry.actuator, q,
             )
         )  # fmt: skip
     _refuse(problems)
@@ -135,9 +148,12 @@ def across_leg(u: Array, outward: Array) -> Array:
     return np.array([0.0, 1.0, 0.0])
 
 
-def _axes(entry: LegEntry, tangent: Array, T: RigidTransform) -> tuple[Array, Array]:
-    """Return the axes of a leg at base and platform, both in the base link."""
-    base = tangent if entry.base_axis is None else entry.base_axis
+def _axes(entry: LegEntry, tangent: Array, T: RigidTransform, q: float) -> tuple[Array, Array]:
+    """Return the axes of a leg at base and platform at home, both in the base link."""
+    base = tangent
+    if entry.base_axis is not None:
+        turn = np.eye(3) if entry.actuator is None else entry.actuator.rotations(np.array([q]))[0]
+        base = np.asarray(turn @ entry.base_axis)
     platform = tangent
     if entry.platform_axis is not None:
         platform = np.asarray(T.rotation.apply(entry.platform_axis))
@@ -169,6 +185,8 @@ def _base_frame(described: Description, count: int) -> tuple[str, ...]:
     combos = list(combinations(range(len(legs)), count))
     if len(legs) == 6 and count == 3:
         combos.insert(0, (0, 2, 4))
+    motors = [j if leg.actuator is None else leg.actuator.joint for j, leg in enumerate(legs)]
+    combos.sort(key=lambda chosen: -len({motors[j] for j in chosen}))  # of different motors first
     for chosen in combos:
         if not _degenerate(described, chosen):
             return tuple(legs[j].name for j in chosen)
@@ -225,19 +243,25 @@ class _ClosingEquations:
         self.planar = all_revolute(described)
         legs = [_fixed_leg(entry, self.planar, mid_travel) for entry in described.legs]
         self.legs = tuple(leg for leg in legs if leg.n_constraints)
+        self.actuators = actuators_of(self.legs)
         self.A = np.array([leg.A for leg in legs])
         self.B = np.array([leg.B for leg in legs])
         lengths = [leg.q0 for leg in self.legs if leg.kind is LegKind.CONSTANT]
         spread = max(float(np.ptp(points, axis=0).max()) for points in (self.A, self.B))
         self.size = max(spread, 1e-3, *lengths)
-        self.unit = np.array([1.0] * 3 + [self.size] * 3)
+        turns = [1.0 if actuator.turns else self.size for actuator in self.actuators]
+        self.unit = np.array([1.0] * 3 + [self.size] * 3 + turns)
 
-    def __call__(self, poses: Array) -> tuple[Array, Array]:
-        """Return residuals (k, m) at poses (k, 3, 4) and derivatives (k, m, 6)."""
+    def __call__(self, poses: Array, readings: Array | None = None) -> tuple[Array, Array]:
+        """Return residuals (k, m) at poses (k, 3, 4) and derivatives (k, m, 6).
+
+        *readings* (n_actuators,) are those of motors that carry joints, if there are any.
+        """
         if not self.legs:
             return np.zeros((len(poses), 0)), np.zeros((len(poses), 0, 6))
+        legs = self.legs if readings is None else self._at(readings)
         with np.errstate(invalid="ignore"):  # a leg without length has no direction
-            found = pose_equations(self.legs, poses[:, :, :3], poses[:, :, 3], by_local=False)
+            found = pose_equations(legs, poses[:, :, :3], poses[:, :, 3], by_local=False)
         values, by_pose = [found.values / self.size], [found.by_pose / self.size]
         for leg in self.legs if self.planar else ():
             if leg.base_axis is not None and leg.platform_axis is not None:
@@ -247,24 +271,72 @@ class _ClosingEquations:
                 by_pose.append(np.concatenate([slope, np.zeros_like(slope)], axis=2))
         return np.concatenate(values, axis=1), np.concatenate(by_pose, axis=1)
 
+    def readings_near(self, T: RigidTransform) -> Array:
+        """Return the readings of the actuators at which the first rod of each reaches a pose."""
+        first = {a.joint: leg for leg in reversed(self.legs) if (a := leg.actuator) is not None}
+        return np.array([_candidates(first[a.joint], T)[0] for a in self.actuators])
+
+    def _at(self, readings: Array) -> tuple[Leg, ...]:
+        """Return the legs as they stand at readings."""
+        index = actuator_index(self.legs)
+        return tuple(
+            leg if a < 0 else _standing(leg, float(readings[a]))
+            for leg, a in zip(self.legs, index, strict=True)
+        )
+
     def residual(self, T: RigidTransform) -> float:
         """Return the largest residual at a pose."""
-        return float(np.abs(self(T.as_matrix()[None, :3])[0]).max(initial=0.0))
+        values, _ = self(T.as_matrix()[None, :3], self.readings_near(T))
+        return float(np.abs(values).max(initial=0.0))
 
     def nearest(self, T: RigidTransform) -> RigidTransform:
         """Return the nearest pose that closes, as far as steps get nearer to one."""
         found = solve(
-            self, poses_after, T.as_matrix()[None, :3], tolerance=1e-16, unit=self.unit, steps=30
+            self._with_readings,
+            _after,
+            np.concatenate([T.as_matrix()[:3].ravel(), self.readings_near(T)])[None],
+            tolerance=1e-16,
+            unit=self.unit,
+            steps=30,
         )
-        return motion_of(found.points[0, :, :3], found.points[0, :, 3])
+        pose = found.points[0, :12].reshape(3, 4)
+        return motion_of(pose[:, :3], pose[:, 3])
+
+    def _with_readings(self, points: Array) -> tuple[Array, Array]:
+        """Return residuals (k, m) at poses beside readings (k, 12 + n), and their derivatives."""
+        if not self.actuators:
+            return self(points.reshape(-1, 3, 4))
+        found = [self._at_one(point) for point in points]
+        return np.array([f[0] for f in found]), np.array([f[1] for f in found])
+
+    def _at_one(self, point: Array) -> tuple[Array, Array]:
+        """Return residuals (m,) at one pose beside readings, and derivatives (m, 6 + n)."""
+        pose, readings = point[:12].reshape(1, 3, 4), point[12:]
+        values, by_pose = self(pose, readings)
+        by_q = np.zeros((values.shape[1], len(readings)))
+        legs = self._at(readings)
+        rows = pose_equations(legs, pose[:, :, :3], pose[:, :, 3])
+        index = actuator_index(self.legs)
+        for row, j in enumerate(rows.leg.tolist()):
+            actuator = self.legs[j].actuator
+            if actuator is None:
+                continue
+            local, a = rows.by_local[0, row], index[j]
+            motion = actuator.motion(self.legs[j].A, readings[a : a + 1])
+            by_q[row, a] = local[LegColumns.A] @ motion.by_q[0]
+            axis = legs[j].base_axis
+            if actuator.turns and axis is not None:
+                by_q[row, a] += local[LegColumns.BASE_AXIS] @ normal_basis(axis) @ actuator.axis
+        return values[0], np.concatenate([by_pose[0], by_q / self.size], axis=1)
 
     def describe(self, T: RigidTransform) -> list[str]:
         """Return the residuals at a pose in words."""
         matrix = T.as_matrix()[None]
-        found = pose_equations(self.legs, matrix[:, :3, :3], matrix[:, :3, 3], by_local=False)
+        legs = self._at(self.readings_near(T))
+        found = pose_equations(legs, matrix[:, :3, :3], matrix[:, :3, 3], by_local=False)
         words = []
         for j, kind, value in zip(found.leg, found.kinds, found.values[0], strict=True):
-            leg = self.legs[j]
+            leg = legs[j]
             length = float(np.linalg.norm(T.apply(leg.B) - leg.A))
             if kind is EquationKind.LENGTH:
                 if abs(value) > CLOSED * self.size:
@@ -289,7 +361,7 @@ def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool) -> Leg:
     if mid_travel and entry.kind is LegKind.ACTUATED and entry.travel is not None:
         length = (entry.offset or 0.0) + 0.5 * sum(entry.travel)
     z = np.array([0.0, 0.0, 1.0]) if planar else None
-    return Leg(
+    leg = Leg(
         entry.type.base,
         entry.type.platform,
         LegKind.PASSIVE if length is None else LegKind.CONSTANT,
@@ -298,8 +370,87 @@ def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool) -> Leg:
         0.0 if length is None else length,
         z if entry.base_axis is None else entry.base_axis,
         z if entry.platform_axis is None else entry.platform_axis,
+        travel=(0.0, 0.0) if entry.actuator is None else entry.actuator.travel,
         name=entry.name,
+        actuator=entry.actuator,
     )
+    if mid_travel and entry.actuator is not None:
+        return _standing(leg, 0.5 * sum(entry.actuator.travel))
+    return leg
+
+
+def _standing(leg: Leg, q: float) -> Leg:
+    """Return a rod with its joint at A fixed where its motor holds it at a reading."""
+    if leg.actuator is None:
+        return leg
+    axis, readings = leg.base_axis, np.array([q])
+    return replace(
+        leg,
+        A=leg.actuator.at(leg.A, readings)[0],
+        base_axis=None if axis is None else leg.actuator.rotations(readings)[0] @ axis,
+        actuator=None,
+    )
+
+
+def _candidates(leg: Leg, T: RigidTransform) -> list[float]:
+    """Return the two readings at which a rod reaches a pose, that inside its travel first."""
+    B = np.asarray(T.apply(leg.B))[None]
+    low, high = leg.travel
+    found = [float(reading_of_rod(replace(leg, mode=mode), B)[0]) for mode in (1, -1)]
+    return sorted(found, key=lambda q: max(low - q, q - high, 0.0))
+
+
+def _at(entry: LegEntry, readings: Mapping[str, float]) -> Array:
+    """Return the joint at A (3,) at readings of motors that carry joints."""
+    if entry.actuator is None:
+        return entry.A_base
+    q = np.array([readings[entry.actuator.joint]])
+    return np.asarray(entry.actuator.at(entry.A_base, q)[0])
+
+
+def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, float]:
+    """Return the readings at home of motors that carry joints.
+
+    Raises
+    ------
+    ModelError
+        If home is outside a travel, or two readings inside it close the machine there.
+    """
+    closure = _ClosingEquations(described, mid_travel=False)
+    found, problems = dict[str, float](), list[str]()
+    for actuator in closure.actuators:
+        rods = [leg for leg in closure.legs if leg.actuator is actuator]
+        chosen, other = _candidates(rods[0], T)
+        found[actuator.joint] = chosen
+        unit, scale = ("deg", np.degrees(1.0)) if actuator.turns else ("mm", 1e3)
+        low, high = (scale * end for end in actuator.travel)
+        where = f"{described.source}: motor '{actuator.joint}' cannot close at home"
+        needed = f"needed one in its travel of {low:.6g} to {high:.6g} {unit}"
+        outside = [max(low - scale * q, scale * q - high) > 1e-6 for q in (chosen, other)]
+        if outside[0]:
+            problems.append(
+                f"{where}: found the readings {scale * chosen:.6g} and {scale * other:.6g} {unit} "
+                f"there, {needed}; correct home, lengths or travel."
+            )
+        elif not outside[1] and abs(other - chosen) > 1e-9:
+            problems.append(
+                f"{where}: found two readings there, {scale * chosen:.6g} and {scale * other:.6g} "
+                f"{unit}, {needed} and not two; give it a travel on one side of where {_of(rods)} "
+                "stands across the motion."
+            )
+    _refuse(problems)
+    return found
+
+
+def _of(rods: Sequence[Leg]) -> str:
+    """Return rods in words."""
+    return legs_in_words([leg.name for leg in rods])
+
+
+def _after(points: Array, steps: Array) -> Array:
+    """Return poses beside readings (k, 12 + n) after steps (k, 6 + n)."""
+    poses = poses_after(points[:, :12].reshape(-1, 3, 4), steps[:, :6])
+    return np.concatenate([poses.reshape(-1, 12), points[:, 12:] + steps[:, 6:]], axis=1)
 
 
 def _project(described: Description, home: Home) -> Home:

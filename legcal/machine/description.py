@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.files import motion_from_xyz_quat
 from legcal.geometry import Array
+from legcal.machine.actuator import Actuator, ActuatorKind
 from legcal.machine.classification import PERPENDICULAR
 from legcal.machine.leg import (
     MAX_LENGTH,
@@ -19,21 +20,23 @@ from legcal.machine.leg import (
     LegKind,
 )
 
-_TYPE = re.compile(r"([RUS])(P?)([RUS]?)")
+_TYPE = re.compile(r"([PR])([RUS])([RUS])|([RUS])(P?)([RUS]?)")
 
 NEEDED_TYPE = (
     "R, U or S at the base, P for a slider, then R, U or S at the platform or nothing for a leg "
-    "that is fixed there (UPS, SPU, RPR, UP, SS)"
+    "that is fixed there (UPS, SPU, RPR, UP, SS); for a rod that hangs on a motor P or R first "
+    "(PSS, RSS, PRS)"
 )
 
 
 @dataclass(frozen=True)
 class LegType:
-    """The joints of a leg from base to platform, as they are written: ``UPS``, ``SS``, ``UP``."""
+    """The joints of a leg from base to platform, as they are written: ``UPS``, ``SS``, ``PSS``."""
 
-    base: JointType  # the joint at the base
-    has_slider: bool  # whether there is a P
+    base: JointType  # the joint at the base, or on what a motor moves
+    has_slider: bool  # whether there is a P along the leg
     platform: JointType  # the joint at the platform
+    actuator: ActuatorKind | None = None  # the motor that carries the joint at A
 
     @property
     def has_sphere(self) -> bool:
@@ -45,13 +48,23 @@ class LegType:
         """Whether both joints are R, as in planar machines."""
         return self.base is self.platform is JointType.REVOLUTE
 
+    def __str__(self) -> str:
+        """Return it as it is written."""
+        motor = {None: "", ActuatorKind.PRISMATIC: "P", ActuatorKind.REVOLUTE: "R"}[self.actuator]
+        return f"{motor}{self.base}{'P' * self.has_slider}{self.platform}"
+
 
 def leg_type(text: str) -> LegType | None:
     """Return the leg type of a text such as ``UPS``; None for any other text."""
     match = _TYPE.fullmatch(text)
-    if match is None or not (match[2] or match[3]):
+    if match is None:
         return None
-    return LegType(JointType(match[1]), bool(match[2]), JointType(match[3]))
+    if match[1]:
+        kind = ActuatorKind.PRISMATIC if match[1] == "P" else ActuatorKind.REVOLUTE
+        return LegType(JointType(match[2]), False, JointType(match[3]), kind)
+    if not (match[5] or match[6]):
+        return None
+    return LegType(JointType(match[4]), bool(match[5]), JointType(match[6]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,14 +74,15 @@ class LegEntry:
     name: str  # its name
     type: LegType  # its joints
     kind: LegKind  # whether its slider has a motor, moves freely, or is not there
-    A_base: Array  # (3,) joint centre in the base link [m]
+    A_base: Array  # (3,) joint centre in the base link [m]; on a motor that at reading 0
     B_platform: Array  # (3,) joint centre in the platform link [m]
     offset: float | None  # length at reading zero [m] of an actuated leg, length of a constant one
     travel: tuple[float, float] | None  # lowest and highest reading [m]
     tube: float | None  # radius of the half at the base [m]
     rod: float | None  # radius of the half at the platform [m]
-    base_axis: Array | None  # (3,) in the base link; None for the default
+    base_axis: Array | None  # (3,) in the base link, on a motor at reading 0; None for the default
     platform_axis: Array | None  # (3,) in the platform link; None for the default
+    actuator: Actuator | None = None  # what its joint at A rides on, in the base link
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,7 @@ from legcal.files import (
     validate,
 )
 from legcal.geometry import Array
+from legcal.machine.actuator import Actuator, ActuatorKind
 from legcal.machine.description import (
     NEEDED_TYPE,
     Description,
@@ -216,6 +217,43 @@ class HomeEntry(FileSchema):
     rpy_deg: Vector | None = None
 
 
+def _ends(value: Any) -> Any:
+    if not _is_pair(value):
+        raise ValueError(f"found {describe(value)}, needed [lowest, highest] reading; correct it.")
+    return _lower_first(value)
+
+
+def _direction(value: Any) -> Any:
+    return None if value is None else _directions([value])[0]
+
+
+Ends = Annotated[
+    list[float],
+    BeforeValidator(_ends),
+    WithJsonSchema({**_ROW, "minItems": 2, "maxItems": 2}),
+]
+Direction = Annotated[
+    list[float],
+    BeforeValidator(_direction),
+    WithJsonSchema({**_ROW, "minItems": 3, "maxItems": 3}),
+]
+
+
+class ActuatorEntry(FileSchema):
+    """A motor that rods hang on: a carriage that slides, or an arm that turns, in the base link."""
+
+    direction: Direction | None = None
+    point: Vector | None = None
+    axis: Direction | None = None
+    travel: Ends | None = None
+    travel_deg: Ends | None = None
+
+    @property
+    def turns(self) -> bool:
+        """Whether it is an arm."""
+        return self.axis is not None
+
+
 class TableFile(FileSchema):
     """A table in YAML. All lengths are in ``unit``; directions have no length."""
 
@@ -238,6 +276,8 @@ class TableFile(FileSchema):
     ] = None
     base_axes: Directions | None = None
     platform_axes: Directions | None = None
+    actuators: Annotated[dict[PlainName, ActuatorEntry], Field(min_length=1)] | None = None
+    hangs_on: list[str | None] | None = None
     home: HomeEntry | None = None
     platform_in: Literal["base", "platform"] | None = None
     base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
@@ -255,15 +295,18 @@ OPTIONS = {
     "platform_in": "--platform-in",
 }
 _XYZ = ("x", "y", "z")
+_MOTIONS = ("direction", "point", "axis")  # of what rods hang on
 _RADII = ("radius", "tube", "rod")
 _POINTS = tuple(f"{side}_{i}" for side in ("base", "platform") for i in _XYZ)
 _NUMBERS = (
     *("offset", "length", "min_length", "max_length", "travel_low", "travel_high"),
     *_RADII,
     *(f"{side}_axis_{i}" for side in ("base", "platform") for i in _XYZ),
+    *(f"{what}_{i}" for what in ("direction", "point", "axis") for i in _XYZ),
+    *("travel_deg_low", "travel_deg_high"),
 )
 COLUMNS = (
-    *(Column(name, "text", required=False) for name in ("leg", "type", "kind", "unit")),
+    *(Column(name, "text", required=False) for name in ("leg", "type", "kind", "unit", "hangs_on")),
     *(
         Column(
             name,
@@ -311,11 +354,31 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         x, y, z = (table.number(f"{side}_{i}") for i in _XYZ)
         return np.column_stack([x, y, np.nan_to_num(z)]).tolist()  # type: ignore[no-any-return]
 
-    def directions(side: str) -> list[Any]:
-        found = zip(*(numbers(f"{side}_axis_{i}") for i in _XYZ), strict=True)
+    def vectors(name: str) -> list[Any]:
+        found = zip(*(numbers(f"{name}_{i}") for i in _XYZ), strict=True)
         return [None if vector == (None,) * 3 else list(vector) for vector in found]
 
-    travel = zip(numbers("travel_low"), numbers("travel_high"), strict=True)
+    def pairs(name: str) -> list[Any]:
+        found = zip(numbers(f"{name}_low"), numbers(f"{name}_high"), strict=True)
+        return [None if pair == (None, None) else list(pair) for pair in found]
+
+    hangs_on, travel = texts("hangs_on"), pairs("travel")
+    actuators = dict[str, dict[str, Any]]()
+    for row, (motor, *values) in enumerate(
+        zip(hangs_on, *map(vectors, _MOTIONS), travel, pairs("travel_deg"), strict=True)
+    ):
+        said = dict(zip((*_MOTIONS, "travel", "travel_deg"), values, strict=True))
+        if motor is None:
+            continue
+        travel[row] = None
+        entry = actuators.setdefault(motor, said)
+        for key, value in said.items():
+            if entry[key] is None:
+                entry[key] = value
+            elif value is not None and value != entry[key]:
+                needed = f"the same {key} in all rows of '{motor}'; correct it, or leave it empty"
+                table.refuse(row, f"another {key}", needed, "hangs_on", what="hangs_on")
+    table.check()
     document: dict[str, Any] = {
         "legcal_table": 1,
         "name": path.stem,
@@ -323,7 +386,7 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         "types": texts("type") if "type" in table else None,
         "base_joints": points("base"),
         "platform_joints": points("platform"),
-        "travel": [None if pair == (None, None) else list(pair) for pair in travel],
+        "travel": travel,
         "radius": [
             {k: x for k, x in (("tube", tube), ("rod", rod)) if x is not None} or radius
             for radius, tube, rod in zip(*map(numbers, _RADII), strict=True)
@@ -336,9 +399,15 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         "lengths": numbers("length"),
         "min_length": numbers("min_length"),
         "max_length": numbers("max_length"),
-        "base_axes": directions("base"),
-        "platform_axes": directions("platform"),
+        "base_axes": vectors("base_axis"),
+        "platform_axes": vectors("platform_axis"),
+        "hangs_on": hangs_on,
     }
+    if actuators:
+        document["actuators"] = {
+            name: {key: value for key, value in entry.items() if value is not None}
+            for name, entry in actuators.items()
+        }
     return document | {
         key: column for key, column in optional.items() if any(x is not None for x in column)
     }
@@ -452,7 +521,7 @@ def _conflicting_entries(file: TableFile, source: str) -> list[str]:
     problems = []
     for key in (
         "platform_joints", "types", "legs", "offsets", "lengths", "min_length", "max_length",
-        "travel", "radius", "kinds", "base_axes", "platform_axes",
+        "travel", "radius", "kinds", "base_axes", "platform_axes", "hangs_on",
     ):  # fmt: skip
         value = getattr(file, key)
         if (
@@ -495,8 +564,102 @@ def _conflicting_entries(file: TableFile, source: str) -> list[str]:
             "correct it."
         )
     problems += _wrong_home(file, source)
+    problems += _wrong_actuators(file, source, names)
     problems += _wrong_lengths(file, source, names)
     return problems
+
+
+def _hangs_on(file: TableFile) -> list[str | None]:
+    """Return the motor that each leg hangs on: as stated, or in the order of the motors."""
+    n, motors = len(file.base_joints), list(file.actuators or ())
+    if file.hangs_on is None:
+        return [*motors] if len(motors) == n else [None] * n
+    return file.hangs_on
+
+
+def _wrong_actuators(file: TableFile, source: str, names: list[str]) -> list[str]:
+    """Return what does not fit together of motors that rods hang on."""
+    problems = []
+    known = file.actuators or {}
+    for name, entry in known.items():
+        where = f"{source}: actuators.{name} could not be used"
+        given = [key for key in _MOTIONS if getattr(entry, key) is not None]
+        if given not in (["direction"], ["point", "axis"]):
+            problems.append(
+                f"{where}: found {' and '.join(given) or 'no motion'}, needed the direction of a "
+                "carriage, or a point and the axis of an arm; correct it."
+            )
+            continue
+        right, wrong = ("travel_deg", "travel") if entry.turns else ("travel", "travel_deg")
+        if getattr(entry, right) is None or getattr(entry, wrong) is not None:
+            found = wrong if getattr(entry, wrong) is not None else "no travel"
+            what = "an arm, in degrees" if entry.turns else f"a carriage, in {file.unit}"
+            problems.append(
+                f"{where}: found {found}, needed {right}, the lowest and highest reading of "
+                f"{what}; correct it."
+            )
+    motors = _hangs_on(file)
+    for leg, type_, motor in zip(names, _types(file, len(names)), motors, strict=False):
+        where = f"{source}: leg '{leg}' could not be used"
+        if motor is not None and motor not in known:
+            found = f"'{motor}' in hangs_on, which is not among actuators; "
+            problems.append(f"{where}: found {found}{closest(motor, list(known) or ['none'])}")
+        elif (motor is None) is not (type_.actuator is None):
+            on = "no motor that it hangs on" if motor is None else f"it on '{motor}'"
+            problems.append(
+                f"{where}: found {on} and the type {type_}, needed actuators and hangs_on for "
+                "types that begin with the motor of a rod (PSS, RSS, PRS), and for no others; "
+                "correct them."
+            )
+        elif motor is not None and known[motor].turns is not (
+            type_.actuator is ActuatorKind.REVOLUTE
+        ):
+            moves = "turns" if known[motor].turns else "slides"
+            problems.append(
+                f"{where}: found the type {type_} on '{motor}', which {moves}, needed a type that "
+                f"begins with {'R' if known[motor].turns else 'P'}; correct the type or the motor."
+            )
+    problems += [
+        f"{source}: actuators.{name} could not be used: found no leg that hangs on it, needed one "
+        "in hangs_on; leave it out, or name it there."
+        for name in known
+        if name not in motors
+    ]
+    lengths = _of_each(file.lengths, len(names))
+    lacking = [
+        leg
+        for leg, motor, length in zip(names, motors, lengths, strict=False)
+        if motor is not None and length is None
+    ]
+    if lacking and not problems:
+        problems.append(
+            f"{source}: {legs_in_words(lacking)} could not be used: found no length, needed that "
+            "of rods that hang on a motor; add lengths."
+        )
+    return problems
+
+
+def _actuators(file: TableFile) -> dict[str, Actuator]:
+    """Return the motors that rods hang on, in the base link."""
+    found, motors = {}, _hangs_on(file)
+    for name, entry in (file.actuators or {}).items():
+        along = np.array(entry.axis or entry.direction, dtype=float)
+        A = [file.base_joints[j] for j, motor in enumerate(motors) if motor == name]
+        at = entry.point or np.mean(A, axis=0).tolist()
+        ends = entry.travel_deg or entry.travel or [0.0, 0.0]
+        if entry.turns:
+            travel = [float(np.radians(end)) for end in ends]
+        else:
+            travel = [in_metres(end, file.unit) for end in ends]
+        found[name] = Actuator(
+            name,
+            ActuatorKind.REVOLUTE if entry.turns else ActuatorKind.PRISMATIC,
+            np.asarray(along / np.linalg.norm(along)),
+            np.array([in_metres(x, file.unit) for x in at]),
+            (travel[0], travel[1]),
+            f"{name}_link",
+        )
+    return found
 
 
 def _wrong_home(file: TableFile, source: str) -> list[str]:
@@ -602,6 +765,7 @@ def _description(file: TableFile, source: str) -> Description:
         return _of_each(value, n)
 
     names = file.legs or [f"leg{j + 1}" for j in range(n)]
+    actuators, motors = _actuators(file), _hangs_on(file)
     laws = [_of_each(value, n) for value in _laws(file)]
     notes = list[str]()
     legs = []
@@ -633,6 +797,7 @@ def _description(file: TableFile, source: str) -> Description:
                 np.array(metres(file.base_joints[j])), np.array(metres(file.platform_joints[j])),
                 metres(offset), None if limits is None else (limits[0], limits[1]), tube, rod,
                 _unit_axis(file.base_axes, j), _unit_axis(file.platform_axes, j),
+                None if (motor := motors[j]) is None else actuators[motor],
             )
         )  # fmt: skip
     frame = None if file.base_frame is None else tuple(file.base_frame)

@@ -12,6 +12,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import UsageError
 from legcal.files import plain_name
 from legcal.geometry import Array, cross
+from legcal.machine.actuated_family import (
+    ALIASES,
+    FAMILIES,
+    OPTIONAL,
+    ActuatedFamily,
+    describe_actuated_family,
+)
 from legcal.machine.assembly import across_leg
 from legcal.machine.description import NEEDED_TYPE, Description, Home, LegEntry, LegType, leg_type
 from legcal.machine.description_table import in_metres, read_description
@@ -27,10 +34,13 @@ SHORTEST, STROKE, RADIUS = 0.8, 0.4, 0.02  # parts of the length at home
 class Family:
     """The dimensions of a machine, lengths in ``unit`` and angles in degrees."""
 
-    family: str  # number and type of the legs, ``6-UPS``
+    family: str  # number and type of the legs, ``6-UPS``, or a name of FAMILIES, ``delta``
     unit: str | None = None  # unit of the lengths; required
     base_radius: float | None = None  # of the circle on which the base joints lie; required
     platform_radius: float | None = None  # of the circle on which the platform joints lie; required
+    arm_length: float | None = None  # of the arms, of families that have some
+    rod_length: float | None = None  # of rods on carriages or arms
+    rod_spacing: float | None = None  # of the two rods of a parallelogram
     height: float | None = None  # height of the platform over the base at home
     base_spread: float | None = None  # angle between the two joints of a pair on the base, 6 legs
     platform_spread: float | None = None  # the same on the platform
@@ -44,12 +54,21 @@ class Family:
 
 def describe_family(given: Family) -> Description:
     """Return the machine of a family: joints on circles, its legs at home with default lengths."""
+    name = ALIASES.get(given.family.lower(), given.family.lower())
+    if name in FAMILIES:
+        return _describe_named(name, FAMILIES[name], given)
     match = _FAMILY.fullmatch(given.family)
     of_legs = None if match is None else leg_type(match[2])
-    if match is None or of_legs is None or not 2 <= int(match[1]) <= MAX_LEGS:
+    if (
+        match is None
+        or of_legs is None
+        or of_legs.actuator is not None
+        or not 2 <= int(match[1]) <= MAX_LEGS
+    ):
         raise UsageError(
             f"The family could not be read: found '{given.family}', needed a number of legs "
-            f"from 2 to {MAX_LEGS} and their type, such as 6-UPS: {NEEDED_TYPE}; correct --family."
+            f"from 2 to {MAX_LEGS} and their type, such as 6-UPS: {NEEDED_TYPE.split('; for')[0]}; "
+            f"or, with rods that hang on motors, {', '.join(FAMILIES)}; correct --family."
         )
     count = int(match[1])
     problems = [*_wrong_dimensions(given, of_legs), *_unused_dimensions(given, count, of_legs)]
@@ -99,6 +118,82 @@ def describe_family(given: Family) -> Description:
     return Description(name, f"--family {given.family}", unit, tuple(legs), home, None)
 
 
+def _describe_named(name: str, family: ActuatedFamily, given: Family) -> Description:
+    """Return a machine whose rods hang on motors, its dimensions by default those of its family."""
+    where = f"The family {given.family} could not be built"
+    known = (*family.dimensions, *OPTIONAL.get(name, ()))
+    stated = {
+        key: value
+        for key in ("base_radius", "platform_radius", "height", "arm_length", "rod_length",
+                    "rod_spacing", "leg_radius", "base_spread", "platform_spread", "offset", "turn")
+        if (value := getattr(given, key)) is not None
+    } | ({"tilt": given.tilt} if given.tilt else {})  # fmt: skip
+    problems = [
+        f"{where}: found {_option(key)}, needed some of {', '.join(map(_option, known))} and "
+        "--travel; leave it out."
+        for key in stated
+        if key not in known
+    ]
+    lengths = [key for key in stated if not key.endswith("spread")]
+    in_lengths = not family.turns and given.travel is not None
+    if given.unit is None and (lengths or in_lengths):
+        problems.append(
+            f"{where}: found {_option([*lengths, 'travel'][0])} and no unit of lengths, needed m "
+            "or mm; give --unit mm."
+        )
+    for key, value in stated.items():
+        low = -1e9 if key == "height" else 0.0
+        high = 120.0 if key.endswith("spread") else 1e9
+        if not low < value < high:
+            needed = "an angle between 0 and 120 deg" if high == 120.0 else "a positive length"
+            problems.append(f"{where}: found {_option(key)} {value:g}, needed {needed}; mend it.")
+    if given.travel is not None and not -1e9 < given.travel[0] < given.travel[1] < 1e9:
+        problems.append(_wrong_travel(where, given.travel))
+    if given.name is not None:
+        problems += _wrong_name(where, given.name)
+    if problems:
+        raise UsageError(problems)
+    unit = given.unit or "mm"
+
+    def metres(value: float) -> float:
+        return in_metres(value, unit)
+
+    travel = given.travel
+    if travel is not None and not family.turns:
+        travel = metres(travel[0]), metres(travel[1])
+    size = {k: v if k.endswith("spread") else metres(v) for k, v in stated.items()}
+    source = f"--family {given.family}"
+    try:
+        return describe_actuated_family(given.name or name, source, family, size, travel, unit)
+    except ValueError as error:
+        raise UsageError(
+            f"{where}: found {error}, needed longer rods; enlarge --rod-length, or correct the "
+            "other dimensions."
+        ) from error
+
+
+def _option(dimension: str) -> str:
+    """Return the option of a dimension."""
+    return f"--{dimension.replace('_', '-')}"
+
+
+def _wrong_travel(where: str, travel: tuple[float, float]) -> str:
+    """Return that the ends of a travel are in the wrong order."""
+    return (
+        f"{where}: found --travel {travel[0]:g} {travel[1]:g}, needed the lower reading first; "
+        "swap them."
+    )
+
+
+def _wrong_name(where: str, name: str) -> list[str]:
+    """Return what is wrong with the name of a model."""
+    try:
+        plain_name(name)
+    except ValueError as error:
+        return [f"{where}: the name could not be used: {error}"]
+    return []
+
+
 def _wrong_dimensions(given: Family, of_legs: LegType) -> list[str]:
     """Return what is missing or impossible among the dimensions."""
     in_plane = of_legs.is_planar
@@ -140,17 +235,11 @@ def _wrong_dimensions(given: Family, of_legs: LegType) -> list[str]:
             f"{where}: found --turn {given.turn:g} deg, needed at most 180 deg either way; mend it."
         )
     if given.travel is not None and not -1e9 < given.travel[0] < given.travel[1] < 1e9:
-        problems.append(
-            f"{where}: found --travel {given.travel[0]:g} {given.travel[1]:g}, needed the lower "
-            "reading first; swap them."
-        )
+        problems.append(_wrong_travel(where, given.travel))
     if given.offset is not None and not abs(given.offset) < 1e9:
         problems.append(f"{where}: found --offset {given.offset:g}, needed a length; mend it.")
     if given.name is not None:
-        try:
-            plain_name(given.name)
-        except ValueError as error:
-            problems.append(f"{where}: the name could not be used: {error}")
+        problems += _wrong_name(where, given.name)
     return problems
 
 
@@ -165,6 +254,9 @@ def _unused_dimensions(given: Family, count: int, of_legs: LegType) -> list[str]
         "--platform-spread": count != 6 and given.platform_spread is not None and f"{count} legs",
         "--offset": not of_legs.has_slider and given.offset is not None and "legs without P",
         "--travel": not of_legs.has_slider and given.travel is not None and "legs without P",
+        "--arm-length": given.arm_length is not None and "legs without arms",
+        "--rod-length": given.rod_length is not None and "legs on no motor",
+        "--rod-spacing": given.rod_spacing is not None and "legs on no motor",
     }
     return [
         f"The family {given.family} could not be built: found {option} for {what}, needed none; "

@@ -9,11 +9,13 @@ import numpy as np
 from legcal.errors import LegcalError, OutOfResources, UsageError
 from legcal.files import temporary_folder, write_schemas
 from legcal.geometry import Array, cross
+from legcal.machine.actuator import arm_rotation
 from legcal.machine.assembly import Assembled, AssembledLeg, assemble
 from legcal.machine.description import Description
 from legcal.machine.leg import JointType, LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
+from legcal.machine.motor_visuals import motor_visuals
 from legcal.machine.schema import mechanism_yaml
 from legcal.machine.spanning_tree import UrdfBuilder, axis_xml, limit_xml, origin_xml_at, visual_xml
 
@@ -32,6 +34,7 @@ def urdf_text(machine: Assembled) -> str:
         _joint(tree, "platform_free", "planar", ("base", "platform"), height, moving=_AXES["z"])
     else:
         _joint(tree, "platform_free", "floating", ("base", "platform"))
+    _add_actuators(tree, machine)
     for leg in machine.legs:
         _Branch(tree, machine, leg).write()
     return tree.robot(machine.name).decode()
@@ -44,7 +47,7 @@ def yaml_text(machine: Assembled) -> str:
             (f"{leg.name}_end", f"{leg.name}_seat", "3d" if leg.type.has_sphere else "6d")
             for leg in machine.legs
         ],
-        [f"{leg.name}_prismatic" for leg in machine.legs if leg.kind is LegKind.ACTUATED],
+        list(dict.fromkeys(_motor(leg) for leg in machine.legs if _motor(leg))),
         {
             "urdf": f"../urdf/{machine.name}.urdf",
             "base": "base",
@@ -57,8 +60,37 @@ def yaml_text(machine: Assembled) -> str:
     )
 
 
+def _motor(leg: AssembledLeg) -> str:
+    """Return the joint of the motor that moves a leg, empty without one."""
+    if leg.actuator is not None:
+        return leg.actuator.joint
+    return f"{leg.name}_prismatic" if leg.kind is LegKind.ACTUATED else ""
+
+
+def _add_actuators(tree: UrdfBuilder, machine: Assembled) -> None:
+    """Add the motors that carry joints: a carriage or an arm each, in the axes of the base."""
+    on_base = list[str]()
+    for actuator in dict.fromkeys(leg.actuator for leg in machine.legs):
+        if actuator is None:
+            continue
+        rods = [leg for leg in machine.legs if leg.actuator is actuator]
+        motor, carried = motor_visuals(actuator, rods)
+        on_base += motor
+        tree.link(actuator.link)
+        tree.show(actuator.link, "".join(carried))
+        kind = actuator.kind.value
+        moving = axis_xml(actuator.axis) + limit_xml(actuator.travel)
+        links = "base", actuator.link
+        _joint(tree, actuator.joint, kind, links, actuator.point, moving=moving)
+    if on_base:
+        tree.show("base", "".join(on_base))
+
+
 def _hangs_from_base(leg: AssembledLeg) -> bool:
-    """Say whether a leg hangs from the base, and not from the platform with its S at the base."""
+    """Say whether a leg hangs from the base, or what moves on it, and not from the platform.
+
+    From the platform hangs a leg whose S is at the base.
+    """
     return not leg.type.base.twists_freely or leg.type.platform.twists_freely
 
 
@@ -93,14 +125,22 @@ class _Branch:
         self._from_base = _hangs_from_base(leg)
         self._R_base_platform = machine.T_base_platform.rotation.as_matrix()
         self._T = machine.T_base_platform
-        self._link = "base" if self._from_base else "platform"
+        self._carrier, self._A = "base", leg.A_base  # that, and the joint at A in it
+        self._R_base_carrier = np.eye(3)  # at home
+        if leg.actuator is not None:
+            self._carrier, self._A = leg.actuator.link, leg.A_base - leg.actuator.point
+            self._R_base_carrier = arm_rotation(leg.actuator, leg.q_home).as_matrix()
+        self._link = self._carrier if self._from_base else "platform"
         self._along = np.zeros(3)  # where the next joint stands in the link before it
 
     def write(self) -> None:
         """Add the leg to the tree."""
         leg = self._leg
         if self._from_base:
-            R = self._near("a", leg.type.base, leg.u, leg.base_axis, leg.A_base)
+            R_carrier = self._R_base_carrier.T
+            axis = R_carrier @ leg.base_axis
+            R = self._near("a", leg.type.base, R_carrier @ leg.u, axis, self._A)
+            R = self._R_base_carrier @ R
         else:
             inverse = self._R_base_platform.T
             axis = inverse @ leg.platform_axis
@@ -151,7 +191,8 @@ class _Branch:
         tree.link(end)
         tree.link(seat)
         _joint(tree, f"{end}_frame", "fixed", (self._link, end), self._along)
-        carrier, at = ("platform", leg.B_platform) if self._from_base else ("base", leg.A_base)
+        at_base = self._carrier, self._A
+        carrier, at = ("platform", leg.B_platform) if self._from_base else at_base
         turned = None if leg.type.has_sphere else self._R_base_platform.T @ R
         _joint(tree, f"{seat}_frame", "fixed", (carrier, seat), at, turned)
 

@@ -152,6 +152,11 @@ def visual_xml(at: str, radius: float, length: float) -> str:
     return f"<visual>{at}<geometry>{shape}</geometry></visual>"
 
 
+def box_xml(at: str, sizes: Array) -> str:
+    """Return the ``<visual>`` of a box (3,) [m] at an ``<origin>``."""
+    return f'<visual>{at}<geometry><box size="{_numbers(sizes)}"/></geometry></visual>'
+
+
 def limit_xml(limits: tuple[float, float] | None) -> str:
     """Return the ``<limit>`` of a joint; a URDF must name an effort and a velocity too."""
     ends = ""
