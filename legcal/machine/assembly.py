@@ -17,7 +17,7 @@ from legcal.geometry import (
     motion_of,
     normal_basis,
 )
-from legcal.machine.actuator import Actuator, actuator_index, actuators_of, reading_of_rod
+from legcal.machine.actuator import Actuator
 from legcal.machine.description import (
     Description,
     Home,
@@ -30,6 +30,7 @@ from legcal.machine.description import (
 )
 from legcal.machine.equations import pose_equations
 from legcal.machine.leg import EquationKind, Leg, LegColumns, LegKind
+from legcal.machine.rods import actuator_index, actuators_of, reading_of_rod
 from legcal.machine.solver import poses_after, solve
 
 TRIALS = 40

@@ -9,7 +9,6 @@ import numpy as np
 from legcal.errors import LegcalError, OutOfResources, UsageError
 from legcal.files import temporary_folder, write_schemas
 from legcal.geometry import Array, cross
-from legcal.machine.actuator import arm_rotation
 from legcal.machine.assembly import Assembled, AssembledLeg, assemble
 from legcal.machine.description import Description
 from legcal.machine.leg import JointType, LegKind
@@ -129,7 +128,7 @@ class _Branch:
         self._R_base_carrier = np.eye(3)  # at home
         if leg.actuator is not None:
             self._carrier, self._A = leg.actuator.link, leg.A_base - leg.actuator.point
-            self._R_base_carrier = arm_rotation(leg.actuator, leg.q_home).as_matrix()
+            self._R_base_carrier = leg.actuator.rotations(np.array([leg.q_home]))[0]
         self._link = self._carrier if self._from_base else "platform"
         self._along = np.zeros(3)  # where the next joint stands in the link before it
 

@@ -16,29 +16,31 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, OutOfResources, UsageError
+from legcal.errors import DidNotConverge, OutOfClass, OutOfResources, UsageError
 from legcal.files import motion_to_xyz_quat, write_atomically
 from legcal.geometry import roll_pitch_yaw
 from legcal.machine.files import FOLDER_YAML, read_file
 from legcal.machine.formats import XML_SUFFIXES
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
-from legcal.machine.leg import Leg, LegKind
+from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.origins import moved_origins
+from legcal.machine.rods import actuators_of
 from legcal.machine.schema import mechanism_yaml
 from legcal.machine.urdf import UrdfPatch
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # needs no quotes in YAML
 CLOSES = 1e-9  # [m] and [rad], home against the pose at its own readings
 ROUNDING = 4e-16  # [m]: what moves less does not move
+MAX_GAIN_ERROR = 1e-12  # of motors that carry rods
 
 
 def mechanism_text(machine: Machine, urdf: str) -> str:
     """Return the YAML of a mechanism, complete."""
     return mechanism_yaml(
         [(c.frame_1, c.frame_2, c.kind) for c in machine.chain.closures],
-        [str(leg.prismatic) for leg in machine.legs if leg.kind is LegKind.ACTUATED],
+        [str(machine.legs[j].prismatic) for j in machine.motors],
         {
             "urdf": urdf,
             "base": machine.base,
@@ -85,11 +87,12 @@ def write_model(machine: Machine, folder: Path) -> tuple[Path, Path]:
 
 
 def _joint_of(machine: Machine, leg: Leg) -> str:
-    """Return a joint that stands for a leg: its slider, or any other on it."""
-    if leg.prismatic is not None:
+    """Return a joint that stands for a leg: its slider, or any other that is its own."""
+    if leg.prismatic is not None and leg.actuator is None:
         return leg.prismatic
     chain = leg.urdf_chain
-    moving = [step.connection.joint for step in chain.steps if step.connection.joint]
+    own = chain.steps[chain.actuator is not None :]
+    moving = [step.connection.joint for step in own if step.connection.joint]
     fixed = [joint.name for joint in machine.urdf.joints.values() if joint.child in chain.bodies]
     return str([*moving, *fixed][0])
 
@@ -100,7 +103,13 @@ def write_urdf(machine: Machine, legs: Sequence[Leg], destination: Path) -> None
     Loading it again gives these numbers to 1e-12 m and rad, with R_b and R_e where they were.
     Radii are not written: they absorb the bias of edges. Nor is home looked at: with other rods
     or axes the mechanism may close elsewhere.
+
+    Raises
+    ------
+    OutOfClass
+        If a motor that carries rods has a gain other than 1, which a URDF has no place for.
     """
+    _check_gains(machine, legs)
     patch = UrdfPatch(machine.urdf.content)
     for name, (after, is_turned) in moved_origins(machine, legs).items():
         before = machine.urdf.joints[name].T_parent_origin
@@ -110,6 +119,18 @@ def write_urdf(machine: Machine, legs: Sequence[Leg], destination: Path) -> None
         if rpy is not None or not stays:
             patch.set_origin(name, None if stays else xyz, rpy)
     destination.write_bytes(patch.content())
+
+
+def _check_gains(machine: Machine, legs: Sequence[Leg]) -> None:
+    """Check that motors move what they carry by their readings, as joints of a URDF do."""
+    wrong = [a for a in actuators_of(legs) if abs(a.gain - 1.0) > MAX_GAIN_ERROR]
+    if wrong:
+        named = ", ".join(f"'{a.joint}' {a.gain:.9g}" for a in wrong)
+        raise OutOfClass(
+            f"{machine.yaml_path}: the URDF could not be written: found gains other than 1 "
+            f"({named}), needed joints that move by their values, as those of a URDF do; multiply "
+            "the readings by them and calibrate with gains fixed at 1."
+        )
 
 
 def write_calibrated_yaml(

@@ -1,10 +1,11 @@
 """Which origins of a URDF carry the numbers of legs, and where they go with other numbers.
 
 A number of a leg is carried by the origin of a joint: that of its first joint by A, of its last by
-B, of its slider or of a joint of its rod by the length. Where an origin moves that leg alone it is
-a :class:`Handle`. Trees in which no origin does, because the last joint of a leg carries the
-platform or a frame of a closure lies on a link with other things, get a link of its own there
-(:func:`with_own_origins`).
+B, of its slider or of a joint of its rod by the length. Of a rod on a carriage or an arm the origin
+of the motor's joint carries the axis, and that of the joint at A in the arm A at reading 0. Where
+an origin moves that leg alone it is a :class:`Handle`. Trees in which no origin does, because the
+last joint of a leg carries the platform or a frame of a closure lies on a link with other things,
+get a link of its own there (:func:`with_own_origins`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import OutOfClass
 from legcal.geometry import Array, matrix_inverse, matrix_product, rotation_between
+from legcal.machine.actuator import Actuator
 from legcal.machine.bodies import Bodies, frame_link, rigid_bodies
 from legcal.machine.chain import Closure
 from legcal.machine.leg import Leg, LegChain, Step
@@ -32,6 +34,7 @@ def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[Rigi
     """Return the new origin of every joint that carries a number of a leg, and if it is turned."""
     handles = Handles(machine.urdf, machine.chain.closures, machine.platform_joint)
     found: dict[str, tuple[RigidTransform, bool]] = {}
+    moved = set[str]()  # motors that carry rods
 
     def move(handle: Handle, motion: Motion, body: str) -> None:
         """Move a joint by a motion that is given in a link of its body."""
@@ -52,8 +55,16 @@ def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[Rigi
             move(*_at_slider(handles, leg, chain, grown))
         elif any(grown):
             move(*_in_rod(handles, leg, chain, grown))
-        first, last = chain.steps[0], chain.steps[-1]
+        first, last = chain.steps[chain.actuator is not None], chain.steps[-1]
         base, platform = machine.base, machine.platform
+        if chain.actuator is not None:
+            carried = _carried(leg.actuator, wanted.actuator)
+            if carried.joint not in moved:
+                step, motion = chain.actuator, carried.motion
+                move(handles.of(step, step.near, base, leg.name), motion, base)
+                moved.add(carried.joint)
+            base = handles.link(chain.actuator, chain.actuator.far)
+            at_base = carried.onward(leg, wanted, handles.at_zero(chain, machine.base, base))
         move(handles.of(first, first.near, base, leg.name), at_base, base)
         move(handles.of(last, last.far, platform, leg.name), at_platform, platform)
     return found
@@ -102,6 +113,9 @@ def _find_all(handles: Handles, leg: Leg, machine: Machine) -> None:
     chain = leg.urdf_chain
     first, last = chain.steps[0], chain.steps[-1]
     handles.of(first, first.near, machine.base, leg.name)
+    if chain.actuator is not None:
+        arm = handles.link(chain.actuator, chain.actuator.far)
+        handles.of(chain.steps[1], chain.steps[1].near, arm, leg.name)
     handles.of(last, last.far, machine.platform, leg.name)
     if chain.slider is None:
         _in_rod(handles, leg, chain, (0.0, 0.0))
@@ -172,6 +186,13 @@ class Handles:
             return frame_link(self._urdf, (closure.frame_1, closure.frame_2)[side])
         joint = self._urdf.joints[str(connection.joint)]
         return (joint.parent, joint.child)[side]
+
+    def at_zero(self, chain: LegChain, base: str, link: str) -> RigidTransform:
+        """Return the pose in the base link of the link behind a motor, with its reading zero."""
+        T_base_body = matrix_inverse(self.bodies.T_body_link[base])
+        T_body_arm = matrix_product(matrix_inverse(chain.poses[0]), chain.poses[1])
+        T_arm_link = self.bodies.T_body_link[link]
+        return RigidTransform.from_matrix(T_base_body @ T_body_arm @ T_arm_link)
 
     def _onward(self, joint: UrdfJoint, body: str) -> UrdfJoint:
         """Return the fixed joint that leads from the child of a joint to the rest of its body."""
@@ -249,6 +270,33 @@ class Motion:
             return RigidTransform.from_components(T.translation + self.shift, T.rotation)
         arm = self.turn.apply(T.translation - self.about)
         return RigidTransform.from_components(self.about + arm + self.shift, self.turn * T.rotation)
+
+
+class _Carried(NamedTuple):
+    """How the motor of a rod moves in the base link, with what it carries at reading zero."""
+
+    joint: str
+    motion: Motion
+
+    def onward(self, leg: Leg, wanted: Leg, T_base_arm: RigidTransform) -> Motion:
+        """Return how the joint at A moves in the arm, which has moved with its motor."""
+        before = self.motion.of(RigidTransform.from_translation(leg.A))
+        axis = leg.base_axis
+        if axis is not None and self.motion.turn is not None:
+            axis = np.asarray(self.motion.turn.apply(axis))
+        A = np.asarray(before.translation)
+        onward = Motion(wanted.A - A, A, _turn(axis, wanted.base_axis))
+        return onward.seen_from(self.motion.of(T_base_arm).inv())
+
+
+def _carried(actuator: Actuator | None, wanted: Actuator | None) -> _Carried:
+    """Return how a motor moves: its axis onto another, its point with it where it turns."""
+    if actuator is None or wanted is None:
+        raise ValueError("a rod that hangs on a motor has its numbers")
+    turn = _turn(actuator.axis, wanted.axis, directed=True)
+    shift = wanted.point - actuator.point if actuator.turns else np.zeros(3)
+    along = shift @ wanted.axis  # where on its axis it stands is no number
+    return _Carried(actuator.joint, Motion(shift - along * wanted.axis, actuator.point, turn))
 
 
 def _ends(leg: Leg, wanted: Leg) -> tuple[Motion, Motion]:
