@@ -10,7 +10,7 @@ import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from machines import ROOT, SHIPPED, TRIPOD, made, read_family, read_table, write_table
+from machines import ROOT, SHIPPED, TRIPOD, check_same, made, read_family, read_table, write_table
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, UsageError
@@ -22,7 +22,6 @@ from legcal.machine import (
     forward_kinematics,
     inverse_kinematics,
     load_mechanism,
-    main_cylinders,
     shipped_names,
     singularity,
 )
@@ -53,43 +52,6 @@ EXPECTED = {
 
 def texts(machine: Machine) -> tuple[str, str]:
     return machine.yaml_path.read_text(), machine.urdf_path.read_text()
-
-
-def check_same(machine: Machine, description: Any) -> None:
-    """Compare a loaded model with its description."""
-    assert machine.name == description.name
-    assert machine.leg_names == tuple(leg.name for leg in description.legs)
-    for leg, entry in zip(machine.legs, description.legs, strict=True):
-        assert leg.type == str(entry.type)
-        assert leg.kind is entry.kind
-        assert leg.sign == 1
-        np.testing.assert_allclose(leg.A, entry.A_base, rtol=0, atol=1e-12)
-        if entry.type.platform:
-            np.testing.assert_allclose(leg.B, entry.B_platform, rtol=0, atol=1e-12)
-            if entry.offset is not None:
-                assert abs(leg.q0 - entry.offset) < 1e-12
-        if (motor := entry.actuator) is not None:
-            found = leg.actuator
-            assert found is not None
-            assert (found.joint, found.kind, found.link) == (motor.joint, motor.kind, motor.link)
-            np.testing.assert_allclose(found.axis, motor.axis, rtol=0, atol=1e-15)
-            np.testing.assert_allclose(found.travel, motor.travel, rtol=0, atol=1e-15)
-            off = np.cross(found.point - motor.point, motor.axis) if motor.turns else 0.0
-            assert np.linalg.norm(off) < 1e-12
-        if entry.travel is not None:
-            np.testing.assert_allclose(leg.travel, entry.travel, rtol=0, atol=1e-15)
-        for axis, wanted in (
-            (leg.base_axis, entry.base_axis),
-            (leg.platform_axis, entry.platform_axis),
-        ):
-            if axis is not None and wanted is not None:
-                assert np.linalg.norm(np.cross(axis, wanted)) < 1e-12
-        parts = {c.side: c.radius for c in main_cylinders(leg.cylinders).values()}
-        radii = {"base": entry.tube, "platform": entry.rod}
-        if entry.kind is LegKind.CONSTANT:
-            assert set(parts.values()) <= set(radii.values())
-        elif entry.type.platform:
-            assert parts == {side: radius for side, radius in radii.items() if radius is not None}
 
 
 # --- shipped models -----------------------------------------------------------------------------

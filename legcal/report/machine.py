@@ -57,6 +57,7 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
             f"{1e3 * _at(leg, leg['q_home']):.2f}",
         )
         for leg in legs
+        if "actuator" not in leg
     ]
     of_laws = ("leg", ">travel [mm]", ">length [mm]", ">reading at home", ">length at home")
     axes = [
@@ -75,7 +76,8 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
     return report(
         title,
         table(*columns, rows=rows, least={1: kinds}),
-        table(*of_laws, rows=laws),
+        table(*of_laws, rows=laws) if laws else None,
+        _motors(description) if "actuators" in description else None,
         table(*of_axes, rows=axes) if axes else None,
         [
             _home(description["home"]),
@@ -83,6 +85,29 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
             *(f"note: {note}" for note in description["diagnostics"]),
         ],
     )
+
+
+def _motors(description: dict[str, Any]) -> RenderableType:
+    """Return the motors that rods hang on: what moves them, and how far."""
+    rows = []
+    for joint, motor in description["actuators"].items():
+        rods = [leg for leg in description["legs"] if leg.get("actuator") == joint]
+        turns = motor["kind"] == "revolute"
+        scale, unit = (degrees(1.0), "deg") if turns else (1e3, "mm")
+        low, high = rods[0]["travel"]
+        rows.append(
+            (
+                joint,
+                ", ".join(leg["name"] for leg in rods),
+                "turns" if turns else "slides",
+                _direction(motor["axis"] if turns else motor["direction"]),
+                _points([motor["point"]])[0] if turns else "",
+                f"{scale * low:z.2f} to {scale * high:z.2f} {unit}",
+                f"{scale * rods[0]['q_home']:z.2f} {unit}",
+            )
+        )
+    columns = ("motor", "legs", "", ">axis", ">point [mm]", ">travel", ">reading at home")
+    return table(*columns, rows=rows)
 
 
 def _direction(axis: Sequence[float] | None) -> str:

@@ -1,0 +1,279 @@
+"""Machines whose rods hang on carriages and arms: written, loaded, refused, and by closed forms."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from machines import ROOT, check_same, read_family, read_table
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import LegcalError, ModelError, UsageError
+from legcal.geometry import Array
+from legcal.machine import (
+    Machine,
+    create_model,
+    description_of,
+    forward_kinematics,
+    inverse_kinematics,
+    load_mechanism,
+    parametrization_of,
+    random_configurations,
+    write_model,
+)
+
+TABLES = ROOT / "models" / "tables"
+COUNTS = {  # parameters with radii known, of the motors alone, and those that define the frames
+    "hexaglide": (42, 12),
+    "3-prs": (21, 6),
+    "linear-delta": (36, 6),
+    "orthoglide": (36, 6),
+    "delta": (42, 12),
+    "servo-hexapod": (54, 24),
+}
+
+
+def family(folder: Path, name: str, **dimensions: Any) -> Machine:
+    """Return the machine of a family."""
+    return create_model(read_family(name, **dimensions), folder).machine
+
+
+# --- what is shipped ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_the_family_is_what_is_shipped_and_has_the_unknowns_of_its_class(
+    name: str, tmp_path: Path
+) -> None:
+    machine, shipped = family(tmp_path, name), load_mechanism(name)
+    for key in ("A_base", "B_platform", "q0"):
+        np.testing.assert_allclose(getattr(machine, key), getattr(shipped, key), atol=1e-12)
+    np.testing.assert_allclose(machine.home.as_matrix(), shipped.home.as_matrix(), atol=1e-10)
+    names = parametrization_of(machine).names
+    of_motors = [n for n in names if n.split(".")[0] in {a.joint for a in machine.actuators}]
+    assert (len(names), len(of_motors)) == COUNTS[name]
+    assert {leg.actuator.joint for leg in machine.legs if leg.actuator} == set(machine.motor_names)
+    assert all(len(leg.cylinders) == 1 for leg in machine.legs)  # arms and rails are no cylinders
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_readings_of_a_pose_lead_back_to_it(name: str) -> None:
+    machine = load_mechanism(name)
+    found = random_configurations(machine, 5, np.random.default_rng(4))
+    for T in found.poses:
+        q = inverse_kinematics(machine, T)
+        for leg, reading in zip(machine.legs, q, strict=True):
+            assert leg.in_travel(np.array([reading]))[0]
+        back = forward_kinematics(machine, q)
+        np.testing.assert_allclose(back.as_matrix(), T.as_matrix(), atol=1e-9)
+
+
+# --- closed forms -------------------------------------------------------------------------------
+
+
+def trilaterated(centres: Array, length: float, side: float) -> Array:
+    """Return the point at one distance from three, on that side of their plane along z."""
+    x = (centres[1] - centres[0]) / np.linalg.norm(centres[1] - centres[0])
+    to_third = centres[2] - centres[0]
+    y = to_third - (to_third @ x) * x
+    y /= np.linalg.norm(y)
+    d = float(np.linalg.norm(centres[1] - centres[0]))
+    u = 0.5 * d
+    v = (to_third @ to_third - 2.0 * u * (to_third @ x)) / (2.0 * (to_third @ y))
+    z = np.cross(x, y)
+    w = np.sqrt(length**2 - u**2 - v**2) * side * np.sign(z[2])
+    return np.asarray(centres[0] + u * x + v * y + w * z)
+
+
+def outwards(k: int) -> Array:
+    """Return the direction in which motor k stands."""
+    return np.array([np.cos(2.0 * np.pi * k / 3.0), np.sin(2.0 * np.pi * k / 3.0), 0.0])
+
+
+def test_a_delta_moves_by_its_closed_forms(tmp_path: Path) -> None:
+    """Compare with three spheres, and with the equation of one arm in its plane.
+
+    Both are those of R. Clavel, Conception d'un robot parallele rapide a 4 degres de liberte
+    (1991), and R. L. Williams II, The Delta Parallel Robot (2016).
+    """
+    R, r, arm, rod = 0.14, 0.045, 0.2, 0.4
+    machine = family(tmp_path, "delta", base_radius=140.0, platform_radius=45.0)
+    z = np.array([0.0, 0.0, 1.0])
+    for q in np.radians([[20.0, 20.0, 20.0], [5.0, 40.0, 25.0], [-20.0, 30.0, 60.0]]):
+        elbows = [
+            (R - r + arm * np.cos(a)) * outwards(k) - arm * np.sin(a) * z for k, a in enumerate(q)
+        ]
+        wanted = trilaterated(np.array(elbows), rod, -1.0)
+        T = forward_kinematics(machine, np.repeat(q, 2))
+        np.testing.assert_allclose(T.translation, wanted, atol=1e-9)
+        assert T.rotation.magnitude() < 1e-9
+        for k in range(3):
+            x, height = R - r - wanted @ outwards(k), wanted[2]
+            beside = wanted @ np.cross(z, outwards(k))
+            K = (rod**2 - arm**2 - x**2 - beside**2 - height**2) / (2.0 * arm)
+            both = np.arctan2(height, x) + np.array([1.0, -1.0]) * np.arccos(
+                K / np.hypot(x, height)
+            )
+            turned = (both - q[k] + np.pi) % (2.0 * np.pi) - np.pi
+            assert np.abs(turned).min() < 1e-9
+        found = inverse_kinematics(machine, RigidTransform.from_translation(wanted))
+        np.testing.assert_allclose(found, np.repeat(q, 2), atol=1e-9)
+
+
+def test_linear_deltas_and_orthoglides_move_by_three_spheres(tmp_path: Path) -> None:
+    machine = family(tmp_path, "linear-delta", base_radius=260.0)
+    q, z = np.array([0.02, 0.11, 0.16]), np.array([0.0, 0.0, 1.0])
+    down = np.sqrt(0.4**2 - 0.2**2)
+    carriages = [0.2 * outwards(k) + (0.15 + down + a - 0.1) * z for k, a in enumerate(q)]
+    T = forward_kinematics(machine, np.repeat(q, 2))
+    np.testing.assert_allclose(
+        T.translation, trilaterated(np.array(carriages), 0.4, -1.0), atol=1e-9
+    )
+    machine = family(tmp_path, "orthoglide")
+    p = np.array([0.03, -0.04, 0.05])
+    across = np.sqrt(0.4**2 - (p @ p - p**2))
+    wanted = p - across + 0.4 + 0.1  # of the carriages, at mid-travel at home
+    found = inverse_kinematics(machine, RigidTransform.from_translation(p))
+    np.testing.assert_allclose(found, np.repeat(wanted, 2), atol=1e-9)
+    T = forward_kinematics(machine, np.repeat(wanted, 2))
+    np.testing.assert_allclose(T.translation, p, atol=1e-9)
+    assert T.rotation.magnitude() < 1e-9
+
+
+# --- tables -------------------------------------------------------------------------------------
+
+
+def test_a_csv_gives_the_same_model_as_its_yaml(tmp_path: Path) -> None:
+    table = yaml.safe_load((TABLES / "delta.yaml").read_text())
+    header = (
+        "type,base_x,base_y,base_z,platform_x,platform_y,platform_z,length,radius,hangs_on,"
+        "point_x,point_y,point_z,axis_x,axis_y,axis_z,travel_deg_low,travel_deg_high,unit"
+    )
+    rows, told = [header], set[str]()
+    for a, b, motor in zip(
+        table["base_joints"], table["platform_joints"], table["hangs_on"], strict=True
+    ):
+        entry = table["actuators"][motor]
+        motion = [*entry["point"], *entry["axis"], *entry["travel_deg"]]
+        cells = [""] * 8 if motor in told else motion  # once is enough
+        told.add(motor)
+        rows.append(",".join(map(str, ["RSS", *a, *b, 400, 5, motor, *cells, "mm"])))
+    path = tmp_path / "delta.csv"
+    path.write_text("\n".join(rows))
+    height = {"height": table["home"]["xyz"][2]}
+    described = description_of(path, family=None, unit=None, name=None, dimensions=height)
+    machine, shipped = create_model(described, tmp_path).machine, load_mechanism("delta")
+    check_same(machine, read_table(TABLES / "delta.yaml"))
+    np.testing.assert_allclose(machine.home.as_matrix(), shipped.home.as_matrix(), atol=1e-10)
+    other = rows[2].replace("," * 8, ",,,,1,0,0,,")
+    path.write_text("\n".join([*rows[:2], other]))
+    with pytest.raises(ModelError, match=r"line 3.*another axis.*'arm1'"):
+        read_table(path)
+
+
+def test_rods_of_other_joints_are_loaded_as_they_were_stated(tmp_path: Path) -> None:
+    """Build each kind of rod once, on an arm and on a carriage, and write it as a model again."""
+    table = yaml.safe_load((TABLES / "servo-hexapod.yaml").read_text())
+    del table["type"]
+    table["types"] = ["RSU", "RUS", "RSS", "PUS", "PSU", "PSS"]
+    for name in ("servo4", "servo5", "servo6"):
+        table["actuators"][name] = {"direction": [0, 0.1, 1], "travel": [-20, 30]}
+    path = tmp_path / "mixed.yaml"
+    path.write_text(yaml.safe_dump(table | {"name": "mixed", "home": None}, sort_keys=False))
+    machine = create_model(read_table(path), tmp_path).machine
+    assert [leg.type for leg in machine.legs] == table["types"]
+    assert machine.mobility == len(machine.motors) == 6
+    again = load_mechanism(write_model(machine, tmp_path / "again")[0])
+    assert [leg.actuator.joint for leg in again.legs if leg.actuator] == list(machine.motor_names)
+    np.testing.assert_array_equal(again.A_base, machine.A_base)
+
+
+ARMS: dict[str, Any] = yaml.safe_load((TABLES / "delta.yaml").read_text())
+ARM1 = ARMS["actuators"]["arm1"]
+
+
+def _arm1(**changes: Any) -> dict[str, Any]:
+    """Return the table's motors with another first one."""
+    entry = {key: value for key, value in (ARM1 | changes).items() if value is not None}
+    return {"actuators": ARMS["actuators"] | {"arm1": entry}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        (_arm1(axis=None), ("actuators.arm1", "found point", "direction of a carriage")),
+        (_arm1(travel_deg=None, travel=[0, 1]), ("actuators.arm1", "found travel", "travel_deg")),
+        (_arm1(travel_deg=[70, -30]), ("arm1", "lower reading first")),
+        (_arm1(axis=[0, 0, 0]), ("arm1", "direction of three numbers")),
+        ({"type": "6-PSS"}, ("'leg1'", "which turns", "begins with R")),
+        ({"type": "6-SS"}, ("'leg1'", "the type SS", "PSS, RSS, PRS")),
+        ({"hangs_on": ["arm1"] * 4 + ["arm3", "arm9"]}, ("'leg6'", "'arm9'", "mean 'arm3'")),
+        ({"hangs_on": ["arm1"] * 4 + ["arm3"] * 2}, ("actuators.arm2", "no leg")),
+        ({"actuators": None, "hangs_on": None}, ("'leg1'", "no motor", "RSS")),
+        ({"lengths": None}, ("'leg1'", "no length")),
+        ({"travel": [0, 1]}, ("travel", "'leg1'", "with P only")),
+        ({"lengths": 200}, ("'arm1'", "82.6898 and 118.505 deg", "-30 to 70 deg")),
+        ({"lengths": [400, 420, *[400] * 4]}, ("home", "'leg2'", "400 mm long instead of 420 mm")),
+        (_arm1(travel_deg=[40, 70]), ("'arm1'", "20 and", "40 to 70 deg")),
+        (_arm1(travel_deg=[-180, 179]), ("'arm1'", "two readings", "not two")),
+    ],
+)
+def test_what_a_table_of_motors_cannot_say(
+    tmp_path: Path, changes: dict[str, Any], named: tuple[str, ...]
+) -> None:
+    path = tmp_path / "table.yaml"
+    table = {key: value for key, value in (ARMS | changes).items() if value is not None}
+    path.write_text(yaml.safe_dump(table))
+    with pytest.raises(ModelError) as caught:
+        create_model(read_table(path), tmp_path)
+    assert all(word in str(caught.value) for word in named), str(caught.value)
+    assert [p.name for p in tmp_path.iterdir()] == ["table.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("name", "dimensions", "named"),
+    [
+        ("delta", {"tilt": 5.0}, ("--tilt", "--arm-length")),
+        ("hexaglide", {"arm_length": 20.0}, ("--arm-length", "--rod-length")),
+        ("delta", {"rod_length": 100.0}, ("rods of 100 mm", "--rod-length")),
+        ("delta", {"rod_length": 100.0, "unit": None}, ("no unit", "--unit mm")),
+        ("3-prs", {"rod_length": -1.0}, ("--rod-length -1", "positive")),
+        ("orthoglide", {"travel": (5.0, 1.0)}, ("--travel 5 1",)),
+        ("6-UPS", {"rod_length": 100.0}, ("--rod-length",)),
+        ("5-PSS", {}, ("'5-PSS'", "hexaglide")),
+    ],
+)
+def test_what_a_family_of_motors_cannot_be(
+    name: str, dimensions: dict[str, Any], named: tuple[str, ...]
+) -> None:
+    with pytest.raises(UsageError) as caught:
+        read_family(name, **dimensions)
+    assert all(word in str(caught.value) for word in named), str(caught.value)
+
+
+# --- files that are outside the method -----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        (
+            'lower="-0.5235987755982988" upper="1.2217304763960306"',
+            'lower="-30" upper="70"',
+            ("rad",),
+        ),
+    ],
+)
+def test_what_a_file_of_motors_cannot_be(
+    tmp_path: Path, old: str, new: str, named: tuple[str, ...]
+) -> None:
+    model, urdf = (ROOT / f"{folder}/delta.{folder.replace('models', 'yaml')}" for folder in
+                   ("models", "urdf"))  # fmt: skip
+    text = urdf.read_text()
+    assert old in text
+    (tmp_path / "delta.urdf").write_text(text.replace(old, new))
+    (tmp_path / "delta.yaml").write_text(model.read_text().replace("../urdf/", ""))
+    with pytest.raises(LegcalError) as caught:
+        load_mechanism(tmp_path / "delta.yaml")
+    assert all(word in str(caught.value) for word in named), str(caught.value)
