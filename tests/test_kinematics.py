@@ -86,7 +86,7 @@ def test_random_configurations_are_closed_inside_the_travel_and_unflipped(name: 
         np.testing.assert_allclose(configuration[columns], q[sliding], atol=1e-12)
         np.testing.assert_allclose(inverse_kinematics(machine, T), q, atol=1e-11)
         vectors = vectors_A_to_B(machine, T)
-        lengths = (machine.sign * q + machine.q0)[sliding]
+        lengths = machine.lengths_at(q)[sliding]
         assert lengths.min() > 0.0
         np.testing.assert_allclose(lengths, np.linalg.norm(vectors, axis=1)[sliding], atol=1e-11)
         for leg, u in zip(machine.legs, vectors, strict=True):
@@ -124,6 +124,8 @@ def test_forward_kinematics_inverts_inverse_kinematics_from_any_start(name: str)
 
 def test_closed_forms_have_the_derivatives_of_the_closures(name: str) -> None:
     machine, drawn = machine_of(name), drawn_of(name)
+    if machine.actuators:
+        pytest.skip("rods on motors: their rates are compared in test_equations")
     columns = slider_columns(machine, machine.motors)[1]
     for configuration, T in zip(drawn.configurations[:3], drawn.poses[:3], strict=True):
         motions = free_motions(machine, configuration)

@@ -2,6 +2,7 @@
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,9 +10,19 @@ from scipy.spatial.transform import Rotation
 from yourdfpy import URDF
 
 from legcal.errors import ModelError
-from legcal.machine import Machine, load_mechanism
+from legcal.geometry import Array
+from legcal.machine import Machine, load_mechanism, vectors_A_to_B
 from legcal.simulation import draw_poses, dressed
-from legcal.simulation.solids import Box, Mesh, SolidCylinder, Sphere, link_poses, placed, solids_of
+from legcal.simulation.solids import (
+    Box,
+    Mesh,
+    Shape,
+    SolidCylinder,
+    Sphere,
+    link_poses,
+    placed,
+    solids_of,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted(p.stem for p in (ROOT / "models").glob("*.yaml"))
@@ -39,11 +50,17 @@ def hexapod_showing(folder: Path, visuals: str, materials: str = "") -> Machine:
     return load_mechanism(folder / "models" / "hexapod.yaml")
 
 
+def joints_at_home(machine: Machine) -> tuple[Array, Array]:
+    """Return the joint centres A and B in the base link at home, (n_legs, 3) each."""
+    B = machine.home.apply(machine.B_platform)
+    return B - vectors_A_to_B(machine, machine.home), B
+
+
 @pytest.mark.parametrize("name", SHIPPED)
 def test_leg_cylinders_stand_on_the_lines_of_their_legs(name: str) -> None:
     machine = load_mechanism(ROOT / "models" / f"{name}.yaml")
     solids = solids_of(machine)
-    A, B = machine.A_base, machine.home.apply(machine.B_platform)
+    A, B = joints_at_home(machine)
     counted = {(j, c.link) for j, leg in enumerate(machine.legs) for c in leg.cylinders}
     assert {(s.leg, s.link) for s in solids if s.leg is not None} == counted
     for p in placed(solids, link_poses(machine, machine.home_configuration)):
@@ -122,14 +139,20 @@ def test_visuals_stand_where_the_scene_of_yourdfpy_shows_them(name: str) -> None
                 root = parents[root]
             found = (poses[root].inv() * p.T_base_solid).as_matrix()
             T_root = np.linalg.inv(robot.get_transform(root))
-            (size,) = {
-                (float(solid.radius), float(solid.height))
+            there = [
+                shape_of(robot.scene.geometry[geometry].primitive)
                 for T, geometry in shown
-                for solid in [robot.scene.geometry[geometry].primitive]
                 if np.abs(T_root @ T - found).max() < 1e-12
-                and float(solid.radius) == vars(p.solid.shape)["radius"]
-            }
-            assert p.solid.shape == SolidCylinder(*size)
+            ]
+            assert p.solid.shape in there
+
+
+def shape_of(primitive: Any) -> Shape:
+    """Return a cylinder or a box of trimesh."""
+    if hasattr(primitive, "radius"):
+        return SolidCylinder(float(primitive.radius), float(primitive.height))
+    x, y, z = (float(size) for size in primitive.extents)
+    return Box((x, y, z))
 
 
 def test_a_mesh_is_scaled_and_placed_as_yourdfpy_shows_it(tmp_path: Path) -> None:
@@ -156,11 +179,12 @@ def test_dressing_carries_every_joint_and_leaves_the_legs_free(name: str) -> Non
     machine = load_mechanism(ROOT / "models" / f"{name}.yaml")
     solids = placed(dressed(machine), link_poses(machine, machine.home_configuration))
     balls = [p.T_base_solid.translation for p in solids if isinstance(p.solid.shape, Sphere)]
-    A, B = machine.A_base, machine.home.apply(machine.B_platform)
-    ends = [A, B[[leg.platform_joint != "" for leg in machine.legs]]]
+    A, B = joints_at_home(machine)
+    on_base = machine.base not in {s.link for s in solids_of(machine)}  # without rails or motors
+    ends = [A[: len(A) * on_base], B[[leg.platform_joint != "" for leg in machine.legs]]]
     assert np.allclose(balls, np.concatenate(ends), atol=1e-6)
     plates = [p for p in solids if p.solid.name.endswith("_plate")]
-    assert len(plates) == 2
+    assert len(plates) == 1 + on_base
     middles = 0.5 * (A + B)
     for plate in plates:
         assert isinstance(plate.solid.shape, SolidCylinder)

@@ -54,10 +54,14 @@ ORIGINS = re.compile(rb'(<origin xyz=")[^"]*(" rpy=")[^"]*(")')
 RADIUS = re.compile(rb'radius="[^"]*"')
 
 
+MOVING = ["hexaglide", "3-prs", "delta", "servo-hexapod"]  # joints at A that move
+
+
 def other_legs(nominal: Machine, size: float) -> tuple[Leg, ...]:
     """Return legs whose every parameter is wrong by so much [m, and ten times that in rad]."""
     parametrization = parametrization_of(nominal, twists=True)
-    unit = np.where([unit == "m" for unit in parametrization.units], size, 10.0 * size)
+    sizes = {"m": size, "rad": 10.0 * size, "": 0.0}  # gains stay: a URDF has no place for them
+    unit = np.array([sizes[unit] for unit in parametrization.units])
     signs = np.random.default_rng(2).choice([-1.0, 1.0], len(unit))
     legs = moved_legs(geometries(nominal), parametrization.place, unit * signs)
     return reframed(legs, nominal.frame_legs, np.asarray(nominal.T_platform_Re.inv().translation))
@@ -90,7 +94,8 @@ def apart(one: Leg, two: Leg) -> float:
 
 
 @pytest.mark.parametrize(
-    "name", ["hexapod", "3-rpr", "3-rps", "3-upu-tilted", "hexapod-rod", "tricept"]
+    "name",
+    ["hexapod", "3-rpr", "3-rps", "3-upu-tilted", "hexapod-rod", "tricept", *MOVING],
 )
 def test_a_calibrated_model_has_the_numbers_that_were_wanted(name: str, tmp_path: Path) -> None:
     nominal = load_mechanism(name)
@@ -105,10 +110,21 @@ def test_a_calibrated_model_has_the_numbers_that_were_wanted(name: str, tmp_path
         )
 
 
-def test_nominal_parameters_leave_every_byte(tmp_path: Path) -> None:
-    nominal = load_mechanism("hexapod")
+@pytest.mark.parametrize("name", ["hexapod", "delta", "3-prs"])
+def test_nominal_parameters_leave_every_byte(name: str, tmp_path: Path) -> None:
+    nominal = load_mechanism(name)
     write_urdf(nominal, geometries(nominal), tmp_path / "same.urdf")
-    assert (tmp_path / "same.urdf").read_bytes() == SHIPPED_URDF.read_bytes()
+    assert (tmp_path / "same.urdf").read_bytes() == nominal.urdf_path.read_bytes()
+
+
+def test_a_gain_has_no_place_in_a_urdf(tmp_path: Path) -> None:
+    nominal = load_mechanism("linear-delta")
+    parametrization = parametrization_of(nominal, twists=True)
+    step = np.array([1e-3 * name.endswith("rail2.gain") for name in parametrization.names])
+    legs = moved_legs(geometries(nominal), parametrization.place, step)
+    with pytest.raises(OutOfClass, match=r"gains other than 1 \('rail2' 1.001\)"):
+        write_urdf(nominal, legs, tmp_path / "never.urdf")
+    assert not list(tmp_path.iterdir())
 
 
 def _canonical(content: bytes) -> bytes:

@@ -92,13 +92,14 @@ class ParameterErrors:
     Attributes
     ----------
     base_joints, platform_joints : Spread
-        Errors of each coordinate of the joint centres [m].
+        Errors of each coordinate of the joint centres [m]; those of the base also of where the axes
+        of motors lie that carry joints.
     offsets : Spread
         Errors of the offsets of actuated legs [m].
     lengths : Spread
         Errors of the lengths of constant legs [m].
     axes : Spread
-        Errors of both angles of axes at base and platform [rad].
+        Errors of both angles of axes at base and platform, and of such motors [rad].
     twists : Spread
         Errors of the twists of legs without an S joint [rad].
     radii : Spread
@@ -125,6 +126,9 @@ ERRORS_OF = {  # kind of parameter, as in its name
     "base_axis": "axes",
     "platform_axis": "axes",
     "twist": "twists",
+    "direction": "axes",
+    "axis": "axes",
+    "axis_point": "base_joints",
 }
 
 
@@ -134,7 +138,7 @@ KINDS = (*dict.fromkeys(ERRORS_OF.values()), "radii")  # the fields that are siz
 def kinds_of(machine: Machine) -> set[str]:
     """Return the kinds of errors, fields of :class:`ParameterErrors`, that a machine can have."""
     names = parametrization_of(machine, twists=True).names
-    kinds = {ERRORS_OF[name.split(".")[1]] for name in names}
+    kinds = {ERRORS_OF[name.split(".")[1]] for name in names if not name.endswith(".gain")}
     return kinds | ({"radii"} if any(leg.cylinders for leg in machine.legs) else set())
 
 

@@ -27,12 +27,15 @@ from legcal.geometry import (
 )
 from legcal.machine import (
     COAXIAL,
+    Actuator,
     Configurations,
     Leg,
     Machine,
+    joint_values,
     number_list,
     origins_of,
     parse_robot,
+    vectors_A_to_B,
 )
 
 _SIZES = {"cylinder": ("radius", "length"), "sphere": ("radius",), "box": ("size",)}
@@ -311,8 +314,9 @@ def _leg_along(
     """Return the leg that has a visual of a link, at home, among its cylinders."""
     half = np.array([0.0, 0.0, 0.5 * shape.length])
     ends = T_base_shape.apply(np.stack([-half, half]))
-    A, B = machine.A_base, machine.home.apply(machine.B_platform)
-    u = (B - A) / np.linalg.norm(B - A, axis=-1, keepdims=True)
+    vectors = vectors_A_to_B(machine, machine.home)
+    A = machine.home.apply(machine.B_platform) - vectors
+    u = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
     for j, leg in enumerate(machine.legs):
         has_it = any(
             c.link == link and abs(c.radius - shape.radius) < COAXIAL for c in leg.cylinders
@@ -344,7 +348,8 @@ def dressed(machine: Machine) -> tuple[Solid, ...]:
     """Return all that pictures show of a mechanism: its visuals, and what they lack.
 
     A link that has no visual of its own gets balls at the joint centres and, for three joints or
-    more, a round plate that carries them on posts, on the side away from the legs. Both plates of a
+    more, a round plate that carries them on posts, on the side away from the legs; what a motor
+    moves has balls only, and a base with nothing but such motors nothing. Both plates of a
     planar machine are below its legs, that of the base lowest, so that the legs are seen from
     above.
     """
@@ -352,10 +357,15 @@ def dressed(machine: Machine) -> tuple[Solid, ...]:
     bare = {machine.base, machine.platform} - {s.link for s in shown if s.leg is None}
     radii = np.array([_radius(leg, machine) for leg in machine.legs])
     added: list[Solid] = []
-    if machine.base in bare:
-        away = _away(machine.A_base, machine, -1.0)
+    on_base = [j for j, leg in enumerate(machine.legs) if leg.actuator is None]
+    if machine.base in bare and on_base:
+        A = machine.A_base[on_base]
+        away = _away(A, machine, -1.0)
         below = 0.0 if machine.spatial else _POST_LENGTH + _PLATE_THICKNESS + _GAP
-        added += _end(machine.base, machine.A_base, radii, [True] * len(radii), away, below)
+        added += _end(machine.base, A, radii[on_base], [True] * len(A), away, below)
+    for actuator in machine.actuators:
+        if actuator.link not in {s.link for s in shown}:
+            added += _on_actuator(machine, actuator, radii)
     if machine.platform in bare:
         balls = [not leg.is_fixed_to_platform for leg in machine.legs]
         B = machine.B_platform
@@ -364,6 +374,15 @@ def dressed(machine: Machine) -> tuple[Solid, ...]:
             away = machine.home.rotation.inv().apply(away)
         added += _end(machine.platform, B, radii, balls, away)
     return (*shown, *added)
+
+
+def _on_actuator(machine: Machine, actuator: Actuator, radii: Array) -> list[Solid]:
+    """Return the balls at the joints of what a motor moves, in its link."""
+    on_it = [j for j, leg in enumerate(machine.legs) if leg.actuator is actuator]
+    T_base_link = link_poses(machine, machine.home_configuration)[actuator.link]
+    A = machine.home.apply(machine.B_platform) - vectors_A_to_B(machine, machine.home)
+    joints = np.asarray(T_base_link.inv().apply(A[on_it]))
+    return _end(actuator.link, joints, radii[on_it], [True] * len(on_it), None)
 
 
 def _end(
@@ -413,7 +432,7 @@ def _away(joints_base: Array, machine: Machine, side: float) -> Array | None:
     if len(joints_base) < 3 or sizes[1] < 0.05 * sizes[0]:
         return None
     normal = axes[2]
-    legs = (machine.home.apply(machine.B_platform) - machine.A_base).mean(axis=0)
+    legs = vectors_A_to_B(machine, machine.home).mean(axis=0)
     cosine = float(normal @ legs) / max(float(np.linalg.norm(legs)), 1e-12)
     if abs(cosine) < _FLAT:  # the legs lie along the plates: one on each side
         cosine = float(normal[np.argmax(np.abs(normal))])
@@ -424,8 +443,10 @@ def _radius(leg: Leg, machine: Machine) -> float:
     """Return the radius of the thickest cylinder of a leg, or one that suits it [m]."""
     if leg.cylinders:
         return max(c.radius for c in leg.cylinders)
-    length = np.linalg.norm(machine.home.apply(leg.B) - leg.A)
-    return _DEFAULT_RADIUS * float(length)
+    length = leg.q0
+    if leg.actuator is None:
+        length = float(np.linalg.norm(machine.home.apply(leg.B) - leg.A))
+    return _DEFAULT_RADIUS * length
 
 
 @dataclass(frozen=True, eq=False)
@@ -487,9 +508,8 @@ def pose_machine(
         here = placed(solids, link_poses(machine, configuration))
         vertices = [p.T_base_solid.apply(m.vertices) for p, m in zip(here, meshes, strict=True)]
         B = np.asarray(T.apply(machine.B_platform))
-        posed_machines.append(
-            PosedMachine(machine.A_base, B, here, np.concatenate(vertices), stacked)
-        )
+        A = machine.A_at(joint_values(machine, configuration))
+        posed_machines.append(PosedMachine(A, B, here, np.concatenate(vertices), stacked))
     return tuple(posed_machines)
 
 

@@ -79,6 +79,8 @@ def draw_errors(
 def _spread(errors: ParameterErrors, name: str) -> Spread:
     """Return how large the error of a parameter is, by its name."""
     _, kind, *more = name.split(".")
+    if kind == "gain":  # of motors: readings are true
+        return Spread()
     if errors.coplanar and kind in ("base", "platform") and more == ["z"]:
         return Spread()
     found: Spread = getattr(errors, ERRORS_OF[kind])
