@@ -255,25 +255,30 @@ def test_what_a_family_of_motors_cannot_be(
 # --- files that are outside the method -----------------------------------------------------------
 
 
+LIMITS = 'lower="-0.5235987755982988" upper="1.2217304763960306"'
+MOTORS = "name_mot:\n- arm1\n"
+A2 = '"leg1_a2" type="revolute"'
+
+
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
-        (
-            'lower="-0.5235987755982988" upper="1.2217304763960306"',
-            'lower="-30" upper="70"',
-            ("rad",),
-        ),
+        (LIMITS, 'lower="-30" upper="70"', ("'arm1'", "-30 to 70 rad", "degrees")),
+        ("home:\n", "home_readings: {arm7: 0.1}\n  home:\n", ("home_readings.arm7", "arm1")),
+        (MOTORS, f"{MOTORS}- leg1_a2\n", ("'leg1_a2'", "one motor for each leg")),
+        (MOTORS, "name_mot:\n", ("'arm1'", "carries 2 rods", "a motor in name_mot")),
+        (A2, '"leg1_a2" type="prismatic"', ("slider 'leg1_a2'", "'arm1'")),
+        ('"arm1" type="revolute"', '"arm1" type="continuous"', ("'arm1'", "continuous", "<limit>")),
     ],
 )
-def test_what_a_file_of_motors_cannot_be(
+def test_what_files_of_motors_cannot_be(
     tmp_path: Path, old: str, new: str, named: tuple[str, ...]
 ) -> None:
-    model, urdf = (ROOT / f"{folder}/delta.{folder.replace('models', 'yaml')}" for folder in
-                   ("models", "urdf"))  # fmt: skip
-    text = urdf.read_text()
-    assert old in text
-    (tmp_path / "delta.urdf").write_text(text.replace(old, new))
-    (tmp_path / "delta.yaml").write_text(model.read_text().replace("../urdf/", ""))
+    texts = [(ROOT / path).read_text() for path in ("models/delta.yaml", "urdf/delta.urdf")]
+    assert sum(old in text for text in texts) == 1
+    model, urdf = (text.replace(old, new) for text in texts)
+    (tmp_path / "delta.urdf").write_text(urdf)
+    (tmp_path / "delta.yaml").write_text(model.replace("../urdf/", ""))
     with pytest.raises(LegcalError) as caught:
         load_mechanism(tmp_path / "delta.yaml")
     assert all(word in str(caught.value) for word in named), str(caught.value)

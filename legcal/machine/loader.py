@@ -62,9 +62,10 @@ from legcal.machine.topology import (
     propose_block,
     propose_frame,
 )
-from legcal.machine.urdf import Urdf
+from legcal.machine.urdf import Urdf, UrdfJoint
 
 MAX_ORIGIN = 1e4  # [m]; beyond, floats do not resolve the tolerances of joints
+MAX_TURN = 4.0 * np.pi  # [rad] of an arm; limits beyond are most likely degrees
 _DEVIATION = {  # by [deg]
     EquationKind.BASE_AXIS: "its revolute axis at the base {} deg from perpendicular to the leg",
     EquationKind.PLATFORM_AXIS: "its revolute axis at the platform {} deg from perpendicular to it",
@@ -437,6 +438,13 @@ def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, p
                 f"{path}: the motor '{motor}' could not be used: found a continuous joint, needed "
                 "one with the limits of its readings; write its type as revolute, with <limit>."
             )
+        elif kind == "revolute" and motor in moving and _beyond_turns(urdf.joints[motor]):
+            lower, upper = urdf.joints[motor].limits or (0.0, 0.0)
+            problems.append(
+                f"{path}: the motor '{motor}' could not be used: found the limits {lower:g} to "
+                f"{upper:g} rad, needed at most two turns either way; these look like degrees: "
+                "write its limits, and its readings, in radian."
+            )
         elif kind != "prismatic" and motor not in moving:
             problems.append(
                 f"{path}: the motor '{motor}' is outside the method: found a {kind} joint in "
@@ -452,6 +460,11 @@ def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, p
             )
     if problems:
         raise OutOfClass(problems)
+
+
+def _beyond_turns(joint: UrdfJoint) -> bool:
+    """Say whether a joint turns further than any arm."""
+    return joint.limits is not None and max(map(abs, joint.limits)) > MAX_TURN
 
 
 def _check_frames(machine: Machine) -> None:
