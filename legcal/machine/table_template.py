@@ -52,6 +52,14 @@ radius: {{tube: 14, rod: 9}}
 # Height of the platform's origin over that of the base when the machine stands level.
 home: {{height: 400}}
 
+# Rods of constant length that hang on carriages or arms (type 6-PSS, 6-RSS, 3-PRS): base joints at
+# reading 0, "lengths" of the rods in place of shortest and longest ones, and the motors:
+# actuators:
+#   rail1: {{direction: [1, 0, 0], travel: [0, 200]}}
+#   arm1: {{point: [120, 0, 0], axis: [0, 1, 0], travel_deg: [-30, 70]}}
+# hangs_on: [rail1, arm1, ...]  # of each leg; motors in the order of the legs without
+# A whole one to start from: legcal new --family delta -o DIR; models/tables has their tables.
+
 # legs: [front, ...]          # names; leg1, leg2, ... without
 # base_axes: [[0, 1, 0], ...] # directions of R joints and of the outer axes of U joints, if known
 """

@@ -16,7 +16,6 @@ from legcal.errors import LegcalError
 from legcal.geometry import Array, BoolArray, motion_of
 from legcal.machine import (
     Follower,
-    LegKind,
     Machine,
     consistent_readings,
     coordinates_of,
@@ -26,6 +25,7 @@ from legcal.machine import (
     own_coordinates,
     poses_at_coordinates,
     readings_at,
+    readings_at_poses,
 )
 
 _AT_END = 1e-6  # [m] from the end of a travel
@@ -92,7 +92,7 @@ class Motion:
 
     @property
     def _slides(self) -> BoolArray:
-        return np.array([leg.kind is not LegKind.CONSTANT for leg in self.machine.legs])
+        return np.array([leg.has_value for leg in self.machine.legs])
 
     def ranges_of_readings(self) -> Array:
         """Return from where to where each leg is moved, (n_legs, 2) [m]."""
@@ -119,9 +119,7 @@ class Motion:
                 wanted = np.repeat(centre[None], _TICKS, axis=0)
                 wanted[:, k] += steps
                 poses, reached = poses_at_coordinates(machine, self.own, wanted, home)
-                in_base = machine.B_platform @ poses[:, :, :3].transpose(0, 2, 1)
-                vectors = in_base + poses[:, None, :, 3] - machine.A_base
-                q = machine.sign * (np.linalg.norm(vectors, axis=2) - machine.q0)
+                q = readings_at_poses(machine, poses)
                 inside = reached & (((q >= lower) & (q <= upper)) | ~self._slides).all(axis=1)
                 last = int(np.argmin(inside)) if not inside.all() else _TICKS
                 found[k, side] = centre[k] + _BEYOND * steps[max(last - 1, 0)]
@@ -149,7 +147,8 @@ class Motion:
                 )
             q[motors] += step / share * pulled
         else:
-            q[leg] = value
+            reads = np.array(self.machine.reads)
+            q[reads == reads[leg]] = value
         try:
             T = self._follower.move_to(q)
         except LegcalError as error:

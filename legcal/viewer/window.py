@@ -274,7 +274,7 @@ class Window:
         """Bring sliders and words up to date."""
         posture, motion = self.motion.posture, self.motion
         for j, slider in self._reading_sliders.items():
-            slider.value = _shown(1e3 * posture.q[j], slider.min, slider.max)
+            slider.value = _shown(self._scale(j) * posture.q[j], slider.min, slider.max)
         for k, (slider, value) in enumerate(
             zip(self._pose_sliders, motion.coordinates.tolist(), strict=True)
         ):
@@ -318,13 +318,17 @@ class Window:
         self._add_comparison()
         self._reading_sliders: dict[int, Any] = {}
         if machine.is_determined:
-            with gui.add_folder("Readings [mm]"):
-                for j, (low, high) in enumerate((1e3 * motion.ranges_of_readings()).tolist()):
+            units = {"mm" if self._scale(j) == 1e3 else "deg" for j in machine.motors}
+            with gui.add_folder(f"Readings [{', '.join(sorted(units, reverse=True))}]"):
+                for j, ends in enumerate(motion.ranges_of_readings()):
                     if j not in machine.motors:
                         continue
+                    low, high = (self._scale(j) * ends).tolist()
+                    actuator = machine.legs[j].actuator
                     slider = gui.add_slider(
-                        machine.leg_names[j], low, high, _STEP,
-                        _shown(1e3 * motion.posture.q[j], low, high),
+                        machine.leg_names[j] if actuator is None else actuator.joint,
+                        low, high, _STEP,
+                        _shown(self._scale(j) * motion.posture.q[j], low, high),
                     )  # fmt: skip
                     self._on_update(slider, ("leg", j), partial(self._read, j))
                     self._reading_sliders[j] = slider
@@ -343,7 +347,12 @@ class Window:
                 self._pose_sliders.append(slider)
 
     def _read(self, leg: int, value: float) -> None:
-        self.motion.read(leg, 1e-3 * value)
+        self.motion.read(leg, value / self._scale(leg))
+
+    def _scale(self, leg: int) -> float:
+        """Return by what the reading of a leg is multiplied for people: mm, or degrees of arms."""
+        actuator = self.source.machine.legs[leg].actuator
+        return float(np.degrees(1.0)) if actuator is not None and actuator.turns else 1e3
 
     def _place(self, k: int, value: float) -> None:
         self.motion.place(k, value / _scale(int(self.motion.own[k])))
