@@ -193,7 +193,7 @@ def test_a_session_by_hand_is_shot_with_its_board_where_the_plan_lays_it(
     high = {f"t{k}": {"xyz": [float(np.cos(k)), float(np.sin(k)), 3.2]} for k in range(0, 8, 2)}
     (tmp_path / "high.yaml").write_text(yaml.safe_dump({"places": high}))
     held = legcal.plan(
-        "3-rpr", images=4, board="chessboard:6x5:15mm", hand_held=True, noise=planning.WHITE,
+        "3-rpr", images=4, board="chessboard:6x5:25mm", hand_held=True, noise=planning.WHITE,
         setting=FEW, places=tmp_path / "high.yaml",
     )  # fmt: skip
     assert held.board is not None
@@ -343,6 +343,8 @@ def test_what_else_is_in_the_way_is_refused(
     (tmp_path / "away.yaml").write_text(yaml.safe_dump({"places": {"a": away}}))
     refused(NotVisible, "0 of 1 camera places", places=tmp_path / "away.yaml")
     refused(UsageError, "found 1 places for 2", places=tmp_path / "away.yaml", cameras=2)
+    refused(NotVisible, "use another board", board="charuco:7x5:4mm:3mm:DICT_4X4_50",
+            places=places(tmp_path))  # fmt: skip
     for name in ("dataset.yaml", "plan.json"):  # their views are places too
         refused(UsageError, "found 2 places for 3", places=shot / "session" / name, cameras=3)
     refused(UsageError, "leg9.base.x", criterion="parameters", parameters=["leg9.base.x"],

@@ -2,7 +2,7 @@
 
 It lies flat at the level of the base joints, in their middle or beside them, its print up: there
 most places see it. An image shows it if all of its corners are in the picture, seen from above by
-enough, and behind neither a leg nor the plate of the platform.
+enough and large enough to be read, and behind neither a leg nor the plate of the platform.
 """
 
 from __future__ import annotations
@@ -16,12 +16,15 @@ from scipy.spatial.transform import RigidTransform
 from legcal.geometry import Array, BoolArray, normal_basis
 from legcal.machine import Cylinder, Machine
 from legcal.planning.sight import behind_plate
-from legcal.vision import Board, Camera, facing_board, in_picture, rays_past_axes
+from legcal.vision import Board, Camera, dictionary, facing_board, in_picture, rays_past_axes
 
 _SIDES = 4  # directions beside the machine
 _DISTANCE = 1.05  # half diagonals of the board beyond the base joints
 _MIN_COSINE = 0.45  # between the normal of the print and the line of sight
 _NEAREST = 0.1  # [m] before the camera
+_MODULE_PX = 2.0  # of a module of a marker, across which it looks narrowest
+_MODULES = 4.0  # that a square without a marker counts as
+_FRAME = {"charuco": 2, "aprilgrid": 4}  # modules of the black frame of a marker, both sides
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +52,8 @@ class LaidBoard:
         B: Array,  # (n_images, n_legs, 3) the same
         cylinders: Sequence[Sequence[Cylinder]],  # of each leg
         margin_px: float = 0.0,
+        *,
+        is_read: bool = True,  # whether it must look large enough
     ) -> BoolArray:
         """Return which images of one camera show it, (n_images,)."""
         n = len(B)
@@ -58,6 +63,8 @@ class LaidBoard:
         sight = eye - outer
         cosine = sight @ normal / np.linalg.norm(sight, axis=1)
         if cosine.min() < _MIN_COSINE or not in_picture(camera, P, _NEAREST, margin_px).all():
+            return np.zeros(n, dtype=np.bool_)
+        if is_read and self._narrowest(camera.project(P)) < _MODULE_PX:
             return np.zeros(n, dtype=np.bool_)
         points = np.concatenate([outer, self.T_base_board.apply(self.board.points)])
         T = T_base_camera.inv()
@@ -71,6 +78,17 @@ class LaidBoard:
         hidden = (square < aside**2) & (depth > 0.0) & (depth < distance[..., None])
         hidden = hidden.any(axis=-1) | behind_plate(P[:, None], B, 0.0)[:, 0]
         return ~np.asarray(hidden.any(axis=1))
+
+    def _narrowest(self, px: Array) -> float:
+        """Return how wide a module looks where it is narrowest, from outer corners (4, 2) [px]."""
+        board = self.board
+        x, y = (px[1] - px[0]) / board.columns, (px[3] - px[0]) / board.rows  # of a tile
+        tile = abs(x[0] * y[1] - x[1] * y[0]) / max(np.linalg.norm(x), np.linalg.norm(y))
+        if board.kind == "chessboard":
+            return float(tile / _MODULES)
+        n = dictionary(board.dictionary).markerSize + _FRAME[board.kind]
+        of_tile = board.marker / board.side if board.marker else 1.0 / (1.0 + board.spacing)
+        return float(tile * of_tile / n)
 
 
 def feet(board: Board, A: Array, up: Array) -> list[tuple[Array, Array]]:

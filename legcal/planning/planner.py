@@ -115,14 +115,28 @@ class Scene:
         return what_is_seen(self.task.predictor.camera, T, self.A, B, cylinders, margin)
 
     def board_is_shown(
-        self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool
+        self,
+        T: RigidTransform,
+        poses: Sequence[RigidTransform],
+        *,
+        surely: bool,
+        is_read: bool = True,
     ) -> BoolArray:
         """Return which images show the board, (n_images,); all of them where there is none."""
         if self.task.laid is None:
             return np.ones(len(poses), dtype=np.bool_)
         B, margin = self._before(T, poses, surely=surely)
         cylinders = [leg.cylinders for leg in self.task.machine.legs]
-        return self.task.laid.is_shown(self.task.predictor.camera, T, self.A, B, cylinders, margin)
+        camera = self.task.predictor.camera
+        return self.task.laid.is_shown(camera, T, self.A, B, cylinders, margin, is_read=is_read)
+
+    def showing(self, own: Candidates) -> Candidates:
+        """Return the candidates whose images show the board, the same if all do."""
+        poses = platforms_in_base(self.task.machine, own.poses.poses)
+        shown = self.board_is_shown(own.place.T_base_camera, poses, surely=True)
+        if shown.all():
+            return own
+        return replace(own, poses=some_of(own.poses, np.flatnonzero(shown).tolist()))
 
     def _before(
         self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool
@@ -215,8 +229,16 @@ def plan_session(
     criterion = criterion_of(task.goal, work, legs, shown[0][1].basis, task.named)
     n_places = min(N_HANDS, len(shown)) if task.hand_held else task.n_views
     chosen = choose_places([c for _, c in shown], n_places, task.n_images, criterion, given)
-    current = [Candidates(shown[i][0], poses) for i in chosen]
+    current = [scene.showing(Candidates(shown[i][0], poses)) for i in chosen]
+    count = [len(own.poses.poses) for own in current]
+    if sum(count) < task.n_images:
+        raise NotVisible(
+            f"{machine.yaml_path}: no session could be planned: found {sum(count)} images from "
+            f"{len(current)} places that show legs and the board, needed {task.n_images}; plan "
+            "fewer --images, more --cameras, or a board of another size."
+        )
     least = 0 if task.hand_held else max(1, int(MIN_SHARE * task.n_images / task.n_views))
+    least = min([least, *count])
     session = Session(_required(scene, current, run), given)
     images = choose(session, task.n_images, criterion, rng, least, task.n_images, progress=progress)
     images = exchange(
@@ -277,14 +299,17 @@ def _with_laid_board(task: Task, poses: Configurations) -> Task:
     for laid in lying(task.board, task.machine):
         trial = replace(task, laid=laid)
         scene = Scene.nominal(trial)
-        share = np.mean([scene.board_is_shown(T, in_Rb, surely=False) for T in places])
+        of_all = [
+            scene.board_is_shown(T, in_Rb, surely=False, is_read=bool(task.places)) for T in places
+        ]
+        share = np.mean(of_all)
         if share > most:
             best, most = trial, float(share)
     if not most:
         raise NotVisible(
             f"{task.machine.yaml_path}: no session could be planned: found no place of the board "
             "flat on the base that a camera sees beside the legs wherever it is set, needed one; "
-            "use a smaller board, higher --places, wider --bounds, or a camera with a wider view."
+            "use another board, higher --places, wider --bounds, or a camera with a wider view."
         )
     return best
 
@@ -309,14 +334,16 @@ def _probed(
             found.append((place, contributions))
         progress("Camera places", k + 1, len(places))
     needed = 1 if scene.task.hand_held else scene.task.n_views
-    board = " and the board" if scene.task.board is not None else ""
+    board, another = "", ""
+    if scene.task.board is not None:
+        board, another = " and the board", ", more pixels or a board of larger squares"
     if not found or (scene.task.places and len(found) < needed):
         raise NotVisible(
             f"{machine.yaml_path}: no session could be planned: found {len(found)} of "
             f"{len(places)} camera places that see legs{board} wherever the tripod is set within "
             f"{1e2 * scene.task.setting.shift:g} cm and "
             f"{np.degrees(scene.task.setting.turn):g} deg, needed {needed}; move the places "
-            "further away or turn them to the machine, or use a camera with a wider view."
+            f"further away or turn them to the machine, or use a camera with a wider view{another}."
         )
     return found
 
@@ -414,7 +441,7 @@ def _better_places(
             place = near(current[v].place, target, up, PLACE_STEP * step, rng)
             trial = replace(own, place=place)
             found = scene.of(trial) if place.is_inside(task.bounds) else None
-            if found is None:
+            if found is None or scene.showing(trial) is not trial:
                 continue
             others = [*known[:v], found, *known[v + 1 :]]
             there = float(criterion(_with_all(others, given).machine[None])[0])
@@ -441,7 +468,7 @@ def _better_poses(
         poses = own.poses
         if not stop():
             poses = poses_near(task.machine, task.predictor.legs, task.setting, poses, far, rng)
-        widened.append(replace(own, poses=poses))
+        widened.append(scene.showing(replace(own, poses=poses)))
     session = Session(_required(scene, widened, run), given)
     images = [(v, k) for v, own in enumerate(current) for k in range(len(own.poses.poses))]
     for slot, image in images:

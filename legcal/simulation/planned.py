@@ -94,8 +94,8 @@ def read_plan(folder: Path, nominal: Machine) -> PlannedSession:
         setting = Setting(shift, turn)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, DatasetError) as error:
         raise UsageError(
-            f"{folder}: the plan could not be shot: found no {PLAN_NAME} of legcal in it, needed "
-            "the folder that legcal plan wrote; correct --plan."
+            f"{folder}: the plan could not be shot: found no {PLAN_NAME} in it that can be read, "
+            "needed the folder that legcal plan wrote; correct --plan."
         ) from error
     dataset = load_dataset(folder, check_images=False)
     if other := difference(nominal, dataset.machine):
