@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -85,28 +85,38 @@ def pose_equations(
         return _without_readings(legs, R, t)
     if all(leg.kind is not LegKind.PASSIVE and len(leg.equations) == 1 for leg in legs):
         return _lengths(legs, R, t, by_local, q)
-    parts = []
+    groups: dict[tuple[object, ...], list[int]] = {}  # legs alike at once, those on actuators alone
     for j, leg in enumerate(legs):
-        at = None if q is None or on[j] < 0 else q[:, on[j]]
-        found = leg_equations(leg, R, t, by_local=by_local, q=at)
-        by_q = np.zeros((*found.values.shape, 0 if q is None else q.shape[1]))
+        own = j if on[j] >= 0 else -1
+        joints = leg.base_joint, leg.platform_joint
+        groups.setdefault((own, leg.kind, *joints, *leg.equations), []).append(j)
+    parts: dict[int, PoseEquations] = {}
+    for alike in groups.values():
+        leg, a = legs[alike[0]], on[alike[0]]
+        at = None if q is None or a < 0 else q[:, a]
+        length, *found, by_own = _of_alike([legs[j] for j in alike], R, t, by_local, at)
+        by_q = np.zeros((*found[0].shape, 0 if q is None else q.shape[1]))
         if at is not None:
-            by_q[:, :, on[j]] = found.by_q[:, :, 0]
-        rows = np.array([leg.kind is not LegKind.PASSIVE] + [True] * (len(leg.equations) - 1))
-        is_length = np.array([kind is EquationKind.LENGTH for kind in found.kinds])
-        arm = np.where(is_length, 1.0, found.values[:, :1] + leg.q0)
-        parts.append(
-            PoseEquations(
-                arm * found.values,
-                arm[..., None] * found.by_pose,
-                arm[..., None] * found.by_local,
-                np.full(len(rows), j),
-                found.kinds,
-                found.measured,
-                arm[..., None] * by_q,
-            ).of(rows)
-        )
-    return _stacked(parts)
+            by_q[..., a] = by_own[..., 0]
+        rows = slice(1 if leg.kind is LegKind.PASSIVE else 0, None)
+        kinds = leg.equations[rows]
+        is_length = np.array([kind is EquationKind.LENGTH for kind in kinds], dtype=np.bool_)
+        arm = np.where(is_length, 1.0, length[..., None])
+        values, by_pose, local, by_q = (x[:, :, rows] for x in (*found, by_q))
+        values = arm * values
+        by_pose, local, by_q = (arm[..., None] * x for x in (by_pose, local, by_q))
+        measured = _measured(leg)[rows]
+        for i, j in enumerate(alike):
+            parts[j] = PoseEquations(
+                values[:, i],
+                by_pose[:, i],
+                local[:, i],
+                np.full(len(kinds), j),
+                kinds,
+                measured,
+                by_q[:, i],
+            )
+    return _stacked([parts[j] for j in range(len(legs))])
 
 
 def readings_of_rods(legs: Sequence[Leg], R: Array, t: Array) -> Array:
@@ -195,49 +205,71 @@ def leg_equations(
     Rows but that of the length have no unit; a passive leg has the row of its length too. Of a rod
     on an actuator *q* (k,) are its readings, zero if they are not given.
     """
-    arm = R @ leg.B
-    moved = None
-    if leg.actuator is not None:
-        moved = leg.actuator.motion(leg.A, np.zeros(len(t)) if q is None else q)
-    vector = arm + t - (leg.A if moved is None else moved.A)
-    length = np.linalg.norm(vector, axis=1)
-    at = _Placed(leg, R, length, vector / length[:, None], moved)
-    kinds = leg.equations
-    values, by_pose = np.empty((len(t), len(kinds))), np.empty((len(t), len(kinds), 6))
-    local = np.zeros((len(t), len(kinds), LegColumns.COUNT if by_local else 0))
-    by_q = np.zeros((len(t), len(kinds), 0 if moved is None else 1))
+    _, *found = _of_alike([leg], R, t, by_local, q)
+    values, by_pose, local, by_q = (x[:, 0] for x in found)
+    owner = np.zeros(len(leg.equations), dtype=np.intp)
+    return PoseEquations(values, by_pose, local, owner, leg.equations, _measured(leg), by_q)
+
+
+def _measured(leg: Leg) -> BoolArray:
+    """Return which equations of a leg are about its reading, (m,)."""
+    return np.array(
+        [
+            leg.actuator is not None
+            or (kind is EquationKind.LENGTH and leg.kind is LegKind.ACTUATED)
+            for kind in leg.equations
+        ]
+    )
+
+
+def _of_alike(
+    legs: Sequence[Leg], R: Array, t: Array, by_local: bool, q: Array | None
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the equations of n legs with the same joints and equations; n is 1 on an actuator.
+
+    They are lengths (k, n), and of m rows values (k, n, m) and derivatives (k, n, m, 6) by the
+    pose, (k, n, m, 17) by the numbers of the legs and (k, n, m, 1) by the readings q (k,).
+    """
+    A, B = np.array([leg.A for leg in legs]), np.array([leg.B for leg in legs])
+    arm = B @ np.swapaxes(R, 1, 2)
+    actuator, moved = legs[0].actuator, None
+    if actuator is not None:
+        moved = actuator.motion(legs[0].A, np.zeros(len(t)) if q is None else q)
+    vector = arm + t[:, None] - (A if moved is None else moved.A[:, None])
+    length = np.linalg.norm(vector, axis=2)
+    at = _Placed(legs, R, length, vector / length[..., None], moved)
+    kinds, shape = legs[0].equations, length.shape
+    values, by_pose = np.empty((*shape, len(kinds))), np.empty((*shape, len(kinds), 6))
+    local = np.zeros((*shape, len(kinds), LegColumns.COUNT if by_local else 0))
+    by_q = np.zeros((*shape, len(kinds), 0 if moved is None else 1))
     for i, kind in enumerate(kinds):
         row = _RESIDUALS[kind](at)
-        values[:, i] = row.value
-        by_pose[:, i, :3], by_pose[:, i, 3:] = cross(arm, row.by_leg), row.by_leg
+        values[:, :, i] = row.value
+        by_pose[:, :, i, :3], by_pose[:, :, i, 3:] = cross(arm, row.by_leg), row.by_leg
         if row.by_tied is not None:
-            by_pose[:, i, :3] += cross(at.in_base(row.tied), row.by_tied)
+            by_pose[:, :, i, :3] += cross(at.in_base(row.tied), row.by_tied)
         if moved is not None:
-            by_q[:, i, 0] = _by_actuator(leg, moved, row, local[:, i])
+            by_q[:, 0, i, 0] = _by_actuator(legs[0], moved, row, local[:, 0, i])
         if by_local:
-            local[:, i, LegColumns.A] = -_back(moved, row.by_leg)
-            local[:, i, LegColumns.B] = _in_platform(R, row.by_leg)
-            local[:, i, LegColumns.LENGTH] = row.by_q0
-            local[:, i, LegColumns.TWIST] = row.by_twist
+            local[:, :, i, LegColumns.A] = -_back(moved, row.by_leg)
+            local[:, :, i, LegColumns.B] = row.by_leg @ R
+            local[:, :, i, LegColumns.LENGTH] = row.by_q0
+            local[:, :, i, LegColumns.TWIST] = row.by_twist
             if row.by_base_axis is not None:
-                e1, e2 = _basis(_given(leg.base_axis))
+                e = _basis(at.axes("base"))
                 by_axis = _back(moved, row.by_base_axis)
-                turns = np.stack([-by_axis @ e2, by_axis @ e1], axis=1)
-                local[:, i, LegColumns.BASE_AXIS] = turns
+                turns = [-_dot(by_axis, e[:, 1]), _dot(by_axis, e[:, 0])]
+                local[:, :, i, LegColumns.BASE_AXIS] = np.stack(turns, axis=-1)
             if row.by_tied is not None:
-                turns = cross(_basis(_given(leg.platform_axis)), row.tied)
-                local[:, i, LegColumns.PLATFORM_AXIS] = _in_platform(R, row.by_tied) @ turns.T
-    measured = [
-        moved is not None or (kind is EquationKind.LENGTH and leg.kind is LegKind.ACTUATED)
-        for kind in kinds
-    ]
-    owner = np.zeros(len(kinds), dtype=np.intp)
-    return PoseEquations(values, by_pose, local, owner, kinds, np.array(measured), by_q)
+                turned = cross(_basis(at.axes("platform")), row.tied[:, None])
+                by_platform = np.einsum("kni,nji->knj", row.by_tied @ R, turned)
+                local[:, :, i, LegColumns.PLATFORM_AXIS] = by_platform
+    return length, values, by_pose, local, by_q
 
 
 def _back(moved: JointMotion | None, vectors: Array) -> Array:
-    """Return gradients (k, 3) by what is fixed in the base by what is at reading 0."""
-    return vectors if moved is None else np.einsum("kij,ki->kj", moved.by_A, vectors)
+    """Return gradients (k, ..., 3) by what is fixed in the base by what is at reading 0."""
+    return vectors if moved is None else np.einsum("kij,k...i->k...j", moved.by_A, vectors)
 
 
 def _write_actuator(moved: JointMotion, by_leg: Array, local: Array) -> None:
@@ -253,18 +285,20 @@ def _by_actuator(leg: Leg, moved: JointMotion, row: _EquationRow, local: Array) 
 
     They go into *local* (k, 17), which may have no columns.
     """
-    by_q, columns = -_dot(moved.by_q, row.by_leg), ActuatorColumns
+    by_leg = row.by_leg[:, 0]
+    by_q, columns = -_dot(moved.by_q, by_leg), ActuatorColumns
     if local.shape[1]:
-        _write_actuator(moved, row.by_leg, local)
+        _write_actuator(moved, by_leg, local)
     actuator = leg.actuator
     if row.by_base_axis is None or actuator is None or not actuator.turns:
         return by_q
     v = moved.by_A @ _given(leg.base_axis)  # it turns with the arm
-    by_angle = _dot(cross(actuator.axis, v), row.by_base_axis)
+    by_axis = row.by_base_axis[:, 0]
+    by_angle = _dot(cross(actuator.axis, v), by_axis)
     if local.shape[1]:
-        for k, e in enumerate(_basis(actuator.axis)):
+        for k, e in enumerate(_basis(actuator.axis[None])[0]):
             turned = cross(e, v) - moved.by_A @ cross(e, _given(leg.base_axis))
-            local[:, columns.AXIS.start + k] += _dot(turned, row.by_base_axis)
+            local[:, columns.AXIS.start + k] += _dot(turned, by_axis)
         local[:, columns.GAIN] += by_angle * moved.angle / actuator.gain
     return by_q + actuator.gain * by_angle
 
@@ -492,7 +526,7 @@ def _stacked(parts: Sequence[PoseEquations]) -> PoseEquations:
 
 
 class VectorOps(NamedTuple):
-    """Products of vectors: of rows (k, 3) in numpy, or of symbols, as CasADi has them."""
+    """Products of vectors: of arrays (..., 3) in numpy, or of symbols, as CasADi has them."""
 
     dot: Callable[[Any, Any], Any]
     cross: Callable[[Any, Any], Any]
@@ -512,48 +546,52 @@ def twist_residual(p: Any, w: Any, u: Any, twist: Any, ops: VectorOps) -> Any:
 
 
 class _Placed(NamedTuple):
-    """A leg at k poses."""
+    """n legs with the same joints and equations, at k poses."""
 
-    leg: Leg
+    legs: Sequence[Leg]
     R: Array  # (k, 3, 3)
-    length: Array  # (k,) [m]
-    u: Array  # (k, 3)
-    moved: JointMotion | None = None  # of the joint at A, on an actuator
+    length: Array  # (k, n) [m]
+    u: Array  # (k, n, 3)
+    moved: JointMotion | None = None  # of the joint at A, on an actuator: of one leg alone
+
+    def axes(self, end: Literal["base", "platform"]) -> Array:
+        """Return the axes of the joints at one end, (n, 3), at reading 0."""
+        return np.array([_given(getattr(leg, f"{end}_axis")) for leg in self.legs])
 
     @property
     def base_axis(self) -> Array:
-        """The axis of the joint at A, (k, 3)."""
-        v = np.broadcast_to(_given(self.leg.base_axis), self.u.shape)
-        return v if self.moved is None else np.asarray((self.moved.by_A @ v[..., None])[..., 0])
+        """The axes of the joints at A, (k, n, 3)."""
+        v = np.broadcast_to(self.axes("base"), self.u.shape)
+        return v if self.moved is None else np.einsum("kij,knj->kni", self.moved.by_A, v)
 
-    def in_base(self, vector: Array) -> Array:
-        """Return a direction of the platform in the frame of the base, (k, 3)."""
-        return np.asarray(self.R @ vector)
+    def in_base(self, vectors: Array) -> Array:
+        """Return directions (n, 3) of the platform in the frame of the base, (k, n, 3)."""
+        return np.asarray(vectors @ np.swapaxes(self.R, 1, 2))
 
     def by_leg(self, by_u: Array) -> Array:
         """Return the gradient by the vector from A to B of what depends on its direction."""
-        across = by_u - self.u * _dot(self.u, by_u)[:, None]
-        return np.asarray(across / self.length[:, None])
+        across = by_u - self.u * _dot(self.u, by_u)[..., None]
+        return np.asarray(across / self.length[..., None])
 
 
-_NOTHING = np.zeros(3)
+_NOTHING = np.zeros((1, 3))
 
 
 class _EquationRow(NamedTuple):
-    """One equation at k poses: its residual, and its gradients by what it depends on."""
+    """One equation of each leg at k poses: its residual, and its gradients."""
 
-    value: Array  # (k,)
-    by_leg: Array  # (k, 3) by the vector from A to B
-    by_base_axis: Array | None = None  # (k, 3)
-    tied: Array = _NOTHING  # (3,) a direction that is tied to the platform and to its axis
-    by_tied: Array | None = None  # (k, 3), in the frame of the base
+    value: Array  # (k, n)
+    by_leg: Array  # (k, n, 3) by the vector from A to B
+    by_base_axis: Array | None = None  # (k, n, 3)
+    tied: Array = _NOTHING  # (n, 3) a direction that is tied to the platform and to its axis
+    by_tied: Array | None = None  # (k, n, 3), in the frame of the base
     by_q0: float = 0.0
     by_twist: Array | float = 0.0
 
 
 def _length(at: _Placed) -> _EquationRow:
     """Return |AB| - q0."""
-    return _EquationRow(at.length - at.leg.q0, at.u, by_q0=-1.0)
+    return _EquationRow(at.length - np.array([leg.q0 for leg in at.legs]), at.u, by_q0=-1.0)
 
 
 def _base_axis(at: _Placed) -> _EquationRow:
@@ -564,7 +602,7 @@ def _base_axis(at: _Placed) -> _EquationRow:
 
 def _platform_axis(at: _Placed) -> _EquationRow:
     """Return v . u of eq (7) at the platform."""
-    return _component(at, _given(at.leg.platform_axis))
+    return _component(at, at.axes("platform"))
 
 
 def _component(at: _Placed, tied: Array) -> _EquationRow:
@@ -575,17 +613,17 @@ def _component(at: _Placed, tied: Array) -> _EquationRow:
 
 def _twist(at: _Placed) -> _EquationRow:
     """Return sin(angle - twist) of the axes p and w in the leg, and its gradients."""
-    leg, u, tau = at.leg, at.u, float(at.leg.twist or 0.0)
-    b = _given(leg.platform_axis)
-    tied = _basis(b)[0] if leg.is_fixed_to_platform else b
+    leg, u, b = at.legs[0], at.u, at.axes("platform")
+    tau = np.array([float(one.twist or 0.0) for one in at.legs])
+    tied = _basis(b)[:, 0] if leg.is_fixed_to_platform else b
     outer = at.base_axis, at.in_base(tied)
     joints = leg.base_joint, leg.platform_joint
     p, w = (axis_in_leg(*end, u, _ROWS) for end in zip(joints, outer, strict=True))
-    c, s = np.cos(tau), np.sin(tau)
+    c, s = np.cos(tau)[:, None], np.sin(tau)[:, None]
     by_u, by_axes = c * cross(p, w), [c * cross(w, u) - s * w, c * cross(u, p) - s * p]
     for i, (joint, axis) in enumerate(zip(joints, outer, strict=True)):
         if joint.inner_is_across:
-            size = np.linalg.norm(cross(axis, u), axis=1)[:, None]
+            size = np.linalg.norm(cross(axis, u), axis=-1)[..., None]
             by_u = by_u + cross(by_axes[i], axis) / size
             by_axes[i] = cross(u, by_axes[i]) / size
     return _EquationRow(
@@ -602,8 +640,8 @@ _RESIDUALS: dict[EquationKind, Callable[[_Placed], _EquationRow]] = {
     EquationKind.LENGTH: _length,
     EquationKind.BASE_AXIS: _base_axis,
     EquationKind.PLATFORM_AXIS: _platform_axis,
-    EquationKind.DIRECTION_1: lambda at: _component(at, _basis(_given(at.leg.platform_axis))[0]),
-    EquationKind.DIRECTION_2: lambda at: _component(at, _basis(_given(at.leg.platform_axis))[1]),
+    EquationKind.DIRECTION_1: lambda at: _component(at, _basis(at.axes("platform"))[:, 0]),
+    EquationKind.DIRECTION_2: lambda at: _component(at, _basis(at.axes("platform"))[:, 1]),
     EquationKind.TWIST: _twist,
 }
 
@@ -615,32 +653,27 @@ def _given(vector: Array | None) -> Array:
     return vector
 
 
-def _basis(axis: Array) -> Array:
-    """Return the two directions across an axis of a leg, which is needed at every pose."""
-    return _basis_of(np.ascontiguousarray(axis, dtype=np.float64).tobytes())
+def _basis(axes: Array) -> Array:
+    """Return the two directions (n, 2, 3) across axes (n, 3) of legs, needed at every pose."""
+    return _basis_of(np.ascontiguousarray(axes, dtype=np.float64).tobytes())
 
 
 @lru_cache(maxsize=1024)
-def _basis_of(axis: bytes) -> Array:
-    """Return the basis of an axis by its three numbers, not to be written to."""
-    basis = normal_basis(np.frombuffer(axis))
+def _basis_of(axes: bytes) -> Array:
+    """Return the bases of axes by their numbers, not to be written to."""
+    basis = normal_basis(np.frombuffer(axes).reshape(-1, 3))
     basis.flags.writeable = False
     return basis
 
 
 def _dot(a: Array, b: Array) -> Array:
-    """Return the scalar products of rows."""
-    return np.asarray(np.einsum("ki,ki->k", a, b))
-
-
-def _in_platform(R: Array, vectors: Array) -> Array:
-    """Return directions of the base's frame in that of the platform, (k, 3)."""
-    return np.asarray((vectors[:, None] @ R)[:, 0])
+    """Return the scalar products of vectors (..., 3)."""
+    return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
 def _unit(vectors: Array) -> Array:
-    """Return unit vectors of rows."""
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=1)[:, None])
+    """Return unit vectors (..., 3)."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1)[..., None])
 
 
 _ROWS = VectorOps(_dot, cross, _unit, np.cos, np.sin)
