@@ -1,18 +1,28 @@
 """Joints at A that actuators move: the four steps by analogy, counts, ranks, and the scale."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
-from actuated_sessions import MACHINES, session
+from actuated_sessions import MACHINES, frame_legs, machine, session
+from scipy.spatial.transform import RigidTransform, Rotation
 from staged_sessions import Observed, planned
 
+from legcal.calibration.identify import identifiability
+from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.identify.predicted_observations import PredictedObservations
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.scale import is_scale_open, scale_sources
 from legcal.calibration.joint_fit import Choices, Prior
 from legcal.errors import NotIdentifiable
-from legcal.machine import parametrize
+from legcal.machine import (
+    actuator_index,
+    parametrize,
+    random_poses_of_legs,
+    readings_of_rods,
+)
 from legcal.paper import count_conditions, enough_readings
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
 
@@ -85,6 +95,13 @@ def test_too_few_readings_of_an_arm_are_refused_by_name() -> None:
     few = replace(observed, measurements=replace(m, q=q))
     with pytest.raises(NotIdentifiable, match=r"leg1 .* 5 different readings of motor1"):
         few.run()
+
+
+def test_steps_of_planar_machines_with_arms_are_refused() -> None:
+    observed = seen("delta")
+    planar = replace(observed, nominal=replace(observed.nominal, frame_legs=(0, 2)))
+    with pytest.raises(NotIdentifiable, match="moves in a plane, needed a machine that moves in"):
+        planar.run()
 
 
 def test_readings_and_outlines_that_disagree_on_lengths_are_told() -> None:
@@ -166,3 +183,33 @@ def test_a_rod_that_no_view_shows_leaves_a_direction_open_and_is_named() -> None
     assert found["hexaglide"].rank == 42  # its readings tell of it
     (weak,) = found["delta"].weak
     assert all("2" in name.partition(".")[0] for name in weak.parameters)
+
+
+def test_an_unknown_scale_is_refused_with_what_would_fix_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        identifiability, "recorded_observations", lambda dataset, twists: session("6-rss")
+    )
+    dataset: Any = SimpleNamespace(folder="servo")
+    wanted = "leg1.length measured to 0.05 mm, or a calibration board on the base .* --prior"
+    with pytest.raises(NotIdentifiable, match=wanted):
+        check_identifiable(dataset)
+
+
+@pytest.mark.parametrize("name", ["delta", "hexaglide"])
+def test_random_poses_are_closed_and_inside_the_travel_of_actuators(name: str) -> None:
+    legs, R0, t0 = machine(name)
+    home = RigidTransform.from_components(t0, Rotation.from_matrix(R0))
+    travel = np.array([leg.actuator.travel for leg in legs if leg.actuator])
+    rng = np.random.default_rng(0)
+    R, t = random_poses_of_legs(legs, frame_legs(6), home, travel, 12, rng)
+    q = readings_of_rods(legs, R, t)
+    assert np.ptp(q, axis=0).min() > 0.3 * np.ptp(travel, axis=1).min()
+    for leg, a, (low, high) in zip(legs, actuator_index(legs), travel, strict=True):
+        assert leg.actuator is not None
+        reach = R @ leg.B + t - leg.actuator.at(leg.A, q[:, a])
+        assert np.linalg.norm(reach, axis=1) == pytest.approx(leg.q0, abs=1e-9)
+        margin = 0.06 * (high - low)
+        assert q[:, a].min() > low - margin
+        assert q[:, a].max() < high + margin
