@@ -6,6 +6,7 @@ In go a :class:`NominalMachine` (where the steps start), the leg axes that the i
 =====================  =======  ==================================================================
 ``conditions``         3.2-3.5  counts of equations and unknowns as printed, (10)-(12), (15), (17)
 ``joints_in_camera``   3.2      step 1: base joints and revolute axes in each camera, (6), (7)
+``carriers``           ours     joints at A that move: (6') in place of (6)
 ``joints_in_base``     3.3      step 2: the same in R_b, and where the cameras stood, (8), (9)
 ``offsets``            3.4      step 3: offsets of the legs, (13), (14)
 ``platform``           3.5      step 4: joints and axes on the platform, passive legs, (16)-(19)

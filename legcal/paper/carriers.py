@@ -105,11 +105,17 @@ def linear_motion(
     right = np.einsum("ka,kij,kj->ai", B, normal, M).ravel()
     found = np.linalg.solve(F, right).reshape(-1, 3)
     if not actuator.turns:
-        d = found[1] / np.linalg.norm(found[1])
+        size = float(np.linalg.norm(found[1]))
+        if size <= _SAME:
+            return None
+        d = found[1] / size
         return found[0], replace(actuator, axis=d, point=found[0])
     centre, x, y = found
     w = cross(x, y)
-    w /= np.linalg.norm(w)
+    size = float(np.linalg.norm(w))
+    if size <= _SAME * float(x @ x + y @ y):
+        return None
+    w /= size
     # The orthogonal pair of one length that is nearest to x and y
     arm = 0.5 * (x + cross(y, w))
     return centre + arm, replace(actuator, axis=w, point=centre)

@@ -44,6 +44,7 @@ from legcal.paper.nominal import NominalMachine
 
 _WRONG_SCALE = 0.02  # of the motion of a carriage: as wrong as radii may be
 _SURE = 5.0  # standard deviations
+_LEAST = 1e-13  # of the largest information: what is known worse is not known
 _SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
 _MAX_SIGMA_CENTRE = 0.1  # of the distance to the camera
 _MAX_SIGMA_TURN = 1.0  # [rad] of an axis; beyond, nothing is known of it
@@ -621,7 +622,7 @@ def _weighted_carrier(
         J = J[:, kept][..., columns]
         back = np.swapaxes(J, 1, 2) @ weight
         F, right = (back @ J).sum(axis=0), (back @ residual[..., None]).sum(axis=0)[:, 0]
-        C = np.linalg.pinv(F, rcond=1e-14, hermitian=True)
+        C = _covariance_of(F)
         step = np.zeros(CarrierColumns.COUNT)
         step[columns] = -C @ right
         far = np.linalg.norm(step[[0, 1, 2, 7, 8]]) / np.linalg.norm(A, axis=1).mean()
@@ -636,6 +637,15 @@ def _weighted_carrier(
     by_gain[:, :2] = np.einsum("kia,ka->ki", across, carrier.actuator.motion(carrier.A, q).by_gain)
     wrong = _wrong_scale(carrier.actuator, J, weight, residual, C, by_gain[:, kept])
     return replace(carrier, covariance=covariance), float(np.log1p(chi).sum()), wrong
+
+
+def _covariance_of(F: Array) -> Array:
+    """Return the inverse of an information matrix, large where nothing is known."""
+    size = np.sqrt(np.diag(F))
+    size = np.maximum(size, _LEAST * float(size.max()))
+    values, vectors = np.linalg.eigh(F / np.outer(size, size))
+    inverse = (vectors / np.maximum(values, _LEAST * values[-1])) @ vectors.T
+    return np.asarray(inverse / np.outer(size, size))
 
 
 def _wrong_scale(

@@ -206,7 +206,8 @@ def ranks_of_dataset(
 
 def _analysis_of(dataset: Dataset, choices: Choices) -> Analysis:
     """Return the analysis of what a dataset records."""
-    twists = any(name.endswith(".twist") for name in (*choices.free, *choices.priors))
+    chosen = (*choices.free, *choices.priors)
+    twists = any(name.endswith((".twist", ".gain")) for name in chosen)
     return Analysis(recorded_observations(dataset, twists=twists), choices)
 
 

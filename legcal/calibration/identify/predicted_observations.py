@@ -365,7 +365,7 @@ def recorded_observations(
     # names, or all
     dataset: Dataset,
     *,
-    twists: bool = False,  # count the twists of legs among the parameters
+    twists: bool = False,  # count twists of legs and gains of actuators among the parameters
 ) -> PredictedObservations:
     """Return the session of a dataset.
 
