@@ -14,6 +14,7 @@ from legcal.calibration.identify import identifiability
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.identify.predicted_observations import PredictedObservations
 from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.report import RmsMotion
 from legcal.calibration.identify.scale import is_scale_open, scale_sources
 from legcal.calibration.joint_fit import Choices, Prior
 from legcal.errors import NotIdentifiable
@@ -25,6 +26,7 @@ from legcal.machine import (
 )
 from legcal.paper import count_conditions, enough_readings
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
+from legcal.report.identify import _verdict
 
 RANKS = {"hexaglide": 42, "6-rss": 54, "linear-delta": 36, "delta": 42, "3-prs": 21}
 TURNING = ("6-rss", "delta")
@@ -157,6 +159,22 @@ def test_ranks_are_the_published_ones_and_radii_carry_the_scale_of_arms(name: st
         assert not is_scale_open(Analysis(session(name), known))
         radius = Choices(priors={"leg1.radius.rod": Prior(0.008, 1e-5)})
         assert not is_scale_open(Analysis(session(name), radius))
+
+
+def test_the_verdict_names_the_scale_as_the_largest_part_of_the_error() -> None:
+    analysis = Analysis(session("6-rss"))
+    report: Any = SimpleNamespace(
+        identifiable=True,
+        full=analysis.full,
+        staged=analysis.staged,
+        platform_sigma=RmsMotion(1e-4, 1e-3),
+        scale=scale_sources(analysis),
+        conditions=(),
+        notes=(),
+    )
+    text = " ".join(str(line) for line in _verdict(report))
+    assert "With radii alone it is 3.1 mm: the scale is the largest part of it" in text
+    assert "better is leg1.length measured to 0.05 mm, or a calibration board on the base" in text
 
 
 def gained(name: str) -> PredictedObservations:

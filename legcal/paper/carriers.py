@@ -105,17 +105,17 @@ def linear_motion(
     right = np.einsum("ka,kij,kj->ai", B, normal, M).ravel()
     found = np.linalg.solve(F, right).reshape(-1, 3)
     if not actuator.turns:
-        size = float(np.linalg.norm(found[1]))
-        if size <= _SAME:
+        scale = float(np.linalg.norm(found[1]))
+        if scale <= _SAME:
             return None
-        d = found[1] / size
+        d = found[1] / scale
         return found[0], replace(actuator, axis=d, point=found[0])
     centre, x, y = found
     w = cross(x, y)
-    size = float(np.linalg.norm(w))
-    if size <= _SAME * float(x @ x + y @ y):
+    area = float(np.linalg.norm(w))
+    if area <= _SAME * float(x @ x + y @ y):
         return None
-    w /= size
+    w /= area
     # The orthogonal pair of one length that is nearest to x and y
     arm = 0.5 * (x + cross(y, w))
     return centre + arm, replace(actuator, axis=w, point=centre)

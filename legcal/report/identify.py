@@ -169,8 +169,8 @@ def _scale(report: Identifiability) -> list[str | RenderableType]:
         motion = source.platform_sigma
         rows.append((source.assumed, scale, "" if motion is None else f"{1e3 * motion.dX_m:.2g}"))
     return [
-        "Readings of arms carry no length: the scale of the machine is that of the radii, unless "
-        "a length is measured or a board is seen.",
+        "Readings carry no length here: the scale of the machine is that of the radii, unless "
+        "something else fixes it.",
         table("what fixes the scale", ">sigma of it", ">platform [mm]", rows=rows),
     ]
 
@@ -254,12 +254,13 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
             "at both ends of a leg."
         )
         lines.append(Text(expected, style="dim"))
-        radii = next((s for s in report.scale if s.source == "radii"), None)
-        if radii is not None and radii.platform_sigma is not None:
-            lines.append(
-                f"With radii alone it is {_two_digits(1e3 * radii.platform_sigma.dX_m)} mm: the "
-                "scale is the largest part of it; calibrate with a measured length or a board."
-            )
+        ways = [s.assumed for s in report.scale if s.sigma is not None and s.source != "radii"]
+        for radii in (s.platform_sigma for s in report.scale if s.source == "radii"):
+            if radii is not None:
+                lines.append(
+                    f"With radii alone it is {_two_digits(1e3 * radii.dX_m)} mm: the scale is the "
+                    f"largest part of it; better is {', or '.join(ways)}."
+                )
     weak = (*report.staged.weak, *report.full.weak)
     if any(direction.dX_m is not None and not direction.harmless for direction in weak):
         hidden = "The platform error of a direction is that for 1 mm in its largest component."
