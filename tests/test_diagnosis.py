@@ -164,14 +164,17 @@ def test_given_outlines_name_a_mistake_as_photographs_do(
     assert ("To tell these apart" in found.sentence) == bool(found.same_as)
 
 
-def _mirrored(d: Dataset, v: int) -> Dataset:
-    """Mirror the outlines of a view, of all for -1."""
+def _mirrored(d: Dataset, v: int, only: slice = slice(None)) -> Dataset:
+    """Mirror the outlines of some images of a view, of all views for -1."""
     outlines, camera = d.observations, d.measurements.views[0].camera
     assert outlines is not None
-    chosen = (d.measurements.view[outlines.row] == v) | (v < 0)
-    h = np.where(chosen[:, None], outlines.h * [-1.0, 1.0, 1.0], outlines.h)
-    ends = outlines.ends.copy()
-    ends[chosen, :, 0] = 2.0 * camera.K[0, 2] - ends[chosen, :, 0]
+    rows = np.flatnonzero((d.measurements.view == v) | (v < 0))[only]
+    chosen = np.isin(outlines.row, rows)
+    middle = 0.5 * (camera.width - 1.0)
+    h, ends = outlines.h.copy(), outlines.ends.copy()
+    h[chosen, 2] += 2.0 * h[chosen, 0] * (middle - camera.K[0, 2]) / camera.K[0, 0]
+    h[chosen, 0] *= -1.0
+    ends[chosen, :, 0] = 2.0 * middle - ends[chosen, :, 0]
     return replace(d, observations=replace(outlines, h=h, ends=ends))
 
 
@@ -209,6 +212,16 @@ def test_mirrored_outlines_of_one_view_lose_to_no_mistake_of_all_views(
     found = _diagnosed(d, {"columns exchanged", "images mirrored"}, monkeypatch)
     assert found.what == "the outlines of view c2 look mirrored"
     assert (found.after, found.same_as) == (14, ())
+
+
+def test_single_images_that_are_mirrored_are_named(
+    outlines: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    d = _mirrored(outlines, 1, slice(3))
+    found = _diagnosed(d, {"tube and rod exchanged"}, monkeypatch)
+    name = row_names(d.measurements)[int(np.flatnonzero(d.measurements.view == 1)[0])]
+    assert found.what == f"the outlines {name} and 2 more of view c2 look mirrored"
+    assert found.after > found.before
 
 
 def test_a_diagnosis_names_each_kind_of_mistake_that_images_do_not_tell_from_it(

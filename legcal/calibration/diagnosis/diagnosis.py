@@ -378,7 +378,8 @@ class _Judge:
         if what.of_few:  # too few for signed ranks, and chosen by what they gain
             some, before = one.at(what.of_few), self.own.at(what.of_few)
             is_plain = float((some.share - before.share).mean()) >= _PLAIN_GAIN
-            return is_plain and one.images >= self.own.images + MIN_IMAGES
+            are_enough = some.images >= before.images + MIN_IMAGES
+            return is_plain and are_enough and one.images > self.own.images
         if _explains(one, self.own):
             return True
         gain = _signed_ranks(one.share - self.own.share)
