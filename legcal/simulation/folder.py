@@ -88,7 +88,7 @@ def write_session(
         "legcal_dataset": 1,
         "mechanism": model,
         "measurements": "measurements.csv",
-        "encoder_sigma": m.sigma_q,
+        "encoder_sigma": dict(m.sigma_by_joint) or m.sigma_q,
         "views": views,
     }
     if board is not None:

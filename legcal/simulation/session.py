@@ -15,7 +15,8 @@ import numpy as np
 
 from legcal.data import Corners, Measurements, Outlines, View
 from legcal.errors import NotVisible, UsageError
-from legcal.machine import Configurations, Machine
+from legcal.geometry import distance_to_line
+from legcal.machine import Configurations, Leg, Machine
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import chosen_board, placed_at
 from legcal.simulation.cameras import (
@@ -271,6 +272,17 @@ def _encoding(views: Sequence[Viewpoint], gamma: float, given: bool) -> tuple[Vi
     return tuple(replace(view, camera=cameras[id(view.camera)]) for view in views)
 
 
+def _reading_error(leg: Leg, size: float) -> float:
+    """Return an error of a reading [m] as that of a leg, where its motor turns [rad].
+
+    It is then the angle by which the joint at A moves as far.
+    """
+    actuator = leg.actuator
+    if actuator is None or not actuator.turns:
+        return size
+    return size / float(distance_to_line(leg.A, actuator.axis, actuator.point))
+
+
 def _recorded(
     truth: Machine,
     poses: Configurations,
@@ -292,11 +304,13 @@ def _recorded(
         shown = tuple(legs[j] for j in images.seen_in_view(v, least))
         used = shown if 0 < len(shown) < len(legs) else None
         views.append(View(view.name, view.camera, *((T, used) if hints else (None, None))))
-    q, size = poses.readings, settings.readings.size
+    q = poses.readings
+    size = np.array([_reading_error(leg, settings.readings.size) for leg in truth.legs])
     if settings.readings.distribution is Distribution.UNIFORM:
-        q = q + rngs["readings"].uniform(-size, size, q.shape)
+        errors = rngs["readings"].uniform(-size, size, q.shape)
     else:
-        q = q + size * rngs["readings"].normal(size=q.shape)
+        errors = size * rngs["readings"].normal(size=q.shape)
+    q = q + errors[:, list(truth.reads)]
     names = [""] * len(images)
     if photographs:
         repeated, suffix = int(images.repeat.max()) > 0, settings.appearance.pipeline.suffix
@@ -312,6 +326,14 @@ def _recorded(
         pose=pose.astype(np.intp),
         q=q[images.pose],
         sigma_q=max(settings.encoder_sigma, _MIN_SIGMA_Q),
+        sigma_by_joint={
+            str(truth.legs[j].prismatic): max(
+                _reading_error(truth.legs[j], settings.encoder_sigma), _MIN_SIGMA_Q
+            )
+            for j in truth.motors
+        }
+        if any(a.turns for a in truth.actuators)
+        else {},
         pose_labels=tuple(labels[p] for p in seen),
     )
 
