@@ -18,6 +18,8 @@ from legcal.calibration.result import Calibration
 from legcal.data import Dataset
 from legcal.errors import UsageError
 from legcal.files import RESULT, in_the_way, path_problem, read_json
+from legcal.geometry import components
+from legcal.machine import ends_at_poses
 from legcal.progress import Report
 from legcal.workers import Run
 
@@ -77,9 +79,10 @@ def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
     """Return the outlines of a fit, and where it has the legs and cameras, as a detection."""
     machine, measurements = dataset.machine, dataset.measurements
     T_base_Rb = machine.T_base_Rb
-    A = T_base_Rb.apply(np.array([leg.A for leg in solution.legs]))
-    B_Re = np.array([leg.B for leg in solution.legs])
-    B = np.array([(T_base_Rb * T).apply(B_Re) for T in solution.T_Rb_Re])
+    A, B = (
+        T_base_Rb.apply(ends.reshape(-1, 3)).reshape(ends.shape)
+        for ends in ends_at_poses(solution.legs, *components(solution.T_Rb_Re))
+    )
     cylinders = tuple(
         tuple(replace(c, radius=solution.radii.get((j, c.link), c.radius)) for c in leg.cylinders)
         for j, leg in enumerate(machine.legs)
@@ -87,7 +90,7 @@ def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
     return Detection(
         dataset=dataset,
         outlines=solution.outlines,
-        A_base=np.broadcast_to(A, (measurements.n_rows, *A.shape)),
+        A_base=A[measurements.pose],
         B_base=B[measurements.pose],
         cylinders=cylinders,
         T_base_camera=tuple(T_base_Rb * T.inv() for T in solution.T_camera_Rb),

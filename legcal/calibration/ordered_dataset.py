@@ -42,6 +42,7 @@ from legcal.machine import (
     platform_in_base,
     platforms_in_base,
     solve_poses,
+    vectors_A_to_B,
 )
 from legcal.paper import Criteria, Transformation
 from legcal.perception import CandidatePairs, Photographs
@@ -228,8 +229,8 @@ def nominal_poses(
         nearest, residual[off] = _least_squares(machine, q[off], [T[k] for k in off])
         for k, pose in zip(off, nearest, strict=True):
             T[k] = pose
-    B = machine.home.apply(machine.B_platform)
-    most = MAX_NOMINAL_RESIDUAL * float(np.linalg.norm(B - machine.A_base, axis=1).mean())
+    at_home = vectors_A_to_B(machine, machine.home)
+    most = MAX_NOMINAL_RESIDUAL * float(np.linalg.norm(at_home, axis=1).mean())
     contradicting = _contradictions(machine, measurements, T)
     first = measurements.first_rows.tolist()
     wrong = {first[k]: what for k, what in contradicting.items()}

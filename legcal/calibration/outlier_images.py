@@ -28,7 +28,7 @@ from legcal.estimation import (
     normal_equations,
 )
 from legcal.geometry import Array, IntArray, cross
-from legcal.machine import Machine
+from legcal.machine import Machine, actuator_index, joints_at
 
 MIN_REJECTED = 0.34  # share of an image's outlines that the fit rejected
 MIN_REJECTED_LEGS = 2  # of which it rejected all outlines
@@ -107,8 +107,18 @@ def _shown(
     if n + len(held) < MIN_OUTLINES or (not held and len(np.unique(legs)) < MIN_LEGS):
         return None
     T_camera_Rb = solution.T_camera_Rb[int(measurements.view[row])]
-    A = np.array([leg.A for leg in solution.legs])
     B = np.array([leg.B for leg in solution.legs])
+    on = actuator_index(solution.legs)
+    read = [on.index(a) for a in range(max(on) + 1)]
+    q_row = measurements.q[row : row + 1]
+    A = joints_at(solution.legs, q_row[:, read])[0]
+    T_here = solution.T_Rb_Re[int(measurements.pose[row])]
+    at, slope = np.zeros(len(B)), np.ones(len(B))
+    for j, leg in enumerate(solution.legs):
+        if leg.actuator is not None:  # the reading at which the rod would have its length
+            by_q = leg.actuator.motion(leg.A, q_row[:, j]).by_q[0]
+            AB = T_here.apply(leg.B) - A[j]
+            at[j], slope[j] = q_row[0, j], float(by_q @ AB) / float(np.linalg.norm(AB))
     radius = np.array([solution.radii[int(o.leg[i]), o.part[i]] for i in chosen.tolist()])
     signed = np.where(o.edge[chosen] == 1, radius, -radius)
     q0 = np.array([leg.q0 for leg in solution.legs])
@@ -125,8 +135,8 @@ def _shown(
         arm = B @ state.pose.R[0].T
         AB = arm + state.pose.t - A
         length = np.linalg.norm(AB, axis=1)
-        u = sign[:, None] * AB / length[:, None]
-        return sign * (length - q0), np.concatenate([cross(arm, u), u], axis=1)
+        u = (sign / slope)[:, None] * AB / length[:, None]
+        return at + sign * (length - q0) / slope, np.concatenate([cross(arm, u), u], axis=1)
 
     def differences(state: _State) -> Residuals:
         q, J = readings(state)

@@ -70,8 +70,8 @@ from legcal.data import (
 )
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.files import check_destination, output_path
-from legcal.geometry import IntArray
-from legcal.machine import Machine
+from legcal.geometry import IntArray, components
+from legcal.machine import Machine, ends_at_poses
 from legcal.paper import Criteria, Transformation
 from legcal.perception import (
     MeasuredImages,
@@ -486,16 +486,16 @@ def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
 def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredImages) -> Placement:
     """Return where a fit puts the legs, R_b laid on the nominal one; no camera is placed anew."""
     T_base_Rb = data.machine.T_base_Rb
-    A = T_base_Rb.apply(np.array([leg.A for leg in solution.legs]))
-    B = np.array([leg.B for leg in solution.legs])
-    placed = np.array([(T_base_Rb * T).apply(B) for T in data.poses_by(solution.legs)])
+    A, B = (
+        T_base_Rb.apply(ends.reshape(-1, 3)).reshape(ends.shape)
+        for ends in ends_at_poses(solution.legs, *components(data.poses_by(solution.legs)))
+    )
     pose = data.measurements.pose
     cameras = tuple(
         None if known is None else T_base_Rb * T.inv()
         for known, T in zip(seen.placement.T_base_camera, solution.T_camera_Rb, strict=True)
     )
-    A_base = np.broadcast_to(A, placed.shape)[pose]
-    return Placement.of_fit(A_base, placed[pose], cameras, seen.blur)
+    return Placement.of_fit(A[pose], B[pose], cameras, seen.blur)
 
 
 def _not_found_again(first: Estimate, again: Estimate) -> list[str]:

@@ -45,6 +45,7 @@ from legcal.machine import (
     parametrization_of,
     pose_sensitivity,
     vector_of,
+    vectors_A_to_B,
 )
 from legcal.progress import Progress, shown_progress
 from legcal.vision import shared_cameras
@@ -257,7 +258,7 @@ class _EarlierEstimate:
         legs, found = geometries(machine), parametrization_of(machine, twists=True)
         values = vector_of(found, legs, legs)
         chosen = [found.names.index(name) for name in earlier.names]
-        at_home = machine.home.apply(machine.B_platform) - machine.A_base
+        at_home = vectors_A_to_B(machine, machine.home)
         held_sigma = PRIOR_SIGMA * float(np.mean(np.linalg.norm(at_home, axis=1)))
         sigma = np.array([held_sigma if found.units[i] == "m" else PRIOR_SIGMA for i in chosen])
         covariance = earlier.covariance + held_sigma**2 * earlier.held.T @ earlier.held

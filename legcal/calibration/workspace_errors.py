@@ -23,11 +23,11 @@ from legcal.calibration.result import Calibration
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, BoolArray, motions_of
 from legcal.machine import (
-    LegKind,
     Machine,
     geometries,
     platforms_in_base,
     pose_differences,
+    readings_at_poses,
     workspace,
 )
 
@@ -82,9 +82,7 @@ def platform_map(calibration: Calibration) -> PlatformMap | None:
     places = np.stack([grid.ravel() for grid in grids[::-1]], axis=1)
     R = np.broadcast_to(machine.home.rotation.as_matrix(), (len(places), 3, 3))
     poses = list(motions_of(R, places))
-    ends = machine.home.rotation.apply(machine.B_platform) + places[:, None]
-    lengths = np.linalg.norm(ends - machine.A_base, axis=2)
-    readings = machine.sign * (lengths - machine.q0)
+    readings = readings_at_poses(machine, np.concatenate([R, places[..., None]], axis=2))
     inside = _inside(machine, readings)
     every = [*drawn, *(poses[k] for k in np.flatnonzero(inside))]
     found = _errors(calibration, np.concatenate([q, readings[inside]]), every)
@@ -116,7 +114,7 @@ def _inside(machine: Machine, q: Array) -> BoolArray:
     """Return which rows of readings (n, n_legs) are within the travels."""
     inside = np.ones(len(q), dtype=np.bool_)
     for j, leg in enumerate(machine.legs):
-        if leg.kind is LegKind.ACTUATED:
+        if leg.is_motor:
             inside &= (q[:, j] >= leg.travel[0]) & (q[:, j] <= leg.travel[1])
     return inside
 

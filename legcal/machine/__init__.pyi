@@ -129,6 +129,8 @@ from .parameters import vector_of as vector_of
 from .parameters import with_numbers as with_numbers
 from .rods import actuator_index as actuator_index
 from .rods import actuators_of as actuators_of
+from .rods import ends_at_poses as ends_at_poses
+from .rods import joints_at as joints_at
 from .rods import rod_mode as rod_mode
 from .solver import poses_after as poses_after
 from .solver import solve as solve

@@ -37,6 +37,24 @@ def joints_at(legs: Sequence[Leg], q: Array) -> Array:
     return A
 
 
+def ends_at_poses(
+    legs: Sequence[Leg], R: Array, t: Array, q: Array | None = None
+) -> tuple[Array, Array]:
+    """Return A and B of legs (k, n_legs, 3) [m] in the frame of the base at poses R, t.
+
+    Joints at A that move are where readings q (k, n_actuators) have them, or without these where
+    the first rod on their actuator reaches the platform.
+    """
+    B = np.stack([R @ leg.B + t for leg in legs], axis=1)
+    if q is None:
+        q, known = np.zeros((len(t), len(actuators_of(legs)))), set[int]()
+        for j, (leg, a) in enumerate(zip(legs, actuator_index(legs), strict=True)):
+            if a >= 0 and a not in known:
+                known.add(a)
+                q[:, a] = reading_of_rod(leg, B[:, j])
+    return joints_at(legs, q), B
+
+
 def reading_of_rod(leg: Leg, B: Array, near: Array | None = None) -> Array:
     """Return the readings (k,) at which a rod reaches points B (k, 3) in the frame of the base.
 

@@ -30,7 +30,7 @@ from legcal.calibration.documents import DiagnosisBlock
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.errors import LegcalError
 from legcal.geometry import Array, IntArray
-from legcal.machine import Machine
+from legcal.machine import Machine, vectors_A_to_B
 from legcal.perception import (
     Agreement,
     Assumption,
@@ -471,7 +471,8 @@ def symmetries(machine: Machine) -> list[Array]:
     Two legs of a machine may come to lie on any two others: four points on four define a motion.
     """
     B = machine.home.apply(machine.B_platform)
-    legs = np.stack([machine.A_base, B], axis=1)  # (n_legs, 2, 3)
+    A = B - vectors_A_to_B(machine, machine.home)
+    legs = np.stack([A, B], axis=1)  # (n_legs, 2, 3)
     size = float(np.std(legs.reshape(-1, 3), axis=0).max())
     found = list[Array]()
     for j, k in permutations(range(len(legs)), 2):

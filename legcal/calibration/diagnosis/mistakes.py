@@ -14,7 +14,7 @@ from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.data import INCH, inverse, readings_of_lengths, row_names
 from legcal.files import LENGTH
 from legcal.geometry import Array, IntArray
-from legcal.machine import Leg, LegKind, Machine, follow_poses, readings_at
+from legcal.machine import Leg, Machine, follow_poses, readings_at
 from legcal.perception import LEFT_RIGHT, UPSIDE_DOWN
 
 _STEP = 1.0 / 16.0  # of the way from home to readings, at least
@@ -62,7 +62,7 @@ class Assumed:
         found[part < 1.0] = np.nan
         B = np.full((len(self.q), machine.n_legs, 3), np.nan)
         B[chosen] = found
-        return np.broadcast_to(machine.A_base, B.shape), B
+        return machine.A_at(self.q[:, list(machine.reads)]), B
 
     def is_as(self, other: Assumed, rows: Sequence[int]) -> bool:
         """Whether nothing differs from another in some rows."""
@@ -79,7 +79,7 @@ class Assumed:
         return all(
             bool(leg.in_travel(self.q[:, j]).all())
             for j, leg in enumerate(self.machine.legs)
-            if leg.kind is LegKind.ACTUATED
+            if leg.is_motor
         )
 
 
@@ -127,7 +127,7 @@ def mistakes(data: OrderedDataset) -> list[Mistake]:
 def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
     """Yield readings of other legs: exchanged, reversed, from another leg on."""
     order = inverse(data.order.legs)  # legs as the files have them
-    motors = [j for j in order.tolist() if given.machine.legs[j].kind is LegKind.ACTUATED]
+    motors = [j for j in order.tolist() if j in given.machine.motors]
     names = [given.machine.legs[j].prismatic for j in motors]
 
     def with_columns(source: Sequence[int]) -> Assumed:
@@ -252,7 +252,7 @@ def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
 
 def _of_encoders(given: Assumed) -> Iterator[Mistake]:
     """Yield readings of another direction, zero or unit, of one encoder or of all."""
-    motors = [j for j, leg in enumerate(given.machine.legs) if leg.kind is LegKind.ACTUATED]
+    motors = list(given.machine.motors)
     legs = [given.machine.legs[j] for j in motors]
 
     def with_readings(change: Array, which: Sequence[int]) -> Assumed:
