@@ -166,7 +166,10 @@ def simulate_session(
     ]
     if planned is not None:
         poses_of = list(planned.poses_of)
-    images = take_images(truth.legs, posed_machines, views, poses_of, settings.images, progress)
+    images = take_images(
+        truth.legs, posed_machines, views, poses_of, settings.images, progress,
+        each=planned is None or not planned.hand,
+    )  # fmt: skip
     rows = list(range(len(images)))
     if settings.level is not Level.PHOTOGRAPHS:
         rows = [row for row in rows if images.seen(row)]

@@ -308,6 +308,8 @@ def take_images(
     poses_of: Sequence[Sequence[int]],  # poses that each view sees
     n_images: int,  # of each pose in each view
     progress: Report = no_progress,
+    *,
+    each: bool = True,  # whether each view must show a leg, or one of them
 ) -> Images:
     """Return the images that cameras take of a machine in its poses."""
     rows: list[tuple[int, int, int]] = []
@@ -324,7 +326,7 @@ def take_images(
             rows += [(v, p, k) for k in range(n_images)]
             shown += [view] * n_images
     progress("Views", len(viewpoints), len(viewpoints))
-    if problems:
+    if problems and (each or len(problems) == len(viewpoints)):
         raise NotVisible(problems)
     view_of_row, pose_of_row, repeat_of_row = np.array(rows, dtype=np.intp).T
     return Images(view_of_row, pose_of_row, repeat_of_row, tuple(shown))
