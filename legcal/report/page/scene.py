@@ -29,7 +29,9 @@ MAX_POSES = 60  # of the slider
 MAX_CAMERAS = 60
 _ROOM = 0.8  # of the size of the machine: about it
 _RING = 0.06  # of it: the median ellipsoid
-_EYE = np.array([1.3, -1.5, 0.8])  # where it is looked at from, in its size
+_EYE = np.array([1.3, -1.5, 0.8])  # where it is looked at from, in its size, at least
+_FURTHER = 2.0  # times that, at most, to see cameras as well
+_SLOPE = 0.4  # of what is seen, to the line of sight
 _N_RING = 20  # points of a ring
 _GREY, _BLUE, _AMBER, _GREEN = "#9aa1ab", "#1f5fa8", "#b26a00", "#1e7d46"
 
@@ -123,6 +125,12 @@ def _view(machine: Array, cameras: Array, size: float) -> dict[str, Any]:
     middle = 0.5 * (machine.min(axis=0) + machine.max(axis=0))
     centre = (middle - 0.5 * (low + high)) / size  # scenes measure from the middle of the ranges
 
+    off = (cameras - middle) / size
+    towards = off @ (_EYE / np.linalg.norm(_EYE))
+    aside = np.sqrt(np.maximum(np.sum(off**2, axis=1) - towards**2, 0.0))
+    needed = (towards + aside / _SLOPE).max(initial=0.0) / np.linalg.norm(_EYE)
+    eye = centre + float(np.clip(needed, 1.0, _FURTHER)) * _EYE
+
     def place(xyz: Array) -> dict[str, float]:
         return dict(zip("xyz", np.round(xyz, 4).tolist(), strict=True))
 
@@ -131,7 +139,7 @@ def _view(machine: Array, cameras: Array, size: float) -> dict[str, Any]:
         "look": {
             "aspectmode": "manual",
             "aspectratio": place((high - low) / size),
-            "camera": {"center": place(centre), "eye": place(centre + _EYE)},
+            "camera": {"center": place(centre), "eye": place(eye)},
         },
     }
 
