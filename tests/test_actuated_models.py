@@ -9,7 +9,8 @@ import yaml
 from machines import ROOT, check_same, read_family, read_table
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import LegcalError, ModelError, UsageError
+from legcal.errors import LegcalError, ModelError, OutOfClass, UsageError
+from legcal.exports import Subject, export
 from legcal.geometry import Array
 from legcal.machine import (
     Machine,
@@ -282,3 +283,24 @@ def test_what_files_of_motors_cannot_be(
     with pytest.raises(LegcalError) as caught:
         load_mechanism(tmp_path / "delta.yaml")
     assert all(word in str(caught.value) for word in named), str(caught.value)
+
+
+@pytest.mark.parametrize(("to", "suffix"), [("urdf", "urdf"), ("mjcf", "xml")])
+def test_exported_robots_are_the_same_machine(to: str, suffix: str, tmp_path: Path) -> None:
+    machine = load_mechanism("delta")
+    export(Subject(machine, "delta"), to, tmp_path / f"delta.{suffix}")
+    back = load_mechanism(tmp_path / f"delta.{suffix}")
+    assert sorted(back.motor_names) == sorted(machine.motor_names)
+    q = dict(zip(machine.motor_names, np.radians([5.0, 40.0, 25.0]), strict=True))
+    poses = [
+        forward_kinematics(m, np.array([q[leg.prismatic or ""] for leg in m.legs]))
+        for m in (machine, back)
+    ]
+    np.testing.assert_allclose(poses[1].as_matrix(), poses[0].as_matrix(), atol=1e-9)
+
+
+def test_source_code_of_kinematics_needs_joints_that_stay(tmp_path: Path) -> None:
+    for to in ("python", "c", "matlab"):
+        with pytest.raises(OutOfClass, match=r"the motor 'arm1' moves joints at A"):
+            export(Subject(load_mechanism("delta"), "delta"), to, tmp_path / "code.m")
+    assert not list(tmp_path.iterdir())

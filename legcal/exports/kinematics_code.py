@@ -35,6 +35,11 @@ _ALONG_PLATFORM = (EquationKind.DIRECTION_1, EquationKind.DIRECTION_2)
 def kinematics_refusal(subject: Subject) -> str | None:
     """Return why a machine has no kinematics that Newton's method follows, or None."""
     machine = subject.machine
+    if machine.actuators:
+        return (
+            f"found that the motor '{machine.actuators[0].joint}' moves joints at A of rods, "
+            "needed joints that stay in the base"
+        )
     if not machine.is_determined:
         return f"found that {machine.undetermined}, needed readings that give the pose"
     if machine.is_redundant:

@@ -18,7 +18,7 @@ from legcal.exports.identifiers import comment
 from legcal.exports.robot_files import STUB_INERTIA, STUB_MASS
 from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject
 from legcal.geometry import Array
-from legcal.machine import LegKind, Machine, UrdfJoint, origins_of, parse_robot
+from legcal.machine import Machine, UrdfJoint, origins_of, parse_robot
 from legcal.version import __version__
 
 WORLD = "world"
@@ -70,6 +70,7 @@ class _Writer:
         if WORLD in self._name and urdf.root != WORLD:
             self._name[WORLD] = _unused(WORLD, set(urdf.links))
         self._joints = set(urdf.joints)
+        self._motors = {machine.legs[j].prismatic for j in machine.motors}
         self._body: dict[str, etree._Element] = {urdf.root: self._world}
 
     def model(self, name: str) -> etree._Element:
@@ -98,10 +99,9 @@ class _Writer:
             tag = "connect" if closure.kind == "3d" else "weld"
             etree.SubElement(equality, tag, {"name": f"loop_{i}", "solref": STIFF, **sites})
         motors = etree.SubElement(mujoco, "actuator")
-        for leg in machine.legs:
-            if leg.kind is LegKind.ACTUATED:
-                slider = str(leg.prismatic)
-                etree.SubElement(motors, "position", name=slider, joint=slider, kp=_text(GAIN))
+        for j in machine.motors:
+            motor = str(machine.legs[j].prismatic)
+            etree.SubElement(motors, "position", name=motor, joint=motor, kp=_text(GAIN))
         return mujoco
 
     def _add(self, joint: UrdfJoint) -> None:
@@ -130,7 +130,7 @@ class _Writer:
                 value = np.arctan2(home[chain.q_index(joint.name) + 1], value)
             is_slide = joint.type == "prismatic"
             element = _joint(body, joint.name, "slide" if is_slide else "hinge", joint.axis, value)
-            if joint.limits is not None and is_slide:
+            if joint.limits is not None and (is_slide or joint.name in self._motors):
                 element.set("range", _text(*joint.limits))
         if joint.moves:
             self._inertia(link, body)

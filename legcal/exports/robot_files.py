@@ -16,7 +16,7 @@ from lxml import etree
 from legcal.exports.identifiers import identifier
 from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject
 from legcal.files import motion_to_xyz_quat
-from legcal.machine import LegKind, Machine
+from legcal.machine import Machine
 from legcal.version import __version__
 
 STUB_MASS, STUB_INERTIA = 1.0, 1e-3  # [kg], [kg m^2] about all axes of the link
@@ -62,8 +62,8 @@ def urdf_text(machine: Machine, *, inertia: bool) -> tuple[bytes, tuple[str, ...
             link = frame if frame in machine.urdf.links else joints[frame].child
             etree.SubElement(loop, tag, link=link)
     named = {e.get("name") for e in robot.iterfind("transmission/joint")}
-    for leg in machine.legs:
-        if leg.kind is LegKind.ACTUATED and leg.prismatic not in named:
+    for leg in (machine.legs[j] for j in machine.motors):
+        if leg.prismatic not in named:
             motor = etree.SubElement(robot, "transmission", name=f"{leg.prismatic}_transmission")
             etree.SubElement(motor, "type").text = "transmission_interface/SimpleTransmission"
             etree.SubElement(motor, "joint", name=str(leg.prismatic))
@@ -116,7 +116,7 @@ def _calibration(subject: Subject) -> dict[str, object]:
         "legs": {
             leg.name: {
                 "joint": leg.prismatic,
-                "is_motor": leg.kind is LegKind.ACTUATED,
+                "is_motor": leg.is_motor,
                 "base_joint": leg.A.tolist(),
                 "platform_joint": leg.B.tolist(),
                 "offset": float(leg.q0),
@@ -125,6 +125,8 @@ def _calibration(subject: Subject) -> dict[str, object]:
             for leg in machine.legs
         },
     }
+    if machine.actuators:  # which carry the joints of their legs: these are at reading 0
+        found["actuators"] = {a.joint: a.document() for a in machine.actuators}
     if subject.result is not None:
         result = subject.result.document
         known = {row.name: row for row in result.parameters}

@@ -24,6 +24,7 @@ from legcal.machine import (
     PLATFORM_COLOUR,
     Machine,
     around,
+    vectors_A_to_B,
 )
 
 _SIDE, _EDGE, _HEAD, _LINE = 420.0, 46.0, 44.0, 15.0  # of a panel, its margin, title, text [px]
@@ -51,7 +52,8 @@ MACHINE_PICTURE = _Drawing(
 def draw_machine(machine: Machine) -> str:
     """Return a machine as SVG: from above (x to the right, y up) and from the side (z up)."""
     views = machine.sketch.panels
-    points = np.concatenate([machine.A_base, machine.home.apply(machine.B_platform)])
+    B = machine.home.apply(machine.B_platform)
+    points = np.concatenate([B - vectors_A_to_B(machine, machine.home), B])
     low, high = points.min(axis=0), points.max(axis=0)
     scale = (_SIDE - 2 * _EDGE) / max(float((high - low).max()), 1e-6)
     width, height = _SIDE * len(views), _HEAD + _SIDE + _LINE * (2 + (machine.n_legs + 3) // 4)
