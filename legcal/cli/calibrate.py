@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -78,6 +79,16 @@ def calibrate(
         typer.Option(
             metavar="NAME=VALUE+-SIGMA",
             help="What is known already: leg1.length=0.4200+-0.0001, or 420+-0.1mm.",
+            rich_help_panel=_PARAMETERS,
+        ),
+    ] = None,
+    length: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="JOINT:JOINT=VALUE+-SIGMA",
+            help="A distance of two joints that was measured by hand: "
+            "leg1.base:leg3.base=400+-0.05mm, or both ends of a rod. Motors that turn carry no "
+            "length: one fixes the scale.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None,
@@ -190,6 +201,7 @@ def calibrate(
     if check is not None:
         others = {
             "--prior": prior,
+            "--length": length,
             "--fix": fix,
             "--free": free,
             "--holdout": holdout,
@@ -233,7 +245,7 @@ def calibrate(
         "criteria": criteria,
         "transformation": transformation,
         "use_cache": not fresh,
-        "priors": prior or (),
+        "priors": [*(prior or ()), *_lengths(length or ())],
         "fixed": fix or (),
         "free": free or (),
         "holdout": holdout,
@@ -338,6 +350,20 @@ def _page_of_check(output: Path) -> Path:
     page = output / calibration.REPORT_NAME
     report.PAGE.check_place(page)
     return page
+
+
+def _lengths(stated: Sequence[str]) -> list[str]:
+    """Return measured lengths, checked to be between two joints."""
+    from legcal.files import describe
+
+    for text in stated:
+        if ":" not in text.partition("=")[0]:
+            raise UsageError(
+                f"The length {describe(text)} could not be used: found no two joints, needed two "
+                "with a colon between them; write leg1.base:leg3.base=400+-0.05mm, or both ends "
+                "of a rod, leg1.base:leg1.platform."
+            )
+    return list(stated)
 
 
 def _check(

@@ -10,8 +10,10 @@ from typing import Annotated, Any
 from pydantic import (
     AfterValidator,
     BeforeValidator,
+    Discriminator,
     Field,
     Strict,
+    Tag,
     WithJsonSchema,
     field_validator,
 )
@@ -69,6 +71,9 @@ class ParametersEntry(FileSchema):
     priors: dict[
         Name, Annotated[Quantity, BeforeValidator(read_prior), WithJsonSchema(PRIOR_SCHEMA)]
     ] = Field(default_factory=dict)
+    lengths: dict[
+        Name, Annotated[Quantity, BeforeValidator(read_prior), WithJsonSchema(PRIOR_SCHEMA)]
+    ] = Field(default_factory=dict)  # between two joints: LEG.base:LEG.base
     fixed: list[Annotated[Name, AfterValidator(_can_be_fixed)]] = Field(default_factory=list)
     free: list[Name] = Field(default_factory=list)
 
@@ -79,6 +84,10 @@ class ParametersEntry(FileSchema):
             *(
                 read_override("prior", name, f"{block}.priors.{name}", stated, in_file=True)
                 for name, stated in self.priors.items()
+            ),
+            *(
+                read_override("prior", name, f"{block}.lengths.{name}", stated, in_file=True)
+                for name, stated in self.lengths.items()
             ),
             *(
                 read_override("fixed", text, f"{block}.fixed '{text}'", in_file=True)
@@ -97,12 +106,19 @@ class DatasetEntry(FileSchema):
     legcal_dataset: Version
     mechanism: str
     measurements: str
-    encoder_sigma: (
+    encoder_sigma: Annotated[
         Annotated[
-            Number, Field(gt=0.0, json_schema_extra=dict(zip(_BOUNDS, ENCODER_SIGMAS, strict=True)))
+            Annotated[
+                Number,
+                Field(gt=0.0, json_schema_extra=dict(zip(_BOUNDS, ENCODER_SIGMAS, strict=True))),
+            ],
+            Tag("[number]"),
         ]
-        | Annotated[dict[str, Annotated[Number, Field(gt=0.0)]], Field(min_length=1)]
-    )
+        | Annotated[
+            dict[str, Annotated[Number, Field(gt=0.0)]], Field(min_length=1), Tag("[by joint]")
+        ],
+        Discriminator(lambda given: "[by joint]" if isinstance(given, dict) else "[number]"),
+    ]
     views: Annotated[dict[Name, ViewEntry], Field(min_length=1)]
     parameters: ParametersEntry = Field(default_factory=ParametersEntry)
     board: dict[str, Any] | list[Any] | None = None  # read by their kinds

@@ -389,7 +389,7 @@ def closest(word: str, known: Iterable[str]) -> str:
 
 def _sentence(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: str) -> str:
     """Return what pydantic found wrong as one sentence."""
-    loc = [step for step in error["loc"] if step != "[key]"]
+    loc = [step for step in error["loc"] if not str(step).startswith("[")]  # key, or kind of value
     place = ".".join([*[prefix] * bool(prefix), *map(str, loc)]) or "the file"
     context = error.get("ctx", {})
     match error["type"]:

@@ -230,7 +230,8 @@ def check_identifiable(
     if analysis.predicted.actuators and is_scale_open(analysis):
         raise NotIdentifiable(
             f"{dataset.folder}: the parameters cannot be identified: "
-            f"{scale_in_words(scale_sources(analysis))}; state it with --prior."
+            f"{scale_in_words(scale_sources(analysis))}; state a measured length with "
+            "--length, or radii with --prior."
         )
     tied = ties_in_words(dataset.machine)
     notes = [] if tied is None else [tied]

@@ -22,6 +22,7 @@ from legcal.calibration.identify.predicted_observations import (
 )
 from legcal.calibration.identify.report import CameraIntrinsics
 from legcal.calibration.joint_fit import Choices
+from legcal.calibration.joint_fit.parameter_choices import joints_of_length
 from legcal.calibration.joint_fit.variables import RefinementSettings
 from legcal.estimation import (
     Factor,
@@ -34,7 +35,7 @@ from legcal.estimation import (
     marginal_rows,
 )
 from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
-from legcal.machine import EquationKind, freedoms, pose_equations
+from legcal.machine import EquationKind, LegColumns, freedoms, pose_equations
 
 SIGMA_EXACT = 1e-7  # [m]: of what the mechanism itself demands
 INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -141,12 +142,31 @@ def prior_of(predicted: PredictedObservations, choices: Choices) -> GaussianPrio
     return GaussianPrior(known, np.zeros(len(sigma)), values)
 
 
+def length_rows(predicted: PredictedObservations, choices: Choices) -> Array:
+    """Return measured distances of joints by the parameters, whitened, (n, p)."""
+    rows, names = [np.zeros((0, len(predicted.unit)))], predicted.leg_names
+    scatter = predicted.local_to_parameters
+    for name, prior in choices.priors.items():
+        joints = joints_of_length(name)
+        if joints is None:
+            continue
+        (one, side), (other, _) = joints
+        j, k = names.index(one), names.index(other)
+        columns = LegColumns.A if side == "base" else LegColumns.B
+        points = [leg.A if side == "base" else leg.B for leg in predicted.legs]
+        u = points[j] - points[k]
+        u /= np.linalg.norm(u)
+        rows.append((u @ (scatter[j, columns] - scatter[k, columns]) / prior.sigma)[None])
+    return np.concatenate(rows)
+
+
 def problem_of(
     predicted: PredictedObservations,
     images: Array,  # of image_rows
     equations: WhitenedEquations,
     prior: GaussianPrior,
     more: Sequence[tuple[Variables, IntArray, Array]] = (),  # see below
+    lengths: Array | None = None,  # of length_rows
 ) -> tuple[Problem[_Nominal], _Nominal]:
     """Return the problem of a session and the state that it is linearised at.
 
@@ -160,6 +180,8 @@ def problem_of(
     n, m, whole = n_images * n_legs, len(equations.leg), slice(None)
     J = np.concatenate([images[..., n_f:], *(by for _, _, by in more)], axis=3).reshape(n, 4, -1)
     ties = predicted.ties[None] / SIGMA_EXACT
+    if lengths is not None:
+        ties = np.concatenate([ties, lengths[None]], axis=1)
     tied = Residuals.of(np.zeros(ties.shape[:2]), ties)
     shown = Residuals.of(np.zeros((n, 4)), J, images[..., :n_f].reshape(n, 4, n_f))
     on_platform = _platform_board(predicted)

@@ -10,6 +10,7 @@ import numpy as np
 from legcal.calibration.identify.information import (
     WhitenedEquations,
     image_rows,
+    length_rows,
     prior_of,
     problem_of,
     whitened_leg_equations,
@@ -116,7 +117,13 @@ class Analysis:
     def of_cameras(self) -> Array:
         """The joint fit: rows by parameters and cameras, (m, p + 6 n_frames)."""
         return information_rows(
-            *problem_of(self.predicted, self.images, self.equations, self.prior)
+            *problem_of(
+                self.predicted,
+                self.images,
+                self.equations,
+                self.prior,
+                lengths=length_rows(self.predicted, self.choices),
+            )
         )
 
     @cached_property

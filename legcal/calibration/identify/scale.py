@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from legcal.calibration.identify.information import problem_of, radius_rows
+from legcal.calibration.identify.information import length_rows, problem_of, radius_rows
 from legcal.calibration.identify.ranks import Analysis, undetermined
 from legcal.calibration.identify.report import ScaleSource
 from legcal.calibration.joint_fit.variables import RefinementSettings
@@ -101,7 +101,12 @@ def _information(analysis: Analysis, *, common: float | None = None, stated: boo
         leg = np.broadcast_to(np.arange(n_legs), shape)
         own = (Variables("radius", all_free(n_legs, 1), prior=prior), leg, by_radius)
     problem, state = problem_of(
-        predicted, analysis.images, analysis.equations, analysis.prior, (own,)
+        predicted,
+        analysis.images,
+        analysis.equations,
+        analysis.prior,
+        (own,),
+        length_rows(predicted, analysis.choices),
     )
     return marginal_rows(information_rows(problem, state), problem.where("parameters"))
 

@@ -32,7 +32,7 @@ from legcal.estimation import (
     named_information,
 )
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import radius_name
+from legcal.machine import Actuator, actuators_of, radius_name
 from legcal.vision import LINKS, Link, intrinsic_names, intrinsic_unit
 
 _SIGNIFICANT = 5.0  # standard deviations between a prior and the measurements
@@ -480,9 +480,13 @@ def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
     try:
         yield
     except (DidNotConverge, NotIdentifiable) as failure:
-        stated = {name.split(".")[1] for name in _stated(problem)}
+        stated = {name.split(".")[1] for name in _stated(problem) if ":" not in name}
         measured = len(problem.readings) + sum(map(len, problem.boards))
-        if measured or stated & {"base", "platform", "offset", "length"}:
+        rails = problem.observed.actuator_readings.sigma[
+            [not actuator.turns for actuator in _of_readings(problem)]
+        ]
+        is_length = any(":" in name for name in problem.choices.priors)
+        if measured or len(rails) or is_length or stated & {"base", "platform", "offset", "length"}:
             raise
         raise type(failure)(
             [
@@ -494,6 +498,12 @@ def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
                 *failure.problems,
             ]
         ) from None
+
+
+def _of_readings(problem: FitProblem) -> list[Actuator]:
+    """Return the actuator of each of their readings."""
+    actuators = actuators_of(problem.legs.nominal)
+    return [actuators[a] for a in problem.observed.actuator_readings.actuator.tolist()]
 
 
 def _stated(problem: FitProblem) -> list[str]:

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from legcal.calibration.joint_fit.parameter_choices import Choices, joints_of_length
 from legcal.calibration.joint_fit.variables import FittedLegs, State
 from legcal.data import Corners, LegAxes, Measurements, Outlines, join_axes
 from legcal.errors import DatasetError
@@ -517,6 +518,52 @@ def observed_actuator_readings(measurements: Measurements, legs: FittedLegs) -> 
     actuator, pose = np.nonzero(np.isfinite(q).T)
     sigma = measurements.sigma_of(legs.nominal)[first]
     return ActuatorReadings(actuator, pose, q[pose, actuator], sigma[actuator])
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredLengths:
+    """Distances of joints that were measured by hand, n of them."""
+
+    leg: IntArray  # (n, 2) the legs of both joints
+    is_base: BoolArray  # (n,) whether they are on the base, at reading 0, or on the platform
+    length: Array  # (n,) [m]
+    sigma: Array  # (n,) standard deviations [m]
+
+    def __len__(self) -> int:
+        return len(self.length)
+
+    def rows(self, state: State) -> Residuals:
+        """Return predicted minus measured distances (n, 1) [m] with their derivatives."""
+        points = np.where(self.is_base[:, None, None], state.A[self.leg], state.B[self.leg])
+        vector = points[:, 0] - points[:, 1]
+        distance = np.linalg.norm(vector, axis=1)
+        u, J = vector / distance[:, None], np.zeros((len(self), 1, 2, 2, 3))
+        row = np.arange(len(self))
+        side = np.where(self.is_base, 0, 1)
+        J[row, 0, 0, side], J[row, 0, 1, side] = u, -u
+        return Residuals.of((distance - self.length)[:, None], J.reshape(len(self), 1, 12))
+
+    def factor(self) -> Factor[State]:
+        """Return the factor of these distances."""
+        touches = (("legs", self.leg[:, 0], _SIX), ("legs", self.leg[:, 1], _SIX))
+        whitening = 1.0 / self.sigma[:, None, None]
+        return Factor("lengths", self.rows, touches, len(self), 1, None, whitening)
+
+
+def measured_lengths(names: Sequence[str], choices: Choices) -> MeasuredLengths:
+    """Return the distances of joints that are stated, of legs with these names."""
+    found = [
+        (joints, prior)
+        for name, prior in sorted(choices.priors.items())
+        if (joints := joints_of_length(name)) is not None
+    ]
+    legs = [[names.index(leg) for leg, _ in joints] for joints, _ in found]
+    return MeasuredLengths(
+        np.array(legs, dtype=np.intp).reshape(-1, 2),
+        np.array([joints[0][1] == "base" for joints, _ in found], dtype=np.bool_),
+        np.array([prior.mean for _, prior in found]),
+        np.array([prior.sigma for _, prior in found]),
+    )
 
 
 # ----------------------------------------------------------------------------------------- axes

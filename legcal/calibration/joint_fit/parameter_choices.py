@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from itertools import permutations
 from typing import Literal
 
 import numpy as np
@@ -120,6 +121,12 @@ class KnownParameters:
     others: Mapping[str, str]
     # other names of intrinsics, and the one that counts: views of one camera share them
     synonyms: Mapping[str, str]
+    # distances of two joints, by both names with a colon: what a person can measure
+    lengths: Mapping[str, KnownParameter] = field(default_factory=dict)
+
+    def parameter(self, name: str) -> KnownParameter:
+        """Return a parameter, or a distance of joints, by the name that counts."""
+        return self.by_name[name] if name in self.by_name else self.lengths[name]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -152,11 +159,37 @@ def known_parameters(
         board_scale(fixed.link): KnownParameter(1.0, "", "board", 1.0 / _RATIO, _RATIO)
         for fixed in boards
     }
+    lengths = _lengths(machine)
     if axes_given:
         reason = "measured axes, in which cameras and radii are contained already"
         others |= dict.fromkeys((*seen, *synonyms), reason)
-        return KnownParameters(by_name | board, others, {})
-    return KnownParameters(by_name | seen | board, others, synonyms)
+        return KnownParameters(by_name | board, others, {}, lengths)
+    return KnownParameters(by_name | seen | board, others, synonyms, lengths)
+
+
+def _lengths(machine: Machine) -> dict[str, KnownParameter]:
+    """Return the distances of joints on the base and on the platform, by LEG.SIDE:LEG.SIDE.
+
+    Joints at A that move are where they are at reading 0.
+    """
+    found: dict[str, KnownParameter] = {}
+    for side in ("base", "platform"):
+        points = machine.A_base if side == "base" else machine.B_platform
+        for (j, one), (k, other) in permutations(enumerate(machine.leg_names), 2):
+            nominal = float(np.linalg.norm(points[j] - points[k]))
+            limits = nominal / _RATIO, nominal * _RATIO
+            name = f"{one}.{side}:{other}.{side}"
+            found[name] = KnownParameter(nominal, "m", "kinematic", *limits)
+    return found
+
+
+def joints_of_length(name: str) -> tuple[tuple[str, str], tuple[str, str]] | None:
+    """Return leg and side of both joints that a measured length is between, None if it is none."""
+    ends = [tuple(end.rpartition(".")[::2]) for end in name.split(":")]
+    if len(ends) != 2:
+        return None
+    (one, side), (other, there) = ends
+    return (one, side), (other, there)
 
 
 def _kinematic(machine: Machine) -> dict[str, KnownParameter]:
@@ -273,7 +306,7 @@ def resolve(overrides: Sequence[Override], known: KnownParameters) -> Choices:
         (note,) if given_way else (),
     )
     names = [name for name, p in known.by_name.items() if p.kind == "kinematic"]
-    if all(choices.holds(name, by_default=name.endswith(".twist")) for name in names):
+    if all(choices.holds(n, by_default=n.endswith((".twist", ".gain"))) for n in names):
         raise UsageError(
             "The mechanism could not be calibrated: found all of its parameters fixed, needed one "
             "at least that is not; fix fewer of them."
@@ -301,7 +334,7 @@ def _decisions(
         if not names:
             problems.append(_no_match(override, known))
         for name in names:
-            parameter = known.by_name[name]
+            parameter = known.parameter(name)
             problem = _misstated(override, name, parameter)
             if problem:
                 problems.append(problem)
@@ -322,12 +355,35 @@ def _matches(override: Override, known: KnownParameters) -> tuple[str, ...]:
     """Return the parameters that an override is about, by the names that count."""
     if override.name in known.names:
         return (known.counted(override.name),)
+    if ":" in override.name:
+        return _matching_length(override, known)
     names = [known.counted(name) for name in known.names if fnmatchcase(name, override.name)]
     return tuple(dict.fromkeys(names))
 
 
+def _matching_length(override: Override, known: KnownParameters) -> tuple[str, ...]:
+    """Return the distance of joints that an override is about; that of a rod is its length."""
+    if override.action != "prior":
+        return ()
+    joints = joints_of_length(override.name)
+    if joints is not None and joints[0][0] == joints[1][0]:
+        name = f"{joints[0][0]}.length"
+        sides = {side for _, side in joints}
+        return (name,) if name in known.by_name and sides == {"base", "platform"} else ()
+    one, _, other = override.name.partition(":")
+    pair = min(override.name, f"{other}:{one}")
+    return (pair,) if pair in known.lengths else ()
+
+
 def _no_match(override: Override, known: KnownParameters) -> str:
     """Return the sentence about a name that is no parameter's."""
+    if ":" in override.name:
+        return (
+            f"{override.where} could not be used: found no two joints whose distance is that, "
+            "needed LEG.base:LEG.base or LEG.platform:LEG.platform of different legs, or both ends "
+            "of a rod, with a value and its sigma; the first legs are "
+            f"{', '.join(dict.fromkeys(n.split('.')[0] for n in known.by_name if '.base' in n))}."
+        )
     others = [
         name for name in known.others if name == override.name or fnmatchcase(name, override.name)
     ]

@@ -24,6 +24,7 @@ from legcal.calibration.joint_fit.factors import (
     ObservedCorners,
     ObservedOutlines,
     Readings,
+    measured_lengths,
     observed_actuator_readings,
     observed_arrays,
     observed_axes,
@@ -375,7 +376,7 @@ def _built(
     return FitProblem(
         variables=tuple(_stated(block, choices) for block in blocks),
         eliminated=_poses(n_poses, legs.n_actuators),
-        factors=observed.factors(keys),
+        factors=(*observed.factors(keys), measured_lengths(legs.names, choices).factor()),
         constraint=LegConstraints(parameters),
         name="joint fit",
         remedy="start nearer to the truth (joints to 5 mm, cameras to 2 cm and 2 deg) and check "
