@@ -26,6 +26,8 @@ from legcal.machine import (
     Leg,
     LegKind,
     Machine,
+    actuator_index,
+    ends_at_poses,
     free_coordinates,
     from_vector,
     geometries,
@@ -34,6 +36,7 @@ from legcal.machine import (
     parameters_of_legs,
     platform_in_base,
     point_like_legs,
+    readings_of_rods,
     to_vector,
 )
 from legcal.simulation import (
@@ -67,6 +70,8 @@ SHIPPED = (
     "3-upu",
     "3-upu-tilted",
     "tricept",
+    "hexaglide",
+    "linear-delta",
 )
 SIGMA_Q = 2e-6  # [m]
 _TURN, _SHIFT = 0.12, 0.06  # of poses: [rad], of the length of a leg
@@ -178,9 +183,12 @@ def _poses(
 
 
 def _readings(machine: Machine, legs: tuple[Leg, ...], R: Array, t: Array) -> Array:
-    q = np.full((len(t), len(legs)), np.nan)
+    q, on = np.full((len(t), len(legs)), np.nan), actuator_index(legs)
+    of_actuators = readings_of_rods(legs, R, t)
     for j, leg in enumerate(legs):
-        if leg.kind is LegKind.ACTUATED:
+        if leg.actuator is not None:
+            q[:, j] = of_actuators[:, on[j]]
+        elif leg.kind is LegKind.ACTUATED:
             length = np.linalg.norm(R @ leg.B + t - leg.A, axis=1)
             q[:, j] = machine.sign[j] * (length - leg.q0)
     return q
@@ -208,13 +216,12 @@ def shown_outlines(
 ) -> Outlines:
     """Return both outlines of every part of every leg in every image."""
     R, t = components(truth.T_Rb_Re)
-    A, B = (np.array([getattr(leg, joint) for leg in truth.legs]) for joint in "AB")
-    ends = np.einsum("kij,lj->kli", R, B) + t[:, None]
+    A, ends = ends_at_poses(truth.legs, R, t)
     views = [
         Viewpoint(view.name, view.camera, T.inv())
         for view, T in zip(m.views, truth.T_camera_Rb, strict=True)
     ]
-    scene = plain_scene(np.broadcast_to(A, ends.shape), ends, views, m.view, m.pose, radii)
+    scene = plain_scene(A, ends, views, m.view, m.pose, radii)
     return outlines_of(scene, OutlineNoise(0.2, 150))
 
 
@@ -228,7 +235,7 @@ def _wrong(
     """Return legs every number of which is wrong by as much, up or down; twists are right."""
     parametrization = fitted.parametrization
     size = np.where(np.array(parametrization.units) == "m", length, angle / np.sqrt(2.0))
-    size[[name.endswith(".twist") for name in parametrization.names]] = 0.0
+    size[[name.endswith((".twist", ".gain")) for name in parametrization.names]] = 0.0
     step = size * rng.choice([-1.0, 1.0], len(size))
     return moved_legs(legs, parametrization.place, step)
 

