@@ -52,6 +52,22 @@ def test_a_prior_is_written_as_people_write_it(text: str, mean: float, sigma: fl
     assert (by_option.mean, by_option.sigma) == (mean, sigma)
 
 
+def test_a_length_is_between_two_joints_and_that_of_a_rod_is_its_own() -> None:
+    delta = known("delta")
+    one, other = (
+        choose([f"{name}=550±0.05mm"], parameters=delta).priors
+        for name in ("leg3.base:leg1.base", "leg1.base:leg3.base")
+    )
+    assert one == other == {"leg1.base:leg3.base": Prior(0.55, 5e-5)}
+    rod = choose(["leg2.base:leg2.platform=400±0.05mm"], parameters=delta)
+    assert rod.priors == {"leg2.length": Prior(0.4, 5e-5)}
+    for name in ("leg1.base:leg3.platform", "leg1.base:nothing", "leg1.base:leg1.base"):
+        with pytest.raises(UsageError, match=r"needed LEG\.base:LEG\.base"):
+            choose([f"{name}=550±0.05mm"], parameters=delta)
+    with pytest.raises(UsageError, match="check the number and its unit"):
+        choose(["leg1.base:leg3.base=550±0.05m"], parameters=delta)
+
+
 def test_the_four_ways_to_state_a_prior_are_one() -> None:
     expected = {"leg1.offset": Prior(0.35, 1e-4)}
     for priors in (
