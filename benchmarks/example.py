@@ -33,8 +33,7 @@ def platform_error(
     near = calibration.solution.T_Rb_Re
     frame_legs = machine.frame_legs
     poses, true_poses = (
-        platform_poses(point_like_legs(p), driven + p.offsets, near, frame_legs)
-        for p in (parameters, truth)
+        platform_poses(point_like_legs(p), driven, near, frame_legs) for p in (parameters, truth)
     )
     displacement, rotation = pose_differences(poses, true_poses)
     return float(displacement.mean()), float(rotation.mean())

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from outline_sessions import (
     Design,
+    Noise,
     moved_poses,
 )
 from scipy.linalg import null_space
@@ -21,7 +22,16 @@ from scipy.stats import chi2, norm
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array
-from legcal.machine import Leg, by_step, freedoms, independent, moved_legs, pose_equations
+from legcal.machine import (
+    Leg,
+    actuator_index,
+    by_step,
+    freedoms,
+    independent,
+    joints_at,
+    moved_legs,
+    pose_equations,
+)
 from legcal.simulation import silhouette
 
 _STEP = 1e-6  # [m] or [rad] of differences
@@ -75,19 +85,27 @@ def information_of(design: Design, sigma_q: float, radius_sigma: float) -> Array
     """
     n_cameras, n_parameters = 6 * len(design.T_Rb_camera), len(design.parametrization)
     by_pose, by_shared = _outline_rows(design)
-    demands = pose_equations(design.legs.nominal, design.R, design.t)
+    legs, q = design.legs.nominal, design.q_of_actuators
+    demands = pose_equations(legs, design.R, design.t, q=q if q.shape[1] else None)
     by_parameters = demands.by_parameters(design.parametrization)
-    constraints, read = ~demands.measured, demands.measured
-    columns = list(freedoms(design.legs.frame_legs))
+    hangs = np.array([leg.actuator is not None for leg in legs])[demands.leg]
+    constraints, read = ~demands.measured | hangs, demands.measured & ~hangs
+    columns = [*freedoms(design.legs.frame_legs), *range(6, 6 + q.shape[1])]
+    by_posture = np.concatenate([demands.by_pose, demands.by_q], axis=2)
+    on, sigma = actuator_index(legs), Noise(sigma_q=sigma_q).of_readings(legs)
+    of_q = np.zeros((q.shape[1], 6 + q.shape[1]))
+    for a in range(q.shape[1]):
+        of_q[a, 6 + a] = 1.0 / sigma[on.index(a)]
     pose = design.pose[design.outlines.row]
     parameters = slice(n_cameras, n_cameras + n_parameters)
     rows = []
     for k in range(len(design.t)):
-        F, G = demands.by_pose[k][:, columns], by_parameters[k]
-        of_readings = np.zeros((int(read.sum()), by_shared.shape[-1]))
-        of_readings[:, parameters] = G[read] / sigma_q
+        F, G = by_posture[k][:, columns], by_parameters[k]
+        of_readings = np.zeros((int(read.sum()) + len(of_q), by_shared.shape[-1]))
+        of_readings[: int(read.sum()), parameters] = G[read] / sigma_q
         seen = pose == k
-        own = np.concatenate([by_pose[seen].reshape(-1, 6)[:, columns], F[read] / sigma_q])
+        by_own = by_pose[seen].reshape(-1, by_pose.shape[-1])[:, columns]
+        own = np.concatenate([by_own, F[read] / sigma_q, of_q[:, columns]])
         shared = np.concatenate([by_shared[seen].reshape(-1, by_shared.shape[-1]), of_readings])
         # A pose follows the parameters where F d_pose + G d_xi = 0; the rest of it is free.
         _, singular, right = np.linalg.svd(F[constraints])
@@ -119,21 +137,31 @@ class _Numbers:
     t: Array
     T_Rb_camera: Sequence[RigidTransform]
     radii: Mapping[tuple[int, str], float]
+    q: Array  # of actuators
 
 
 def _outline_rows(design: Design) -> tuple[Array, Array]:
-    """Return whitened derivatives of all outlines, (n, 2, 6) by their pose and (n, 2, m) by others.
+    """Return whitened derivatives of all outlines by pose and readings of actuators, and others.
+
+    The former are (n, 2, 6 + n_actuators), the latter (n, 2, m).
 
     The others are six motions of each camera, then the kinematic parameters, then the radii.
     """
     place = design.parametrization.place
-    truth = _Numbers(design.legs.nominal, design.R, design.t, design.T_Rb_camera, design.legs.radii)
+    truth = _Numbers(
+        design.legs.nominal,
+        design.R,
+        design.t,
+        design.T_Rb_camera,
+        design.legs.radii,
+        design.q_of_actuators,
+    )
     ends = design.camera.undistort(design.outlines.ends)
     whitening = np.linalg.inv(np.linalg.cholesky(design.outlines.covariance))
 
     def with_poses(step: Array) -> _Numbers:
-        R, t = moved_poses(truth.R, truth.t, step)
-        return replace(truth, R=R, t=t)
+        R, t = moved_poses(truth.R, truth.t, step[:6])
+        return replace(truth, R=R, t=t, q=truth.q + step[6:])
 
     def with_camera(view: int, step: Array) -> _Numbers:
         cameras = list(truth.T_Rb_camera)
@@ -165,14 +193,15 @@ def _outline_rows(design: Design) -> tuple[Array, Array]:
         *derivatives(with_legs, len(design.parametrization)),
         *(d for part in design.parts for d in derivatives(partial(with_radius, part), 1)),
     ]
-    return np.concatenate(derivatives(with_poses, 6), axis=-1), np.concatenate(of_others, axis=-1)
+    of_postures = derivatives(with_poses, 6 + truth.q.shape[1])
+    return np.concatenate(of_postures, axis=-1), np.concatenate(of_others, axis=-1)
 
 
 def _offsets(design: Design, ends: Array, numbers: _Numbers) -> Array:
     """Return how far (n, 2) [px] the ends of the true outlines are from those of some numbers."""
     shown, legs, cameras = design.outlines, numbers.legs, numbers.T_Rb_camera
     pose, view, leg = design.pose[shown.row], design.view[shown.row], shown.leg
-    A, B = np.array([x.A for x in legs])[leg], np.array([x.B for x in legs])[leg]
+    A, B = joints_at(legs, numbers.q)[pose, leg], np.array([x.B for x in legs])[leg]
     along = np.einsum("nij,nj->ni", numbers.R[pose], B) + numbers.t[pose] - A
     u = along / np.linalg.norm(along, axis=1)[:, None]
     turn = np.array([T.rotation.as_matrix().T for T in cameras])[view]

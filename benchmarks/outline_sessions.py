@@ -30,14 +30,16 @@ from legcal.calibration import (
 from legcal.data import Measurements, Outlines, View, axes_from_outlines
 from legcal.errors import DidNotConverge
 from legcal.files import read_yaml
-from legcal.geometry import Array, IntArray
+from legcal.geometry import Array, IntArray, distance_to_line
 from legcal.machine import (
     Leg,
     LegKind,
     Machine,
     Parametrization,
+    actuator_index,
     create_model,
     description_of,
+    ends_at_poses,
     geometries,
     load_mechanism,
     moved_legs,
@@ -46,6 +48,7 @@ from legcal.machine import (
     platform_in_base,
     pose_differences,
     radius_name,
+    readings_of_rods,
     solve_poses,
 )
 from legcal.paper import Criteria, NominalMachine, run_steps
@@ -142,6 +145,12 @@ class Design:
     outlines: Outlines  # with the covariance of the noise
 
     @property
+    def q_of_actuators(self) -> Array:
+        """Exact readings of actuators, (n_poses, n_actuators) [m or rad]."""
+        on = actuator_index(self.legs.nominal)
+        return self.q[:, [on.index(a) for a in range(max(on) + 1)]]
+
+    @property
     def parametrization(self) -> Parametrization:
         """The kinematic parameters; twists are known."""
         return parametrize(self.legs.names, self.legs.nominal, self.legs.frame_legs)
@@ -182,9 +191,10 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
     rotation: Rotation = at.rotation
     R, t = closed_poses(legs, machine.frame_legs, rotation.as_matrix(), at.translation)
     # Joint centres stand where the equations of the legs put them, to the last digit.
-    B = np.einsum("kij,lj->kli", R, np.array([leg.B for leg in legs])) + t[:, None]
-    B_base = np.array([machine.T_base_Rb.apply(points) for points in B])
-    A_base = np.array([machine.A for machine in machines])
+    A, B = ends_at_poses(legs, R, t)
+    A_base, B_base = (
+        np.array([machine.T_base_Rb.apply(points) for points in ends]) for ends in (A, B)
+    )
     outlines = outlines_of(Scene(A_base, B_base, views, images), OutlineNoise(sigma_px, None))
     most = _MOST_LEGS if machine.n_legs >= _MANY_LEGS else machine.n_legs
     seen = []
@@ -199,6 +209,8 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
     for j, leg in enumerate(legs):
         if leg.kind is LegKind.PASSIVE:
             q[:, j] = np.nan
+        elif leg.actuator is not None:
+            q[:, j] = readings_of_rods(legs, R, t)[:, actuator_index(legs)[j]]
         elif leg.kind is LegKind.ACTUATED:
             q[:, j] = machine.sign[j] * (np.linalg.norm(B[:, j] - leg.A, axis=-1) - leg.q0)
     radii = {
@@ -229,6 +241,15 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
         pose=images.pose,
         outlines=outlines.choose(told),
     )
+
+
+def reading_leg(legs: Sequence[Leg]) -> list[int]:
+    """Return whose reading each leg has: of rods on one actuator that of the first."""
+    first: dict[str | None, int] = {}
+    return [
+        j if leg.actuator is None else first.setdefault(leg.actuator.joint, j)
+        for j, leg in enumerate(legs)
+    ]
 
 
 def closed_poses(
@@ -276,6 +297,22 @@ class Noise:
     sigma_q: float = 2e-6  # of a reading [m]
     radius_sigma: float = 0.02  # of the nominal radii, as a part of the true ones
 
+    def of_readings(self, legs: Sequence[Leg]) -> Array:
+        """Return the standard deviation of the reading of each leg, (n_legs,) [m or rad].
+
+        A motor that turns has that with which the joint at A moves by ``sigma_q``.
+        """
+        return np.array(
+            [
+                0.0
+                if not leg.is_motor
+                else self.sigma_q / float(distance_to_line(leg.A, a.axis, a.point))
+                if (a := leg.actuator) is not None and a.turns
+                else self.sigma_q
+                for leg in legs
+            ]
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class OutlineSession:
@@ -293,15 +330,26 @@ def draw_session(
     """Return a measurement of a design, and what is known of it before."""
     step = _parameter_errors(design.parametrization, errors, rng)
     true = design.legs
-    is_read = [leg.kind is LegKind.ACTUATED for leg in true.nominal]
-    q = design.q + np.where(is_read, noise.sigma_q, 0.0) * rng.normal(size=design.q.shape)
+    sigma = noise.of_readings(true.nominal)
+    errors_of_q = sigma * rng.normal(size=design.q.shape)
+    q = design.q + errors_of_q[:, reading_leg(true.nominal)]
     views = tuple(
         View(f"c{v + 1}", design.camera, _rough(T, errors, rng), seen)
         for v, (T, seen) in enumerate(zip(design.T_Rb_camera, design.seen, strict=True))
     )
     image = ("",) * len(design.view)
     measurements = Measurements(
-        views, image, design.view, design.pose, q[design.pose], noise.sigma_q
+        views,
+        image,
+        design.view,
+        design.pose,
+        q[design.pose],
+        noise.sigma_q,
+        sigma_by_joint={
+            str(leg.prismatic): s
+            for leg, s in zip(true.nominal, sigma.tolist(), strict=True)
+            if leg.actuator is not None
+        },
     )
     outlines = noisy_outlines(design.outlines, design.camera, rng)
     nominal = moved_legs(true.nominal, design.parametrization.place, step)
@@ -368,8 +416,12 @@ def nominal_start(session: OutlineSession) -> Start:
     poses: Sequence[RigidTransform] = (session.home,) * measurements.n_poses
     B = session.home.apply([leg.B for leg in legs.nominal])
     home = np.linalg.norm(B - [leg.A for leg in legs.nominal], axis=1)
-    q0 = np.array([leg.q0 for leg in legs.nominal])
-    wanted = legs.sign * measurements.q[measurements.first_rows] + q0
+    home -= np.array([leg.q0 for leg in legs.nominal])
+    R, t = session.home.rotation.as_matrix()[None], session.home.translation[None]
+    for j, a in enumerate(actuator_index(legs.nominal)):
+        if a >= 0:
+            home[j] = readings_of_rods(legs.nominal, R, t)[0, a]
+    wanted = legs.sign * measurements.q[measurements.first_rows]
     for part in WAY:
         poses = platform_poses(legs.nominal, home + part * (wanted - home), poses, legs.frame_legs)
     return start_from(legs.nominal, measurements, legs, cameras, poses, "nominal")
@@ -390,6 +442,5 @@ def platform_errors(design: Design, legs: Sequence[Leg]) -> tuple[Array, Array]:
     Where legs cannot have these readings, the platform stands where it misses them least.
     """
     poses = design.poses
-    lengths = design.legs.sign * design.q + np.array([leg.q0 for leg in legs])
-    there = platform_poses(legs, lengths, poses, design.legs.frame_legs)
+    there = platform_poses(legs, design.legs.sign * design.q, poses, design.legs.frame_legs)
     return pose_differences(there, poses)

@@ -223,9 +223,9 @@ def test_platform_poses_have_the_lengths_of_the_readings(session: HexapodSession
 
 
 def test_lengths_that_no_pose_has_give_the_nearest_pose(session: HexapodSession) -> None:
-    lengths = session.measurements.q + TRUTH.offsets
-    lengths[0, 2] += 0.4
-    poses = platform_poses(point_like_legs(TRUTH), lengths, session.T_Rb_Re, FRAME_LEGS)
+    lengthening = session.measurements.q.copy()
+    lengthening[0, 2] += 0.4
+    poses = platform_poses(point_like_legs(TRUTH), lengthening, session.T_Rb_Re, FRAME_LEGS)
     assert np.all(np.isfinite(poses[0].as_matrix()))
     np.testing.assert_allclose(poses[1].as_matrix(), session.T_Rb_Re[1].as_matrix(), atol=1e-9)
 
