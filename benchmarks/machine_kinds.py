@@ -27,7 +27,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from bound import ERRORS
 from classes_study import errors_of_fit
-from outline_sessions import Noise, design_of, draw_session, kinds, made, one_fit
+from outline_sessions import CARRIED, Noise, design_of, draw_session, kinds, made, one_fit
 from outline_study import failures_of
 
 from legcal import LegcalError, calibrate, evaluate, load_mechanism
@@ -35,8 +35,6 @@ from legcal.calibration import Evaluation
 from legcal.simulation import Level, SimulationSettings, failure_of, simulate
 
 N_VIEWS, N_POSES = 3, 15
-# Shipped models whose joints at A move on carriages and arms
-CARRIED = ("hexaglide", "3-prs", "linear-delta", "orthoglide", "delta", "servo-hexapod")
 LENGTH_SIGMA = 0.05  # [mm] of the distance of two joints that motors which turn need
 
 

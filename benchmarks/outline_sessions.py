@@ -70,6 +70,8 @@ from legcal.vision import Camera
 
 COPLANAR, NONCOPLANAR = "6-spu-coplanar", "6-spu-noncoplanar"
 MACHINES = (NONCOPLANAR, COPLANAR, "3-upu-tilted", "3-rpr")
+# Whose joints at A move on carriages and arms
+CARRIED = ("hexaglide", "3-prs", "linear-delta", "orthoglide", "delta", "servo-hexapod")
 SHIPPED = (
     "hexapod",
     "nategh-agheli",
@@ -82,6 +84,7 @@ SHIPPED = (
     "3-upu-tilted",
     "tricept",
     "3-rpr",
+    *CARRIED,
 )
 KINDS = Path(__file__).with_name("machine_kinds.yaml")
 _MANY_LEGS, _MOST_LEGS = 6, 4  # of six or more that a view is said to see, as in the paper

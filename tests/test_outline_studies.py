@@ -254,7 +254,8 @@ def test_the_fit_of_every_class_states_the_bound(machine: str) -> None:
     stated = error / of_sigma  # hardly changed by where axes count from
     kinematic = [not name.split(".")[1].endswith("axis") for name in bound.names]
     ratio = np.abs(stated / bound.sigma)[kinematic]
-    assert np.all(np.abs(ratio - 1.0) < 0.2)  # the noise is estimated from few outlines
+    # The noise is estimated from few outlines, which leave open what they may share.
+    assert np.all((ratio > 0.8) & (ratio < 1.5))
     assert np.sqrt(np.mean((error / bound.sigma) ** 2)) < 2.0
     assert 0.3 < errors["nse"] < 2.0
     true = design.legs.nominal

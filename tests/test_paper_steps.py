@@ -51,6 +51,8 @@ from legcal.simulation import (
     shifted_outlines,
 )
 
+# (14) does not see the length that all rods of an ideal linear Delta have.
+MACHINES = [name for name in SHIPPED if name != "linear-delta"]
 LIKE_HEXAPOD = ("nategh-agheli", "6-sps")
 FULL_RANK = ("3-rpr", "3-spr", "3-upu-tilted")  # of (9): in a plane, or three joints and no axis
 EVEN = ("3-rps", "tricept", "hexapod-rod")
@@ -74,7 +76,7 @@ def open_space(observed: Observed, name: str) -> Array:
     return np.linalg.qr(rows.T)[0].T
 
 
-@pytest.mark.parametrize("name", thinned(SHIPPED, lambda name: name not in LIKE_HEXAPOD))
+@pytest.mark.parametrize("name", thinned(MACHINES, lambda name: name not in LIKE_HEXAPOD))
 def test_exact_outlines_give_all_that_is_determined_from_3_mm_and_1_degree(name: str) -> None:
     observed = shipped(name)
     is_angle, before = observed.is_angle, observed.errors(observed.nominal.legs)

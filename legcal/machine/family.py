@@ -38,9 +38,6 @@ class Family:
     unit: str | None = None  # unit of the lengths; required
     base_radius: float | None = None  # of the circle on which the base joints lie; required
     platform_radius: float | None = None  # of the circle on which the platform joints lie; required
-    arm_length: float | None = None  # of the arms, of families that have some
-    rod_length: float | None = None  # of rods on carriages or arms
-    rod_spacing: float | None = None  # of the two rods of a parallelogram
     height: float | None = None  # height of the platform over the base at home
     base_spread: float | None = None  # angle between the two joints of a pair on the base, 6 legs
     platform_spread: float | None = None  # the same on the platform
@@ -50,6 +47,9 @@ class Family:
     leg_radius: float | None = None  # radius of tube and rod; by default 0.02 of the length at home
     tilt: float = 0.0  # of axes out of the horizontal; those at the platform the other way
     name: str | None = None  # name of the model; the family in small letters by default
+    arm_length: float | None = None  # of the arms, of families that have some
+    rod_length: float | None = None  # of rods on carriages or arms
+    rod_spacing: float | None = None  # of the two rods of a parallelogram
 
 
 def describe_family(given: Family) -> Description:
