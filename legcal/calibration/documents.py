@@ -18,6 +18,7 @@ from pydantic import (
     StrictInt,
     StrictStr,
     model_serializer,
+    model_validator,
 )
 
 from legcal.data import Measurements, by_cause, row_names
@@ -31,6 +32,7 @@ from legcal.files import (
     refuse_too_large,
     validate,
 )
+from legcal.machine import Actuator
 from legcal.vision import Link
 
 Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
@@ -47,6 +49,27 @@ class Pose(Document):
     quat_xyzw: Annotated[list[Number], Field(min_length=4, max_length=4)]
 
 
+class ActuatorBlock(Document):
+    """A motor that moves joints at A, in R_b at reading 0 [m]."""
+
+    kind: Literal["prismatic", "revolute"]
+    direction: Triple | None = None  # of a prismatic
+    point: Triple | None = None  # of the axis of a revolute
+    axis: Triple | None = None
+
+    @model_validator(mode="after")
+    def _has_its_motion(self) -> ActuatorBlock:
+        needed = ("direction",) if self.kind == "prismatic" else ("point", "axis")
+        missing = [key for key in needed if getattr(self, key) is None]
+        if missing:
+            raise ValueError(f"a {self.kind} actuator has no '{missing[0]}'")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_none(self, whole: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in whole(self).items() if value is not None}
+
+
 class Legs(Document):
     """The legs in R_b and R_e [m, rad]."""
 
@@ -56,6 +79,7 @@ class Legs(Document):
     base_axes: AxesByLeg  # of axes that are parameters
     platform_axes: AxesByLeg
     twists: dict[str, Number]
+    actuators: dict[str, ActuatorBlock] | None = None  # by joint; left out where none moves A
 
 
 class ParameterRow(Document):
@@ -189,6 +213,13 @@ class Staged(Legs):
 
     diagnostics: list[str]
     from_fit: Distance | None = None  # None where the motors do not determine the pose
+
+    @model_serializer(mode="wrap")
+    def _without_actuators(self, whole: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        found: dict[str, Any] = whole(self)
+        if self.actuators is None:
+            del found["actuators"]
+        return found
 
 
 class NoSteps(Document):
@@ -391,6 +422,7 @@ class Result(Legs, Heading):
     """``result.json``: the heading, the calibrated legs, and how well they are known."""
 
     nominal_axes: dict[str, AxesByLeg]  # that turns count from, by side
+    nominal_actuators: dict[str, ActuatorBlock] | None = None  # likewise; left out where none is
     parameters: Annotated[list[ParameterRow], Field(min_length=1)]
     covariance: Matrix  # of the estimated parameters, in their order
     kinematic: Kinematic
@@ -416,10 +448,16 @@ class Result(Legs, Heading):
     @model_serializer(mode="wrap")
     def _without_absent_blocks(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         found: dict[str, Any] = handler(self)
-        optional = ("links", "observations", "board", "platform_board", "holdout", "diagnosis",
-                    "overlays")  # fmt: skip
+        optional = ("actuators", "nominal_actuators", "links", "observations", "board",
+                    "platform_board", "holdout", "diagnosis", "overlays")  # fmt: skip
         absent = [key for key in optional if found[key] is None]
         return {key: value for key, value in found.items() if key not in absent}
+
+    def nominal_actuator(self, calibrated: Actuator | None) -> Actuator | None:
+        """Return the actuator that the parameters count from."""
+        if calibrated is None or self.nominal_actuators is None:
+            return calibrated
+        return calibrated.placed(self.nominal_actuators[calibrated.joint].document())
 
     @classmethod
     def read(cls, path: Path) -> Result:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.documents import (
+    ActuatorBlock,
     BoardPose,
     Distance,
     Gamma,
@@ -56,6 +57,7 @@ from legcal.files import motion_to_xyz_quat
 from legcal.machine import (
     Leg,
     LegKind,
+    actuators_of,
     describe_direction,
     geometries,
     nominal_axes,
@@ -156,7 +158,8 @@ def _result_of(calibration: Calibration) -> Result:
         held=solution.held_basis.tolist(),
     )
     on_base, on_platform = (_board(calibration, link) for link in LINKS)
-    turned_from = nominal_axes(names, geometries(machine))
+    nominal = geometries(machine)
+    turned_from = nominal_axes(names, nominal)
     return Result(
         legcal_result=1,
         status="converged",
@@ -165,6 +168,7 @@ def _result_of(calibration: Calibration) -> Result:
         legs=list(names),
         **_legs(names, solution.legs),
         nominal_axes=turned_from,
+        nominal_actuators=_actuators(nominal),
         parameters=parameters,
         covariance=solution.covariance.tolist(),
         kinematic=kinematic,
@@ -218,7 +222,14 @@ def _legs(names: Sequence[str], legs: Sequence[Leg]) -> dict[str, Any]:
             n: leg.platform_axis.tolist() for n, leg in named if leg.platform_axis is not None
         },
         "twists": {name: leg.twist for name, leg in named if leg.twist is not None},
+        "actuators": _actuators(legs),
     }
+
+
+def _actuators(legs: Sequence[Leg]) -> dict[str, ActuatorBlock] | None:
+    """Return what moves joints at A, by joint; None where nothing does."""
+    found = actuators_of(legs)
+    return {one.joint: ActuatorBlock.model_validate(one.document()) for one in found} or None
 
 
 def _pose(T: RigidTransform) -> Pose:

@@ -217,6 +217,7 @@ def load_result(given: str | Path) -> EarlierResult:
     machine = machine.with_leg_order(document.legs)
     legs, known = geometries(machine), parametrization_of(machine, twists=True)
     values = {row.name: row.value for row in document.parameters}
+    _check_actuators(path, document, machine)
     nominal_legs = _with_nominal_axes(machine.leg_names, legs, document, values)
     estimated = [row for row in document.parameters if row.status == "estimated"]
     _check_covariance(path, estimated, np.array([row.sigma for row in estimated]), document)
@@ -261,9 +262,23 @@ def _with_nominal_axes(
             base_axis=base.get(name, leg.base_axis),
             platform_axis=platform.get(name, leg.platform_axis),
             twist=values.get(f"{name}.twist", leg.twist),
+            actuator=document.nominal_actuator(leg.actuator),
         )
         for name, leg in zip(names, legs, strict=True)
     )
+
+
+def _check_actuators(path: Path, document: Result, machine: Machine) -> None:
+    """Refuse a document whose actuators are not those of the model beside it."""
+    needed = {actuator.joint: actuator.kind.value for actuator in machine.actuators}
+    for blocks in (document.actuators, document.nominal_actuators):
+        found = {joint: block.kind for joint, block in (blocks or {}).items()}
+        if found != needed:
+            words, wanted = (
+                ", ".join(f"{joint} ({kind})" for joint, kind in sorted(of.items())) or "none"
+                for of in (found, needed)
+            )
+            raise unreadable(path, f"the actuators {words}", f"{wanted} as in {RESULT_YAML}")
 
 
 def _check_covariance(

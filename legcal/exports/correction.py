@@ -23,7 +23,6 @@ from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subjec
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
     COORDINATES,
-    LegKind,
     Machine,
     coordinates_of,
     equations_of_readings,
@@ -31,6 +30,7 @@ from legcal.machine import (
     own_coordinates,
     poses_after,
     poses_at_coordinates,
+    readings_at_poses,
     solve,
     turned_back,
     workspace,
@@ -70,13 +70,8 @@ class _Model:
     def readings(self, poses: Array) -> Array:
         """Return the readings (k, n_legs) at poses, zero for legs without a motor."""
         machine = self.machine
-        vectors = (
-            np.einsum("kij,nj->kni", poses[:, :, :3], machine.B_platform)
-            + poses[:, None, :, 3]
-            - machine.A_base
-        )
-        q = machine.sign * (np.linalg.norm(vectors, axis=2) - machine.q0)
-        return np.where([leg.kind is LegKind.ACTUATED for leg in machine.legs], q, 0.0)
+        moved = [leg.is_motor for leg in machine.legs]
+        return np.where(moved, readings_at_poses(machine, poses), 0.0)
 
     def in_travel(self, q: Array) -> BoolArray:
         """Say where readings lie in the travel."""

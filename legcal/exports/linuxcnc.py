@@ -29,7 +29,7 @@ def linuxcnc_refusal(subject: Subject) -> str | None:
     if len(legs) != N_STRUTS:
         return f"found {len(legs)} legs, {needed}"
     others = [
-        f"'{leg.name}' of type {leg.type}{'' if leg.kind is LegKind.ACTUATED else ' without motor'}"
+        f"'{leg.name}' of type {leg.type}{'' if leg.is_motor else ' without motor'}"
         for leg in legs
         if leg.kind is not LegKind.ACTUATED or len(leg.equations) > 1
     ]

@@ -113,6 +113,7 @@ def _nominal(result: EarlierResult) -> Machine:
                 base_axis=leg.base_axis if base is None else np.array(base),
                 platform_axis=leg.platform_axis if platform is None else np.array(platform),
                 twist=leg.twist if twist is None else twist.nominal,
+                actuator=document.nominal_actuator(leg.actuator),
             )
         )
     return replace(machine, legs=legs_in_links(machine, legs))

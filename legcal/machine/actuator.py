@@ -11,9 +11,10 @@ a is A at reading 0, and the gain g is 1 unless it is estimated. Several rods ma
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -172,6 +173,13 @@ class Actuator:
         along = float(self.axis @ nominal.axis)
         s = float((nominal.point - self.point) @ nominal.axis) / along
         return self.point + s * self.axis, s, along
+
+    def placed(self, document: Mapping[str, Any]) -> Actuator:
+        """Return it where a result has it; the inverse of :meth:`document`."""
+        if self.turns:
+            axis, point = np.array(document["axis"]), np.array(document["point"])
+            return replace(self, axis=axis, point=point)
+        return replace(self, axis=np.array(document["direction"]))
 
     def document(self) -> dict[str, object]:
         """Return it as result files have it, in its frame."""
