@@ -93,6 +93,11 @@ class ParameterRow(Document):
     status: Literal["estimated", "fixed", "weak"]  # weak: part of a direction that is held
     prior_sigma: Positive | None = None  # of an intrinsic by its camera file; else left out
 
+    @property
+    def is_shown(self) -> bool:
+        """Whether tables have it: they leave out gains of motors that are fixed at 1."""
+        return not (self.name.endswith(".gain") and self.status == "fixed" and self.value == 1.0)
+
     @model_serializer(mode="wrap")
     def _without_none(self, whole: SerializerFunctionWrapHandler) -> dict[str, Any]:
         row: dict[str, Any] = whole(self)

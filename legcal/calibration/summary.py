@@ -53,7 +53,7 @@ class ParameterTable:
         """Return the table of a result, joint centres in R_b and R_e or left out."""
         rows, digits = [], []
         for row in result.parameters:
-            if not joints and row.name.endswith(_COORDINATES):
+            if not row.is_shown or (not joints and row.name.endswith(_COORDINATES)):
                 continue
             scale, unit, n = UNITS[row.unit]
             value, nominal = scale * row.value, scale * row.nominal

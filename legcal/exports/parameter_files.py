@@ -18,7 +18,7 @@ import numpy as np
 
 from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
 from legcal.geometry import Array
-from legcal.machine import Leg, LegKind, geometries
+from legcal.machine import Leg, LegKind, Machine, actuators_of, geometries
 from legcal.version import __version__
 
 if TYPE_CHECKING:
@@ -96,17 +96,19 @@ def json_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered
                 machine.leg_names, machine.legs_of_frames, geometries(machine), strict=True
             )
         ],
+        **_actuators(machine),
         "rows": [{c: getattr(row, c) for c in COLUMNS} for row in rows_of(subject)],
     }
     if subject.result is not None:
         result = subject.result.document
         unit = {row.name: row.unit for row in result.parameters}
         names = result.kinematic.names
-        scale = np.array([UNITS["rad" if unit.get(name) == "rad" else "m"][0] for name in names])
+        units = [UNITS.get(unit.get(name, "m"), (1.0, "")) for name in names]
+        scale = np.array([one for one, _ in units])
         covariance = np.array(result.kinematic.covariance) * np.outer(scale, scale)
         document["covariance"] = {
             "names": names,
-            "units": [UNITS["rad" if unit.get(name) == "rad" else "m"][1] for name in names],
+            "units": [word for _, word in units],
             "matrix": covariance.tolist(),
         }
     return one_file(json.dumps(document, indent=1, allow_nan=False) + "\n")
@@ -148,6 +150,24 @@ def _joint_rows(subject: Subject) -> Iterator[Row]:
                 status = _MODEL if joint is None else "derived"
                 name = f"{leg.name}.{side}_axis.{letter}"
                 yield Row(name, link, "", float(axis[k]), before_k, None, status)
+    yield from _actuator_rows(machine, nominal)
+
+
+def _actuator_rows(machine: Machine, nominal: Machine | None) -> Iterator[Row]:
+    """Give directions and axes of what moves joints at A, in the base link."""
+    before = {} if nominal is None else {one.joint: one for one in nominal.actuators}
+    status = _MODEL if nominal is None else "derived"
+    for actuator in machine.actuators:
+        other = before.get(actuator.joint)
+        what = "axis" if actuator.turns else "direction"
+        for k, letter in enumerate("xyz"):
+            was = None if other is None else float(other.axis[k])
+            name = f"{actuator.joint}.{what}.{letter}"
+            yield Row(name, machine.base, "", float(actuator.axis[k]), was, None, status)
+        for k, letter in enumerate("xyz" * actuator.turns):
+            was = None if other is None else 1e3 * float(other.point[k])
+            name, value = f"{actuator.joint}.axis_point.{letter}", 1e3 * float(actuator.point[k])
+            yield Row(name, machine.base, "mm", value, was, None, status)
 
 
 def _joints(subject: Subject) -> dict[tuple[str, str], JointInLink]:
@@ -167,6 +187,8 @@ def _parameter_rows(subject: Subject) -> Iterator[Row]:
     """Give the parameters in R_b and R_e: those of the result, or of the model."""
     if subject.result is not None:
         for row in subject.result.document.parameters:
+            if not row.is_shown:
+                continue
             scale, unit = UNITS.get(row.unit, (1.0, row.unit))
             sigma = None if row.sigma is None else scale * row.sigma
             numbers = scale * row.value, scale * row.nominal, sigma
@@ -195,14 +217,16 @@ def _leg(
     name: str, in_links: Leg, in_frames: Leg, known: Mapping[tuple[str, str], JointInLink]
 ) -> dict[str, Any]:
     """Return a leg of the document."""
-    has_travel = in_links.kind is not LegKind.CONSTANT and bool(np.isfinite(in_links.travel).all())
+    actuator = in_links.actuator
+    has_travel = in_links.has_value and bool(np.isfinite(in_links.travel).all())
+    scale = UNITS["m" if actuator is None else actuator.unit][0]
     return {
         "name": name,
         "type": in_links.type,
         "kind": in_links.kind.value,
         "sign": in_links.sign,
         "offset": None if in_links.kind is LegKind.PASSIVE else 1e3 * in_links.q0,
-        "travel": [1e3 * x for x in in_links.travel] if has_travel else None,
+        "travel": [scale * x for x in in_links.travel] if has_travel else None,
         "A": {
             "link": _point(in_links.A),
             "R_b": _point(in_frames.A),
@@ -216,7 +240,25 @@ def _leg(
         "base_axis": _axes(in_links.base_axis, in_frames.base_axis, "R_b"),
         "platform_axis": _axes(in_links.platform_axis, in_frames.platform_axis, "R_e"),
         "twist": None if in_links.twist is None else float(np.degrees(in_links.twist)),
+        **({} if actuator is None else {"actuator": actuator.joint}),
     }
+
+
+def _actuators(machine: Machine) -> dict[str, Any]:
+    """Return what moves joints at A, by joint, in the base link and in R_b."""
+    in_frames = {actuator.joint: actuator for actuator in actuators_of(geometries(machine))}
+    found = {}
+    for actuator in machine.actuators:
+        there = in_frames[actuator.joint]
+        what = "axis" if actuator.turns else "direction"
+        found[actuator.joint] = {
+            "kind": actuator.kind.value,
+            what: _axes(actuator.axis, there.axis, "R_b"),
+        }
+        if actuator.turns:
+            points = {"link": _point(actuator.point), "R_b": _point(there.point)}
+            found[actuator.joint]["point"] = points
+    return {"actuators": found} if found else {}
 
 
 def _point(point: Array) -> list[float]:

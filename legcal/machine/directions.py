@@ -56,6 +56,13 @@ _NOUN = {
     "radius": ("radius of leg", "radii of legs"),
     "": ("camera", "cameras"),
 }
+_NOUN_OF_ACTUATOR = {
+    "direction": ("direction of", "directions of"),
+    "axis": ("axis of", "axes of"),
+    "axis_point": ("place of the axis of", "places of the axes of"),
+    "gain": ("gain of", "gains of"),
+}
+_OF_ACTUATOR = re.compile(r"(.+)\.(?:(direction|axis|axis_point)\.[12]|(gain))")
 
 
 def list_in_words(words: Sequence[str]) -> str:
@@ -78,7 +85,7 @@ def leg_labels(leg_names: Sequence[str]) -> dict[str, str]:
 def describe_direction(parameters: Sequence[str], leg_names: Sequence[str]) -> str:
     """Return in words which parameters change together: ``z of platform joints 2 and 4 together``.
 
-    Others are ``offset of leg 3`` and ``fx of camera c1``.
+    Others are ``offset of leg 3``, ``direction of rail1`` and ``fx of camera c1``.
     """
     coordinates: dict[tuple[str, str], list[str]] = {}
     for name in parameters:
@@ -87,14 +94,14 @@ def describe_direction(parameters: Sequence[str], leg_names: Sequence[str]) -> s
     groups: dict[tuple[str, str], list[str]] = {}
     for (kind, owner), found in coordinates.items():
         axes = list_in_words(sorted(found))
-        if kind == "radius":  # a tube and a rod of one leg
+        if kind == "radius" or kind in _NOUN_OF_ACTUATOR:  # a tube and a rod; two angles
             axes = ""
         elif kind.endswith("_axis"):
             axes = f"angle{'s' * (len(found) > 1)} {axes}"
         groups.setdefault((kind, axes), []).append(owner)
     phrases = []
     for (kind, axes), owners in groups.items():
-        noun = _NOUN[kind][len(owners) > 1]
+        noun = (_NOUN | _NOUN_OF_ACTUATOR)[kind][len(owners) > 1]
         ordered = _labelled(owners, leg_names)
         phrases.append(f"{axes + ' of ' if axes else ''}{noun} {list_in_words(ordered)}")
     if len(phrases) > _MAX_GROUPS:
@@ -114,11 +121,13 @@ def _labelled(owners: Sequence[str], leg_names: Sequence[str]) -> list[str]:
 def _split(name: str, leg_names: Sequence[str]) -> tuple[str, str, str]:
     """Return leg, kind and coordinate of a parameter, or view, nothing and coordinate.
 
-    Names of legs may contain dots.
+    Names of legs may contain dots. Of a motor that moves joints at A it is its joint.
     """
     leg = max((n for n in leg_names if name.startswith(f"{n}.")), key=len, default="")
     kind, _, which = name[len(leg) + 1 :].partition(".")
     if leg and kind in _NOUN:
         return leg, kind, which
+    if of_actuator := _OF_ACTUATOR.fullmatch(name):
+        return of_actuator[1], of_actuator[2] or of_actuator[3], ""
     view, _, which = name.rpartition(".")
     return view, "", which

@@ -73,6 +73,8 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
     of_axes = ("leg", ">axis at base", ">axis at platform", ">twist [deg]")
     frame = ", ".join(description["base_frame"])
     legend = f"R_b and R_e stand on the joints of {frame}; q is the reading."
+    if "actuators" in description:
+        legend = f"R_b and R_e stand on the joints of {frame}, A where their motors read 0."
     return report(
         title,
         table(*columns, rows=rows, least={1: kinds}),
@@ -99,14 +101,16 @@ def _motors(description: dict[str, Any]) -> RenderableType:
             (
                 joint,
                 ", ".join(leg["name"] for leg in rods),
-                "turns" if turns else "slides",
-                _direction(motor["axis"] if turns else motor["direction"]),
-                _points([motor["point"]])[0] if turns else "",
+                f"axis {_direction(motor['axis'])}"
+                if turns
+                else f"along {_direction(motor['direction'])}",
                 f"{scale * low:z.2f} to {scale * high:z.2f} {unit}",
                 f"{scale * rods[0]['q_home']:z.2f} {unit}",
             )
         )
-    columns = ("motor", "legs", "", ">axis", ">point [mm]", ">travel", ">reading at home")
+        if turns:
+            rows.append(("", "", f"at {_points([motor['point']])[0]} mm", "", ""))
+    columns = ("motor", "legs", "moves", ">travel", ">at home")
     return table(*columns, rows=rows)
 
 

@@ -131,6 +131,7 @@ def _parameters(calibration: Calibration) -> list[_Row]:
              priors.get(row.name) if row.status == "estimated" else None,
              _how(row.status, row.sigma, priors.get(row.name)))
         for row in calibration.result.parameters
+        if row.is_shown
     ]  # fmt: skip
 
 
