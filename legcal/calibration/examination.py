@@ -44,7 +44,6 @@ from legcal.data import (
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible
 from legcal.files import Document
 from legcal.geometry import Array
-from legcal.machine import LegKind
 from legcal.perception import (
     TAKE_AGAIN,
     Exposure,
@@ -83,7 +82,8 @@ class EncoderUse(Document):
     """What the readings of an encoder are."""
 
     column: str
-    least: float  # [m]
+    unit: Literal["m", "rad"]  # of what follows
+    least: float
     greatest: float
     travel: tuple[float, float] | None  # None where the model has no limits
     used: float | None  # share of the travel
@@ -301,15 +301,25 @@ def _look_at_readings(found: _Found, notes: Sequence[str]) -> None:
     legs = dataset.machine.legs
     for note in notes:
         found.add("readings", "warning", note)
-    motors = [j for j, leg in enumerate(legs) if leg.kind is LegKind.ACTUATED]
+    motors = dataset.machine.motors
+    sigma, unit = dataset.measurements.sigma_of(legs), dict[int, Literal["m", "rad"]]()
     for j, column in zip(motors, reading_columns(legs), strict=True):
         lower, upper = legs[j].travel
+        actuator = legs[j].actuator
+        unit[j] = "rad" if actuator is not None and actuator.turns else "m"
         is_known = bool(np.isfinite(upper - lower)) and upper > lower
         least, greatest = float(q[:, j].min()), float(q[:, j].max())
         travel = (float(lower), float(upper)) if is_known else None
         used = (greatest - least) / float(upper - lower) if is_known else None
         found.encoders.append(
-            EncoderUse(column=column.name, least=least, greatest=greatest, travel=travel, used=used)
+            EncoderUse(
+                column=column.name,
+                unit=unit[j],
+                least=least,
+                greatest=greatest,
+                travel=travel,
+                used=used,
+            )
         )
     shares = {one.column: one.used for one in found.encoders if one.used is not None}
     found.checks["readings"] = f"{len(motors)} encoders"
@@ -335,21 +345,24 @@ def _look_at_readings(found: _Found, notes: Sequence[str]) -> None:
             f"{100 * LITTLE_USED:.0f} % or more of every encoder for poses that tell parameters "
             "apart; take photographs at poses that differ more, and check the unit of readings.",
         )
-    digit = _last_digit(q[:, motors])
-    if digit is not None and digit / np.sqrt(12.0) > dataset.measurements.sigma_q:
-        rounding = digit / np.sqrt(12.0)
+    for one in ("m", "rad"):
+        of_unit = [j for j in motors if unit[j] == one]
+        digit = _last_digit(q[:, of_unit])
+        if digit is None or digit / np.sqrt(12.0) <= (stated := float(sigma[of_unit].min())):
+            continue
+        step = f"{1e3 * digit:g} mm" if one == "m" else f"{digit:g} rad"
         found.add(
             "readings",
             "warning",
-            f"{dataset.table_path}: found readings in steps of {1e3 * digit:g} mm, whose rounding "
-            f"alone has a standard deviation of {rounding:.2g} m, needed no more than the "
-            f"encoder_sigma of {dataset.measurements.sigma_q:.2g} m in {dataset.yaml_path.name}; "
-            "write more digits, or state a greater encoder_sigma.",
+            f"{dataset.table_path}: found readings in steps of {step}, whose rounding alone has a "
+            f"standard deviation of {digit / np.sqrt(12.0):.2g} {one}, needed no more than the "
+            f"encoder_sigma of {stated:.2g} {one} in {dataset.yaml_path.name}; write more digits, "
+            "or state a greater encoder_sigma.",
         )
 
 
 def _last_digit(q: Array) -> float | None:
-    """Return the size of the last digit that readings have [m]; None where they are too few."""
+    """Return the size of the last digit that readings have; None where they are too few."""
     values = q[np.isfinite(q)]
     if len(values) < MIN_READINGS:
         return None

@@ -163,7 +163,7 @@ class Predictor:
             both *= np.sqrt(loss.efficiency(q)) if factor.robust else 1.0
             blocks.append(_by_element(both, factor.element, n))
         stacked = np.concatenate(blocks, axis=1)
-        own, kept = stacked[..., :6], stacked[..., 6:]
+        own, kept = np.split(stacked, [stacked.shape[2] - problem.n_kept], axis=2)
         if tangent is not None:
             kept = kept + np.einsum("krd,mkd->krm", own, tangent.Q)
             own = own @ tangent.Z

@@ -48,7 +48,7 @@ class LaidBoard:
         self,
         camera: Camera,
         T_base_camera: RigidTransform,
-        A: Array,  # (n_legs, 3) in the base link [m]
+        A: Array,  # (n_images, n_legs, 3) in the base link [m]
         B: Array,  # (n_images, n_legs, 3) the same
         cylinders: Sequence[Sequence[Cylinder]],  # of each leg
         margin_px: float = 0.0,
@@ -69,11 +69,11 @@ class LaidBoard:
         points = np.concatenate([outer, self.T_base_board.apply(self.board.points)])
         T = T_base_camera.inv()
         P = np.broadcast_to(T.apply(points), (n, len(points), 3))
-        A, B = T.apply(A), T.apply(B.reshape(-1, 3)).reshape(B.shape)
+        A, B = (T.apply(X.reshape(-1, 3)).reshape(X.shape) for X in (A, B))
         length = np.linalg.norm(B - A, axis=-1)
         u = (B - A) / length[..., None]
         radius = np.array([max((c.radius for c in some), default=0.0) for some in cylinders])
-        distance, depth, square = rays_past_axes(P, np.broadcast_to(A, B.shape), u, length)
+        distance, depth, square = rays_past_axes(P, A, u, length)
         aside = radius + self.board.side * depth / distance[..., None]
         hidden = (square < aside**2) & (depth > 0.0) & (depth < distance[..., None])
         hidden = hidden.any(axis=-1) | behind_plate(P[:, None], B, 0.0)[:, 0]

@@ -30,7 +30,7 @@ from legcal.files import (
     validate,
 )
 from legcal.geometry import Array, direction_above, look_at
-from legcal.machine import Machine
+from legcal.machine import Machine, vectors_A_to_B
 from legcal.vision import Camera, in_picture
 
 _TURNS = 16  # directions around the machine
@@ -239,4 +239,7 @@ def near(place: Place, target: Array, up: Array, step: float, rng: np.random.Gen
 def all_points(machine: Machine, poses: Sequence[RigidTransform]) -> Array:
     """Return the joints (n, 3) of a machine in poses, in the base link [m]."""
     ends = [T.apply(machine.B_platform) for T in poses]
-    return np.concatenate([machine.A_base, *ends])
+    if not machine.actuators:
+        return np.concatenate([machine.A_base, *ends])
+    carried = [B - vectors_A_to_B(machine, T) for B, T in zip(ends, poses, strict=True)]
+    return np.concatenate([*carried, *ends])

@@ -20,7 +20,7 @@ from legcal.calibration import poses_at_readings
 from legcal.errors import NotIdentifiable, NotVisible
 from legcal.estimation import Frames
 from legcal.geometry import Array, BoolArray, look_at
-from legcal.machine import Configurations, Leg, Machine, platforms_in_base
+from legcal.machine import Configurations, Leg, Machine, ends_at_poses, platforms_in_base
 from legcal.planning.exchange import Chosen, Criterion, Session, choose, exchange
 from legcal.planning.goals import Goal, Workspace, criterion_of, workspace_of
 from legcal.planning.information import Contributions, Predictor
@@ -94,25 +94,23 @@ class Scene:
     """The nominal machine, or one that is drawn, before cameras."""
 
     task: Task
-    A: Array  # (n_legs, 3) in the base link
     legs: tuple[Leg, ...]  # in R_b and R_e
 
     @classmethod
     def nominal(cls, task: Task) -> Scene:
         """Return the nominal machine."""
-        return cls(task, task.machine.A_base, task.predictor.legs.nominal)
+        return cls(task, task.predictor.legs.nominal)
 
     @classmethod
     def drawn(cls, task: Task, rng: np.random.Generator) -> Scene:
         """Return a machine as it may be."""
-        legs = drawn_legs(task.predictor.legs, task.setting, rng)
-        return cls(task, task.machine.T_base_Rb.apply(np.array([leg.A for leg in legs])), legs)
+        return cls(task, drawn_legs(task.predictor.legs, task.setting, rng))
 
     def seen(self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool) -> Seen:
         """Return what a camera sees at poses T_Rb_Re; *surely*: wherever the tripod is set."""
-        B, margin = self._before(T, poses, surely=surely)
+        A, B, margin = self._before(T, poses, surely=surely)
         cylinders = [leg.cylinders for leg in self.task.machine.legs]
-        return what_is_seen(self.task.predictor.camera, T, self.A, B, cylinders, margin)
+        return what_is_seen(self.task.predictor.camera, T, A, B, cylinders, margin)
 
     def board_is_shown(
         self,
@@ -125,10 +123,10 @@ class Scene:
         """Return which images show the board, (n_images,); all of them where there is none."""
         if self.task.laid is None:
             return np.ones(len(poses), dtype=np.bool_)
-        B, margin = self._before(T, poses, surely=surely)
+        A, B, margin = self._before(T, poses, surely=surely)
         cylinders = [leg.cylinders for leg in self.task.machine.legs]
         camera = self.task.predictor.camera
-        return self.task.laid.is_shown(camera, T, self.A, B, cylinders, margin, is_read=is_read)
+        return self.task.laid.is_shown(camera, T, A, B, cylinders, margin, is_read=is_read)
 
     def showing(self, own: Candidates) -> Candidates:
         """Return the candidates whose images show the board, the same if all do."""
@@ -140,18 +138,20 @@ class Scene:
 
     def _before(
         self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool
-    ) -> tuple[Array, float]:
-        """Return platform joints (n, n_legs, 3) in the base link, and the margin [px]."""
+    ) -> tuple[Array, Array, float]:
+        """Return A and B (n, n_legs, 3) in the base link, and the margin [px]."""
         machine, camera = self.task.machine, self.task.predictor.camera
         R, t = Frames.of(poses)
-        in_Rb = np.swapaxes(R @ np.array([leg.B for leg in self.legs]).T, 1, 2) + t[:, None]
-        B = machine.T_base_Rb.apply(in_Rb.reshape(-1, 3)).reshape(in_Rb.shape)
+        A, B = (
+            machine.T_base_Rb.apply(X.reshape(-1, 3)).reshape(-1, machine.n_legs, 3)
+            for X in ends_at_poses(self.legs, R, t)
+        )
         margin = 0.0
         if surely:
-            joints = np.concatenate([self.A, B.reshape(-1, 3)])
+            joints = np.concatenate([A, B]).reshape(-1, 3)
             nearest = float(T.inv().apply(joints)[:, 2].min())
             margin = self.task.setting.margin(camera, max(nearest, 0.1))
-        return B, margin
+        return A, B, margin
 
     def contributions(
         self,

@@ -82,19 +82,29 @@ def surely_reached(
         drawn = drawn_legs(legs, wider, rng)
         R, t = Frames.of(poses_at_readings(machine, drawn, poses.readings, nearby))
         ends = np.swapaxes(R @ np.array([leg.B for leg in drawn]).T, 1, 2) + t[:, None]
-        length = np.linalg.norm(ends - np.array([leg.A for leg in drawn]), axis=2)
-        wanted = machine.sign * poses.readings + [leg.q0 for leg in drawn]
+        A, wanted = _at_readings(drawn, poses.readings)
+        length = np.linalg.norm(ends - A, axis=2)
         off = np.abs(length - wanted)[:, measured].max(axis=1)
         moved = np.linalg.norm(t - t_nearby, axis=1)
         reached &= (off < _CLOSED) & (moved < _MOST_MOVED * length.mean())
     return reached
 
 
+def _at_readings(legs: Sequence[Leg], q: Array) -> tuple[Array, Array]:
+    """Return joints at A (k, n_legs, 3) and lengths (k, n_legs) [m] that readings q ask for."""
+    A = np.tile([leg.A for leg in legs], (len(q), 1, 1))
+    wanted = q * [leg.sign for leg in legs] + [leg.q0 for leg in legs]
+    for j, leg in enumerate(legs):
+        if leg.actuator is not None:
+            A[:, j], wanted[:, j] = leg.actuator.at(leg.A, q[:, j]), leg.q0
+    return A, wanted
+
+
 def drawn_legs(legs: FittedLegs, setting: Setting, rng: np.random.Generator) -> tuple[Leg, ...]:
     """Return legs as they may be, within the prior errors of the machine."""
     found = legs.parametrization
     size = np.where([unit == "m" for unit in found.units], setting.length, setting.angle)
-    size = size * np.array([not name.endswith(".twist") for name in found.names])
+    size = size * np.array([not name.endswith((".twist", ".gain")) for name in found.names])
     return moved_legs(legs.nominal, found.place, size * rng.uniform(-1.0, 1.0, len(size)))
 
 

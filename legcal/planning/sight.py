@@ -87,7 +87,7 @@ class Seen:
 def what_is_seen(
     camera: Camera,
     T_base_camera: RigidTransform,
-    A: Array,  # (n_legs, 3) in the base link [m]
+    A: Array,  # (n_images, n_legs, 3) in the base link [m]
     B: Array,  # (n_images, n_legs, 3) the same
     cylinders: Sequence[Sequence[Cylinder]],  # of each leg
     margin_px: float = 0.0,  # that stays free at the border of the picture
@@ -102,20 +102,20 @@ def what_is_seen(
     share = np.linspace(0.0, 1.0, N_SAMPLES)
     s = start[..., None] + (end - start)[..., None] * share
     u_part = u[:, leg]
-    P = A[leg, None] + s[..., None] * u_part[:, :, None]  # (n_images, n_parts, N_SAMPLES, 3)
+    P = A[:, leg, None] + s[..., None] * u_part[:, :, None]  # (n_images, n_parts, N_SAMPLES, 3)
     seen = (end > start)[..., None] & in_picture(camera, P, _NEAREST, margin_px)
-    foot = A[leg] - u_part * np.sum(u_part * A[leg], axis=-1, keepdims=True)
+    foot = A[:, leg] - u_part * np.sum(u_part * A[:, leg], axis=-1, keepdims=True)
     seen &= (np.linalg.norm(foot, axis=-1) > _OUTSIDE * radius)[..., None]
     of_leg = np.zeros(len(cylinders))
     np.maximum.at(of_leg, leg, radius)
     seen &= ~_behind_legs(P, leg, radius, A, u, length, of_leg)
     thick = _IN_PLATE * float(of_leg.max(initial=0.0))
-    seen &= ~behind_plate(P, np.broadcast_to(A, B.shape), thick)
+    seen &= ~behind_plate(P, A, thick)
     seen &= ~behind_plate(P, B, thick)
     first, last = longest_runs(seen)
     image, part = np.nonzero(last > first)
     begin, finish = (s[image, part, k[image, part]] for k in (first, last))
-    u_seen, M = u_part[image, part], A[leg[part]]
+    u_seen, M = u_part[image, part], A[image, leg[part]]
     h = outlines_of_axis(u_seen, M, radius[part])
     axis = M[:, None] + np.stack([begin, finish], axis=1)[..., None] * u_seen[:, None]
     # h . M = epsilon R on the axis: the cylinder touches the plane of its outline at M - eps R h.
@@ -166,7 +166,7 @@ def _behind_legs(
     P: Array,  # (k, n_parts, m, 3)
     own: IntArray,  # (n_parts,)
     radius: Array,  # (n_parts,)
-    A: Array,  # (n_legs, 3)
+    A: Array,  # (n_images, n_legs, 3)
     u: Array,  # (k, n_legs, 3)
     length: Array,  # (k, n_legs)
     of_leg: Array,  # (n_legs,) the largest radius
@@ -177,7 +177,7 @@ def _behind_legs(
     # A ray to the edge of the leg itself passes at its radius, as far as the other leg is nearer.
     beside = radius[:, None, None] * depth / distance[..., None]
     hides = (square < (of_leg + beside) ** 2) & (depth > 0.0) & (depth < distance[..., None])
-    hides &= own[:, None, None] != np.arange(len(A))
+    hides &= own[:, None, None] != np.arange(A.shape[1])
     return np.asarray(hides.any(axis=-1))
 
 

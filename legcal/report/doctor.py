@@ -7,7 +7,7 @@ import shlex
 from rich.console import RenderableType
 from rich.text import Text
 
-from legcal.calibration import Examination
+from legcal.calibration import UNITS, Examination
 from legcal.errors import printable
 from legcal.report.render import heading, report, table
 
@@ -35,20 +35,30 @@ def examination_table(found: Examination) -> RenderableType:
     encoders = [
         (
             printable(one.column),
-            f"{1e3 * one.least:z.3f}",
-            f"{1e3 * one.greatest:z.3f}",
-            "-" if one.travel is None else " to ".join(f"{1e3 * end:z.6g}" for end in one.travel),
+            f"{UNITS[one.unit][0] * one.least:z.3f}",
+            f"{UNITS[one.unit][0] * one.greatest:z.3f}",
+            "-"
+            if one.travel is None
+            else " to ".join(f"{UNITS[one.unit][0] * end:z.6g}" for end in one.travel),
             "-" if one.used is None else f"{100 * one.used:.0f} %",
         )
         for one in found.encoders
     ]
+    units = dict.fromkeys(UNITS[one.unit][1] for one in found.encoders)
     return report(
         heading(printable(found.mechanism), f": {printable(found.dataset)}"),
         table("check", "", "found", rows=checks),
         table("view", ">images", ">blur", ">clipped", ">JPEG", ">legs found", rows=views)
         if views
         else None,
-        table("encoder [mm]", ">least", ">greatest", ">travel", ">used", rows=encoders)
+        table(
+            f"encoder [{', '.join(units)}]",
+            ">least",
+            ">greatest",
+            ">travel",
+            ">used",
+            rows=encoders,
+        )
         if encoders
         else None,
         [

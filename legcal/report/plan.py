@@ -15,7 +15,7 @@ from rich.console import RenderableType
 from legcal.errors import printable
 from legcal.figures import new_figure, plain
 from legcal.geometry import Array
-from legcal.machine import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR
+from legcal.machine import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR, vectors_A_to_B
 from legcal.pages import Drawing, Items, Picture, Row, page_html
 from legcal.planning import LaidBoard, Plan, views_in_words
 from legcal.report.page.text_page import text_page
@@ -204,7 +204,8 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
 def _draw_places(plan: Plan) -> Figure:
     """Return a figure of machine and cameras from above and from the side, with distances."""
     machine = plan.machine
-    A, B = machine.A_base, np.asarray(machine.home.apply(machine.B_platform))
+    B = np.asarray(machine.home.apply(machine.B_platform))
+    A = B - vectors_A_to_B(machine, machine.home)
     with new_figure(2, 2, _PANEL) as (figure, axes):
         for ax, (i, j), title in zip(
             axes, ((0, 1), (0, 2)), ("from above: x, y [mm]", "from the side: x, z [mm]"),

@@ -27,7 +27,7 @@ def joints_at(
     *,
     by_readings: bool = True,
 ) -> tuple[Array, Array]:
-    """Return A (n, 3) and B (k, n, 3) of legs in the base link [m], the platform at readings.
+    """Return A and B (k, n, 3) of legs in the base link [m], motors and platform at readings.
 
     Legs are in R_b and R_e, poses T_Rb_Re are looked for *near* others; the platform stays at
     these where it is not placed *by_readings* q (k, n).
@@ -38,11 +38,15 @@ def joints_at(
 
         poses = poses_at_readings(machine, legs, q, near)
     frame = machine.T_base_Rb
-    A = frame.apply(np.array([leg.A for leg in legs]))
+    turn = frame.rotation.as_matrix().T
+    A = np.tile([leg.A for leg in legs], (len(q), 1, 1))
+    for j, leg in enumerate(legs):
+        if leg.actuator is not None:
+            A[:, j] = leg.actuator.at(leg.A, q[:, j])
     B = np.array([leg.B for leg in legs])
     R, t = components(poses)
     in_frame = B @ R.transpose(0, 2, 1) + t[:, None]
-    return A, in_frame @ frame.rotation.as_matrix().T + frame.translation
+    return A @ turn + frame.translation, in_frame @ turn + frame.translation
 
 
 def directions(

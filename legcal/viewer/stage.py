@@ -13,7 +13,6 @@ from legcal.machine import (
     Leg,
     Machine,
     geometries,
-    legs_in_links,
     moved_legs,
     parametrization_of,
     platform_in_base,
@@ -182,10 +181,7 @@ class Stage:
         near = platform_in_base(self.machine, posture.T)
         by_readings = by_readings and self.machine.is_determined
         A, B = joints_at(self.machine, legs, posture.q[None], [near], by_readings=by_readings)
-        for j, leg in enumerate(legs_in_links(self.machine, legs)):
-            if leg.actuator is not None:
-                A[j] = leg.actuator.at(leg.A, posture.q[j : j + 1])[0]
-        return A, B[0]
+        return A[0], B[0]
 
     def _rods(self, A: Array, B: Array) -> Rods:
         """Return the cylinders of legs from A to B (n, 3)."""

@@ -83,10 +83,8 @@
       elements.factor_text.value = `${factor} times`;
       if (elements.pose) elements.pose_text.value = extra.poses[pose];
       const between = (a, b) => a.map((p, i) => p.map((x, k) => x + factor * (b[i][k] - x)));
-      const parts = [
-        [mode.base[0], mode.platform[pose][0]],
-        [between(...mode.base), between(...mode.platform[pose])],
-      ];
+      const base = mode.base[pose] ?? mode.base[0], platform = mode.platform[pose];
+      const parts = [[base[0], platform[0]], [between(...base), between(...platform)]];
       const x = [[], [], []], which = [];
       const put = (trace, points) => {
         which.push(trace);

@@ -49,12 +49,12 @@ def machine_scene(calibration: Calibration) -> Plot:
     turn_platform = machine.T_platform_Re.rotation.as_matrix().T
 
     def placed(legs: Sequence[Leg], near: Sequence[RigidTransform]) -> tuple[Array, Array]:
-        """Return A (n, 3) and B (k, n, 3) of legs at the readings, in the base link."""
+        """Return A and B (k, n, 3) of legs at the readings, in the base link."""
         by_readings = calibration.platform is not None
         return joints_at(machine, legs, q, near, by_readings=by_readings)
 
     found = placed(solution.legs, fitted)
-    size = float(np.ptp(np.concatenate([found[0], found[1][0]]), axis=0).max())
+    size = float(np.ptp(np.concatenate([found[0][0], found[1][0]]), axis=0).max())
     nominal = placed(geometries(machine), fitted)
     legend = ("nominal", "calibrated")
     modes = [_mode("what the calibration changed", legend, nominal, found, size)]
@@ -74,7 +74,7 @@ def machine_scene(calibration: Calibration) -> Plot:
         "poses": [plain(images[row]) for row in measurements.first_rows[chosen].tolist()],
         "turns": _rounded(turn_base @ components(fitted)[0] @ turn_platform, 6),
         "rings": rings,
-        "outline": {"base": around(found[0]), "platform": around(found[1][0])},
+        "outline": {"base": around(found[0][0]), "platform": around(found[1][0])},
         "traces": {"legs": [0, 1], "base": [2, 3], "platform": [4, 5], "rings": 6},
     }
     names = [plain(name) for name in machine.leg_names]
@@ -88,12 +88,12 @@ def machine_scene(calibration: Calibration) -> Plot:
         _lines("calibrated platform", _BLUE, 3, legend=False),
         _lines(f"1 sigma, {ring_factor:g} times as large", _AMBER, 2),
         cameras,
-        _words(names, found[0], "#1d2126"),
+        _words(names, found[0][0], "#1d2126"),
     ]
     hidden = {"showbackground": False, "gridcolor": "#e8ebef", "zeroline": False,
               "title": {"text": ""}, "tickfont": {"size": 10, "color": "#667080"}}  # fmt: skip
     seen = [[v for v in cameras[a] if v is not None] for a in "xyz"]
-    frame_of_view = _view(np.concatenate([found[0], *found[1]]), np.array(seen).T, size)
+    frame_of_view = _view(np.concatenate([*found[0], *found[1]]), np.array(seen).T, size)
     look = {
         "font": FONT,
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
@@ -153,11 +153,16 @@ def _mode(
 ) -> dict[str, Any]:
     """Return what is shown of a difference, exaggerated at first so that it is seen."""
     moved = max(float(np.abs(b - a).max()) for a, b in zip(before, after, strict=True))
+    # Joints at A that no motor moves are given once.
+    poses = slice(1 if all(np.ptp(A, axis=0).max() == 0.0 for A in (before[0], after[0])) else None)
     return {
         "name": name,
         "legend": legend,
         "step": step_shown(moved, size),
-        "base": [_rounded(before[0], 7), _rounded(after[0], 7)],
+        "base": [
+            [_rounded(a, 7), _rounded(b, 7)]
+            for a, b in zip(before[0][poses], after[0][poses], strict=True)
+        ],
         "platform": [
             [_rounded(a, 7), _rounded(b, 7)] for a, b in zip(before[1], after[1], strict=True)
         ],
