@@ -131,6 +131,7 @@ from .rods import actuator_index as actuator_index
 from .rods import actuators_of as actuators_of
 from .rods import ends_at_poses as ends_at_poses
 from .rods import joints_at as joints_at
+from .rods import reading_of_rod as reading_of_rod
 from .rods import rod_mode as rod_mode
 from .solver import poses_after as poses_after
 from .solver import solve as solve

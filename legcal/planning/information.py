@@ -33,9 +33,9 @@ from legcal.calibration import (
     with_gamma,
 )
 from legcal.data import Measurements, Outlines, View
-from legcal.estimation import PseudoHuber, linearize
+from legcal.estimation import Frames, PseudoHuber, linearize
 from legcal.geometry import Array, IntArray
-from legcal.machine import Leg, Machine
+from legcal.machine import Leg, Machine, reading_of_rod
 from legcal.vision import Camera
 
 KINEMATIC = "machine"  # names of coordinates of the machine begin so
@@ -118,14 +118,19 @@ class Predictor:
         legs: Sequence[Leg] | None = None,  # in R_b and R_e, if not the nominal ones
     ) -> Contributions:
         """Return what images add to the information."""
-        n = len(poses)
+        n, shown = len(poses), tuple(legs or self.legs.nominal)
+        R, t = Frames.of(poses)
+        q = np.zeros((n, self.legs.n_legs))
+        for j, leg in enumerate(shown):
+            if leg.actuator is not None:  # it has joints at A where readings say
+                q[:, j] = reading_of_rod(leg, R @ leg.B + t)
         camera = replace(self.camera, gamma_is_given=False)
         measurements = Measurements(
             views=tuple(View(name, camera, T) for name, T in views.items()),
             image=("",) * n,
             view=view,
             pose=np.arange(n, dtype=np.intp),
-            q=np.zeros((n, self.legs.n_legs)),
+            q=q,
             sigma_q=self.sigma_q,
         )
         problem = unchecked_fit(
@@ -137,7 +142,7 @@ class Predictor:
         )
         T_base_Rb = self.machine.T_base_Rb
         start = Start(
-            tuple(legs or self.legs.nominal),
+            shown,
             tuple(T.inv() * T_base_Rb for T in views.values()),
             tuple(poses),
             "plan",
