@@ -41,7 +41,7 @@ from legcal.files import (
     result_folder,
     with_schema,
 )
-from legcal.machine import LegKind, Machine, main_cylinders
+from legcal.machine import Machine, main_cylinders
 from legcal.simulation.board import documents
 from legcal.simulation.session import SimulatedSession
 from legcal.simulation.settings import SimulationSettings
@@ -117,7 +117,7 @@ def write_truth(
     sliders = [
         (j, str(leg.prismatic))
         for j, leg in enumerate(truth.legs)
-        if leg.kind is not LegKind.CONSTANT
+        if leg.has_value
     ]
     document = {
         "legcal_truth": 1,
