@@ -114,11 +114,7 @@ def write_truth(
 ) -> None:
     """Write ``truth.json``: settings, radii, cameras, poses and board as they really were."""
     truth, poses = session.truth, session.poses
-    sliders = [
-        (j, str(leg.prismatic))
-        for j, leg in enumerate(truth.legs)
-        if leg.has_value
-    ]
+    sliders = [(j, str(leg.prismatic)) for j, leg in enumerate(truth.legs) if leg.has_value]
     document = {
         "legcal_truth": 1,
         "legcal": __version__,
