@@ -28,6 +28,7 @@ from .identify.report import CameraIntrinsics as CameraIntrinsics
 from .identify.report import Identifiability as Identifiability
 from .identify.report import Ranks as Ranks
 from .identify.report import WeakDirection as WeakDirection
+from .joint_fit import Prior as Prior
 from .joint_fit.factors import average_images as average_images
 from .joint_fit.fit import bound as bound
 from .joint_fit.fit import refine as refine

@@ -249,7 +249,7 @@ def follow_each(machine: Machine, readings: Array) -> Iterator[Array]:
 def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the joint value of every leg at a pose, ``q = sign (|AB| - q0)``.
 
-    Of a rod it is the reading of the actuator that it hangs on, with |A(q) - B| = l.
+    Of a rod it is the reading of the actuator that it hangs on, with ``|A(q) - B| = l``.
 
     A length is a distance, so that no leg is ever flipped. Values outside the travel are
     returned as they are.

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.calibration import NO_CHOICES, Choices, Prior
 from legcal.data import Dataset, load_dataset
 from legcal.errors import DatasetError, NotIdentifiable, UsageError
 from legcal.geometry import Array
@@ -31,6 +32,7 @@ from legcal.vision import (
 from legcal.workers import Run, Workers, worker_pool
 
 SIGMA_Q = 2e-6  # [m] of a reading, where nobody says
+LENGTH_SIGMA = 5e-5  # [m] of a rod that somebody measures, where readings carry no length
 IMAGES_PER_VIEW = 15
 MOST_IMAGES, MOST_VIEWS = 400, 12
 SAME_MACHINE = 0.01  # [m] between joints of the model and of a dataset that was shot of it
@@ -141,8 +143,9 @@ def plan(
     if encoder_sigma is None:
         encoder_sigma = SIGMA_Q if shot is None else shot.measurements.sigma_q
     errors = noise if isinstance(noise, PredictedNoise) else read_noise(Path(noise))
+    lengths, counted = _measured_length(machine, board=board is not None)
     task = Task(
-        Predictor(machine, chosen, errors, encoder_sigma),
+        Predictor(machine, chosen, errors, encoder_sigma, lengths),
         n_images,
         n_views,
         Goal(criterion),
@@ -162,7 +165,21 @@ def plan(
             found = plan_session(task, report, stop, run)
         else:
             found = _fewest(task, target, report, stop, run)
-        return replace(found, notes=(*found.notes, *run.notes))
+        return replace(found, notes=(*found.notes, *counted, *run.notes))
+
+
+def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[str, ...]]:
+    """Return the length that a plan counts on where readings carry none, and a note on it."""
+    carries = [leg.is_motor and not (leg.actuator and leg.actuator.turns) for leg in machine.legs]
+    if board or not machine.actuators or any(carries):
+        return NO_CHOICES, ()
+    rod = next(leg for leg in machine.legs if leg.actuator is not None)
+    ends = f"{rod.name}.base:{rod.name}.platform"
+    return Choices(priors={f"{rod.name}.length": Prior(rod.q0, LENGTH_SIGMA)}), (
+        f"Readings of motors that turn carry no length: the plan counts on the rod of {rod.name} "
+        f"measured to {1e3 * LENGTH_SIGMA:g} mm (legcal calibrate --length "
+        f"{ends}={1e3 * rod.q0:.3f}+-{1e3 * LENGTH_SIGMA:g}mm, with what you measure).",
+    )
 
 
 def _fewest(

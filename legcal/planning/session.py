@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from legcal.calibration import PLAN_NAME
-from legcal.data import reading_columns
+from legcal.data import SIGMA_ANGLE, reading_columns
 from legcal.errors import UsageError
 from legcal.files import (
     OutputKind,
@@ -119,13 +119,25 @@ def _dataset(plan: Plan, model: str) -> str:
         "legcal_dataset": 1,
         "mechanism": model,
         "measurements": MEASUREMENTS,
-        "encoder_sigma": plan.sigma_q,
+        "encoder_sigma": _encoder_sigma(plan),
         "views": views,
     }
     if plan.board is not None:
         document["board"] = board_document(plan.board.board)
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
     return with_schema("dataset", text)
+
+
+def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
+    """Return the standard deviation of readings [m], by motor [m or rad] where one turns."""
+    machine = plan.machine
+    if not any(actuator.turns for actuator in machine.actuators):
+        return plan.sigma_q
+    legs = [machine.legs[j] for j in machine.motors]
+    return {
+        str(leg.prismatic): SIGMA_ANGLE if leg.actuator and leg.actuator.turns else plan.sigma_q
+        for leg in legs
+    }
 
 
 def _measurements(plan: Plan) -> str:
