@@ -48,6 +48,7 @@ from legcal.machine import (
     platform_in_base,
     pose_differences,
     radius_name,
+    reading_legs,
     readings_of_rods,
     solve_poses,
 )
@@ -246,15 +247,6 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
     )
 
 
-def reading_leg(legs: Sequence[Leg]) -> list[int]:
-    """Return whose reading each leg has: of rods on one actuator that of the first."""
-    first: dict[str | None, int] = {}
-    return [
-        j if leg.actuator is None else first.setdefault(leg.actuator.joint, j)
-        for j, leg in enumerate(legs)
-    ]
-
-
 def closed_poses(
     legs: Sequence[Leg], frame_legs: Sequence[int], R: Array, t: Array
 ) -> tuple[Array, Array]:
@@ -335,7 +327,7 @@ def draw_session(
     true = design.legs
     sigma = noise.of_readings(true.nominal)
     errors_of_q = sigma * rng.normal(size=design.q.shape)
-    q = design.q + errors_of_q[:, reading_leg(true.nominal)]
+    q = design.q + errors_of_q[:, list(reading_legs(true.nominal))]
     views = tuple(
         View(f"c{v + 1}", design.camera, _rough(T, errors, rng), seen)
         for v, (T, seen) in enumerate(zip(design.T_Rb_camera, design.seen, strict=True))

@@ -42,7 +42,6 @@ from .equations import n_pose_constraints as n_pose_constraints
 from .equations import pose_equations as pose_equations
 from .equations import pose_sensitivity as pose_sensitivity
 from .equations import posture_constraints as posture_constraints
-from .equations import readings_of_rods as readings_of_rods
 from .equations import twist_residual as twist_residual
 from .family import description_of as description_of
 from .feasibility import JITTER as JITTER
@@ -131,7 +130,9 @@ from .rods import actuator_index as actuator_index
 from .rods import actuators_of as actuators_of
 from .rods import ends_at_poses as ends_at_poses
 from .rods import joints_at as joints_at
+from .rods import reading_legs as reading_legs
 from .rods import reading_of_rod as reading_of_rod
+from .rods import readings_of_rods as readings_of_rods
 from .rods import rod_mode as rod_mode
 from .solver import poses_after as poses_after
 from .solver import solve as solve

@@ -17,13 +17,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge
 from legcal.geometry import Array, BoolArray, motions_of
-from legcal.machine.equations import (
-    PoseEquations,
-    equations_at_readings,
-    freedoms,
-    pose_equations,
-    readings_of_rods,
-)
+from legcal.machine.equations import PoseEquations, equations_at_readings, freedoms, pose_equations
 from legcal.machine.kinematics import (
     consistent_readings,
     follow,
@@ -40,7 +34,7 @@ from legcal.machine.model import (
     readings_at_poses,
     slider_columns,
 )
-from legcal.machine.rods import actuator_index
+from legcal.machine.rods import actuator_index, readings_of_rods
 from legcal.machine.solver import RANK, poses_after
 
 MAX_DRAWS = 40  # draws for each configuration

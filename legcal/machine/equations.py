@@ -29,7 +29,7 @@ from legcal.machine.actuator import ActuatorColumns, JointMotion
 from legcal.machine.leg import EquationKind, JointType, Leg, LegColumns, LegKind
 from legcal.machine.model import Machine
 from legcal.machine.parameters import Parametrization
-from legcal.machine.rods import actuator_index, actuators_of, reading_of_rod
+from legcal.machine.rods import actuator_index, actuators_of, readings_of_rods
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ def pose_equations(
     """Return the equations of legs at poses R (k, 3, 3), t (k, 3) [m]; all rows are lengths.
 
     *q* (k, n) are the readings of actuators [m, rad], in the order of
-    :func:`~legcal.machine.actuator.actuators_of`; all rows of their rods then count as measured:
+    :func:`~legcal.machine.rods.actuators_of`; all rows of their rods then count as measured:
     they hold at these readings. Without *q* they are at the readings at which rods reach the
     platform, one row for each actuator measured and the others constraints, and derivatives by
     parameters are not to be had. Without *by_local* these have no columns, which takes two thirds
@@ -117,17 +117,6 @@ def pose_equations(
                 by_q[:, i],
             )
     return _stacked([parts[j] for j in range(len(legs))])
-
-
-def readings_of_rods(legs: Sequence[Leg], R: Array, t: Array) -> Array:
-    """Return the readings of actuators (k, n) at poses R, t: those of the first rod on each."""
-    q = np.zeros((len(t), len(actuators_of(legs))))
-    known: set[int] = set()
-    for leg, a in zip(legs, actuator_index(legs), strict=True):
-        if a >= 0 and a not in known:
-            known.add(a)
-            q[:, a] = reading_of_rod(leg, R @ leg.B + t)
-    return q
 
 
 def n_pose_constraints(legs: Sequence[Leg]) -> int:

@@ -25,7 +25,7 @@ from legcal.machine.leg import (
     parameters_of_legs,
     with_platform_points,
 )
-from legcal.machine.rods import actuators_of, reading_of_rod
+from legcal.machine.rods import actuators_of, reading_legs, reading_of_rod
 from legcal.machine.urdf import Urdf
 
 if TYPE_CHECKING:
@@ -84,11 +84,7 @@ class Machine:
     @cached_property
     def reads(self) -> tuple[int, ...]:
         """The leg whose motor moves each leg: its own, or the first on the same actuator."""
-        first: dict[str | None, int] = {}
-        return tuple(
-            j if leg.actuator is None else first.setdefault(leg.actuator.joint, j)
-            for j, leg in enumerate(self.legs)
-        )
+        return reading_legs(self.legs)
 
     @cached_property
     def actuators(self) -> tuple[Actuator, ...]:

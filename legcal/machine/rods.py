@@ -46,21 +46,33 @@ def ends_at_poses(
     the first rod on their actuator reaches the platform.
     """
     B = np.stack([R @ leg.B + t for leg in legs], axis=1)
-    if q is None:
-        q, known = np.zeros((len(t), len(actuators_of(legs)))), set[int]()
-        for j, (leg, a) in enumerate(zip(legs, actuator_index(legs), strict=True)):
-            if a >= 0 and a not in known:
-                known.add(a)
-                q[:, a] = reading_of_rod(leg, B[:, j])
-    return joints_at(legs, q), B
+    return joints_at(legs, readings_of_rods(legs, R, t) if q is None else q), B
 
 
-def reading_of_rod(leg: Leg, B: Array, near: Array | None = None) -> Array:
+def reading_legs(legs: Sequence[Leg]) -> tuple[int, ...]:
+    """Return whose reading each leg has: its own, or of rods on one actuator that of the first."""
+    first: dict[str | None, int] = {}
+    return tuple(
+        j if leg.actuator is None else first.setdefault(leg.actuator.joint, j)
+        for j, leg in enumerate(legs)
+    )
+
+
+def readings_of_rods(legs: Sequence[Leg], R: Array, t: Array) -> Array:
+    """Return the readings of actuators (k, n) at poses R, t: those of the first rod on each."""
+    first = sorted({j for j in reading_legs(legs) if legs[j].actuator is not None})
+    q = np.zeros((len(t), len(first)))  # in the order of actuators_of
+    for a, j in enumerate(first):
+        q[:, a] = reading_of_rod(legs[j], R @ legs[j].B + t)
+    return q
+
+
+def reading_of_rod(leg: Leg, B: Array) -> Array:
     """Return the readings (k,) at which a rod reaches points B (k, 3) in the frame of the base.
 
-    |A(q) - B| = l has two solutions; the one is taken in whose mode the rod is (``Leg.mode``), or
-    without *near* [the same unit], where the axis turns, that nearest to it in whole turns. Where
-    the rod does not reach B it is the reading at which it comes nearest.
+    |A(q) - B| = l has two solutions; the one is taken in whose mode the rod is (``Leg.mode``), of a
+    motor that turns the one nearest to the middle of its travel in whole turns. Where the rod does
+    not reach B it is the reading at which it comes nearest.
     """
     actuator = leg.actuator
     if actuator is None:
@@ -81,7 +93,7 @@ def reading_of_rod(leg: Leg, B: Array, near: Array | None = None) -> Array:
     cosine = (size**2 + radius**2 + z**2 - leg.q0**2) / np.maximum(2.0 * radius * size, 1e-300)
     # |AB|^2 = r^2 + size^2 + z^2 - 2 r size cos(angle - towards): grows beyond the direction of B
     angle = np.arctan2(y, x) + leg.mode * np.arccos(np.clip(cosine, -1.0, 1.0))
-    middle = 0.5 * sum(actuator.travel) if near is None else near
+    middle = 0.5 * sum(actuator.travel)
     q = angle / actuator.gain
     turn = 2.0 * np.pi / actuator.gain
     return np.asarray(q - turn * np.round((q - middle) / turn))
