@@ -34,15 +34,19 @@ from legcal.exports import FORMATS, ExportOptions, Subject, export, formats_of, 
 from legcal.exports.identifiers import identifiers
 from legcal.geometry import Array
 from legcal.machine import (
+    COORDINATES,
     Machine,
     forward_kinematics,
     inverse_kinematics,
+    own_coordinates,
     random_poses,
 )
 from legcal.simulation import ParameterErrors, Spread, write_true_model
 
 NAMES = ("hexapod", "3-rps", "3-upu", "tricept", "3-rpr")
-KINEMATICS = (*NAMES, "hexapod-rod", "nategh-agheli")
+ACTUATED = ("delta", "servo-hexapod", "3-prs", "hexaglide", "linear-delta", "orthoglide")
+OTHERS = ("hexapod-rod", "nategh-agheli")
+KINEMATICS = (*NAMES, *OTHERS, *ACTUATED)
 ERRORS = ParameterErrors(
     base_joints=Spread(2e-3),
     platform_joints=Spread(2e-3),
@@ -78,6 +82,24 @@ def poses_of(machine: Machine, count: int = 3) -> tuple[Array, list[RigidTransfo
     return np.where(is_motor, q, 0.0), poses
 
 
+def column_legs(machine: Machine) -> list[int]:
+    """Return the leg of each column of readings: rods on one motor have one."""
+    return sorted(set(machine.reads))
+
+
+def far_away(machine: Machine) -> Array:
+    """Return readings that no machine reaches."""
+    columns = column_legs(machine)
+    other_way = [machine.legs[j].actuator is not None and k % 2 for k, j in enumerate(columns)]
+    return np.where(other_way, 5.0, -5.0) * machine.sign[columns]
+
+
+def own_of(T: RigidTransform, names: tuple[str, ...]) -> Array:
+    """Return a machine's own coordinates of a pose [m, rad]."""
+    everything = [*T.translation, *T.rotation.as_euler("xyz")]
+    return np.array([everything[COORDINATES.index(name)] for name in names])
+
+
 # --- source code --------------------------------------------------------------------------------
 
 
@@ -90,33 +112,46 @@ def module_at(path: Path) -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("name", thinned(KINEMATICS, ["3-rpr", "3-upu", "tricept"], "system"))
+@pytest.mark.parametrize(
+    "name",
+    thinned(
+        KINEMATICS,
+        ["3-rpr", "3-upu", "tricept", "servo-hexapod", "hexaglide", "linear-delta", "orthoglide"],
+        "system",
+    ),
+)
 def test_kinematics_in_python_are_those_of_the_model(
     name: str, calibrated: Callable[[str], Subject], tmp_path: Path
 ) -> None:
     subject = calibrated(name)
     machine = subject.machine
     found = module_at(written(subject, "python", tmp_path / "kinematics.py"))
+    columns = column_legs(machine)
     assert machine.leg_names == found.LEGS
+    assert [name or None for name in found.READINGS] == [machine.legs[j].prismatic for j in columns]
     for q, T in zip(*poses_of(machine, 2), strict=True):
         pose = forward_kinematics(machine, q)
         np.testing.assert_allclose(pose.as_matrix(), T.as_matrix(), atol=1e-10)
         np.testing.assert_allclose(
-            found.inverse_kinematics(T.as_matrix()), inverse_kinematics(machine, T), atol=1e-10
+            found.inverse_kinematics(T.as_matrix()),
+            inverse_kinematics(machine, T)[columns],
+            atol=1e-10,
         )
-        np.testing.assert_allclose(found.forward_kinematics(q), T.as_matrix(), atol=1e-9)
+        np.testing.assert_allclose(found.forward_kinematics(q[columns]), T.as_matrix(), atol=1e-9)
+        there = found.pose_at(own_of(T, found.COORDINATES))
+        np.testing.assert_allclose(there, T.as_matrix(), atol=1e-9)
     off = machine.home.as_matrix()
     off[:3, :3] = Rotation.from_rotvec([0.3, 0.2, 0.1]).as_matrix() @ off[:3, :3]
-    if any(leg.n_constraints for leg in machine.legs):
+    if machine.mobility < 6:
         with pytest.raises(ValueError, match="do not allow"):
             found.inverse_kinematics(off)
     off[0, 0] = np.nan
     with pytest.raises(ValueError, match="do not allow"):
         found.inverse_kinematics(off)
     with pytest.raises(ValueError, match=r"no pose was found|finite"):
-        found.forward_kinematics(np.full(machine.n_legs, np.nan))
+        found.forward_kinematics(np.full(len(columns), np.nan))
     with pytest.raises(ValueError, match="no pose was found"):
-        found.forward_kinematics(-5.0 * machine.sign)
+        found.forward_kinematics(far_away(machine))
 
 
 @pytest.mark.system
@@ -132,25 +167,31 @@ def test_kinematics_in_c_compile_and_are_those_of_the_model(
     strict = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2", "-shared", "-fPIC")
     subprocess.run(["gcc", *strict, source, "-o", library, "-lm"], check=True)
     found: Any = ctypes.CDLL(str(library))
-    prefix = identifiers([subject.name])[0]
-    numbers = ctypes.c_double * machine.n_legs
+    prefix, columns = identifiers([subject.name])[0], column_legs(machine)
+    numbers = ctypes.c_double * len(columns)
     pose = ctypes.c_double * 12
+    own = tuple(COORDINATES[k] for k in own_coordinates(machine))
 
     def packed(T: RigidTransform) -> Any:
         matrix = T.as_matrix()
         return pose(*matrix[:3, :3].ravel(), *matrix[:3, 3])
 
     for q, T in zip(*poses_of(machine), strict=True):
-        readings, there = numbers(), packed(machine.home)
+        readings, there, again = numbers(), packed(machine.home), packed(machine.home)
+        wanted = inverse_kinematics(machine, T)[columns]
         assert getattr(found, f"{prefix}_inverse_kinematics")(packed(T), readings) == 0
-        np.testing.assert_allclose(np.array(readings), inverse_kinematics(machine, T), atol=1e-10)
-        assert getattr(found, f"{prefix}_forward_kinematics")(numbers(*q), there) == 0
+        np.testing.assert_allclose(np.array(readings), wanted, atol=1e-10)
+        assert getattr(found, f"{prefix}_forward_kinematics")(numbers(*q[columns]), there) == 0
         np.testing.assert_allclose(np.array(there), np.array(packed(T)), atol=1e-9)
-    stays = packed(machine.home)
-    assert (
-        getattr(found, f"{prefix}_forward_kinematics")(numbers(*(-5.0 * machine.sign)), stays) == -1
-    )
+        x = (ctypes.c_double * len(own))(*own_of(T, own))
+        assert getattr(found, f"{prefix}_pose_at")(x, again) == 0
+        np.testing.assert_allclose(np.array(again), np.array(packed(T)), atol=1e-9)
+    stays, far = packed(machine.home), numbers(*far_away(machine))
+    assert getattr(found, f"{prefix}_forward_kinematics")(far, stays) == -1
     np.testing.assert_array_equal(stays, packed(machine.home))
+    if machine.actuators:  # rods have an end
+        x = (ctypes.c_double * len(own))(*own_of(machine.home, own) + 10.0)
+        assert getattr(found, f"{prefix}_pose_at")(x, stays) == -1
     off = packed(machine.home)
     off[0] = float("nan")
     assert getattr(found, f"{prefix}_inverse_kinematics")(off, numbers()) == -1
@@ -166,18 +207,22 @@ def test_kinematics_for_matlab_run_in_octave_and_are_those_of_the_model(
     machine = subject.machine
     written(subject, "matlab", tmp_path / "kinematics.m")
     readings, poses = poses_of(machine)
+    columns = column_legs(machine)
+    own = tuple(COORDINATES[k] for k in own_coordinates(machine))
     lines = ["m = kinematics();", "format long"]
-    for q, T in zip(readings, poses, strict=True):
+    for q, T in zip(readings[:, columns], poses, strict=True):
         matrix = ";".join(" ".join(map(repr, row)) for row in T.as_matrix().tolist())
         lines += [
             f"q = [{' '.join(map(repr, q.tolist()))}];",
+            f"x = [{' '.join(map(repr, own_of(T, own).tolist()))}];",
             f"printf('%.17g ', m.inverse_kinematics([{matrix}]), m.forward_kinematics(q));",
+            "printf('%.17g ', m.pose_at(x));",
             "printf('\\n');",
         ]
     lines += [
         f"try, {call}; catch e, disp(e.message), end"
         for call in (
-            "m.forward_kinematics(-5.0 * m.sign)",
+            f"m.forward_kinematics([{' '.join(map(str, far_away(machine)))}])",
             "q = m.home_readings; q(m.is_motor) = NaN; m.forward_kinematics(q)",
             "q(m.is_motor) = Inf; m.forward_kinematics(q)",
             "T = m.home; T(1, 1) = NaN; m.inverse_kinematics(T)",
@@ -195,9 +240,10 @@ def test_kinematics_for_matlab_run_in_octave_and_are_those_of_the_model(
     assert "do not allow" in no_pose
     for T, printed in zip(poses, rows, strict=True):
         numbers = np.array(printed.split(), dtype=float)
-        q, pose = np.split(numbers, [machine.n_legs])
-        np.testing.assert_allclose(q, inverse_kinematics(machine, T), atol=1e-10)
-        np.testing.assert_allclose(pose.reshape(4, 4).T, T.as_matrix(), atol=1e-9)
+        q, *both = np.split(numbers, [len(columns), len(columns) + 16])
+        np.testing.assert_allclose(q, inverse_kinematics(machine, T)[columns], atol=1e-10)
+        for pose in both:
+            np.testing.assert_allclose(pose.reshape(4, 4).T, T.as_matrix(), atol=1e-9)
 
 
 # --- models of other programs -------------------------------------------------------------------

@@ -2,8 +2,10 @@
 
 All three languages write the same equations, those of :mod:`legcal.machine.equations` in the links
 of base and platform: lengths of legs, directions that stay across a leg (R joints, legs that are
-fixed to the platform), twists, and the plane of a planar machine. The pose at readings is followed
-from a start in short steps by Newton's method, so that the assembly mode is kept.
+fixed to the platform), twists, and the plane of a planar machine. Joints at A on carriages and arms
+are where readings have them; readings at a pose are in closed form, in the working mode of home.
+The pose at readings, or at coordinates of the platform, is followed from a start in short steps by
+Newton's method, so that the assembly mode is kept.
 """
 
 from __future__ import annotations
@@ -24,22 +26,29 @@ from legcal.exports.identifiers import (
 )
 from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
 from legcal.geometry import Array, normal_basis
-from legcal.machine import EquationKind, Leg, LegKind, Machine, inverse_kinematics, leg_scale
+from legcal.machine import (
+    COORDINATES,
+    Actuator,
+    EquationKind,
+    Leg,
+    LegKind,
+    Machine,
+    actuator_index,
+    inverse_kinematics,
+    leg_scale,
+    own_coordinates,
+)
 from legcal.version import __version__
 
 TEMPLATES = Path(__file__).parent / "templates"
-MAX_STEP = 0.05  # of a leg length: of the readings, from one pose to the next
+MAX_STEP = 0.05  # of a leg length: what readings or coordinates move, from one pose to the next
+MAX_TURN = 0.25  # [rad] of a short arm
 _ALONG_PLATFORM = (EquationKind.DIRECTION_1, EquationKind.DIRECTION_2)
 
 
 def kinematics_refusal(subject: Subject) -> str | None:
     """Return why a machine has no kinematics that Newton's method follows, or None."""
     machine = subject.machine
-    if machine.actuators:
-        return (
-            f"found that the motor '{machine.actuators[0].joint}' moves joints at A of rods, "
-            "needed joints that stay in the base"
-        )
     if not machine.is_determined:
         return f"found that {machine.undetermined}, needed readings that give the pose"
     if machine.is_redundant:
@@ -101,7 +110,11 @@ def _row(numbers: Any) -> str:
 def _numbers(machine: Machine) -> dict[str, Any]:
     """Return what templates are filled in with."""
     home = machine.home.as_matrix()
-    legs = machine.legs
+    legs, on = machine.legs, actuator_index(machine.legs)
+    scale = leg_scale(machine, machine.home)
+    first = sorted(set(machine.reads))  # the leg of each reading
+    home_readings = inverse_kinematics(machine, machine.home)[first]
+    own = own_coordinates(machine)
     return {
         "version": __version__,
         "base": machine.base,
@@ -109,25 +122,65 @@ def _numbers(machine: Machine) -> dict[str, Any]:
         "legs": [
             {
                 "name": leg.name,
-                "identifier": own,
+                "identifier": known,
                 "type": leg.type,
                 "A": leg.A,
                 "B": leg.B,
                 "q0": leg.q0,
                 "sign": leg.sign,
                 "moves": int(leg.kind is not LegKind.CONSTANT),
-                "is_motor": int(leg.kind is LegKind.ACTUATED),
                 "has_length": int(leg.kind is not LegKind.PASSIVE),
+                "reading": first.index(machine.reads[j]),
+                "hangs_on": on[j],
             }
-            for leg, own in zip(legs, identifiers(machine.leg_names), strict=True)
+            for j, (leg, known) in enumerate(zip(legs, identifiers(machine.leg_names), strict=True))
+        ],
+        "readings": [
+            {
+                "name": legs[j].prismatic or "",
+                "leg": j,
+                "is_motor": int(legs[j].is_motor),
+                "step": _step(legs[j], MAX_STEP * scale),
+            }
+            for j in first
+        ],
+        "actuators": [
+            _carrier(j, legs[j].mode, actuator, float(home_readings[r]))
+            for r, j in enumerate(first)
+            if (actuator := legs[j].actuator) is not None
+        ],
+        "coordinates": [
+            {"name": COORDINATES[k], "number": int(k), "step": MAX_STEP * (scale if k < 3 else 1.0)}
+            for k in own
         ],
         "across": [row for j, leg in enumerate(legs) for row in _across(j, leg)],
         "twists": [row for j, leg in enumerate(legs) for row in _twists(j, leg)],
         "plane": None if machine.spatial else _plane(machine),
         "home": home[:3],
-        "home_readings": inverse_kinematics(machine, machine.home),
-        "scale": leg_scale(machine, machine.home),
-        "max_step": MAX_STEP * leg_scale(machine, machine.home),
+        "home_readings": home_readings,
+        "scale": scale,
+    }
+
+
+def _step(leg: Leg, length: float) -> float:
+    """Return by how much a reading may change where the joint that it moves goes a length [m]."""
+    if leg.actuator is None or not leg.actuator.turns:
+        return length
+    arm = float(np.linalg.norm(np.cross(leg.actuator.axis, leg.A - leg.actuator.point)))
+    return MAX_TURN if arm * MAX_TURN <= length else length / arm
+
+
+def _carrier(j: int, mode: int, actuator: Actuator, at_home: float) -> dict[str, Any]:
+    """Return a carriage or an arm, and how its first rod, leg j, gives its reading."""
+    middle = 0.5 * sum(actuator.travel)
+    return {
+        "leg": j,
+        "mode": mode,
+        "turns": int(actuator.turns),
+        "axis": actuator.axis,
+        "point": actuator.point,
+        "gain": actuator.gain,
+        "middle": middle if np.isfinite(middle) else at_home,
     }
 
 
