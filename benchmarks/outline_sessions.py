@@ -30,7 +30,7 @@ from legcal.calibration import (
 from legcal.data import Measurements, Outlines, View, axes_from_outlines
 from legcal.errors import DidNotConverge
 from legcal.files import read_yaml
-from legcal.geometry import Array, IntArray, distance_to_line
+from legcal.geometry import Array, IntArray
 from legcal.machine import (
     Leg,
     LegKind,
@@ -297,16 +297,7 @@ class Noise:
 
         A motor that turns has that with which the joint at A moves by ``sigma_q``.
         """
-        return np.array(
-            [
-                0.0
-                if not leg.is_motor
-                else self.sigma_q / float(distance_to_line(leg.A, a.axis, a.point))
-                if (a := leg.actuator) is not None and a.turns
-                else self.sigma_q
-                for leg in legs
-            ]
-        )
+        return np.array([0.0 if not leg.is_motor else leg.reading_of(self.sigma_q) for leg in legs])
 
 
 @dataclass(frozen=True, eq=False)

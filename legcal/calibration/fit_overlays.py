@@ -19,7 +19,7 @@ from legcal.data import Dataset
 from legcal.errors import UsageError
 from legcal.files import RESULT, in_the_way, path_problem, read_json
 from legcal.geometry import components
-from legcal.machine import ends_at_poses
+from legcal.machine import ends_in_base
 from legcal.progress import Report
 from legcal.workers import Run
 
@@ -78,11 +78,7 @@ def _rows_with_image(dataset: Dataset) -> list[int]:
 def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
     """Return the outlines of a fit, and where it has the legs and cameras, as a detection."""
     machine, measurements = dataset.machine, dataset.measurements
-    T_base_Rb = machine.T_base_Rb
-    A, B = (
-        T_base_Rb.apply(ends.reshape(-1, 3)).reshape(ends.shape)
-        for ends in ends_at_poses(solution.legs, *components(solution.T_Rb_Re))
-    )
+    A, B = ends_in_base(machine, solution.legs, *components(solution.T_Rb_Re))
     cylinders = tuple(
         tuple(replace(c, radius=solution.radii.get((j, c.link), c.radius)) for c in leg.cylinders)
         for j, leg in enumerate(machine.legs)
@@ -93,7 +89,7 @@ def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
         A_base=A[measurements.pose],
         B_base=B[measurements.pose],
         cylinders=cylinders,
-        T_base_camera=tuple(T_base_Rb * T.inv() for T in solution.T_camera_Rb),
+        T_base_camera=tuple(machine.T_base_Rb * T.inv() for T in solution.T_camera_Rb),
         rows=np.array(_rows_with_image(dataset), dtype=np.intp),
         unplaced={},
         image_notes=(),

@@ -71,7 +71,7 @@ from legcal.data import (
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.files import check_destination, output_path
 from legcal.geometry import IntArray, components
-from legcal.machine import Machine, ends_at_poses
+from legcal.machine import Machine, ends_in_base
 from legcal.paper import Criteria, Transformation
 from legcal.perception import (
     MeasuredImages,
@@ -485,11 +485,8 @@ def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
 
 def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredImages) -> Placement:
     """Return where a fit puts the legs, R_b laid on the nominal one; no camera is placed anew."""
-    T_base_Rb = data.machine.T_base_Rb
-    A, B = (
-        T_base_Rb.apply(ends.reshape(-1, 3)).reshape(ends.shape)
-        for ends in ends_at_poses(solution.legs, *components(data.poses_by(solution.legs)))
-    )
+    T_base_Rb, poses = data.machine.T_base_Rb, components(data.poses_by(solution.legs))
+    A, B = ends_in_base(data.machine, solution.legs, *poses)
     pose = data.measurements.pose
     cameras = tuple(
         None if known is None else T_base_Rb * T.inv()

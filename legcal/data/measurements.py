@@ -89,9 +89,7 @@ class Measurements:
             [
                 self.sigma_by_joint.get(
                     str(leg.prismatic),
-                    SIGMA_ANGLE
-                    if leg.actuator is not None and leg.actuator.turns
-                    else self.sigma_q,
+                    SIGMA_ANGLE if leg.reads_angle else self.sigma_q,
                 )
                 for leg in legs
             ]
@@ -182,15 +180,10 @@ def legs_with_readings(legs: Sequence[Leg]) -> list[Leg]:
     return list(found.values())
 
 
-def turns(leg: Leg) -> bool:
-    """Say whether the readings of a leg are angles."""
-    return leg.actuator is not None and leg.actuator.turns
-
-
 def reading_columns(legs: Sequence[Leg]) -> list[Column]:
     """Return the columns of readings of the motors, in the order of the legs."""
     return [
-        Column(str(leg.prismatic), what="reading", unit="radians" if turns(leg) else "metres")
+        Column(str(leg.prismatic), what="reading", unit="radians" if leg.reads_angle else "metres")
         for leg in legs_with_readings(legs)
     ]
 
@@ -210,7 +203,7 @@ def readings_in(table: Table, legs: Sequence[Leg]) -> tuple[Array, tuple[str, ..
             continue
         outside = (column < lower) | (column > upper)
         far = outside & ~leg.in_travel(column)
-        unit = "rad" if turns(leg) else "m"
+        unit = "rad" if leg.reads_angle else "m"
         travel = f"{lower:g} to {upper:g} {unit} (the joint limits of the model)"
         if np.any(far):
             found = f"found {_some(table, column, far, unit)}, needed {travel} with a margin of "
@@ -242,7 +235,7 @@ def _likely_cause(readings: Array, legs: Sequence[Leg]) -> str:
 
     Of what would bring all of them into their travel, that with which they move in it most.
     """
-    rotary = np.array([turns(leg) for leg in legs], dtype=np.bool_)
+    rotary = np.array([leg.reads_angle for leg in legs], dtype=np.bool_)
     if rotary.any() and not rotary.all():
         for some in (np.flatnonzero(rotary).tolist(), np.flatnonzero(~rotary).tolist()):
             cause = _likely_cause(readings[:, some], [legs[j] for j in some])
@@ -394,7 +387,7 @@ def _shared_readings(
 ) -> Array:
     """Return the readings with those of one pose replaced by their mean."""
     joints = [column.name for column in reading_columns(legs)]
-    units = ["rad" if turns(leg) else "m" for leg in legs_with_readings(legs)]
+    units = ["rad" if leg.reads_angle else "m" for leg in legs_with_readings(legs)]
     labels = table.text("pose")
     shared = readings.copy()
     for p in np.unique(pose):

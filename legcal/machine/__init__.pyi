@@ -129,6 +129,8 @@ from .parameters import with_numbers as with_numbers
 from .rods import actuator_index as actuator_index
 from .rods import actuators_of as actuators_of
 from .rods import ends_at_poses as ends_at_poses
+from .rods import ends_in_base as ends_in_base
+from .rods import first_rods as first_rods
 from .rods import joints_at as joints_at
 from .rods import reading_legs as reading_legs
 from .rods import reading_of_rod as reading_of_rod

@@ -288,6 +288,20 @@ class Leg:
         return self.kind is not LegKind.CONSTANT or self.actuator is not None
 
     @property
+    def reads_angle(self) -> bool:
+        """Whether its motor turns, so that its reading is an angle [rad]."""
+        return self.actuator is not None and self.actuator.turns
+
+    def reading_of(self, distance: float) -> float:
+        """Return the reading [m or rad] by which its motor moves the joint at A, or B, so far [m].
+
+        It is the distance itself where the motor slides.
+        """
+        if self.actuator is None or not self.actuator.turns:
+            return distance
+        return distance / float(distance_to_line(self.A, self.actuator.axis, self.actuator.point))
+
+    @property
     def type(self) -> str:
         """The leg's joints from base to platform, such as ``SPU``; ``UP`` if fixed there.
 

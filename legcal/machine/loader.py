@@ -557,8 +557,7 @@ def _check_unit(machine: Machine) -> None:
         )
     for leg in machine.legs:
         reach = leg.travel[1] - leg.travel[0]
-        turns = leg.actuator is not None and leg.actuator.turns
-        if leg.is_motor and not turns and reach > MAX_LENGTH:
+        if leg.is_motor and not leg.reads_angle and reach > MAX_LENGTH:
             raise ModelError(
                 f"{machine.urdf_path}: the travel of leg '{leg.name}' could not be used: found "
                 f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m, needed at most 20 m; write the "

@@ -6,12 +6,16 @@ See :mod:`legcal.machine.actuator` for how A moves.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from legcal.geometry import Array, cross
 from legcal.machine.actuator import Actuator
 from legcal.machine.leg import Leg
+
+if TYPE_CHECKING:
+    from legcal.machine.model import Machine
 
 
 def actuators_of(legs: Sequence[Leg]) -> tuple[Actuator, ...]:
@@ -49,6 +53,17 @@ def ends_at_poses(
     return joints_at(legs, readings_of_rods(legs, R, t) if q is None else q), B
 
 
+def ends_in_base(
+    machine: Machine, legs: Sequence[Leg], R: Array, t: Array, q: Array | None = None
+) -> tuple[Array, Array]:
+    """Return what :func:`ends_at_poses` does in the base link, R_b laid on the machine's."""
+    A, B = (
+        machine.T_base_Rb.apply(ends.reshape(-1, 3)).reshape(ends.shape)
+        for ends in ends_at_poses(legs, R, t, q)
+    )
+    return A, B
+
+
 def reading_legs(legs: Sequence[Leg]) -> tuple[int, ...]:
     """Return whose reading each leg has: its own, or of rods on one actuator that of the first."""
     first: dict[str | None, int] = {}
@@ -58,10 +73,15 @@ def reading_legs(legs: Sequence[Leg]) -> tuple[int, ...]:
     )
 
 
+def first_rods(legs: Sequence[Leg]) -> list[int]:
+    """Return the first leg on each of :func:`actuators_of`."""
+    return sorted({j for j in reading_legs(legs) if legs[j].actuator is not None})
+
+
 def readings_of_rods(legs: Sequence[Leg], R: Array, t: Array) -> Array:
     """Return the readings of actuators (k, n) at poses R, t: those of the first rod on each."""
-    first = sorted({j for j in reading_legs(legs) if legs[j].actuator is not None})
-    q = np.zeros((len(t), len(first)))  # in the order of actuators_of
+    first = first_rods(legs)
+    q = np.zeros((len(t), len(first)))
     for a, j in enumerate(first):
         q[:, a] = reading_of_rod(legs[j], R @ legs[j].B + t)
     return q

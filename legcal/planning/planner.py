@@ -20,7 +20,7 @@ from legcal.calibration import poses_at_readings
 from legcal.errors import NotIdentifiable, NotVisible
 from legcal.estimation import Frames
 from legcal.geometry import Array, BoolArray, look_at
-from legcal.machine import Configurations, Leg, Machine, ends_at_poses, platforms_in_base
+from legcal.machine import Configurations, Leg, Machine, ends_in_base, platforms_in_base
 from legcal.planning.exchange import Chosen, Criterion, Session, choose, exchange
 from legcal.planning.goals import Goal, Workspace, criterion_of, workspace_of
 from legcal.planning.information import Contributions, Predictor
@@ -142,10 +142,7 @@ class Scene:
         """Return A and B (n, n_legs, 3) in the base link, and the margin [px]."""
         machine, camera = self.task.machine, self.task.predictor.camera
         R, t = Frames.of(poses)
-        A, B = (
-            machine.T_base_Rb.apply(X.reshape(-1, 3)).reshape(-1, machine.n_legs, 3)
-            for X in ends_at_poses(self.legs, R, t)
-        )
+        A, B = ends_in_base(machine, self.legs, R, t)
         margin = 0.0
         if surely:
             joints = np.concatenate([A, B]).reshape(-1, 3)

@@ -134,10 +134,7 @@ def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
     if not any(actuator.turns for actuator in machine.actuators):
         return plan.sigma_q
     legs = [machine.legs[j] for j in machine.motors]
-    return {
-        str(leg.prismatic): SIGMA_ANGLE if leg.actuator and leg.actuator.turns else plan.sigma_q
-        for leg in legs
-    }
+    return {str(leg.prismatic): SIGMA_ANGLE if leg.reads_angle else plan.sigma_q for leg in legs}
 
 
 def _measurements(plan: Plan) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array, components
-from legcal.machine import Leg, Machine, Parametrization
+from legcal.machine import Leg, Machine, Parametrization, ends_in_base, first_rods
 
 if TYPE_CHECKING:
     from legcal.calibration import Result
@@ -37,16 +37,7 @@ def joints_at(
         from legcal.calibration import poses_at_readings  # which a model alone does not need
 
         poses = poses_at_readings(machine, legs, q, near)
-    frame = machine.T_base_Rb
-    turn = frame.rotation.as_matrix().T
-    A = np.tile([leg.A for leg in legs], (len(q), 1, 1))
-    for j, leg in enumerate(legs):
-        if leg.actuator is not None:
-            A[:, j] = leg.actuator.at(leg.A, q[:, j])
-    B = np.array([leg.B for leg in legs])
-    R, t = components(poses)
-    in_frame = B @ R.transpose(0, 2, 1) + t[:, None]
-    return A @ turn + frame.translation, in_frame @ turn + frame.translation
+    return ends_in_base(machine, legs, *components(poses), q[:, first_rods(legs)])
 
 
 def directions(

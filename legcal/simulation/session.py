@@ -15,8 +15,7 @@ import numpy as np
 
 from legcal.data import Corners, Measurements, Outlines, View
 from legcal.errors import NotVisible, UsageError
-from legcal.geometry import distance_to_line
-from legcal.machine import Configurations, Leg, Machine
+from legcal.machine import Configurations, Machine
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import chosen_board, placed_at
 from legcal.simulation.cameras import (
@@ -275,17 +274,6 @@ def _encoding(views: Sequence[Viewpoint], gamma: float, given: bool) -> tuple[Vi
     return tuple(replace(view, camera=cameras[id(view.camera)]) for view in views)
 
 
-def _reading_error(leg: Leg, size: float) -> float:
-    """Return an error of a reading [m] as that of a leg, where its motor turns [rad].
-
-    It is then the angle by which the joint at A moves as far.
-    """
-    actuator = leg.actuator
-    if actuator is None or not actuator.turns:
-        return size
-    return size / float(distance_to_line(leg.A, actuator.axis, actuator.point))
-
-
 def _recorded(
     truth: Machine,
     poses: Configurations,
@@ -308,7 +296,7 @@ def _recorded(
         used = shown if 0 < len(shown) < len(legs) else None
         views.append(View(view.name, view.camera, *((T, used) if hints else (None, None))))
     q = poses.readings
-    size = np.array([_reading_error(leg, settings.readings.size) for leg in truth.legs])
+    size = np.array([leg.reading_of(settings.readings.size) for leg in truth.legs])
     if settings.readings.distribution is Distribution.UNIFORM:
         errors = rngs["readings"].uniform(-size, size, q.shape)
     else:
@@ -331,7 +319,7 @@ def _recorded(
         sigma_q=max(settings.encoder_sigma, _MIN_SIGMA_Q),
         sigma_by_joint={
             str(truth.legs[j].prismatic): max(
-                _reading_error(truth.legs[j], settings.encoder_sigma), _MIN_SIGMA_Q
+                truth.legs[j].reading_of(settings.encoder_sigma), _MIN_SIGMA_Q
             )
             for j in truth.motors
         }

@@ -351,8 +351,7 @@ class Window:
 
     def _scale(self, leg: int) -> float:
         """Return by what the reading of a leg is multiplied for people: mm, or degrees of arms."""
-        actuator = self.source.machine.legs[leg].actuator
-        return float(np.degrees(1.0)) if actuator is not None and actuator.turns else 1e3
+        return float(np.degrees(1.0)) if self.source.machine.legs[leg].reads_angle else 1e3
 
     def _place(self, k: int, value: float) -> None:
         self.motion.place(k, value / _scale(int(self.motion.own[k])))

@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration.ordered_dataset import nominal_poses
 from legcal.data import SIGMA_ANGLE, Dataset
 from legcal.estimation import Frames
-from legcal.geometry import Array, BoolArray, IntArray, cross
+from legcal.geometry import Array, BoolArray, IntArray, components, cross
 from legcal.machine import (
     Actuator,
     ActuatorColumns,
@@ -29,6 +29,7 @@ from legcal.machine import (
     actuator_index,
     actuators_of,
     by_step,
+    ends_at_poses,
     freedoms,
     geometries,
     independent,
@@ -549,14 +550,9 @@ def radii(legs: Sequence[Leg], length: float) -> Array:
 
 
 def joints_at(legs: Sequence[Leg], T: RigidTransform) -> tuple[Array, Array]:
-    """Return the joint centres A and B at a pose, in R_b."""
-    A, B = np.array([leg.A for leg in legs]), np.array([leg.B for leg in legs])
-    matrix = T.as_matrix()[None]
-    q = readings_of_rods(legs, matrix[:, :3, :3], matrix[:, :3, 3])
-    for j, (leg, a) in enumerate(zip(legs, actuator_index(legs), strict=True)):
-        if leg.actuator is not None:
-            A[j] = leg.actuator.at(leg.A, q[:, a])[0]
-    return A, np.asarray(T.apply(B))
+    """Return the joint centres A and B (n_legs, 3) at a pose, in R_b."""
+    A, B = ends_at_poses(legs, *components([T]))
+    return A[0], B[0]
 
 
 def travel_of(machine: Machine) -> Array:
