@@ -78,7 +78,7 @@ def _rows_with_image(dataset: Dataset) -> list[int]:
 def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
     """Return the outlines of a fit, and where it has the legs and cameras, as a detection."""
     machine, measurements = dataset.machine, dataset.measurements
-    A, B = ends_in_base(machine, solution.legs, *components(solution.T_Rb_Re))
+    A, B = ends_in_base(solution.legs, machine.T_base_Rb, *components(solution.T_Rb_Re))
     cylinders = tuple(
         tuple(replace(c, radius=solution.radii.get((j, c.link), c.radius)) for c in leg.cylinders)
         for j, leg in enumerate(machine.legs)

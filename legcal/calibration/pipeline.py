@@ -486,7 +486,7 @@ def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
 def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredImages) -> Placement:
     """Return where a fit puts the legs, R_b laid on the nominal one; no camera is placed anew."""
     T_base_Rb, poses = data.machine.T_base_Rb, components(data.poses_by(solution.legs))
-    A, B = ends_in_base(data.machine, solution.legs, *poses)
+    A, B = ends_in_base(solution.legs, T_base_Rb, *poses)
     pose = data.measurements.pose
     cameras = tuple(
         None if known is None else T_base_Rb * T.inv()

@@ -6,16 +6,13 @@ See :mod:`legcal.machine.actuator` for how A moves.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array, cross
 from legcal.machine.actuator import Actuator
 from legcal.machine.leg import Leg
-
-if TYPE_CHECKING:
-    from legcal.machine.model import Machine
 
 
 def actuators_of(legs: Sequence[Leg]) -> tuple[Actuator, ...]:
@@ -54,11 +51,11 @@ def ends_at_poses(
 
 
 def ends_in_base(
-    machine: Machine, legs: Sequence[Leg], R: Array, t: Array, q: Array | None = None
+    legs: Sequence[Leg], T_base_Rb: RigidTransform, R: Array, t: Array, q: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return what :func:`ends_at_poses` does in the base link, R_b laid on the machine's."""
+    """Return what :func:`ends_at_poses` does, of legs in R_b, in the base link."""
     A, B = (
-        machine.T_base_Rb.apply(ends.reshape(-1, 3)).reshape(ends.shape)
+        T_base_Rb.apply(ends.reshape(-1, 3)).reshape(ends.shape)
         for ends in ends_at_poses(legs, R, t, q)
     )
     return A, B

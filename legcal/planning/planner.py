@@ -142,7 +142,7 @@ class Scene:
         """Return A and B (n, n_legs, 3) in the base link, and the margin [px]."""
         machine, camera = self.task.machine, self.task.predictor.camera
         R, t = Frames.of(poses)
-        A, B = ends_in_base(machine, self.legs, R, t)
+        A, B = ends_in_base(self.legs, machine.T_base_Rb, R, t)
         margin = 0.0
         if surely:
             joints = np.concatenate([A, B]).reshape(-1, 3)

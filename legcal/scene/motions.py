@@ -37,7 +37,7 @@ def joints_at(
         from legcal.calibration import poses_at_readings  # which a model alone does not need
 
         poses = poses_at_readings(machine, legs, q, near)
-    return ends_in_base(machine, legs, *components(poses), q[:, first_rods(legs)])
+    return ends_in_base(legs, machine.T_base_Rb, *components(poses), q[:, first_rods(legs)])
 
 
 def directions(
