@@ -191,6 +191,14 @@ def test_a_contradicted_focal_length_counts_in_the_verdict(
     assert not _judged(planar[1], focal_error=10.0).verdict.trustworthy
 
 
+def test_a_leg_of_a_view_that_was_left_out_speaks_against_a_model(
+    planar: tuple[Path, Calibration],
+) -> None:
+    verdict = _judged(planar[1], left_out=("30 of 30 of leg1 in view c2",)).verdict
+    assert not verdict.trustworthy
+    assert "30 of 30 of leg1 in view c2" in verdict.sentence
+
+
 # Recovery from outlines and axes.
 
 

@@ -12,6 +12,7 @@ from dense_fit import allowed, by_differences, projected_move, residuals
 from fit_sessions import (
     BOARD_SCALE,
     LENS,
+    PINHOLE,
     SHIPPED,
     AxesSession,
     HexapodSession,
@@ -28,6 +29,7 @@ from fit_sessions import (
     place_of_board,
     with_board,
 )
+from outline_sessions import Noise, StartErrors, design_of, draw_session, one_fit
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
@@ -62,6 +64,7 @@ from legcal.machine import (
     parametrize,
     radius_name,
 )
+from legcal.simulation import moved_outlines
 
 MACHINES = ("3-rps", "tricept", "hexapod-rod", "3-rpr")
 SCALE = 2.5
@@ -427,6 +430,38 @@ def test_the_better_start_wins_and_is_named_and_between_equal_ones_the_first(
     equal = replace(disturbed_start(small, seed=9), label="staged")
     assert refine_from_best(small.legs, *noisy, [good, equal]).start == "nominal"
     assert refine_from_best(small.legs, *noisy, [equal, good]).start == "staged"
+
+
+def test_a_leg_that_one_view_takes_for_another_is_left_out_and_named(small: HexapodSession) -> None:
+    o = small.outlines
+    wrong = (o.leg == 0) & (small.measurements.view[o.row] == 1)
+    away = np.random.default_rng(0).uniform(5.0, 20.0, small.measurements.n_rows)
+    by = np.where(wrong, away[o.row], 0.0)[:, None] * np.ones(2)
+    found = refine(
+        small.legs, small.measurements, moved_outlines(o, PINHOLE, by), disturbed_start(small)
+    )
+    (leg,) = found.left_out
+    assert leg.endswith(f"of {wrong.sum()} of leg1 in view c2")
+    assert np.abs(joint_errors(found.parameters)).max() < 1e-4
+    one_image = by * (o.row == o.row[wrong].min())[:, None]
+    once = moved_outlines(o, PINHOLE, one_image)
+    found = refine(small.legs, small.measurements, once, disturbed_start(small))
+    assert not found.outlines.used.all()
+    assert not found.left_out
+
+
+@pytest.mark.slow
+def test_a_fit_that_leaves_out_legs_of_a_view_is_tried_from_other_models() -> None:
+    """A platform that is turned by 16 degrees explains all outlines but those of two rods."""
+    noise = Noise()
+    design = design_of("delta", 3, 15, noise.sigma_px)
+    rng = np.random.default_rng(np.random.SeedSequence(0).spawn(29)[28])
+    errors = StartErrors(0.002, float(np.deg2rad(1.0)), 0.015, float(np.deg2rad(1.5)), full=False)
+    session = draw_session(design, noise, errors, rng)
+    found = one_fit(session, noise.radius_sigma)
+    assert found.outlines.used.all()
+    for pose, true in zip(found.T_Rb_Re, design.poses, strict=True):
+        assert (pose.inv() * true).rotation.magnitude() < np.deg2rad(1.0)
 
 
 def noisy(name: str) -> MachineSession:

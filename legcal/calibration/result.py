@@ -76,7 +76,7 @@ if TYPE_CHECKING:
 class Verdict:
     """Whether the calibrated model should replace the nominal one."""
 
-    trustworthy: bool  # the predicted improvement exceeds two of its standard deviations
+    trustworthy: bool  # the predicted improvement exceeds two sigma, and nothing speaks against it
     sentence: str  # the same, for people
 
 

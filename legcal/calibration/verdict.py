@@ -39,7 +39,8 @@ def judge(
     The improvement that the fit predicts is the distance between the nominal and the
     calibrated platform at the readings of the dataset; it counts where it exceeds two of its
     standard deviations. Where readings do not determine a pose, it is that of the parameters.
-    Nothing is trusted that a diagnosis of the session speaks against.
+    Nothing is trusted that a diagnosis of the session speaks against, nor what left out a leg of a
+    view: either that is another leg, or the fit is at a wrong minimum.
     """
     machine, measurements = dataset.machine, dataset.measurements
     platform = platform_accuracy(
@@ -58,6 +59,14 @@ def judge(
     if diagnosis:
         why = f"{diagnosis[0].sentence} As it is, {found}."
         verdict = Verdict(False, f"Do not load this into the controller: {why}")
+    elif solution.left_out:
+        verdict = Verdict(
+            False,
+            f"Do not load this into the controller: {found}, but most outlines of a leg that a "
+            f"view shows disagree with that ({', '.join(solution.left_out)}), so that they are of "
+            "something else or the fit is wrong; look at them in the table of observations, and "
+            "correct them or leave the leg out of the legs of that view.",
+        )
     else:
         verdict = _verdict(change, sigma, found)
     return Calibration(

@@ -413,6 +413,23 @@ def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
     return (f"{words}.",)
 
 
+def legs_left_out(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
+    """Return the legs of views most of whose outlines disagree with the fit, and how many do.
+
+    They do so in several images of the view: what is wrong in one is a matter of chance.
+    """
+    o, names = problem.outlines, problem.legs.names
+    together = o.leg * len(o.views) + o.view
+    shown = [f"{leg} in view {view}" for leg in names for view in o.views]
+    return tuple(
+        f"{rejected} of {total} of {shown[k]}"
+        for k in np.unique(together[~accepted]).tolist()
+        if (rejected := int(np.sum(own := (together == k) & ~accepted)))
+        > _MOST_REJECTED * (total := int(np.sum(together == k)))
+        and len(np.unique(o.pose[own])) >= _MIN_COUNT
+    )
+
+
 def scale_notes(problem: FitProblem, state: State, settings: RefinementSettings) -> tuple[str, ...]:
     """Return a note where all radii come out larger or smaller than the model's by one factor."""
     free = problem.block("radii").unknown[:, 0] >= 0

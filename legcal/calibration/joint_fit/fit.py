@@ -9,6 +9,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from legcal.calibration.joint_fit.determinacy import (
     held_at_nominal,
     open_directions,
@@ -57,6 +59,11 @@ _MAX_RADIUS_CHANGE = 0.5
 _COST_TOLERANCE = 1e-6  # relative: the same minimum
 _POSE_ROUNDS = 8  # in which other poses are looked for, where readings leave them open
 _PART_OF_MODEL = 0.1  # of the errors of a nominal model, which are left then
+_SEED = 2001  # of other starts
+_OTHER_STARTS = 8  # where a fit leaves out a leg of a view, at most
+_OTHER_MODEL = 0.005  # of the mean leg length, angles at it: errors of models that are tried
+_SAME_COST = 0.01  # relative: the same minimum, by first minima
+_ENOUGH_STARTS = 3  # that come to the same minimum: there is no better one near
 
 
 def refine(
@@ -105,12 +112,9 @@ def refine(
     DatasetError
         If an outline or an axis cannot be used.
     """
-    problem = build_fit(
-        legs, measurements, outlines, settings, axes=axes, board=board, choices=choices
+    return refine_from_best(
+        legs, measurements, outlines, (start,), settings, axes=axes, board=board, choices=choices
     )
-    with naming_missing_lengths(problem):
-        minimum = _first(problem, start, settings)
-        return _refined(problem, outlines, start, minimum, settings)
 
 
 def _called(start: Start) -> str:
@@ -175,6 +179,8 @@ def _best(
             failures.append(failure)
             notes.append(f"The joint fit started from {_called(start)} was given up. {failure}")
             continue
+        if found.left_out:
+            found = _from_other_starts(problem, outlines, start, minimum, found, settings)
         return dataclasses.replace(found, notes=(*found.notes, *notes), details=tuple(details))
     if failures and all(isinstance(failure, NotIdentifiable) for failure in failures):
         raise failures[0]
@@ -184,9 +190,49 @@ def _best(
     )
 
 
-def _first(problem: FitProblem, start: Start, settings: RefinementSettings) -> Minimum[State]:
-    """Return the first minimum that a start leads to."""
-    begin = problem.begin(start)
+def _from_other_starts(
+    problem: FitProblem,
+    outlines: Outlines,
+    start: Start,
+    first: Minimum[State],
+    found: Solution,
+    settings: RefinementSettings,
+) -> Solution:
+    """Return what a fit that left out a leg of a view finds from other models, if that is better.
+
+    Outlines of one leg in one view are not wrong together by chance: they are of another leg, or
+    the fit is at a wrong minimum, where it may pass through all others without an error. So nominal
+    models that are wrong otherwise are tried, until the fit leaves out no leg of a view, or several
+    starts come to the same minimum.
+    """
+    rng, begin = np.random.default_rng(_SEED), problem.begin(start)
+    n = problem.n_kinematic
+    unit = np.array([begin.mean_length if unit == "m" else 1.0 for unit in problem.units[:n]])
+    n_same = 0
+    for _ in range(_OTHER_STARTS):
+        step = np.zeros(problem.size)
+        step[:n] = _OTHER_MODEL * unit * rng.normal(size=n)
+        try:
+            minimum = _first(problem, start, settings, problem.moved(begin, step))
+            if minimum.cost > (1.0 - _SAME_COST) * first.cost:
+                n_same += minimum.cost < (1.0 + _SAME_COST) * first.cost
+                if n_same == _ENOUGH_STARTS:
+                    break
+                continue
+            found = _refined(problem, outlines, start, minimum, settings)
+        except (DidNotConverge, NotIdentifiable):
+            continue
+        if not found.left_out:
+            break
+        first, n_same = minimum, 0
+    return found
+
+
+def _first(
+    problem: FitProblem, start: Start, settings: RefinementSettings, begin: State | None = None
+) -> Minimum[State]:
+    """Return the first minimum that a start leads to, or another begin near it."""
+    begin = problem.begin(start) if begin is None else begin
     try:
         if are_free(problem, begin):
             return _first_of_free_poses(problem, begin, settings)

@@ -14,6 +14,7 @@ from legcal.calibration.joint_fit.determinacy import HeldDirections, held_spread
 from legcal.calibration.joint_fit.diagnostics import (
     contradicted_radii,
     doubted_cameras,
+    legs_left_out,
     rejected_notes,
     scale_notes,
 )
@@ -117,6 +118,7 @@ class Solution:
     details: tuple[str, ...] = ()  # how it was found, the same
     focal_error: float = 0.0  # relative error of a focal length that the measurements contradict
     contradicted_cameras: tuple[str, ...] = ()  # views that stand for such cameras
+    left_out: tuple[str, ...] = ()  # legs of views most of whose outlines disagree: how many
 
     @property
     def parameters(self) -> KinematicParameters:
@@ -239,6 +241,7 @@ def assemble_solution(
         posterior=Posterior(problem, state, fit.edge_biases, fit.noise, kept),
         focal_error=max((abs(f.change) for f in contradicted), default=0.0),
         contradicted_cameras=(*of_tests, *(camera.view for camera in doubted)),
+        left_out=legs_left_out(problem, fit.accepted),
         notes=(
             *fit.notes,
             *rejected_notes(problem, fit.accepted),
