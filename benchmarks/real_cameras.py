@@ -1,7 +1,8 @@
 """What calibrations state, and how true it is, on photographs by each kind of camera.
 
     OMP_NUM_THREADS=1 python benchmarks/real_cameras.py [--sessions 60] [--kinds phone webcam ...]
-        [--models hexapod 3-rps 3-upu] [--views 3] [--poses 15] [--keep FOLDER] [--workers 1]
+        [--models hexapod 3-rps 3-upu] [--views 3] [--poses 15] [--keep FOLDER [--kept]]
+        [--workers 1]
 
 Cameras of five kinds (``legcal simulate --camera KIND``), from industrial ones to those of people,
 photograph simulated machines from tilted poses and a chessboard; the models take turns, each
@@ -10,8 +11,9 @@ photographs of the board, and nobody tells the gamma; then the machine is calibr
 session, and a line a kind, a machine and for all of them:
 
     n          sessions, and of these: how many were refused, how many are trusted ("Calibrated")
-    e'C^-1e    mean of e' C^-1 e / rank: e the errors of the platform at the session's poses,
-               against the truth, C their predicted covariance; 1 where it is honest
+    e'C^-1e    mean of e' C^-1 e / rank, and one standard deviation of this mean: e the errors of
+               the platform at the session's poses, against the truth, C their predicted
+               covariance; 1 where it is honest
     error      median over sessions of the error of the platform, rms over its poses [mm]
     sigma      median of what is predicted of it [mm]
     gamma      median of the gammas found; they are 2.2
@@ -19,10 +21,11 @@ session, and a line a kind, a machine and for all of them:
     dropped    outlines that were measured and left out: too rough, of a wrong width, by the fit
 
 With ``--keep`` photographs stay in that folder, a folder a session, and are used again, so that
-only the calibrations are repeated, of copies.
+only the calibrations are repeated, of copies; with ``--kept`` of all sessions that lie there.
 """
 
 import argparse
+import re
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -41,10 +44,11 @@ from legcal.simulation.rendering.pipeline import CAMERAS
 from legcal.workers import worker_pool
 
 MODELS = "hexapod", "3-rps", "3-upu"
+_NAME = re.compile(rf"({'|'.join(CAMERAS)})-({'|'.join(MODELS)})-(\d+)x(\d+)-(\d+)")
 N_BOARDS = 15
 _LEAST_SIGMA = 1e-3  # of the largest standard deviation of the platform: directions that count
 HEADER = (
-    f"{'':26}{'n':>4} {'refused':>7} {'trusted':>7} {'e`C^-1e':>8} {'error':>7} {'sigma':>7} "
+    f"{'':26}{'n':>4} {'refused':>7} {'trusted':>7} {'e`C^-1e':>13} {'error':>7} {'sigma':>7} "
     f"{'gamma':>6} {'largest':>8} {'dropped':>8}"
 )
 
@@ -63,6 +67,14 @@ class Session:
     def name(self) -> str:
         """The name of its folder."""
         return f"{self.kind}-{self.model}-{self.views}x{self.poses}-{self.seed}"
+
+    @classmethod
+    def named(cls, name: str) -> "Session | None":
+        """Return the session whose folder has a name, None if none has."""
+        found = _NAME.fullmatch(name)
+        if found is None:
+            return None
+        return cls(found[1], found[2], int(found[5]), int(found[3]), int(found[4]))
 
 
 @dataclass(frozen=True)
@@ -166,8 +178,10 @@ def summary(name: str, found: Sequence[Outcome]) -> str:
     gammas = [gamma for one in fitted for gamma in one.gammas]
     gamma = f"{np.median(gammas):.2f}" if gammas else "-"
     largest = max((one.error / one.sigma for one in trusted), default=0.0)
+    squares = [one.square for one in fitted]
+    of_mean = f" ± {np.std(squares, ddof=1) / len(squares) ** 0.5:.2f}" if len(squares) > 1 else ""
     return start + (
-        f"{np.mean([one.square for one in fitted]):8.2f} "
+        f"{f'{np.mean(squares):.2f}{of_mean}':>13} "
         f"{1e3 * np.median([one.error for one in fitted]):7.3f} "
         f"{1e3 * np.median([one.sigma for one in fitted]):7.3f} {gamma:>6} {largest:8.2f} "
         f"{100.0 * np.mean([one.dropped for one in fitted]):6.1f} %"
@@ -205,15 +219,25 @@ def main() -> None:
     parser.add_argument("--poses", type=int, default=15, help="of each view; 15")
     parser.add_argument("--first", type=int, default=1, help="the first seed; 1")
     parser.add_argument("--keep", type=Path, help="where photographs stay and are used again")
+    parser.add_argument("--kept", action="store_true", help="all that lie there, and no others")
     parser.add_argument("--workers", type=int, default=1, help="processes; 1")
     options = parser.parse_args()
-    print(HEADER)
+    if options.kept and options.keep is None:
+        parser.error("--kept needs --keep FOLDER")
     n = len(options.models)
     sessions = [
         Session(kind, options.models[k % n], options.first + k // n, options.views, options.poses)
         for k in range(options.sessions)
         for kind in options.kinds
     ]
+    if options.kept:
+        lying = [Session.named(folder.name) for folder in sorted(options.keep.iterdir())]
+        sessions = [
+            one
+            for one in lying
+            if one is not None and one.kind in options.kinds and one.model in options.models
+        ]
+    print(HEADER)
     with TemporaryDirectory() as scratch:
         kept = options.keep or Path(scratch)
         found = list(outcomes(sessions, kept, options.workers))

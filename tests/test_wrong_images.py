@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 from hexapod_example import Picture, Spoiled, spoiled
 from numpy.typing import NDArray
 from outline_tables import outlines_of
@@ -569,6 +570,27 @@ def test_a_focal_length_that_is_wrong_by_a_twentieth_is_named(tmp_path: Path, hi
     assert not found.verdict.trustworthy
     assert any(note.startswith("The focal length of c1 does not agree") for note in found.notes)
     assert any("camera_info.yaml" in note for note in found.notes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "factor"), [(3, 1.2), (6, 1.15)])
+def test_a_zoom_that_leads_the_fit_away_from_the_outlines_is_named(
+    tmp_path: Path, n: int, factor: float
+) -> None:
+    made = spoiled(tmp_path / "zoom", n)
+    path = made.path / "camera_info.yaml"
+    camera = yaml.safe_load(path.read_text())
+    for k in (0, 4):
+        camera["camera_matrix"]["data"][k] /= factor
+    path.write_text(yaml.safe_dump(camera))
+    try:
+        found = calibrate(made.write())
+    except NotIdentifiable as refusal:
+        said: tuple[str, ...] = refusal.problems
+    else:
+        assert not found.verdict.trustworthy
+        said = found.notes
+    assert any(sentence.startswith("The focal length of c1 does not agree") for sentence in said)
 
 
 def test_a_reading_whose_own_image_is_right_does_not_rival_an_exchange() -> None:

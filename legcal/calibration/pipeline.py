@@ -96,7 +96,7 @@ TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal 
 # predicts looks like other radii, so that residuals never show it [px].
 LIMB_BIAS = {"bias of many edges": 0.02}
 MAX_LEFT_OUT = 0.25  # of the images, or of the outlines, beyond which common mistakes are tried
-MIN_FOUND_AGAIN = 0.5  # of the outlines of an image
+MIN_FOUND_AGAIN = 0.5  # of the outlines of an image, or of all
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,7 +322,14 @@ def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimat
     # 3 and 4. Four steps and joint fit.
     first = _fit(fitted, seen.outlines, seen.placement, board, options)
     # 5. Measure again near that fit, and fit again.
-    estimate = _measure_again(data, first, seen, board, options)
+    try:
+        estimate = _measure_again(data, first, seen, board, options)
+    except (NotVisible, NotIdentifiable, DidNotConverge) as error:
+        # A fit with a wrong camera may lead away from outlines that were found before it.
+        if not first.solution.camera_notes:
+            raise
+        cameras = (*first.solution.camera_notes, *_camera_notes(data.dataset, first.solution))
+        raise type(error)([*cameras, *error.problems]) from error
     return replace(
         estimate,
         image_notes=(
@@ -496,14 +503,19 @@ def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredIm
 
 
 def _not_found_again(first: Estimate, again: Estimate) -> list[str]:
-    """Return the notes of a first fit on images in which hardly anything is found near it."""
+    """Return the notes of a first fit on images in which hardly anything is found near it.
+
+    Those on cameras as well, where that is so of all images together.
+    """
     after, o = again.outliers, again.solution.outlines
     gone = {
         row: what
         for row, what in first.outliers.items()
         if row not in after and o.used[o.row == row].mean() < MIN_FOUND_AGAIN
     }
-    return image_notes(first.fitted.measurements, gone)
+    few_found = o.used.sum() < MIN_FOUND_AGAIN * first.solution.outlines.used.sum()
+    cameras = first.solution.camera_notes if few_found else ()
+    return [*cameras, *image_notes(first.fitted.measurements, gone)]
 
 
 def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:

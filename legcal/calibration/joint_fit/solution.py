@@ -119,6 +119,7 @@ class Solution:
     focal_error: float = 0.0  # relative error of a focal length that the measurements contradict
     contradicted_cameras: tuple[str, ...] = ()  # views that stand for such cameras
     left_out: tuple[str, ...] = ()  # legs of views most of whose outlines disagree: how many
+    camera_notes: tuple[str, ...] = ()  # those of the notes that are about these
 
     @property
     def parameters(self) -> KinematicParameters:
@@ -176,6 +177,7 @@ def assemble_solution(
     distorted = [test for test in disagreeing if isinstance(test, LensDistortion)]
     of_tests = tuple(test.view for test in disagreeing)
     doubted = [c for c in doubted_cameras(problem, state, kept) if c.view not in of_tests]
+    camera_notes = (*map(str, disagreeing), *map(str, doubted))
     named = problem.named
     of_files = {named[i] for i in problem.calibrated.tolist()}
     shown = [i for i, name in enumerate(names) if name not in of_files]
@@ -242,6 +244,7 @@ def assemble_solution(
         focal_error=max((abs(f.change) for f in contradicted), default=0.0),
         contradicted_cameras=(*of_tests, *(camera.view for camera in doubted)),
         left_out=legs_left_out(problem, fit.accepted),
+        camera_notes=camera_notes,
         notes=(
             *fit.notes,
             *rejected_notes(problem, fit.accepted),
@@ -250,8 +253,7 @@ def assemble_solution(
             *notes_on_blur(fit.edge_biases, problem.outlines.covariance[fit.accepted]),
             *(scale or contradicted_radii(problem, state, normal)),
             *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
-            *map(str, disagreeing),
-            *map(str, doubted),
+            *camera_notes,
         ),
     )
 
