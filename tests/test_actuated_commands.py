@@ -28,7 +28,10 @@ def test_commands_know_that_joints_at_A_move(
     said("simulate", name, "-o", session, "--level", "outlines", "--poses", "5", "-q")
     truth = load_mechanism(tmp_path / "session" / "truth" / "models" / f"{name}.yaml")
     known = ["--prior", f"leg1.length={truth.legs[0].q0!r}+-0.00005"] * (name == "delta")
-    said("calibrate", session, "-o", out, "-q", "--no-report", *known)
+    assert "where their motors read 0" in said("calibrate", session, "-o", out, "-q", *known)
+    scene = (tmp_path / "out" / "report.html").read_text()
+    ends = np.array(json.JSONDecoder().raw_decode(scene.split('"standing": ')[1])[0])
+    assert ends.shape == (2, 4 * len(truth.actuators), 3)  # rim and rails or axes, of both models
 
     found = load_result(out).document
     nominal = load_mechanism(name)

@@ -12,6 +12,7 @@ from layouts import Layout, write_machine
 from machines import of_types
 from scipy.ndimage import map_coordinates
 
+from legcal.geometry import Array
 from legcal.machine import (
     Machine,
     inverse_kinematics,
@@ -110,6 +111,12 @@ def test_what_is_not_reached_leaves_the_machine_where_it_was(hexapod: Machine) -
     assert "allow no pose" in motion.place(2, 5.0).problem
 
 
+def along_z(wxyz: Array) -> Array:
+    """Return where turns take the z axis, (n, 3)."""
+    w, x, y, z = wxyz.T
+    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+
+
 def test_rods_join_the_joints(hexapod: Machine) -> None:
     stage, motion = Stage(Source(hexapod)), Motion(hexapod)
     motion.read(3, motion.posture.q[3] + 0.02)
@@ -117,8 +124,7 @@ def test_rods_join_the_joints(hexapod: Machine) -> None:
     np.testing.assert_allclose(
         np.linalg.norm(seen.B - seen.A, axis=1), hexapod.lengths_at(motion.posture.q), atol=1e-12
     )
-    w, x, y, z = seen.rods.wxyz.T
-    along = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    along = along_z(seen.rods.wxyz)
     A, u = seen.A[stage.rod_legs], (seen.B - seen.A)[stage.rod_legs]
     u /= np.linalg.norm(u, axis=1)[:, None]
     np.testing.assert_allclose(along, u, atol=1e-12)
@@ -278,3 +284,21 @@ def test_rims_leave_out_a_leg_in_the_middle_and_no_other() -> None:
             assert len(rim) == n + 1
             assert rim[0] == rim[-1]
             assert len(set(rim)) == n
+
+
+@pytest.mark.parametrize("name", ["delta", "linear-delta"])
+def test_arms_and_carriages_are_drawn_to_the_joints_that_they_carry(name: str) -> None:
+    machine = load_mechanism(name)
+    stage, motion = Stage(Source(machine)), Motion(machine)
+    before = stage.seen(motion.posture)
+    motion.read(2, motion.posture.q[2] - 0.05)
+    seen = stage.seen(motion.posture)
+    np.testing.assert_allclose(np.linalg.norm(seen.B - seen.A, axis=1), machine.q0, atol=1e-9)
+    ends = seen.motors.position + 0.5 * seen.motors.scale[:, 2:] * along_z(seen.motors.wxyz)
+    where = [stage.n_standing + 2 * k for k in range(3)]  # each followed by the bar of its rods
+    middles = 0.5 * (seen.A[::2] + seen.A[1::2])
+    carried = seen.motors.position[where] if name == "linear-delta" else ends[where]
+    np.testing.assert_allclose(carried, middles, atol=1e-12)
+    np.testing.assert_allclose(seen.motors.scale, before.motors.scale, atol=1e-12)
+    moved = np.linalg.norm(seen.motors.position - before.motors.position, axis=1) > 1e-6
+    assert np.flatnonzero(moved).tolist() == [stage.n_standing + 2, stage.n_standing + 3]

@@ -57,6 +57,7 @@ from .joint_fit.variables import platform_poses as platform_poses
 from .joint_fit.variables import start_from as start_from
 from .link_joints import FRAMES as FRAMES
 from .link_joints import joints_in_links as joints_in_links
+from .link_joints import joints_title as joints_title
 from .link_joints import mark_in_words as mark_in_words
 from .location.document import LOCATION_FILE as LOCATION_FILE
 from .location.document import Location as Location

@@ -125,6 +125,12 @@ class _LinkFrame:
         return found
 
 
+def joints_title(side: str, link: str, joints_move: bool) -> str:
+    """Return the title of a table of joints, of which those at A may move with readings."""
+    at_zero = ", where their motors read 0" * (joints_move and side == "base")
+    return f"Joints of the {side} in the link {link}{at_zero} [mm]"
+
+
 def joints_in_links(
     machine: Machine,
     parameters: Sequence[ParameterRow],

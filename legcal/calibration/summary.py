@@ -19,7 +19,7 @@ from legcal.calibration.documents import (
     Result,
     WorkspaceAccuracy,
 )
-from legcal.calibration.link_joints import FRAMES, mark_in_words
+from legcal.calibration.link_joints import FRAMES, joints_title, mark_in_words
 from legcal.calibration.plots import plot_uncertainty
 from legcal.errors import OutOfResources
 from legcal.machine import list_in_words
@@ -206,7 +206,7 @@ def tables(result: Result) -> list[tuple[str, ParameterTable]]:
         columns = tuple(f"in {FRAMES[side]}" if c == "in_frame" else c for c in joints.columns)
         found.append(
             (
-                f"Joints of the {side} in the link {block.link} [mm]",
+                joints_title(side, block.link, result.actuators is not None),
                 replace(joints, columns=columns),
             )
         )

@@ -29,8 +29,11 @@ from .directions import split_by_motion as split_by_motion
 from .drawing import AXIS_COLOURS as AXIS_COLOURS
 from .drawing import BASE_COLOUR as BASE_COLOUR
 from .drawing import LEG_COLOUR as LEG_COLOUR
+from .drawing import MOTOR_COLOUR as MOTOR_COLOUR
 from .drawing import PLATFORM_COLOUR as PLATFORM_COLOUR
+from .drawing import MotorLines as MotorLines
 from .drawing import around as around
+from .drawing import motor_lines as motor_lines
 from .equations import PoseEquations as PoseEquations
 from .equations import VectorOps as VectorOps
 from .equations import axis_in_leg as axis_in_leg

@@ -1,24 +1,29 @@
-"""What a picture of a machine at home shows: from above and from the side, joints and frames."""
+"""What pictures show of a machine: at home from above and from the side, motors as lines."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.figures import new_figure, plain
 from legcal.geometry import Array
+from legcal.machine.leg import Leg
+from legcal.machine.rods import actuator_index, actuators_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 BASE_COLOUR, PLATFORM_COLOUR, LEG_COLOUR = "#333333", "#1f66b0", "#b9b9b9"
+MOTOR_COLOUR = "#8a6d3b"  # arms, carriages and rails
 AXIS_COLOURS = ("#c62828", "#2e7d32", "#1565c0")  # x, y, z
 _PANEL = (5.0, 5.0)  # [inch]
 _ARM = 0.1  # of the size of the machine: the axes of a frame
+_CARRIAGE = 0.06  # of its travel: the length of a carriage
 _RING = 140.0  # [pt^2]: around joints that define R_b and R_e
 
 
@@ -31,6 +36,52 @@ class Panel:
     A: Array  # (n_legs, 2) joints of the base
     B: Array  # (n_legs, 2) joints of the platform at home
     frames: tuple[tuple[str, Array], ...]  # R_b and R_e: (4, 2) origin, and x, y, z from it
+    rim: Array  # (n, 2) what the base is drawn about: its joints, or where its motors stand
+    standing: Array  # (n_motors, 2, 2) ends of rails and axes
+    moving: Array  # (m, 2, 2) ends of arms, of carriages, and of bars between their joints
+
+
+class MotorLines(NamedTuple):
+    """Motors that move joints at A, as lines [m]."""
+
+    anchors: Array  # (n_motors, 3) middles of rails, and where arms meet their axes
+    standing: Array  # (n_motors, 2, 3) rails over their travel, and axes
+    moving: Array  # (k, m, 2, 3) carriages, arms, and bars between the joints of one motor
+
+
+def motor_lines(legs: Sequence[Leg], A: Array) -> MotorLines:
+    """Return the motors of legs, with joints at A where these are, (k, n_legs, 3), in their frame.
+
+    Machines whose joints at A do not move have none. The sizes of carriages and axes are for show.
+    """
+    on, k = actuator_index(legs), len(A)
+    anchors, standing, moving = list[Array](), list[Array](), list[Array]()
+    for number, motor in enumerate(actuators_of(legs)):
+        rods = [j for j, a in enumerate(on) if a == number]
+        joints = A[:, rods]
+        middle = joints.mean(axis=1)
+        start = np.mean([legs[j].A for j in rods], axis=0)
+        if motor.turns:
+            foot = motor.point + ((start - motor.point) @ motor.axis) * motor.axis
+            size = float(np.linalg.norm(start - foot))
+            anchors.append(foot)
+            standing.append(foot + size * np.outer([-0.25, 0.25], motor.axis))
+            moving.append(np.stack([np.tile(foot, (k, 1)), middle], axis=1))
+        else:
+            low, high = motor.travel
+            if not np.isfinite(high - low):
+                low, high = -0.5 * legs[rods[0]].q0, 0.5 * legs[rods[0]].q0
+            rail = start + motor.gain * np.outer([low, high], motor.axis)
+            anchors.append(rail.mean(axis=0))
+            standing.append(rail)
+            half = 0.5 * _CARRIAGE * (rail[1] - rail[0])
+            moving.append(np.stack([middle - half, middle + half], axis=1))
+        moving += [joints[:, i : i + 2] for i in range(len(rods) - 1)]
+    return MotorLines(
+        np.array(anchors).reshape(-1, 3),
+        np.array(standing).reshape(-1, 2, 3),
+        np.stack(moving, axis=1) if moving else np.zeros((k, 0, 2, 3)),
+    )
 
 
 def around(joints: Array) -> Array:
@@ -58,6 +109,7 @@ class Sketch:
         radii: tuple[float, ...],
         joints: tuple[Array, Array],  # (n_legs, 3) of base and platform at home, in the base [m]
         frames: tuple[tuple[str, RigidTransform], ...],  # in the base
+        motors: MotorLines,
         *,
         spatial: bool,
     ) -> Sketch:
@@ -74,6 +126,9 @@ class Sketch:
                     (frame, np.vstack([T.translation, T.rotation.as_matrix().T])[:, axes])
                     for frame, T in frames
                 ),
+                (motors.anchors if len(motors.anchors) > 2 else A)[:, axes],
+                motors.standing[..., axes],
+                motors.moving[0][..., axes],
             )
             for view, axes in views
         )
@@ -97,9 +152,12 @@ def _draw(sketch: Sketch, panel: Panel, ax: Axes) -> None:
     """Draw one panel."""
     A, B = 1e3 * panel.A, 1e3 * panel.B
     size = float(np.ptp(np.concatenate([A, B]), axis=0).max())
-    for joints, colour in ((A, BASE_COLOUR), (B, PLATFORM_COLOUR)):
+    for joints, colour in ((1e3 * panel.rim, BASE_COLOUR), (B, PLATFORM_COLOUR)):
         if panel.is_plan:
             ax.fill(*around(joints).T, facecolor=colour, edgecolor=colour, alpha=0.08)
+    for lines, width in ((panel.standing, 1.5), (panel.moving, 4.0)):
+        for ends in lines:
+            ax.plot(*(1e3 * ends).T, color=MOTOR_COLOUR, linewidth=width, alpha=0.8)
     for j, (a, b) in enumerate(zip(A, B, strict=True)):
         across = np.array([a[1] - b[1], b[0] - a[0]])
         across *= 1e3 * sketch.radii[j] / max(float(np.linalg.norm(across)), 1e-9)

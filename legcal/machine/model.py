@@ -15,7 +15,7 @@ from legcal.files import motion_to_xyz_quat
 from legcal.geometry import Array, frame_on_points
 from legcal.machine.actuator import Actuator
 from legcal.machine.chain import ClosedChain
-from legcal.machine.drawing import Sketch
+from legcal.machine.drawing import Sketch, motor_lines
 from legcal.machine.leg import (
     Cylinder,
     JointType,
@@ -223,6 +223,7 @@ class Machine:
             tuple(max([c.radius for c in leg.cylinders], default=0.0) for leg in self.legs),
             (A, B),
             (("R_b", self.T_base_Rb), ("R_e", self.home * self.T_platform_Re)),
+            motor_lines(self.legs, A[None]),
             spatial=self.spatial,
         )
 

@@ -9,7 +9,15 @@ import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
-from legcal.calibration import FRAMES, NUMBERS, UNITS, mark_in_words, sentences, tables
+from legcal.calibration import (
+    FRAMES,
+    NUMBERS,
+    UNITS,
+    joints_title,
+    mark_in_words,
+    sentences,
+    tables,
+)
 from legcal.report.render import report, table
 
 if TYPE_CHECKING:
@@ -119,7 +127,8 @@ def _joint_tables(evaluation: Evaluation) -> list[RenderableType]:
             for joint in block.joints
             for k, axis in enumerate("xyz")
         ]
-        title = f"Joints of the {side} in the link {block.link} [mm]"
+        moves = any(name.endswith((".direction.1", ".axis_point.1")) for name in evaluation.names)
+        title = joints_title(side, block.link, moves)
         columns = ("leg", "axis", ">model", ">reference", ">difference", "")
         found.append(table(*columns, rows=rows, title=title))
         apart, frame = block.frames_apart, FRAMES[side]

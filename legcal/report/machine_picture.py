@@ -2,7 +2,7 @@
 
 A joint of the base is a disc ``A1``, one of the platform a disc ``B1``; those that define R_b and
 R_e, the gauge of a calibration, have a ring. Legs are as thick as what is seen of them, axes of
-the frames red (x), green (y) and blue (z).
+the frames red (x), green (y) and blue (z). Rails, carriages and arms are brown.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ from legcal.machine import (
     AXIS_COLOURS,
     BASE_COLOUR,
     LEG_COLOUR,
+    MOTOR_COLOUR,
     PLATFORM_COLOUR,
     Machine,
     around,
+    motor_lines,
     vectors_A_to_B,
 )
 
@@ -53,7 +55,9 @@ def draw_machine(machine: Machine) -> str:
     """Return a machine as SVG: from above (x to the right, y up) and from the side (z up)."""
     views = machine.sketch.panels
     B = machine.home.apply(machine.B_platform)
-    points = np.concatenate([B - vectors_A_to_B(machine, machine.home), B])
+    A = B - vectors_A_to_B(machine, machine.home)
+    motors = motor_lines(machine.legs, A[None])
+    points = np.concatenate([A, B, motors.standing.reshape(-1, 3), motors.moving.reshape(-1, 3)])
     low, high = points.min(axis=0), points.max(axis=0)
     scale = (_SIDE - 2 * _EDGE) / max(float((high - low).max()), 1e-6)
     width, height = _SIDE * len(views), _HEAD + _SIDE + _LINE * (2 + (machine.n_legs + 3) // 4)
@@ -65,7 +69,8 @@ def draw_machine(machine: Machine) -> str:
         _text((12, 20), f"{machine.name} at home", size=15),
     ]
     for k, panel in enumerate(views):
-        both = np.concatenate([panel.A, panel.B])
+        ends = (panel.standing.reshape(-1, 2), panel.moving.reshape(-1, 2))
+        both = np.concatenate([panel.A, panel.B, *ends])
         middle = 0.5 * (both.min(axis=0) + both.max(axis=0))
         corner = np.array([_SIDE * (k + 0.5), _HEAD + 0.5 * _SIDE])
 
@@ -75,15 +80,19 @@ def draw_machine(machine: Machine) -> str:
         A, B = on_paper(panel.A), on_paper(panel.B)
         lines.append(_text((_SIDE * k + 12, _HEAD), panel.title))
         if panel.is_plan:
-            lines += [*_outline(A, BASE_COLOUR), *_outline(B, PLATFORM_COLOUR)]
+            lines += [*_outline(on_paper(panel.rim), BASE_COLOUR), *_outline(B, PLATFORM_COLOUR)]
+        for parts, thick in ((panel.standing, 2.0), (panel.moving, 6.0)):
+            for part in parts:
+                start, end = on_paper(part)
+                lines.append(_line(start, end, MOTOR_COLOUR, thick, opacity=0.8))
         for j, (a, b) in enumerate(zip(A, B, strict=True)):
             thick = 2.0 * scale * machine.sketch.radii[j]
             lines.append(_line(a, b, LEG_COLOUR, max(thick, 1.5), opacity=0.7))
         for letter, joints, colour in (("A", A, BASE_COLOUR), ("B", B, PLATFORM_COLOUR)):
             lines += _joints(machine, letter, joints, colour, is_plan=panel.is_plan)
         for frame, (origin, *arms) in panel.frames:
-            ends = origin + _ARM / scale * np.array(arms)
-            lines += _frame(frame, on_paper(np.vstack([origin, ends])))
+            tips = origin + _ARM / scale * np.array(arms)
+            lines += _frame(frame, on_paper(np.vstack([origin, tips])))
     lines += _legend(machine, scale)
     return "\n".join([*lines, "</svg>"]) + "\n"
 
@@ -135,8 +144,10 @@ def _legend(machine: Machine, scale: float) -> Iterator[str]:
     yield _text((18 + step * scale, y + 4), f"{1e3 * step:g} mm")
     frame = ", ".join(str(j + 1) for j in machine.frame_legs)
     y += _LINE
+    at_zero = ", where their motors read 0" if machine.actuators else ""
     yield _text(
-        (12, y + 6), f"Rings: the joints of legs {frame} define R_b (base) and R_e (platform)."
+        (12, y + 6),
+        f"Rings: the joints of legs {frame} define R_b (base{at_zero}) and R_e (platform).",
     )
     for k in range(0, machine.n_legs, 4):
         y += _LINE

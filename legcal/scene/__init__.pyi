@@ -1,6 +1,7 @@
 from .motions import FACTORS as FACTORS
 from .motions import directions as directions
 from .motions import joints_at as joints_at
+from .motions import motors_at as motors_at
 from .motions import step_shown as step_shown
 from .shapes import around as around
 from .shapes import ellipsoids as ellipsoids

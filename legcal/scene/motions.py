@@ -9,7 +9,15 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array, components
-from legcal.machine import Leg, Machine, Parametrization, ends_in_base, first_rods
+from legcal.machine import (
+    Leg,
+    Machine,
+    MotorLines,
+    Parametrization,
+    ends_in_base,
+    first_rods,
+    motor_lines,
+)
 
 if TYPE_CHECKING:
     from legcal.calibration import Result
@@ -38,6 +46,17 @@ def joints_at(
 
         poses = poses_at_readings(machine, legs, q, near)
     return ends_in_base(legs, machine.T_base_Rb, *components(poses), q[:, first_rods(legs)])
+
+
+def motors_at(machine: Machine, legs: Sequence[Leg], A: Array) -> MotorLines:
+    """Return the motors of legs in R_b as lines in the base link [m], joints at A (k, n, 3) there.
+
+    Motors stand in the base link, also where A defines R_b.
+    """
+    frame = machine.T_base_Rb
+    turn = frame.rotation.as_matrix()
+    lines = motor_lines(legs, (A - frame.translation) @ turn)
+    return MotorLines(*(points @ turn.T + frame.translation for points in lines))
 
 
 def directions(

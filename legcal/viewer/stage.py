@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,12 +25,14 @@ from legcal.scene import (
     ellipsoids,
     enlargement,
     joints_at,
+    motors_at,
     step_shown,
 )
 from legcal.viewer.motion import Posture
 from legcal.viewer.source import Source
 
 _THIN = 0.006  # of the size of the machine: the radius of a leg without cylinders
+_STANDING, _MOVING = 0.8, 1.4  # of the thickest rod: rails and axes, arms and carriages
 _USUAL = 0.02  # of it: the median ellipsoid, and
 _WIDER = 4.0  # of the ball that it must be seen about
 _JOINT = 1.25  # of the thickest cylinder of a leg: the ball at its joints
@@ -51,8 +54,20 @@ class Seen:
     A: Array  # (n, 3)
     B: Array  # (n, 3)
     rods: Rods  # of Stage.rod_legs
+    base: Array  # (n, 3) what its base is drawn about: A, or where motors stand that move these
+    motors: Rods  # rails and axes of those motors, then carriages and arms
     beside: tuple[Array, Array] | None  # A and B of what it is compared with
+    skeleton: Array | None  # (m, 2, 3) lines of that
     apart: float  # how far joints are from those beside, without exaggeration [m]
+
+
+class _Placed(NamedTuple):
+    """Joints and motors of a model at a posture, in the base link [m]."""
+
+    A: Array  # (n, 3)
+    B: Array  # (n, 3)
+    anchors: Array  # (n_motors, 3) where motors that move joints at A stand
+    motors: Array  # (m, 2, 3) their rails and axes, then carriages and arms
 
 
 class Stage:
@@ -68,6 +83,8 @@ class Stage:
         The leg of each rod.
     rod_is_thick : (m,) array of bool
         Whether it is a part of the base's half.
+    n_standing : int
+        The first of ``Seen.motors``, which stand.
     motions : tuple of str
         What else can be shown as a motion: weak and held directions.
     """
@@ -79,7 +96,6 @@ class Stage:
         self._nominal = None if source.nominal is None else geometries(source.nominal)
         A, B = self.machine.A_base, self.machine.home.apply(self.machine.B_platform)
         self.size = float(np.ptp(np.concatenate([A, B]), axis=0).max())
-        self.rims = around(A), around(B)
         parts = [
             (j, c.radius, c.side == "base", c)
             for j, leg in enumerate(self.machine.legs)
@@ -91,6 +107,13 @@ class Stage:
         self.rod_is_thick = np.array([p[2] for p in parts] + [False] * len(bare))
         thin = _THIN * self.size
         self._radii = np.array([p[1] for p in parts] + [thin] * len(bare))
+        self.n_standing = len(self.machine.actuators)
+        home = motors_at(self.machine, self._legs, A[None])
+        thickest = float(self._radii.max())
+        self._motor_radii = thickest * np.array(
+            [_STANDING] * self.n_standing + [_MOVING] * home.moving.shape[1]
+        )
+        self.rims = around(_corners(A, home.anchors)), around(B)
         self.ball_radii = _JOINT * np.array(
             [self._radii[self.rod_legs == j].max() for j in range(self.machine.n_legs)]
         )
@@ -120,20 +143,20 @@ class Stage:
 
     def compared(
         self, posture: Posture, motion: int | None = None
-    ) -> tuple[tuple[Array, Array], tuple[Array, Array]] | None:
-        """Return A and B (n, 3) before and after what is compared, at the readings of a posture.
+    ) -> tuple[_Placed, _Placed] | None:
+        """Return the joints before and after what is compared, at the readings of a posture.
 
         That is what the calibration changed, or one sigma along a direction, number *motion*.
         """
-        here = self._joints(self._legs, posture, by_readings=False)
+        here = self._placed(self._legs, posture, by_readings=False)
         if motion is not None:
             parameters = parametrization_of(self.machine, twists=True)
             step = self._directions[motion][1]
             moved = moved_legs(self._legs, parameters.place, step)
-            return here, self._joints(moved, posture)
+            return here, self._placed(moved, posture)
         if self._nominal is None:
             return None
-        return self._joints(self._nominal, posture), here
+        return self._placed(self._nominal, posture), here
 
     def first_step(self, posture: Posture, motion: int) -> int:
         """Return which of the factors of exaggeration shows a direction at first."""
@@ -141,7 +164,7 @@ class Stage:
         if compared is None:
             return FACTORS.index(1)
         before, after = compared
-        moved = max(float(np.abs(b - a).max()) for a, b in zip(before, after, strict=True))
+        moved = max(float(np.abs(b - a).max()) for a, b in zip(before[:2], after[:2], strict=True))
         return step_shown(moved, self.size)
 
     def seen(
@@ -166,22 +189,41 @@ class Stage:
         """
         compared = self.compared(posture, motion)
         if compared is None:
-            A, B = self._joints(self._legs, posture, by_readings=False)
-            return Seen(A, B, self._rods(A, B), None, 0.0)
-        before, after = compared
-        apart = float(np.linalg.norm(np.subtract(after, before), axis=2).max())
-        share = factor * phase
-        A, B = (a + share * (b - a) for a, b in zip(before, after, strict=True))
-        return Seen(A, B, self._rods(A, B), before, apart)
+            here, before, apart = self._placed(self._legs, posture, by_readings=False), None, 0.0
+        else:
+            before, after = compared
+            apart = float(np.linalg.norm(np.subtract(after[:2], before[:2]), axis=2).max())
+            share = factor * phase
+            here = _Placed(*(a + share * (b - a) for a, b in zip(before, after, strict=True)))
+        return Seen(
+            here.A,
+            here.B,
+            self._rods(here.A, here.B),
+            _corners(here.A, here.anchors),
+            _between(here.motors, self._motor_radii),
+            None if before is None else (before.A, before.B),
+            None if before is None else self._skeleton(before),
+            apart,
+        )
 
-    def _joints(
+    def _placed(
         self, legs: Sequence[Leg], posture: Posture, *, by_readings: bool = True
-    ) -> tuple[Array, Array]:
-        """Return A and B (n, 3) of legs at the readings of a posture."""
+    ) -> _Placed:
+        """Return joints and motors of legs at the readings of a posture."""
         near = platform_in_base(self.machine, posture.T)
         by_readings = by_readings and self.machine.is_determined
         A, B = joints_at(self.machine, legs, posture.q[None], [near], by_readings=by_readings)
-        return A[0], B[0]
+        motors = motors_at(self.machine, legs, A)
+        lines = np.concatenate([motors.standing, motors.moving[0]])
+        return _Placed(A[0], B[0], motors.anchors, lines)
+
+    def _skeleton(self, placed: _Placed) -> Array:
+        """Return legs, motors and rims as lines (m, 2, 3)."""
+        found = [np.stack([placed.A, placed.B], axis=1), placed.motors]
+        corners = _corners(placed.A, placed.anchors), placed.B
+        for joints, rim in zip(corners, self.rims, strict=True):
+            found.append(np.stack([joints[rim[:-1]], joints[rim[1:]]], axis=1))
+        return np.concatenate(found)
 
     def _rods(self, A: Array, B: Array) -> Rods:
         """Return the cylinders of legs from A to B (n, 3)."""
@@ -194,6 +236,19 @@ class Stage:
         position = A[self.rod_legs] + ends.mean(axis=1)[:, None] * along
         scale = np.stack([self._radii, self._radii, np.ptp(ends, axis=1)], axis=1)
         return Rods(position, from_z(along), scale)
+
+
+def _corners(A: Array, anchors: Array) -> Array:
+    """Return what the base is drawn about, of joints at A (n, 3) and motors (m, 3)."""
+    return anchors if len(anchors) > 2 else A
+
+
+def _between(ends: Array, radii: Array) -> Rods:
+    """Return cylinders between ends (m, 2, 3)."""
+    along = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    scale = np.stack([radii, radii, length], axis=1)
+    return Rods(ends.mean(axis=1), from_z(along / np.maximum(length, 1e-12)[:, None]), scale)
 
 
 def from_z(u: Array) -> Array:

@@ -41,6 +41,7 @@ _PLAIN = "nominal and calibrated"
 _NONE = "none"
 _STEP = 0.01  # of sliders [mm, deg]
 _STEEL, _ROD, _BASE, _PLATFORM = (88, 96, 108), (190, 197, 206), (70, 74, 80), (31, 95, 168)
+_ARM = (138, 109, 59)
 _BESIDE, _RED, _AMBER, _GREEN = (150, 156, 164), (190, 20, 15), (190, 95, 0), (30, 125, 70)
 _USED, _LEFT_OUT = (60, 220, 90), (235, 70, 60)
 
@@ -150,6 +151,14 @@ class Window:
             "/legs", vertices, faces, seen.rods.wxyz, seen.rods.position,
             batched_scales=seen.rods.scale, batched_colors=self._rod_colours(), lod="off",
         )  # fmt: skip
+        self._motors = None
+        if len(seen.motors.position):
+            colours = np.full((len(seen.motors.position), 3), _ARM, dtype=np.uint8)
+            colours[: stage.n_standing] = _BASE
+            self._motors = scene.add_batched_meshes_simple(
+                "/motors", vertices, faces, seen.motors.wxyz, seen.motors.position,
+                batched_scales=seen.motors.scale, batched_colors=colours, lod="off",
+            )  # fmt: skip
         vertices, faces = _ball(12)
         radii = np.repeat(np.tile(stage.ball_radii, 2)[:, None], 3, axis=1)
         upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(radii), 1))
@@ -165,7 +174,7 @@ class Window:
                 flat_shading=True, cast_shadow=False,
             )
             for name, joints, rim, colour in (
-                ("/base", seen.A, stage.rims[0], _BASE),
+                ("/base", seen.base, stage.rims[0], _BASE),
                 ("/platform", seen.B, stage.rims[1], _PLATFORM),
             )
         ]  # fmt: skip
@@ -181,7 +190,7 @@ class Window:
             for j, name in enumerate(self.source.machine.leg_names)
         ]
         self._beside = scene.add_line_segments(
-            "/beside", _skeleton(seen.A, seen.B, stage.rims), colors=_BESIDE, thickness=2.5,
+            "/beside", np.zeros((1, 2, 3)), colors=_BESIDE, thickness=2.5,
             thickness_units="screen",
             visible=False,
         )  # fmt: skip
@@ -251,15 +260,19 @@ class Window:
         self._rods.batched_wxyzs = seen.rods.wxyz.astype(np.float32)
         self._rods.batched_scales = seen.rods.scale.astype(np.float32)
         self._rods.batched_colors = self._rod_colours()
+        if self._motors is not None:
+            self._motors.batched_positions = seen.motors.position.astype(np.float32)
+            self._motors.batched_wxyzs = seen.motors.wxyz.astype(np.float32)
+            self._motors.batched_scales = seen.motors.scale.astype(np.float32)
         self._balls.batched_positions = np.concatenate([seen.A, seen.B]).astype(np.float32)
-        for plate, joints, rim in zip(self._plates, (seen.A, seen.B), stage.rims, strict=True):
+        for plate, joints, rim in zip(self._plates, (seen.base, seen.B), stage.rims, strict=True):
             plate.vertices = _plate(joints, rim)[0]
         T = posture.T
         self._frame.position, self._frame.wxyz = T.translation, T.rotation.as_quat()[[3, 0, 1, 2]]
-        is_beside = seen.beside is not None and self._show_beside.value
+        is_beside = seen.skeleton is not None and self._show_beside.value
         self._beside.visible = is_beside
-        if seen.beside is not None and is_beside:
-            self._beside.points = _skeleton(*seen.beside, stage.rims).astype(np.float32)
+        if seen.skeleton is not None and is_beside:
+            self._beside.points = seen.skeleton.astype(np.float32)
         if self._ellipsoids is not None:
             self._ellipsoids.visible = self._show_ellipsoids.value
             self._ellipsoids.batched_positions = np.concatenate([seen.A, seen.B]).astype(np.float32)
@@ -279,8 +292,10 @@ class Window:
             zip(self._pose_sliders, motion.coordinates.tolist(), strict=True)
         ):
             slider.value = _shown(value * _scale(int(motion.own[k])), slider.min, slider.max)
-        names = self.source.machine.leg_names
-        ends = [names[j] for j in np.flatnonzero(motion.at_end)]
+        legs = [self.source.machine.legs[j] for j in np.flatnonzero(motion.at_end)]
+        ends = dict.fromkeys(
+            leg.name if leg.actuator is None else leg.actuator.joint for leg in legs
+        )
         lines = []
         if ends:
             lines.append(f"**At the end of the travel:** {_plain(', '.join(ends))}")
@@ -551,14 +566,6 @@ def _plate(joints: Array, rim: list[int]) -> tuple[Any, Any]:
         np.concatenate([ring, ring.mean(axis=0)[None]]).astype(np.float32),
         np.array(faces, dtype=np.uint32),
     )
-
-
-def _skeleton(A: Array, B: Array, rims: tuple[list[int], list[int]]) -> Array:
-    """Return legs and rims as segments (m, 2, 3)."""
-    found = [np.stack([A, B], axis=1)]
-    for joints, rim in zip((A, B), rims, strict=True):
-        found.append(np.stack([joints[rim[:-1]], joints[rim[1:]]], axis=1))
-    return np.concatenate(found)
 
 
 def _principal(axes: Array) -> tuple[Rotation, Array]:

@@ -85,6 +85,10 @@
       const between = (a, b) => a.map((p, i) => p.map((x, k) => x + factor * (b[i][k] - x)));
       const base = mode.base[pose] ?? mode.base[0], platform = mode.platform[pose];
       const parts = [[base[0], platform[0]], [between(...base), between(...platform)]];
+      const motors = mode.motors?.[pose] ?? mode.motors?.[0], moves = motors?.[0].length > 0;
+      const bodies = moves && [motors[0], between(...motors)];
+      const standing = moves && [mode.standing[0], between(...mode.standing)];
+      const apart = (ends) => ends.flatMap((p, k) => (k % 2 ? [p, null] : [p]));
       const x = [[], [], []], which = [];
       const put = (trace, points) => {
         which.push(trace);
@@ -92,7 +96,10 @@
       };
       parts.forEach(([A, B], i) => {
         put(extra.traces.legs[i], A.flatMap((a, j) => [a, B[j], null]));
-        put(extra.traces.base[i], extra.outline.base.map((j) => A[j]));
+        if (bodies) {
+          put(extra.traces.base[i], apart(standing[i]));
+          put(extra.traces.motors[i], apart(bodies[i]));
+        } else put(extra.traces.base[i], extra.outline.base.map((j) => A[j]));
         put(extra.traces.platform[i], extra.outline.platform.map((j) => B[j]));
       });
       const [A, B] = parts[1];

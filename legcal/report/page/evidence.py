@@ -38,7 +38,9 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
     n_held = len(calibration.solution.held_basis)
     counts = {
         "Equations": f"{problem.n_equations}: "
-        + ", ".join(f"{f.n * f.n_rows} of {f.name}" for f in problem.factors if f.n),
+        + ", ".join(
+            f"{f.n * f.n_rows} of {f.name.replace('_', ' ')}" for f in problem.factors if f.n
+        ),
         "Priors": str(len(problem.priors.mean)),
         "Unknowns": f"{problem.n_unknowns}: "
         + ", ".join(

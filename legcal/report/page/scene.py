@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -21,6 +21,7 @@ from legcal.scene import (
     ellipsoids,
     enlargement,
     joints_at,
+    motors_at,
     pyramid,
     step_shown,
 )
@@ -34,6 +35,17 @@ _FURTHER = 2.0  # times that, at most, to see cameras as well
 _SLOPE = 0.4  # of what is seen, to the line of sight
 _N_RING = 20  # points of a ring
 _GREY, _BLUE, _AMBER, _GREEN = "#9aa1ab", "#1f5fa8", "#b26a00", "#1e7d46"
+_NO_LINES = np.zeros((0, 2, 3))
+_BROWN = "#8a6d3b"
+
+
+class _Placed(NamedTuple):
+    """What is drawn of a model at k poses, in the base link [m]."""
+
+    A: Array  # (k, n_legs, 3)
+    B: Array  # (k, n_legs, 3)
+    standing: Array  # (m, 2, 3) rim of the base, rails and axes of motors that move joints at A
+    moving: Array  # (k, m, 2, 3) carriages and arms
 
 
 def machine_scene(calibration: Calibration) -> Plot:
@@ -48,18 +60,25 @@ def machine_scene(calibration: Calibration) -> Plot:
     turn_base = machine.T_base_Rb.rotation.as_matrix()
     turn_platform = machine.T_platform_Re.rotation.as_matrix().T
 
-    def placed(legs: Sequence[Leg], near: Sequence[RigidTransform]) -> tuple[Array, Array]:
-        """Return A and B (k, n, 3) of legs at the readings, in the base link."""
+    rim: list[int] = []  # of where motors stand: the same for all that are compared
+
+    def placed(legs: Sequence[Leg], near: Sequence[RigidTransform]) -> _Placed:
+        """Return what is drawn of legs at the readings, in the base link."""
         by_readings = calibration.platform is not None
-        return joints_at(machine, legs, q, near, by_readings=by_readings)
+        A, B = joints_at(machine, legs, q, near, by_readings=by_readings)
+        motors = motors_at(machine, legs, A)
+        rim[:] = rim or (around(motors.anchors) if len(motors.anchors) > 2 else [])
+        edges = motors.anchors[np.stack([rim[:-1], rim[1:]], axis=1)] if rim else _NO_LINES
+        standing = np.concatenate([edges, motors.standing])
+        return _Placed(A, B, standing, motors.moving)
 
     found = placed(solution.legs, fitted)
-    size = float(np.ptp(np.concatenate([found[0][0], found[1][0]]), axis=0).max())
+    size = float(np.ptp(np.concatenate([found.A[0], found.B[0]]), axis=0).max())
     nominal = placed(geometries(machine), fitted)
     legend = ("nominal", "calibrated")
     modes = [_mode("what the calibration changed", legend, nominal, found, size)]
     parameters = solution.parametrization
-    length = float(np.mean(np.linalg.norm(found[1][0] - found[0], axis=1)))
+    length = float(np.mean(np.linalg.norm(found.B[0] - found.A[0], axis=1)))
     for what, step in directions(calibration.result, parameters, length):
         legs = moved_legs(solution.legs, parameters.place, step)
         legend = ("calibrated", "moved along the direction")
@@ -74,8 +93,14 @@ def machine_scene(calibration: Calibration) -> Plot:
         "poses": [plain(images[row]) for row in measurements.first_rows[chosen].tolist()],
         "turns": _rounded(turn_base @ components(fitted)[0] @ turn_platform, 6),
         "rings": rings,
-        "outline": {"base": around(found[0][0]), "platform": around(found[1][0])},
-        "traces": {"legs": [0, 1], "base": [2, 3], "platform": [4, 5], "rings": 6},
+        "outline": {"base": around(found.A[0]), "platform": around(found.B[0])},
+        "traces": {
+            "legs": [0, 1],
+            "base": [2, 3],
+            "platform": [4, 5],
+            "rings": 6,
+            "motors": [7, 8],
+        },
     }
     names = [plain(name) for name in machine.leg_names]
     cameras = _cameras(calibration, 0.25 * size)
@@ -87,13 +112,17 @@ def machine_scene(calibration: Calibration) -> Plot:
         _lines("nominal platform", _GREY, 2, legend=False),
         _lines("calibrated platform", _BLUE, 3, legend=False),
         _lines(f"1 sigma, {ring_factor:g} times as large", _AMBER, 2),
+        _lines("nominal motors", _GREY, 4, legend=False),
+        _lines("calibrated motors", _BROWN, 8, legend=False),
         cameras,
-        _words(names, found[0][0], "#1d2126"),
+        _words(names, found.A[0], "#1d2126"),
     ]
     hidden = {"showbackground": False, "gridcolor": "#e8ebef", "zeroline": False,
               "title": {"text": ""}, "tickfont": {"size": 10, "color": "#667080"}}  # fmt: skip
     seen = [[v for v in cameras[a] if v is not None] for a in "xyz"]
-    frame_of_view = _view(np.concatenate([*found[0], *found[1]]), np.array(seen).T, size)
+    frame_of_view = _view(
+        np.concatenate([*found.A, *found.B, *found.standing]), np.array(seen).T, size
+    )
     look = {
         "font": FONT,
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
@@ -113,7 +142,7 @@ def machine_scene(calibration: Calibration) -> Plot:
         "same readings, or grey the calibrated one and blue where a direction would move it; the "
         "slider exaggerates the difference. Rings are ellipsoids of one "
         "standard deviation at the joints: those that define R_b and R_e have flat ones or none."
-        f"{left_out}"
+        f"{' Brown are arms and carriages, at the readings.' * bool(machine.actuators)}{left_out}"
     )
     return Plot("machine-scene", traces, look, 560, caption, extra)
 
@@ -147,24 +176,29 @@ def _view(machine: Array, cameras: Array, size: float) -> dict[str, Any]:
 def _mode(
     name: str,
     legend: tuple[str, str],
-    before: tuple[Array, Array],
-    after: tuple[Array, Array],
+    before: _Placed,
+    after: _Placed,
     size: float,
 ) -> dict[str, Any]:
     """Return what is shown of a difference, exaggerated at first so that it is seen."""
-    moved = max(float(np.abs(b - a).max()) for a, b in zip(before, after, strict=True))
+    moved = max(float(np.abs(b - a).max()) for a, b in zip(before[:2], after[:2], strict=True))
     # Joints at A that no motor moves are given once.
-    poses = slice(1 if all(np.ptp(A, axis=0).max() == 0.0 for A in (before[0], after[0])) else None)
+    poses = slice(1 if all(np.ptp(A, axis=0).max() == 0.0 for A in (before.A, after.A)) else None)
     return {
         "name": name,
         "legend": legend,
         "step": step_shown(moved, size),
         "base": [
             [_rounded(a, 7), _rounded(b, 7)]
-            for a, b in zip(before[0][poses], after[0][poses], strict=True)
+            for a, b in zip(before.A[poses], after.A[poses], strict=True)
         ],
         "platform": [
-            [_rounded(a, 7), _rounded(b, 7)] for a, b in zip(before[1], after[1], strict=True)
+            [_rounded(a, 7), _rounded(b, 7)] for a, b in zip(before.B, after.B, strict=True)
+        ],
+        "standing": [_rounded(one.standing.reshape(-1, 3), 6) for one in (before, after)],
+        "motors": [
+            [_rounded(one.reshape(-1, 3), 6) for one in both]
+            for both in zip(before.moving[poses], after.moving[poses], strict=True)
         ],
     }
 
