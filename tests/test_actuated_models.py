@@ -173,6 +173,35 @@ def test_a_csv_gives_the_same_model_as_its_yaml(tmp_path: Path) -> None:
         read_table(path)
 
 
+def test_a_table_says_at_which_of_two_readings_a_motor_stands_at_home(tmp_path: Path) -> None:
+    table = yaml.safe_load((TABLES / "linear-delta.yaml").read_text())
+    for entry in table["actuators"].values():
+        entry["travel"] = [-800, 200]  # the carriages may stand below the platform too
+    path, shipped = tmp_path / "table.yaml", load_mechanism("linear-delta")
+
+    def at(reading: float, **changes: Any) -> Machine:
+        stated = {"home_readings": dict.fromkeys(table["actuators"], float(1e3 * reading))}
+        path.write_text(yaml.safe_dump(table | stated | changes))
+        return create_model(read_table(path), tmp_path / f"{reading:g}").machine
+
+    above = float(inverse_kinematics(shipped, shipped.home)[0])
+    below = above - 2.0 * float(np.sqrt(0.4**2 - (0.25 - 0.06) ** 2))
+    for reading, sign in ((above, 1), (below, -1)):
+        machine = at(reading)
+        np.testing.assert_allclose(inverse_kinematics(machine, machine.home), reading, atol=1e-9)
+        again = load_mechanism(write_model(machine, tmp_path / f"again{sign}")[0])
+        modes = {leg.mode for leg in (*machine.legs, *again.legs)}
+        assert modes == {sign * shipped.legs[0].mode}
+    for wrong, changes, named in (
+        (above - 0.05, {}, "'rail1'.* correct home or home_readings"),
+        (above, {"home_readings": None}, "'rail1'.* two readings there, .* home_readings"),
+        (above, {"home_readings": {"rail9": 1}}, "home_readings.rail9 .* no such carriage"),
+        (above, {"home_readings_deg": {"rail1": 1}}, "home_readings_deg.rail1 .* no such arm"),
+    ):
+        with pytest.raises(ModelError, match=named):
+            at(wrong, **changes)
+
+
 def test_rods_of_other_joints_are_loaded_as_they_were_stated(tmp_path: Path) -> None:
     """Build each kind of rod once, on an arm and on a carriage, and write it as a model again."""
     table = yaml.safe_load((TABLES / "servo-hexapod.yaml").read_text())

@@ -44,8 +44,16 @@ def init(
     unit: Annotated[
         str | None,
         typer.Option(
-            help="Unit of the readings: m, cm, mm, um; by default as the headings say, else the "
-            "one in which they lie in the travel."
+            help="Unit of the readings: m, cm, mm, um, of motors that turn rad, mrad, deg, us; by "
+            "default as the headings say, else the one in which they lie in the travel."
+        ),
+    ] = None,
+    servo: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[JOINT=]CENTRE,US_PER_DEG",
+            help="Pulses of hobby servos: 1500,11.1 for all, or of one (repeat it); negative us "
+            "for one degree where longer pulses turn it backwards. By default as the model says.",
         ),
     ] = None,
     lengths: Annotated[
@@ -75,7 +83,10 @@ def init(
     ] = None,
     encoder_sigma: Annotated[
         str | None,
-        typer.Option(help="Sigma of a reading, 2um; by default the last digit of the table."),
+        typer.Option(
+            help="Sigma of a reading, 2um or 0.5deg; by default the last digit of the table, of "
+            "pulses of servos 0.5deg."
+        ),
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show the matching and write nothing.")
@@ -85,11 +96,7 @@ def init(
 ) -> None:
     """Make a dataset from a folder of photographs and a table of readings."""
     from legcal import data, report
-    from legcal.files import LENGTH, parse_quantity
 
-    sigma = (
-        None if encoder_sigma is None else parse_quantity(encoder_sigma, LENGTH, "--encoder-sigma")
-    )
     found = data.plan_new_dataset(
         folder,
         readings,
@@ -101,7 +108,8 @@ def init(
         views=[] if views is None else views.split(","),
         view_pattern=view_pattern,
         by=match,
-        encoder_sigma=sigma,
+        encoder_sigma=encoder_sigma,
+        servos=servo or (),
     )
     if not as_json:
         print_table(report.matching_table(found))

@@ -34,7 +34,6 @@ from .image_tables import inverse as inverse
 from .image_tables import measurements_at as measurements_at
 from .image_tables import reorder_measurements as reorder_measurements
 from .measurements import INCH as INCH
-from .measurements import SIGMA_ANGLE as SIGMA_ANGLE
 from .measurements import Measurements as Measurements
 from .measurements import View as View
 from .measurements import few as few
@@ -66,6 +65,8 @@ from .photograph_notes import GOOD_QUALITY as GOOD_QUALITY
 from .photograph_notes import compressed as compressed
 from .photograph_notes import compression_note as compression_note
 from .photograph_notes import notes_on_photographs as notes_on_photographs
+from .reading_units import SIGMA_ANGLE as SIGMA_ANGLE
 from .readings_sheet import Headings as Headings
 from .readings_sheet import readings_of as readings_of
 from .readings_sheet import unit_of as unit_of
+from .readings_sheet import units_in_words as units_in_words

@@ -20,10 +20,17 @@ from legcal.data.dataset_file import (
     read_dataset_file,
     view_problems,
 )
-from legcal.data.measurements import Measurements, View, read_measurements
+from legcal.data.measurements import Measurements, View, few, read_measurements
 from legcal.data.outlines import Outlines, read_observations
 from legcal.data.overrides import Override
 from legcal.data.photograph_notes import notes_on_photographs
+from legcal.data.reading_units import (
+    PULSES,
+    SERVO_SIGMA,
+    ReadingUnit,
+    reading_units,
+    sigma_in,
+)
 from legcal.errors import DatasetError
 from legcal.files import closest, describe, path_problem
 from legcal.machine import Machine, load_mechanism, shipped_folder, shipped_names
@@ -130,19 +137,31 @@ class ImageReader:
 
 
 def _encoder_sigmas(
-    path: Path, machine: Machine, stated: float | Mapping[str, float]
+    path: Path,
+    machine: Machine,
+    stated: float | Mapping[str, float | str] | None,
+    units: Mapping[str, ReadingUnit],
 ) -> tuple[float, dict[str, float]]:
     """Return the standard deviation of readings in metres, and those by joint [m or rad].
+
+    Servos whose readings are their pulses need none: they are taken to be good to half a degree.
 
     Raises
     ------
     DatasetError
-        If one number is stated and a motor turns, or joints are not those of the motors.
+        If one number is stated and a motor turns, joints are not those of the motors, or a motor
+        has none.
     """
     turning = [a.joint for a in machine.actuators if a.turns]
+    commanded = {name: SERVO_SIGMA for name, unit in units.items() if unit.name == PULSES}
+    if stated is None:
+        stated = {}
     if not isinstance(stated, Mapping):
         if turning:
-            every = ", ".join(f"{name}: 0.0001" for name in machine.motor_names)
+            every = ", ".join(
+                f"{name}: {'0.5deg' if name in commanded else 0.0001}"
+                for name in machine.motor_names
+            )
             raise DatasetError(
                 f"{path}: encoder_sigma could not be used: found one number [m], but the motor "
                 f"'{turning[0]}' turns, needed one for each motor in its unit; write "
@@ -156,14 +175,25 @@ def _encoder_sigmas(
                 f"{path}: encoder_sigma.{name} could not be used: found no motor of that name, "
                 f"needed each of {', '.join(motors)}; {closest(name, motors)}"
             )
-    missing = [name for name in motors if name not in stated]
+    missing = [name for name in motors if name not in stated and name not in commanded]
     if missing:
         raise DatasetError(
-            f"{path}: encoder_sigma is incomplete: found none for {', '.join(missing)}, needed one "
-            "for each motor in its unit (m or rad); add it."
+            f"{path}: encoder_sigma is incomplete: found none for {few(missing)}, needed one "
+            f"standard deviation of a reading{'' if machine.actuators else ' [m]'}, for each motor "
+            "in the unit of its readings where one turns; add it."
         )
-    linear = [sigma for name, sigma in stated.items() if name not in turning]
-    return min(linear, default=ENCODER_SIGMAS[0]), dict(stated)
+    of_motor = {str(leg.prismatic): leg for leg in reversed(machine.legs)}
+    found, problems = dict[str, float](), list[str]()
+    for name, sigma in stated.items():
+        try:
+            found[name] = sigma_in(sigma, units[name], of_motor[name])
+        except ValueError as error:
+            problems.append(f"{path}: encoder_sigma.{name} could not be used: {error}")
+    if problems:
+        raise DatasetError(problems)
+    linear = [sigma for name, sigma in found.items() if name not in turning]
+    known = commanded | found
+    return min(linear, default=ENCODER_SIGMAS[0]), {name: known[name] for name in motors}
 
 
 def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
@@ -210,8 +240,11 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         for (name, view), path in zip(entry.views.items(), camera_paths, strict=True)
     )
     table_path = folder / entry.measurements
-    sigma_q, by_joint = _encoder_sigmas(yaml_path, machine, entry.encoder_sigma)
-    rows, notes = read_measurements(table_path, folder, views, machine.legs, sigma_q, by_joint)
+    units = reading_units(yaml_path, machine.legs, entry.readings)
+    sigma_q, by_joint = _encoder_sigmas(yaml_path, machine, entry.encoder_sigma, units)
+    rows, notes = read_measurements(
+        table_path, folder, views, machine.legs, sigma_q, by_joint, units
+    )
     measurements, origin, problems = expand_hand_held(yaml_path, rows, entry.views)
     if problems:
         raise DatasetError(problems)

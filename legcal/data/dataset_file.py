@@ -19,6 +19,7 @@ from pydantic import (
 )
 
 from legcal.data.overrides import Override, read_override
+from legcal.data.reading_units import ReadingsEntry, ReadingUnitName
 from legcal.errors import DatasetError
 from legcal.files import (
     PRIOR_SCHEMA,
@@ -37,6 +38,7 @@ from legcal.machine import DATASET_YAML
 from legcal.vision import Link
 
 ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
+_Text = Annotated[str, Strict(), WithJsonSchema({"type": "string"})]
 _BOUNDS = ("minimum", "maximum")
 GAMMAS = (0.2, 5.0)  # no camera encodes light more strongly
 
@@ -100,6 +102,20 @@ class ParametersEntry(FileSchema):
         )
 
 
+def _kind_of_sigma(given: Any) -> str:
+    """Return which form a standard deviation of readings has."""
+    if given is None:
+        return "[none]"
+    return "[by joint]" if isinstance(given, dict) else "[number]"
+
+
+def _kind_of_readings(given: Any) -> str:
+    """Return which form the units of readings have."""
+    if given is None:
+        return "[none]"
+    return "[by joint]" if isinstance(given, dict) else "[unit]"
+
+
 class DatasetEntry(FileSchema):
     """The whole of ``dataset.yaml``."""
 
@@ -115,19 +131,30 @@ class DatasetEntry(FileSchema):
             Tag("[number]"),
         ]
         | Annotated[
-            dict[str, Annotated[Number, Field(gt=0.0)]], Field(min_length=1), Tag("[by joint]")
-        ],
-        Discriminator(lambda given: "[by joint]" if isinstance(given, dict) else "[number]"),
-    ]
+            dict[str, Annotated[Number, Field(gt=0.0)] | _Text],
+            Field(min_length=1),
+            Tag("[by joint]"),
+        ]
+        | Annotated[None, Tag("[none]")],
+        Discriminator(_kind_of_sigma),
+    ] = None  # of servos whose readings are their pulses
+    readings: Annotated[
+        Annotated[ReadingUnitName, Tag("[unit]")]
+        | Annotated[dict[str, ReadingsEntry], Field(min_length=1), Tag("[by joint]")]
+        | Annotated[None, Tag("[none]")],
+        Discriminator(_kind_of_readings),
+    ] = None  # unit of the table, where it is not m or rad
     views: Annotated[dict[Name, ViewEntry], Field(min_length=1)]
     parameters: ParametersEntry = Field(default_factory=ParametersEntry)
     board: dict[str, Any] | list[Any] | None = None  # read by their kinds
 
     @field_validator("encoder_sigma")
     @classmethod
-    def _is_that_of_an_encoder(cls, sigma: float | dict[str, float]) -> float | dict[str, float]:
+    def _is_that_of_an_encoder(
+        cls, sigma: float | dict[str, float | str] | None
+    ) -> float | dict[str, float | str] | None:
         least, most = ENCODER_SIGMAS
-        if isinstance(sigma, dict):
+        if sigma is None or isinstance(sigma, dict):
             return sigma
         if not least <= sigma <= most:
             raise ValueError(

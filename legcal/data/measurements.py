@@ -18,7 +18,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
+from legcal.data.reading_units import PULSES, SIGMA_ANGLE, ReadingUnit, default_unit
 from legcal.files import (
+    ANGLE,
     LENGTH,
     Column,
     Table,
@@ -35,6 +37,8 @@ from legcal.vision import Camera
 MAX_NAMED = 5  # views or other things, in one sentence
 MAX_READING_SPREAD = 10.0  # sigma by which rows of one pose may differ
 INCH = 0.0254  # [m]
+HARDLY_MOVES, SURELY_MOVES = 0.02, 0.2  # of the travel: in the unit stated, and in another
+USUAL_PULSES = (400.0, 2700.0)  # [us], of hobby servos
 _MAX_SHOWN = 3  # readings quoted in a sentence about many
 
 
@@ -168,9 +172,6 @@ def few_views(names: Sequence[str]) -> str:
     return f"view{'s' * (len(names) > 1)} {few(names)}"
 
 
-SIGMA_ANGLE = 1e-4  # [rad], of a reading of a motor that turns, where none is stated
-
-
 def legs_with_readings(legs: Sequence[Leg]) -> list[Leg]:
     """Return the legs of which a table has readings: of rods on one actuator the first."""
     found: dict[str, Leg] = {}
@@ -180,41 +181,59 @@ def legs_with_readings(legs: Sequence[Leg]) -> list[Leg]:
     return list(found.values())
 
 
-def reading_columns(legs: Sequence[Leg]) -> list[Column]:
+def reading_columns(
+    legs: Sequence[Leg], units: Mapping[str, ReadingUnit] = MappingProxyType({})
+) -> list[Column]:
     """Return the columns of readings of the motors, in the order of the legs."""
     return [
-        Column(str(leg.prismatic), what="reading", unit="radians" if leg.reads_angle else "metres")
+        Column(
+            str(leg.prismatic),
+            what="reading",
+            unit=units.get(str(leg.prismatic), default_unit(leg)).words,
+        )
         for leg in legs_with_readings(legs)
     ]
 
 
-def readings_in(table: Table, legs: Sequence[Leg]) -> tuple[Array, tuple[str, ...]]:
+def readings_in(
+    table: Table, legs: Sequence[Leg], units: Mapping[str, ReadingUnit] | None = None
+) -> tuple[Array, tuple[str, ...]]:
     """Return the readings in a table (n_rows, n_motors) [m or rad], and notes on odd ones.
 
-    Readings outside their travel by more than 5 % of it are refused, others are noted.
+    Readings outside their travel by more than 5 % of it are refused, others are noted. Refused is
+    as well what hardly moves in its unit and makes use of the travel in another. *units* are those
+    that a dataset states, None of tables that have readings in m and rad.
     """
     actuated = legs_with_readings(legs)
-    readings = table.numbers(str(leg.prismatic) for leg in actuated)
+    given = table.numbers(str(leg.prismatic) for leg in actuated)
+    stated = [(units or {}).get(str(leg.prismatic), default_unit(leg)) for leg in actuated]
+    readings = np.empty_like(given)
+    for j, unit in enumerate(stated):
+        readings[:, j] = unit.values(given[:, j])
     notes = []
     beyond: list[tuple[str, str, bool]] = []  # column, what was found of it, whether of most rows
-    for leg, column in zip(actuated, readings.T, strict=True):
+    for leg, one, numbers, column in zip(actuated, stated, given.T, readings.T, strict=True):
         lower, upper = leg.travel
         if not 0.0 < upper - lower < np.inf:
             continue
         outside = (column < lower) | (column > upper)
         far = outside & ~leg.in_travel(column)
-        unit = "rad" if leg.reads_angle else "m"
-        travel = f"{lower:g} to {upper:g} {unit} (the joint limits of the model)"
+        unit_name, ends = one.name, sorted(map(one.reading, leg.travel))
+        travel = f"{ends[0]:g} to {ends[1]:g} {unit_name} (the joint limits of the model)"
         if np.any(far):
-            found = f"found {_some(table, column, far, unit)}, needed {travel} with a margin of "
+            found = (
+                f"found {_some(table, numbers, far, unit_name)}, needed {travel} with a margin of "
+            )
             found += f"{TRAVEL_MARGIN:.0%}"
             beyond.append((str(leg.prismatic), found, 2 * np.sum(far) >= len(column)))
         elif np.any(outside):
             notes.append(
                 f"{table.path}, column {leg.prismatic}: readings are a little outside the travel "
-                f"{travel}: {_some(table, column, outside, unit)}."
+                f"{travel}: {_some(table, numbers, outside, unit_name)}."
             )
-    cause = _likely_cause(readings, actuated) if any(most for *_, most in beyond) else ""
+    cause = ""
+    if any(most for *_, most in beyond):
+        cause = _likely_cause(given, actuated, stated, in_dataset=units is not None)
     alike = [name for name, _, most in beyond if most and cause]
     for name, found, _ in beyond:
         if name in alike[1:]:
@@ -227,24 +246,131 @@ def readings_in(table: Table, legs: Sequence[Leg]) -> tuple[Array, tuple[str, ..
         table.refuse_file(
             f"{table.path}, {of_this}: readings are outside the travel: {found}; {remedy}."
         )
+    if not beyond:
+        for problem in _hardly_moving(given, readings, actuated, stated):
+            table.refuse_file(f"{table.path}, {problem}")
     return readings, tuple(notes)
 
 
-def _likely_cause(readings: Array, legs: Sequence[Leg]) -> str:
+def _hardly_moving(
+    given: Array, readings: Array, legs: Sequence[Leg], units: Sequence[ReadingUnit]
+) -> list[str]:
+    """Return which columns hardly move in the unit that is stated, and do in a larger one."""
+    problems = []
+    for name in dict.fromkeys(unit.name for unit in units):
+        some = [j for j, unit in enumerate(units) if unit.name == name]
+        width = np.ptp([legs[j].travel for j in some], axis=1)
+        sizes = ANGLE if legs[some[0]].reads_angle else LENGTH
+        if name not in sizes or not np.all((width > 0.0) & np.isfinite(width)):
+            continue
+        used = float(np.max(np.ptp(readings[:, some], axis=0) / width))
+        for other, size in sizes.items():
+            meant = size * given[:, some]
+            moved = float(np.max(np.ptp(meant, axis=0) / width))
+            if (
+                used < HARDLY_MOVES < SURELY_MOVES < moved
+                and size > sizes[name]
+                and np.all(in_travel(meant, [legs[j] for j in some]))
+            ):
+                columns = few([str(legs[j].prismatic) for j in some])
+                problems.append(
+                    f"column{'s' * (len(some) > 1)} {columns}: the readings could not be used: "
+                    f"found that they use {100 * used:.2g} % of the travel in {name}, which is "
+                    f"stated, and {100 * moved:.2g} % in {other}, needed the unit in which they "
+                    f"are; write it in readings of the dataset file."
+                )
+                break
+    return problems
+
+
+def _likely_cause(
+    given: Array, legs: Sequence[Leg], units: Sequence[ReadingUnit], *, in_dataset: bool
+) -> str:
     """Return what readings (n_rows, n_legs) look like, and the remedy; "" where it is not clear.
 
-    Of what would bring all of them into their travel, that with which they move in it most.
+    Of what would bring all of them into their travel, that with which they move in it most. They
+    are as the table has them, in *units*.
     """
-    rotary = np.array([leg.reads_angle for leg in legs], dtype=np.bool_)
-    if rotary.any() and not rotary.all():
-        for some in (np.flatnonzero(rotary).tolist(), np.flatnonzero(~rotary).tolist()):
-            cause = _likely_cause(readings[:, some], [legs[j] for j in some])
+    groups = dict.fromkeys(
+        (leg.reads_angle, unit.name) for leg, unit in zip(legs, units, strict=True)
+    )
+    if len(groups) > 1:
+        for group in sorted(groups, reverse=True):
+            some = [j for j, unit in enumerate(units) if (legs[j].reads_angle, unit.name) == group]
+            chosen = [[of[j] for j in some] for of in (legs, units)]
+            cause = _likely_cause(given[:, some], *chosen, in_dataset=in_dataset)  # type: ignore[arg-type]
             if cause:
                 return cause
         return ""
+    name = units[0].name
+    if legs[0].reads_angle:
+        tried = _as_angles(given, legs, units, in_dataset)
+    elif name == "m":
+        tried = _as_lengths(given, legs)
+    else:
+        tried = tuple(
+            (size * given, f"{other}: write readings: {other}")
+            for other, size in LENGTH.items()
+            if other != name
+        )
     width = np.ptp([leg.travel for leg in legs], axis=1)
+    found, most = "", 0.0
+    for meant, what in tried:
+        moved = float(np.mean(np.ptp(meant, axis=0) / width))
+        if moved > most and np.all(in_travel(meant, legs)):
+            found, most = f"these look like {what}", moved
+    low, high = USUAL_PULSES
+    if (
+        not found
+        and legs[0].reads_angle
+        and name != PULSES
+        and np.all((given > low) & (given < high))
+    ):
+        found = "these look like pulses of servos in us: "
+        found += (
+            f"write readings: {{{legs[0].prismatic}: {{unit: us, centre_us: 1500, us_per_deg: "
+            "11.1}, ...} in the dataset file, with the numbers of your servos"
+            if in_dataset
+            else "convert them to radians"
+        )
+    return found
+
+
+def _as_angles(
+    given: Array, legs: Sequence[Leg], units: Sequence[ReadingUnit], in_dataset: bool
+) -> tuple[tuple[Array, str], ...]:
+    """Return what readings of motors that turn may be meant as, and how that is said."""
+    name, degrees = units[0].name, np.degrees(1.0)
+
+    def write(unit: str) -> str:
+        return f"write readings: {unit} in the dataset file"
+
+    angles = np.column_stack([u.values(x) for u, x in zip(units, given.T, strict=True)])
+    pulses = [leg.actuator.pulses if leg.actuator is not None else None for leg in legs]
+    found: list[tuple[Array, str]] = []
+    if name == "rad":
+        or_write = f", or {write('deg')}" if in_dataset else ""
+        found += [
+            (given / degrees, f"degrees: multiply them by pi/180{or_write}"),
+            (-given / degrees, "degrees with the opposite sign: multiply them by -pi/180"),
+            (given * degrees, "radians divided by 180/pi once too often: multiply by 180/pi"),
+        ]
+    else:
+        found.append((given, f"radians: {write('rad')}"))
+        if name == PULSES:
+            found.append((given / degrees, f"degrees: {write('deg')}"))
+    if name != PULSES and all(pulses):
+        meant = [p.angles(x) for p, x in zip(pulses, given.T, strict=True) if p is not None]
+        remedy = write(PULSES) if in_dataset else "convert them to radians"
+        found.append((np.column_stack(meant), f"pulses of servos in us: {remedy}"))
+    reverse = "reverse them" if name != PULSES else "give us_per_deg the other sign"
+    return (*found, (-angles, f"readings with the opposite sign: {reverse}"))
+
+
+def _as_lengths(readings: Array, legs: Sequence[Leg]) -> tuple[tuple[Array, str], ...]:
+    """Return what readings in metres may be meant as, and how that is said."""
     whole = "subtract the leg lengths at reading zero (legcal inspect tells them)"
-    tried: tuple[tuple[Array, str], ...] = (
+    return (
         (LENGTH["mm"] * readings, "millimetres: divide them by 1000"),
         (readings_of_lengths(readings, legs), f"whole leg lengths: {whole}"),
         (
@@ -255,19 +381,6 @@ def _likely_cause(readings: Array, legs: Sequence[Leg]) -> str:
         (INCH * readings, "inches: multiply them by 0.0254"),
         (-readings, "readings with the opposite sign: reverse them"),
     )
-    if rotary.all():
-        tried = (
-            (np.radians(readings), "degrees: multiply them by pi/180"),
-            (np.radians(-readings), "degrees with the opposite sign: multiply them by -pi/180"),
-            (np.degrees(readings), "radians divided by 180/pi once too often: multiply by 180/pi"),
-            (-readings, "readings with the opposite sign: reverse them"),
-        )
-    found, most = "", 0.0
-    for meant, what in tried:
-        moved = float(np.mean(np.ptp(meant, axis=0) / width))
-        if moved > most and np.all(in_travel(meant, legs)):
-            found, most = f"these look like {what}", moved
-    return found
 
 
 def readings_of_lengths(lengths: Array, legs: Sequence[Leg]) -> Array:
@@ -298,6 +411,7 @@ def read_measurements(
     legs: Sequence[Leg],
     sigma_q: float,
     sigma_by_joint: Mapping[str, float] = MappingProxyType({}),
+    units: Mapping[str, ReadingUnit] = MappingProxyType({}),
 ) -> tuple[Measurements, tuple[str, ...]]:
     """Return the table ``measurements.csv`` in the order of the file, and notes on odd readings.
 
@@ -313,7 +427,7 @@ def read_measurements(
         path,
         "table of measurements",
         "row",
-        [*texts, *reading_columns(legs)],
+        [*texts, *reading_columns(legs, units)],
         needed="one row for each image; record measurements",
     )
     view_index = {view.name: i for i, view in enumerate(views)}
@@ -323,7 +437,7 @@ def read_measurements(
             needed = f"a view of the dataset file; {closest(name, view_index)}"
             table.refuse(row, f"the unknown view {describe(name)}", needed, "view")
     _refuse_images(table, images, folder)
-    readings, notes = readings_in(table, legs)
+    readings, notes = readings_in(table, legs, units)
     pose, labels = _poses(table.text("pose"))
     q = np.full((len(table), len(legs)), math.nan)
     q[:, [not leg.has_value for leg in legs]] = 0.0

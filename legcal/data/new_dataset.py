@@ -28,21 +28,30 @@ from legcal.data.photograph_matching import (
     likely_pattern,
     match,
 )
-from legcal.data.readings_sheet import Headings, readings_of, unit_of
+from legcal.data.reading_units import (
+    PULSES,
+    SERVO_SIGMA,
+    SIGMA_ANGLE,
+    ReadingUnit,
+    sigma_in,
+)
+from legcal.data.readings_sheet import Headings, readings_of, unit_of, units_in_words
 from legcal.errors import DatasetError, UsageError
 from legcal.files import (
+    LENGTH,
     NAME_NEEDED,
     OutputKind,
     check_path,
     describe,
     format_table,
     is_name,
+    parse_quantity,
     read_table,
     result_folder,
     with_schema,
 )
 from legcal.geometry import Array
-from legcal.machine import DATASET_YAML, Machine, load_mechanism, shipped_names
+from legcal.machine import DATASET_YAML, Leg, Machine, Pulses, load_mechanism, shipped_names
 from legcal.vision import Camera, inspect_image, read_camera
 
 KIND = OutputKind("dataset", "", "legcal_dataset")  # other files may stand beside it
@@ -81,11 +90,11 @@ class NewDataset:
     views : tuple of str
         The view of each pair.
     readings : (n_rows, n_motors) array
-        Of the actuated legs, in their order [m].
+        Of the motors, in the order of their legs [m or rad].
     cameras : dict
         The camera file of each view.
-    encoder_sigma : float
-        One standard deviation of a reading [m].
+    encoder_sigma : float or mapping
+        One standard deviation of a reading [m], by joint [m or rad] where a motor turns.
     notes : tuple of str
         What is odd, or was chosen.
     """
@@ -105,7 +114,7 @@ class NewDataset:
     views: tuple[str, ...]
     readings: Array
     cameras: Mapping[str, Path]
-    encoder_sigma: float
+    encoder_sigma: float | dict[str, float]
     notes: tuple[str, ...]
 
     @property
@@ -164,7 +173,8 @@ def plan_new_dataset(
     views: Sequence[str] = (),
     view_pattern: str | None = None,
     by: str | None = None,
-    encoder_sigma: float | None = None,
+    encoder_sigma: float | str | Mapping[str, float] | None = None,
+    servos: Sequence[str] = (),
 ) -> NewDataset:
     """Return a dataset of photographs and readings, checked and not written yet.
 
@@ -181,7 +191,8 @@ def plan_new_dataset(
     cameras : sequence of str
         Camera files: one for all views, or ``VIEW=FILE`` for each.
     unit : str, optional
-        Of the readings: m, cm, mm, um; by default that of the headings, else found from the travel.
+        Of the readings: m, cm, mm, um, of motors that turn rad, mrad, deg or us (pulses of hobby
+        servos); by default that of the headings, else found from the travel.
     lengths : bool
         Whether the table holds whole lengths of legs in place of readings.
     views : sequence of str
@@ -190,8 +201,11 @@ def plan_new_dataset(
         Which part of the file names is the view, if it is not the folder: ``{view}_*``.
     by : str, optional
         How to match photographs: ``name``, ``time`` or ``order``.
-    encoder_sigma : float, optional
-        One standard deviation of a reading [m]; by default the last digit of the table.
+    encoder_sigma : float, str or mapping, optional
+        One standard deviation of a reading [m], as text with its unit, or by joint [m or rad]; by
+        default the last digit of the table, and half a degree for pulses of servos.
+    servos : sequence of str
+        ``[JOINT=]CENTRE,US_PER_DEG``: pulses of servos of which the model does not know them.
 
     Raises
     ------
@@ -208,8 +222,9 @@ def plan_new_dataset(
         reshape=headings.reshape,
     )  # fmt: skip
     table.check()
-    found_unit, unit_from = unit_of(table, headings, unit, lengths)
-    q, digit = readings_of(table, headings, found_unit, lengths)
+    pulses = read_servos(servos, headings.motors)
+    units, unit_from = unit_of(table, headings, unit, lengths, pulses)
+    q, digits = readings_of(table, headings, units, lengths)
     rows = tuple(
         Row(where, *texts)
         for where, *texts in zip(
@@ -229,7 +244,7 @@ def plan_new_dataset(
         raise DatasetError(problems)
     read = {camera: read_camera(camera) for camera in dict.fromkeys(of_views.values())}
     _check_photographs(matching, [read[of_views[view]] for view in view_of])
-    sigma, note = _sigma(encoder_sigma, digit)
+    sigma, note = _sigmas(encoder_sigma, headings.motors, units, digits)
     notes = [*headings.notes, *matching.notes, *note]
     if set(view_of) == {ONE_VIEW} and not any(row.view for row in rows):
         likely = likely_pattern([photograph for _, photograph in matching.pairs])
@@ -247,7 +262,7 @@ def plan_new_dataset(
         table=path,
         destination=destination,
         columns=headings.taken,
-        unit=found_unit,
+        unit=units_in_words(units),
         unit_from=unit_from,
         are_lengths=lengths,
         rows=rows,
@@ -327,6 +342,83 @@ def _check_place(folder: Path, destination: Path) -> None:
             f"{destination}: the dataset could not be written: found a place in the folder of the "
             "photographs, which is not changed, needed one beside it; give another folder with -o."
         )
+
+
+def read_servos(texts: Sequence[str], motors: Sequence[Leg]) -> dict[str, Pulses]:
+    """Return the pulses of servos by joint, from ``[JOINT=]CENTRE,US_PER_DEG``.
+
+    Raises
+    ------
+    UsageError
+        If a text is no such thing, or names no motor that turns.
+    """
+    turning = [str(leg.prismatic) for leg in motors if leg.reads_angle]
+    found = dict[str, Pulses]()
+    for text in sorted(texts, key=lambda text: "=" in text):  # those of one joint win
+        name, _, numbers = text.rpartition("=")
+        where = f"--servo {text} could not be used"
+        if (name and name not in turning) or not turning:
+            raise UsageError(
+                f"{where}: found no motor {f'{describe(name)} ' * bool(name)}that turns, needed "
+                f"{f'one of {few(turning)}' if turning else 'one'}; correct it."
+            )
+        try:
+            centre, per_degree = (float(part) for part in numbers.split(","))
+        except ValueError:
+            raise UsageError(
+                f"{where}: found {describe(numbers)}, needed the pulse at joint value 0 [us] and "
+                "the us for one degree (negative for the other sense), such as 1500,11.1; correct "
+                "it."
+            ) from None
+        try:
+            pulses = Pulses.stated(centre, per_degree)
+        except ValueError as error:
+            raise UsageError(f"{where}: {error}") from None
+        if pulses is not None:
+            found |= dict.fromkeys([name] if name else turning, pulses)
+    return found
+
+
+def _sigmas(
+    given: float | str | Mapping[str, float] | None,
+    motors: Sequence[Leg],
+    units: Sequence[ReadingUnit],
+    digits: Array,
+) -> tuple[float | dict[str, float], list[str]]:
+    """Return the standard deviation of readings [m], by joint [m or rad] where a motor turns."""
+    if not any(leg.reads_angle for leg in motors):
+        if isinstance(given, str):
+            given = parse_quantity(given, LENGTH, "--encoder-sigma")
+        if not isinstance(given, Mapping):
+            return _sigma(given, float(digits.min()))
+    if isinstance(given, Mapping):
+        return dict(given), []
+    found, notes = dict[str, float](), list[str]()
+    for leg, unit, digit in zip(motors, units, digits.tolist(), strict=True):
+        name = str(leg.prismatic)
+        if given is not None:
+            try:
+                found[name] = sigma_in(given, unit, leg)
+            except ValueError as error:
+                raise UsageError(
+                    "The standard deviation of a reading could not be used: " + str(error)
+                ) from None
+        elif unit.name == PULSES:
+            found[name] = SERVO_SIGMA
+        else:
+            found[name] = max(digit, SIGMA_ANGLE if leg.reads_angle else MIN_SIGMA)
+    if given is None:
+        of = {True: "rad", False: "m"}
+        said = [f"{name} {found[name]:.2g} {of[leg.reads_angle]}" for leg, name in
+                zip(motors, found, strict=True)]  # fmt: skip
+        why = "the last digit of the table, at least that of a good encoder"
+        if any(unit.name == PULSES for unit in units):
+            why = "half a degree of what a hobby servo makes of its pulses"
+        notes.append(
+            f"encoder_sigma is {few(said)}, {why}: give --encoder-sigma if readings are known "
+            "better or worse."
+        )
+    return found, notes
 
 
 def _sigma(given: float | None, digit: float) -> tuple[float, list[str]]:

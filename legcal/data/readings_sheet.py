@@ -8,21 +8,25 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
 from legcal.data.measurements import few, in_travel, reading_columns, readings_of_lengths
+from legcal.data.reading_units import PULSES, ReadingUnit, unit_named
 from legcal.errors import DatasetError, UsageError
-from legcal.files import LENGTH, Column, Lines, Table, describe, split_heading
+from legcal.files import ANGLE, LENGTH, Column, Lines, Table, describe, split_heading
 from legcal.geometry import Array
-from legcal.machine import Leg
+from legcal.machine import Leg, Pulses
 
 LEAST_USED = 0.01  # of the travel: less is the use that is made of it in a larger unit
-GUESSED = ("m", "mm")  # units that are tried where none is stated
+# units that are tried where none is stated, of motors that slide and that turn
+GUESSED = {False: ("m", "mm"), True: ("rad", "deg", PULSES)}
+READING_ANGLES = (*ANGLE, PULSES)
 _HEADINGS = {
     "view": ("view", "camera", "cam", "cameraposition", "viewpoint", "station", "setup"),
     "image": ("image", "img", "file", "filename", "imagefile", "name", "photo", "photograph",
@@ -55,6 +59,7 @@ class Headings:
         """Return lines under the names that their columns have here; others are left out."""
         number, header = lines[0]
         split = [split_heading(text) for text in header]
+        readings = [split_heading(text, (*LENGTH, *READING_ANGLES)) for text in header]
         meaning: dict[int, str] = {}
         clock: dict[int, float] = {}  # what one is in seconds, of a column of times with a unit
         for i, (key, _) in enumerate(split):
@@ -64,11 +69,12 @@ class Headings:
                     meaning[i] = name
                 if timed and meaning.get(i) == name:
                     clock = {i: _SECONDS[timed[1]]}
-        meaning |= self._joints([i for i in range(len(header)) if i not in meaning], split, header)
+        free = [i for i in range(len(header)) if i not in meaning]
+        meaning |= self._joints(free, readings, header)
         for i, name in meaning.items():
             self.taken[header[i]] = name
             if name in self.joints:
-                self.units[name] = split[i][1]
+                self.units[name] = readings[i][1]
         unused = [text for i, text in enumerate(header) if i not in meaning and text]
         if unused:
             one = len(unused) == 1
@@ -135,42 +141,118 @@ def _dated(cell: str, size: float | None) -> str:
         return cell
 
 
-def unit_of(table: Table, headings: Headings, given: str | None, lengths: bool) -> tuple[str, str]:
-    """Return the unit of the readings and where it was found."""
-    stated = sorted({unit for unit in headings.units.values() if unit})
-    if given is not None and given not in LENGTH:
+def unit_of(
+    table: Table,
+    headings: Headings,
+    given: str | None,
+    lengths: bool,
+    servos: Mapping[str, Pulses] = MappingProxyType({}),
+) -> tuple[tuple[ReadingUnit, ...], str]:
+    """Return the unit of the readings of each motor, and where they were found.
+
+    *given* is that of the motors of its kind, those that slide or turn. *servos* are the pulses of
+    those of which the model does not know them.
+    """
+    motors = headings.motors
+    known = [*LENGTH, *READING_ANGLES]
+    if given is not None and given not in known:
         raise UsageError(
-            f"The unit could not be used: found '{given}', needed one of {', '.join(LENGTH)}; "
+            f"The unit could not be used: found '{given}', needed one of {', '.join(known)}; "
             "correct --unit."
         )
+    if given is not None and not any(leg.reads_angle is (given not in LENGTH) for leg in motors):
+        does = "slides" if given in LENGTH else "turns"
+        raise UsageError(
+            f"The unit could not be used: found '{given}' and no motor that {does}, needed one of "
+            f"{', '.join(READING_ANGLES if given in LENGTH else LENGTH)}; correct --unit."
+        )
+    if lengths and any(leg.actuator is not None for leg in motors):
+        raise UsageError(
+            "The table could not be read: found --lengths and motors that move joints at A, needed "
+            "readings of these; leave out --lengths."
+        )
+    found, where = dict[int, ReadingUnit](), list[str]()
+    for turning in (False, True):
+        some = [j for j, leg in enumerate(motors) if leg.reads_angle is turning]
+        if some:
+            own = given if given is not None and (given in LENGTH) is not turning else None
+            units, how = _unit_of_kind(table, headings, some, own, lengths, servos)
+            found |= dict(zip(some, units, strict=True))
+            where.append(how)
+    return tuple(found[j] for j in range(len(motors))), " and ".join(dict.fromkeys(where))
+
+
+def units_in_words(units: Sequence[ReadingUnit]) -> str:
+    """Return the units of readings, each once."""
+    return " and ".join(dict.fromkeys(unit.name for unit in units))
+
+
+def _unit_of_kind(
+    table: Table,
+    headings: Headings,
+    some: Sequence[int],
+    given: str | None,
+    lengths: bool,
+    servos: Mapping[str, Pulses],
+) -> tuple[list[ReadingUnit], str]:
+    """Return the unit of the readings of motors that all slide, or all turn, and where it was."""
+    motors = [headings.motors[j] for j in some]
+    joints, turning = [headings.joints[j] for j in some], motors[0].reads_angle
+    stated = sorted({unit for joint in joints if (unit := headings.units.get(joint, ""))})
     if len(stated) > 1 or (given and stated and stated != [given]):
         raise DatasetError(
             f"{table.path}: the unit could not be decided: found "
             f"{' and '.join(dict.fromkeys([*([given] if given else []), *stated]))}, needed the "
             "same for all readings; correct the headings or --unit."
         )
-    values, motors = table.numbers(headings.joints), headings.motors
+    values = table.numbers(joints)
+
+    def units_of(name: str) -> list[ReadingUnit]:
+        return [
+            unit_named(name, leg, servos.get(joint))
+            for leg, joint in zip(motors, joints, strict=True)
+        ]
 
     def fits(unit: str, as_lengths: bool, *, moving: bool = True) -> bool:
         """Say whether most readings lie in the travel, and use a part of it."""
-        q = LENGTH[unit] * values
+        q = np.column_stack(
+            [one.values(column) for one, column in zip(units_of(unit), values.T, strict=True)]
+        )
         q = readings_of_lengths(q, motors) if as_lengths else q
         moves = np.ptp(q, axis=0) > LEAST_USED * np.ptp([leg.travel for leg in motors], axis=1)
         return bool(2 * in_travel(q, motors).mean() >= 1.0 and (not moving or moves.any()))
 
+    has_pulses = all(
+        joint in servos or (leg.actuator is not None and leg.actuator.pulses is not None)
+        for leg, joint in zip(motors, joints, strict=True)
+    )
+    every = [x for x in READING_ANGLES if x != PULSES or has_pulses] if turning else [*LENGTH]
     known = stated[0] if stated else given
-    tried = (known,) if known else GUESSED
+    tried = (known,) if known else tuple(x for x in GUESSED[turning] if x in every)
     where = "as the heading says" if stated else "as given"
     if known is None:
         where = "the unit in which the readings lie in the travel of the legs"
+    elif known not in every and known != PULSES:
+        does = "turns" if turning else "slides"
+        raise DatasetError(
+            f"{table.path}: the unit could not be used: found {known} of '{joints[0]}', which "
+            f"{does}, needed one of {', '.join(every)}; correct the heading."
+        )
+    elif known == PULSES and not has_pulses:
+        raise DatasetError(
+            f"{table.path}: the readings could not be used: found pulses of servos of which "
+            "neither centre nor us for one degree is known, needed both; give --servo 1500,11.1 "
+            "for all (JOINT=1500,-11.1 for one that turns the other way), or centre_us and "
+            "us_per_deg in legcal.motors of the model, with your numbers."
+        )
     for unit in tried:
         if fits(unit, lengths):
-            return unit, where
+            return units_of(unit), where
     words = ("lengths of legs", "readings") if lengths else ("readings", "lengths of legs")
     low, high = float(values.min()), float(values.max())
-    for unit in (*tried, *(unit for unit in LENGTH if unit not in tried)):
+    for unit in (*tried, *(unit for unit in every if unit not in tried)):
         for other in (lengths, not lengths):
-            if not fits(unit, other):
+            if (other and motors[0].actuator is not None) or not fits(unit, other):
                 continue
             remedies = []
             if other is not lengths:
@@ -183,41 +265,73 @@ def unit_of(table: Table, headings: Headings, given: str | None, lengths: bool) 
             )
     for unit in tried:
         if fits(unit, lengths, moving=False):
-            return unit, where
-    leg = motors[0]
-    at = [1e3 * leg.length_at(q) for q in leg.travel]
+            return units_of(unit), where
     raise DatasetError(
         f"{table.path}: the {words[0]} could not be used: found {low:g} to {high:g}, needed "
-        f"readings in the travel of the model ({1e3 * leg.travel[0]:g} to {1e3 * leg.travel[1]:g} "
-        f"mm for leg '{leg.name}') or lengths ({min(at):g} to {max(at):g} mm, with --lengths); "
-        "correct the travel of the model, or the table."
+        f"{_needed(motors[0], has_pulses=has_pulses)}; correct the travel of the model, or the "
+        "table."
     )
 
 
-def readings_of(table: Table, headings: Headings, unit: str, lengths: bool) -> tuple[Array, float]:
-    """Return readings (n_rows, n_motors) [m], and the size of the last digit of the table [m].
+def _needed(leg: Leg, *, has_pulses: bool) -> str:
+    """Return what readings of a leg lie in, in words."""
+    if leg.reads_angle:
+        low, high = (math.degrees(x) for x in leg.travel)
+        servo = "" if has_pulses else ", or pulses of servos with --servo CENTRE,US_PER_DEG"
+        return (
+            f"readings in the travel of the model ({low:g} to {high:g} deg for motor "
+            f"'{leg.prismatic}'){servo}"
+        )
+    travel = f"{1e3 * leg.travel[0]:g} to {1e3 * leg.travel[1]:g} mm for leg '{leg.name}'"
+    if leg.actuator is not None:
+        return f"readings in the travel of the model ({travel})"
+    at = [1e3 * leg.length_at(q) for q in leg.travel]
+    return (
+        f"readings in the travel of the model ({travel}) or lengths ({min(at):g} to {max(at):g} "
+        "mm, with --lengths)"
+    )
+
+
+def readings_of(
+    table: Table, headings: Headings, units: Sequence[ReadingUnit], lengths: bool
+) -> tuple[Array, Array]:
+    """Return readings (n_rows, n_motors) and the size of the last digit of each motor [m or rad].
 
     Raises DatasetError with a sentence for each reading outside its travel.
     """
-    power = round(math.log10(LENGTH[unit]))
     texts = [table.text(joint) for joint in headings.joints]
-    exact = [[Decimal(text).scaleb(power) for text in column] for column in texts]
-    values = np.array([[float(x) for x in column] for column in exact]).T
+    values = np.array([_exactly(column, unit) for column, unit in zip(texts, units, strict=True)]).T
     q = values
     if lengths:
         q = np.round(readings_of_lengths(values, headings.motors), 12) + 0.0
     inside = in_travel(q, headings.motors)
     for row, j in np.argwhere(~inside).tolist():
-        leg = headings.motors[j]
-        low, high = (1e3 * x for x in leg.travel)
+        leg, unit = headings.motors[j], units[j]
+        size, shown = (math.degrees(1.0), "deg") if leg.reads_angle else (1e3, "mm")
+        low, high = (size * x for x in leg.travel)
         table.refuse(
             row,
-            f"{texts[j][row]} {unit}, which is the reading {1e3 * q[row, j]:.6g} mm",
-            f"one in the travel of leg '{leg.name}', {low:g} to {high:g} mm; correct the reading "
-            "or the limits of the model",
+            f"{texts[j][row]} {unit.name}, which is the reading {size * q[row, j]:.6g} {shown}",
+            f"one in the travel of leg '{leg.name}', {low:g} to {high:g} {shown}; correct the "
+            "reading or the limits of the model",
             next(text for text, name in headings.taken.items() if name == headings.joints[j]),
             what="reading",
         )
     table.check()
-    digits = [int(x.as_tuple().exponent) for column in exact for x in column]
-    return q, 10.0 ** min(digits)
+    digits = [min(int(Decimal(x).as_tuple().exponent) for x in column) for column in texts]
+    of_unit = zip(digits, units, strict=True)
+    return q, np.array([_scaled(Decimal(1).scaleb(digit), unit) for digit, unit in of_unit])
+
+
+def _exactly(texts: Sequence[str], unit: ReadingUnit) -> list[float]:
+    """Return readings [m or rad], lengths by their decimal digits."""
+    if unit.name in LENGTH:
+        return [_scaled(Decimal(text), unit) for text in texts]
+    return [float(x) for x in unit.values(np.array([float(text) for text in texts]))]
+
+
+def _scaled(number: Decimal, unit: ReadingUnit) -> float:
+    """Return a difference of readings [m or rad], positive or not."""
+    if unit.name in LENGTH:
+        return float(number.scaleb(round(math.log10(unit.size))))
+    return float(number) * abs(unit.size)

@@ -31,6 +31,7 @@ from .quantity import Quantity as Quantity
 from .quantity import parse_quantity as parse_quantity
 from .quantity import read_prior as read_prior
 from .quantity import read_value as read_value
+from .quantity import split_quantity as split_quantity
 from .reading import MAX_DOCUMENT as MAX_DOCUMENT
 from .reading import MAX_IMAGE as MAX_IMAGE
 from .reading import MAX_MESH as MAX_MESH

@@ -20,10 +20,15 @@ _VALUE = re.compile(_NUMBER, re.ASCII)
 _PRIOR = re.compile(rf"{_NUMBER}(?:±|\+/?-){_NUMBER}", re.ASCII)
 
 
+def split_quantity(text: str) -> tuple[float, str]:
+    """Return the number and the unit of a text, NaN and "" where it is none."""
+    match = _VALUE.fullmatch(text)
+    return (float(match[1]), match[2]) if match else (math.nan, "")
+
+
 def parse_quantity(text: str, units: Mapping[str, float], what: str) -> float:
     """Return a quantity in metres, radians or pixels."""
-    match = _VALUE.fullmatch(text)
-    value, unit = (float(match[1]), match[2]) if match else (math.nan, "")
+    value, unit = split_quantity(text)
     if not math.isfinite(value) or (unit not in units and (unit or value != 0.0)):
         raise UsageError(
             f"{what} could not be used: found {describe(text)}, needed a number and its unit "

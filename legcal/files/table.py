@@ -16,6 +16,7 @@ import math
 import re
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -31,9 +32,6 @@ MAX_ROWS = 50_000
 MAX_COLUMNS = 300
 _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
 _COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?", re.ASCII)
-_HEADING = re.compile(
-    rf"(.*?)(?:\s*[\[(]\s*({'|'.join(LENGTH)}|µm|μm)\s*[\])]|[\s_/]({'|'.join(LENGTH)}|µm|μm))?"
-)
 _WORKBOOKS = {b"PK\x03\x04": "an XLSX or ODS workbook", b"\xd0\xcf\x11\xe0": "an XLS workbook"}
 
 Lines = list[tuple[int, list[str]]]  # those that are not blank: number from 1, stripped cells
@@ -311,12 +309,19 @@ def _too_large(path: Path, what: str) -> DatasetError:
     )
 
 
-def split_heading(text: str) -> tuple[str, str]:
-    """Return a heading in small letters and digits alone, and its unit of length or "".
+@cache
+def _heading_with(units: tuple[str, ...]) -> re.Pattern[str]:
+    """Return the pattern of headings with one of some units behind them."""
+    one = "|".join([*map(re.escape, units), "µm", "μm"])
+    return re.compile(rf"(.*?)(?:\s*[\[(]\s*({one})\s*[\])]|[\s_/]({one}))?")
+
+
+def split_heading(text: str, units: Iterable[str] = LENGTH) -> tuple[str, str]:
+    """Return a heading in small letters and digits alone, and its unit (of length) or "".
 
     ``Leg 1 [mm]``, ``leg1_mm`` and ``LEG-1 (mm)`` are all ``leg1`` in ``mm``.
     """
-    match = _HEADING.fullmatch(text.strip())
+    match = _heading_with(tuple(units)).fullmatch(text.strip())
     name, unit = (match[1], match[2] or match[3] or "") if match else (text, "")
     letters = "".join(letter for letter in name.casefold() if letter.isalnum())
     return letters, "um" if unit in ("µm", "μm") else unit

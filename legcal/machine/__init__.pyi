@@ -2,6 +2,7 @@ from .actuator import Actuator as Actuator
 from .actuator import ActuatorColumns as ActuatorColumns
 from .actuator import ActuatorKind as ActuatorKind
 from .actuator import JointMotion as JointMotion
+from .actuator import Pulses as Pulses
 from .configurations import MIN_SINGULARITY as MIN_SINGULARITY
 from .configurations import TRAVEL_TOLERANCE as TRAVEL_TOLERANCE
 from .configurations import WORKSPACE_POSES as WORKSPACE_POSES

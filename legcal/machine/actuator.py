@@ -54,6 +54,59 @@ class JointMotion(NamedTuple):
     angle: Array  # (k,) by which a revolute has turned [rad]; zero of a prismatic
 
 
+US_PER_DEG = (0.1, 1000.0)  # of hobby servos, either way
+
+
+@dataclass(frozen=True)
+class Pulses:
+    """How a hobby servo is told where to go: by pulses, one of the centre for joint value 0."""
+
+    centre: float  # [us]
+    per_degree: float  # [us/deg], negative where longer pulses turn it backwards
+
+    @staticmethod
+    def stated(
+        centre: float | None, per_degree: float | None, *, turns: bool = True
+    ) -> Pulses | None:
+        """Return the pulses that a file states, None where it says nothing of them.
+
+        Raises
+        ------
+        ValueError
+            If a number is missing or is none of a servo, or the motor does not turn.
+        """
+        if centre is None and per_degree is None:
+            return None
+        if not turns:
+            raise ValueError(
+                "found pulses of a motor that slides, needed one that turns; leave out centre_us "
+                "and us_per_deg."
+            )
+        if centre is None or per_degree is None:
+            missing = "centre_us" if centre is None else "us_per_deg"
+            raise ValueError(
+                f"found no {missing}, needed the pulse at joint value 0 (centre_us: 1500) and the "
+                "us for one degree (us_per_deg: 11.1, negative for the other sense); add "
+                f"{missing}."
+            )
+        least, most = US_PER_DEG
+        if not (centre > 0.0 and least <= abs(per_degree) <= most):
+            raise ValueError(
+                f"found centre_us {centre:g} and us_per_deg {per_degree:g}, needed a positive "
+                f"pulse, usually 1500, and {least:g} to {most:g} us for one degree either way, "
+                "usually 5.6 to 11.1; correct them."
+            )
+        return Pulses(centre, per_degree)
+
+    def angles(self, pulses: Array) -> Array:
+        """Return the joint values [rad] of pulses [us]."""
+        return np.asarray(np.radians((pulses - self.centre) / self.per_degree))
+
+    def of(self, angle: float) -> float:
+        """Return the pulse [us] of a joint value [rad]."""
+        return self.centre + self.per_degree * float(np.degrees(angle))
+
+
 @dataclass(frozen=True, eq=False)
 class Actuator:
     """A motor that carries joints at A, in the frame of its legs: the base link, or R_b."""
@@ -65,6 +118,7 @@ class Actuator:
     travel: tuple[float, float]  # limits of the joint [m or rad]
     link: str = ""  # the carriage or arm
     gain: float = 1.0  # true motion over reading
+    pulses: Pulses | None = None  # of a hobby servo
 
     @property
     def turns(self) -> bool:

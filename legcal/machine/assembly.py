@@ -1,7 +1,7 @@
 """A described machine put together: a pose in which it closes, lengths and axes of all legs."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
@@ -75,6 +75,7 @@ class Assembled:
     home: Home  # a pose in which it closes, as the file gets it
     base_frame: tuple[str, ...]  # the legs whose joints define R_b and R_e
     planar: bool  # whether it moves in the xy plane of base and platform
+    home_readings: Mapping[str, float] = field(default_factory=dict)  # as stated [m or rad]
 
     @property
     def T_base_platform(self) -> RigidTransform:
@@ -111,7 +112,8 @@ def assemble(described: Description) -> Assembled:
     _refuse(problems)
     planar = all_revolute(described) and is_planar(legs, T)
     frame = _base_frame(described, 2 if _in_a_plane(legs) else 3)
-    return Assembled(described.name, tuple(legs), home, frame, planar)
+    at_home = {name: readings[name] for name in described.home_readings}
+    return Assembled(described.name, tuple(legs), home, frame, planar, at_home)
 
 
 def all_revolute(described: Description) -> bool:
@@ -242,7 +244,8 @@ class _ClosingEquations:
 
     def __init__(self, described: Description, *, mid_travel: bool) -> None:
         self.planar = all_revolute(described)
-        legs = [_fixed_leg(entry, self.planar, mid_travel) for entry in described.legs]
+        self.stated = described.home_readings
+        legs = [_fixed_leg(entry, self.planar, mid_travel, self.stated) for entry in described.legs]
         self.legs = tuple(leg for leg in legs if leg.n_constraints)
         self.actuators = actuators_of(self.legs)
         self.A = np.array([leg.A for leg in legs])
@@ -275,7 +278,8 @@ class _ClosingEquations:
     def readings_near(self, T: RigidTransform) -> Array:
         """Return the readings of the actuators at which the first rod of each reaches a pose."""
         first = {a.joint: leg for leg in reversed(self.legs) if (a := leg.actuator) is not None}
-        return np.array([_candidates(first[a.joint], T)[0] for a in self.actuators])
+        found = [_candidates(first[a.joint], T, self.stated.get(a.joint)) for a in self.actuators]
+        return np.array([both[0] for both in found])
 
     def _at(self, readings: Array) -> tuple[Leg, ...]:
         """Return the legs as they stand at readings."""
@@ -356,7 +360,7 @@ class _ClosingEquations:
         return words or ["axes of a planar mechanism that are not parallel"]
 
 
-def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool) -> Leg:
+def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool, stated: Mapping[str, float]) -> Leg:
     """Return a leg of the length that home needs, passive where any will do."""
     length = entry.offset if entry.kind is LegKind.CONSTANT else None
     if mid_travel and entry.kind is LegKind.ACTUATED and entry.travel is not None:
@@ -376,7 +380,8 @@ def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool) -> Leg:
         actuator=entry.actuator,
     )
     if mid_travel and entry.actuator is not None:
-        return _standing(leg, 0.5 * sum(entry.actuator.travel))
+        middle = 0.5 * sum(entry.actuator.travel)
+        return _standing(leg, stated.get(entry.actuator.joint, middle))
     return leg
 
 
@@ -393,11 +398,16 @@ def _standing(leg: Leg, q: float) -> Leg:
     )
 
 
-def _candidates(leg: Leg, T: RigidTransform) -> list[float]:
-    """Return the two readings at which a rod reaches a pose, that inside its travel first."""
+def _candidates(leg: Leg, T: RigidTransform, stated: float | None = None) -> list[float]:
+    """Return the two readings at which a rod reaches a pose.
+
+    That inside its travel is the first, or the one nearer to what is stated.
+    """
     B = np.asarray(T.apply(leg.B))[None]
     low, high = leg.travel
     found = [float(reading_of_rod(replace(leg, mode=mode), B)[0]) for mode in (1, -1)]
+    if stated is not None:
+        return sorted(found, key=lambda q: abs(q - stated))
     return sorted(found, key=lambda q: max(low - q, q - high, 0.0))
 
 
@@ -421,7 +431,8 @@ def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, fl
     found, problems = dict[str, float](), list[str]()
     for actuator in closure.actuators:
         rods = [leg for leg in closure.legs if leg.actuator is actuator]
-        chosen, other = _candidates(rods[0], T)
+        stated = described.home_readings.get(actuator.joint)
+        chosen, other = _candidates(rods[0], T, stated)
         found[actuator.joint] = chosen
         unit, scale = ("deg", np.degrees(1.0)) if actuator.turns else ("mm", 1e3)
         low, high = (scale * end for end in actuator.travel)
@@ -433,11 +444,18 @@ def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, fl
                 f"{where}: found the readings {scale * chosen:.6g} and {scale * other:.6g} {unit} "
                 f"there, {needed}; correct home, lengths or travel."
             )
+        elif stated is not None:
+            if abs(chosen - stated) > MAX_HOME_RESIDUAL * (actuator.travel[1] - actuator.travel[0]):
+                problems.append(
+                    f"{where} at the reading {scale * stated:.6g} {unit} of home_readings: found "
+                    f"{scale * chosen:.6g} and {scale * other:.6g} {unit} there, needed one within "
+                    f"{MAX_HOME_RESIDUAL:.0%} of its travel; correct home or home_readings."
+                )
         elif not outside[1] and abs(other - chosen) > 1e-9:
             problems.append(
                 f"{where}: found two readings there, {scale * chosen:.6g} and {scale * other:.6g} "
-                f"{unit}, {needed} and not two; give it a travel on one side of where {_of(rods)} "
-                "stands across the motion."
+                f"{unit}, {needed} and not two; write the one in home_readings, or give it a "
+                f"travel on one side of where {_of(rods)} stands across the motion."
             )
     _refuse(problems)
     return found

@@ -1,8 +1,8 @@
 """A machine as a table or a family describes it, and what cannot be in one."""
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -96,6 +96,7 @@ class Description:
     home: "Home | None"  # T_base_platform of a pose in which it closes
     base_frame: tuple[str, ...] | None  # the legs whose joints define R_b and R_e
     notes: tuple[str, ...] = ()  # what was assumed
+    home_readings: Mapping[str, float] = field(default_factory=dict)  # of motors [m or rad]
 
 
 @dataclass(frozen=True, eq=False)

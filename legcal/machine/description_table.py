@@ -34,7 +34,7 @@ from legcal.files import (
     validate,
 )
 from legcal.geometry import Array
-from legcal.machine.actuator import Actuator, ActuatorKind
+from legcal.machine.actuator import Actuator, ActuatorKind, Pulses
 from legcal.machine.description import (
     NEEDED_TYPE,
     Description,
@@ -247,6 +247,9 @@ class ActuatorEntry(FileSchema):
     axis: Direction | None = None
     travel: Ends | None = None
     travel_deg: Ends | None = None
+    travel_us: Ends | None = None  # of a hobby servo, with the two numbers of its pulses
+    centre_us: Number | None = None
+    us_per_deg: Number | None = None
 
     @property
     def turns(self) -> bool:
@@ -279,6 +282,8 @@ class TableFile(FileSchema):
     actuators: Annotated[dict[PlainName, ActuatorEntry], Field(min_length=1)] | None = None
     hangs_on: list[str | None] | None = None
     home: HomeEntry | None = None
+    home_readings: dict[PlainName, Number] | None = None  # of carriages, in the unit
+    home_readings_deg: dict[PlainName, Number] | None = None  # of arms
     platform_in: Literal["base", "platform"] | None = None
     base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
 
@@ -295,15 +300,18 @@ OPTIONS = {
     "platform_in": "--platform-in",
 }
 _XYZ = ("x", "y", "z")
+_TRAVELS = ("travel", "travel_deg", "travel_us")
 _MOTIONS = ("direction", "point", "axis")  # of what rods hang on
 _RADII = ("radius", "tube", "rod")
+_AT_HOME = {"home_reading": "home_readings", "home_reading_deg": "home_readings_deg"}
 _POINTS = tuple(f"{side}_{i}" for side in ("base", "platform") for i in _XYZ)
 _NUMBERS = (
     *("offset", "length", "min_length", "max_length", "travel_low", "travel_high"),
     *_RADII,
     *(f"{side}_axis_{i}" for side in ("base", "platform") for i in _XYZ),
     *(f"{what}_{i}" for what in ("direction", "point", "axis") for i in _XYZ),
-    *("travel_deg_low", "travel_deg_high"),
+    *(f"{travel}_{end}" for travel in ("travel_deg", "travel_us") for end in ("low", "high")),
+    *("centre_us", "us_per_deg", "home_reading", "home_reading_deg"),
 )
 COLUMNS = (
     *(Column(name, "text", required=False) for name in ("leg", "type", "kind", "unit", "hangs_on")),
@@ -364,10 +372,14 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
 
     hangs_on, travel = texts("hangs_on"), pairs("travel")
     actuators = dict[str, dict[str, Any]]()
-    for row, (motor, *values) in enumerate(
-        zip(hangs_on, *map(vectors, _MOTIONS), travel, pairs("travel_deg"), strict=True)
-    ):
-        said = dict(zip((*_MOTIONS, "travel", "travel_deg"), values, strict=True))
+    said_of_motors = {
+        **{key: vectors(key) for key in _MOTIONS},
+        "travel": travel[:],
+        **{key: pairs(key) for key in ("travel_deg", "travel_us")},
+        **{key: numbers(key) for key in ("centre_us", "us_per_deg", *_AT_HOME)},
+    }
+    for row, motor in enumerate(hangs_on):
+        said = {key: values[row] for key, values in said_of_motors.items()}
         if motor is None:
             continue
         travel[row] = None
@@ -392,7 +404,7 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
             for radius, tube, rod in zip(*map(numbers, _RADII), strict=True)
         ],
     }
-    optional = {
+    optional: dict[str, Any] = {
         "legs": texts("leg"),
         "kinds": texts("kind"),
         "offsets": numbers("offset"),
@@ -405,9 +417,14 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
     }
     if actuators:
         document["actuators"] = {
-            name: {key: value for key, value in entry.items() if value is not None}
+            name: {
+                k: value for k, value in entry.items() if value is not None and k not in _AT_HOME
+            }
             for name, entry in actuators.items()
         }
+        for column, key in _AT_HOME.items():
+            stated = {name: entry[column] for name, entry in actuators.items()}
+            optional[key] = {k: value for k, value in stated.items() if value is not None} or [None]
     return document | {
         key: column for key, column in optional.items() if any(x is not None for x in column)
     }
@@ -565,6 +582,7 @@ def _conflicting_entries(file: TableFile, source: str) -> list[str]:
         )
     problems += _wrong_home(file, source)
     problems += _wrong_actuators(file, source, names)
+    problems += _wrong_home_readings(file, source)
     problems += _wrong_lengths(file, source, names)
     return problems
 
@@ -590,13 +608,24 @@ def _wrong_actuators(file: TableFile, source: str, names: list[str]) -> list[str
                 "carriage, or a point and the axis of an arm; correct it."
             )
             continue
-        right, wrong = ("travel_deg", "travel") if entry.turns else ("travel", "travel_deg")
-        if getattr(entry, right) is None or getattr(entry, wrong) is not None:
-            found = wrong if getattr(entry, wrong) is not None else "no travel"
-            what = "an arm, in degrees" if entry.turns else f"a carriage, in {file.unit}"
+        try:
+            pulses = Pulses.stated(entry.centre_us, entry.us_per_deg, turns=entry.turns)
+        except ValueError as error:
+            problems.append(f"{where}: {error}")
+            continue
+        travels = [key for key in _TRAVELS if getattr(entry, key) is not None]
+        right = ["travel_deg", "travel_us"] if entry.turns else ["travel"]
+        if (
+            len(travels) != 1
+            or travels[0] not in right
+            or (travels == ["travel_us"] and not pulses)
+        ):
+            what = f"a carriage, in {file.unit}"
+            if entry.turns:
+                what = "an arm, in degrees, or travel_us with centre_us and us_per_deg of a servo"
             problems.append(
-                f"{where}: found {found}, needed {right}, the lowest and highest reading of "
-                f"{what}; correct it."
+                f"{where}: found {' and '.join(travels) or 'no travel'}, needed {right[0]}, the "
+                f"lowest and highest reading of {what}; correct it."
             )
     motors = _hangs_on(file)
     for leg, type_, motor in zip(names, _types(file, len(names)), motors, strict=False):
@@ -646,8 +675,11 @@ def _actuators(file: TableFile) -> dict[str, Actuator]:
         along = np.array(entry.axis or entry.direction, dtype=float)
         A = [file.base_joints[j] for j, motor in enumerate(motors) if motor == name]
         at = entry.point or np.mean(A, axis=0).tolist()
+        pulses = Pulses.stated(entry.centre_us, entry.us_per_deg, turns=entry.turns)
         ends = entry.travel_deg or entry.travel or [0.0, 0.0]
-        if entry.turns:
+        if entry.travel_us and pulses:
+            travel = sorted(pulses.angles(np.array(entry.travel_us)).tolist())
+        elif entry.turns:
             travel = [float(np.radians(end)) for end in ends]
         else:
             travel = [in_metres(end, file.unit) for end in ends]
@@ -658,8 +690,32 @@ def _actuators(file: TableFile) -> dict[str, Actuator]:
             np.array([in_metres(x, file.unit) for x in at]),
             (travel[0], travel[1]),
             f"{name}_link",
+            pulses=pulses,
         )
     return found
+
+
+def _home_readings(file: TableFile) -> dict[str, float]:
+    """Return the readings of motors at home that a table states [m or rad]."""
+    return {
+        **{name: in_metres(q, file.unit) for name, q in (file.home_readings or {}).items()},
+        **{name: float(np.radians(q)) for name, q in (file.home_readings_deg or {}).items()},
+    }
+
+
+def _wrong_home_readings(file: TableFile, source: str) -> list[str]:
+    """Return which readings at home are of no motor of their kind."""
+    problems = []
+    for key, turns in (("home_readings", False), ("home_readings_deg", True)):
+        right = [name for name, entry in (file.actuators or {}).items() if entry.turns is turns]
+        what = "arm, in degrees" if turns else f"carriage, in {file.unit}"
+        problems += [
+            f"{source}: {key}.{name} could not be used: found no such {what}, needed "
+            f"{', '.join(right) or 'one among actuators'}; {closest(name, right or ['none'])}"
+            for name in getattr(file, key) or {}
+            if name not in right
+        ]
+    return problems
 
 
 def _wrong_home(file: TableFile, source: str) -> list[str]:
@@ -802,8 +858,9 @@ def _description(file: TableFile, source: str) -> Description:
         )  # fmt: skip
     frame = None if file.base_frame is None else tuple(file.base_frame)
     described = Description(
-        file.name, source, file.unit, tuple(legs), _home(file), frame, tuple(notes)
-    )
+        file.name, source, file.unit, tuple(legs), _home(file), frame, tuple(notes),
+        _home_readings(file),
+    )  # fmt: skip
     if file.home is not None and file.home.height is not None:
         has_turn = file.home.quat_xyzw is not None or file.home.rpy_deg is not None
         turn = _turn(file.home) if has_turn else None

@@ -66,8 +66,8 @@ def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
     return projected
 
 
-def home_at_mid_travel(machine: Machine) -> RigidTransform:
-    """Return a pose where every leg is at the middle of its travel.
+def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None) -> RigidTransform:
+    """Return a pose where every leg is at the middle of its travel, or at readings (n_legs,).
 
     Among the poses that seeded starts lead to, the one with the smallest rotation of the platform
     is taken, counted from where its joints lie over those of the base, and among mirror images in
@@ -80,6 +80,8 @@ def home_at_mid_travel(machine: Machine) -> RigidTransform:
         If none is found.
     """
     middle = np.array([0.5 * sum(leg.travel) for leg in machine.legs])
+    if readings is not None:
+        middle = np.asarray(readings, dtype=np.float64)
     rng = np.random.default_rng(1965)
     A = machine.A_at(middle)
     centre = A.mean(axis=0)

@@ -16,6 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import LegcalError, ModelError, OutOfClass
 from legcal.files import MotionEntry, closest, motion_to_xyz_quat
 from legcal.geometry import Array
+from legcal.machine.actuator import Actuator, Pulses
 from legcal.machine.bodies import Bodies, rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.classification import CONCURRENT, PERPENDICULAR, actuator_of, leg_of
@@ -122,8 +123,9 @@ def _load(source: Source) -> Machine:
     if given is None:
         _check_spread(machine)  # before a home of kilometres is looked for
         if machine.actuators:
-            given = home_at_mid_travel(machine)
-            machine = _in_modes(machine, given, [0.5 * sum(leg.travel) for leg in machine.legs])
+            q = _stated_or_middle(machine, block.home_readings or {})
+            given = home_at_mid_travel(machine, q)
+            machine = _in_modes(machine, given, q)
     else:
         if machine.actuators:
             q = _readings_at_home(machine, block.home_readings or {})
@@ -201,6 +203,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         for chain in reversed(chains)  # its point is where the first leg has it
         if chain.actuator is not None
     }
+    actuators = _as_stated(actuators, block, yaml_path)
     legs = tuple(
         leg_of(
             name,
@@ -238,6 +241,37 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     return machine
 
 
+def _as_stated(
+    found: Mapping[str | None, Actuator | None], block: LegcalBlock, path: Path
+) -> dict[str | None, Actuator | None]:
+    """Return the actuators with what the YAML says of them beside the URDF.
+
+    Raises
+    ------
+    ModelError
+        With one sentence for each motor of which it says what cannot be.
+    """
+    problems, stated = [], dict(found)
+    for name, entry in (block.motors or {}).items():
+        actuator, where = stated.get(name), f"{path}: legcal.motors.{name} could not be used"
+        if actuator is None:
+            known = sorted(str(motor) for motor in stated)
+            problems.append(
+                f"{where}: found no motor of that name that carries rods, needed one of "
+                f"{', '.join(known) or 'them in the model'}; {closest(name, known or ['none'])}"
+            )
+            continue
+        try:
+            pulses = Pulses.stated(entry.centre_us, entry.us_per_deg, turns=actuator.turns)
+        except ValueError as error:
+            problems.append(f"{where}: {error}")
+        else:
+            stated[name] = replace(actuator, pulses=pulses)
+    if problems:
+        raise ModelError(problems)
+    return stated
+
+
 def _travel(chain: LegChain, urdf: Urdf) -> tuple[float, float]:
     """Return the limits of a leg's slider or actuator [m or rad], zero for a rod."""
     limits = None if chain.motor is None else urdf.joints[chain.motor].limits
@@ -254,6 +288,23 @@ def _in_modes(machine: Machine, T_base_platform: RigidTransform, q: Sequence[flo
     return replace(machine, legs=legs)
 
 
+def _check_home_readings(machine: Machine, given: Mapping[str, float]) -> None:
+    """Refuse readings at home of joints that are no actuators."""
+    known = sorted(actuator.joint for actuator in machine.actuators)
+    for name in given:
+        if name not in known:
+            raise ModelError(
+                f"{machine.yaml_path}: legcal.home_readings.{name} could not be used: found no "
+                f"actuator of that name, needed one of {', '.join(known)}; {closest(name, known)}"
+            )
+
+
+def _stated_or_middle(machine: Machine, given: Mapping[str, float]) -> list[float]:
+    """Return the readings of legs at a home that is looked for: as *given*, else mid-travel."""
+    _check_home_readings(machine, given)
+    return [given.get(str(leg.prismatic), 0.5 * sum(leg.travel)) for leg in machine.legs]
+
+
 def _readings_at_home(machine: Machine, given: Mapping[str, float]) -> list[float]:
     """Return the joint values at home: as *given* for actuators, else the one inside the travel.
 
@@ -263,13 +314,8 @@ def _readings_at_home(machine: Machine, given: Mapping[str, float]) -> list[floa
         If both readings at which a rod reaches the platform at home are inside the travel, or a
         reading is given of a joint that is no actuator.
     """
-    path, known = machine.yaml_path, {actuator.joint for actuator in machine.actuators}
-    for name in given:
-        if name not in known:
-            raise ModelError(
-                f"{path}: legcal.home_readings.{name} could not be used: found no actuator of that "
-                f"name, needed one of {', '.join(sorted(known))}; {closest(name, sorted(known))}"
-            )
+    path = machine.yaml_path
+    _check_home_readings(machine, given)
     B = machine.home.apply(machine.B_platform)
     q = [0.0] * machine.n_legs
     for j, leg in enumerate(machine.legs):

@@ -15,7 +15,7 @@ from legcal.machine.leg import JointType, LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.motor_visuals import motor_visuals
-from legcal.machine.schema import mechanism_yaml
+from legcal.machine.schema import mechanism_yaml, motor_entries
 from legcal.machine.spanning_tree import UrdfBuilder, axis_xml, limit_xml, origin_xml_at, visual_xml
 
 TURN = (-3.15, 3.15)  # [rad]
@@ -41,6 +41,7 @@ def urdf_text(machine: Assembled) -> str:
 
 def yaml_text(machine: Assembled) -> str:
     """Return the mechanism YAML of a machine: closures, motors, legs and home."""
+    stated = motor_entries([leg.actuator for leg in machine.legs if leg.actuator is not None])
     return mechanism_yaml(
         [
             (f"{leg.name}_end", f"{leg.name}_seat", "3d" if leg.type.has_sphere else "6d")
@@ -54,6 +55,8 @@ def yaml_text(machine: Assembled) -> str:
             "platform_joint": "platform_free",
             "base_frame": list(machine.base_frame),
             "home": {"xyz": list(machine.home.xyz), "quat_xyzw": list(machine.home.quat_xyzw)},
+            **({"home_readings": dict(machine.home_readings)} if machine.home_readings else {}),
+            **({"motors": stated} if stated else {}),
             "legs": {leg.name: _joint_of(leg) for leg in machine.legs},
         },
     )

@@ -11,6 +11,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -24,10 +25,10 @@ from legcal.machine.formats import XML_SUFFIXES
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
+from legcal.machine.model import Machine, readings_at
 from legcal.machine.origins import moved_origins
 from legcal.machine.rods import actuators_of
-from legcal.machine.schema import mechanism_yaml
+from legcal.machine.schema import mechanism_yaml, motor_entries
 from legcal.machine.urdf import UrdfPatch
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # needs no quotes in YAML
@@ -48,9 +49,19 @@ def mechanism_text(machine: Machine, urdf: str) -> str:
             "platform_joint": machine.platform_joint,
             "base_frame": [machine.leg_names[j] for j in machine.frame_legs],
             "home": motion_to_xyz_quat(machine.home),
+            **_actuators_in_words(machine),
             "legs": {leg.name: _joint_of(machine, leg) for leg in machine.legs},
         },
     )
+
+
+def _actuators_in_words(machine: Machine) -> dict[str, Any]:
+    """Return what the YAML says of actuators: their readings at home, and what no URDF has."""
+    q = readings_at(machine, machine.home)
+    home = {str(machine.legs[j].prismatic): float(q[j]) for j in machine.motors
+            if machine.legs[j].actuator is not None}  # fmt: skip
+    stated = motor_entries(machine.actuators)
+    return ({"home_readings": home} if home else {}) | ({"motors": stated} if stated else {})
 
 
 def model_name(machine: Machine) -> str:

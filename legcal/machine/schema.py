@@ -11,6 +11,7 @@ from legcal.errors import DatasetError, ModelError
 from legcal.files import (
     FileSchema,
     MotionEntry,
+    Number,
     PlainName,
     Version,
     closest,
@@ -18,10 +19,18 @@ from legcal.files import (
     validate,
     with_schema,
 )
+from legcal.machine.actuator import Actuator
 from legcal.machine.files import DATASET_YAML, read_file, what_a_dataset_is_for
 
 WHAT = "mechanism file"
 MAX_LOOPS = 100
+
+
+class MotorEntry(FileSchema):
+    """What a URDF has no place for of a motor that carries rods."""
+
+    centre_us: Number | None = None  # pulse at joint value 0 [us], of a hobby servo
+    us_per_deg: Number | None = None  # negative where longer pulses turn it backwards
 
 
 class LegcalBlock(FileSchema):
@@ -38,6 +47,7 @@ class LegcalBlock(FileSchema):
     base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
     home: MotionEntry | None = None
     home_readings: dict[str, float] | None = None  # of actuators at home [m or rad]
+    motors: dict[str, MotorEntry] | None = None  # that carry rods, by their joints
     legs: Annotated[dict[PlainName, str], Field(min_length=1)]
 
     @field_validator("base_frame")
@@ -152,6 +162,18 @@ def _contradictions(file: MechanismFile, path: Path) -> list[str]:
         if name not in block.legs
     ]
     return problems
+
+
+def motor_entries(actuators: Sequence[Actuator]) -> dict[str, Any]:
+    """Return what the YAML says of actuators beside the URDF, by their joints."""
+    return {
+        actuator.joint: {
+            "centre_us": actuator.pulses.centre,
+            "us_per_deg": actuator.pulses.per_degree,
+        }
+        for actuator in actuators
+        if actuator.pulses is not None
+    }
 
 
 def mechanism_yaml(

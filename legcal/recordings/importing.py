@@ -13,6 +13,7 @@ import numpy as np
 
 from legcal.data import (
     MIN_SIGMA,
+    SIGMA_ANGLE,
     few,
     plan_new_dataset,
     reading_columns,
@@ -68,9 +69,9 @@ class View:
     stills : tuple of Still
         Intervals in which the frames rest.
     readings : (n_used, n_motors) array
-        Means over the intervals that are used [m].
-    scatter : float
-        Standard deviation of a reading around them [m].
+        Means over the intervals that are used [m or rad].
+    scatter : (n_motors,) array
+        Standard deviation of a reading around them [m or rad].
     series : Series
         All readings.
     notes : tuple of str
@@ -83,7 +84,7 @@ class View:
     offset: Offset
     stills: tuple[Still, ...]
     readings: Array
-    scatter: float
+    scatter: Array
     series: Series
     notes: tuple[str, ...]
 
@@ -121,9 +122,22 @@ class Import:
     cameras: tuple[str, ...]
 
     @property
-    def encoder_sigma(self) -> float:
-        """Standard deviation of a reading at rest [m]; errors that last do not average out."""
-        return max(max(view.scatter for view in self.views), MIN_SIGMA)
+    def encoder_sigma(self) -> float | dict[str, float]:
+        """Standard deviation of a reading at rest [m]; errors that last do not average out.
+
+        By joint [m or rad] where a motor turns.
+        """
+        scatter = np.max([view.scatter for view in self.views], axis=0)
+        turning = [bool((on := self.machine.legs[j].actuator) and on.turns)
+                   for j in self.machine.motors]  # fmt: skip
+        if not any(turning):
+            return max(float(scatter.max()), MIN_SIGMA)
+        return {
+            name: max(sigma, SIGMA_ANGLE if turns else MIN_SIGMA)
+            for name, sigma, turns in zip(
+                self.machine.motor_names, scatter.tolist(), turning, strict=True
+            )
+        }
 
     def document(self) -> dict[str, Any]:
         """Return what ``legcal import --json`` prints."""
@@ -306,7 +320,7 @@ def _view(
     q = np.array([series.q[rows].mean(axis=0) for rows in kept])
     rest = np.concatenate([series.q[rows] - q[k] for k, rows in enumerate(kept)])
     freedoms = max(len(rest) - len(kept), 1)
-    scatter = float(np.sqrt((rest**2).sum(axis=0).max() / freedoms))
+    scatter = np.sqrt((rest**2).sum(axis=0) / freedoms)
     return View(
         name=name, recording=recording, n_frames=len(times), offset=apart, stills=tuple(stills),
         readings=q, scatter=scatter, series=series,
@@ -364,7 +378,10 @@ def import_recordings(
         If files are in the way and *force* is not given.
     """
     check_path(found.destination)
-    joints = [column.name for column in reading_columns(found.machine.legs)]
+    of = {"metres": "m", "radians": "rad"}
+    joints = [
+        f"{column.name} [{of[column.unit]}]" for column in reading_columns(found.machine.legs)
+    ]
     try:
         with temporary_folder(existing_parent(found.destination), found.destination.name) as folder:
             rows: list[tuple[object, ...]] = []
@@ -386,7 +403,7 @@ def import_recordings(
             table.write_text(format_table(["view", "image", *joints], rows), encoding="utf-8")
             new = plan_new_dataset(
                 folder / _SHOTS, table, found.model, found.destination, cameras=found.cameras,
-                unit="m", by="name", encoder_sigma=found.encoder_sigma,
+                by="name", encoder_sigma=found.encoder_sigma,
             )  # fmt: skip
             return write_new_dataset(new, force=force)
     except OSError as error:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.data import Headings, reading_columns, readings_of, unit_of
+from legcal.data import Headings, reading_columns, readings_of, unit_of, units_in_words
 from legcal.errors import DatasetError
 from legcal.files import describe, read_table
 from legcal.geometry import Array
@@ -41,7 +41,7 @@ class Series:
     times : (n,) array
         Increasing [s], of their own clock.
     q : (n, n_motors) array
-        Readings [m], in the order of the actuated legs.
+        Readings [m or rad], in the order of the actuated legs.
     taken : mapping
         What each heading was taken for.
     unit : str
@@ -70,18 +70,25 @@ def read_series(path: Path, machine: Machine, unit: str | None, lengths: bool) -
             "seconds or as dates; add it or call it so, or use legcal init for photographs of "
             f"poses that were held. {' '.join(headings.notes)}".rstrip()
         )
-    found, where = unit_of(table, headings, unit, lengths)
-    q, _ = readings_of(table, headings, found, lengths)
+    units, where = unit_of(table, headings, unit, lengths)
+    q, _ = readings_of(table, headings, units, lengths)
     times = _seconds(table.text("time"), path)
     return _in_order(
-        Series(str(path), times, q, headings.taken, f"{found}, {where}", tuple(headings.notes))
+        Series(
+            str(path),
+            times,
+            q,
+            headings.taken,
+            f"{units_in_words(units)}, {where}",
+            tuple(headings.notes),
+        )
     )
 
 
 def series_of_joints(
     source: str, times: Sequence[float], states: Sequence[Mapping[str, float]], machine: Machine
 ) -> Series:
-    """Return the readings of joint states: positions [m] by the names of joints."""
+    """Return the readings of joint states: positions [m or rad] by the names of joints."""
     joints = [column.name for column in reading_columns(machine.legs)]
     complete = [k for k, state in enumerate(states) if all(name in state for name in joints)]
     if not complete:

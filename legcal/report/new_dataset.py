@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
@@ -21,13 +22,16 @@ def matching_table(new: NewDataset) -> RenderableType:
     """Return what was understood of a folder and a table, and which photograph has which row."""
     pairs = list(zip(new.matching.pairs, new.views, strict=True))
     joints = new.joints
+    first = new.machine.legs[new.machine.motors[0]].actuator
+    turns = first is not None and first.turns
+    size, unit = (np.degrees(1.0), "deg") if turns else (1e3, "mm")
     rows = [
         (
             str(k + 1),
             new.rows[k].image or new.rows[k].time,
             photograph.name,
             view,
-            f"{1e3 * new.readings[k, 0]:z.3f}",
+            f"{size * new.readings[k, 0]:z.3f}",
         )
         for (k, photograph), view in pairs[:_MOST]
     ]
@@ -52,7 +56,7 @@ def matching_table(new: NewDataset) -> RenderableType:
             "in the table",
             "photograph",
             "view",
-            f">{joints[0]} [mm]",
+            f">{joints[0]} [{unit}]",
             rows=[tuple(map(printable, row)) for row in rows],
         ),
         [
@@ -110,5 +114,10 @@ def import_table(found: Import) -> RenderableType:
             table(">rest from [s]", ">for [s]", "used", rows=shown),
             [Text(printable(f"note: {note}")) for note in view.notes],
         ]  # fmt: skip
-    sigma = f"encoder_sigma, the scatter at rest: {1e6 * found.encoder_sigma:.3g} um."
-    return report(*blocks, [sigma])
+    sigma = found.encoder_sigma
+    said = (
+        f"{1e6 * sigma:.3g} um"
+        if isinstance(sigma, float)
+        else ", ".join(f"{name} {one:.3g}" for name, one in sigma.items()) + " [m or rad]"
+    )
+    return report(*blocks, [f"encoder_sigma, the scatter at rest: {said}."])

@@ -1,0 +1,189 @@
+"""Units of readings: what a number in a table is as the joint value of a motor.
+
+Tables have readings in m, of motors that turn in rad, unless ``readings`` in ``dataset.yaml`` says
+otherwise: another unit of length or angle, or pulses of hobby servos, of which the model or the
+dataset knows the centre and the us for one degree.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from pydantic import GetJsonSchemaHandler, model_validator
+
+from legcal.errors import DatasetError
+from legcal.files import ANGLE, LENGTH, FileSchema, Number, closest, describe, split_quantity
+from legcal.geometry import Array
+from legcal.machine import Leg, Pulses
+
+PULSES = "us"
+SERVO_SIGMA = math.radians(0.5)  # [rad], of what a hobby servo makes of its command
+SIGMA_ANGLE = 1e-4  # [rad], of a reading of a motor that turns, where none is stated
+MOST_SIGMA = 0.2  # of the travel: no encoder is worse, so that the unit is most likely another
+ReadingUnitName = Literal["m", "cm", "mm", "um", "rad", "mrad", "deg", "us"]
+_WORDS = {"m": "metres", "rad": "radians", "deg": "degrees", "us": "us (pulses of a servo)"}
+
+
+@dataclass(frozen=True)
+class ReadingUnit:
+    """A unit of the readings of one motor: joint value = size (reading - zero)."""
+
+    name: str
+    size: float = 1.0  # [m or rad]
+    zero: float = 0.0  # the reading at joint value 0
+
+    @property
+    def words(self) -> str:
+        """The unit as messages about cells name it."""
+        return _WORDS.get(self.name, self.name)
+
+    def values(self, readings: Array) -> Array:
+        """Return the joint values [m or rad] of readings."""
+        return readings if self.name in ("m", "rad") else (readings - self.zero) * self.size
+
+    def reading(self, value: float) -> float:
+        """Return the reading at a joint value."""
+        return value / self.size + self.zero
+
+
+def default_unit(leg: Leg) -> ReadingUnit:
+    """Return the unit of readings of which nothing is said."""
+    return ReadingUnit("rad" if leg.reads_angle else "m")
+
+
+def unit_of_pulses(pulses: Pulses) -> ReadingUnit:
+    """Return pulses of a servo as a unit."""
+    return ReadingUnit(PULSES, math.radians(1.0) / pulses.per_degree, pulses.centre)
+
+
+def unit_named(name: str, leg: Leg, pulses: Pulses | None = None) -> ReadingUnit:
+    """Return a unit for the readings of a leg.
+
+    Raises
+    ------
+    ValueError
+        If the leg cannot have readings in it; the text goes on after what could not be used.
+    """
+    motor = leg.prismatic
+    of_kind = ANGLE if leg.reads_angle else LENGTH
+    if name in of_kind:
+        return ReadingUnit(name, of_kind[name])
+    if name != PULSES or not leg.reads_angle:
+        does = "turns" if leg.reads_angle else "slides"
+        known = [*of_kind, PULSES] if leg.reads_angle else [*of_kind]
+        raise ValueError(
+            f"found {name} for '{motor}', which {does}, needed one of {', '.join(known)}; correct "
+            "it."
+        )
+    found = pulses or (leg.actuator.pulses if leg.actuator is not None else None)
+    if found is None:
+        raise ValueError(
+            f"found pulses of '{motor}' and neither centre nor us for one degree, needed both: "
+            f"{{{motor}: {{unit: us, centre_us: 1500, us_per_deg: 11.1}}}}, or centre_us and "
+            "us_per_deg of it in legcal.motors of the model; add them."
+        )
+    return unit_of_pulses(found)
+
+
+class ReadingsEntry(FileSchema):
+    """The unit of the readings of one motor, in the block ``readings``."""
+
+    unit: ReadingUnitName
+    centre_us: Number | None = None  # pulse at joint value 0 [us]
+    us_per_deg: Number | None = None  # negative where longer pulses turn the servo backwards
+
+    @classmethod
+    def __get_pydantic_json_schema__(
+        cls, core_schema: Any, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        """Return its schema, or that of a unit alone."""
+        return {"anyOf": [handler(core_schema), {"enum": [*get_args(ReadingUnitName)]}]}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _unit_alone(cls, given: Any) -> Any:
+        return {"unit": given} if isinstance(given, str) else given
+
+
+def reading_units(
+    path: Path, legs: Sequence[Leg], stated: str | Mapping[str, ReadingsEntry] | None
+) -> dict[str, ReadingUnit]:
+    """Return the unit of the readings of each motor, by its joint.
+
+    One unit for all is that of the motors of its kind: those that slide, or those that turn.
+
+    Raises
+    ------
+    DatasetError
+        With one sentence for each motor whose readings cannot have their unit.
+    """
+    motors = dict[str, Leg]()
+    for leg in legs:
+        if leg.is_motor:
+            motors.setdefault(str(leg.prismatic), leg)
+    units = {name: default_unit(leg) for name, leg in motors.items()}
+    if stated is None:
+        return units
+    problems = []
+    if isinstance(stated, str):
+        alike = [name for name, leg in motors.items() if leg.reads_angle is (stated not in LENGTH)]
+        given = {name: ReadingsEntry(unit=stated) for name in alike}  # type: ignore[arg-type]
+        if not alike:
+            does = "slides" if stated in LENGTH else "turns"
+            problems.append(
+                f"{path}: readings could not be used: found {stated} and no motor that {does}, "
+                f"needed {'an angle or us' if does == 'slides' else 'a length'}; correct it."
+            )
+    else:
+        given = dict(stated)
+    for name, entry in given.items():
+        where = f"{path}: readings.{name} could not be used"
+        if name not in motors:
+            problems.append(
+                f"{where}: found no motor of that name, needed one of {', '.join(motors)}; "
+                f"{closest(name, [*motors])}"
+            )
+            continue
+        try:
+            pulses = Pulses.stated(
+                entry.centre_us, entry.us_per_deg, turns=motors[name].reads_angle
+            )
+            units[name] = unit_named(entry.unit, motors[name], pulses)
+        except ValueError as error:
+            problems.append(f"{where}: {error}")
+    if problems:
+        raise DatasetError(problems)
+    return units
+
+
+def sigma_in(stated: float | str, unit: ReadingUnit, leg: Leg) -> float:
+    """Return a standard deviation of readings [m or rad]: a number in their unit, or with its own.
+
+    Raises
+    ------
+    ValueError
+        If it is none; the text goes on after what could not be used.
+    """
+    sizes = {PULSES: unit.size} if unit.name == PULSES else {}
+    sizes |= ANGLE if leg.reads_angle else LENGTH
+    number, name = (
+        (stated, unit.name) if isinstance(stated, float | int) else split_quantity(stated)
+    )
+    if not (math.isfinite(number) and number > 0.0) or name not in sizes:
+        raise ValueError(
+            f"found {describe(stated)}, needed a positive number and its unit "
+            f"({', '.join(sizes)}), or one in the unit of the readings ({unit.name}); correct it."
+        )
+    sigma = number * abs(sizes[name])
+    width = leg.travel[1] - leg.travel[0]
+    if leg.reads_angle and 0.0 < width < math.inf and sigma > MOST_SIGMA * width:
+        raise ValueError(
+            f"found {number:g} {name}, which is {math.degrees(sigma):.3g} deg, needed at most "
+            f"{MOST_SIGMA:.0%} of the travel of {math.degrees(width):.4g} deg; write its unit "
+            f"behind it ('{number:g}deg' if it is in degrees)."
+        )
+    return sigma

@@ -1,0 +1,225 @@
+"""Readings in degrees, radians and pulses of servos, stated and taken for each other."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from command_line import run
+from csv_rows import read_rows
+from machines import ROOT, read_table
+from photograph_files import jpeg
+
+from legcal.data import load_dataset
+from legcal.errors import LegcalError, ModelError
+from legcal.machine import create_model, load_mechanism, write_model
+
+SERVOS = tuple(f"servo{j}" for j in range(1, 7))
+ARMS = ("arm1", "arm2", "arm3")
+CAMERA = ROOT / "examples/hexapod/camera_info.yaml"
+ANGLES = 0.5 * np.sin(np.arange(24.0).reshape(4, 6))  # [rad]
+PULSES = {"centre_us": 1500, "us_per_deg": 11.1}
+
+
+def dataset(
+    folder: Path,
+    readings: np.ndarray,
+    entry: Mapping[str, Any],
+    model: str = "servo-hexapod",
+    joints: tuple[str, ...] = SERVOS,
+) -> Path:
+    """Write a dataset of readings (n_rows, n_motors)."""
+    lines = ["view,image," + ",".join(joints)]
+    lines += [f"c1,{k}.png," + ",".join(f"{x:.9g}" for x in row) for k, row in enumerate(readings)]
+    (folder / "measurements.csv").write_text("\n".join(lines) + "\n")
+    document = {
+        "legcal_dataset": 1,
+        "mechanism": model,
+        "measurements": "measurements.csv",
+        "views": {"c1": {"camera": str(CAMERA)}},
+        **entry,
+    }
+    (folder / "dataset.yaml").write_text(yaml.safe_dump(document))
+    return folder
+
+
+def pulses(angles: np.ndarray, centre: float = 1500.0, per_degree: float = 11.1) -> np.ndarray:
+    return np.asarray(centre + per_degree * np.degrees(angles))
+
+
+def test_units_of_each_motor_give_joint_values_and_their_sigmas(tmp_path: Path) -> None:
+    given = pulses(ANGLES)
+    given[:, 1] = pulses(ANGLES[:, 1], 1520.0, -10.0)
+    given[:, 2] = np.degrees(ANGLES[:, 2])
+    given[:, 3] = ANGLES[:, 3]
+    servo = {"unit": "us", **PULSES}
+    units: dict[str, Any] = dict.fromkeys(SERVOS, servo)
+    units |= {
+        "servo2": {"unit": "us", "centre_us": 1520, "us_per_deg": -10},
+        "servo3": "deg",
+        "servo4": "rad",
+    }
+    sigmas = {"servo3": 0.1, "servo4": "0.2deg", "servo5": 3.0, "servo6": "4us"}
+    found = load_dataset(
+        dataset(tmp_path, given, {"readings": units, "encoder_sigma": sigmas}), check_images=False
+    ).measurements
+    np.testing.assert_allclose(found.q, ANGLES, atol=1e-8)
+    wanted = [0.5, 0.5, 0.1, 0.2, 3.0 / 11.1, 4.0 / 11.1]
+    got = [np.degrees(found.sigma_by_joint[name]) for name in SERVOS]
+    np.testing.assert_allclose(got, wanted)
+
+
+def servo_table(folder: Path, **changes: Any) -> Path:
+    """Write the table of the servo hexapod with pulses in place of angles."""
+    table = yaml.safe_load((ROOT / "models/tables/servo-hexapod.yaml").read_text())
+    for entry in table["actuators"].values():
+        del entry["travel_deg"]
+        entry |= {"travel_us": [1000.5, 1999.5], **PULSES, **changes}
+    path = folder / "servos.yaml"
+    path.write_text(yaml.safe_dump(table | {"name": "servos"}, sort_keys=False))
+    return path
+
+
+def test_a_model_keeps_the_pulses_of_its_servos(tmp_path: Path) -> None:
+    machine = create_model(read_table(servo_table(tmp_path)), tmp_path).machine
+    np.testing.assert_allclose(machine.actuators[0].travel, np.radians([-45.0, 45.0]))
+    again = load_mechanism(write_model(machine, tmp_path / "again")[0])
+    assert [a.pulses for a in again.actuators] == [a.pulses for a in machine.actuators]
+    model = str(tmp_path / "models/servos.yaml")
+    found = load_dataset(
+        dataset(tmp_path, pulses(ANGLES), {"readings": "us"}, model), check_images=False
+    ).measurements
+    np.testing.assert_allclose(found.q, ANGLES, atol=1e-8)
+    with pytest.raises(ModelError, match=r"actuators.servo1.*found no us_per_deg"):
+        read_table(servo_table(tmp_path, us_per_deg=None))
+    with pytest.raises(ModelError, match=r"actuators.servo1.*us_per_deg 0.*5.6 to 11.1"):
+        read_table(servo_table(tmp_path, us_per_deg=0))
+
+
+SIGMA = {"encoder_sigma": dict.fromkeys(SERVOS, 1e-4)}
+DEGREES = {"readings": "deg", "encoder_sigma": dict.fromkeys(SERVOS, 0.1)}
+IN_US = {"readings": {name: {"unit": "us", **PULSES} for name in SERVOS}}
+
+
+@pytest.mark.parametrize(
+    ("readings", "entry", "named"),
+    [
+        (np.degrees(ANGLES), SIGMA, ("look like degrees", "pi/180", "readings: deg")),
+        (ANGLES, DEGREES, ("% of the travel in deg", "in rad", "readings of the dataset file")),
+        (pulses(ANGLES), SIGMA, ("look like pulses", "centre_us: 1500")),
+        (pulses(ANGLES), DEGREES, ("look like pulses", "centre_us: 1500")),
+        (ANGLES, IN_US, ("found 0 us", "1000.5 to 1999.5 us", "look like radians")),
+        (np.degrees(ANGLES), IN_US, ("look like degrees: write readings: deg",)),
+        (pulses(ANGLES + 0.4), IN_US, ("us in row",)),
+        (pulses(ANGLES), SIGMA | {"readings": "us"}, ("readings.servo1", "neither centre nor us")),
+        (ANGLES, SIGMA | {"readings": "mm"}, ("found mm and no motor that slides",)),
+        (ANGLES, SIGMA | {"readings": {"servo9": "deg"}}, ("readings.servo9", "servo1, servo2")),
+        (ANGLES, SIGMA | {"readings": {"servo1": "mm"}}, ("readings.servo1", "which turns")),
+        (ANGLES, SIGMA | {"readings": "turns"}, ("readings", "'turns'")),
+        (ANGLES, {"readings": "rad"}, ("encoder_sigma is incomplete", "servo1, servo2")),
+        (ANGLES, {"encoder_sigma": dict.fromkeys(SERVOS, 0.5)}, ("28.6 deg", "0.5deg")),
+        (ANGLES, {"encoder_sigma": dict.fromkeys(SERVOS, "2um")}, ("'2um'", "rad")),
+        (ANGLES, {"encoder_sigma": 1e-4}, ("one number [m]", "'servo1' turns")),
+    ],
+)
+def test_units_that_are_taken_for_others_are_told_before_images_are_looked_at(
+    readings: np.ndarray, entry: dict[str, Any], named: tuple[str, ...], tmp_path: Path
+) -> None:
+    with pytest.raises(LegcalError) as caught:
+        load_dataset(dataset(tmp_path, readings, entry))
+    (said, *_) = caught.value.problems
+    assert all(word in said for word in named), said
+
+
+def photographs(folder: Path, n: int) -> None:
+    """Write photographs and the file of their camera."""
+    (folder / "photos").mkdir()
+    for k in range(n):
+        picture = np.full((48, 64), 40 + k, dtype=np.uint8)
+        (folder / f"photos/IMG_{k}.jpg").write_bytes(jpeg(picture))
+    (folder / "camera_info.yaml").write_text(
+        "image_width: 64\nimage_height: 48\ncamera_name: c\n"
+        "camera_matrix: {rows: 3, cols: 3, data: [80, 0, 32, 0, 80, 24, 0, 0, 1]}\n"
+        "distortion_model: plumb_bob\n"
+        "distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("headings", "scale", "words", "sigma_deg"),
+    [
+        ("{}", "rad", (), 0.0057),
+        ("{}", "deg", (), 0.0057),
+        ("{} [deg]", "deg", ("--encoder-sigma", "0.2deg"), 0.2),
+        ("{}_us", "us", ("--servo", "1500,11.1"), 0.5),
+        ("{}", "us", ("--servo", "1500,11.1", "--encoder-sigma", "3us"), 3.0 / 11.1),
+    ],
+)
+def test_init_takes_angles_and_pulses(
+    headings: str,
+    scale: str,
+    words: tuple[str, ...],
+    sigma_deg: float,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    photographs(tmp_path, 4)
+    given = {"rad": ANGLES, "deg": np.degrees(ANGLES), "us": pulses(ANGLES)}[scale]
+    assert init(tmp_path, given, headings, words, monkeypatch) == 0
+    rows = read_rows(tmp_path / "dataset/measurements.csv")
+    found = [[float(row[name]) for name in SERVOS] for row in rows]
+    np.testing.assert_allclose(found, ANGLES, atol=1e-4)
+    measurements = load_dataset(tmp_path / "dataset").measurements
+    got = np.degrees([measurements.sigma_by_joint[name] for name in SERVOS])
+    np.testing.assert_allclose(got, sigma_deg, rtol=0.01)
+
+
+def init(
+    folder: Path,
+    given: np.ndarray,
+    headings: str,
+    words: tuple[str, ...],
+    monkeypatch: pytest.MonkeyPatch,
+) -> int:
+    """Return what legcal init says of a table of readings."""
+    table = [",".join(headings.format(name) for name in SERVOS)]
+    table += [",".join(f"{x:.4f}" for x in row) for row in given]
+    (folder / "own.csv").write_text("\n".join(table) + "\n")
+    return run(
+        monkeypatch, "init", folder / "photos", "--readings", folder / "own.csv", "--model",
+        "servo-hexapod", "-o", folder / "dataset", *words,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("headings", "given", "words", "named"),
+    [
+        ("{}_us", pulses(ANGLES), (), ("pulses of servos", "--servo 1500,11.1")),
+        ("{}", pulses(ANGLES), (), ("1182.01", "-45 to 45 deg", "--servo CENTRE")),
+        ("{} [mm]", ANGLES, (), ("found mm of 'servo1', which turns",)),
+        ("{}", ANGLES, ("--unit", "mm"), ("no motor that slides",)),
+        ("{}", ANGLES, ("--lengths",), ("--lengths", "leave out")),
+        ("{}", ANGLES, ("--servo", "servo9=1500,11"), ("'servo9'", "servo1")),
+        ("{}", ANGLES, ("--servo", "1500"), ("'1500'", "1500,11.1")),
+        ("{}", ANGLES, ("--servo", "1500,0"), ("us_per_deg 0",)),
+        ("{}", ANGLES, ("--encoder-sigma", "2um"), ("'2um'", "deg")),
+        ("{} [rad]", np.degrees(ANGLES), (), ("look like readings in deg",)),
+    ],
+)
+def test_what_init_cannot_make_of_angles(
+    headings: str,
+    given: np.ndarray,
+    words: tuple[str, ...],
+    named: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    photographs(tmp_path, 4)
+    assert init(tmp_path, given, headings, words, monkeypatch) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert said.count("legcal: ") == 1
+    assert all(word in said for word in named), said
+    assert not (tmp_path / "dataset").exists()
