@@ -5,21 +5,36 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, Field, create_model
+from pydantic import BaseModel, Field, RootModel, create_model
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
 from legcal.calibration.camera_calibration.document import CameraDocument
 from legcal.calibration.detection import DetectionDocument
-from legcal.calibration.documents import CheckDocument, EvaluationDocument, Result
+from legcal.calibration.documents import (
+    CheckDocument,
+    DiagnosisBlock,
+    EvaluationDocument,
+    Result,
+)
 from legcal.calibration.examination import ExaminationDocument
 from legcal.calibration.fleet import FleetDocument
+from legcal.calibration.identify.report import IdentifyDocument
 from legcal.calibration.location.document import LocationFile
 from legcal.calibration.measurement_noise.document import NoiseDocument
 from legcal.data.dataset_file import DatasetEntry
+from legcal.data.new_dataset import NewDatasetDocument
+from legcal.exports.formats import ExportDocument
+from legcal.files import Document
 from legcal.files.published import write_schemas
 from legcal.machine.description_table import TableFile
+from legcal.machine.inspection import Inspection
 from legcal.machine.schema import MechanismFile
+from legcal.planning import PlanDocument
+from legcal.recordings.importing import ImportDocument
+from legcal.simulation.dataset import SimulationDocument
+from legcal.simulation.paper_report import PaperDocument
+from legcal.simulation.study import StudyHeading
 from legcal.vision.board_file import AprilgridEntry, CharucoEntry, ChessboardEntry
 from legcal.vision.camera_file import RosEntry
 
@@ -38,7 +53,55 @@ FILES: Mapping[str, type[BaseModel]] = {  # that people write
     "table": TableFile,
     "camera": RosEntry,
 }
+
+
+class _ModelFiles(Document):
+    yaml: str
+    urdf: str
+
+
+class _TemplateFiles(Document):
+    yaml: str
+    csv: str
+
+
+class _Created(Inspection):
+    paths: _ModelFiles
+
+
+class _Template(Document):
+    paths: _TemplateFiles
+
+
+class _NewDocument(RootModel[_Created | _Template]):
+    """What ``legcal new --json`` prints, and ``legcal new --template --json``."""
+
+
+class _Error(Document):
+    kind: str
+    message: str
+
+
+class _ErrorDocument(Document):
+    """What every command prints with ``--json`` where it fails."""
+
+    error: _Error
+    diagnosis: list[DiagnosisBlock] | None = None
+
+
 DOCUMENTS: Mapping[str, type[BaseModel]] = {  # that legcal writes
+    "error": _ErrorDocument,
+    "inspect": Inspection,
+    "new": _NewDocument,
+    "identify": IdentifyDocument,
+    "plan": PlanDocument,
+    "init": NewDatasetDocument,
+    "import": ImportDocument,
+    "example": create_model("Example", __base__=Document, path=(str, ...)),
+    "export": ExportDocument,
+    "simulate": SimulationDocument,
+    "study": create_model("Study", __base__=(PaperDocument, StudyHeading)),
+    "locate": create_model("Locate", __base__=LocationFile, written=(list[str], ...)),
     "location": LocationFile,
     "result": Result,
     "check": CheckDocument,

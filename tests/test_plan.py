@@ -193,7 +193,7 @@ def test_a_session_by_hand_is_shot_with_its_board_where_the_plan_lays_it(
     high = {f"t{k}": {"xyz": [float(np.cos(k)), float(np.sin(k)), 3.2]} for k in range(0, 8, 2)}
     (tmp_path / "high.yaml").write_text(yaml.safe_dump({"places": high}))
     held = legcal.plan(
-        "3-rpr", images=4, board="chessboard:6x5:25mm", hand_held=True, noise=planning.WHITE,
+        "3-rpr", images=4, board="chessboard:6x5:40mm", hand_held=True, noise=planning.WHITE,
         setting=FEW, places=tmp_path / "high.yaml",
     )  # fmt: skip
     assert held.board is not None
@@ -211,6 +211,14 @@ def test_a_session_by_hand_is_shot_with_its_board_where_the_plan_lays_it(
         json.dumps(held.document() | {"T_base_board": None})
     )
     with pytest.raises(UsageError, match="no place of the board"):
+        simulate(load_mechanism("3-rpr"), tmp_path / "again", settings)
+    wide = held.document()["tolerance"] | {"camera_rad": 3.0}
+    (tmp_path / "session" / "plan.json").write_text(
+        json.dumps(held.document() | {"tolerance": wide})
+    )
+    with pytest.raises(
+        DatasetError, match=r"tolerance.camera_rad .* found 3.0, needed 0.8 or less"
+    ):
         simulate(load_mechanism("3-rpr"), tmp_path / "again", settings)
 
 
@@ -293,7 +301,8 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"given": "nowhere"}, DatasetError, "nowhere"),
     ({"noise": "nowhere"}, UsageError, "--noise"),
     ({"places": "nowhere.yaml"}, DatasetError, "nowhere.yaml"),
-    ({"setting": Setting(draws=0)}, UsageError, "one draw"),
+    ({"setting": Setting(draws=0)}, UsageError, "0 draws"),
+    ({"setting": Setting(shift=50.0)}, UsageError, "of 50 and"),
     ({"setting": Setting(length=0.5), "images": 4}, DidNotConverge, "--model-error"),
     ({"bounds": np.array([[5.0, 6.0]] * 3), "images": 4}, NotVisible, "wider bounds"),
 ]

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 import yaml
 from command_line import run
 from format_schemas import FILES, FOLDER, ROOT
 from hexapod_example import Run
 from simulated import simulated
 
+from legcal.cli.app import app
 from legcal.data.dataset_file import read_dataset_file
 from legcal.errors import LegcalError
 from legcal.files import read_yaml, schema_names
@@ -90,6 +92,17 @@ def test_printed_documents_fit_their_schemas(
     document = json.loads(capsys.readouterr().out)
     _check("evaluate", document)
     assert not _validator("evaluate").is_valid({**document, "poses": "many"})
+    assert run(monkeypatch, "export", "hexapod", "--to", "gcode", "-o", "x", "--json") == 2
+    _check("error", json.loads(capsys.readouterr().out))
+
+
+def test_every_command_that_prints_a_document_has_a_schema() -> None:
+    own = {"calibrate": "result", "camera": "camera-calibration"}
+    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    parameters = {name: {p.name for p in found.params} for name, found in commands.items()}
+    printing = {name for name, found in parameters.items() if "as_json" in found} | {"study"}
+    assert len(printing) > 15
+    assert {own.get(name, name) for name in printing} <= set(schema_names())
 
 
 def _faulty(document: Mapping[str, Any], keys: str, value: object) -> dict[str, Any]:

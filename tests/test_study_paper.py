@@ -169,7 +169,7 @@ def test_means_have_their_standard_deviations() -> None:
     drawn = rng.uniform(1.0, 2.0, (7, len(SCALARS)))
     for row in drawn:
         means.add({**dict(zip(SCALARS, row.tolist(), strict=True)), "parameters": [float(row[0])]})
-    row, sigma = means.document(), drawn.std(axis=0, ddof=1) / np.sqrt(len(drawn))
+    row, sigma = means.row().document(), drawn.std(axis=0, ddof=1) / np.sqrt(len(drawn))
     assert row["dX_mm"] == pytest.approx(1e3 * drawn[:, 0].mean())
     assert row["dE_deg"] == pytest.approx(np.rad2deg(drawn[:, 1].mean()))
     assert row["parameters_mm"] == pytest.approx([1e3 * drawn[:, 0].mean()])

@@ -195,7 +195,8 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
     Raises
     ------
     NotVisible
-        If no image shows a board, or that of a hand-held view does not show the base's.
+        If no image shows a board, or most of the hand-held views do not show the base's; the legs
+        place the others, or they are left out.
     DatasetError
         If what is shown cannot be the board that the dataset describes, or it has moved.
     """
@@ -210,16 +211,18 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
     tables = []
     for fixed in dataset.boards:
         on_base = fixed.link == "base"
-        needed = hand_held if on_base else set[str]()
         if given is not None:
             own = given.choose(fixed.has(given.corner))
             own = replace(own, corner=own.corner - fixed.first)
         else:
             rows = [row for row, image in enumerate(measurements.image) if image]
-            load = data.photographs.load
-            own = detect_corners(fixed.board, load, rows, data.pool, data.progress)
-            shown = needed if len(own) else {view.name for view in used}
-            require_board(fixed.board, own, load, measurements, shown)
+            own = detect_corners(fixed.board, data.photographs.load, rows, data.pool, data.progress)
+        shown_in = {measurements.views[v].name for v in measurements.view[own.row].tolist()}
+        few = on_base and 2 * len(hand_held & shown_in) < len(hand_held)
+        needed = hand_held if few else set[str]()
+        if given is None:
+            asked = needed if len(own) else {view.name for view in used}
+            require_board(fixed.board, own, data.photographs.load, measurements, asked)
         if on_base:
             T_board_camera, own = camera_poses_by_board(own, fixed.board, measurements, needed)
             found = any(T is not None for T in T_board_camera)

@@ -18,7 +18,6 @@ from pydantic import (
     StrictInt,
     StrictStr,
     model_serializer,
-    model_validator,
 )
 
 from legcal.data import Measurements, by_cause, row_names
@@ -26,48 +25,22 @@ from legcal.errors import DatasetError
 from legcal.files import (
     Document,
     Number,
+    Pose,
+    SparseDocument,
+    Triple,
     Version,
     content_of,
     describe,
     refuse_too_large,
     validate,
 )
-from legcal.machine import Actuator
+from legcal.machine import Actuator, ActuatorBlock
 from legcal.vision import Link
 
-Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
 AxesByLeg = dict[str, Triple]  # unit vectors
 Matrix = list[list[Number]]
 Positive = Annotated[Number, Field(gt=0.0)]
 NotNegative = Annotated[Number, Field(ge=0.0)]
-
-
-class Pose(Document):
-    """A rigid motion."""
-
-    xyz: Triple
-    quat_xyzw: Annotated[list[Number], Field(min_length=4, max_length=4)]
-
-
-class ActuatorBlock(Document):
-    """A motor that moves joints at A, in R_b at reading 0 [m]."""
-
-    kind: Literal["prismatic", "revolute"]
-    direction: Triple | None = None  # of a prismatic
-    point: Triple | None = None  # of the axis of a revolute
-    axis: Triple | None = None
-
-    @model_validator(mode="after")
-    def _has_its_motion(self) -> ActuatorBlock:
-        needed = ("direction",) if self.kind == "prismatic" else ("point", "axis")
-        missing = [key for key in needed if getattr(self, key) is None]
-        if missing:
-            raise ValueError(f"a {self.kind} actuator has no '{missing[0]}'")
-        return self
-
-    @model_serializer(mode="wrap")
-    def _without_none(self, whole: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {key: value for key, value in whole(self).items() if value is not None}
 
 
 class Legs(Document):
@@ -82,7 +55,7 @@ class Legs(Document):
     actuators: dict[str, ActuatorBlock] | None = None  # by joint; left out where none moves A
 
 
-class ParameterRow(Document):
+class ParameterRow(SparseDocument):
     """One parameter."""
 
     name: str
@@ -97,13 +70,6 @@ class ParameterRow(Document):
     def is_shown(self) -> bool:
         """Whether tables have it: they leave out gains of motors that are fixed at 1."""
         return not (self.name.endswith(".gain") and self.status == "fixed" and self.value == 1.0)
-
-    @model_serializer(mode="wrap")
-    def _without_none(self, whole: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        row: dict[str, Any] = whole(self)
-        if self.prior_sigma is None:
-            del row["prior_sigma"]
-        return row
 
 
 class Kinematic(Document):
@@ -423,7 +389,7 @@ class Overlay(Document):
     file: str
 
 
-class Result(Legs, Heading):
+class Result(Legs, Heading, SparseDocument):
     """``result.json``: the heading, the calibrated legs, and how well they are known."""
 
     nominal_axes: dict[str, AxesByLeg]  # that turns count from, by side
@@ -449,14 +415,6 @@ class Result(Legs, Heading):
     details: list[str] = Field(default_factory=list)  # how the fit went, for those who ask
     diagnosis: list[DiagnosisBlock] | None = None  # left out where nothing looks wrong
     overlays: list[Overlay] | None = None  # left out where none were asked for
-
-    @model_serializer(mode="wrap")
-    def _without_absent_blocks(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        found: dict[str, Any] = handler(self)
-        optional = ("actuators", "nominal_actuators", "links", "observations", "board",
-                    "platform_board", "holdout", "diagnosis", "overlays")  # fmt: skip
-        absent = [key for key in optional if found[key] is None]
-        return {key: value for key, value in found.items() if key not in absent}
 
     def nominal_actuator(self, calibrated: Actuator | None) -> Actuator | None:
         """Return the actuator that the parameters count from."""

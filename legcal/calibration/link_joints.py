@@ -26,10 +26,9 @@ from legcal.calibration.documents import (
     Kinematic,
     LinkBlock,
     ParameterRow,
-    Pose,
     WeakInLinks,
 )
-from legcal.files import motion_to_xyz_quat
+from legcal.files import Pose, motion_to_xyz_quat
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis, turned_axis
 from legcal.machine import (
     SHOWN,

@@ -13,7 +13,6 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.documents import (
-    ActuatorBlock,
     BoardPose,
     Distance,
     Gamma,
@@ -26,7 +25,6 @@ from legcal.calibration.documents import (
     ParameterRow,
     PlatformBlock,
     PlatformBoardPose,
-    Pose,
     PoseAccuracy,
     ResidualsBlock,
     Result,
@@ -53,8 +51,9 @@ from legcal.calibration.plots import plot_residuals
 from legcal.calibration.residuals import OutlineResiduals, outline_residuals
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data import Corners, Dataset, row_names
-from legcal.files import motion_to_xyz_quat
+from legcal.files import Pose, motion_to_xyz_quat
 from legcal.machine import (
+    ActuatorBlock,
     Leg,
     LegKind,
     actuators_of,

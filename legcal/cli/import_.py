@@ -99,6 +99,6 @@ def import_(
         with shown_progress(not quiet) as progress:
             written = recordings.import_recordings(found, force=force, progress=progress)
     if as_json:
-        print_json(found.document() | {"written": [str(path) for path in written]})
+        print_json(found.document(written))
     elif written:
         print_table(report.written_lines(output, written))

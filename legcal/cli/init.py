@@ -115,6 +115,6 @@ def init(
         print_table(report.matching_table(found))
     written = [] if dry_run else data.write_new_dataset(found, force=force)
     if as_json:
-        print_json(found.document() | {"written": [str(path) for path in written]})
+        print_json(found.document(written))
     elif written:
         print_table(report.written_lines(output, written))

@@ -40,6 +40,8 @@ from legcal.errors import DatasetError, UsageError
 from legcal.files import (
     LENGTH,
     NAME_NEEDED,
+    Document,
+    Number,
     OutputKind,
     check_path,
     describe,
@@ -59,6 +61,39 @@ MEASUREMENTS = "measurements.csv"
 ONE_VIEW = "c1"
 MIN_SIGMA = 1e-6  # [m], of readings whose noise nobody stated
 _CAMERA_NAMES = ("camera_info.yaml", "camera_info.yml", "camera.yaml")
+
+
+class ViewToWrite(Document):
+    """A camera position."""
+
+    camera: str  # its camera file
+
+
+class MatchedImage(Document):
+    """A photograph with the readings of its row."""
+
+    row: int  # of the table, from 1
+    view: str
+    photograph: str
+    image: str  # in the dataset
+    readings: dict[str, Number]  # by joint [m, or rad of what turns]
+
+
+class NewDatasetDocument(Document):
+    """What ``legcal init --json`` prints."""
+
+    dataset: str
+    mechanism: str
+    columns: dict[str, str]  # of the table, by joint
+    unit: str
+    unit_from: str
+    lengths: bool  # whether the table has lengths of legs, not readings
+    matched: str
+    encoder_sigma: Number
+    views: dict[str, ViewToWrite]
+    images: list[MatchedImage]
+    notes: list[str]
+    written: list[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,36 +157,31 @@ class NewDataset:
         """The columns of the readings."""
         return [column.name for column in reading_columns(self.machine.legs)]
 
-    def document(self) -> dict[str, Any]:
-        """Return what ``legcal init --json`` prints."""
-        return {
-            "dataset": str(self.destination),
-            "mechanism": self.model,
-            "columns": dict(self.columns),
-            "unit": self.unit,
-            "unit_from": self.unit_from,
-            "lengths": self.are_lengths,
-            "matched": self.matching.how,
-            "encoder_sigma": self.encoder_sigma,
-            "views": {view: {"camera": str(path)} for view, path in self.cameras.items()},
-            "images": [
-                {
-                    "row": k + 1,
-                    "view": view,
-                    "photograph": photograph.name,
-                    "image": self.place(photograph),
-                    "readings": dict(
-                        zip(
-                            self.joints,
-                            self.readings[k].tolist(),
-                            strict=True,
-                        )
-                    ),
-                }
+    def document(self, written: Sequence[Path]) -> dict[str, Any]:
+        """Return what ``legcal init --json`` prints, with the files that were written."""
+        return NewDatasetDocument(
+            dataset=str(self.destination),
+            mechanism=self.model,
+            columns=dict(self.columns),
+            unit=self.unit,
+            unit_from=self.unit_from,
+            lengths=self.are_lengths,
+            matched=self.matching.how,
+            encoder_sigma=self.encoder_sigma,
+            views={view: ViewToWrite(camera=str(path)) for view, path in self.cameras.items()},
+            images=[
+                MatchedImage(
+                    row=k + 1,
+                    view=view,
+                    photograph=photograph.name,
+                    image=self.place(photograph),
+                    readings=dict(zip(self.joints, self.readings[k].tolist(), strict=True)),
+                )
                 for (k, photograph), view in zip(self.matching.pairs, self.views, strict=True)
             ],
-            "notes": list(self.notes),
-        }
+            notes=list(self.notes),
+            written=[str(path) for path in written],
+        ).document()
 
     def place(self, photograph: Photograph) -> str:
         """Return the path of a photograph relative to the dataset's folder."""

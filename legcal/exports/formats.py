@@ -16,7 +16,7 @@ from legcal.exports.mjcf import mjcf_files, mjcf_refusal
 from legcal.exports.parameter_files import csv_files, json_files, table_files
 from legcal.exports.robot_files import ros_files, urdf_files
 from legcal.exports.subject import RESULT_NAME, ExportOptions, Rendered, Subject, load_subject
-from legcal.files import OutputFile, OutputKind, result_folder
+from legcal.files import Document, Number, OutputFile, OutputKind, SparseDocument, result_folder
 
 Render = Callable[[Subject, ExportOptions, Path], Rendered]
 
@@ -64,12 +64,32 @@ class Exported:
 
     def document(self) -> dict[str, Any]:
         """Return what ``legcal export --json`` prints."""
-        return {
-            "format": self.format,
-            "written": [str(path) for path in self.paths],
-            **self.figures,
-            "notes": list(self.notes),
-        }
+        written = [str(path) for path in self.paths]
+        return ExportDocument(
+            format=self.format, written=written, **self.figures, notes=list(self.notes)
+        ).document()
+
+
+class Residual(Document):
+    """How far the platform is from where it should be between the nodes of a table."""
+
+    rms_dX_m: Number
+    max_dX_m: Number
+    rms_dE_rad: Number
+    max_dE_rad: Number
+
+
+class ExportDocument(SparseDocument):
+    """What ``legcal export --json`` prints; beside the files figures of a table of corrections."""
+
+    format: str
+    written: list[str]
+    coordinates: list[str] | None = None
+    nodes: int | None = None
+    residual: Residual | None = None  # with the corrected commands
+    uncorrected: Residual | None = None
+    tested: int | None = None  # middles of cells
+    notes: list[str]
 
 
 def export(

@@ -45,6 +45,9 @@ from .schema import FileSchema as FileSchema
 from .schema import Name as Name
 from .schema import Number as Number
 from .schema import PlainName as PlainName
+from .schema import Pose as Pose
+from .schema import SparseDocument as SparseDocument
+from .schema import Triple as Triple
 from .schema import Version as Version
 from .schema import closest as closest
 from .schema import content_of as content_of

@@ -17,8 +17,10 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    SerializerFunctionWrapHandler,
     Strict,
     ValidationError,
+    model_serializer,
 )
 from pydantic_core import ErrorDetails
 
@@ -106,6 +108,7 @@ Name = Annotated[str, AfterValidator(_one_plain_line)]
 PlainName = Annotated[str, BeforeValidator(plain_name)]
 Number = Annotated[float, Strict()]  # true is not one, nor is text
 Metres = Annotated[Number, Field(gt=-1e6, lt=1e6)]  # squares of far larger ones overflow
+Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 _Schema = TypeVar("_Schema", bound=BaseModel)
 
@@ -126,6 +129,26 @@ class Document(BaseModel):
     def document(self) -> dict[str, Any]:
         """Return what ``--json`` prints."""
         return self.model_dump()
+
+
+class SparseDocument(Document):
+    """A document without the keys that are null by default: what a machine or session lacks."""
+
+    @model_serializer(mode="wrap")
+    def _without_none(self, whole: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        absent = {
+            key
+            for key, field in type(self).model_fields.items()
+            if not field.is_required() and field.default is None and getattr(self, key) is None
+        }
+        return {key: value for key, value in whole(self).items() if key not in absent}
+
+
+class Pose(Document):
+    """A rigid motion."""
+
+    xyz: Triple
+    quat_xyzw: Annotated[list[Number], Field(min_length=4, max_length=4)]
 
 
 class _Loader(yaml.SafeLoader):

@@ -60,6 +60,8 @@ from .files import shipped_folder as shipped_folder
 from .files import shipped_names as shipped_names
 from .home import home_of_legs as home_of_legs
 from .home import legs_outside as legs_outside
+from .inspection import ActuatorBlock as ActuatorBlock
+from .inspection import machine_document as machine_document
 from .kinematics import Follower as Follower
 from .kinematics import consistent_readings as consistent_readings
 from .kinematics import contradiction as contradiction
@@ -95,7 +97,6 @@ from .mobility import leg_scale as leg_scale
 from .mobility import singularity as singularity
 from .model import Machine as Machine
 from .model import joint_values as joint_values
-from .model import machine_document as machine_document
 from .model import platform_pose as platform_pose
 from .model import readings_at as readings_at
 from .model import readings_at_poses as readings_at_poses

@@ -4,24 +4,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.errors import UsageError
-from legcal.files import motion_to_xyz_quat
 from legcal.geometry import Array, frame_on_points
 from legcal.machine.actuator import Actuator
 from legcal.machine.chain import ClosedChain
 from legcal.machine.drawing import Sketch, motor_lines
 from legcal.machine.leg import (
     Cylinder,
-    JointType,
     KinematicParameters,
     Leg,
-    LegKind,
     parameters_of_legs,
     with_platform_points,
 )
@@ -321,64 +318,3 @@ def joint_values(machine: Machine, configuration: Array) -> Array:
     sliding = [j for j, leg in enumerate(machine.legs) if leg.has_value]
     values[sliding] = configuration[slider_columns(machine, sliding)[0]]
     return values
-
-
-def machine_document(machine: Machine) -> dict[str, Any]:
-    """Return the document of ``legcal inspect --json``: legs with types, frames, mobility.
-
-    A is in the base link and B in the platform link [m], twist in [rad]; ``travel`` [m, or rad of
-    what turns] is null for legs that no slider or actuator moves, ``q_home`` the reading at
-    ``home`` (T_base_platform). ``actuators`` are in the base link, with A at reading 0. ``n_d`` is
-    the number of legs that define the frames, ``r`` that of R joints on the base, ``n_ac`` that of
-    legs that are actuated or of constant length, ``motor_rank`` that of the freedoms of the
-    platform that motors hold, ``idle_spins`` that of those that only turn a leg about itself.
-    """
-    kinds = [leg.kind for leg in machine.legs]
-    return {
-        "name": machine.name,
-        "spatial": machine.spatial,
-        "mobility": machine.mobility,
-        "motors": len(machine.motors),
-        "motor_rank": machine.motor_rank,
-        "n": machine.n_legs,
-        "n_d": len(machine.frame_legs),
-        "r": sum(leg.base_joint is JointType.REVOLUTE for leg in machine.legs),
-        "n_ac": len(kinds) - kinds.count(LegKind.PASSIVE),
-        "idle_spins": sum(leg.idle_spins for leg in machine.legs),
-        "base_frame": [machine.leg_names[j] for j in machine.frame_legs],
-        "home": motion_to_xyz_quat(machine.home),
-        "legs": [
-            _leg(leg, float(q))
-            for leg, q in zip(machine.legs, readings_at(machine, machine.home), strict=True)
-        ],
-        **(
-            {"actuators": {a.joint: a.document() for a in machine.actuators}}
-            if machine.actuators
-            else {}
-        ),
-        "diagnostics": list(machine.diagnostics),
-    }
-
-
-def _leg(leg: Leg, q_home: float) -> dict[str, Any]:
-    """Return one leg of the document."""
-    has_travel = leg.has_value and bool(np.isfinite(leg.travel).all())
-    return {
-        "name": leg.name,
-        "type": leg.type,
-        "actuated": leg.is_motor,
-        "kind": leg.kind.value,
-        "A": [float(x) for x in leg.A],
-        "B": [float(x) for x in leg.B],
-        "q0": float(leg.q0),
-        "sign": leg.sign,
-        "travel": [float(x) for x in leg.travel] if has_travel else None,
-        "q_home": q_home,
-        "base_axis": None if leg.base_axis is None else [float(x) for x in leg.base_axis],
-        "platform_axis": (
-            None if leg.platform_axis is None else [float(x) for x in leg.platform_axis]
-        ),
-        "twist": leg.twist,
-        "cylinders": [{"link": c.link, "radius": c.radius} for c in leg.cylinders],
-        **({} if leg.actuator is None else {"actuator": leg.actuator.joint}),
-    }

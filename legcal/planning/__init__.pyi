@@ -15,6 +15,7 @@ from .places import all_points as all_points
 from .places import parse_bounds as parse_bounds
 from .places import places_along as places_along
 from .planned_session import Plan as Plan
+from .planned_session import PlanDocument as PlanDocument
 from .planned_session import PlannedView as PlannedView
 from .planned_session import views_in_words as views_in_words
 from .planner import Candidates as Candidates

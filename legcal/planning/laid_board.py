@@ -23,7 +23,7 @@ _DISTANCE = 1.05  # half diagonals of the board beyond the base joints
 _MIN_COSINE = 0.45  # between the normal of the print and the line of sight
 _NEAREST = 0.1  # [m] before the camera
 _MODULE_PX = 2.0  # of a module of a marker, across which it looks narrowest
-_MODULES = 4.0  # that a square without a marker counts as
+_MODULES = 6.0  # that a square without a marker counts as
 _FRAME = {"charuco": 2, "aprilgrid": 4}  # modules of the black frame of a marker, both sides
 
 
@@ -76,7 +76,7 @@ class LaidBoard:
         distance, depth, square = rays_past_axes(P, A, u, length)
         aside = radius + self.board.side * depth / distance[..., None]
         hidden = (square < aside**2) & (depth > 0.0) & (depth < distance[..., None])
-        hidden = hidden.any(axis=-1) | behind_plate(P[:, None], B, 0.0)[:, 0]
+        hidden = hidden.any(axis=-1) | behind_plate(P[:, None], B, 0.0, surely=False)[:, 0]
         return ~np.asarray(hidden.any(axis=1))
 
     def _narrowest(self, px: Array) -> float:

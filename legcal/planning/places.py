@@ -42,6 +42,9 @@ _CLEARANCE = 0.3  # of the size, between camera and machine, at least
 _ROUNDING = 1e-9
 
 
+MAX_LENGTH, MAX_ANGLE, MAX_DRAWS = 1.0, 0.8, 10_000  # of a setting [m], [rad]
+
+
 @dataclass(frozen=True)
 class Setting:
     """How well a tripod is set, and what is known of the machine before.

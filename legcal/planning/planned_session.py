@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.calibration import KINDS, PlatformError
-from legcal.files import motion_to_xyz_quat
+from legcal.files import Document, Number, Pose, Version, motion_to_xyz_quat
 from legcal.geometry import Array, BoolArray
 from legcal.machine import Configurations, Machine
 from legcal.planning.goals import Goal
 from legcal.planning.information import PredictedNoise
 from legcal.planning.laid_board import LaidBoard
-from legcal.planning.places import Setting
+from legcal.planning.places import MAX_ANGLE, MAX_DRAWS, MAX_LENGTH, Setting
 from legcal.planning.sight import Seen
 from legcal.version import __version__
 from legcal.vision import Camera
@@ -109,62 +110,138 @@ class Plan:
         )
 
     def document(self) -> dict[str, Any]:
-        """Return the document of ``legcal plan --json``, which ``plan.json`` holds."""
-        error, names = self.error, self.machine.leg_names
-        return {
-            "legcal_plan": 1,
-            "legcal": __version__,
-            "mechanism": self.machine.name,
-            "images": self.n_images,
-            "seed": self.seed,
-            "criterion": self.goal.value,
-            "value": self.value,
-            "expected": None
-            if error is None
-            else {
-                "dX_m": error.mean_displacement,
-                "dE_rad": error.mean_rotation,
-                "dX_max_m": error.max_displacement,
-                "dE_max_rad": error.max_rotation,
-            },
-            "tolerance": {
-                "camera_m": self.setting.shift,
-                "camera_rad": self.setting.turn,
-                "machine_m": self.setting.length,
-                "machine_rad": self.setting.angle,
-                "draws": self.setting.draws,
-            },
-            "noise": {
-                "sigma_px": self.noise.sigma_px,
-                "correlation": self.noise.correlation,
-                "common_px": dict(zip(KINDS, self.noise.common_px, strict=True)),
-                "gamma_px": self.noise.gamma_px,
-                "source": self.noise.source,
-            },
-            "board": self.board is not None,
-            "T_base_board": None
-            if self.board is None
-            else motion_to_xyz_quat(self.board.T_base_board),
-            "hand_held": self.hand_held,
-            "given": self.given or None,
-            "views": {
-                view.name: {
-                    "T_base_camera": motion_to_xyz_quat(view.T_base_camera),
-                    "images": len(view.poses.poses),
-                    "legs": dict(zip(names, view.shows.sum(axis=0).tolist(), strict=True)),
-                }
+        """Return the document of ``legcal plan --json``, a :class:`PlanDocument`."""
+        error, names, setting, noise = self.error, self.machine.leg_names, self.setting, self.noise
+        expected = None
+        if error is not None:
+            expected = ExpectedError(
+                dX_m=error.mean_displacement,
+                dE_rad=error.mean_rotation,
+                dX_max_m=error.max_displacement,
+                dE_max_rad=error.max_rotation,
+            )
+        rows = zip(self.names, self.sigma.tolist(), self.units, strict=True)
+        return PlanDocument(
+            legcal_plan=1,
+            legcal=__version__,
+            mechanism=self.machine.name,
+            images=self.n_images,
+            seed=self.seed,
+            criterion=self.goal.value,
+            value=self.value,
+            expected=expected,
+            tolerance=Tolerance(
+                camera_m=setting.shift,
+                camera_rad=setting.turn,
+                machine_m=setting.length,
+                machine_rad=setting.angle,
+                draws=setting.draws,
+            ),
+            noise=NoiseOfPlan(
+                sigma_px=noise.sigma_px,
+                correlation=noise.correlation,
+                common_px=dict(zip(KINDS, noise.common_px, strict=True)),
+                gamma_px=noise.gamma_px,
+                source=noise.source,
+            ),
+            board=self.board is not None,
+            T_base_board=None if self.board is None else _pose(self.board.T_base_board),
+            hand_held=self.hand_held,
+            given=self.given or None,
+            views={
+                view.name: ViewOfPlan(
+                    T_base_camera=_pose(view.T_base_camera),
+                    images=len(view.poses.poses),
+                    legs=dict(zip(names, view.shows.sum(axis=0).tolist(), strict=True)),
+                )
                 for view in self.views
             },
-            "parameters": [
-                {"name": name, "sigma": sigma, "unit": unit}
-                for name, sigma, unit in zip(
-                    self.names, self.sigma.tolist(), self.units, strict=True
-                )
-            ],
-            "growth": [{"images": int(n), "value": float(x)} for n, x in self.growth],
-            "limits": self.limits,
-            "notes": list(self.notes),
-        }
+            parameters=[ExpectedSigma(name=n, sigma=sigma, unit=u) for n, sigma, u in rows],
+            growth=[Growth(images=int(n), value=float(x)) for n, x in self.growth],
+            limits=self.limits,
+            notes=list(self.notes),
+        ).document()
+
+
+def _pose(T: RigidTransform) -> Pose:
+    """Return a motion as documents have it."""
+    return Pose.model_validate(motion_to_xyz_quat(T))
+
+
+class ExpectedError(Document):
+    """The expected error of the platform over the workspace, one standard deviation."""
+
+    dX_m: Number  # mean
+    dE_rad: Number
+    dX_max_m: Number
+    dE_max_rad: Number
+
+
+class Tolerance(Document):
+    """How far a session may be from its plan, and the machine from its model, at most."""
+
+    camera_m: Annotated[Number, Field(ge=0.0, le=MAX_LENGTH)]
+    camera_rad: Annotated[Number, Field(ge=0.0, le=MAX_ANGLE)]
+    machine_m: Annotated[Number, Field(ge=0.0, le=MAX_LENGTH)]
+    machine_rad: Annotated[Number, Field(ge=0.0, le=MAX_ANGLE)]
+    draws: Annotated[int, Field(ge=1, le=MAX_DRAWS)]  # sessions that were drawn to judge the plan
+
+
+class NoiseOfPlan(Document):
+    """The errors of outlines that were counted on."""
+
+    sigma_px: Number
+    correlation: Number
+    common_px: dict[str, Number]  # standard deviations of common-mode edge biases, by kind
+    gamma_px: Number
+    source: str
+
+
+class ViewOfPlan(Document):
+    """A camera place; of a camera in the hand, an image."""
+
+    T_base_camera: Pose
+    images: int
+    legs: dict[str, int]  # in how many of its images each is seen
+
+
+class ExpectedSigma(Document):
+    """The expected standard deviation of a parameter."""
+
+    name: str
+    sigma: Number
+    unit: str
+
+
+class Growth(Document):
+    """The criterion with so many images."""
+
+    images: int
+    value: Number
+
+
+class PlanDocument(Document):
+    """What ``plan.json`` holds and ``legcal plan --json`` prints."""
+
+    legcal_plan: Version
+    legcal: str  # the version that planned
+    mechanism: str
+    images: int
+    seed: int
+    criterion: Literal["mean", "worst", "d", "parameters"]
+    value: Number  # of the criterion [m; the determinant's root without a unit]
+    expected: ExpectedError | None  # None where readings do not give the pose of the platform
+    tolerance: Tolerance
+    noise: NoiseOfPlan
+    board: bool  # on the base, in every image
+    T_base_board: Pose | None
+    hand_held: bool
+    given: str | None  # the dataset that it adds to
+    views: dict[str, ViewOfPlan]
+    parameters: list[ExpectedSigma]
+    growth: list[Growth]
+    limits: dict[str, Number]  # the criterion [m] if an error were not there, or images without end
+    notes: list[str]
 
 
 def views_in_words(views: Sequence[PlannedView]) -> str:

@@ -108,7 +108,8 @@ class Scene:
 
     def seen(self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool) -> Seen:
         """Return what a camera sees at poses T_Rb_Re; *surely*: wherever the tripod is set."""
-        A, B, margin = self._before(T, poses, surely=surely)
+        A, B = self._joints(poses)
+        margin = self._margin(T, np.concatenate([A, B]).reshape(-1, 3)) if surely else 0.0
         cylinders = [leg.cylinders for leg in self.task.machine.legs]
         return what_is_seen(self.task.predictor.camera, T, A, B, cylinders, margin)
 
@@ -121,12 +122,13 @@ class Scene:
         is_read: bool = True,
     ) -> BoolArray:
         """Return which images show the board, (n_images,); all of them where there is none."""
-        if self.task.laid is None:
+        laid, camera = self.task.laid, self.task.predictor.camera
+        if laid is None:
             return np.ones(len(poses), dtype=np.bool_)
-        A, B, margin = self._before(T, poses, surely=surely)
+        A, B = self._joints(poses)
+        margin = self._margin(T, laid.corners) if surely else 0.0
         cylinders = [leg.cylinders for leg in self.task.machine.legs]
-        camera = self.task.predictor.camera
-        return self.task.laid.is_shown(camera, T, A, B, cylinders, margin, is_read=is_read)
+        return laid.is_shown(camera, T, A, B, cylinders, margin, is_read=is_read)
 
     def showing(self, own: Candidates) -> Candidates:
         """Return the candidates whose images show the board, the same if all do."""
@@ -136,19 +138,14 @@ class Scene:
             return own
         return replace(own, poses=some_of(own.poses, np.flatnonzero(shown).tolist()))
 
-    def _before(
-        self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool
-    ) -> tuple[Array, Array, float]:
-        """Return A and B (n, n_legs, 3) in the base link, and the margin [px]."""
-        machine, camera = self.task.machine, self.task.predictor.camera
-        R, t = Frames.of(poses)
-        A, B = ends_in_base(self.legs, machine.T_base_Rb, R, t)
-        margin = 0.0
-        if surely:
-            joints = np.concatenate([A, B]).reshape(-1, 3)
-            nearest = float(T.inv().apply(joints)[:, 2].min())
-            margin = self.task.setting.margin(camera, max(nearest, 0.1))
-        return A, B, margin
+    def _joints(self, poses: Sequence[RigidTransform]) -> tuple[Array, Array]:
+        """Return A and B (n, n_legs, 3) in the base link."""
+        return ends_in_base(self.legs, self.task.machine.T_base_Rb, *Frames.of(poses))
+
+    def _margin(self, T: RigidTransform, points: Array) -> float:
+        """Return how far in the picture points (n, 3) in the base link move at most [px]."""
+        nearest = float(T.inv().apply(points)[:, 2].min())
+        return self.task.setting.margin(self.task.predictor.camera, max(nearest, 0.1))
 
     def contributions(
         self,

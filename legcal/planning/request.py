@@ -16,7 +16,15 @@ from legcal.machine import Machine, follow_each, load_mechanism, poses_at
 from legcal.planning.goals import Goal
 from legcal.planning.information import DEFAULT_NOISE, PredictedNoise, Predictor
 from legcal.planning.noise import read_noise
-from legcal.planning.places import USUAL, Place, Setting, read_places
+from legcal.planning.places import (
+    MAX_ANGLE,
+    MAX_DRAWS,
+    MAX_LENGTH,
+    USUAL,
+    Place,
+    Setting,
+    read_places,
+)
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Task, plan_session
 from legcal.progress import Progress, Report, shown_progress
@@ -320,10 +328,16 @@ def _check(
             f"{start} a camera in the hand without a board, needed a calibration board on the base "
             "in every image, which alone tells where it was; describe it with --board."
         )
-    if min(setting.shift, setting.turn, setting.length, setting.angle) < 0.0 or setting.draws < 1:
+    lengths, angles = (setting.shift, setting.length), (setting.turn, setting.angle)
+    if not (
+        all(0.0 <= x <= MAX_LENGTH for x in lengths)
+        and all(0.0 <= x <= MAX_ANGLE for x in angles)
+        and 1 <= setting.draws <= MAX_DRAWS
+    ):
         problems.append(
-            f"{start} a tolerance below zero or {setting.draws} draws, needed zero or more, and "
-            "one draw; correct it."
+            f"{start} tolerances of {lengths[0]:g} and {lengths[1]:g} m, {angles[0]:g} and "
+            f"{angles[1]:g} rad and {setting.draws} draws, needed 0 to {MAX_LENGTH:g} m, 0 to "
+            f"{MAX_ANGLE:g} rad and 1 to {MAX_DRAWS}; correct --model-error, or the setting."
         )
     if problems:
         raise UsageError(problems)

@@ -32,6 +32,7 @@ MIN_LENGTH_PX = 20.0  # of a stretch that is measured
 _NEAREST = 0.1  # [m] before the camera
 _OUTSIDE = 1.2  # radii between the camera and an axis, at least
 _PLATE = 1.1  # size of a plate, over that of its joints
+_ROUND = 1.3  # radius of a plate of unknown shape, over that of the circle around its joints
 _IN_PLATE = 3.0  # radii of the thickest leg: nearer to a plate, points are in it
 _THIN = 1e-3  # of the largest extent of joints that span no plate
 
@@ -181,10 +182,11 @@ def _behind_legs(
     return np.asarray(hides.any(axis=-1))
 
 
-def behind_plate(P: Array, joints: Array, thick: float) -> BoolArray:
+def behind_plate(P: Array, joints: Array, thick: float, *, surely: bool = True) -> BoolArray:
     """Return which points (k, n, m, 3) have the plate between joints (k, n_legs, 3) before them.
 
     Points in the plate are not behind it, by its thickness [m]: so are legs of a planar machine.
+    Without *surely* those count too that a plate of another shape may hide.
     """
     middle = joints.mean(axis=1, keepdims=True)
     _, extent, axes = np.linalg.svd(joints - middle)
@@ -201,6 +203,10 @@ def behind_plate(P: Array, joints: Array, thick: float) -> BoolArray:
     flat = np.stack([np.einsum("klx,kx->kl", joints - middle, axis) for axis in (x, y)], axis=-1)
     at = np.stack([np.einsum("kpmx,kx->kpm", hit, axis) for axis in (x, y)], axis=-1)
     for k, corners in enumerate(flat):
+        if not surely:
+            reach = _ROUND * np.linalg.norm(corners, axis=-1).max()
+            inside[k] = np.linalg.norm(at[k], axis=-1) < reach
+            continue
         try:
             sides = ConvexHull(corners * _PLATE).equations
         except QhullError:

@@ -22,6 +22,8 @@ from legcal.data import (
 from legcal.errors import DatasetError, OutOfResources, UsageError
 from legcal.files import (
     NAME_NEEDED,
+    Document,
+    Number,
     check_path,
     describe,
     existing_parent,
@@ -50,6 +52,38 @@ LEAST_STILL = 0.3  # [s]
 ONE_CLOCK = 2.0  # [s] that frames and readings in one bag are apart at most
 _WIDTH = 160  # [px] of frames that are compared
 _SHOTS, _TABLE = "shots", "readings.csv"
+
+
+class StillBlock(Document):
+    """A time in which the machine stood still."""
+
+    begin_s: Number
+    end_s: Number
+    frame: int | None  # that is used
+    why_not: str  # "" where it is used
+
+
+class RecordingBlock(Document):
+    """What was found in the recording of a view."""
+
+    recording: str
+    readings: str  # where they are from
+    frames: int
+    used: int
+    offset_s: Number  # between the clocks
+    offset_sigma_s: Number
+    agreement: Number | None  # correlation of motions; None where the offset was stated
+    stills: list[StillBlock]
+    notes: list[str]
+
+
+class ImportDocument(Document):
+    """What ``legcal import --json`` prints."""
+
+    dataset: str
+    encoder_sigma: Number
+    views: dict[str, RecordingBlock]
+    written: list[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,22 +127,22 @@ class View:
         """The frames that are used."""
         return [still.frame for still in self.stills if still.frame is not None]
 
-    def document(self) -> dict[str, Any]:
+    def block(self) -> RecordingBlock:
         """Return what ``legcal import --json`` says of the view."""
-        return {
-            "recording": str(self.recording.path),
-            "readings": self.series.source,
-            "frames": self.n_frames,
-            "used": len(self.used),
-            "offset_s": self.offset.seconds,
-            "offset_sigma_s": self.offset.sigma,
-            "agreement": self.offset.agreement,
-            "stills": [
-                {"begin_s": s.begin, "end_s": s.end, "frame": s.frame, "why_not": s.why_not}
+        return RecordingBlock(
+            recording=str(self.recording.path),
+            readings=self.series.source,
+            frames=self.n_frames,
+            used=len(self.used),
+            offset_s=self.offset.seconds,
+            offset_sigma_s=self.offset.sigma,
+            agreement=self.offset.agreement,
+            stills=[
+                StillBlock(begin_s=s.begin, end_s=s.end, frame=s.frame, why_not=s.why_not)
                 for s in self.stills
             ],
-            "notes": list(self.notes),
-        }
+            notes=list(self.notes),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,13 +173,14 @@ class Import:
             )
         }
 
-    def document(self) -> dict[str, Any]:
-        """Return what ``legcal import --json`` prints."""
-        return {
-            "dataset": str(self.destination),
-            "encoder_sigma": self.encoder_sigma,
-            "views": {view.name: view.document() for view in self.views},
-        }
+    def document(self, written: Sequence[Path]) -> dict[str, Any]:
+        """Return what ``legcal import --json`` prints, with the files that were written."""
+        return ImportDocument(
+            dataset=str(self.destination),
+            encoder_sigma=self.encoder_sigma,
+            views={view.name: view.block() for view in self.views},
+            written=[str(path) for path in written],
+        ).document()
 
 
 def plan_import(

@@ -166,8 +166,8 @@ def _board_in_words(plan: Plan, board: LaidBoard) -> str:
     )
     return (
         "Fix the board to the base, flat at the level of its joints, print up, as places.svg shows "
-        f"it: its middle about {joints}, at x {x:.0f}, y {y:.0f}, z {z:.0f} mm in the base link. "
-        "It must not move, and be whole in every image."
+        f"it: its middle about {joints}, at x {x:z.0f}, y {y:z.0f}, z {z:z.0f} mm in the base "
+        "link. It must not move, and be whole in every image."
     )
 
 

@@ -21,7 +21,7 @@ from legcal.data import (
     write_observations,
 )
 from legcal.errors import UsageError
-from legcal.files import MAX_DOCUMENT, output_path, read_bytes
+from legcal.files import MAX_DOCUMENT, Document, output_path, read_bytes
 from legcal.geometry import Array
 from legcal.machine import Machine, load_mechanism, write_model
 from legcal.progress import Progress, Report, shown_progress
@@ -211,22 +211,43 @@ def _check_readings(nominal: Machine, settings: SimulationSettings) -> None:
         )
 
 
+class ViewSummary(Document):
+    """A view of the dataset."""
+
+    images: int
+    legs: dict[str, int]  # in how many of its images each is seen
+
+
+class SimulationDocument(Document):
+    """What ``legcal simulate --json`` prints."""
+
+    dataset: str
+    level: str
+    mechanism: str
+    truth: str  # the true model
+    images: int
+    poses: int
+    extreme_poses: int  # in which every motor is near an end of its travel
+    left_out: int
+    views: dict[str, ViewSummary]
+
+
 def summary_document(made: SimulatedDataset) -> dict[str, Any]:
     """Return the document of ``legcal simulate --json``."""
-    views = {}
+    views: dict[str, ViewSummary] = {}
     for v, view in enumerate(made.measurements.views):
         rows = made.measurements.view == v
         seen = made.seen[rows].sum(axis=0).tolist()
         legs = dict(zip(made.nominal.leg_names, seen, strict=True))
-        views[view.name] = {"images": int(np.sum(rows)), "legs": legs}
-    return {
-        "dataset": str(made.folder),
-        "level": made.level.value,
-        "mechanism": made.nominal.name,
-        "truth": str(made.truth_path),
-        "images": made.measurements.n_rows,
-        "poses": made.measurements.n_poses,
-        "extreme_poses": made.n_extreme,
-        "left_out": made.left_out,
-        "views": views,
-    }
+        views[view.name] = ViewSummary(images=int(np.sum(rows)), legs=legs)
+    return SimulationDocument(
+        dataset=str(made.folder),
+        level=made.level.value,
+        mechanism=made.nominal.name,
+        truth=str(made.truth_path),
+        images=made.measurements.n_rows,
+        poses=made.measurements.n_poses,
+        extreme_poses=made.n_extreme,
+        left_out=made.left_out,
+        views=views,
+    ).document()

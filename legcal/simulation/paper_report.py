@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from legcal.files import Document, Number
 from legcal.geometry import Array
 from legcal.machine import parametrize, point_like_legs, to_vector
 from legcal.simulation.hexapod import PaperHexapod
@@ -125,11 +126,11 @@ class Means:
         """Mean absolute error of every parameter [m]."""
         return self._parameters / max(self.n, 1)
 
-    def document(self) -> dict[str, Any]:
+    def row(self) -> EstimatorRow:
         """Return a row of ``--json``; null where every run failed."""
         (dX, dE, angle, _), (of_dX, of_dE, *_) = self.scalars.tolist(), self.uncertainties.tolist()
         ratio, of_ratio = self.of_bound
-        figures = {
+        figures: dict[str, Any] = {
             "dX_mm": 1e3 * dX,
             "dE_deg": float(np.degrees(dE)),
             "parameters_mm": (1e3 * self.parameters).tolist(),
@@ -141,14 +142,14 @@ class Means:
         }
         if not self.n:
             figures = {**dict.fromkeys(figures), "parameters_mm": []}
-        return {
-            "estimator": self.estimator,
-            "coplanar": self.machine == "coplanar",
+        return EstimatorRow(
+            estimator=self.estimator,
+            coplanar=self.machine == "coplanar",
             **figures,
-            "runs": self.n,
-            "failed": self.n_failed,
-            "failures": dict(sorted(self.failures.items())),
-        }
+            runs=self.n,
+            failed=self.n_failed,
+            failures=dict(sorted(self.failures.items())),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,18 +189,47 @@ class PaperSummary:
 
     def document(self) -> dict[str, Any]:
         """Return the document of ``--json``."""
-        return {
-            "rows": [means.document() for means in self.means if means.estimator != INITIAL],
-            "initial": [means.document() for means in self.means if means.estimator == INITIAL],
-            "names": list(self.names),
-            "true_values_mm": {name: (1e3 * xi).tolist() for name, xi in self.truths.items()},
-            "as_printed": {"initial": PRINTED_BEFORE, "calibrated": PRINTED_AFTER, "note": CONTEXT},
-            "readings": list(self.readings),
-        }
+        return PaperDocument(
+            rows=[means.row() for means in self.means if means.estimator != INITIAL],
+            initial=[means.row() for means in self.means if means.estimator == INITIAL],
+            names=list(self.names),
+            true_values_mm={name: (1e3 * xi).tolist() for name, xi in self.truths.items()},
+            as_printed={"initial": PRINTED_BEFORE, "calibrated": PRINTED_AFTER, "note": CONTEXT},
+            readings=list(self.readings),
+        ).document()
 
     def files(self) -> dict[str, bytes]:
         """Return figure 4, to look at in a browser and as a picture."""
         return {"fig4.html": _as_html(self), "fig4.png": _as_png(self)}
+
+
+class EstimatorRow(Document):
+    """Means of an estimator's errors on one machine, null where every run failed."""
+
+    estimator: str
+    coplanar: bool  # whether it is the machine with coplanar joints
+    dX_mm: Number | None
+    dE_deg: Number | None
+    parameters_mm: list[Number]  # absolute, in the order of ``names``
+    angle_deg: Number | None
+    dX_mean_sigma_mm: Number | None  # of the mean over the runs
+    dE_mean_sigma_deg: Number | None
+    of_bound: Number | None  # rms error in units of the Cramer-Rao bound
+    of_bound_sigma: Number | None
+    runs: int
+    failed: int
+    failures: dict[str, int]  # by kind of error
+
+
+class PaperDocument(Document):
+    """What the runs of ``legcal study paper`` found together."""
+
+    rows: list[EstimatorRow]
+    initial: list[EstimatorRow]  # before calibration
+    names: list[str]  # of the parameters
+    true_values_mm: dict[str, list[Number]]  # by machine
+    as_printed: dict[str, dict[str, Any] | str]  # in the paper
+    readings: list[str]  # how the paper's text was read where it leaves a choice
 
 
 # Figure 4

@@ -7,14 +7,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration import PLAN_NAME
 from legcal.data import Measurements, load_dataset
-from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
-from legcal.files import MotionEntry, read_json
+from legcal.errors import DidNotConverge, NotVisible, UsageError
+from legcal.files import MotionEntry, Pose, read_json, validate
 from legcal.geometry import Array
 from legcal.machine import Configurations, Machine, follow_each, poses_at
-from legcal.planning import Setting, difference
+from legcal.planning import PlanDocument, Setting, difference
 from legcal.simulation.board import PlacedBoard
 from legcal.simulation.cameras import MAX_HAND_DRAWS
 from legcal.simulation.solids import PosedMachine
@@ -86,17 +87,15 @@ class PlannedSession:
 def read_plan(folder: Path, nominal: Machine) -> PlannedSession:
     """Return a planned session of a machine. Raises UsageError if it is none, or of another one."""
     try:
-        plan = read_json(folder / PLAN_NAME)
-        tolerance, pose = plan["tolerance"], plan.get("T_base_board")
-        places = [MotionEntry(**e["T_base_camera"]).motion() for e in plan["views"].values()]
-        laid = None if pose is None else MotionEntry(**pose).motion()
-        shift, turn = float(tolerance["camera_m"]), float(tolerance["camera_rad"])
-        setting = Setting(shift, turn)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, DatasetError) as error:
+        plan = validate(PlanDocument, dict(read_json(folder / PLAN_NAME)), folder / PLAN_NAME)
+        places = [_motion(view.T_base_camera) for view in plan.views.values()]
+        laid = None if plan.T_base_board is None else _motion(plan.T_base_board)
+    except (OSError, ValueError, TypeError) as error:
         raise UsageError(
             f"{folder}: the plan could not be shot: found no {PLAN_NAME} in it that can be read, "
             "needed the folder that legcal plan wrote; correct --plan."
         ) from error
+    setting = Setting(plan.tolerance.camera_m, plan.tolerance.camera_rad)
     dataset = load_dataset(folder, check_images=False)
     if other := difference(nominal, dataset.machine):
         raise UsageError(
@@ -122,3 +121,8 @@ def read_plan(folder: Path, nominal: Machine) -> PlannedSession:
         both = zip(m.views, places, strict=True)
         m = replace(m, views=tuple(replace(view, T_base_camera=T) for view, T in both))
     return PlannedSession(m, setting, board, hand)
+
+
+def _motion(pose: Pose) -> RigidTransform:
+    """Return a motion of the document; ValueError if it is none."""
+    return MotionEntry(**pose.model_dump()).motion()

@@ -22,7 +22,7 @@ import numpy as np
 
 from legcal.brief import brief
 from legcal.errors import DidNotConverge, LegcalError, OutOfResources, UsageError
-from legcal.files import TEMPORARY_SUFFIX, OutputKind, result_folder
+from legcal.files import TEMPORARY_SUFFIX, OutputKind, SparseDocument, result_folder
 from legcal.processors import processors
 from legcal.progress import Progress, shown_progress
 from legcal.simulation.checkpoint import (
@@ -81,6 +81,18 @@ class Study(Protocol):
         """Summarise the records of all runs that did not fail, read once and in order."""
 
 
+class StudyHeading(SparseDocument):
+    """What the document of every study has beside what was found."""
+
+    study: str
+    settings: dict[str, Any]
+    seed: int
+    runs: int
+    failures: dict[str, int]  # runs that failed as a whole, by kind of error
+    notes: list[str] | None = None  # left out where there are none
+    part: list[int] | None = None  # which part of how many; left out where the runs are all
+
+
 @brief
 @dataclass(frozen=True, eq=False)
 class StudyResult:
@@ -97,16 +109,16 @@ class StudyResult:
 
     def document(self) -> dict[str, Any]:
         """Return the document that ``legcal study --json`` prints."""
-        return {
-            **self.summary.document(),
-            "study": self.study,
-            "settings": self.settings,
-            "seed": self.seed,
-            "runs": self.n_runs,
-            "failures": self.failures,
-            **({"notes": list(self.notes)} if self.notes else {}),
-            **({"part": list(self.part)} if self.part else {}),
-        }
+        heading = StudyHeading(
+            study=self.study,
+            settings=self.settings,
+            seed=self.seed,
+            runs=self.n_runs,
+            failures=self.failures,
+            notes=list(self.notes) or None,
+            part=list(self.part) if self.part else None,
+        )
+        return self.summary.document() | heading.document()
 
 
 def run_study(

@@ -6,7 +6,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from pydantic import Field
+
 from legcal.brief import brief
+from legcal.files import Document, SparseDocument
 from legcal.paper import Condition
 
 
@@ -175,34 +178,79 @@ class Identifiability:
 
     def document(self) -> dict[str, Any]:
         """Return the report as plain JSON types; see the documentation of the files."""
-        document = asdict(self)
-        document["paper"] = {"ok": self.conditions_hold}
+        document = asdict(self) | {"paper": {"ok": self.conditions_hold}}
         document["conditions"] = [_condition(c, self.legs) for c in self.conditions]
-        if not self.scale:
-            del document["scale"]
+        document["scale"] = document["scale"] or None
         for board in ("board", "platform_board"):
             document[board]["with"] = document[board].pop("with_board")
-        return {key: _plain(value) for key, value in document.items()}
+        found = IdentifyDocument.model_validate(document)
+        return found.model_dump(mode="json", by_alias=True)
 
 
-def _condition(condition: Condition, legs: Sequence[str]) -> dict[str, Any]:
-    """Return a condition as a document: a count with its numbers, or the legs that fail it."""
-    document: dict[str, Any] = {"name": condition.name, "ok": condition.ok}
-    if not condition.needed:
-        document["needed"] = False
-    if condition.by_analogy:
-        document["by_analogy"] = True
-    if condition.equations is not None:
-        document |= {"equations": condition.equations, "unknowns": condition.unknowns}
-    else:
-        document["failing"] = [legs[j] for j in condition.legs]
-    return document
+class ConditionBlock(SparseDocument):
+    """A condition of the paper: a count with its numbers, or the legs that fail it."""
+
+    name: str
+    ok: bool
+    needed: bool | None = None  # left out where it is
+    by_analogy: bool | None = None  # left out where it is the paper's
+    equations: int | None = None
+    unknowns: int | None = None
+    failing: list[str] | None = None  # legs
 
 
-def _plain(value: Any) -> Any:
-    """Return tuples as lists, all the way down."""
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, (tuple, list)):
-        return [_plain(inner) for inner in value]
-    return value
+class PaperBlock(Document):
+    """Whether all of the paper's conditions hold that are needed."""
+
+    ok: bool
+
+
+class BoardBlock(Document):
+    """A :class:`BoardReport`."""
+
+    present: bool
+    needed_for: list[str]
+    without: BoardRanks
+    with_board: BoardRanks = Field(alias="with")
+    mends: list[str]
+
+
+class IdentifyDocument(SparseDocument):
+    """What ``legcal identify --json`` prints: an :class:`Identifiability`."""
+
+    spatial: bool
+    legs: list[str]
+    n: int
+    n_d: int
+    r: int
+    n_ac: int
+    conditions: list[ConditionBlock]
+    staged: Ranks
+    full: Ranks
+    identifiable: bool
+    steps: list[StepRank]
+    views: list[list[str]]
+    images: list[int]
+    board: BoardBlock
+    platform_board: BoardBlock
+    platform_sigma: RmsMotion | None
+    remedies: list[Remedy]
+    recommendation: list[Recommendation] | None
+    notes: list[str]
+    intrinsics: list[CameraIntrinsics]
+    scale: list[ScaleSource] | None = None  # left out where readings carry lengths
+    paper: PaperBlock
+
+
+def _condition(condition: Condition, legs: Sequence[str]) -> ConditionBlock:
+    """Return a condition as a document."""
+    is_count = condition.equations is not None
+    return ConditionBlock(
+        name=condition.name,
+        ok=condition.ok,
+        needed=None if condition.needed else False,
+        by_analogy=condition.by_analogy or None,
+        equations=condition.equations,
+        unknowns=condition.unknowns,
+        failing=None if is_count else [legs[j] for j in condition.legs],
+    )

@@ -128,7 +128,8 @@
     button.addEventListener("click", () => {
       const svg = button.querySelector("svg").cloneNode(true);
       stage.replaceChildren(svg);
-      dialog.querySelector("p").textContent = button.parentElement.querySelector("figcaption").textContent;
+      dialog.querySelector("p").textContent = [...button.parentElement.querySelector("figcaption").childNodes]
+        .map((part) => part.textContent.split(" · ")[0].trim()).filter((text) => text).join("; ");
       dialog.showModal();
     });
   }

@@ -1,0 +1,122 @@
+"""What `legcal inspect` says of a machine: its document."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import model_validator
+
+from legcal.files import Document, Number, Pose, SparseDocument, Triple, motion_to_xyz_quat
+from legcal.machine.leg import JointType, Leg, LegKind
+from legcal.machine.model import Machine, readings_at
+
+
+class ActuatorBlock(SparseDocument):
+    """A motor that moves joints at A, in R_b or the base link at reading 0 [m]."""
+
+    kind: Literal["prismatic", "revolute"]
+    direction: Triple | None = None  # of a prismatic
+    point: Triple | None = None  # of the axis of a revolute
+    axis: Triple | None = None
+
+    @model_validator(mode="after")
+    def _has_its_motion(self) -> ActuatorBlock:
+        needed = ("direction",) if self.kind == "prismatic" else ("point", "axis")
+        missing = [key for key in needed if getattr(self, key) is None]
+        if missing:
+            raise ValueError(f"a {self.kind} actuator has no '{missing[0]}'")
+        return self
+
+
+class CylinderBlock(Document):
+    """A visible cylinder of a leg [m]."""
+
+    link: str
+    radius: Number
+
+
+class InspectedLeg(SparseDocument):
+    """A leg as it was found."""
+
+    name: str
+    type: str
+    actuated: bool
+    kind: Literal["actuated", "passive", "constant"]
+    A: Triple  # in the base link [m]
+    B: Triple  # in the platform link [m]
+    q0: Number  # [m]
+    sign: int
+    travel: list[Number] | None  # [m, or rad of what turns]; of what a slider or actuator moves
+    q_home: Number  # the reading at ``home``
+    base_axis: Triple | None
+    platform_axis: Triple | None
+    twist: Number | None  # [rad]
+    cylinders: list[CylinderBlock]
+    actuator: str | None = None  # the joint of the motor that moves A; left out where none does
+
+
+class Inspection(SparseDocument):
+    """What ``legcal inspect --json`` prints: legs with types, frames, mobility."""
+
+    name: str
+    spatial: bool
+    mobility: int
+    motors: int
+    motor_rank: int  # freedoms of the platform that motors hold
+    n: int
+    n_d: int  # legs that define the frames
+    r: int  # legs with an R joint on the base
+    n_ac: int  # legs that are actuated or of constant length
+    idle_spins: int  # freedoms that only turn a leg about itself
+    base_frame: list[str]
+    home: Pose  # T_base_platform
+    legs: list[InspectedLeg]
+    actuators: dict[str, ActuatorBlock] | None = None  # in the base link, with A at reading 0
+    diagnostics: list[str]
+
+
+def machine_document(machine: Machine) -> dict[str, Any]:
+    """Return the document of ``legcal inspect --json``, an :class:`Inspection`."""
+    kinds = [leg.kind for leg in machine.legs]
+    readings = readings_at(machine, machine.home).tolist()
+    actuators = {a.joint: ActuatorBlock.model_validate(a.document()) for a in machine.actuators}
+    return Inspection(
+        name=machine.name,
+        spatial=machine.spatial,
+        mobility=machine.mobility,
+        motors=len(machine.motors),
+        motor_rank=machine.motor_rank,
+        n=machine.n_legs,
+        n_d=len(machine.frame_legs),
+        r=sum(leg.base_joint is JointType.REVOLUTE for leg in machine.legs),
+        n_ac=len(kinds) - kinds.count(LegKind.PASSIVE),
+        idle_spins=sum(leg.idle_spins for leg in machine.legs),
+        base_frame=[machine.leg_names[j] for j in machine.frame_legs],
+        home=Pose.model_validate(motion_to_xyz_quat(machine.home)),
+        legs=[_leg(leg, q) for leg, q in zip(machine.legs, readings, strict=True)],
+        actuators=actuators or None,
+        diagnostics=list(machine.diagnostics),
+    ).document()
+
+
+def _leg(leg: Leg, q_home: float) -> InspectedLeg:
+    """Return one leg of the document."""
+    has_travel = leg.has_value and bool(np.isfinite(leg.travel).all())
+    return InspectedLeg(
+        name=leg.name,
+        type=leg.type,
+        actuated=leg.is_motor,
+        kind=leg.kind.value,
+        A=leg.A.tolist(),
+        B=leg.B.tolist(),
+        q0=float(leg.q0),
+        sign=leg.sign,
+        travel=[float(x) for x in leg.travel] if has_travel else None,
+        q_home=q_home,
+        base_axis=None if leg.base_axis is None else leg.base_axis.tolist(),
+        platform_axis=None if leg.platform_axis is None else leg.platform_axis.tolist(),
+        twist=leg.twist,
+        cylinders=[CylinderBlock(link=c.link, radius=c.radius) for c in leg.cylinders],
+        actuator=None if leg.actuator is None else leg.actuator.joint,
+    )
