@@ -54,6 +54,23 @@ def _write_notebook(app: Any, failure: Exception | None) -> None:
         nbformat.write(notebook, Path(app.outdir) / "tutorial.ipynb")
 
 
+def _joined(outputs: list[Any]) -> list[Any]:
+    """Join the parts of a stream: MyST-NB ends a line after each, wherever it is cut."""
+    found: list[Any] = []
+    streams: dict[str, Any] = {}
+    for output in outputs:
+        if output["output_type"] == "stream" and output["name"] in streams:
+            streams[output["name"]]["text"] += output["text"]
+            continue
+        if output["output_type"] == "stream":
+            streams[output["name"]] = output
+        found.append(output)
+    return found
+
+
 def setup(app: Any) -> None:
     """Connect what is done when the site is built."""
+    from myst_nb.core import render
+
+    render.coalesce_streams = _joined
     app.connect("build-finished", _write_notebook)

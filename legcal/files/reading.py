@@ -11,7 +11,8 @@ import stat
 from pathlib import Path
 from typing import Any, BinaryIO
 
-MAX_TEXT = 4_000_000  # bytes of a table, a URDF, or another file of text
+MAX_TEXT = 4_000_000  # bytes of a URDF or another file of text
+MAX_TABLE = 16_000_000  # of a table: as many rows of outlines as one may have
 MAX_YAML = 2_000_000  # of YAML, which is read more slowly
 MAX_DOCUMENT = 32_000_000  # of a JSON document that legcal wrote
 MAX_IMAGE = 256_000_000

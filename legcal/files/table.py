@@ -24,6 +24,7 @@ import numpy as np
 
 from legcal.errors import DatasetError
 from legcal.files.quantity import LENGTH
+from legcal.files.reading import MAX_TABLE
 from legcal.files.schema import MAX_PROBLEMS, NAME_NEEDED, closest, content_of, describe, is_name
 from legcal.geometry import Array, BoolArray
 
@@ -333,7 +334,7 @@ def _read_lines(path: Path, what: str, *, loose: bool = False) -> Lines:
     A byte-order mark and either kind of line end are accepted; if ``loose``, also what programs
     for tables write in other countries.
     """
-    content = content_of(path, what)
+    content = content_of(path, what, MAX_TABLE)
     workbook = _WORKBOOKS.get(content[:4])
     if loose and workbook:
         raise DatasetError(

@@ -7,6 +7,7 @@ has changed, so that a slider that is dragged faster than that never lags behind
 from __future__ import annotations
 
 import io
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -500,6 +501,7 @@ def _serve(name: str, address: Address) -> viser.ViserServer:
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
 
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # of what connects and is no browser
     with redirect_stdout(io.StringIO()):
         server = Server(address.host, address.port, label=name, verbose=False)
     server.gui.configure_theme(

@@ -18,7 +18,7 @@ from legcal.pages import Crop
 from legcal.vision import Camera, outlines_of_axis
 
 N_WORST, N_MEDIAN = 30, 10
-MAX_BYTES = 3_000_000  # of all pictures in a page, as they are written
+MAX_BYTES = 1_300_000  # of all pictures as they are written: pages of any size stay below 9 MB
 _MARGIN = 18  # about an outline [px]
 _ASPECT = 0.8  # of its sides, the shorter to the longer, at least
 _SIDE = 360  # longer side of a picture; what is larger is reduced [px]
