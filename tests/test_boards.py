@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -22,6 +23,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.calibration.board import observe_board
 from legcal.data import Corners, Measurements, View, found_corners, join_corners
 from legcal.errors import DatasetError, NotVisible
 from legcal.perception import (
@@ -40,6 +42,7 @@ from legcal.simulation.board import INK, BoardPrint
 from legcal.vision import (
     Board,
     Camera,
+    FixedBoard,
     board_document,
     charuco_board,
     parse_board,
@@ -398,6 +401,32 @@ def test_images_are_searched_by_row_and_a_view_without_the_board_is_refused() ->
     require_board(other, nothing, lambda _: image, _measurements((1,)), [])
     with pytest.raises(NotVisible, match=r"c1: .* any of its 1 image: found tags with numbers up"):
         require_board(other, nothing, lambda _: image, _measurements((1,)), ["c1"])
+
+
+def test_of_photographs_by_hand_some_but_not_most_may_miss_the_board() -> None:
+    board, T, image = plain_picture("aprilgrid")
+    blank = np.full_like(image, 100.0)
+    measurements = _measurements((1, 1, 1))
+    measurements = replace(
+        measurements, views=tuple(replace(view, hand_held=True) for view in measurements.views)
+    )
+
+    def observed(images: list[Any]) -> Any:
+        dataset = SimpleNamespace(boards=(FixedBoard(board, "base"),), corners=None, yaml_path=PATH)
+        photographs = SimpleNamespace(load=images.__getitem__)
+        data: Any = SimpleNamespace(
+            dataset=dataset, measurements=measurements, photographs=photographs,
+            pool=in_turn, progress=no_progress,
+        )  # fmt: skip
+        return observe_board(data)
+
+    first, missing, last = observed([image, blank, image]).T_board_camera
+    assert missing is None
+    for found in (first, last):
+        np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=2e-3)
+    with pytest.raises(NotVisible) as refusal:
+        observed([image, blank, blank])
+    assert [problem[:8] for problem in refusal.value.problems] == ["view c2:", "view c3:"]
 
 
 # Where cameras stand before it.

@@ -89,7 +89,7 @@ class NewDatasetDocument(Document):
     unit_from: str
     lengths: bool  # whether the table has lengths of legs, not readings
     matched: str
-    encoder_sigma: Number
+    encoder_sigma: Number | dict[str, Number]  # [m], or by motor [m, rad] where one turns
     views: dict[str, ViewToWrite]
     images: list[MatchedImage]
     notes: list[str]

@@ -81,7 +81,7 @@ class ImportDocument(Document):
     """What ``legcal import --json`` prints."""
 
     dataset: str
-    encoder_sigma: Number
+    encoder_sigma: Number | dict[str, Number]  # [m], or by motor [m, rad] where one turns
     views: dict[str, RecordingBlock]
     written: list[str]
 
