@@ -24,7 +24,7 @@ from legcal.calibration.change_detection import (
 )
 from legcal.data import Dataset, load_dataset
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible
-from legcal.geometry import Array
+from legcal.geometry import Array, frame_on_points
 from legcal.machine import (
     geometries,
     load_mechanism,
@@ -350,6 +350,44 @@ def test_a_joint_of_a_frame_leg_moves_the_coordinates_of_all_others(model: str, 
     assert [len(change.components) for change in whole] == [size] * machine.n_legs
     everything = np.concatenate([change.columns for change in whole], axis=1)
     assert np.linalg.matrix_rank(everything, tol=1e-6) == len(parametrization)
+
+
+@pytest.mark.parametrize(("model", "joint"), [("delta", "arm2"), ("hexaglide", "rail4")])
+def test_what_changes_at_a_motor_that_moves_joints_at_A_is_named(model: str, joint: str) -> None:
+    machine = load_mechanism(model)
+    legs, found = geometries(machine), parametrization_of(machine)
+    changes = single, joints, whole = possible_changes(machine, found)
+    everything = np.concatenate([change.columns for change in whole], axis=1)
+    assert np.linalg.matrix_rank(everything, tol=1e-6) == len(found)
+    (axis,) = (c for c in joints if c.what.split()[0] in ("axis", "direction") and joint in c.what)
+    assert len(axis.components) == (4 if machine.actuators[0].turns else 2)
+    # A reading is too small by 1e-4: joints at A stand where they were at that reading.
+    moved = [
+        replace(leg, A=leg.actuator.at(leg.A, np.array([1e-4]))[0])
+        if leg.actuator is not None and leg.actuator.joint == joint
+        else leg
+        for leg in legs
+    ]
+    platform = [leg.B for leg in legs]
+    frame = list(machine.frame_legs)
+    T = frame_on_points(np.array([leg.A for leg in moved])[frame]).inv()
+    there = [
+        replace(
+            leg,
+            A=T.apply(leg.A),
+            B=B,
+            actuator=leg.actuator and leg.actuator.in_frame(T.as_matrix()),
+        )
+        for leg, B in zip(moved, platform, strict=True)
+    ]
+    step = vector_of(found, there, legs) - vector_of(found, legs, legs)
+    n = len(found)
+    movement = judge_movement((np.eye(n), step, 1e-14 * np.eye(n)), 500, changes, 1e-3)
+    best = movement.explanations[0]
+    assert best.change.what == f"zero of {joint}"
+    assert best.values[0] == pytest.approx(1e-4, rel=1e-3)
+    assert len(movement.explanations) == 1
+    assert {c.what for c in single} >= {f"length of {name}" for name in machine.leg_names}
 
 
 # Rates of the whole check.

@@ -10,16 +10,18 @@ import numpy as np
 import pytest
 from csv_rows import read_rows, write_rows
 from hexapod_example import Spoiled, spoiled
-from simulated import simulated
+from simulated import settings, simulated
 
 from legcal import calibrate, load_dataset
 from legcal.calibration.diagnosis import diagnosis
 from legcal.calibration.diagnosis.diagnosis import diagnose
-from legcal.calibration.diagnosis.mistakes import mistakes
+from legcal.calibration.diagnosis.mistakes import as_given, mistakes
 from legcal.calibration.ordered_dataset import order_dataset
 from legcal.data import Dataset, dataset_at, row_names
 from legcal.errors import DatasetError, NotVisible
+from legcal.geometry import Array
 from legcal.progress import no_progress
+from legcal.simulation import simulate
 from legcal.workers import in_turn
 
 COLUMNS = [f"leg{k}_prismatic" for k in range(1, 7)]
@@ -162,6 +164,60 @@ def test_given_outlines_name_a_mistake_as_photographs_do(
     assert found.after >= 11 > found.before
     assert any(one.startswith(other) for one in found.same_as) or not other
     assert ("To tell these apart" in found.sentence) == bool(found.same_as)
+
+
+@pytest.fixture(scope="module")
+def delta(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("delta") / "set"
+    simulate("delta", folder, settings(poses=6))
+    return load_dataset(folder)
+
+
+def _with_readings(d: Dataset, change: Callable[[Array], Array]) -> Dataset:
+    """Change the readings (n, n_motors) of a machine; rods on one motor have one reading."""
+    q = d.machine.at_readings(change(d.measurements.q[:, list(d.machine.motors)]))
+    return replace(d, measurements=replace(d.measurements, q=q))
+
+
+def test_motors_that_move_joints_at_A_are_mistaken_as_encoders_of_legs_are(delta: Dataset) -> None:
+    small = _with_readings(delta, lambda q: 0.5 * q)  # so that another zero is in their travel
+    data = order_dataset(small, in_turn, no_progress)
+    tried, rows = mistakes(data), list(range(6))
+    of_kinds = {one.kind: one for one in tried}
+    assert "whole lengths" not in of_kinds
+    assert "deg too" in of_kinds["zero of an encoder"].what
+    assert "motors arm" in of_kinds["columns exchanged"].same_as[0]
+    given, mirrored = as_given(data).joints(rows), of_kinds["handedness"].true.joints(rows)
+    for ends, of_mirror in zip(given, mirrored, strict=True):
+        assert np.allclose(ends[rows] * [1.0, -1.0, 1.0], of_mirror[rows], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "kinds", "what"),
+    [
+        (np.deg2rad, {"unit", "direction of encoders"}, "the readings look like radians that"),
+        pytest.param(
+            *(lambda q: q * [1.0, 1.0, -1.0], {"direction of an encoder"}),
+            "column arm3 looks as if it had the opposite sign",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            *(lambda q: q[:, [1, 0, 2]], {"columns exchanged"}),
+            "columns arm1 and arm2 look exchanged",
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_wrong_readings_of_arms_are_named(
+    delta: Dataset,
+    change: Callable[[Array], Array],
+    kinds: set[str],
+    what: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = _diagnosed(_with_readings(delta, change), kinds, monkeypatch)
+    assert found.what.startswith(what)
+    assert found.after >= 11 > found.before
 
 
 def _mirrored(d: Dataset, v: int, only: slice = slice(None)) -> Dataset:

@@ -19,10 +19,13 @@ from scipy.special import fdtrc
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, frame_on_points, normal_basis, whitener
 from legcal.machine import (
+    Actuator,
     Leg,
     LegKind,
     Machine,
     Parametrization,
+    actuator_index,
+    actuators_of,
     geometries,
     twist_after,
     vector_of,
@@ -168,87 +171,125 @@ def possible_changes(
 ) -> tuple[tuple[Change, ...], ...]:
     """Return what may have changed: single lengths first, then joints, then whole legs.
 
-    Joints move along the axes of the links of base and platform.
+    Joints move along the axes of the links of base and platform. What moves joints at A changes
+    for all rods on it.
     """
     legs, frame_legs = geometries(machine), machine.frame_legs
     single, of_joints, of_legs = list[Change](), list[Change](), list[Change]()
-    for j, (name, leg) in enumerate(zip(machine.leg_names, legs, strict=True)):
-        of_leg = list[Change]()
-        for what, components, unit, link, moved in _of_leg(machine, name, leg):
+    things = [
+        (name, [j], _of_leg(machine, name, leg))
+        for j, (name, leg) in enumerate(zip(machine.leg_names, legs, strict=True))
+    ]
+    on = actuator_index(legs)
+    things += [
+        (one.joint, [j for j, other in enumerate(on) if other == a], _of_actuator(one))
+        for a, one in enumerate(actuators_of(legs))
+    ]
+    for name, which, changes in things:
+        of_thing = list[Change]()
+        for what, components, units, link, moved in changes:
             derivatives = []
             for k in range(len(components)):
-                ends = [
-                    vector_of(
-                        parametrization,
-                        _in_frames_of_joints(
-                            [*legs[:j], moved(k, step), *legs[j + 1 :]], frame_legs
-                        ),
-                        legs,
-                    )
-                    for step in (-_STEP, _STEP)
-                ]
+                ends = []
+                for step in (-_STEP, _STEP):
+                    changed = list(legs)
+                    for j in which:
+                        changed[j] = moved(legs[j], k, step)
+                    there = _in_frames_of_joints(changed, frame_legs)
+                    ends.append(vector_of(parametrization, there, legs))
                 derivatives.append((ends[1] - ends[0]) / (2.0 * _STEP))
             columns = np.column_stack(derivatives)
             found = np.any(np.abs(columns) > _STEP, axis=0)
             if found.any():
-                kept = tuple(c for c, is_found in zip(components, found, strict=True) if is_found)
-                n = len(kept)
-                of_leg.append(Change(what, kept, (unit,) * n, (link,) * n, columns[:, found]))
-        single += [change for change in of_leg if len(change.components) == 1]
-        of_joints += [change for change in of_leg if len(change.components) > 1]
-        if len(of_leg) > 1:
-            of_legs.append(_together(name, of_leg))
+                kept = np.flatnonzero(found).tolist()
+                of_thing.append(
+                    Change(
+                        what,
+                        tuple(components[k] for k in kept),
+                        tuple(units[k] for k in kept),
+                        (link,) * len(kept),
+                        columns[:, found],
+                    )
+                )
+        single += [change for change in of_thing if len(change.components) == 1]
+        of_joints += [change for change in of_thing if len(change.components) > 1]
+        if len(of_thing) > 1:
+            of_legs.append(_together(name, of_thing))
     return tuple(single), tuple(of_joints), tuple(of_legs)
 
 
-_Moved = Callable[[int, float], Leg]  # a leg, one number of which has moved by a step
+_Moved = Callable[[Leg, int, float], Leg]  # a leg, one number of which has moved by a step
+# In words, its numbers, their units, the link in whose axes they are, and how
+_Possible = tuple[str, tuple[str, ...], tuple[str, ...], str, _Moved]
+_METRES, _RADIANS = ("m",) * 3, ("rad",) * 2
 
 
-def _of_leg(
-    machine: Machine, name: str, leg: Leg
-) -> list[tuple[str, tuple[str, ...], str, str, _Moved]]:
-    """Return what may change at one leg: in words, its numbers, their unit, link, and how."""
-    found: list[tuple[str, tuple[str, ...], str, str, _Moved]] = []
+def _of_actuator(actuator: Actuator) -> list[_Possible]:
+    """Return what may change of a motor that moves joints at A: its zero, and its axis."""
+
+    def zero_moved(leg: Leg, _: int, step: float) -> Leg:
+        there = np.array([step])
+        axis = leg.base_axis
+        return replace(
+            leg,
+            A=actuator.at(leg.A, there)[0],
+            base_axis=None if axis is None else actuator.rotations(there)[0] @ axis,
+        )
+
+    def axis_moved(leg: Leg, k: int, step: float) -> Leg:
+        change = np.zeros(5)
+        change[k] = step
+        return replace(leg, actuator=actuator.moved(change))
+
+    joint = actuator.joint
+    found: list[_Possible] = [
+        (f"zero of {joint}", (f"{joint}.zero",), (actuator.unit,), "", zero_moved)
+    ]
+    if actuator.turns:
+        numbers, units = ("1", "2", "place 1", "place 2"), (*_RADIANS, *_METRES[:2])
+        return [*found, (f"axis of {joint}", numbers, units, "", axis_moved)]
+    return [*found, (f"direction of {joint}", ("1", "2"), _RADIANS, "", axis_moved)]
+
+
+def _of_leg(machine: Machine, name: str, leg: Leg) -> list[_Possible]:
+    """Return what may change at one leg."""
+    found = list[_Possible]()
     xyz = ("x", "y", "z")
     # Rows are the axes of the links in R_b and R_e.
     base = machine.T_base_Rb.rotation.as_matrix()
     platform = machine.T_platform_Re.rotation.as_matrix()
+
+    def longer(leg: Leg, _: int, step: float) -> Leg:
+        return replace(leg, q0=leg.q0 + step)
+
     if leg.kind is not LegKind.PASSIVE:
         what = "length" if leg.kind is LegKind.CONSTANT else "offset"
-        found.append(
-            (
-                f"{what} of {name}",
-                (f"{name}.{what}",),
-                "m",
-                "",
-                lambda _, step: replace(leg, q0=leg.q0 + step),
-            )
-        )
+        found.append((f"{what} of {name}", (f"{name}.{what}",), ("m",), "", longer))
 
-    def base_moved(k: int, step: float) -> Leg:
+    def base_moved(leg: Leg, k: int, step: float) -> Leg:
         return replace(leg, A=leg.A + step * base[k])
 
-    def platform_moved(k: int, step: float) -> Leg:
+    def platform_moved(leg: Leg, k: int, step: float) -> Leg:
         return replace(leg, B=leg.B + step * platform[k])
 
     found += [
-        (f"base joint of {name}", xyz, "m", machine.base, base_moved),
-        (f"platform joint of {name}", xyz, "m", machine.platform, platform_moved),
+        (f"base joint of {name}", xyz, _METRES, machine.base, base_moved),
+        (f"platform joint of {name}", xyz, _METRES, machine.platform, platform_moved),
     ]
     a, b = leg.base_axis, leg.platform_axis
     if a is not None:
 
-        def base_turned(k: int, step: float) -> Leg:
+        def base_turned(leg: Leg, k: int, step: float) -> Leg:
             return replace(leg, base_axis=_about(a, k, step).apply(a))
 
-        found.append((f"base axis of {name}", ("1", "2"), "rad", "", base_turned))
+        found.append((f"base axis of {name}", ("1", "2"), _RADIANS, "", base_turned))
     if b is not None:
 
-        def platform_turned(k: int, step: float) -> Leg:
+        def platform_turned(leg: Leg, k: int, step: float) -> Leg:
             turn = _about(b, k, step)
             return replace(leg, platform_axis=turn.apply(b), twist=twist_after(leg, turn))
 
-        found.append((f"platform axis of {name}", ("1", "2"), "rad", "", platform_turned))
+        found.append((f"platform axis of {name}", ("1", "2"), _RADIANS, "", platform_turned))
     return found
 
 
@@ -274,6 +315,7 @@ def _in_frames_of_joints(legs: Sequence[Leg], frame_legs: Sequence[int]) -> tupl
             leg,
             A=base.apply(leg.A),
             B=platform.apply(leg.B),
+            actuator=None if leg.actuator is None else leg.actuator.in_frame(base.as_matrix()),
             base_axis=turned(turn_base, leg.base_axis),
             platform_axis=turned(turn_platform, leg.platform_axis),
             twist=twist_after(leg, turn_platform),

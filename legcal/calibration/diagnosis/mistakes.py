@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.ordered_dataset import OrderedDataset
-from legcal.data import INCH, inverse, readings_of_lengths, row_names
+from legcal.data import INCH, few, inverse, readings_of_lengths, row_names
 from legcal.files import LENGTH
 from legcal.geometry import Array, IntArray
 from legcal.machine import Leg, Machine, follow_poses, readings_at
@@ -42,7 +42,7 @@ class Assumed:
     """What is taken for true of a session."""
 
     machine: Machine
-    q: Array  # (n_rows, n_legs) readings [m]
+    q: Array  # (n_rows, n_legs) readings [m or rad]
     flip: Array  # (n_rows, 2) -1 along axes that images are turned over
     focal: float = 1.0  # focal length as a part of the stated one
 
@@ -140,14 +140,16 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
     for i, k in combinations(every, 2):
         source = every.copy()
         source[i], source[k] = k, i
-        legs = f"{given.machine.legs[motors[i]].name} and {given.machine.legs[motors[k]].name}"
+        ones = [given.machine.legs[motors[i]], given.machine.legs[motors[k]]]
+        legs = " and ".join(str(leg.prismatic if leg.actuator else leg.name) for leg in ones)
+        what = "motors" if all(leg.actuator for leg in ones) else "legs"
         yield Mistake(
             "columns exchanged",
             f"columns {names[i]} and {names[k]} look exchanged",
             "with them exchanged",
             "exchange their headers",
             with_columns(source),
-            (f"legs {legs} look exchanged in the model",),
+            (f"{what} {legs} look exchanged in the model",),
             _MOVE_ONE,
         )
     if n > 3:  # of three these are two exchanged
@@ -254,6 +256,9 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
     """Yield readings of another direction, zero or unit, of one encoder or of all."""
     motors = list(given.machine.motors)
     legs = [given.machine.legs[j] for j in motors]
+    names = [leg.prismatic for leg in legs]
+    things = "legs" if not any(leg.actuator for leg in legs) else "motors"
+    zeros = "the offsets" if things == "legs" else "the zeros of motors"
 
     def with_readings(change: Array, which: Sequence[int]) -> Assumed:
         q = given.q.copy()
@@ -269,25 +274,34 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
     moving = np.flatnonzero(np.ptp(own, axis=0) > _STILL * steps).tolist()
     units = ((LENGTH["mm"], "millimetres"), (LENGTH["cm"], "centimetres"), (INCH, "inches"))
     has_travel = all(0.0 < leg.travel[1] - leg.travel[0] < np.inf for leg in legs)
-    for scale, unit in () if has_travel else units:  # readings in their travel are metres
+    turning = [k for k, leg in enumerate(legs) if leg.reads_angle]
+    sliding = [k for k in every if k not in turning]
+    # Readings in their travel are metres; radians that are taken for degrees are in it as well.
+    units_of = [(scale, unit, sliding) for scale, unit in (() if has_travel else units)]
+    angles = (np.pi / 180.0, "degrees"), (180.0 / np.pi, "radians that were taken for degrees")
+    units_of += [(scale, unit, turning) for scale, unit in angles]
+    for scale, unit, which in units_of:
+        if which:
+            of = "" if len(which) == len(every) else f" of {few([str(names[k]) for k in which])}"
+            yield Mistake(
+                "unit",
+                f"the readings{of} look like {unit}",
+                "taken so",
+                f"multiply them by {scale:g}",
+                with_readings(scale * own[:, which], which),
+            )
+    if not any(leg.actuator for leg in legs):
         yield Mistake(
-            "unit",
-            f"the readings look like {unit}",
-            "taken so",
-            f"multiply them by {scale:g}",
-            with_readings(scale * own, every),
+            "whole lengths",
+            "the readings look like whole leg lengths",
+            "less the leg length at reading zero",
+            "subtract that (legcal inspect shows it), or make a model whose offsets are zero",
+            with_readings(readings_of_lengths(own, legs), every),
         )
-    yield Mistake(
-        "whole lengths",
-        "the readings look like whole leg lengths",
-        "less the leg length at reading zero",
-        "subtract that (legcal inspect shows it), or make a model whose offsets are zero",
-        with_readings(readings_of_lengths(own, legs), every),
-    )
     for change, what in ((-own, "the opposite sign"), (ends - own, "the opposite direction")):
         yield Mistake(
             "direction of encoders",
-            f"the readings of all legs look as if they had {what}",
+            f"the readings of all {things} look as if they had {what}",
             "with it reversed",
             "reverse it in the table of readings",
             with_readings(change, every),
@@ -303,7 +317,8 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
 
     def another_zero(which: Sequence[int], m: float) -> Mistake:
         step = steps[which[0]] if len(which) == 1 else float(steps.mean())
-        size = f"{abs(1e3 * m * step):.0f} mm too {'small' if m > 0 else 'large'}"
+        amount, unit = (np.degrees(step), "deg") if which[0] in turning else (1e3 * step, "mm")
+        size = f"{abs(m * amount):.0f} {unit} too {'small' if m > 0 else 'large'}"
         change = with_readings(own[:, which] + m * step, which)
         added, finer = (
             f"with that {'added' if m > 0 else 'taken off'}",
@@ -312,9 +327,9 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
         if len(which) > 1:
             return Mistake(
                 "zero of encoders",
-                f"the readings of all legs look as if they had another zero: about {size}",
+                f"the readings of all {things} look as if they had another zero: about {size}",
                 added,
-                "correct the table of readings, or the offsets in the model",
+                f"correct the table of readings, or {zeros} in the model",
                 change,
                 is_small=True,
                 amount_of="zero of all encoders",
@@ -324,21 +339,28 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
             "zero of an encoder",
             f"column {legs[which[0]].prismatic} looks as if it had another zero: about {size}",
             added,
-            "correct it in the table of readings, or the offset of the leg in the model",
+            "correct it in the table of readings, or "
+            + (
+                f"the zero of {names[which[0]]} in the model"
+                if legs[which[0]].actuator
+                else "the offset of the leg in the model"
+            ),
             change,
             is_small=True,
             amount_of=f"zero of encoder {which[0]}",
             finer=lambda more: finer(m + more),
         )
 
+    are_alike = not (turning and sliding)  # a part of a way and of a turn are no common zero
     for m in (*range(-_ZEROS, 0), *range(1, _ZEROS + 1)):
-        yield another_zero(every, m)
+        if are_alike:
+            yield another_zero(every, m)
         for k in moving:
             yield another_zero([k], m)
 
 
 def _zero_step(leg: Leg, q: Array) -> float:
-    """Return by how much the zero of an encoder is moved in one step [m]."""
+    """Return by how much the zero of an encoder is moved in one step [m or rad]."""
     width = leg.travel[1] - leg.travel[0]
     return (width if 0.0 < width < np.inf else float(np.ptp(q))) / _ZEROS
 
@@ -420,12 +442,15 @@ def _of_model(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
 
 
 def _mirrored(leg: Leg) -> Leg:
-    """Return a leg whose joints and axes have y reversed."""
+    """Return a leg whose joints and axes have y reversed; what turned one way turns the other."""
     base, platform = (
         None if axis is None else _MIRROR @ axis for axis in (leg.base_axis, leg.platform_axis)
     )
-    A, B = _MIRROR @ leg.A, _MIRROR @ leg.B
-    return replace(leg, A=A, B=B, base_axis=base, platform_axis=platform)
+    A, B, actuator = _MIRROR @ leg.A, _MIRROR @ leg.B, leg.actuator
+    if actuator is not None:
+        axis = _MIRROR @ actuator.axis * (-1.0 if actuator.turns else 1.0)
+        actuator = replace(actuator, axis=axis, point=_MIRROR @ actuator.point)
+    return replace(leg, A=A, B=B, base_axis=base, platform_axis=platform, actuator=actuator)
 
 
 def _of_radii(given: Assumed) -> Iterator[Mistake]:
