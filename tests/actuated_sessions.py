@@ -38,7 +38,10 @@ def _ring(radius: float, angles: Array, height: float = 0.0) -> Array:
 
 @cache
 def machine(name: str, seed: int = 0) -> tuple[tuple[Leg, ...], Array, Array]:
-    """Return the legs of a machine in R_b and R_e, without symmetry, and R and t at readings 0."""
+    """Return the legs of a machine in R_b and R_e, without symmetry, and R and t at readings 0.
+
+    A Hexaglide is ``square`` whose second rod stands square to its rail at home.
+    """
     rng = np.random.default_rng(seed)
     pairs = name in ("linear-delta", "delta")
     n = 3 if pairs or name == "3-prs" else 6
@@ -72,6 +75,10 @@ def machine(name: str, seed: int = 0) -> tuple[tuple[Leg, ...], Array, Array]:
                 u = (B + size * UP - A) / length
                 base_axis = np.cross(u, np.cross(side[i], u))
                 base_axis /= np.linalg.norm(base_axis)
+            if name == "square" and i == 1:
+                u = (B + size * UP - A) / length
+                v = v - (v @ u) * u
+                actuator = replace(actuator, axis=v / np.linalg.norm(v))
             legs.append(
                 Leg(
                     S if base_axis is None else JointType.REVOLUTE,

@@ -32,6 +32,7 @@ from legcal.machine import (
     from_vector,
     geometries,
     load_mechanism,
+    measured_readings,
     moved_legs,
     parameters_of_legs,
     platform_in_base,
@@ -148,25 +149,46 @@ def machine_session(
     machine = load_mechanism(name)
     legs, fitted = geometries(machine), fitted_legs(machine)
     R, t = _poses(machine, legs, n_views * n_poses, rng)
-    view = np.repeat(np.arange(n_views), n_poses)
-    T_camera_Rb = _cameras(machine, legs, n_views, camera)
+    fitted = replace(fitted, home=platform_in_base(machine, machine.home))
+    wrong = (length, angle, camera_shift, camera_turn)
+    return session_of_legs(fitted, R, t, _readings(fitted, R, t), wrong, n_views, camera, rng)
+
+
+def session_of_legs(
+    fitted: FittedLegs,
+    R: Array,
+    t: Array,
+    q: Array,
+    wrong_by: tuple[float, float, float, float],
+    n_views: int,
+    camera: Camera,
+    rng: np.random.Generator,
+) -> MachineSession:
+    """Return a session of true legs with a home, whose views see the poses in turn.
+
+    Errors are those of lengths and angles of legs, then of places and turns of cameras [m, rad].
+    """
+    legs, length, angle, camera_shift, camera_turn = fitted.nominal, *wrong_by
+    view = np.repeat(np.arange(n_views), len(t) // n_views)
+    assert fitted.home is not None
+    T_camera_Rb = _cameras(fitted.home, legs, n_views, camera)
     measurements = Measurements(
         tuple(View(f"c{v + 1}", camera) for v in range(n_views)),
         tuple(f"c{v + 1}_{i:03d}.png" for i, v in enumerate(view)),
         view,
         np.arange(len(view)),
-        _readings(machine, legs, R, t),
+        q,
         SIGMA_Q,
     )
     truth = Start(legs, T_camera_Rb, motions_of(R, t), "truth")
     away = _wrong(fitted, legs, length, angle, rng)
-    home = (platform_in_base(machine, machine.home),) * len(t)
+    home = (fitted.home,) * len(t)
     rough = tuple(_shaken(T, camera_shift, camera_turn, rng) for T in T_camera_Rb)
     wrong = replace(fitted, nominal=away)
     return MachineSession(
         wrong,
         measurements,
-        shown_outlines(fitted.radii, measurements, truth),
+        shown_outlines(fitted.radii, measurements, truth, q),
         truth,
         start_from(away, measurements, wrong, rough, home, "nominal"),
     )
@@ -182,7 +204,8 @@ def _poses(
     return closed_poses(legs, machine.frame_legs, *moved_poses(R, t, step))
 
 
-def _readings(machine: Machine, legs: tuple[Leg, ...], R: Array, t: Array) -> Array:
+def _readings(fitted: FittedLegs, R: Array, t: Array) -> Array:
+    legs = fitted.nominal
     q, on = np.full((len(t), len(legs)), np.nan), actuator_index(legs)
     of_actuators = readings_of_rods(legs, R, t)
     for j, leg in enumerate(legs):
@@ -190,15 +213,14 @@ def _readings(machine: Machine, legs: tuple[Leg, ...], R: Array, t: Array) -> Ar
             q[:, j] = of_actuators[:, on[j]]
         elif leg.kind is LegKind.ACTUATED:
             length = np.linalg.norm(R @ leg.B + t - leg.A, axis=1)
-            q[:, j] = machine.sign[j] * (length - leg.q0)
+            q[:, j] = fitted.sign[j] * (length - leg.q0)
     return q
 
 
 def _cameras(
-    machine: Machine, legs: tuple[Leg, ...], n_views: int, camera: Camera
+    home: RigidTransform, legs: tuple[Leg, ...], n_views: int, camera: Camera
 ) -> tuple[RigidTransform, ...]:
     """Return T_camera_Rb of cameras around the middle of the machine."""
-    home = platform_in_base(machine, machine.home)
     joints = np.array([leg.A for leg in legs] + [home.apply(leg.B) for leg in legs])
     middle = joints.mean(axis=0)
     size = np.linalg.norm(joints - middle, axis=1).max()
@@ -212,11 +234,18 @@ def _cameras(
 
 
 def shown_outlines(
-    radii: Mapping[tuple[int, str], float], m: Measurements, truth: Start
+    radii: Mapping[tuple[int, str], float],
+    m: Measurements,
+    truth: Start,
+    q: Array | None = None,
 ) -> Outlines:
-    """Return both outlines of every part of every leg in every image."""
+    """Return both outlines of every part of every leg in every image.
+
+    Joints at A that motors move are where readings q (n_poses, n_legs) have them, if given.
+    """
     R, t = components(truth.T_Rb_Re)
-    A, ends = ends_at_poses(truth.legs, R, t)
+    read = None if q is None else measured_readings(truth.legs, R, t, q)
+    A, ends = ends_at_poses(truth.legs, R, t, read)
     views = [
         Viewpoint(view.name, view.camera, T.inv())
         for view, T in zip(m.views, truth.T_camera_Rb, strict=True)

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from actuated_sessions import frame_legs, machine, poses_at
 from dense_fit import allowed, by_differences, projected_move, residuals
 from fit_sessions import (
     BOARD_SCALE,
@@ -27,10 +28,11 @@ from fit_sessions import (
     noisy_outlines,
     noisy_readings,
     place_of_board,
+    session_of_legs,
     with_board,
 )
 from outline_sessions import Noise, StartErrors, design_of, draw_session, one_fit
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
 from legcal.calibration.identify.predicted_observations import PredictedObservations
@@ -462,6 +464,34 @@ def test_a_fit_that_leaves_out_legs_of_a_view_is_tried_from_other_models() -> No
     assert found.outlines.used.all()
     for pose, true in zip(found.T_Rb_Re, design.poses, strict=True):
         assert (pose.inv() * true).rotation.magnitude() < np.deg2rad(1.0)
+
+
+def test_images_near_a_turning_point_of_a_reading_fit_as_well_as_others() -> None:
+    """There a pose has two readings, or none, and their derivative is infinite."""
+    legs, R0, t0 = machine("square")
+    names = tuple(leg.name for leg in legs)
+    fitted = FittedLegs(
+        names,
+        legs,
+        np.ones(len(legs), dtype=np.intp),
+        frame_legs(len(legs)),
+        {(j, "rod"): 0.008 for j in range(len(legs))},
+        RigidTransform.from_components(t0, Rotation.from_matrix(R0)),
+    )
+    q = np.random.default_rng(0).uniform(-0.1, 0.1, (200, len(legs)))
+    R, t, closed = poses_at("square", q)
+    rod, actuator = legs[1], legs[1].actuator
+    assert actuator is not None
+    cosine = (R @ rod.B + t - actuator.at(rod.A, q[:, 1])) @ actuator.axis / rod.q0
+    off_square = np.degrees(np.arcsin(cosine))
+    near = np.flatnonzero(closed & (np.abs(off_square) < 5.0))[:18]
+    assert off_square[near].min() < -2.0 < 2.0 < off_square[near].max()
+    wrong = (0.003, float(np.deg2rad(1.0)), 0.003, float(np.deg2rad(1.0)))
+    rng = np.random.default_rng(0)
+    exact = session_of_legs(fitted, R[near], t[near], q[near], wrong, 3, LENS, rng)
+    found = refine(exact.legs, exact.measurements, exact.outlines, exact.start)
+    assert max(errors(exact, found).values()) < 1e-7
+    assert found.outlines.used.all()
 
 
 def noisy(name: str) -> MachineSession:

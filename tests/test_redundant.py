@@ -9,6 +9,7 @@ from tempfile import mkdtemp
 import numpy as np
 import pytest
 from csv_rows import read_rows, write_rows
+from fit_sessions import machine_session
 from layouts import Layout, LegSpec, MachineSpec, write_machine
 from machines import displaced, of_types, planar, ring
 from outline_sessions import made
@@ -17,6 +18,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings
 
 import legcal
+from legcal.calibration.joint_fit import refine
 from legcal.calibration.joint_fit.platform import platform_by_parameters
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.exports import ExportOptions, Subject, export
@@ -196,6 +198,23 @@ def test_readings_that_contradict_each_other_are_refused_with_the_motor(tmp_path
     path.write_text(f"{header}\n{','.join(map(str, q))}\n{','.join(map(str, wrong))}\n")
     with pytest.raises(DatasetError, match=rf"row 2 \(line 3\).*{found}"):
         given_poses(machine, path)
+
+
+def test_carriages_may_be_redundant(tmp_path: Path) -> None:
+    """Seven carriages: a fit with too many readings is exact, a contradictory one is named."""
+    machine = made("7-pss", tmp_path)
+    assert machine.is_redundant
+    session = machine_session(str(machine.yaml_path))
+    found = refine(session.legs, session.measurements, session.outlines, session.start)
+    names, truth = found.parametrization.names, session.legs.vector(session.truth.legs)
+    values = np.array([found.values[name] for name in names])
+    begun = session.legs.vector(session.start.legs)
+    assert np.abs(begun - truth).max() > 0.002
+    np.testing.assert_allclose(values, truth, atol=1e-7)
+    wrong = inverse_kinematics(machine, machine.home)
+    wrong[6] += 0.06
+    with pytest.raises(DidNotConverge, match=r"motor 'rail\d' \(or as likely one of rail.* mm"):
+        forward_kinematics(machine, wrong)
 
 
 @pytest.mark.system

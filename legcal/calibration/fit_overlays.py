@@ -19,7 +19,7 @@ from legcal.data import Dataset
 from legcal.errors import UsageError
 from legcal.files import RESULT, in_the_way, path_problem, read_json
 from legcal.geometry import components
-from legcal.machine import ends_in_base
+from legcal.machine import ends_in_base, measured_readings
 from legcal.progress import Report
 from legcal.workers import Run
 
@@ -78,7 +78,9 @@ def _rows_with_image(dataset: Dataset) -> list[int]:
 def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
     """Return the outlines of a fit, and where it has the legs and cameras, as a detection."""
     machine, measurements = dataset.machine, dataset.measurements
-    A, B = ends_in_base(solution.legs, machine.T_base_Rb, *components(solution.T_Rb_Re))
+    poses = components(solution.T_Rb_Re)
+    q = measured_readings(solution.legs, *poses, measurements.q[measurements.first_rows])
+    A, B = ends_in_base(solution.legs, machine.T_base_Rb, *poses, q)
     cylinders = tuple(
         tuple(replace(c, radius=solution.radii.get((j, c.link), c.radius)) for c in leg.cylinders)
         for j, leg in enumerate(machine.legs)

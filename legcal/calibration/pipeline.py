@@ -71,7 +71,7 @@ from legcal.data import (
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.files import check_destination, output_path
 from legcal.geometry import IntArray, components
-from legcal.machine import Machine, ends_in_base
+from legcal.machine import Machine, ends_in_base, measured_readings
 from legcal.paper import Criteria, Transformation
 from legcal.perception import (
     MeasuredImages,
@@ -493,7 +493,9 @@ def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
 def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredImages) -> Placement:
     """Return where a fit puts the legs, R_b laid on the nominal one; no camera is placed anew."""
     T_base_Rb, poses = data.machine.T_base_Rb, components(data.poses_by(solution.legs))
-    A, B = ends_in_base(solution.legs, T_base_Rb, *poses)
+    m = data.measurements
+    q = measured_readings(solution.legs, *poses, m.q[m.first_rows])
+    A, B = ends_in_base(solution.legs, T_base_Rb, *poses, q)
     pose = data.measurements.pose
     cameras = tuple(
         None if known is None else T_base_Rb * T.inv()

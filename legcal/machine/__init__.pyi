@@ -137,6 +137,7 @@ from .rods import ends_at_poses as ends_at_poses
 from .rods import ends_in_base as ends_in_base
 from .rods import first_rods as first_rods
 from .rods import joints_at as joints_at
+from .rods import measured_readings as measured_readings
 from .rods import reading_legs as reading_legs
 from .rods import reading_of_rod as reading_of_rod
 from .rods import readings_of_rods as readings_of_rods

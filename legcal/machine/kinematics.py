@@ -335,19 +335,23 @@ def contradiction(machine: Machine, T: RigidTransform, readings: Array) -> str |
     redundancy = np.maximum(1.0 - np.sum(span**2, axis=1), UNCHECKED)
     q = np.zeros(machine.n_legs)
     q[motors] = readings
+    legs = [machine.legs[j] for j in motors]
     residual = np.abs(reading_residuals(machine, T, q)[motors])
+    residual /= [leg.reading_of(1.0) for leg in legs]  # of angles: how far joints at A move
     test = residual / np.sqrt(redundancy)
     worst, most = int(np.argmax(test)), MAX_CONTRADICTION * leg_scale(machine, T)
     if test[worst] <= most:
         return None
-    alike = [machine.leg_names[motors[i]] for i in np.flatnonzero(test > ALIKE * test[worst])]
-    alike.remove(machine.leg_names[motors[worst]])
+    names = [leg.name if leg.actuator is None else leg.actuator.joint for leg in legs]
+    alike = [names[i] for i in np.flatnonzero(test > ALIKE * test[worst]).tolist()]
+    alike.remove(names[worst])
     others = f" (or as likely one of {', '.join(alike)})" if alike else ""
     off = 1e3 * residual[worst] / redundancy[worst]
     allowed = 1e3 * most / np.sqrt(redundancy[worst])
+    whose = "leg" if legs[worst].actuator is None else "motor"
     return (
-        f"the reading of leg '{machine.leg_names[motors[worst]]}'{others} {off:.1f} mm from where "
-        f"the other motors put it, needed at most {allowed:.1f} mm"
+        f"the reading of {whose} '{names[worst]}'{others} {off:.1f} mm from where the other motors "
+        f"put it, needed at most {allowed:.1f} mm"
     )
 
 

@@ -84,6 +84,16 @@ def readings_of_rods(legs: Sequence[Leg], R: Array, t: Array) -> Array:
     return q
 
 
+def measured_readings(legs: Sequence[Leg], R: Array, t: Array, q: Array) -> Array:
+    """Return the readings of actuators (k, n) at poses R, t: the measured ones of q (k, n_legs).
+
+    Elsewhere, where it is NaN, the first rod on the actuator reaches the pose. Beyond a turning
+    point, where that rod stands square to its motion, the pose alone gives another reading.
+    """
+    read = np.asarray(q, dtype=np.float64)[:, first_rods(legs)]
+    return np.where(np.isfinite(read), read, readings_of_rods(legs, R, t))
+
+
 def reading_of_rod(leg: Leg, B: Array) -> Array:
     """Return the readings (k,) at which a rod reaches points B (k, 3) in the frame of the base.
 

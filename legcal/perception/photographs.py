@@ -28,7 +28,7 @@ from legcal.data import (
     no_outlines,
 )
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Cylinder, Leg, Machine, vectors_at
+from legcal.machine import Cylinder, Leg, Machine, joints_at, measured_readings, vectors_at
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.detection import measure_outlines
 from legcal.perception.diagnostics import (
@@ -161,7 +161,12 @@ def nominal_placement(
 ) -> Placement:
     """Return where a model has the legs at poses (n_poses,), with the rough cameras of views."""
     B_base = np.array([T.apply(machine.B_platform) for T in T_base_platform])
-    A_base = B_base - vectors_at(machine, np.array([T.as_matrix() for T in T_base_platform]))
+    poses = np.array([T.as_matrix() for T in T_base_platform])
+    A_base = B_base - vectors_at(machine, poses)
+    if machine.actuators:
+        q = measurements.q[measurements.first_rows]
+        read = measured_readings(machine.legs, poses[:, :3, :3], poses[:, :3, 3], q)
+        A_base = joints_at(machine.legs, read)
     hints = tuple(view.T_base_camera for view in measurements.views)
     return Placement(A_base[measurements.pose], B_base[measurements.pose], hints)
 
