@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from command_line import run
 
 from legcal.calibration import load_result
@@ -25,8 +26,18 @@ def test_commands_know_that_joints_at_A_move(
         return capsys.readouterr().out
 
     session, out, table = (str(tmp_path / part) for part in ("session", "out", "correction.csv"))
-    said("simulate", name, "-o", session, "--level", "outlines", "--poses", "5", "-q")
+    wants_length = "--length leg1" in said(
+        "simulate", name, "-o", session, "--level", "outlines", "--poses", "5", "-q",
+        *["--length", "leg1.base:leg3.base=0.1mm"] * (name == "hexaglide"),
+    )  # fmt: skip
+    assert wants_length == (name == "delta")
     truth = load_mechanism(tmp_path / "session" / "truth" / "models" / f"{name}.yaml")
+    stated = yaml.safe_load((tmp_path / "session" / "dataset.yaml").read_text()).get("parameters")
+    if name == "hexaglide":
+        value, sigma = stated["lengths"]["leg1.base:leg3.base"].removesuffix("mm").split("+-")
+        distance = float(np.linalg.norm(truth.A_base[0] - truth.A_base[2]))
+        assert float(sigma) == 0.1
+        assert 0.0 < abs(float(value) - 1e3 * distance) < 0.5
     known = ["--prior", f"leg1.length={truth.legs[0].q0!r}+-0.00005"] * (name == "delta")
     assert "where their motors read 0" in said("calibrate", session, "-o", out, "-q", *known)
     scene = (tmp_path / "out" / "report.html").read_text()

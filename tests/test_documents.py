@@ -225,6 +225,21 @@ def test_the_first_commands_of_the_site_run(
             shutil.copy(example_run.folder / name, "hexapod")
 
 
+@pytest.mark.system
+def test_the_rehearsal_of_a_delta_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    block = next(text for language, text, _ in _blocks(ROOT / "docs/arms.md") if language == "sh")
+    for line in _commands(block):
+        quiet = ["--quiet"] * ("export" not in line)
+        assert run(monkeypatch, *_words(line), *quiet) == 0
+    truth = load_mechanism(tmp_path / "rehearsal/truth/models/delta.yaml")
+    off, was = (
+        evaluate(model, truth, dataset="rehearsal").displacement.mean()
+        for model in ("calibrated", "delta")
+    )
+    assert off < 0.05 * was
+
+
 def _write_files_as_people_have_them() -> None:
     """Write joints, photographs and lengths of legs of the example into the current folder."""
     shipped = load_mechanism(HEXAPOD / "models/hexapod.yaml")

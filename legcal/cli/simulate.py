@@ -51,7 +51,11 @@ def simulate(
     workers = image_workers(cluster)
     made = run(nominal, output, settings, force=force, workers=workers, progress=not quiet)
     document, repeated = summary_document(made), options["images"] > 1
-    show(as_json, lambda: document, lambda: simulation_table(document, repeated=repeated))
+    show(
+        as_json,
+        lambda: document,
+        lambda: simulation_table(document, repeated=repeated, has_scale=made.has_scale),
+    )
 
 
 def _requested() -> Iterator[inspect.Parameter]:

@@ -20,12 +20,24 @@ from legcal.version import __version__
 
 N_STRUTS = 6
 _MM = 1e3
+_PARALLEL = 0.99  # cosine between the rails of a linear Delta
 
 
 def linuxcnc_refusal(subject: Subject) -> str | None:
     """Return why a machine is none of genhexkins, or None."""
-    legs = subject.machine.legs
+    machine, legs = subject.machine, subject.machine.legs
     needed = "needed six legs with motors between universal and spherical joints (genhexkins)"
+    if machine.actuators:
+        motor = machine.actuators[0]
+        delta = "rotarydeltakins" if motor.turns else "lineardeltakins"
+        ideal = (
+            f"; {delta} has the dimensions of an ideal Delta and no others: leave the controller "
+            "those of the nominal model and take the correction"
+        )
+        upright = all(abs(one.axis @ motor.axis) > _PARALLEL for one in machine.actuators)
+        is_delta = machine.mobility == len(machine.actuators) == 3 and len(legs) == N_STRUTS
+        is_delta &= motor.turns or upright
+        return f"found that the motor '{motor.joint}' moves joints at A, {needed}{ideal * is_delta}"
     if len(legs) != N_STRUTS:
         return f"found {len(legs)} legs, {needed}"
     others = [

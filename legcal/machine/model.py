@@ -83,6 +83,11 @@ class Machine:
         """The leg whose motor moves each leg: its own, or the first on the same actuator."""
         return reading_legs(self.legs)
 
+    @property
+    def readings_carry_length(self) -> bool:
+        """Whether the scale of the machine is in its readings: not where all of them are angles."""
+        return not self.actuators or any(leg.is_motor and not leg.reads_angle for leg in self.legs)
+
     @cached_property
     def actuators(self) -> tuple[Actuator, ...]:
         """What moves joints at A, each once, in the base link."""

@@ -178,8 +178,7 @@ def plan(
 
 def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[str, ...]]:
     """Return the length that a plan counts on where readings carry none, and a note on it."""
-    carries = [leg.is_motor and not leg.reads_angle for leg in machine.legs]
-    if board or not machine.actuators or any(carries):
+    if board or machine.readings_carry_length:
         return NO_CHOICES, ()
     rod = next(leg for leg in machine.legs if leg.actuator is not None)
     ends = f"{rod.name}.base:{rod.name}.platform"

@@ -104,7 +104,15 @@ def detection_table(found: Detection, output: Path) -> RenderableType:
     )
 
 
-def simulation_table(document: dict[str, Any], *, repeated: bool) -> RenderableType:
+_NO_SCALE = (
+    "Readings of motors that turn carry no length, and nothing else in this dataset does: simulate "
+    "with --length leg1.base:leg1.platform=0.05mm, or calibrate with --length or --prior."
+)
+
+
+def simulation_table(
+    document: dict[str, Any], *, repeated: bool, has_scale: bool = True
+) -> RenderableType:
     """Return the document of ``simulate``: how many images of each view show each leg."""
     n_images, n_poses, left_out = (document[key] for key in ("images", "poses", "left_out"))
     views = document["views"]
@@ -128,6 +136,7 @@ def simulation_table(document: dict[str, Any], *, repeated: bool) -> RenderableT
             _hidden(views.values(), n_images),
             f"{document['extreme_poses']} of {n_poses} poses have every motor near an end of its "
             "travel.",
+            "" if has_scale else Text(_NO_SCALE, style="yellow"),
         ],
         [
             Text(line, overflow="fold")

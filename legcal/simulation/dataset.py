@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +22,7 @@ from legcal.data import (
     write_observations,
 )
 from legcal.errors import UsageError
-from legcal.files import MAX_DOCUMENT, Document, output_path, read_bytes
+from legcal.files import MAX_DOCUMENT, Document, describe, output_path, read_bytes
 from legcal.geometry import Array
 from legcal.machine import Machine, load_mechanism, write_model
 from legcal.progress import Progress, Report, shown_progress
@@ -47,7 +48,7 @@ from legcal.simulation.session import (
     simulate_session,
     streams,
 )
-from legcal.simulation.settings import SimulationSettings, whole_number
+from legcal.simulation.settings import SimulationSettings, joint_distance, whole_number
 from legcal.simulation.truth import write_true_model
 from legcal.workers import Workers, is_number
 
@@ -86,6 +87,7 @@ class SimulatedDataset:
     seen: Array
     left_out: int
     n_extreme: int
+    has_scale: bool
 
 
 def simulate(
@@ -148,7 +150,10 @@ def simulate(
         m, legs = session.measurements, truth.leg_names
         board = documents(session.boards, poses=settings.board_pose)
         model_name = yaml_path.relative_to(folder).as_posix()
-        write_session(folder, nominal, model_name, m, groups=session.groups, board=board)
+        measured = _measured(truth, settings.lengths, rngs["lengths"])
+        write_session(
+            folder, nominal, model_name, m, groups=session.groups, board=board, lengths=measured
+        )
         exact = exact_outlines(session.scene)
         write_observations(folder / TRUTH / "outlines.csv", exact, m, legs)
         if session.outlines is not None:
@@ -178,7 +183,24 @@ def simulate(
         seen=np.array(seen),
         left_out=session.left_out,
         n_extreme=int(np.sum(are_extreme(truth, readings))),
+        has_scale=truth.readings_carry_length or bool(measured or session.boards),
     )
+
+
+def _measured(
+    truth: Machine, lengths: Mapping[str, float], rng: np.random.Generator
+) -> dict[str, str]:
+    """Return distances of joints as somebody measures them, as ``dataset.yaml`` has them."""
+    found = {}
+    for name, sigma in lengths.items():
+        true = joint_distance(truth, name)
+        if true is None:
+            raise UsageError(
+                f"The length {describe(name)} could not be measured: found no two joints of the "
+                "base, of the platform or of one rod, needed them; name others."
+            )
+        found[name] = f"{1e3 * (true + sigma * rng.normal()):.6f}+-{1e3 * sigma:g}mm"
+    return found
 
 
 def _write_photographs(

@@ -64,6 +64,7 @@ def write_session(
     *,
     groups: Sequence[str] = (),  # view of the file of each view, where cameras are in the hand
     board: Any = None,  # the block of one, or of several
+    lengths: Mapping[str, str] | None = None,  # measured distances of joints
 ) -> None:
     """Write ``dataset.yaml``, ``measurements.csv`` and the camera files."""
     cameras: dict[int, str] = {}
@@ -93,6 +94,8 @@ def write_session(
     }
     if board is not None:
         document["board"] = board
+    if lengths:
+        document["parameters"] = {"lengths": dict(lengths)}
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
     (folder / "dataset.yaml").write_text(with_schema("dataset", text), encoding="utf-8")
     motors = list(machine.motors)

@@ -89,8 +89,8 @@ class Request:
     poses: str = field(
         default="15",
         metadata=_option(
-            "Poses for each view; or a CSV of readings in metres, the motors' joints in its "
-            "header, for all views.",
+            "Poses for each view; or a CSV of readings in metres (radians of arms), the motors' "
+            "joints in its header, for all views.",
             _MOTION,
             metavar="N|CSV",
         ),
@@ -192,6 +192,16 @@ class Request:
             flags=("--gamma/--no-gamma",),
             shown="gamma",
             only=Level.PHOTOGRAPHS,
+        ),
+    )
+    length: list[str] | None = field(
+        default=None,
+        metadata=_option(
+            "A distance of two joints measured by hand, with this sigma, written into "
+            "dataset.yaml: leg1.base:leg1.platform=0.05mm. May be repeated.",
+            _NOISE,
+            metavar="JOINT:JOINT=SIGMA",
+            shown="none",
         ),
     )
     pixel_noise: str | None = field(

@@ -53,7 +53,7 @@ from legcal.workers import Workers, worker_pool
 Streams = Mapping[str, np.random.Generator]
 
 _PURPOSES = ("errors", "poses", "cameras", "readings", "hints", "observations", "photographs",
-             "corners")  # fmt: skip
+             "corners", "lengths")  # fmt: skip
 _MIN_SIGMA_Q = 1e-9  # [m] that readings without noise claim
 _MIN_SEEN = 0.5  # of the photographs of a view that show a leg which its hint names
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from dataclasses import Field as DataclassField
 from enum import StrEnum
@@ -34,7 +34,7 @@ from legcal.files import (
     read_yaml,
     validate,
 )
-from legcal.machine import Machine, parametrization_of
+from legcal.machine import LegKind, Machine, parametrization_of
 from legcal.simulation.board import KINDS as BOARD_KINDS
 from legcal.simulation.observe import TableNoise
 from legcal.simulation.rendering.appearance import Appearance, Light
@@ -205,6 +205,9 @@ class SimulationSettings:
         As ``board``, on the platform.
     plan : Path or None
         A session that ``legcal plan`` wrote, which says poses, cameras and views.
+    lengths : dict
+        Distances of two joints that are measured by hand, by ``LEG.SIDE:LEG.SIDE``, with their
+        standard deviations [m].
 
     Raises
     ------
@@ -232,6 +235,7 @@ class SimulationSettings:
     seed: int = 0
     platform_board: Board | str | Path | None = None
     plan: Path | None = None
+    lengths: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, choices in (("level", Level), ("sampling", Sampling)):
@@ -446,7 +450,38 @@ def requested(request: Request, nominal: Machine) -> SimulationSettings:
         appearance=_appearance(request),
         seed=request.seed,
         plan=request.plan,
+        lengths=_lengths(request.length or (), nominal),
     )
+
+
+def _lengths(stated: Sequence[str], nominal: Machine) -> dict[str, float]:
+    """Return the sigma [m] of each distance that is measured."""
+    found = {}
+    for text in stated:
+        name, _, sigma = text.partition("=")
+        if joint_distance(nominal, name.strip()) is None:
+            raise UsageError(
+                f"--length could not be used: found {describe(text)}, needed two joints of the "
+                "base, of the platform or of one rod, and a sigma; write "
+                "leg1.base:leg1.platform=0.05mm."
+            )
+        found[name.strip()] = parse_quantity(sigma, LENGTH, "--length")
+    return found
+
+
+def joint_distance(machine: Machine, name: str) -> float | None:
+    """Return the distance [m] of LEG.SIDE:LEG.SIDE, at reading 0 on the base; None of others."""
+    ends = [end.rpartition(".")[::2] for end in name.split(":")]
+    if len(ends) != 2 or any(leg not in machine.leg_names for leg, _ in ends):
+        return None
+    (one, side), (other, there) = ((machine.leg_names.index(leg), side) for leg, side in ends)
+    if {side, there} == {"base", "platform"} and one == other:
+        leg = machine.legs[one]
+        return leg.q0 if leg.kind is LegKind.CONSTANT else None
+    if side != there or one == other or side not in ("base", "platform"):
+        return None
+    points = machine.A_base if side == "base" else machine.B_platform
+    return float(np.linalg.norm(points[one] - points[other]))
 
 
 def _refuse_contradictions(request: Request, poses: int | Path, nominal: Machine) -> None:
