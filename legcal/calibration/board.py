@@ -283,8 +283,8 @@ def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -
     if without:
         others = "the legs and the board on the platform" if len(dataset.boards) > 1 else "the legs"
         notes.append(
-            f"No image of {', '.join(without)} shows the calibration board, or too little of it: "
-            f"these cameras are placed by {others} alone."
+            f"No image of {', '.join(without)} shows the calibration board so that it places "
+            f"the camera: only {others} can."
         )
     return [*notes, *_misplaced(dataset, solution)]
 
