@@ -442,8 +442,8 @@ def test_a_leg_that_one_view_takes_for_another_is_left_out_and_named(small: Hexa
     found = refine(
         small.legs, small.measurements, moved_outlines(o, PINHOLE, by), disturbed_start(small)
     )
-    (leg,) = found.left_out
-    assert leg.endswith(f"of {wrong.sum()} of leg1 in view c2")
+    assert any(f"of {wrong.sum()} of leg1 in view c2" in note for note in found.notes)
+    assert not found.left_out  # other starts confirm it
     assert np.abs(joint_errors(found.parameters)).max() < 1e-4
     one_image = by * (o.row == o.row[wrong].min())[:, None]
     once = moved_outlines(o, PINHOLE, one_image)

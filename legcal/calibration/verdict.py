@@ -40,7 +40,8 @@ def judge(
     calibrated platform at the readings of the dataset; it counts where it exceeds two of its
     standard deviations. Where readings do not determine a pose, it is that of the parameters.
     Nothing is trusted that a diagnosis of the session speaks against, nor what left out a leg of a
-    view: either that is another leg, or the fit is at a wrong minimum.
+    view where other starts do not confirm it: either that is another leg, or the fit is at a wrong
+    minimum.
     """
     machine, measurements = dataset.machine, dataset.measurements
     platform = platform_accuracy(

@@ -394,14 +394,15 @@ def doubted_cameras(
 
 
 def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
-    """Return a note where many outlines, or most of a leg or a view, disagree with the fit."""
+    """Return a note where many outlines, or most of a leg or of a view, disagree with the fit."""
     o = problem.outlines
     legs = _mostly_rejected(o.leg, problem.legs.names, o.index, accepted)
     views = _mostly_rejected(o.view, o.views, o.index, accepted)
     n, n_rejected = len(accepted), int(np.sum(~accepted))
-    if not legs and not views and n_rejected <= _MANY_REJECTED * n:
-        return ()
     of = [f"{rejected} of {total} of {name}" for name, (rejected, total) in (legs | views).items()]
+    of = of or list(legs_left_out(problem, accepted))
+    if not of and n_rejected <= _MANY_REJECTED * n:
+        return ()
     words = (
         f"The fit left out {n_rejected} of {n} outlines that disagree with it"
         f"{', ' + ', '.join(of) if of else ''}; the stated uncertainty holds only if it is these "

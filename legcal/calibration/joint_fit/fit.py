@@ -203,7 +203,7 @@ def _from_other_starts(
     Outlines of one leg in one view are not wrong together by chance: they are of another leg, or
     the fit is at a wrong minimum, where it may pass through all others without an error. So nominal
     models that are wrong otherwise are tried, until the fit leaves out no leg of a view, or several
-    starts come to the same minimum.
+    starts come to the same minimum, which confirms that it is the outlines that are wrong.
     """
     rng, begin = np.random.default_rng(_SEED), problem.begin(start)
     n = problem.n_kinematic
@@ -217,7 +217,7 @@ def _from_other_starts(
             if minimum.cost > (1.0 - _SAME_COST) * first.cost:
                 n_same += minimum.cost < (1.0 + _SAME_COST) * first.cost
                 if n_same == _ENOUGH_STARTS:
-                    break
+                    return dataclasses.replace(found, left_out=())
                 continue
             found = _refined(problem, outlines, start, minimum, settings)
         except (DidNotConverge, NotIdentifiable):

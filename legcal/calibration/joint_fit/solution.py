@@ -118,7 +118,7 @@ class Solution:
     details: tuple[str, ...] = ()  # how it was found, the same
     focal_error: float = 0.0  # relative error of a focal length that the measurements contradict
     contradicted_cameras: tuple[str, ...] = ()  # views that stand for such cameras
-    left_out: tuple[str, ...] = ()  # legs of views most of whose outlines disagree: how many
+    left_out: tuple[str, ...] = ()  # legs of views most of whose outlines disagree, unconfirmed
     camera_notes: tuple[str, ...] = ()  # those of the notes that are about these
 
     @property
