@@ -203,6 +203,14 @@ def test_a_rod_that_no_view_shows_leaves_a_direction_open_and_is_named() -> None
     assert all("2" in name.partition(".")[0] for name in weak.parameters)
 
 
+def test_views_of_two_arms_leave_open_to_the_steps_what_readings_tell_the_fit() -> None:
+    """Both turn a platform that only translates about a line in the plane of its joints."""
+    arms = Analysis(session("delta", views=((2, 3, 4, 5), (0, 1, 4, 5), (2, 3, 4, 5))))
+    assert (arms.full.rank, arms.staged.rank) == (42, 41)
+    (weak,) = arms.staged.weak
+    assert weak.direction == "z of platform joints 2, 4 and 6 together"
+
+
 def test_an_unknown_scale_is_refused_with_what_would_fix_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
