@@ -12,7 +12,7 @@ import trimesh
 import yaml
 from layouts import Layout, LegLayout, LegSpec, MachineSpec, borne, write_machine
 from lxml import etree
-from machines import MACHINES, ROOT, SHIPPED, SHIPPED_URDF, SHIPPED_YAML, of_types, ring
+from machines import MACHINES, ROOT, SHIPPED, SHIPPED_URDF, SHIPPED_YAML, of_types, read_table, ring
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
@@ -26,11 +26,16 @@ from legcal.machine import (
     Machine,
     UrdfPatch,
     check_closes,
+    create_model,
+    forward_kinematics,
     geometries,
     home_of_legs,
+    inverse_kinematics,
+    joint_values,
     moved_legs,
     parametrization_of,
     pose_equations,
+    random_configurations,
     reframed,
     reload_and_check,
     vector_of,
@@ -60,7 +65,7 @@ MOVING = ["hexaglide", "3-prs", "delta", "servo-hexapod"]  # joints at A that mo
 def other_legs(nominal: Machine, size: float) -> tuple[Leg, ...]:
     """Return legs whose every parameter is wrong by so much [m, and ten times that in rad]."""
     parametrization = parametrization_of(nominal, twists=True)
-    sizes = {"m": size, "rad": 10.0 * size, "": 0.0}  # gains stay: a URDF has no place for them
+    sizes = {"m": size, "rad": 10.0 * size, "": size}
     unit = np.array([sizes[unit] for unit in parametrization.units])
     signs = np.random.default_rng(2).choice([-1.0, 1.0], len(unit))
     legs = moved_legs(geometries(nominal), parametrization.place, unit * signs)
@@ -72,7 +77,7 @@ def write(nominal: Machine, legs: tuple[Leg, ...], folder: Path) -> Machine:
     home = home_of_legs(nominal, legs, 0.2)
     assert home is not None
     write_urdf(nominal, legs, folder / "calibrated.urdf")
-    write_calibrated_yaml(nominal, folder / "calibrated.yaml", "calibrated.urdf", home)
+    write_calibrated_yaml(nominal, folder / "calibrated.yaml", "calibrated.urdf", home, legs)
     return reload_and_check(folder / "calibrated.yaml")
 
 
@@ -117,14 +122,57 @@ def test_nominal_parameters_leave_every_byte(name: str, tmp_path: Path) -> None:
     assert (tmp_path / "same.urdf").read_bytes() == nominal.urdf_path.read_bytes()
 
 
-def test_a_gain_has_no_place_in_a_urdf(tmp_path: Path) -> None:
-    nominal = load_mechanism("linear-delta")
+def test_errors_are_drawn_for_legs_whose_names_have_dots(tmp_path: Path) -> None:
+    table = yaml.safe_load((ROOT / "models/tables/3-prs.yaml").read_text())
+    table["legs"] = ["front.left", "leg.2", "3"]
+    table["actuators"] = {f"rail.{k}": x for k, x in enumerate(table["actuators"].values())}
+    table.pop("hangs_on", None)
+    (tmp_path / "dots.yaml").write_text(yaml.safe_dump(table))
+    dotted = create_model(read_table(tmp_path / "dots.yaml"), tmp_path).machine
+    legs = [
+        draw_errors(m, ParameterErrors(), np.random.default_rng(1))
+        for m in (dotted, load_mechanism("3-prs"))
+    ]
+    for one, two in zip(*legs, strict=True):
+        assert apart(one, two) < 1e-12
+
+
+@pytest.mark.parametrize(("name", "motor"), [("linear-delta", "rail2"), ("delta", "arm2")])
+def test_the_yaml_keeps_the_gains_of_motors(name: str, motor: str, tmp_path: Path) -> None:
+    """The URDF's joint then moves by the reading times the gain, as the equations say."""
+    nominal = load_mechanism(name)
     parametrization = parametrization_of(nominal, twists=True)
-    step = np.array([1e-3 * name.endswith("rail2.gain") for name in parametrization.names])
-    legs = moved_legs(geometries(nominal), parametrization.place, step)
-    with pytest.raises(OutOfClass, match=r"gains other than 1 \('rail2' 1.001\)"):
-        write_urdf(nominal, legs, tmp_path / "never.urdf")
-    assert not list(tmp_path.iterdir())
+    step = np.array([1e-3 * one.startswith(f"{motor}.gain") for one in parametrization.names])
+    assert step.any()
+    at_1001 = write(nominal, moved_legs(geometries(nominal), parametrization.place, step), tmp_path)
+    assert [a.gain for a in at_1001.actuators] == [1.0, 1.001, 1.0]
+    np.testing.assert_allclose(at_1001.A_base, nominal.A_base, atol=1e-12)
+    q = inverse_kinematics(at_1001, at_1001.home) + 0.03  # of the motors, of rods in pairs
+    T = forward_kinematics(at_1001, q)
+    np.testing.assert_allclose(inverse_kinematics(at_1001, T), q, atol=1e-9)
+    moved = q * np.where([leg.prismatic == motor for leg in nominal.legs], 1.001, 1.0)
+    before = forward_kinematics(nominal, moved)
+    np.testing.assert_allclose(T.as_matrix(), before.as_matrix(), atol=1e-9)
+    found = random_configurations(at_1001, 2, np.random.default_rng(3))
+    for T, configuration in zip(found.poses, found.configurations, strict=True):
+        gap = at_1001.chain.residual(configuration)
+        np.testing.assert_allclose(gap, 0.0, atol=1e-9)
+        readings = joint_values(at_1001, configuration)
+        np.testing.assert_allclose(inverse_kinematics(at_1001, T), readings, atol=1e-9)
+    (tmp_path / "more").mkdir()
+    half = write(
+        at_1001, moved_legs(geometries(at_1001), parametrization.place, step), tmp_path / "more"
+    )
+    assert half.actuators[1].gain == pytest.approx(1.002)
+    text = (tmp_path / "calibrated.yaml").read_text()
+    for old, new, named in (
+        (motor + '"', 'arm9"', "legcal.motors.arm9"),
+        ("1.001", "100.0", "needed 2 or less"),
+        ('"gain": 1.001', '"centre_us": 1500', "us_per_deg"),
+    ):
+        (tmp_path / "calibrated.yaml").write_text(text.replace(old, new))
+        with pytest.raises(ModelError, match=named):
+            load_mechanism(tmp_path / "calibrated.yaml")
 
 
 def _canonical(content: bytes) -> bytes:

@@ -143,7 +143,7 @@ def _write_model(machine: Machine, legs: Sequence[Leg], yaml: Path) -> None:
             f"of {machine.yaml_path}, and the nominal model."
         )
     moved = None if home is machine.home else home
-    write_calibrated_yaml(machine, yaml, _urdf_of(yaml).name, moved)
+    write_calibrated_yaml(machine, yaml, _urdf_of(yaml).name, moved, legs)
     written = reload_and_check(yaml)
     found = parametrization_of(written, twists=True)
     apart = vector_of(found, geometries(written), legs) - vector_of(found, legs, legs)

@@ -5,8 +5,9 @@ of an anchor is silently zero unless ``computeJointJacobians`` came first, and o
 the frame anchor's Jacobian is that of the logarithm only after ``Jlog6(M) Ad(M)^-1``.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -38,7 +39,8 @@ class ClosedChain:
     and continuous ones), velocities its tangent vectors. The object holds Pinocchio's work space,
     so that one object serves one thread; it pickles by being built again. *normals* holds, for each
     frame closure that need hold in a plane only, the normal of that plane in its first frame:
-    where all joints move in the plane, rounding of their axes opens it across.
+    where all joints move in the plane, rounding of their axes opens it across. *gains* are of
+    joints, by their names: configurations have a joint's value over its gain, as encoders read it.
 
     Raises
     ------
@@ -47,9 +49,14 @@ class ClosedChain:
     """
 
     def __init__(
-        self, text: str, closures: Sequence[Closure], normals: Sequence[Array | None] = ()
+        self,
+        text: str,
+        closures: Sequence[Closure],
+        normals: Sequence[Array | None] = (),
+        gains: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         self.text = text
+        self.gains = {joint: gain for joint, gain in gains.items() if gain != 1.0}
         self.closures = tuple(closures)
         self.normals = tuple(normals) or (None,) * len(self.closures)
         self._in_plane = [None if n is None else _projector(n) for n in self.normals]
@@ -72,11 +79,15 @@ class ClosedChain:
             name: (int(joint.idx_q), int(joint.idx_v))
             for name, joint in zip(self._model.names, self._model.joints, strict=True)
         }
+        self._of_value, self._of_rate = np.ones(self.nq), np.ones(self.nv)
+        for joint, gain in self.gains.items():
+            q, v = self._joints[joint]
+            self._of_value[q] = self._of_rate[v] = gain
         self._placed_at = self._linearized_at = b""  # the configurations of Pinocchio's work space
         self._linear = np.zeros(0), np.zeros((0, 0))  # what linearize returned last
 
     def __reduce__(self) -> tuple[type["ClosedChain"], tuple[object, ...]]:
-        return ClosedChain, (self.text, self.closures, self.normals)
+        return ClosedChain, (self.text, self.closures, self.normals, self.gains)
 
     def neutral(self) -> Array:
         """Return the configuration with every joint at zero."""
@@ -106,7 +117,7 @@ class ClosedChain:
         model, data, here = self._model, self._data, configuration.tobytes()
         if here == self._linearized_at == self._placed_at:
             return self._linear
-        pin.computeJointJacobians(model, data, configuration)
+        pin.computeJointJacobians(model, data, self._of_value * configuration)
         residual, jacobian = np.empty(self.n_rows), np.empty((self.n_rows, self.nv))
         row = 0
         for closure, anchor, anchor_data, in_plane in zip(
@@ -121,7 +132,7 @@ class ClosedChain:
                 block = pin.Jlog6(M) @ M.inverse().action @ block
             if in_plane is not None:
                 residual[rows], block = in_plane @ residual[rows], in_plane @ block
-            jacobian[rows] = block
+            jacobian[rows] = block * self._of_rate
             row = rows.stop
         residual.flags.writeable = jacobian.flags.writeable = False
         self._placed_at, self._linearized_at, self._linear = here, here, (residual, jacobian)
@@ -169,7 +180,7 @@ class ClosedChain:
             pin.getFrameJacobian(self._model, self._data, self._frame(name), pin.LOCAL)
             for name in (frame, base)
         )
-        return np.asarray(J_frame - M.inverse().action @ J_base)
+        return np.asarray((J_frame - M.inverse().action @ J_base) * self._of_rate)
 
     def q_index(self, joint: str) -> int:
         """Return where the value of a joint stands in a configuration."""
@@ -228,7 +239,7 @@ class ClosedChain:
         """Place all joints, unless they are where they should be."""
         here = configuration.tobytes()
         if here != self._placed_at:
-            pin.forwardKinematics(self._model, self._data, configuration)
+            pin.forwardKinematics(self._model, self._data, self._of_value * configuration)
             self._placed_at = here
 
     def _frame(self, name: str) -> int:

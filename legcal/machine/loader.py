@@ -189,9 +189,11 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     shown = visual_cylinders(urdf)
     if normals is not None:
         chains = at_visible_heights(chains, shown, bodies)
+    known = {joint: entry.gain for joint, entry in (block.motors or {}).items()}
+    gains = {str(c.motor): known.get(str(c.motor), 1.0) for c in chains if c.actuator is not None}
     try:
         chain = ClosedChain(
-            urdf.text, closures, normals_of_closures(in_plane, closures, block, urdf)
+            urdf.text, closures, normals_of_closures(in_plane, closures, block, urdf), gains
         )
     except ModelError as error:
         raise ModelError([f"{urdf.path}: {problem}" for problem in error.problems]) from error
@@ -266,7 +268,7 @@ def _as_stated(
         except ValueError as error:
             problems.append(f"{where}: {error}")
         else:
-            stated[name] = replace(actuator, pulses=pulses)
+            stated[name] = replace(actuator, gain=entry.gain, pulses=pulses)
     if problems:
         raise ModelError(problems)
     return stated

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, OutOfClass, OutOfResources, UsageError
+from legcal.errors import DidNotConverge, OutOfResources, UsageError
 from legcal.files import motion_to_xyz_quat, write_atomically
 from legcal.geometry import roll_pitch_yaw
 from legcal.machine.files import FOLDER_YAML, read_file
@@ -34,7 +34,6 @@ from legcal.machine.urdf import UrdfPatch
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # needs no quotes in YAML
 CLOSES = 1e-9  # [m] and [rad], home against the pose at its own readings
 ROUNDING = 4e-16  # [m]: what moves less does not move
-MAX_GAIN_ERROR = 1e-12  # of motors that carry rods
 
 
 def mechanism_text(machine: Machine, urdf: str) -> str:
@@ -114,13 +113,8 @@ def write_urdf(machine: Machine, legs: Sequence[Leg], destination: Path) -> None
     Loading it again gives these numbers to 1e-12 m and rad, with R_b and R_e where they were.
     Radii are not written: they absorb the bias of edges. Nor is home looked at: with other rods
     or axes the mechanism may close elsewhere.
-
-    Raises
-    ------
-    OutOfClass
-        If a motor that carries rods has a gain other than 1, which a URDF has no place for.
+    A gain other than 1 of a motor that carries rods has its place in the YAML alone.
     """
-    _check_gains(machine, legs)
     patch = UrdfPatch(machine.urdf.content)
     for name, (after, is_turned) in moved_origins(machine, legs).items():
         before = machine.urdf.joints[name].T_parent_origin
@@ -132,44 +126,75 @@ def write_urdf(machine: Machine, legs: Sequence[Leg], destination: Path) -> None
     destination.write_bytes(patch.content())
 
 
-def _check_gains(machine: Machine, legs: Sequence[Leg]) -> None:
-    """Check that motors move what they carry by their readings, as joints of a URDF do."""
-    wrong = [a for a in actuators_of(legs) if abs(a.gain - 1.0) > MAX_GAIN_ERROR]
-    if wrong:
-        named = ", ".join(f"'{a.joint}' {a.gain:.9g}" for a in wrong)
-        raise OutOfClass(
-            f"{machine.yaml_path}: the URDF could not be written: found gains other than 1 "
-            f"({named}), needed joints that move by their values, as those of a URDF do; multiply "
-            "the readings by them and calibrate with gains fixed at 1."
-        )
-
-
 def write_calibrated_yaml(
-    machine: Machine, destination: Path, urdf_name: str, home: RigidTransform | None = None
+    machine: Machine,
+    destination: Path,
+    urdf_name: str,
+    home: RigidTransform | None = None,
+    legs: Sequence[Leg] = (),
 ) -> None:
     """Write the mechanism's YAML with ``legcal.urdf`` naming the calibrated file.
 
     Every other character stays as it was, but for the numbers of ``legcal.home`` where home moves;
-    the key is added where the file does not have it. A mechanism of another format, or without a
-    block ``legcal``, gets a YAML with all it needs.
+    the key is added where the file does not have it, and the gains of the motors of *legs* where
+    they are not those of the model. A mechanism of another format, or without a block ``legcal``,
+    gets a YAML with all it needs.
     """
+    gains = {a.joint: a.gain for a in actuators_of(legs)}
     if not _is_written_down(machine):
         there = machine if home is None else replace(machine, home=home)
+        there = replace(there, legs=tuple(_with_gain(leg, gains) for leg in there.legs))
         destination.write_bytes(mechanism_text(there, urdf_name).encode("utf-8"))
         return
     text = read_file(machine.yaml_path, "mechanism file").decode("utf-8")
     if home is not None:
         text = _with_home(text, home)
+    if any(a.gain != gains.get(a.joint, a.gain) for a in machine.actuators):
+        moved = [leg.actuator for leg in (_with_gain(leg, gains) for leg in machine.legs)]
+        text = _with_motors(text, motor_entries([a for a in moved if a is not None]))
     value = urdf_name if _PLAIN.fullmatch(urdf_name) else json.dumps(urdf_name)
     block = _entry(yaml.compose(text, Loader=yaml.SafeLoader), "legcal")
     written = None if block is None else _entry(block, "urdf")
     if written is not None:
         text = text[: written.start_mark.index] + value + text[written.end_mark.index :]
-    elif isinstance(block, yaml.MappingNode) and block.value:
-        first = block.value[0][0].start_mark
-        separator = ", " if block.flow_style else "\n" + " " * first.column
-        text = f"{text[: first.index]}urdf: {value}{separator}{text[first.index :]}"
+    else:
+        text = _with_first(text, block, f"urdf: {value}")
     destination.write_bytes(text.encode("utf-8"))
+
+
+def _with_gain(leg: Leg, gains: Mapping[str, float]) -> Leg:
+    """Return a leg whose motor has the gain that is given by its joint."""
+    if leg.actuator is None:
+        return leg
+    gain = gains.get(leg.actuator.joint, leg.actuator.gain)
+    return replace(leg, actuator=replace(leg.actuator, gain=gain))
+
+
+def _with_motors(text: str, entries: dict[str, Any]) -> str:
+    """Return the text of a YAML with these entries as ``legcal.motors``."""
+    value = json.dumps(entries)  # as YAML on one line
+    block = _entry(yaml.compose(text, Loader=yaml.SafeLoader), "legcal")
+    written = _entry(block, "motors")
+    if written is not None:
+        end = written.end_mark.index
+        if isinstance(written, yaml.MappingNode) and not written.flow_style:
+            value += "\n" + " " * _indent(block)
+        return text[: written.start_mark.index] + value + text[end:]
+    return _with_first(text, block, f"motors: {value}")
+
+
+def _indent(block: yaml.Node | None) -> int:
+    """Return the column of the keys of a mapping."""
+    return block.value[0][0].start_mark.column if isinstance(block, yaml.MappingNode) else 0
+
+
+def _with_first(text: str, block: yaml.Node | None, entry: str) -> str:
+    """Return a text with an entry before the others of a mapping in it."""
+    if not isinstance(block, yaml.MappingNode) or not block.value:
+        return text
+    first = block.value[0][0].start_mark
+    separator = ", " if block.flow_style else "\n" + " " * first.column
+    return f"{text[: first.index]}{entry}{separator}{text[first.index :]}"
 
 
 def _with_home(text: str, home: RigidTransform) -> str:

@@ -39,6 +39,7 @@ from legcal.machine.rods import actuators_of
 _STEP = 1e-6  # [m or rad], of numerical derivatives
 # Of LegColumns, in this order
 _BLOCKS = (range(3), range(3, 6), (6,), (7, 8), (9, 10), (11,), (12, 13), (14, 15), (16,))
+_COORDINATES = ("x", "y", "z", "1", "2")  # of what is more than one number
 _LOCAL_NAMES = (
     *(f"{side}.{axis}" for side in ("base", "platform") for axis in "xyz"),
     "offset",
@@ -108,6 +109,12 @@ def parametrize(
                 place[j, column] = len(found)
                 found.append((name, unit))
     return Parametrization(tuple(n for n, _ in found), tuple(u for _, u in found), place)
+
+
+def kind_of_parameter(name: str) -> str:
+    """Return what a parameter is, the name of its leg or motor (which may have dots) left out."""
+    parts = name.split(".")
+    return parts[-2] if len(parts) > 2 and parts[-1] in _COORDINATES else parts[-1]
 
 
 def _local_name(leg: Leg, column: int) -> str:

@@ -24,11 +24,14 @@ from legcal.machine.files import DATASET_YAML, read_file, what_a_dataset_is_for
 
 WHAT = "mechanism file"
 MAX_LOOPS = 100
+GAINS = (0.5, 2.0)  # of motors that carry rods: further off the unit is another
+MAX_GAIN_ERROR = 1e-12  # of a gain that is 1
 
 
 class MotorEntry(FileSchema):
     """What a URDF has no place for of a motor that carries rods."""
 
+    gain: Annotated[Number, Field(ge=GAINS[0], le=GAINS[1])] = 1.0  # motion over reading
     centre_us: Number | None = None  # pulse at joint value 0 [us], of a hobby servo
     us_per_deg: Number | None = None  # negative where longer pulses turn it backwards
 
@@ -166,14 +169,15 @@ def _contradictions(file: MechanismFile, path: Path) -> list[str]:
 
 def motor_entries(actuators: Sequence[Actuator]) -> dict[str, Any]:
     """Return what the YAML says of actuators beside the URDF, by their joints."""
-    return {
-        actuator.joint: {
-            "centre_us": actuator.pulses.centre,
-            "us_per_deg": actuator.pulses.per_degree,
-        }
-        for actuator in actuators
-        if actuator.pulses is not None
-    }
+    found = dict[str, dict[str, float]]()
+    for actuator in actuators:
+        said = {} if abs(actuator.gain - 1.0) <= MAX_GAIN_ERROR else {"gain": actuator.gain}
+        if actuator.pulses is not None:
+            said["centre_us"] = actuator.pulses.centre
+            said["us_per_deg"] = actuator.pulses.per_degree
+        if said:
+            found[actuator.joint] = said
+    return found
 
 
 def mechanism_yaml(

@@ -34,7 +34,7 @@ from legcal.files import (
     read_yaml,
     validate,
 )
-from legcal.machine import LegKind, Machine, parametrization_of
+from legcal.machine import LegKind, Machine, kind_of_parameter, parametrization_of
 from legcal.simulation.board import KINDS as BOARD_KINDS
 from legcal.simulation.observe import TableNoise
 from legcal.simulation.rendering.appearance import Appearance, Light
@@ -138,7 +138,7 @@ KINDS = (*dict.fromkeys(ERRORS_OF.values()), "radii")  # the fields that are siz
 def kinds_of(machine: Machine) -> set[str]:
     """Return the kinds of errors, fields of :class:`ParameterErrors`, that a machine can have."""
     names = parametrization_of(machine, twists=True).names
-    kinds = {ERRORS_OF[name.split(".")[1]] for name in names if not name.endswith(".gain")}
+    kinds = {ERRORS_OF[kind_of_parameter(name)] for name in names if not name.endswith(".gain")}
     return kinds | ({"radii"} if any(leg.cylinders for leg in machine.legs) else set())
 
 

@@ -24,6 +24,7 @@ from legcal.machine import (
     check_closes,
     geometries,
     home_of_legs,
+    kind_of_parameter,
     load_mechanism,
     machine_ties,
     mechanism_text,
@@ -78,10 +79,10 @@ def draw_errors(
 
 def _spread(errors: ParameterErrors, name: str) -> Spread:
     """Return how large the error of a parameter is, by its name."""
-    _, kind, *more = name.split(".")
+    kind = kind_of_parameter(name)
     if kind == "gain":  # of motors: readings are true
         return Spread()
-    if errors.coplanar and kind in ("base", "platform") and more == ["z"]:
+    if errors.coplanar and kind in ("base", "platform") and name.endswith(".z"):
         return Spread()
     found: Spread = getattr(errors, ERRORS_OF[kind])
     return found
