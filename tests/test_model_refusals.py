@@ -477,18 +477,27 @@ class Drawing:
         self.loops: list[list[str]] = []
         self.kinds: list[str] = []
         self.legs: dict[str, str] = {}  # name and first joint
+        self.motors: list[str] = []  # where they are not those first joints
 
     def chain(
-        self, name: str, root: str, at: Array, joints: Sequence[Joint], *, end: Array, kind: str
+        self,
+        name: str,
+        root: str,
+        at: Array,
+        joints: Sequence[Joint],
+        *,
+        end: Array,
+        kind: str,
+        on: tuple[str, Array] = ("platform", HEIGHT * Z),
     ) -> None:
-        """Hang joints from a link whose origin is at a point; close on the platform at ``end``."""
+        """Hang joints from a link whose origin is at a point; close at ``end``, on the platform."""
         link, origin = root, at
         for i, (joint, point, axis) in enumerate(joints):
             child = f"{name}_{i}"
             self.add(child, joint, link, point - origin, axis)
             link, origin = child, point
         self.add(f"{name}_end", "fixed", link, end - origin)
-        self.add(f"{name}_seat", "fixed", "platform", end - HEIGHT * Z)
+        self.add(f"{name}_seat", "fixed", on[0], end - on[1])
         self.loops.append([f"{name}_end", f"{name}_seat"])
         self.kinds.append(kind)
 
@@ -511,7 +520,7 @@ class Drawing:
         """Write the files, with or without a block legcal, and with motors if they are driven."""
         document: dict[str, object] = {
             "closed_loop": self.loops, "type": self.kinds,
-            "name_mot": list(self.legs.values()) if driven else [],
+            "name_mot": (self.motors or list(self.legs.values())) if driven else [],
         }  # fmt: skip
         if block:
             document["legcal"] = {
@@ -536,13 +545,14 @@ def _rod(at: Array, end: Array, tangent: Array) -> list[Joint]:
     return [("revolute", at, tangent), ("revolute", at, inner / np.linalg.norm(inner))]
 
 
-def _delta(*, parallelograms: bool) -> Drawing:
+def _delta(*, parallelograms: bool, elbows: int = 1) -> Drawing:
     drawing = Drawing()
     for j in range(3):
         (pivot, axis), (elbow, _) = _around(j, 0.2, 0.0), _around(j, 0.35, 0.1)
         end = _around(j, 0.05, HEIGHT)[0]
         if not parallelograms:
-            joints = [("revolute", pivot, axis), *_rod(elbow, end, axis)]
+            serial: list[Joint] = [("revolute", 0.9 * elbow, axis)] * (elbows - 1)
+            joints = [("revolute", pivot, axis), *serial, *_rod(elbow, end, axis)]
             drawing.chain(f"arm{j}", "base", np.zeros(3), joints, end=end, kind="3d")
             drawing.legs[f"arm{j}"] = f"j_arm{j}_0"
             continue
@@ -551,6 +561,45 @@ def _delta(*, parallelograms: bool) -> Drawing:
         for k, out in enumerate((-0.03 * axis, 0.03 * axis)):
             rod = _rod(elbow + out, end + out, axis)
             drawing.chain(f"rod{j}{k}", f"arm{j}", pivot, rod, end=end + out, kind="3d")
+    return drawing
+
+
+def _articulated(joint: str) -> Drawing:
+    """Return an H4 (revolute) or I4 (prismatic): two bars on the platform, two arms on each."""
+    drawing, x = Drawing(), np.array([0.05, 0.0, 0.0])
+    axis = Z if joint == "revolute" else np.array([0.0, 1.0, 0.0])
+    for bar, side in (("bar0", -1.0), ("bar1", 1.0)):
+        drawing.add(bar, joint, "platform", side * x, axis)
+    for j, side in enumerate((-1.0, -1.0, 1.0, 1.0)):
+        across = np.array([0.0, (-1.0) ** j, 0.0])
+        tangent = np.cross(Z, across)
+        pivot, elbow, end = 0.2 * across, 0.35 * across + 0.1 * Z, side * x + 0.05 * across
+        end = end + HEIGHT * Z
+        drawing.add(f"arm{j}", "revolute", "base", pivot, tangent)
+        for k, out in enumerate((-0.03 * tangent, 0.03 * tangent)):
+            rod = _rod(elbow + out, end + out, tangent)
+            on = ("bar0" if side < 0.0 else "bar1", side * x + HEIGHT * Z)
+            name = f"rod{j}{k}"
+            drawing.chain(name, f"arm{j}", pivot, rod, end=end + out, kind="3d", on=on)
+            drawing.legs[name] = f"j_{name}_0"
+        drawing.motors.append(f"j_arm{j}")
+    return drawing
+
+
+def _couplers() -> Drawing:
+    """Return a Delta whose parallelograms end on bars that turn on the platform."""
+    drawing = Drawing()
+    for j in range(3):
+        (pivot, axis), (elbow, _) = _around(j, 0.2, 0.0), _around(j, 0.35, 0.1)
+        end = _around(j, 0.05, HEIGHT)[0]
+        drawing.add(f"arm{j}", "revolute", "base", pivot, axis)
+        drawing.add(f"bar{j}", "revolute", "platform", end - HEIGHT * Z, axis)
+        drawing.motors.append(f"j_arm{j}")
+        for k, out in enumerate((-0.03 * axis, 0.03 * axis)):
+            rod, name = _rod(elbow + out, end + out, axis), f"rod{j}{k}"
+            on = f"bar{j}", end
+            drawing.chain(name, f"arm{j}", pivot, rod, end=end + out, kind="3d", on=on)
+            drawing.legs[name] = f"j_{name}_0"
     return drawing
 
 
@@ -596,6 +645,26 @@ DRAWN: dict[str, tuple[Callable[[], Drawing], bool, tuple[str, ...]]] = {
     "3-RRR": (lambda: _planar_arms(3), True, ARMS),
     "hinges": (_hinges, True, ("directly between base and platform",)),
 }
+
+
+INNER = ("platform of several bodies", "2 legs that meet on link", "'bar", "H4 or I4")
+LOOP = ("a loop inside the leg", "'j_arm0'", "as a leg of its own")
+DRIVEN: dict[str, tuple[Callable[[], Drawing], bool, tuple[str, ...]]] = {
+    "H4": (lambda: _articulated("revolute"), True, (*INNER, "joint 'j_bar")),
+    "H4 without a block": (lambda: _articulated("revolute"), False, INNER),
+    "I4": (lambda: _articulated("prismatic"), True, (*INNER, "joint 'j_bar")),
+    "a Delta with couplers": (_couplers, True, LOOP),
+    "arm on arm": (lambda: _delta(parallelograms=False, elbows=2), True, (
+        "the leg of motor 'j_arm0_0'", "no slider and 3 joints in different places", "a rod of")),
+    "3-RRR": (lambda: _planar_arms(3), True, ("a planar machine whose joints at A move",)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DRIVEN)
+def test_machines_of_arms_outside_the_method_are_refused_by_name(name: str, tmp_path: Path) -> None:
+    draw, block, named = DRIVEN[name]
+    (problem,) = refused(draw().write(tmp_path, block=block), OutOfClass)
+    assert all(word in problem for word in named), problem
 
 
 @pytest.mark.parametrize("name", DRAWN)

@@ -106,7 +106,10 @@ def _paths(
                 )
             onward = [c for c in at[body] if c is not connection]
             if body == base or len(onward) != 1 or id(onward[0]) in used:
-                raise OutOfClass(_not_a_chain(urdf, steps, body, base, len(onward)))
+                problem = ""
+                if len(onward) > 1 and not _is_an_arm(steps):
+                    problem = _several_bodies(bodies, urdf, steps, body, (base, platform))
+                raise OutOfClass(problem or _not_a_chain(urdf, steps, body, base, len(onward)))
             connection = onward[0]
         paths.append(steps)
     stray = [c for c in bodies.connections if id(c) not in used]
@@ -392,6 +395,49 @@ def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform:
             "directly between base and platform, needed legs; name it in legcal.platform_joint if "
             "it is the virtual joint that carries the platform."
         )
+
+
+def _several_bodies(
+    bodies: Bodies, urdf: Urdf, steps: Sequence[Step], body: str, ends: tuple[str, str]
+) -> str:
+    """Return which loop inside a leg, or platform of several bodies, a body belongs to; else "".
+
+    Seen from the body without base and platform, the joints of a loop inside a leg reach the base
+    by one joint, and those of a part of the platform by those of several legs.
+    """
+    base, platform = ends
+    reached, new = {body}, [body]
+    on_base, on_platform = list[Connection](), list[Connection]()
+    while new:
+        here = new.pop()
+        for connection in bodies.connections:
+            if here not in connection.bodies:
+                continue
+            there = connection.bodies[1 - connection.bodies.index(here)]
+            if there == base:
+                on_base.append(connection)
+            elif there == platform:
+                on_platform.append(connection)
+            elif there not in reached:
+                reached.add(there)
+                new.append(there)
+    if len(on_base) == 1:
+        return (
+            f"{urdf.path}: this machine is outside the method: found a loop inside the leg that "
+            f"starts with {_name(steps[0].connection)}, closed at link '{body}', needed chains "
+            "without loops that end on the platform itself; if these are the rods of a "
+            "parallelogram on an arm or a carriage, close each on the platform as a leg of its "
+            "own, otherwise this machine cannot be calibrated this way."
+        )
+    if len(on_base) > 1 and len(on_platform) == 1:
+        return (
+            f"{urdf.path}: this machine is outside the method: found a platform of several bodies, "
+            f"with {len(on_base)} legs that meet on link '{body}' and the internal "
+            f"{_name(on_platform[0])} between them and the platform (as on an H4 or I4), needed "
+            "one rigid platform; fix that joint if it does not move, otherwise this machine cannot "
+            "be calibrated this way."
+        )
+    return ""
 
 
 def _not_a_chain(urdf: Urdf, steps: list[Step], body: str, base: str, n_onward: int) -> str:
