@@ -58,6 +58,11 @@ def test_commands_know_that_joints_at_A_move(
     figures = json.loads(corrected)
     assert figures["residual"]["rms_dX_m"] < 0.2 * figures["uncorrected"]["rms_dX_m"]
     if name == "delta":  # whose scale nothing fixes here
+        free = ["--free", "*.radius.*"]
+        assert run(monkeypatch, "calibrate", session, "-o", tmp_path / "never", "-q", *free) == 1
+        refusal = " ".join(capsys.readouterr().err.split())
+        assert "carry no length" in refusal
+        assert "state a measured length with --length" in refusal
         looked = json.loads(said("doctor", session, "--json", "-q", code=1))
         assert [one["column"] for one in looked["encoders"]] == list(truth.motor_names)
         assert {one["unit"] for one in looked["encoders"]} == {"rad"}

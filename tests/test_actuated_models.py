@@ -294,6 +294,15 @@ A2 = '"leg1_a2" type="revolute"'
     ("old", "new", "named"),
     [
         (LIMITS, 'lower="-30" upper="70"', ("'arm1'", "-30 to 70 rad", "degrees")),
+        (
+            LIMITS,
+            'lower="-3.1" upper="3.1"',
+            (
+                "'leg1' at home is ambiguous",
+                "readings -178.8 and 20.0 deg of 'arm1'",
+                "home_readings",
+            ),
+        ),
         ("home:\n", "home_readings: {arm7: 0.1}\n  home:\n", ("home_readings.arm7", "arm1")),
         (MOTORS, f"{MOTORS}- leg1_a2\n", ("'leg1_a2'", "one motor for each leg")),
         (MOTORS, "name_mot:\n", ("'arm1'", "carries 2 rods", "a motor in name_mot")),

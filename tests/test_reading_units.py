@@ -1,5 +1,6 @@
 """Readings in degrees, radians and pulses of servos, stated and taken for each other."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -130,6 +131,33 @@ def test_units_that_are_taken_for_others_are_told_before_images_are_looked_at(
     with pytest.raises(LegcalError) as caught:
         load_dataset(dataset(tmp_path, readings, entry))
     (said, *_) = caught.value.problems
+    assert all(word in said for word in named), said
+
+
+@pytest.mark.parametrize(
+    ("hidden", "named"),
+    [
+        ("leg[12]_", ("motor 'arm1'", "no cylinder along leg1, leg2", "<visual>")),
+        ("leg\\d_", ("view c1 could not be used", "found no leg", "visible cylinder")),
+        ("leg1_", ()),
+    ],
+)
+def test_arms_without_a_visible_rod_are_told_before_images_are_looked_at(
+    hidden: str, named: tuple[str, ...], tmp_path: Path
+) -> None:
+    urdf = (ROOT / "urdf/delta.urdf").read_text()
+    bare = re.sub(rf'(<link name="{hidden}\w*">).*?</link>', r"\1</link>", urdf, flags=re.DOTALL)
+    (tmp_path / "delta.urdf").write_text(bare)
+    model = (ROOT / "models/delta.yaml").read_text().replace("../urdf/", "")
+    (tmp_path / "delta.yaml").write_text(model)
+    entry = {"encoder_sigma": dict.fromkeys(ARMS, 1e-4)}
+    made = dataset(tmp_path, ANGLES[:, :3], entry, "delta.yaml", ARMS)
+    if not named:
+        load_dataset(made, check_images=False)
+        return
+    with pytest.raises(LegcalError) as caught:
+        load_dataset(made)
+    (said,) = caught.value.problems
     assert all(word in said for word in named), said
 
 

@@ -20,7 +20,7 @@ from legcal.data.dataset_file import (
     read_dataset_file,
     view_problems,
 )
-from legcal.data.measurements import Measurements, View, few, read_measurements
+from legcal.data.measurements import Measurements, View, few, few_views, read_measurements
 from legcal.data.outlines import Outlines, read_observations
 from legcal.data.overrides import Override
 from legcal.data.photograph_notes import notes_on_photographs
@@ -264,6 +264,8 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         boards=boards,
         corners=read_given_corners(folder / CORNERS_NAME, boards, measurements),
     )
+    if problems := _invisible(dataset):
+        raise DatasetError(problems)
     if not check_images:
         return dataset
     dataset, unusable = inspect_files(dataset)
@@ -280,6 +282,41 @@ def inspect_files(dataset: Dataset) -> tuple[Dataset, list[tuple[int, str]]]:
     ]
     notes = (*dataset.notes, *of_files)
     return replace(dataset, notes=notes, facts=facts, file_notes=tuple(of_files)), problems
+
+
+def _invisible(dataset: Dataset) -> list[str]:
+    """Return which legs images cannot show, where nothing else says where they are.
+
+    The model must have a cylinder along some leg of every view, and of the rods on every motor
+    that carries some.
+    """
+    given = dataset.observations is not None or dataset.axes is not None
+    if given or dataset.board_on("platform") is not None:
+        return []
+    machine = dataset.machine
+    add = "add <visual> cylinders along them, with their radii, to the URDF"
+    shown = {leg.name for leg in machine.legs if leg.cylinders}
+    views = [
+        view.name
+        for view in dataset.measurements.views
+        if not shown.intersection(machine.leg_names if view.legs is None else view.legs)
+    ]
+    if views:
+        return [
+            f"{dataset.yaml_path}: {few_views(views)} could not be used: found no leg of which the "
+            f"model {machine.yaml_path.name} has a visible cylinder, needed one at least; {add}."
+        ]
+    rods = {
+        a.joint: [leg.name for leg in machine.legs if leg.prismatic == a.joint]
+        for a in machine.actuators
+    }
+    return [
+        f"{dataset.yaml_path}: the motor '{joint}' could not be calibrated: found no visible rod "
+        f"on it (the model {machine.yaml_path.name} has no cylinder along {few(names)}), needed "
+        f"one at least; {add}."
+        for joint, names in rods.items()
+        if not shown.intersection(names)
+    ]
 
 
 def _refuse_two_tables(folder: Path) -> None:
