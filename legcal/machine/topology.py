@@ -421,6 +421,8 @@ def _several_bodies(
             elif there not in reached:
                 reached.add(there)
                 new.append(there)
+    if len(on_platform) != 1:
+        return ""
     if len(on_base) == 1:
         return (
             f"{urdf.path}: this machine is outside the method: found a loop inside the leg that "
@@ -429,7 +431,7 @@ def _several_bodies(
             "parallelogram on an arm or a carriage, close each on the platform as a leg of its "
             "own, otherwise this machine cannot be calibrated this way."
         )
-    if len(on_base) > 1 and len(on_platform) == 1:
+    if len(on_base) > 1:
         return (
             f"{urdf.path}: this machine is outside the method: found a platform of several bodies, "
             f"with {len(on_base)} legs that meet on link '{body}' and the internal "
