@@ -14,7 +14,12 @@ from thinned import thinned
 
 from legcal.data import Measurements, Outlines, View
 from legcal.geometry import Array, Image
-from legcal.machine import Cylinder
+from legcal.machine import (
+    Cylinder,
+    inverse_kinematics,
+    load_mechanism,
+    random_configurations,
+)
 from legcal.perception import recognition
 from legcal.perception.camera_search import (
     PoseCandidates,
@@ -24,6 +29,7 @@ from legcal.perception.camera_search import (
     place_camera,
     place_near,
 )
+from legcal.perception.candidate_pairs import find_candidate_pairs
 from legcal.perception.pair_matching import (
     CameraPoses,
     PairMatches,
@@ -50,6 +56,7 @@ from legcal.perception.view_fit import (
 from legcal.vision import Camera, outlines_of_axis
 
 CAMERA = Camera(np.array([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]]), 640, 480)
+OWN, TWIN = [0, 1, 2, 3, 4, 5], [1, 0, 3, 2, 5, 4]  # rods in pairs
 HARD = {"missing": 0.2, "n_clutter": 8, "noise": 0.4}
 
 
@@ -357,6 +364,59 @@ def test_a_model_that_is_wrong_by_ten_millimetres_suffices() -> None:
     away, angle = lp.apart(T, placed.pose())
     assert angle < np.deg2rad(6.0)
     assert away < 0.15
+
+
+def _of_parallelograms(
+    name: str, width: float, rng: np.random.Generator
+) -> tuple[list[Picture], RigidTransform, Array, Array]:
+    """Return pictures of rods *width* px wide in pairs 6 widths apart, arms or carriages beside.
+
+    And T_base_camera, and A and B of the true rods (n, 6, 3).
+    """
+    model, n = load_mechanism(name), 4
+    poses = random_configurations(model, n, rng).poses
+    A = model.A_at(np.array([inverse_kinematics(model, T) for T in poses]))
+    B = np.array([T.apply(model.B_platform) for T in poses])
+    middle = np.concatenate([A, B]).mean(axis=(0, 1))
+    shift = RigidTransform.from_translation(middle - [0.0, 0.0, 0.2])
+    camera = shift * lp.camera(rng)
+    radius = 0.5 * width * lp.PIXEL * float(np.linalg.norm(camera.translation - middle))
+    across = A[:, 1::2] - A[:, ::2]
+    across /= np.linalg.norm(across, axis=2, keepdims=True)
+    for ends in (A, B):
+        between = 0.5 * (ends[:, 1::2] + ends[:, ::2])
+        ends[:, ::2], ends[:, 1::2] = (between + s * 6.0 * radius * across for s in (-1.0, 1.0))
+    rod, arm = (Cylinder("", r, "base", 0.02, 0.38) for r in (radius, 2.0 * radius))
+    true_A, true_B = (x + rng.uniform(-2e-3, 2e-3, (6, 3)) for x in (A, B))
+    feet = np.array([a.point - 0.3 * a.axis * (not a.turns) for a in model.actuators])
+    found = []
+    for k in range(n):
+        tips = 0.5 * (A[k, 1::2] + A[k, ::2])
+        arms = np.array([lp.edges(lp.pieces(feet[j : j + 1], tips[j : j + 1], [
+            replace(arm, end=float(np.linalg.norm(tips[j] - feet[j])))]), camera)[0]
+            for j in range(3)])  # fmt: skip
+        seen = lp.edges(lp.pieces(true_A[k], true_B[k], [rod]), camera)
+        lines = np.concatenate([seen[rng.random(len(seen)) > 0.1], arms, lp.clutter(6, rng)])
+        lines = lines + 0.3 * lp.PIXEL * rng.normal(size=lines.shape)
+        pairs = find_candidate_pairs(lp.segments(lines))
+        found.append(Picture(pairs, lp.pieces(A[k], B[k], [rod]), lp.CORNERS))
+    return found, camera, true_A, true_B
+
+
+@pytest.mark.parametrize("name", ["delta", "linear-delta"])
+@pytest.mark.parametrize("width", [6.0, 20.0])
+def test_the_two_rods_of_an_arm_are_not_exchanged(name: str, width: float) -> None:
+    """Every rod of the model lies nearer to its own than to its twin in the picture."""
+    pictures, T, A, B = _of_parallelograms(name, width, np.random.default_rng(5))
+    placed = place_camera(pictures, 6)
+    assert placed.is_convincing
+    assert _is_right(placed, T)
+    for k, picture in enumerate(pictures):
+        nominal = picture.targets.ends.mean(axis=1)[:6]
+        at = [pose.inv().apply(x) for pose, x in ((placed.pose(), nominal), (T, (A[k] + B[k]) / 2))]
+        shown, true = (x[:, :2] / x[:, 2:] for x in at)
+        own, twin = (np.linalg.norm(shown - true[order], axis=1) for order in (OWN, TWIN))
+        assert np.all(own < 0.5 * twin)
 
 
 @pytest.mark.slow
