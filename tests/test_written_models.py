@@ -18,6 +18,7 @@ from thinned import thinned
 
 from legcal import load_mechanism, simulate
 from legcal.errors import DidNotConverge, ModelError, OutOfClass, UsageError
+from legcal.exports import Subject, export
 from legcal.geometry import Array, roll_pitch_yaw
 from legcal.machine import (
     EquationKind,
@@ -164,6 +165,11 @@ def test_the_yaml_keeps_the_gains_of_motors(name: str, motor: str, tmp_path: Pat
         at_1001, moved_legs(geometries(at_1001), parametrization.place, step), tmp_path / "more"
     )
     assert half.actuators[1].gain == pytest.approx(1.002)
+    subject = Subject(at_1001, "calibrated")
+    (note,) = export(subject, "urdf", tmp_path / "alone.urdf").notes
+    assert f"'{motor}' 1.001" in note
+    with pytest.raises(OutOfClass, match=r"found gains other than 1 .* MuJoCo"):
+        export(subject, "mjcf", tmp_path / "alone.xml")
     text = (tmp_path / "calibrated.yaml").read_text()
     for old, new, named in (
         (motor + '"', 'arm9"', "legcal.motors.arm9"),

@@ -30,6 +30,12 @@ LEAST = 1e-15  # mass, moment of inertia or size that MuJoCo takes
 
 def mjcf_refusal(subject: Subject) -> str | None:
     """Return why a machine's tree cannot be MuJoCo's, or None."""
+    gains = [f"'{a.joint}' {a.gain:.9g}" for a in subject.machine.actuators if a.gain != 1.0]
+    if gains:
+        return (
+            f"found gains other than 1 ({', '.join(gains)}), needed joints that move by their "
+            "readings, as those of MuJoCo do"
+        )
     urdf = subject.machine.urdf
     above = {joint.child: joint for joint in urdf.joints.values()}
     for joint in urdf.joints.values():

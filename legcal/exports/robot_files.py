@@ -70,10 +70,16 @@ def urdf_text(machine: Machine, *, inertia: bool) -> tuple[bytes, tuple[str, ...
             etree.SubElement(motor, "actuator", name=f"{leg.prismatic}_motor")
     etree.indent(robot)
     content = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
-    if not meshes:
-        return content, ()
-    named_meshes = ", ".join(meshes[:3]) + " and more" * (len(meshes) > 3)
-    return content, (f"Meshes lie in files of their own and were left out: {named_meshes}.",)
+    gains = [f"'{a.joint}' {a.gain:.9g}" for a in machine.actuators if a.gain != 1.0]
+    notes = [
+        f"Joints move by their readings times the gain, which a URDF has no place for: {gain}."
+        for gain in [", ".join(gains)]
+        if gains
+    ]
+    if meshes:
+        named_meshes = ", ".join(meshes[:3]) + " and more" * (len(meshes) > 3)
+        notes.append(f"Meshes lie in files of their own and were left out: {named_meshes}.")
+    return content, tuple(notes)
 
 
 def _without_meshes(robot: etree._Element) -> list[str]:
