@@ -8,7 +8,7 @@ import pytest
 import yaml
 from command_line import run
 
-from legcal.calibration import load_result
+from legcal.calibration import calibrate, load_result
 from legcal.machine import load_mechanism
 
 
@@ -66,6 +66,14 @@ def test_commands_know_that_joints_at_A_move(
         looked = json.loads(said("doctor", session, "--json", "-q", code=1))
         assert [one["column"] for one in looked["encoders"]] == list(truth.motor_names)
         assert {one["unit"] for one in looked["encoders"]} == {"rad"}
+        stated = {
+            f"{leg.name}.radius.{part}": (r, 1e-4 * r)
+            for leg in nominal.legs
+            for part, r in leg.radius_of_part.items()
+        }
+        rows = {row["parameter"]: row for row in calibrate(session, priors=stated).table()}
+        sigma = rows["leg1.length"]["sigma"] / rows["leg1.length"]["calibrated"]
+        assert sigma > 0.1 / 20.0  # edges that all lie 0.1 px inwards, of rods up to 40 px wide
     inspected = said("inspect", name)
     assert all(f"{joint} " in inspected for joint in truth.motor_names)
     assert f" {unit}" in inspected

@@ -154,6 +154,21 @@ class ObservedOutlines:
     memory: Memory = field(default_factory=Memory, repr=False)  # of the predicted offsets
 
     @property
+    def width_px(self) -> float:
+        """Median width of the cylinders both of whose edges are seen; infinite without any [px]."""
+        across = self.pixels[:, 1] - self.pixels[:, 0]
+        normal = np.stack([-across[:, 1], across[:, 0]], axis=1)
+        normal /= np.linalg.norm(normal, axis=1)[:, None]
+        middle = self.pixels.mean(axis=1)
+        image = np.stack([self.view, self.pose, self.radius], axis=1)
+        _, of = np.unique(image, axis=0, return_inverse=True)
+        order = np.argsort(of, kind="stable")
+        first, second = order[:-1], order[1:]
+        is_pair = (of[first] == of[second]) & (self.epsilon[first] != self.epsilon[second])
+        away = np.sum(normal[first] * (middle[second] - middle[first]), axis=1)
+        return float(np.median(np.abs(away[is_pair]))) if is_pair.any() else np.inf
+
+    @property
     def epsilon(self) -> Array:
         """+1 or -1 of eq (5), (n,)."""
         return np.asarray(self.constants[:, 8])

@@ -36,6 +36,7 @@ from legcal.calibration.joint_fit.parameter_choices import (
     NO_CHOICES,
     Choices,
     KnownIntrinsics,
+    Prior,
     board_scale,
 )
 from legcal.calibration.joint_fit.variables import (
@@ -74,6 +75,7 @@ from legcal.vision import (
     with_intrinsics,
 )
 
+_EDGE_BIAS_PX = 0.1  # by which light at the limb and blur may move all edges of a camera alike
 _MAX_STEP = (0.3, 0.3, 0.3, np.inf, np.inf, np.inf)  # of a frame: [rad], and any displacement
 
 
@@ -364,6 +366,8 @@ def _built(
     no_biases = Variables("biases", np.zeros((0, 1), dtype=np.intp))
     nominal = np.array([legs.radii[part] for part in outlines.parts])
     radii = [radius_name(legs.names[leg], part) for leg, part in outlines.parts]
+    if all(leg.reads_angle for leg in legs.nominal):
+        choices = replace(choices, priors=_with_edge_bias(choices.priors, radii, nominal, outlines))
     blocks = (
         kinematic,
         _scalars("radii", radii, "m", nominal, settings.radius_sigma * nominal, choices),
@@ -415,6 +419,23 @@ def _scalars(
     prior = GaussianPrior(unknown[known], mean[known], sigma[known])
     free = tuple(label for label, one in zip(labels, is_free, strict=True) if one)
     return Variables(name, unknown[:, None], labels=free, units=(unit,) * len(free), prior=prior)
+
+
+def _with_edge_bias(
+    priors: Mapping[str, Prior], radii: Sequence[str], nominal: Array, outlines: ObservedOutlines
+) -> dict[str, Prior]:
+    """Return priors with those of radii as sure as edges that all lie inwards alike let them be.
+
+    Where readings carry no length, radii give the machine its size, and an error that all edges
+    share is not seen in the residuals: rods look thinner, as those of a larger machine do. Errors
+    of single radii average over the rods and this one does not, so that each variance has it as
+    many times as there are radii.
+    """
+    stated = [name for name in radii if name in priors]
+    common = _EDGE_BIAS_PX / (0.5 * outlines.width_px)  # of a radius
+    of = dict(zip(radii, np.sqrt(len(stated)) * common * nominal, strict=True))
+    wider = {n: replace(priors[n], sigma=float(np.hypot(priors[n].sigma, of[n]))) for n in stated}
+    return {**priors, **wider}
 
 
 def _board_scales(
