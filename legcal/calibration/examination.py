@@ -305,7 +305,7 @@ def _look_at_readings(found: _Found, notes: Sequence[str]) -> None:
     sigma, unit = dataset.measurements.sigma_of(legs), dict[int, Literal["m", "rad"]]()
     for j, column in zip(motors, reading_columns(legs), strict=True):
         lower, upper = legs[j].travel
-        unit[j] = "rad" if legs[j].reads_angle else "m"
+        unit[j] = legs[j].reading_unit
         is_known = bool(np.isfinite(upper - lower)) and upper > lower
         least, greatest = float(q[:, j].min()), float(q[:, j].max())
         travel = (float(lower), float(upper)) if is_known else None

@@ -28,7 +28,7 @@ from legcal.calibration.documents import (
     ParameterRow,
     WeakInLinks,
 )
-from legcal.files import Pose, motion_to_xyz_quat
+from legcal.files import Pose
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis, turned_axis
 from legcal.machine import (
     SHOWN,
@@ -189,7 +189,7 @@ def joints_in_links(
             )
         blocks[side] = LinkBlock(
             link=frame.link,
-            T_link_frame=Pose(**motion_to_xyz_quat(frame.T_link_frame)),
+            T_link_frame=Pose.of(frame.T_link_frame),
             joints=joints,
             axes=_axes_in_link(frame, (axes or {}).get(side, {}), rows, number, everything),
         )

@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.documents import (
@@ -51,7 +50,7 @@ from legcal.calibration.plots import plot_residuals
 from legcal.calibration.residuals import OutlineResiduals, outline_residuals
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data import Corners, Dataset, row_names
-from legcal.files import Pose, motion_to_xyz_quat
+from legcal.files import Pose
 from legcal.machine import (
     ActuatorBlock,
     Leg,
@@ -184,7 +183,7 @@ def _result_of(calibration: Calibration) -> Result:
         ],
         held=list(solution.held),
         views={
-            views[v].name: ViewPose(T_base_camera=_pose(T_base_Rb * solution.T_camera_Rb[v].inv()))
+            views[v].name: ViewPose(T_base_camera=Pose.of(T_base_Rb * solution.T_camera_Rb[v].inv()))
             for v in shown
         },
         cameras={v.name: camera_numbers(v.camera) for v in views if v.name in set(owners)},
@@ -229,10 +228,6 @@ def _actuators(legs: Sequence[Leg]) -> dict[str, ActuatorBlock] | None:
     """Return what moves joints at A, by joint; None where nothing does."""
     found = actuators_of(legs)
     return {one.joint: ActuatorBlock.model_validate(one.document()) for one in found} or None
-
-
-def _pose(T: RigidTransform) -> Pose:
-    return Pose(**motion_to_xyz_quat(T))
 
 
 def _parameters(calibration: Calibration) -> list[ParameterRow]:
@@ -328,8 +323,8 @@ def _board(calibration: Calibration, link: Link) -> dict[str, Any] | None:
         off = Distance(dX_m=float(np.linalg.norm(apart.translation)), dE_rad=turn)
     own = corners.choose(fixed.has(corners.corner))
     numbers: dict[str, Any] = {
-        f"T_{link}_board": _pose(T_link_board),
-        "given": None if given is None else _pose(given),
+        f"T_{link}_board": Pose.of(T_link_board),
+        "given": None if given is None else Pose.of(given),
         "scale": solution.values.get(board_scale(link), 1.0),
         "rms_px": solution.rms_corners_px.get(link),
         "corners": len(own),

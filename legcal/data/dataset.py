@@ -28,6 +28,7 @@ from legcal.data.reading_units import (
     PULSES,
     SERVO_SIGMA,
     ReadingUnit,
+    legs_with_readings,
     reading_units,
     sigma_in,
 )
@@ -182,7 +183,7 @@ def _encoder_sigmas(
             f"standard deviation of a reading{'' if machine.actuators else ' [m]'}, for each motor "
             "in the unit of its readings where one turns; add it."
         )
-    of_motor = {str(leg.prismatic): leg for leg in reversed(machine.legs)}
+    of_motor = {str(leg.prismatic): leg for leg in legs_with_readings(machine.legs)}
     found, problems = dict[str, float](), list[str]()
     for name, sigma in stated.items():
         try:

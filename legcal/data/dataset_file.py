@@ -102,18 +102,15 @@ class ParametersEntry(FileSchema):
         )
 
 
-def _kind_of_sigma(given: Any) -> str:
-    """Return which form a standard deviation of readings has."""
-    if given is None:
-        return "[none]"
-    return "[by joint]" if isinstance(given, dict) else "[number]"
+def _by_joint_or(of_all: str) -> Discriminator:
+    """Return what tells an entry by joint from one for all motors, which has this tag."""
 
+    def form(given: Any) -> str:
+        if given is None:
+            return "[none]"
+        return "[by joint]" if isinstance(given, dict) else of_all
 
-def _kind_of_readings(given: Any) -> str:
-    """Return which form the units of readings have."""
-    if given is None:
-        return "[none]"
-    return "[by joint]" if isinstance(given, dict) else "[unit]"
+    return Discriminator(form)
 
 
 class DatasetEntry(FileSchema):
@@ -136,13 +133,13 @@ class DatasetEntry(FileSchema):
             Tag("[by joint]"),
         ]
         | Annotated[None, Tag("[none]")],
-        Discriminator(_kind_of_sigma),
+        _by_joint_or("[number]"),
     ] = None  # of servos whose readings are their pulses
     readings: Annotated[
         Annotated[ReadingUnitName, Tag("[unit]")]
         | Annotated[dict[str, ReadingsEntry], Field(min_length=1), Tag("[by joint]")]
         | Annotated[None, Tag("[none]")],
-        Discriminator(_kind_of_readings),
+        _by_joint_or("[unit]"),
     ] = None  # unit of the table, where it is not m or rad
     views: Annotated[dict[Name, ViewEntry], Field(min_length=1)]
     parameters: ParametersEntry = Field(default_factory=ParametersEntry)

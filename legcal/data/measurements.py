@@ -18,7 +18,13 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.data.reading_units import PULSES, SIGMA_ANGLE, ReadingUnit, default_unit
+from legcal.data.reading_units import (
+    PULSES,
+    SIGMA_ANGLE,
+    ReadingUnit,
+    default_unit,
+    legs_with_readings,
+)
 from legcal.files import (
     ANGLE,
     LENGTH,
@@ -170,15 +176,6 @@ def few(names: Sequence[str]) -> str:
 def few_views(names: Sequence[str]) -> str:
     """Return views as a sentence names them: ``views c1, c2``, not more than a few."""
     return f"view{'s' * (len(names) > 1)} {few(names)}"
-
-
-def legs_with_readings(legs: Sequence[Leg]) -> list[Leg]:
-    """Return the legs of which a table has readings: of rods on one actuator the first."""
-    found: dict[str, Leg] = {}
-    for leg in legs:
-        if leg.is_motor:
-            found.setdefault(str(leg.prismatic), leg)
-    return list(found.values())
 
 
 def reading_columns(
@@ -501,7 +498,7 @@ def _shared_readings(
 ) -> Array:
     """Return the readings with those of one pose replaced by their mean."""
     joints = [column.name for column in reading_columns(legs)]
-    units = ["rad" if leg.reads_angle else "m" for leg in legs_with_readings(legs)]
+    units = [leg.reading_unit for leg in legs_with_readings(legs)]
     labels = table.text("pose")
     shared = readings.copy()
     for p in np.unique(pose):

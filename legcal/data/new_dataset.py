@@ -438,9 +438,10 @@ def _sigmas(
         else:
             found[name] = max(digit, SIGMA_ANGLE if leg.reads_angle else MIN_SIGMA)
     if given is None:
-        of = {True: "rad", False: "m"}
-        said = [f"{name} {found[name]:.2g} {of[leg.reads_angle]}" for leg, name in
-                zip(motors, found, strict=True)]  # fmt: skip
+        said = [
+            f"{name} {sigma:.2g} {leg.reading_unit}"
+            for leg, (name, sigma) in zip(motors, found.items(), strict=True)
+        ]
         why = "the last digit of the table, at least that of a good encoder"
         if any(unit.name == PULSES for unit in units):
             why = "half a degree of what a hobby servo makes of its pulses"

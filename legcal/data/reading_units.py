@@ -50,9 +50,18 @@ class ReadingUnit:
         return value / self.size + self.zero
 
 
+def legs_with_readings(legs: Sequence[Leg]) -> list[Leg]:
+    """Return the legs of which a table has readings: of rods on one actuator the first."""
+    found: dict[str, Leg] = {}
+    for leg in legs:
+        if leg.is_motor:
+            found.setdefault(str(leg.prismatic), leg)
+    return list(found.values())
+
+
 def default_unit(leg: Leg) -> ReadingUnit:
     """Return the unit of readings of which nothing is said."""
-    return ReadingUnit("rad" if leg.reads_angle else "m")
+    return ReadingUnit(leg.reading_unit)
 
 
 def unit_of_pulses(pulses: Pulses) -> ReadingUnit:
@@ -121,10 +130,7 @@ def reading_units(
     DatasetError
         With one sentence for each motor whose readings cannot have their unit.
     """
-    motors = dict[str, Leg]()
-    for leg in legs:
-        if leg.is_motor:
-            motors.setdefault(str(leg.prismatic), leg)
+    motors = {str(leg.prismatic): leg for leg in legs_with_readings(legs)}
     units = {name: default_unit(leg) for name, leg in motors.items()}
     if stated is None:
         return units

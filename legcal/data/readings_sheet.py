@@ -19,7 +19,7 @@ import numpy as np
 from legcal.data.measurements import few, in_travel, reading_columns, readings_of_lengths
 from legcal.data.reading_units import PULSES, ReadingUnit, unit_named
 from legcal.errors import DatasetError, UsageError
-from legcal.files import ANGLE, LENGTH, Column, Lines, Table, describe, split_heading
+from legcal.files import ANGLE, LENGTH, SHOWN_IN, Column, Lines, Table, describe, split_heading
 from legcal.geometry import Array
 from legcal.machine import Leg, Pulses
 
@@ -307,7 +307,7 @@ def readings_of(
     inside = in_travel(q, headings.motors)
     for row, j in np.argwhere(~inside).tolist():
         leg, unit = headings.motors[j], units[j]
-        size, shown = (math.degrees(1.0), "deg") if leg.reads_angle else (1e3, "mm")
+        size, shown = SHOWN_IN[leg.reading_unit]
         low, high = (size * x for x in leg.travel)
         table.refuse(
             row,

@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.exports.identifiers import comment
 from legcal.exports.robot_files import STUB_INERTIA, STUB_MASS
-from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject
+from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject, other_gains
 from legcal.geometry import Array
 from legcal.machine import Machine, UrdfJoint, origins_of, parse_robot
 from legcal.version import __version__
@@ -30,10 +30,9 @@ LEAST = 1e-15  # mass, moment of inertia or size that MuJoCo takes
 
 def mjcf_refusal(subject: Subject) -> str | None:
     """Return why a machine's tree cannot be MuJoCo's, or None."""
-    gains = [f"'{a.joint}' {a.gain:.9g}" for a in subject.machine.actuators if a.gain != 1.0]
-    if gains:
+    if gains := other_gains(subject.machine):
         return (
-            f"found gains other than 1 ({', '.join(gains)}), needed joints that move by their "
+            f"found gains other than 1 ({gains}), needed joints that move by their "
             "readings, as those of MuJoCo do"
         )
     urdf = subject.machine.urdf

@@ -14,7 +14,7 @@ import yaml
 from lxml import etree
 
 from legcal.exports.identifiers import identifier
-from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject
+from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject, other_gains
 from legcal.files import motion_to_xyz_quat
 from legcal.machine import Machine
 from legcal.version import __version__
@@ -70,12 +70,11 @@ def urdf_text(machine: Machine, *, inertia: bool) -> tuple[bytes, tuple[str, ...
             etree.SubElement(motor, "actuator", name=f"{leg.prismatic}_motor")
     etree.indent(robot)
     content = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
-    gains = [f"'{a.joint}' {a.gain:.9g}" for a in machine.actuators if a.gain != 1.0]
-    notes = [
-        f"Joints move by their readings times the gain, which a URDF has no place for: {gain}."
-        for gain in [", ".join(gains)]
-        if gains
-    ]
+    notes = []
+    if gains := other_gains(machine):
+        notes.append(
+            f"Joints move by their readings times the gain, which a URDF has no place for: {gains}."
+        )
     if meshes:
         named_meshes = ", ".join(meshes[:3]) + " and more" * (len(meshes) > 3)
         notes.append(f"Meshes lie in files of their own and were left out: {named_meshes}.")

@@ -71,6 +71,11 @@ def one_file(text: str, notes: tuple[str, ...] = ()) -> Rendered:
     return Rendered((ExportedFile("", text.encode()),), notes)
 
 
+def other_gains(machine: Machine) -> str:
+    """Return the gains other than 1 of motors, which formats have no place for, in words."""
+    return ", ".join(f"'{a.joint}' {a.gain:.9g}" for a in machine.actuators if a.gain != 1.0)
+
+
 def load_subject(given: str | Path) -> Subject:
     """Return what is exported: the result in a folder or ``result.json``, else a mechanism.
 

@@ -14,6 +14,7 @@ from .folder import temporary_folder as temporary_folder
 from .folder import write_atomically as write_atomically
 from .motions import QUATERNION_TOLERANCE as QUATERNION_TOLERANCE
 from .motions import MotionEntry as MotionEntry
+from .motions import Pose as Pose
 from .motions import Quaternion as Quaternion
 from .motions import Vector as Vector
 from .motions import motion_from_xyz_quat as motion_from_xyz_quat
@@ -27,6 +28,7 @@ from .quantity import EXAMPLE as EXAMPLE
 from .quantity import LENGTH as LENGTH
 from .quantity import PIXELS as PIXELS
 from .quantity import PRIOR_SCHEMA as PRIOR_SCHEMA
+from .quantity import SHOWN_IN as SHOWN_IN
 from .quantity import Quantity as Quantity
 from .quantity import parse_quantity as parse_quantity
 from .quantity import read_prior as read_prior
@@ -45,7 +47,6 @@ from .schema import FileSchema as FileSchema
 from .schema import Name as Name
 from .schema import Number as Number
 from .schema import PlainName as PlainName
-from .schema import Pose as Pose
 from .schema import SparseDocument as SparseDocument
 from .schema import Triple as Triple
 from .schema import Version as Version

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
-from pydantic import AfterValidator, field_validator
+from pydantic import AfterValidator, Field, field_validator
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.files.schema import FileSchema, Metres, Number
+from legcal.files.schema import Document, FileSchema, Metres, Number, Triple
 from legcal.geometry import motion_of
 
 QUATERNION_TOLERANCE = 1e-3  # files round to a few digits; more is a mistake
@@ -46,6 +46,22 @@ class MotionEntry(FileSchema):
     def motion(self) -> RigidTransform:
         """Return the motion, its quaternion made exactly unit."""
         return motion_from_xyz_quat(self.xyz, self.quat_xyzw)
+
+
+class Pose(Document):
+    """A rigid motion."""
+
+    xyz: Triple
+    quat_xyzw: Annotated[list[Number], Field(min_length=4, max_length=4)]
+
+    @classmethod
+    def of(cls, T: RigidTransform) -> "Pose":
+        """Return a motion as documents have it."""
+        return cls(**motion_to_xyz_quat(T))
+
+    def motion(self) -> RigidTransform:
+        """Return the motion; ValueError if its quaternion is none of a turn."""
+        return MotionEntry(**self.model_dump()).motion()
 
 
 def motion_from_xyz_quat(xyz: Sequence[float], quat_xyzw: Sequence[float]) -> RigidTransform:

@@ -144,13 +144,6 @@ class SparseDocument(Document):
         return {key: value for key, value in whole(self).items() if key not in absent}
 
 
-class Pose(Document):
-    """A rigid motion."""
-
-    xyz: Triple
-    quat_xyzw: Annotated[list[Number], Field(min_length=4, max_length=4)]
-
-
 class _Loader(yaml.SafeLoader):
     """Safe YAML: keys are text, repeated keys are refused, 2e-6 is a number and 6:25 is not.
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -102,10 +102,6 @@ class Pulses:
         """Return the joint values [rad] of pulses [us]."""
         return np.asarray(np.radians((pulses - self.centre) / self.per_degree))
 
-    def of(self, angle: float) -> float:
-        """Return the pulse [us] of a joint value [rad]."""
-        return self.centre + self.per_degree * float(np.degrees(angle))
-
 
 @dataclass(frozen=True, eq=False)
 class Actuator:
@@ -126,7 +122,7 @@ class Actuator:
         return self.kind is ActuatorKind.REVOLUTE
 
     @property
-    def unit(self) -> str:
+    def unit(self) -> Literal["m", "rad"]:
         """The unit of its readings."""
         return "rad" if self.turns else "m"
 

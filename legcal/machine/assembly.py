@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError
-from legcal.files import motion_to_xyz_quat
+from legcal.files import SHOWN_IN, motion_to_xyz_quat
 from legcal.geometry import (
     Array,
     cross,
@@ -434,7 +434,7 @@ def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, fl
         stated = described.home_readings.get(actuator.joint)
         chosen, other = _candidates(rods[0], T, stated)
         found[actuator.joint] = chosen
-        unit, scale = ("deg", np.degrees(1.0)) if actuator.turns else ("mm", 1e3)
+        scale, unit = SHOWN_IN[actuator.unit]
         low, high = (scale * end for end in actuator.travel)
         where = f"{described.source}: motor '{actuator.joint}' cannot close at home"
         needed = f"needed one in its travel of {low:.6g} to {high:.6g} {unit}"

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import model_validator
 
-from legcal.files import Document, Number, Pose, SparseDocument, Triple, motion_to_xyz_quat
+from legcal.files import Document, Number, Pose, SparseDocument, Triple
 from legcal.machine.leg import JointType, Leg, LegKind
 from legcal.machine.model import Machine, readings_at
 
@@ -93,7 +93,7 @@ def machine_document(machine: Machine) -> dict[str, Any]:
         n_ac=len(kinds) - kinds.count(LegKind.PASSIVE),
         idle_spins=sum(leg.idle_spins for leg in machine.legs),
         base_frame=[machine.leg_names[j] for j in machine.frame_legs],
-        home=Pose.model_validate(motion_to_xyz_quat(machine.home)),
+        home=Pose.of(machine.home),
         legs=[_leg(leg, q) for leg, q in zip(machine.legs, readings, strict=True)],
         actuators=actuators or None,
         diagnostics=list(machine.diagnostics),

@@ -342,7 +342,7 @@ def contradiction(machine: Machine, T: RigidTransform, readings: Array) -> str |
     worst, most = int(np.argmax(test)), MAX_CONTRADICTION * leg_scale(machine, T)
     if test[worst] <= most:
         return None
-    names = [leg.name if leg.actuator is None else leg.actuator.joint for leg in legs]
+    names = [leg.motor_label for leg in legs]
     alike = [names[i] for i in np.flatnonzero(test > ALIKE * test[worst]).tolist()]
     alike.remove(names[worst])
     others = f" (or as likely one of {', '.join(alike)})" if alike else ""

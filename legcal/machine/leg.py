@@ -292,6 +292,16 @@ class Leg:
         """Whether its motor turns, so that its reading is an angle [rad]."""
         return self.actuator is not None and self.actuator.turns
 
+    @property
+    def reading_unit(self) -> Literal["m", "rad"]:
+        """The unit of its readings."""
+        return "m" if self.actuator is None else self.actuator.unit
+
+    @property
+    def motor_label(self) -> str:
+        """What messages call its motor: the joint that moves A, else the leg itself."""
+        return self.name if self.actuator is None else self.actuator.joint
+
     def reading_of(self, distance: float) -> float:
         """Return the reading [m or rad] by which its motor moves the joint at A, or B, so far [m].
 

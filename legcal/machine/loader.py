@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import LegcalError, ModelError, OutOfClass
-from legcal.files import MotionEntry, closest, motion_to_xyz_quat
+from legcal.files import SHOWN_IN, MotionEntry, closest, motion_to_xyz_quat
 from legcal.geometry import Array
 from legcal.machine.actuator import Actuator, Pulses
 from legcal.machine.bodies import Bodies, rigid_bodies
@@ -331,7 +331,7 @@ def _readings_at_home(machine: Machine, given: Mapping[str, float]) -> list[floa
         inside = [bool(leg.in_travel(np.array([x]))[0]) for x in both]
         scale = 1e-6 * max(1.0, float(np.ptp(leg.travel)))
         if all(inside) and abs(both[0] - both[1]) > scale:
-            size, unit = (180.0 / np.pi, "deg") if leg.actuator.turns else (1e3, "mm")
+            size, unit = SHOWN_IN[leg.reading_unit]
             raise ModelError(
                 f"{path}: the assembly of leg '{leg.name}' at home is ambiguous: found that its "
                 f"rod reaches the platform at the readings {size * both[0]:.1f} and "

@@ -121,9 +121,7 @@ def build_scalar_products(machine: NominalMachine, joints: JointsInCamera) -> Le
     carried = tuple(
         tuple(j for j in of_view if (v, j) in joints.carriers) for v, of_view in enumerate(legs)
     )
-    turning = tuple(
-        j for j, leg in enumerate(machine.legs) if leg.actuator is not None and leg.actuator.turns
-    )
+    turning = tuple(j for j, leg in enumerate(machine.legs) if leg.reads_angle)
     seen = list[float]()
     for v, of_view in enumerate(zip(legs, axes, carried, strict=True)):
         w, c = np.zeros((2, machine.n_legs, 3))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.calibration import KINDS, PlatformError
-from legcal.files import Document, Number, Pose, Version, motion_to_xyz_quat
+from legcal.files import Document, Number, Pose, Version
 from legcal.geometry import Array, BoolArray
 from legcal.machine import Configurations, Machine
 from legcal.planning.goals import Goal
@@ -145,12 +145,12 @@ class Plan:
                 source=noise.source,
             ),
             board=self.board is not None,
-            T_base_board=None if self.board is None else _pose(self.board.T_base_board),
+            T_base_board=None if self.board is None else Pose.of(self.board.T_base_board),
             hand_held=self.hand_held,
             given=self.given or None,
             views={
                 view.name: ViewOfPlan(
-                    T_base_camera=_pose(view.T_base_camera),
+                    T_base_camera=Pose.of(view.T_base_camera),
                     images=len(view.poses.poses),
                     legs=dict(zip(names, view.shows.sum(axis=0).tolist(), strict=True)),
                 )
@@ -161,11 +161,6 @@ class Plan:
             limits=self.limits,
             notes=list(self.notes),
         ).document()
-
-
-def _pose(T: RigidTransform) -> Pose:
-    """Return a motion as documents have it."""
-    return Pose.model_validate(motion_to_xyz_quat(T))
 
 
 class ExpectedError(Document):

@@ -16,7 +16,6 @@ from legcal.data import (
     SIGMA_ANGLE,
     few,
     plan_new_dataset,
-    reading_columns,
     write_new_dataset,
 )
 from legcal.errors import DatasetError, OutOfResources, UsageError
@@ -162,8 +161,7 @@ class Import:
         By joint [m or rad] where a motor turns.
         """
         scatter = np.max([view.scatter for view in self.views], axis=0)
-        turning = [bool((on := self.machine.legs[j].actuator) and on.turns)
-                   for j in self.machine.motors]  # fmt: skip
+        turning = [self.machine.legs[j].reads_angle for j in self.machine.motors]
         if not any(turning):
             return max(float(scatter.max()), MIN_SIGMA)
         return {
@@ -413,10 +411,8 @@ def import_recordings(
         If files are in the way and *force* is not given.
     """
     check_path(found.destination)
-    of = {"metres": "m", "radians": "rad"}
-    joints = [
-        f"{column.name} [{of[column.unit]}]" for column in reading_columns(found.machine.legs)
-    ]
+    motors = [found.machine.legs[j] for j in found.machine.motors]
+    joints = [f"{leg.prismatic} [{leg.reading_unit}]" for leg in motors]
     try:
         with temporary_folder(existing_parent(found.destination), found.destination.name) as folder:
             rows: list[tuple[object, ...]] = []

@@ -12,6 +12,7 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from legcal.calibration import Location
+from legcal.files import SHOWN_IN
 from legcal.geometry import roll_pitch_yaw
 from legcal.report.render import heading, report, table
 
@@ -95,7 +96,7 @@ def _motors(description: dict[str, Any]) -> RenderableType:
     for joint, motor in description["actuators"].items():
         rods = [leg for leg in description["legs"] if leg.get("actuator") == joint]
         turns = motor["kind"] == "revolute"
-        scale, unit = (degrees(1.0), "deg") if turns else (1e3, "mm")
+        scale, unit = SHOWN_IN["rad" if turns else "m"]
         low, high = rods[0]["travel"]
         rows.append(
             (

@@ -6,12 +6,12 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
 from legcal.data import NewDataset
 from legcal.errors import printable
+from legcal.files import SHOWN_IN
 from legcal.recordings import Import
 from legcal.report.render import heading, report, table
 
@@ -22,9 +22,7 @@ def matching_table(new: NewDataset) -> RenderableType:
     """Return what was understood of a folder and a table, and which photograph has which row."""
     pairs = list(zip(new.matching.pairs, new.views, strict=True))
     joints = new.joints
-    first = new.machine.legs[new.machine.motors[0]].actuator
-    turns = first is not None and first.turns
-    size, unit = (np.degrees(1.0), "deg") if turns else (1e3, "mm")
+    size, unit = SHOWN_IN[new.machine.legs[new.machine.motors[0]].reading_unit]
     rows = [
         (
             str(k + 1),

@@ -14,6 +14,7 @@ from rich.console import RenderableType
 
 from legcal.errors import printable
 from legcal.figures import new_figure, plain
+from legcal.files import SHOWN_IN
 from legcal.geometry import Array
 from legcal.machine import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR, vectors_A_to_B
 from legcal.pages import Drawing, Items, Picture, Row, page_html
@@ -44,9 +45,8 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
         for view in plan.views
     ]
     worst = np.argsort(-np.nan_to_num(plan.sigma), kind="stable")[:_WORST]
-    unit = {"m": (1e3, "mm"), "rad": (float(np.degrees(1.0)), "deg")}
     parameters = [
-        (plan.names[i], f"{unit[plan.units[i]][0] * plan.sigma[i]:.4f}", unit[plan.units[i]][1])
+        (plan.names[i], f"{SHOWN_IN[plan.units[i]][0] * plan.sigma[i]:.4f}", SHOWN_IN[plan.units[i]][1])
         for i in worst.tolist()
     ]
     growth = [(f"{n:.0f}", _shown(plan, value)) for n, value in _told(plan)]

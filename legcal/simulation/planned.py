@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration import PLAN_NAME
 from legcal.data import Measurements, load_dataset
 from legcal.errors import DidNotConverge, NotVisible, UsageError
-from legcal.files import MotionEntry, Pose, read_json, validate
+from legcal.files import read_json, validate
 from legcal.geometry import Array
 from legcal.machine import Configurations, Machine, follow_each, poses_at
 from legcal.planning import PlanDocument, Setting, difference
@@ -88,8 +87,8 @@ def read_plan(folder: Path, nominal: Machine) -> PlannedSession:
     """Return a planned session of a machine. Raises UsageError if it is none, or of another one."""
     try:
         plan = validate(PlanDocument, dict(read_json(folder / PLAN_NAME)), folder / PLAN_NAME)
-        places = [_motion(view.T_base_camera) for view in plan.views.values()]
-        laid = None if plan.T_base_board is None else _motion(plan.T_base_board)
+        places = [view.T_base_camera.motion() for view in plan.views.values()]
+        laid = None if plan.T_base_board is None else plan.T_base_board.motion()
     except (OSError, ValueError, TypeError) as error:
         raise UsageError(
             f"{folder}: the plan could not be shot: found no {PLAN_NAME} in it that can be read, "
@@ -121,8 +120,3 @@ def read_plan(folder: Path, nominal: Machine) -> PlannedSession:
         both = zip(m.views, places, strict=True)
         m = replace(m, views=tuple(replace(view, T_base_camera=T) for view, T in both))
     return PlannedSession(m, setting, board, hand)
-
-
-def _motion(pose: Pose) -> RigidTransform:
-    """Return a motion of the document; ValueError if it is none."""
-    return MotionEntry(**pose.model_dump()).motion()

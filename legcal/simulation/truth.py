@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, ModelError, OutOfClass, UsageError
-from legcal.files import MAX_TEXT, read_bytes
+from legcal.files import MAX_TEXT, SHOWN_IN, read_bytes
 from legcal.machine import (
     Leg,
     Machine,
@@ -94,7 +94,7 @@ def _check(errors: ParameterErrors) -> None:
     for kind in KINDS:
         size = getattr(errors, kind).size
         if not (math.isfinite(size) and 0.0 <= size <= MAX_SIZE):
-            scale, unit = (np.rad2deg(1.0), "deg") if kind in ANGLES else (1e3, "mm")
+            scale, unit = SHOWN_IN["rad" if kind in ANGLES else "m"]
             problems.append(
                 f"The errors of {kind.replace('_', ' ')} could not be drawn: found a size of "
                 f"{scale * size:g} {unit}, needed 0 to {scale * MAX_SIZE:.3g} {unit}; correct it."

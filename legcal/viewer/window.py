@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from legcal.errors import UsageError
+from legcal.files import SHOWN_IN
 from legcal.geometry import Array
 from legcal.machine import COORDINATES
 from legcal.scene import FACTORS
@@ -294,9 +295,7 @@ class Window:
         ):
             slider.value = _shown(value * _scale(int(motion.own[k])), slider.min, slider.max)
         legs = [self.source.machine.legs[j] for j in np.flatnonzero(motion.at_end)]
-        ends = dict.fromkeys(
-            leg.name if leg.actuator is None else leg.actuator.joint for leg in legs
-        )
+        ends = dict.fromkeys(leg.motor_label for leg in legs)
         lines = []
         if ends:
             lines.append(f"**At the end of the travel:** {_plain(', '.join(ends))}")
@@ -367,7 +366,7 @@ class Window:
 
     def _scale(self, leg: int) -> float:
         """Return by what the reading of a leg is multiplied for people: mm, or degrees of arms."""
-        return float(np.degrees(1.0)) if self.source.machine.legs[leg].reads_angle else 1e3
+        return SHOWN_IN[self.source.machine.legs[leg].reading_unit][0]
 
     def _place(self, k: int, value: float) -> None:
         self.motion.place(k, value / _scale(int(self.motion.own[k])))

@@ -141,7 +141,7 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         source = every.copy()
         source[i], source[k] = k, i
         ones = [given.machine.legs[motors[i]], given.machine.legs[motors[k]]]
-        legs = " and ".join(str(leg.prismatic if leg.actuator else leg.name) for leg in ones)
+        legs = " and ".join(leg.motor_label for leg in ones)
         what = "motors" if all(leg.actuator for leg in ones) else "legs"
         yield Mistake(
             "columns exchanged",

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration import Calibration
 from legcal.data import row_names
 from legcal.geometry import Array, components
-from legcal.machine import Leg, geometries, moved_legs
+from legcal.machine import MOTOR_COLOUR, Leg, geometries, moved_legs
 from legcal.pages import Plot, plain
 from legcal.report.page.residual_plots import FONT
 from legcal.scene import (
@@ -36,7 +36,6 @@ _SLOPE = 0.4  # of what is seen, to the line of sight
 _N_RING = 20  # points of a ring
 _GREY, _BLUE, _AMBER, _GREEN = "#9aa1ab", "#1f5fa8", "#b26a00", "#1e7d46"
 _NO_LINES = np.zeros((0, 2, 3))
-_BROWN = "#8a6d3b"
 
 
 class _Placed(NamedTuple):
@@ -113,7 +112,7 @@ def machine_scene(calibration: Calibration) -> Plot:
         _lines("calibrated platform", _BLUE, 3, legend=False),
         _lines(f"1 sigma, {ring_factor:g} times as large", _AMBER, 2),
         _lines("nominal motors", _GREY, 4, legend=False),
-        _lines("calibrated motors", _BROWN, 8, legend=False),
+        _lines("calibrated motors", MOTOR_COLOUR, 8, legend=False),
         cameras,
         _words(names, found.A[0], "#1d2126"),
     ]
