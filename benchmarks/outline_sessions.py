@@ -407,7 +407,7 @@ def nominal_start(session: OutlineSession) -> Start:
     for j, a in enumerate(actuator_index(legs.nominal)):
         if a >= 0:
             home[j] = readings_of_rods(legs.nominal, R, t)[0, a]
-    wanted = legs.sign * measurements.q[measurements.first_rows]
+    wanted = legs.sign * measurements.q_of_poses
     for part in WAY:
         poses = platform_poses(legs.nominal, home + part * (wanted - home), poses, legs.frame_legs)
     return start_from(legs.nominal, measurements, legs, cameras, poses, "nominal")

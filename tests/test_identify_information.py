@@ -332,7 +332,7 @@ def test_a_dataset_gives_its_own_readings_cameras_and_legs() -> None:
     session, m = example().predicted, dataset.measurements
     assert (session.n_views, len(session.view), len(session.t)) == (3, m.n_rows, m.n_poses)
     q = (session.length - dataset.machine.q0) * dataset.machine.sign
-    np.testing.assert_allclose(q, m.q[m.first_rows], atol=1e-5)
+    np.testing.assert_allclose(q, m.q_of_poses, atol=1e-5)
     to_Rb = dataset.machine.T_base_Rb.inv()
     for camera, view in zip(session.camera, m.views, strict=True):
         if view.T_base_camera is not None:

@@ -357,7 +357,7 @@ def test_the_start_is_the_nominal_model_at_the_readings(machine: str) -> None:
     nominal = session.legs.nominal
     start = nominal_start(session)
     assert start.legs == nominal
-    q = session.measurements.q[session.measurements.first_rows]
+    q = session.measurements.q_of_poses
     lengths = session.legs.sign * q + np.array([leg.q0 for leg in nominal])
     A, B = (np.array([getattr(leg, name) for leg in nominal]) for name in "AB")
     found = np.array([np.linalg.norm(T.apply(B) - A, axis=1) for T in start.T_Rb_Re])

@@ -105,7 +105,7 @@ def test_without_errors_and_noise_the_dataset_is_that_of_the_model(tmp_path: Pat
     m, truth = load_dataset(made.folder).measurements, truth_of(made.folder)
     assert (m.n_rows, m.pose_labels) == (8, ("p01", "p02"))
     assert m.pose.tolist() == [0, 0, 1, 1] * 2  # two images of each pose, seen by all views
-    for label, q in zip(m.pose_labels, m.q[m.first_rows], strict=True):
+    for label, q in zip(m.pose_labels, m.q_of_poses, strict=True):
         assert list(truth["poses"][label]["joints"].values()) == pytest.approx(q, abs=1e-12)
     assert all(view.T_base_camera is None and view.legs is None for view in m.views)
     given = files_of(made.folder)

@@ -99,7 +99,7 @@ def test_errors_of_readings_have_their_standard_deviation_and_shape(uniform: boo
     )
     m = session.measurements
     lengths = np.linalg.norm(simulated_leg_vectors(machine.parameters, session.T_Rb_Re), axis=-1)
-    error = (m.q[m.first_rows] - (lengths - machine.parameters.offsets)) / 1e-5
+    error = (m.q_of_poses - (lengths - machine.parameters.offsets)) / 1e-5
     assert error.std() == pytest.approx(1.0, rel=0.1)
     assert (np.abs(error).max() < np.sqrt(3.0) + 1e-6) == uniform
 

@@ -38,13 +38,13 @@ from .joint_fit.outline_errors import possible_biases as possible_biases
 from .joint_fit.outline_errors import with_gamma as with_gamma
 from .joint_fit.parameter_choices import NO_CHOICES as NO_CHOICES
 from .joint_fit.parameter_choices import Choices as Choices
+from .joint_fit.parameter_choices import joints_of_length as joints_of_length
 from .joint_fit.platform import PlatformError as PlatformError
 from .joint_fit.platform import expected_error as expected_error
 from .joint_fit.platform import platform_by_parameters as platform_by_parameters
 from .joint_fit.platform import poses_at_readings as poses_at_readings
 from .joint_fit.problem import FitProblem as FitProblem
 from .joint_fit.problem import build_fit as build_fit
-from .joint_fit.problem import unchecked_fit as unchecked_fit
 from .joint_fit.solution import Solution as Solution
 from .joint_fit.variables import DEFAULT_SETTINGS as DEFAULT_SETTINGS
 from .joint_fit.variables import FittedLegs as FittedLegs

@@ -185,20 +185,23 @@ def possible_changes(
         (one.joint, [j for j, other in enumerate(on) if other == a], _of_actuator(one))
         for a, one in enumerate(actuators_of(legs))
     ]
+
+    def derivative(which: Sequence[int], moved: _Moved, k: int) -> Array:
+        """Return that of the parameters by number k of what changes at some legs, (p,)."""
+        before, after = (
+            _in_frames_of_joints(
+                [moved(leg, k, step) if j in which else leg for j, leg in enumerate(legs)],
+                frame_legs,
+            )
+            for step in (-_STEP, _STEP)
+        )
+        change = vector_of(parametrization, after, legs) - vector_of(parametrization, before, legs)
+        return np.asarray(change / (2.0 * _STEP))
+
     for name, which, changes in things:
         of_thing = list[Change]()
         for what, components, units, link, moved in changes:
-            derivatives = []
-            for k in range(len(components)):
-                ends = []
-                for step in (-_STEP, _STEP):
-                    changed = list(legs)
-                    for j in which:
-                        changed[j] = moved(legs[j], k, step)
-                    there = _in_frames_of_joints(changed, frame_legs)
-                    ends.append(vector_of(parametrization, there, legs))
-                derivatives.append((ends[1] - ends[0]) / (2.0 * _STEP))
-            columns = np.column_stack(derivatives)
+            columns = np.column_stack([derivative(which, moved, k) for k in range(len(components))])
             found = np.any(np.abs(columns) > _STEP, axis=0)
             if found.any():
                 kept = np.flatnonzero(found).tolist()

@@ -216,7 +216,7 @@ def _readings_of(dataset: Dataset, machine: Machine) -> Array:
             f"has no {', '.join(missing)}; the dataset must belong to the same machine."
         )
     legs = [names.index(name) for name in machine.leg_names]
-    return dataset.measurements.q[dataset.measurements.first_rows][:, legs]
+    return dataset.measurements.q_of_poses[:, legs]
 
 
 def _poses_at(machine: Machine, q: Array) -> list[RigidTransform | None]:

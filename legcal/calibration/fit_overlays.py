@@ -79,7 +79,7 @@ def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
     """Return the outlines of a fit, and where it has the legs and cameras, as a detection."""
     machine, measurements = dataset.machine, dataset.measurements
     poses = components(solution.T_Rb_Re)
-    q = measured_readings(solution.legs, *poses, measurements.q[measurements.first_rows])
+    q = measured_readings(solution.legs, *poses, measurements.q_of_poses)
     A, B = ends_in_base(solution.legs, machine.T_base_Rb, *poses, q)
     cylinders = tuple(
         tuple(replace(c, radius=solution.radii.get((j, c.link), c.radius)) for c in leg.cylinders)

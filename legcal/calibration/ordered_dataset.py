@@ -217,7 +217,7 @@ def nominal_poses(
     DatasetError
         Naming the images whose residual is more than 3 % of the mean leg length.
     """
-    q = measurements.q[measurements.first_rows]
+    q = measurements.q_of_poses
     if not machine.is_determined:
         home = [platform_in_base(machine, machine.home)] * len(q)
         return _least_squares(machine, q, home)[0], np.zeros(len(q))
@@ -258,7 +258,7 @@ def _contradictions(
     """Return what is found of poses at which readings of redundant motors contradict others."""
     if not machine.is_redundant:
         return {}
-    q = measurements.q[measurements.first_rows][:, list(machine.motors)]
+    q = measurements.q_of_poses[:, list(machine.motors)]
     from_Re = machine.T_platform_Re.inv()
     found = [
         contradiction(machine, product(machine.T_base_Rb, T, from_Re), row)

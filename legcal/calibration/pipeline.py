@@ -494,7 +494,7 @@ def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredIm
     """Return where a fit puts the legs, R_b laid on the nominal one; no camera is placed anew."""
     T_base_Rb, poses = data.machine.T_base_Rb, components(data.poses_by(solution.legs))
     m = data.measurements
-    q = measured_readings(solution.legs, *poses, m.q[m.first_rows])
+    q = measured_readings(solution.legs, *poses, m.q_of_poses)
     A, B = ends_in_base(solution.legs, T_base_Rb, *poses, q)
     pose = data.measurements.pose
     cameras = tuple(

@@ -262,7 +262,7 @@ def _staged(calibration: Calibration) -> Staged | NoSteps:
     from_fit = None
     if calibration.platform is not None:
         measurements = calibration.dataset.measurements
-        near, q = calibration.solution.T_Rb_Re, measurements.q[measurements.first_rows]
+        near, q = calibration.solution.T_Rb_Re, measurements.q_of_poses
         displacement, rotation = pose_differences(
             poses_at_readings(machine, steps.legs, q, near),
             poses_at_readings(machine, calibration.solution.legs, q, near),

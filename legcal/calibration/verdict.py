@@ -49,7 +49,7 @@ def judge(
         solution.legs,
         solution.parametrization,
         solution.kinematic_covariance + solution.held_covariance,
-        measurements.q[measurements.first_rows],
+        measurements.q_of_poses,
         solution.T_Rb_Re,
         solution.sensitivities,
     )

@@ -89,6 +89,11 @@ class Measurements:
         return np.asarray(np.unique(self.pose, return_index=True)[1])
 
     @property
+    def q_of_poses(self) -> Array:
+        """The readings of every pose, (n_poses, n_legs) [m or rad]."""
+        return self.q[self.first_rows]
+
+    @property
     def n_poses(self) -> int:
         """Number of different platform poses."""
         return int(self.pose.max()) + 1 if len(self.pose) else 0

@@ -34,6 +34,7 @@ from .drawing import MOTOR_COLOUR as MOTOR_COLOUR
 from .drawing import PLATFORM_COLOUR as PLATFORM_COLOUR
 from .drawing import MotorLines as MotorLines
 from .drawing import around as around
+from .drawing import corners_of_base as corners_of_base
 from .drawing import motor_lines as motor_lines
 from .equations import PoseEquations as PoseEquations
 from .equations import VectorOps as VectorOps

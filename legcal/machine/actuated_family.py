@@ -143,29 +143,35 @@ def _hexaglide(size: Mapping[str, float], travel: tuple[float, float]) -> Made:
 
 
 def _three_prs(size: Mapping[str, float], travel: tuple[float, float]) -> Made:
-    """Return three upright rails whose rods lean inwards, each in its plane."""
-    R, r, h = size["base_radius"], size["platform_radius"], size["height"]
-    up = _leg_over(size["rod_length"], R - r, "inwards")
-    motors, rods = list[tuple[Array, Array]](), list[Rod]()
-    for k in range(3):
-        out, _ = _third(k)
-        A = R * out + (h - up - 0.5 * sum(travel)) * _Z
-        motors.append((A, _Z))
-        rods.append(Rod(A, r * out, k))
-    return Made(tuple(motors), tuple(rods), h)
+    """Return three upright rails with a rod each, the platform above the carriages."""
+    ends = _on_upright_rails(size, travel, side=-1.0)
+    motors = tuple((A, _Z) for A, _, _ in ends)
+    rods = tuple(Rod(A, B, k) for k, (A, B, _) in enumerate(ends))
+    return Made(motors, rods, size["height"])
 
 
 def _linear_delta(size: Mapping[str, float], travel: tuple[float, float]) -> Made:
     """Return three upright rails with two parallel rods each, the platform below the carriages."""
+    ends = _on_upright_rails(size, travel, side=1.0)
+    motors, rods = tuple((A, _Z) for A, _, _ in ends), list[Rod]()
+    for k, (A, B, along) in enumerate(ends):
+        rods += _pair(A, B, along, size["rod_spacing"], k)
+    return Made(motors, tuple(rods), size["height"])
+
+
+def _on_upright_rails(
+    size: Mapping[str, float], travel: tuple[float, float], *, side: float
+) -> list[tuple[Array, Array, Array]]:
+    """Return A, B and the direction along the circle of rods that lean inwards on three rails.
+
+    Carriages are above the platform (*side* 1) or below it (-1).
+    """
     R, r, h = size["base_radius"], size["platform_radius"], size["height"]
-    down = _leg_over(size["rod_length"], R - r, "inwards")
-    motors, rods = list[tuple[Array, Array]](), list[Rod]()
-    for k in range(3):
-        out, along = _third(k)
-        A = R * out + (h + down - 0.5 * sum(travel)) * _Z
-        motors.append((A, _Z))
-        rods += _pair(A, r * out, along, size["rod_spacing"], k)
-    return Made(tuple(motors), tuple(rods), h)
+    away = side * _leg_over(size["rod_length"], R - r, "inwards")
+    thirds = [_third(k) for k in range(3)]
+    return [
+        (R * out + (h + away - 0.5 * sum(travel)) * _Z, r * out, along) for out, along in thirds
+    ]
 
 
 def _orthoglide(size: Mapping[str, float], travel: tuple[float, float]) -> Made:

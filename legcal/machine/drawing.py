@@ -84,6 +84,11 @@ def motor_lines(legs: Sequence[Leg], A: Array) -> MotorLines:
     )
 
 
+def corners_of_base(A: Array, anchors: Array) -> Array:
+    """Return what the base is drawn about: where three motors or more stand, else its joints A."""
+    return anchors if len(anchors) > 2 else A
+
+
 def around(joints: Array) -> Array:
     """Return joints (n, 2) in the order of their angles about their middle."""
     away = joints - joints.mean(axis=0)
@@ -126,7 +131,7 @@ class Sketch:
                     (frame, np.vstack([T.translation, T.rotation.as_matrix().T])[:, axes])
                     for frame, T in frames
                 ),
-                (motors.anchors if len(motors.anchors) > 2 else A)[:, axes],
+                corners_of_base(A, motors.anchors)[:, axes],
                 motors.standing[..., axes],
                 motors.moving[0][..., axes],
             )

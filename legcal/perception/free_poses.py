@@ -191,7 +191,7 @@ def find_free_poses(
         view = int(m.view[row])
         image = _Image(view, pairs, sensor_extent(m.views[view].camera))
         images.setdefault(int(m.pose[row]), []).append(image)
-    scene = _Scene.of(machine, search.wanted, m.q[m.first_rows], images)
+    scene = _Scene.of(machine, search.wanted, m.q_of_poses, images)
     poses, cameras = dict[int, Array](), tuple(hints)
     for _ in range(ROUNDS):
         for k, found in zip(images, run(partial(_searched, scene, cameras), images), strict=True):

@@ -164,7 +164,7 @@ def nominal_placement(
     poses = np.array([T.as_matrix() for T in T_base_platform])
     A_base = B_base - vectors_at(machine, poses)
     if machine.actuators:
-        q = measurements.q[measurements.first_rows]
+        q = measurements.q_of_poses
         read = measured_readings(machine.legs, poses[:, :3, :3], poses[:, :3, 3], q)
         A_base = joints_at(machine.legs, read)
     hints = tuple(view.T_base_camera for view in measurements.views)

@@ -27,9 +27,9 @@ from legcal.calibration import (
     NoiseModel,
     Start,
     State,
+    build_fit,
     fitted_legs,
     possible_biases,
-    unchecked_fit,
     with_gamma,
 )
 from legcal.data import Measurements, Outlines, View
@@ -133,9 +133,7 @@ class Predictor:
             q=q,
             sigma_q=self.sigma_q,
         )
-        problem = unchecked_fit(
-            self.legs, measurements, self.noise.of(outlines), choices=self.choices
-        )
+        problem = build_fit(self.legs, measurements, self.noise.of(outlines), choices=self.choices)
         biases = possible_biases(problem.outlines, self.legs.names)
         problem = problem.with_biases(
             biases.of_sizes(with_gamma(np.append(self.noise.common_px, 0.0)))

@@ -1,6 +1,6 @@
 from .motions import FACTORS as FACTORS
 from .motions import directions as directions
-from .motions import joints_at as joints_at
+from .motions import ends_at_readings as ends_at_readings
 from .motions import motors_at as motors_at
 from .motions import step_shown as step_shown
 from .shapes import around as around

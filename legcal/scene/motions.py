@@ -27,7 +27,7 @@ _SHOWN = 0.12  # of the size of the machine: how far the largest change is drawn
 _HELD = 1e-3  # [m]
 
 
-def joints_at(
+def ends_at_readings(
     machine: Machine,
     legs: Sequence[Leg],
     q: Array,

@@ -237,7 +237,7 @@ def one_fit(session: HexapodSession, nominal: PaperHexapod) -> KinematicParamete
     measurements = session.measurements
     axes = average_images(session.axes, measurements)
     legs = _legs(nominal)
-    lengths = nominal.sign * measurements.q[measurements.first_rows] + nominal.parameters.offsets
+    lengths = nominal.sign * measurements.q_of_poses + nominal.parameters.offsets
     start = start_from(
         legs.nominal,
         measurements,
@@ -258,6 +258,7 @@ def bound_covariance(session: HexapodSession, exact: LegAxes) -> Array:
     axes = average_images(exact, session.measurements)
     legs = _legs(session.machine)
     problem = build_fit(legs, session.measurements, no_outlines(), axes=axes)
+    problem.require_determined()
     truth = Start(
         legs.nominal,
         tuple(camera.T_Rb_camera.inv() for camera in session.cameras),

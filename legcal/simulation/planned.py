@@ -73,7 +73,7 @@ class PlannedSession:
         m = self.measurements
         reached: list[Array] = []
         try:
-            for configuration in follow_each(truth, m.q[m.first_rows][:, list(truth.motors)]):
+            for configuration in follow_each(truth, m.q_of_poses[:, list(truth.motors)]):
                 reached.append(configuration)
         except DidNotConverge as error:
             raise DidNotConverge(

@@ -21,6 +21,7 @@ from typing import Annotated, Any, get_type_hints
 import numpy as np
 from pydantic import Field, create_model
 
+from legcal.calibration import joints_of_length
 from legcal.data import SIGMA_RANGE
 from legcal.errors import UsageError
 from legcal.files import (
@@ -471,10 +472,10 @@ def _lengths(stated: Sequence[str], nominal: Machine) -> dict[str, float]:
 
 def joint_distance(machine: Machine, name: str) -> float | None:
     """Return the distance [m] of LEG.SIDE:LEG.SIDE, at reading 0 on the base; None of others."""
-    ends = [end.rpartition(".")[::2] for end in name.split(":")]
-    if len(ends) != 2 or any(leg not in machine.leg_names for leg, _ in ends):
+    joints = joints_of_length(name)
+    if joints is None or any(leg not in machine.leg_names for leg, _ in joints):
         return None
-    (one, side), (other, there) = ((machine.leg_names.index(leg), side) for leg, side in ends)
+    (one, side), (other, there) = ((machine.leg_names.index(leg), side) for leg, side in joints)
     if {side, there} == {"base", "platform"} and one == other:
         leg = machine.legs[one]
         return leg.q0 if leg.kind is LegKind.CONSTANT else None

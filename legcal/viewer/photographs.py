@@ -79,7 +79,7 @@ class Photographs:
         self.places = _places(source.dataset, source.result)
         self.names = row_names(measurements)
         self.poses = tuple(self.names[row] for row in measurements.first_rows.tolist())
-        self.q = measurements.q[measurements.first_rows]
+        self.q = measurements.q_of_poses
 
     @property
     def has_outlines(self) -> bool:

@@ -13,6 +13,7 @@ from legcal.geometry import Array
 from legcal.machine import (
     Leg,
     Machine,
+    corners_of_base,
     geometries,
     moved_legs,
     parametrization_of,
@@ -23,8 +24,8 @@ from legcal.scene import (
     around,
     directions,
     ellipsoids,
+    ends_at_readings,
     enlargement,
-    joints_at,
     motors_at,
     step_shown,
 )
@@ -113,7 +114,7 @@ class Stage:
         self._motor_radii = thickest * np.array(
             [_STANDING] * self.n_standing + [_MOVING] * home.moving.shape[1]
         )
-        self.rims = around(_corners(A, home.anchors)), around(B)
+        self.rims = around(corners_of_base(A, home.anchors)), around(B)
         self.ball_radii = _JOINT * np.array(
             [self._radii[self.rod_legs == j].max() for j in range(self.machine.n_legs)]
         )
@@ -199,7 +200,7 @@ class Stage:
             here.A,
             here.B,
             self._rods(here.A, here.B),
-            _corners(here.A, here.anchors),
+            corners_of_base(here.A, here.anchors),
             _between(here.motors, self._motor_radii),
             None if before is None else (before.A, before.B),
             None if before is None else self._skeleton(before),
@@ -212,7 +213,9 @@ class Stage:
         """Return joints and motors of legs at the readings of a posture."""
         near = platform_in_base(self.machine, posture.T)
         by_readings = by_readings and self.machine.is_determined
-        A, B = joints_at(self.machine, legs, posture.q[None], [near], by_readings=by_readings)
+        A, B = ends_at_readings(
+            self.machine, legs, posture.q[None], [near], by_readings=by_readings
+        )
         motors = motors_at(self.machine, legs, A)
         lines = np.concatenate([motors.standing, motors.moving[0]])
         return _Placed(A[0], B[0], motors.anchors, lines)
@@ -220,7 +223,7 @@ class Stage:
     def _skeleton(self, placed: _Placed) -> Array:
         """Return legs, motors and rims as lines (m, 2, 3)."""
         found = [np.stack([placed.A, placed.B], axis=1), placed.motors]
-        corners = _corners(placed.A, placed.anchors), placed.B
+        corners = corners_of_base(placed.A, placed.anchors), placed.B
         for joints, rim in zip(corners, self.rims, strict=True):
             found.append(np.stack([joints[rim[:-1]], joints[rim[1:]]], axis=1))
         return np.concatenate(found)
@@ -236,11 +239,6 @@ class Stage:
         position = A[self.rod_legs] + ends.mean(axis=1)[:, None] * along
         scale = np.stack([self._radii, self._radii, np.ptp(ends, axis=1)], axis=1)
         return Rods(position, from_z(along), scale)
-
-
-def _corners(A: Array, anchors: Array) -> Array:
-    """Return what the base is drawn about, of joints at A (n, 3) and motors (m, 3)."""
-    return anchors if len(anchors) > 2 else A
 
 
 def _between(ends: Array, radii: Array) -> Rods:

@@ -33,6 +33,7 @@ from legcal.machine import (
     freedoms,
     geometries,
     independent,
+    joints_at,
     leg_labels,
     list_in_words,
     machine_ties,
@@ -149,10 +150,7 @@ class PredictedObservations:
     @cached_property
     def A_at(self) -> Array:
         """Base joint centres in R_b at every pose, (k, n_legs, 3) [m]."""
-        A = np.tile(self.A, (len(self.t), 1, 1))
-        for j, actuator, a in self._carried():
-            A[:, j] = actuator.at(self.legs[j].A, self.q[:, a])
-        return A
+        return joints_at(self.legs, self.q)
 
     @cached_property
     def A_by_local(self) -> Array:
@@ -331,7 +329,7 @@ def planned_observations(
     """
     home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
     legs, length, rng = machine_near(machine, home)
-    A, B = joints_at(legs, home)
+    A, B = ends_at_pose(legs, home)
     n_poses = images * len(views)
     R, t = random_poses_of_legs(
         legs, machine.frame_legs, home, travel_of(machine), max(n_poses, REACHED), rng
@@ -399,7 +397,7 @@ def recorded_observations(
         shown_legs = np.zeros((len(m.views), len(machine.leg_names)), dtype=np.bool_)
         shown_legs[m.view[dataset.axes.row], dataset.axes.leg] = True
         seen = shown_legs[used]
-    A, B = joints_at(legs, home)
+    A, B = ends_at_pose(legs, home)
     shown = [np.flatnonzero(row).tolist() for row in seen]
     camera = default_cameras(A, B, shown, machine.spatial, rng)
     for v, view in enumerate(views):
@@ -519,7 +517,7 @@ def machine_near(
     """Return legs near the nominal ones, their mean length at home [m], and a source of chance."""
     rng = np.random.default_rng(_SEED)
     nominal = geometries(machine)
-    A, B = joints_at(nominal, home)
+    A, B = ends_at_pose(nominal, home)
     length = float(np.linalg.norm(B - A, axis=1).mean())
     found = parametrization_of(machine)
     scale = np.where([unit == "m" for unit in found.units], length, 1.0)
@@ -549,7 +547,7 @@ def radii(legs: Sequence[Leg], length: float) -> Array:
     )
 
 
-def joints_at(legs: Sequence[Leg], T: RigidTransform) -> tuple[Array, Array]:
+def ends_at_pose(legs: Sequence[Leg], T: RigidTransform) -> tuple[Array, Array]:
     """Return the joint centres A and B (n_legs, 3) at a pose, in R_b."""
     A, B = ends_at_poses(legs, *components([T]))
     return A[0], B[0]

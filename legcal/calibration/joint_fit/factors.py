@@ -492,7 +492,7 @@ def observed_readings(measurements: Measurements, legs: FittedLegs) -> Readings:
 
     Images of one pose share one reading: that of the first row. Legs without a motor have none.
     """
-    length = legs.sign * measurements.q[measurements.first_rows]
+    length = legs.sign * measurements.q_of_poses
     actuated = np.array([leg.kind is LegKind.ACTUATED for leg in legs.nominal], dtype=np.bool_)
     leg, pose = np.nonzero((np.isfinite(length) & actuated).T)
     return Readings(leg, pose, length[pose, leg], measurements.sigma_q, legs.n_legs)
@@ -529,7 +529,7 @@ def observed_actuator_readings(measurements: Measurements, legs: FittedLegs) -> 
     """Return the readings of actuators, one row of them for each platform pose."""
     on = actuator_index(legs.nominal)
     first = [on.index(a) for a in range(legs.n_actuators)]
-    q = measurements.q[measurements.first_rows][:, first]
+    q = measurements.q_of_poses[:, first]
     actuator, pose = np.nonzero(np.isfinite(q).T)
     sigma = measurements.sigma_of(legs.nominal)[first]
     return ActuatorReadings(actuator, pose, q[pose, actuator], sigma[actuator])

@@ -147,6 +147,7 @@ def refine_from_best(
     problem = build_fit(
         legs, measurements, outlines, settings, axes=axes, board=board, choices=choices
     )
+    problem.require_determined()
     with naming_missing_lengths(problem):
         return _best(problem, outlines, starts, settings)
 

@@ -151,6 +151,20 @@ class FitProblem(Problem[State]):
         """Number of residuals, priors left out."""
         return sum(factor.n * factor.n_rows for factor in self.factors)
 
+    def require_determined(self) -> None:
+        """Raise NotIdentifiable if there are fewer equations than unknowns."""
+        equations = self.n_equations + len(self.priors.mean)
+        if equations >= self.n_unknowns:
+            return
+        shown = f"{len(self.outlines)} outlines"
+        if len(self.axes):
+            shown = f"{len(self.axes)} axes" + f", {shown}" * bool(len(self.outlines))
+        raise NotIdentifiable(
+            f"The fit is not determined: {len(self.images)} images with {shown} and "
+            f"{len(self.readings)} readings give {equations} equations for {self.n_unknowns} "
+            "unknowns; add images."
+        )
+
     def begin(self, start: Start) -> State:
         """Return the state at a start, with everything that is fixed at its value."""
         return State(
@@ -256,40 +270,14 @@ def build_fit(
 ) -> FitProblem:
     """Build the joint fit without solving it; arguments as those of :func:`refine`.
 
+    The images need not determine it (:meth:`FitProblem.require_determined`): they may be some of
+    those that will be.
+
     Raises
     ------
-    NotIdentifiable
-        If there are fewer equations than unknowns.
     DatasetError
         If an outline or an axis cannot be used.
     """
-    problem = unchecked_fit(
-        legs, measurements, outlines, settings, axes=axes, board=board, choices=choices
-    )
-    equations = problem.n_equations + len(problem.priors.mean)
-    if equations < problem.n_unknowns:
-        shown = f"{len(problem.outlines)} outlines"
-        if len(problem.axes):
-            shown = f"{len(problem.axes)} axes" + f", {shown}" * bool(len(problem.outlines))
-        raise NotIdentifiable(
-            f"The fit is not determined: {measurements.n_rows} images with {shown} "
-            f"and {len(problem.readings)} readings give {equations} equations for "
-            f"{problem.n_unknowns} unknowns; add images."
-        )
-    return problem
-
-
-def unchecked_fit(
-    legs: FittedLegs,
-    measurements: Measurements,
-    outlines: Outlines,
-    settings: RefinementSettings = DEFAULT_SETTINGS,
-    *,
-    axes: LegAxes | None = None,
-    board: BoardCorners | None = None,
-    choices: Choices = NO_CHOICES,
-) -> FitProblem:
-    """Build the joint fit of images that need not determine it: some of those that will be."""
     names, given = [v.name for v in measurements.views], [v.camera for v in measurements.views]
     owners = shared_cameras(names, given)
     cameras = tuple(

@@ -543,7 +543,7 @@ def start_from(
     *T_Rb_Re* has a pose nearby for each, in the right assembly mode: the nominal forward
     kinematics.
     """
-    lengthening = legs.sign * measurements.q[measurements.first_rows]
+    lengthening = legs.sign * measurements.q_of_poses
     poses = platform_poses(geometry, lengthening, T_Rb_Re, legs.frame_legs)
     return Start(tuple(geometry), tuple(T_camera_Rb), poses, label)
 

@@ -168,7 +168,7 @@ def _search(
 ) -> tuple[Placement, dict[str, Outlines]]:
     """Place the cameras; return the outlines that each method finds in all repeated images."""
     measurements = every.measurements
-    poses = forward_kinematics_many(every.machine, measurements.q[measurements.first_rows])
+    poses = forward_kinematics_many(every.machine, measurements.q_of_poses)
     nominal = nominal_placement(every.machine, measurements, poses)
     views = {group.view for group in repeats}  # placed by one image of every pose
     groups = group_rows(measurements, every.detect)

@@ -19,8 +19,8 @@ from legcal.scene import (
     around,
     directions,
     ellipsoids,
+    ends_at_readings,
     enlargement,
-    joints_at,
     motors_at,
     pyramid,
     step_shown,
@@ -54,7 +54,7 @@ def machine_scene(calibration: Calibration) -> Plot:
     chosen = np.unique(
         np.linspace(0, measurements.n_poses - 1, min(MAX_POSES, measurements.n_poses)).astype(int)
     )
-    q = measurements.q[measurements.first_rows][chosen]
+    q = measurements.q_of_poses[chosen]
     fitted = [solution.T_Rb_Re[k] for k in chosen.tolist()]
     turn_base = machine.T_base_Rb.rotation.as_matrix()
     turn_platform = machine.T_platform_Re.rotation.as_matrix().T
@@ -64,7 +64,7 @@ def machine_scene(calibration: Calibration) -> Plot:
     def placed(legs: Sequence[Leg], near: Sequence[RigidTransform]) -> _Placed:
         """Return what is drawn of legs at the readings, in the base link."""
         by_readings = calibration.platform is not None
-        A, B = joints_at(machine, legs, q, near, by_readings=by_readings)
+        A, B = ends_at_readings(machine, legs, q, near, by_readings=by_readings)
         motors = motors_at(machine, legs, A)
         rim[:] = rim or (around(motors.anchors) if len(motors.anchors) > 2 else [])
         edges = motors.anchors[np.stack([rim[:-1], rim[1:]], axis=1)] if rim else _NO_LINES
