@@ -183,7 +183,9 @@ def _result_of(calibration: Calibration) -> Result:
         ],
         held=list(solution.held),
         views={
-            views[v].name: ViewPose(T_base_camera=Pose.of(T_base_Rb * solution.T_camera_Rb[v].inv()))
+            views[v].name: ViewPose(
+                T_base_camera=Pose.of(T_base_Rb * solution.T_camera_Rb[v].inv())
+            )
             for v in shown
         },
         cameras={v.name: camera_numbers(v.camera) for v in views if v.name in set(owners)},

@@ -46,7 +46,11 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
     ]
     worst = np.argsort(-np.nan_to_num(plan.sigma), kind="stable")[:_WORST]
     parameters = [
-        (plan.names[i], f"{SHOWN_IN[plan.units[i]][0] * plan.sigma[i]:.4f}", SHOWN_IN[plan.units[i]][1])
+        (
+            plan.names[i],
+            f"{SHOWN_IN[plan.units[i]][0] * plan.sigma[i]:.4f}",
+            SHOWN_IN[plan.units[i]][1],
+        )
         for i in worst.tolist()
     ]
     growth = [(f"{n:.0f}", _shown(plan, value)) for n, value in _told(plan)]
