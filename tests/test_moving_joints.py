@@ -159,6 +159,8 @@ def test_ranks_are_the_published_ones_and_radii_carry_the_scale_of_arms(name: st
         assert not is_scale_open(Analysis(session(name), known))
         radius = Choices(priors={"leg1.radius.rod": Prior(0.008, 1e-5)})
         assert not is_scale_open(Analysis(session(name), radius))
+        few = scale_sources(Analysis(session(name, images=1)))
+        assert [s.sigma for s in few] == [None] * 4  # lengths are open whatever is known
 
 
 def test_the_verdict_names_the_scale_as_the_largest_part_of_the_error() -> None:

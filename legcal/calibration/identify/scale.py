@@ -21,6 +21,7 @@ from legcal.machine import LegColumns
 from legcal.vision import Link
 
 LENGTH_SIGMA = 5e-5  # [m] of a length that somebody measures
+_OPEN = 1e-6  # of their mean, in directions that are not determined: lengths are open
 _LINKS: tuple[Link, ...] = ("base", "platform")
 
 
@@ -65,18 +66,19 @@ def is_scale_open(analysis: Analysis) -> bool:
 
 
 def _source(analysis: Analysis, name: str, words: str, information: Array) -> ScaleSource:
-    """Return what a source gives."""
+    """Return what a source gives: nothing where images leave lengths open all the same."""
     predicted = analysis.predicted
-    if len(undetermined(predicted, information)) > len(
-        undetermined(predicted, analysis.information)
-    ):
-        return ScaleSource(name, words, None, None)
     columns = predicted.columns(LegColumns.LENGTH)
     lengths = np.array([leg.q0 for leg in predicted.legs])[: len(columns)]
     mean = np.zeros(len(predicted.unit))  # of the relative errors of lengths
     mean[columns] = 1.0 / (len(columns) * lengths)
+    hidden = undetermined(predicted, information)
+    leaves_more = len(hidden) > len(undetermined(predicted, analysis.information))
+    if leaves_more or np.linalg.norm(hidden @ mean) > _OPEN * np.linalg.norm(mean):
+        return ScaleSource(name, words, None, None)
     _, singular, basis = np.linalg.svd(information, full_matrices=False)
-    sigma = float(np.linalg.norm(basis @ mean / singular))
+    seen = singular > 0.0
+    sigma = float(np.linalg.norm(basis[seen] @ mean / singular[seen]))
     return ScaleSource(name, words, sigma, analysis.motion.sigma(information))
 
 
@@ -127,7 +129,8 @@ def _stated_radii(analysis: Analysis) -> Array:
 
 def scale_in_words(sources: Sequence[ScaleSource]) -> str:
     """Return what is needed, as one sentence for a refusal."""
-    ways = ", or ".join(source.assumed for source in sources if source.sigma is not None)
+    known = [source.assumed for source in sources if source.sigma is not None]
+    ways = ", or ".join(known or [source.assumed for source in sources])
     return (
         "found that readings of arms carry no length, so that machine, rods and cameras could all "
         f"be larger alike, needed something that fixes the scale: {ways}"
