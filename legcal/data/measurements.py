@@ -258,7 +258,9 @@ def _hardly_moving(
     given: Array, readings: Array, legs: Sequence[Leg], units: Sequence[ReadingUnit]
 ) -> list[str]:
     """Return which columns hardly move in the unit that is stated, and do in a larger one."""
-    problems = []
+    problems = list[str]()
+    if not len(given):
+        return problems
     for name in dict.fromkeys(unit.name for unit in units):
         some = [j for j, unit in enumerate(units) if unit.name == name]
         width = np.ptp([legs[j].travel for j in some], axis=1)
