@@ -36,7 +36,7 @@ from legcal.geometry import Array, IntArray, motions_of
 from legcal.machine import Leg
 from legcal.simulation import moved_outlines
 
-MACHINES = ("6-spu-coplanar", "3-upu-tilted", "3-rpr")
+MACHINES = ("6-spu-coplanar", "hexaglide", "3-prs", "3-upu-tilted", "3-rpr")
 N_SEEDS = 2
 
 
@@ -75,7 +75,7 @@ def _compared(truth: Truth, posterior: Posterior, outlines: Outlines) -> HeldOut
     return compare_held_out(posterior, truth.measurements, outlines, truth.poses, 4.5)
 
 
-@pytest.mark.parametrize("name", thinned(MACHINES, ["6-spu-coplanar"]))
+@pytest.mark.parametrize("name", thinned(MACHINES, ["6-spu-coplanar", "hexaglide"]))
 def test_the_true_model_predicts_images_to_their_noise(name: str) -> None:
     truth = _truth(name)
     found = _compared(truth, truth.posterior, truth.outlines)

@@ -275,16 +275,20 @@ def test_right_fixed_values_are_accepted_beside_wrong_outlines(noisy: MachineSes
 
 
 def test_a_leg_most_of_whose_outlines_disagree_is_named(noisy: MachineSession) -> None:
+    names = ("leg", "leg.2", "leg.3", "leg.2.4", *noisy.legs.names[4:])
+    noisy = replace(noisy, legs=replace(noisy.legs, names=names))
     own = np.flatnonzero(noisy.outlines.leg == 3)
     offsets = np.zeros((len(noisy.outlines), 2))
     offsets[own[: 2 * len(own) // 3]] = 12.0 * (-1.0) ** np.arange(2 * len(own) // 3)[:, None]
     outlines = shifted(noisy, noisy.outlines, offsets)
-    choices = Choices(priors={"leg4.offset": Prior(true_values(noisy)["leg4.offset"], 1e-3)})
+    true = true_values(noisy)
+    stated = ("leg.2.4.offset", "leg.2.offset")
+    choices = Choices(priors={name: Prior(true[name], 1e-3) for name in stated})
     found = fitted(replace(noisy, outlines=outlines), choices)
     (note,) = found.notes
-    assert f"{2 * len(own) // 3} of {len(own)} of leg4" in note
-    assert "what was stated of leg4.offset" in note
-    assert "leg3" not in note
+    assert f"{2 * len(own) // 3} of {len(own)} of leg.2.4" in note
+    assert "what was stated of leg.2.4.offset" in note
+    assert not {"leg.3", "leg.2.offset"} & set(note.rstrip(".").replace(",", "").split())
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from fit_sessions import machine_session
 from hexapod_example import Picture, Spoiled, spoiled
 from numpy.typing import NDArray
 from outline_tables import outlines_of
@@ -18,7 +19,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
 
 from legcal import calibrate, detect, load_dataset
-from legcal.calibration import Calibration, Detection
+from legcal.calibration import Calibration, Detection, refine
 from legcal.calibration.joint_fit import DISAGREES
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.calibration.outlier_images import outlier_images
@@ -26,6 +27,7 @@ from legcal.calibration.pipeline import rough_placement
 from legcal.data import Outlines
 from legcal.errors import NotIdentifiable
 from legcal.geometry import BoolArray
+from legcal.machine import load_mechanism
 from legcal.perception.diagnostics import (
     NOTHING_LIKE,
     ImageExplanation,
@@ -503,6 +505,22 @@ def test_a_wrong_digit_is_named_where_outlines_of_few_legs_leave_the_pose_open(
         assert found is not None, notes
         assert int(found[1]) == leg + 1
         assert float(found[2]) == pytest.approx(1e3 * m.q[row, leg], abs=1.0)
+
+
+def test_a_wrong_angle_of_an_arm_is_named_in_degrees_beyond_its_sigma() -> None:
+    session = machine_session("delta", n_poses=3)
+    m, machine, row = session.measurements, load_mechanism("delta"), 1
+    found = refine(session.legs, m, session.outlines, session.start)
+    fit = replace(found, outlines=_with_rejected(found.outlines, found.outlines.row == row))
+    q = m.q.copy()
+    q[row, :2] += 0.25  # of both rods of the first arm
+    (note,) = outlier_images(replace(m, q=q), machine, fit).values()
+    shown = re.search(r"reading of arm1 of ([\d.-]+) \+- [\d.]+ deg, given ([\d.-]+) deg", note)
+    assert shown is not None, note
+    expected = np.degrees([m.q[row, 0], q[row, 0]])
+    np.testing.assert_allclose([float(x) for x in shown.groups()], expected, atol=0.02)
+    rough = replace(m, q=q, sigma_by_joint=dict.fromkeys(machine.motor_names, 0.06))
+    assert "its readings suit it" in outlier_images(rough, machine, fit)[row]
 
 
 def test_no_reading_is_said_that_the_travel_does_not_have(fitted: Calibration) -> None:

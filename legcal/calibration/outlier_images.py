@@ -27,8 +27,9 @@ from legcal.estimation import (
     minimise,
     normal_equations,
 )
+from legcal.files import SHOWN_IN
 from legcal.geometry import Array, IntArray, cross
-from legcal.machine import Machine, actuator_index, joints_at
+from legcal.machine import Machine, actuator_index, joints_at, reading_of_rod
 
 MIN_REJECTED = 0.34  # share of an image's outlines that the fit rejected
 MIN_REJECTED_LEGS = 2  # of which it rejected all outlines
@@ -38,10 +39,10 @@ MIN_OUTLINES, MIN_LEGS = 6, 3  # that determine a pose
 MIN_NOISE = 5e-5  # of an outline at its leg [m]
 LOSS = PseudoHuber(4.0)  # of outlines, in least noises
 MAX_STEP = (0.3, 0.3, 0.3, np.inf, np.inf, np.inf)  # of the pose: [rad], and any displacement
-READING_NOISE = 6e-5  # of readings beside the legs of a fit [m]
+# Of readings, as far as they move a joint [m]: noise beside the legs of a fit, what is named at
+# least, and the tolerance for the reading of another image
+READING_NOISE, MIN_READING_ERROR, SAME_READING = 6e-5, 3e-4, 1e-3
 SIGNIFICANT_SIGMAS = 5.0
-MIN_READING_ERROR = 3e-4  # [m]
-SAME_READING = 1e-3  # tolerance for the reading of another image [m]
 BEYOND_TRAVEL = 0.05  # of the travel: what joint limits of a model leave out
 
 
@@ -52,7 +53,7 @@ class _State:
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """The pose of an image as readings, (n_legs,) [m]."""
+    """The pose of an image as readings, (n_legs,) [m or rad]."""
 
     readings: Array
     sigma: Array
@@ -141,15 +142,16 @@ def _shown(
     def differences(state: _State) -> Residuals:
         q, J = readings(state)
         r = q[list(held)] - measurements.q[row, list(held)]
-        return Residuals.of(r[:, None], J[list(held), None])
+        return Residuals.of((white * r)[:, None], white[:, None, None] * J[list(held), None])
 
+    sigma = measurements.sigma_of(machine.legs)
+    white = 1.0 / np.maximum(_by(machine, READING_NOISE), sigma)[list(held)]
     zero, m = np.zeros(max(n, len(held)), dtype=np.intp), len(held)
     of_outlines, of_readings = (("pose", zero[:k], slice(None)) for k in (n, m))
-    white = 1.0 / MIN_NOISE
-    factors = [Factor("outlines", distances, (of_outlines,), n, 1, whitening=white, robust=True)]
+    by_noise = 1.0 / MIN_NOISE
+    factors = [Factor("outlines", distances, (of_outlines,), n, 1, whitening=by_noise, robust=True)]
     if held:
-        white = 1.0 / READING_NOISE
-        factors.append(Factor("readings", differences, (of_readings,), m, 1, whitening=white))
+        factors.append(Factor("readings", differences, (of_readings,), m, 1))
     pose = Variables("pose", all_free(1, 6), Frames.moved, max_step=MAX_STEP)
     problem, loss = Problem[_State]((pose,), None, tuple(factors)), LOSS
     begin = _State(Frames.of([solution.T_Rb_Re[int(measurements.pose[row])]]))
@@ -162,6 +164,10 @@ def _shown(
         return None
     scale = max(1.0, 1.48 * float(np.median(np.abs(found.linear["outlines"].r))))
     q, J = readings(found.state)
+    ends = (B @ found.state.pose.R[0].T + found.state.pose.t)[:, None]
+    for j, leg in enumerate(solution.legs):
+        if leg.actuator is not None:  # far from the given reading its slope is another one
+            q[j] = reading_of_rod(leg, ends[j])[0]
     variance = scale**2 * np.einsum("ja,ab,jb->j", J, np.linalg.inv(normal), J)
     return _Shown(q, np.sqrt(variance), scale * MIN_NOISE, found.cost / scale**2)
 
@@ -185,17 +191,35 @@ def _wrong_reading(
         return ""
     found, given = shown[best], float(measurements.q[row, best])
     value, sigma = float(found.readings[best]), float(found.sigma[best])
-    least = max(SIGNIFICANT_SIGMAS * max(sigma, found.noise), MIN_READING_ERROR)
-    if abs(value - given) < least or not _is_in_travel(machine, best, value, sigma):
+    off = np.abs(found.readings - measurements.q[row])
+    least = _least(measurements, machine)
+    if np.any((off > least)[[other for other in motors if other != best]]):
+        return ""  # it is not the only one
+    noise = machine.legs[best].reading_of(found.noise)
+    if off[best] < max(SIGNIFICANT_SIGMAS * max(sigma, noise), float(least[best])):
+        return ""
+    if not _is_in_travel(machine, best, value, sigma):
         return ""
     return _one_wrong(machine, best, value, sigma, given)
 
 
 def _one_wrong(machine: Machine, leg: int, shown: float, sigma: float, given: float) -> str:
+    size, unit = SHOWN_IN[machine.legs[leg].reading_unit]
     return (
-        f"it shows a reading of {machine.legs[leg].prismatic} of {1e3 * shown:.2f} +- "
-        f"{1e3 * sigma:.2f} mm, given {1e3 * given:.2f} mm; check that reading"
+        f"it shows a reading of {machine.legs[leg].prismatic} of {size * shown:.2f} +- "
+        f"{size * sigma:.2f} {unit}, given {size * given:.2f} {unit}; check that reading"
     )
+
+
+def _by(machine: Machine, distance: float) -> Array:
+    """Return the readings (n_legs,) [m or rad] that move a joint so far [m]."""
+    return np.array([leg.reading_of(distance) for leg in machine.legs])
+
+
+def _least(measurements: Measurements, machine: Machine) -> Array:
+    """Return by how much readings (n_legs,) are wrong at least where they are said to be."""
+    sigma = measurements.sigma_of(machine.legs)
+    return np.maximum(_by(machine, MIN_READING_ERROR), SIGNIFICANT_SIGMAS * sigma)
 
 
 def _is_in_travel(machine: Machine, leg: int, reading: float, sigma: float) -> bool:
@@ -218,7 +242,8 @@ def _explanation(
     given = measurements.q[row, motors]
     shown, sigma = alone.readings[motors], alone.sigma[motors]
     off = shown - given
-    wrong = np.flatnonzero(np.abs(off) > np.maximum(SIGNIFICANT_SIGMAS * sigma, MIN_READING_ERROR))
+    least = np.maximum(SIGNIFICANT_SIGMAS * sigma, _least(measurements, machine)[motors])
+    wrong = np.flatnonzero(np.abs(off) > least)
     if len(wrong) == 0:
         return ""
     distance = np.abs(measurements.q[:, motors] - shown)
@@ -227,7 +252,7 @@ def _explanation(
         for other in range(measurements.n_rows)
         if measurements.image[other]
         and measurements.pose[other] != measurements.pose[row]
-        and np.all(distance[other] < np.maximum(SIGNIFICANT_SIGMAS * sigma, SAME_READING))
+        and np.all(distance[other] < np.maximum(least, _by(machine, SAME_READING)[motors]))
     ]
     if alike:
         nearest = min(alike, key=lambda other: float(distance[other].max()))
@@ -246,9 +271,12 @@ def _explanation(
     names = [str(machine.legs[motors[k]].prismatic) for k in wrong]
     travel = [machine.legs[motors[k]].travel for k in wrong]
     possible = np.clip(shown[wrong], *np.transpose(travel)) - given[wrong]
-    worst = 1e3 * float(np.abs(possible).max())
+    worst = dict[str, float]()
+    for k, off_by in zip(wrong.tolist(), np.abs(possible).tolist(), strict=True):
+        size, unit = SHOWN_IN[machine.legs[motors[k]].reading_unit]
+        worst[unit] = max(worst.get(unit, 0.0), size * off_by)
     return (
-        "it shows another pose than its reading says, with readings of "
-        f"{few(names)} off by up to "
-        f"{worst:.1f} mm; check that it was taken there"
+        f"it shows another pose than its reading says, with readings of {few(names)} off by up to "
+        f"{' and '.join(f'{most:.1f} {unit}' for unit, most in worst.items())}; check that it was "
+        "taken there"
     )

@@ -85,6 +85,7 @@ from legcal.perception import (
     nominal_placement,
     place_and_measure,
     require_rough_cameras,
+    require_standing_joints,
     used_as_before,
 )
 from legcal.progress import Progress, shown_progress
@@ -365,13 +366,15 @@ def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]
     ------
     NotIdentifiable
         If readings do not give the poses of images that are to be searched, and a view of these has
-        no rough camera pose; nothing is searched then.
+        no rough camera pose or joints at A move; nothing is searched then.
     """
     hints = [view.T_base_camera for view in data.measurements.views]
     on_base = data.dataset.board_on("base")
     by_board = on_base is not None and (
         on_base.T_link_board is not None or any(T is not None for T in hints)
     )
+    if not data.machine.is_determined and len(data.photographs.detect):
+        require_standing_joints(data.machine)
     if not data.machine.is_determined and not by_board:
         require_rough_cameras(data.measurements, data.photographs.detect.tolist(), hints)
     placement = nominal_placement(data.machine, data.measurements, data.T_base_platform)

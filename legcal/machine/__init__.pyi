@@ -123,6 +123,7 @@ from .parameters import moved_legs as moved_legs
 from .parameters import n_frame_legs as n_frame_legs
 from .parameters import nominal_axes as nominal_axes
 from .parameters import numbers_of as numbers_of
+from .parameters import owner_of_parameter as owner_of_parameter
 from .parameters import parametrization_of as parametrization_of
 from .parameters import parametrize as parametrize
 from .parameters import reframed as reframed

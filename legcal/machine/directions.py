@@ -7,6 +7,7 @@ import numpy as np
 from scipy.linalg import qr
 
 from legcal.geometry import Array
+from legcal.machine.parameters import owner_of_parameter
 
 SHOWN = 0.02  # of the largest component
 
@@ -123,7 +124,7 @@ def _split(name: str, leg_names: Sequence[str]) -> tuple[str, str, str]:
 
     Names of legs may contain dots. Of a motor that moves joints at A it is its joint.
     """
-    leg = max((n for n in leg_names if name.startswith(f"{n}.")), key=len, default="")
+    leg = owner_of_parameter(name, leg_names)
     kind, _, which = name[len(leg) + 1 :].partition(".")
     if leg and kind in _NOUN:
         return leg, kind, which

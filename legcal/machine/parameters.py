@@ -6,7 +6,7 @@ frames (their gauge), lengths, two turns of each axis that is a parameter, and t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -115,6 +115,11 @@ def kind_of_parameter(name: str) -> str:
     """Return what a parameter is, the name of its leg or motor (which may have dots) left out."""
     parts = name.split(".")
     return parts[-2] if len(parts) > 2 and parts[-1] in _COORDINATES else parts[-1]
+
+
+def owner_of_parameter(name: str, owners: Iterable[str]) -> str:
+    """Return which of some legs, or views, a parameter is of; "" if none. Names may have dots."""
+    return max((owner for owner in owners if name.startswith(f"{owner}.")), key=len, default="")
 
 
 def _local_name(leg: Leg, column: int) -> str:

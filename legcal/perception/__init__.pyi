@@ -34,6 +34,7 @@ from .diagnostics import images_left_out as images_left_out
 from .diagnostics import is_visible as is_visible
 from .diagnostics import left_out_notes as left_out_notes
 from .free_poses import require_rough_cameras as require_rough_cameras
+from .free_poses import require_standing_joints as require_standing_joints
 from .image_quality import Exposure as Exposure
 from .image_quality import measure_exposure as measure_exposure
 from .outline import HIDDEN as HIDDEN

@@ -182,9 +182,10 @@ def find_free_poses(
     Raises
     ------
     NotIdentifiable
-        If a view has no rough camera pose.
+        If a view has no rough camera pose, or joints at A move.
     """
     m = search.measurements
+    require_standing_joints(machine)
     require_rough_cameras(m, rows, hints)
     images: dict[int, list[_Image]] = {}
     for row, pairs in zip(rows, run(search.own_pairs, rows), strict=True):
@@ -200,6 +201,16 @@ def find_free_poses(
                 progress(k)
         poses, cameras = _fitted(scene, poses, cameras)
     return FreePoses({k: motion_of(at[:, :3], at[:, 3]) for k, at in poses.items()}, cameras)
+
+
+def require_standing_joints(machine: Machine) -> None:
+    """Refuse to look for poses where joints at A move, so that nothing says where legs begin."""
+    if machine.actuators:
+        raise NotIdentifiable(
+            "The images could not be searched: found joints at A that move and that "
+            f"{machine.undetermined}, needed motors that do, or the outlines in observations.csv; "
+            "name the other motors in name_mot of the model."
+        )
 
 
 def require_rough_cameras(

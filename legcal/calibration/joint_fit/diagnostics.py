@@ -32,7 +32,13 @@ from legcal.estimation import (
     named_information,
 )
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Actuator, actuators_of, radius_name
+from legcal.machine import (
+    Actuator,
+    actuators_of,
+    kind_of_parameter,
+    owner_of_parameter,
+    radius_name,
+)
 from legcal.vision import LINKS, Link, intrinsic_names, intrinsic_unit
 
 _SIGNIFICANT = 5.0  # standard deviations between a prior and the measurements
@@ -408,7 +414,11 @@ def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
         f"{', ' + ', '.join(of) if of else ''}; the stated uncertainty holds only if it is these "
         "that are wrong; look at them and their reasons in the table of observations"
     )
-    stated = [name for name in _stated(problem) if name.split(".")[0] in legs]
+    stated = [
+        name
+        for name in _stated(problem)
+        if any(owner_of_parameter(end, problem.legs.names) in legs for end in name.split(":"))
+    ]
     if stated:
         words += f", and at what was stated of {_listed(stated)}"
     return (f"{words}.",)
@@ -498,7 +508,7 @@ def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
     try:
         yield
     except (DidNotConverge, NotIdentifiable) as failure:
-        stated = {name.split(".")[1] for name in _stated(problem) if ":" not in name}
+        stated = {kind_of_parameter(name) for name in _stated(problem) if ":" not in name}
         measured = len(problem.readings) + sum(map(len, problem.boards))
         rails = problem.observed.actuator_readings.sigma[
             [not actuator.turns for actuator in _of_readings(problem)]
@@ -510,9 +520,14 @@ def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
             [
                 "The joint fit could not be made: found no measured length, neither a reading of a "
                 "leg nor a board, so that radii alone say how large the machine is, and hardly "
-                "where its platform joints are; put a calibration board on the platform and one "
-                "on the base, give a leg an encoder, or state measured coordinates of joints "
-                "(--prior).",
+                "where its platform joints are; "
+                + (
+                    "measure a distance of two joints and state it (--length), or put a "
+                    "calibration board on the base."
+                    if problem.legs.n_actuators
+                    else "put a calibration board on the platform and one on the base, give a leg "
+                    "an encoder, or state measured coordinates of joints (--prior)."
+                ),
                 *failure.problems,
             ]
         ) from None

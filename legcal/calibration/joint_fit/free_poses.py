@@ -23,7 +23,7 @@ from legcal.estimation import (
     normal_equations,
 )
 from legcal.geometry import Array
-from legcal.machine import freedoms, pose_equations
+from legcal.machine import first_rods, freedoms, pose_equations
 
 _SEED, _DRAWN = 1965, 16  # places from which every pose is looked for, beside where it is
 _TURN, _SHIFT = 0.4, 0.3  # of these from there [rad, mean leg lengths], one standard deviation
@@ -68,12 +68,13 @@ def with_better_poses(problem: FitProblem, state: State, part: float = 0.0, seed
     problem = _softened(problem, part) if part else problem
     loss = PseudoHuber(_width(problem, state))
     rng, n = np.random.default_rng((_SEED, seed)), len(state.platform_pose.t)
-    size = np.array([_TURN] * 3 + [_SHIFT * state.mean_length] * 3)
+    size = np.zeros(problem.d_element)  # the readings of a posture follow its pose
+    size[:6] = np.repeat([_TURN, _SHIFT * state.mean_length], 3)
     size[np.setdiff1d(np.arange(6), freedoms(problem.legs.frame_legs))] = 0.0
     best, least = _settled(problem, state, loss)
     least = _BETTER * least
     for _ in range(_DRAWN):
-        moved = state.platform_pose.moved(size * rng.normal(size=(n, 6)))
+        moved = state.platform_pose.moved(size * rng.normal(size=(n, len(size))))
         there = LegConstraints(problem.parameters).with_poses(state, moved)
         there, cost = _settled(problem, there, loss)
         best = best.with_chosen(cost < least, there.platform_pose)
@@ -91,9 +92,16 @@ def have_outliers(problem: FitProblem, state: State) -> bool:
 def _softened(problem: FitProblem, part: float) -> FitProblem:
     """Return the problem with a part of the errors of a nominal model added to the noise."""
     noise = NoiseModel(1.0, part * _MODEL_PX, part * _MODEL_PX)
-    readings = problem.factor("readings")
+    readings, of_actuators = problem.factor("readings"), problem.factor("actuator_readings")
     sigma = float(np.hypot(problem.readings.sigma, part * _MODEL_LENGTH))
-    return problem.weighted(noise).with_parts((), (replace(readings, whitening=1.0 / sigma),))
+    read, legs = problem.observed.actuator_readings, problem.legs.nominal
+    off = np.array([legs[j].reading_of(part * _MODEL_LENGTH) for j in first_rods(legs)])
+    own = np.hypot(read.sigma, off[read.actuator] if len(read) else 0.0)
+    softer = (
+        replace(readings, whitening=1.0 / sigma),
+        replace(of_actuators, whitening=1.0 / own[:, None, None]),
+    )
+    return problem.weighted(noise).with_parts((), softer)
 
 
 def _width(problem: FitProblem, state: State) -> float:
@@ -114,13 +122,13 @@ def _settled(problem: FitProblem, state: State, loss: PseudoHuber) -> tuple[Stat
     n = len(state.platform_pose.t)
     damping = np.full(n, _DAMPING)
     constraints = LegConstraints(problem.parameters)
-    reach = np.repeat([1.0, state.mean_length], 3)  # of a step
+    reach = state.posture_scale  # of a step
     linear = linearize(problem, state)
     cost = _costs(problem, linear, loss, n)
     for _ in range(_STEPS):
         # Where a leg is not before its camera nothing is finite, and the pose stays as it is.
         step = np.nan_to_num(normal_equations(problem, state, linear, loss).element_step(damping))
-        own = step[problem.n_kept :].reshape(n, 6) / reach
+        own = step[problem.n_kept :].reshape(n, len(reach)) / reach
         own /= np.maximum(np.abs(own).max(axis=1, keepdims=True), 1.0)
         moved = constraints.with_poses(state, state.platform_pose.moved(own * reach))
         ahead = _costs(problem, linearize(problem, moved), loss, n)

@@ -31,7 +31,7 @@ from legcal.machine import pose_differences
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """HeldDirections-out images, and what a fit predicts of them."""
+    """Held-out images, and what a fit predicts of them."""
 
     problem: FitProblem  # their outlines and readings; the unknowns of the fit, their own biases
     state: State  # where the fit ended, at the poses of these images
@@ -89,6 +89,7 @@ class Posterior:
         return covariance
 
 
+_READINGS = "readings", "actuator_readings"  # factors of them
 _ROBUST_STEPS, _MAX_STEPS = 10, 30
 _WIDTH = 3.0  # whitened distance at which an outline starts to count less
 _MAX_SIGMA = 0.03  # [rad], or of a leg's length: a pose known worse is none
@@ -137,7 +138,7 @@ def poses_by_outlines(predicted: Predicted, rejection: float) -> PosesByOutlines
         known &= is_near
         linear = linearize(problem, state)
     outlines = _by_outlines(problem, state, linear, weight)
-    readings = information(problem, state, linear, only=("readings",))
+    readings = information(problem, state, linear, only=_READINGS)
     which = np.flatnonzero(known & converged & _is_known(outlines, length))
     covariance = _covariance(outlines, readings, predicted.covariance)[which]
     return PosesByOutlines(state.platform_pose.motions, which, covariance)
@@ -154,7 +155,7 @@ def _by_outlines(
 
 
 def _step(normal: NormalEquations) -> tuple[Array, Array]:
-    """Return Gauss-Newton's steps (n_poses, 6) and their squared lengths in sigmas (n_poses,)."""
+    """Return Gauss-Newton's steps (n_poses, d) and their squared lengths in sigmas (n_poses,)."""
     y = -(normal.V_inverse @ normal.g_elements[..., None])[..., 0]
     squared = np.einsum("kf,kfh,kh->k", y, normal.V, y)
     return (_motions(normal) @ y[..., None])[..., 0], np.asarray(squared)
@@ -163,15 +164,13 @@ def _step(normal: NormalEquations) -> tuple[Array, Array]:
 def _moved(
     predicted: Predicted, state: State, change: Array, length: float
 ) -> tuple[State, BoolArray]:
-    """Return poses after a change [rad, m] that is not too large, and which are near the first.
+    """Return poses after a change (n_poses, d) that is not too large, and which are near the first.
 
     Those that are not are back at the first ones, and so are those that put a camera into a leg.
     """
     problem, begin = predicted.problem, predicted.state
     first = begin.platform_pose
-    unit = np.ones(problem.d_element)
-    unit[3:6] = length
-    reach = np.linalg.norm(change / unit, axis=1, keepdims=True)
+    reach = np.linalg.norm(change / begin.posture_scale, axis=1, keepdims=True)
     change = change * np.minimum(1.0, _MAX_STEP / np.maximum(reach, 1e-300))
     moved = state.platform_pose.moved(change)
     cosine = 0.5 * (np.einsum("kij,kij->k", moved.R, first.R) - 1.0)
@@ -201,18 +200,18 @@ def _is_known(normal: NormalEquations, length: float) -> BoolArray:
 
 
 def _covariance(outlines: NormalEquations, readings: NormalEquations, of_fit: Array) -> Array:
-    """Return the covariance of the motions between poses by readings and by outlines.
+    """Return the covariance (n_poses, 6, 6) of motions between poses by readings and by outlines.
 
     Each has its own noise, and both follow the errors of the fit.
     """
     apart = outlines.elements_by_kept - readings.elements_by_kept
     inside = outlines.V_inverse + readings.V_inverse + apart @ of_fit @ np.swapaxes(apart, 1, 2)
-    Z = _motions(outlines)
+    Z = _motions(outlines)[:, :6]
     return np.asarray(Z @ inside @ np.swapaxes(Z, 1, 2))
 
 
 def _motions(normal: NormalEquations) -> Array:
-    """Return the basis of the motions of poses, (n_poses, 6, f)."""
+    """Return the basis of the motions of postures, (n_poses, d, f)."""
     if normal.tangent is None:
         return np.broadcast_to(np.eye(6), (len(normal.V), 6, 6))
     return normal.tangent.Z
@@ -224,7 +223,7 @@ _RANK_TOLERANCE = 1e-18  # of the largest eigenvalue of what readings say of a p
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """HeldDirections-out images compared with the predictions of a fit.
+    """Held-out images compared with the predictions of a fit.
 
     Offsets are without the biases that outlines share with fitted ones. What is expected is one
     standard deviation, by the noise of outlines and readings and the covariance of all that the fit
@@ -295,7 +294,7 @@ def compare_held_out(
     L = np.linalg.cholesky(posterior.noise.covariance(problem.outlines.covariance))
     linear = linearize(problem, state)
     _refuse_unseen(linear)
-    readings = information(problem, state, linear, only=("readings",))
+    readings = information(problem, state, linear, only=_READINGS)
     _refuse_undetermined(readings)
     expected = np.eye(2) + explained_share(
         problem, linear, readings, "outlines", predicted.covariance

@@ -159,9 +159,10 @@ class FitProblem(Problem[State]):
         shown = f"{len(self.outlines)} outlines"
         if len(self.axes):
             shown = f"{len(self.axes)} axes" + f", {shown}" * bool(len(self.outlines))
+        n_readings = len(self.readings) + len(self.observed.actuator_readings)
         raise NotIdentifiable(
             f"The fit is not determined: {len(self.images)} images with {shown} and "
-            f"{len(self.readings)} readings give {equations} equations for {self.n_unknowns} "
+            f"{n_readings} readings give {equations} equations for {self.n_unknowns} "
             "unknowns; add images."
         )
 

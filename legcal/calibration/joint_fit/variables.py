@@ -29,6 +29,7 @@ from legcal.machine import (
     Ties,
     actuator_index,
     actuators_of,
+    first_rods,
     freedoms,
     geometries,
     independent,
@@ -182,6 +183,16 @@ class State:
         """Mean distance of the joints of a leg over the poses [m]."""
         ends = self.arms + self.platform_pose.t[:, None]
         return float(np.linalg.norm(ends - self.A_at_poses, axis=-1).mean())
+
+    @property
+    def posture_scale(self) -> Array:
+        """What steps of a posture (6 + n,) are large beside: 1 rad, or a mean leg length [m].
+
+        Of readings it is how far they move the joint at A of a rod so far.
+        """
+        length = self.mean_length
+        readings = [self.legs[j].reading_of(length) for j in first_rods(self.legs)]
+        return np.array([1.0, 1.0, 1.0, length, length, length, *readings])
 
 
 @dataclass(frozen=True, eq=False)
