@@ -1,6 +1,6 @@
 """A small dataset folder of the example hexapod, for tests to spoil."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[1]
 HEXAPOD = ROOT / "examples" / "hexapod" / "models" / "hexapod.yaml"
 JOINTS = [f"leg{j}_prismatic" for j in range(1, 7)]
 SIZE = (64, 48)
+SERVOS = tuple(f"servo{j}" for j in range(1, 7))
 
 
 @cache
@@ -88,3 +89,25 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Folder:
     made = Folder(tmp_path / "set", rows, ["view", "image", *JOINTS], entry)
     made.write()
     return made
+
+
+def dataset_of_readings(
+    folder: Path,
+    readings: np.ndarray,
+    entry: Mapping[str, Any],
+    model: str = "servo-hexapod",
+    joints: tuple[str, ...] = SERVOS,
+) -> Path:
+    """Write a dataset of readings (n_rows, n_motors) of a machine of arms, without images."""
+    lines = ["view,image," + ",".join(joints)]
+    lines += [f"c1,{k}.png," + ",".join(f"{x:.9g}" for x in row) for k, row in enumerate(readings)]
+    (folder / "measurements.csv").write_text("\n".join(lines) + "\n")
+    document = {
+        "legcal_dataset": 1,
+        "mechanism": model,
+        "measurements": "measurements.csv",
+        "views": {"c1": {"camera": str(ROOT / "examples/hexapod/camera_info.yaml")}},
+        **entry,
+    }
+    (folder / "dataset.yaml").write_text(yaml.safe_dump(document))
+    return folder

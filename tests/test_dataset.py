@@ -4,6 +4,7 @@ Refusals of single cells and keys are in the table of tests/characterisation; he
 Python alone shows, and every kind and every fault of an image file.
 """
 
+import re
 import struct
 import sys
 import zlib
@@ -13,7 +14,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from dataset_folder import HEXAPOD, JOINTS, ROOT, SIZE, Folder, folder, hexapod, readings
+from dataset_folder import (
+    HEXAPOD,
+    JOINTS,
+    ROOT,
+    SIZE,
+    Folder,
+    dataset_of_readings,
+    folder,
+    hexapod,
+    readings,
+)
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data import Measurements, load_dataset
@@ -393,3 +404,32 @@ def test_files_that_are_no_pictures_are_refused_quietly(
         read_image(path, CAMERA, "table, row 3")
     assert cv2.utils.logging.getLogLevel() == level
     assert "OpenCV" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("hidden", "named"),
+    [
+        ("leg[12]_", ("motor 'arm1'", "no cylinder along leg1, leg2", "<visual>")),
+        ("leg\\d_", ("view c1 could not be used", "found no leg", "visible cylinder")),
+        ("leg1_", ()),
+    ],
+)
+def test_arms_without_a_visible_rod_are_told_before_images_are_looked_at(
+    hidden: str, named: tuple[str, ...], tmp_path: Path
+) -> None:
+    urdf = (ROOT / "urdf/delta.urdf").read_text()
+    bare = re.sub(rf'(<link name="{hidden}\w*">).*?</link>', r"\1</link>", urdf, flags=re.DOTALL)
+    (tmp_path / "delta.urdf").write_text(bare)
+    model = (ROOT / "models/delta.yaml").read_text().replace("../urdf/", "")
+    (tmp_path / "delta.yaml").write_text(model)
+    arms = ("arm1", "arm2", "arm3")
+    angles = np.array([[0.3, 0.2, 0.1], [0.1, 0.4, 0.3]])
+    entry = {"encoder_sigma": dict.fromkeys(arms, 1e-4)}
+    made = dataset_of_readings(tmp_path, angles, entry, "delta.yaml", arms)
+    if not named:
+        load_dataset(made, check_images=False)
+        return
+    with pytest.raises(LegcalError) as caught:
+        load_dataset(made)
+    (said,) = caught.value.problems
+    assert all(word in said for word in named), said

@@ -19,6 +19,7 @@ from legcal import evaluate, load_mechanism
 from legcal.calibration import Evaluation
 from legcal.errors import DidNotConverge, ModelError
 from legcal.machine import (
+    Pulses,
     create_model,
     geometries,
     machine_document,
@@ -42,6 +43,19 @@ def _described(name: str | Path) -> dict[str, Any]:
     document = json.loads(json.dumps(machine_document(load_mechanism(name)), allow_nan=False))
     assert isinstance(document, dict)
     return document
+
+
+def test_pulses_and_gains_of_motors_are_shown() -> None:
+    machine = load_mechanism("servo-hexapod")
+    legs = tuple(
+        replace(leg, actuator=replace(leg.actuator, gain=1.002, pulses=Pulses(1500.0, -11.1)))
+        for leg in machine.legs
+        if leg.actuator is not None
+    )
+    document = machine_document(replace(machine, legs=legs))
+    text = _printed(inspect_table(document))
+    assert text.count("1500 us at 0, -11.1 us/deg") == text.count("gain 1.002") == 6
+    assert {"gain", "us_per_deg"}.isdisjoint(_described("delta")["actuators"]["arm1"])
 
 
 def test_counts_of_the_paper_follow_from_legs_and_motors() -> None:

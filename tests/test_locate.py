@@ -171,9 +171,9 @@ def test_right_rows_are_not_left_out_for_what_is_stated_of_the_measurement() -> 
     assert right.dof == 36
     wide = locate(hexapod.machine, hexapod.poses, position_sigma=1e-3, angle_sigma=SIGMA_ANGLE)
     assert any("look too large: positions" in note for note in wide.notes)
-    beside = locate(hexapod.machine, hexapod.poses, **KNOWN, encoder_sigma=50e-6)
+    beside = locate(hexapod.machine, hexapod.poses, **KNOWN, encoder_sigma="50um")
     assert np.all(beside.sigma > right.sigma)
-    assert beside.noise.reading == 50e-6
+    assert beside.noise.reading == pytest.approx(50e-6)
 
 
 def test_a_row_that_is_stated_to_be_worse_counts_less() -> None:
@@ -301,6 +301,7 @@ SLOW = pytest.mark.slow
         (lambda: _rows([0, 1, 2]), {"position_sigma": 0.0}, UsageError, ("position sigma", "0 m")),
         (lambda: _rows([0, 1, 2]), {"angle_sigma": 0.5}, UsageError, ("angle sigma", "0.5 rad")),
         (lambda: _rows([0, 1, 2]), {"encoder_sigma": float("nan")}, UsageError, ("nan",)),
+        (lambda: _rows([0, 1, 2]), {"encoder_sigma": "0.5deg"}, UsageError, ("0.5deg", "mm")),
         (lambda: _rows([0, 1, 2]), {"tool_position": (0.0, 1.0)}, UsageError, ("three numbers",)),
         (lambda: _rows([0, 1, 2]), {"tool_position": (0.0, 0.0, float("inf"))}, UsageError,
          ("tool position",)),

@@ -137,14 +137,15 @@ def test_a_search_ends_at_most_rows_where_others_are_wrong() -> None:
     assert np.abs(frame_errors(found, BASE, TOOL)).max() < 1e-3
 
 
-@pytest.mark.parametrize("name", ["hexapod", "3-rps", "3-rpr"])
+@pytest.mark.parametrize("name", ["hexapod", "3-rps", "3-rpr", "3-prs", "delta"])
 def test_errors_of_readings_move_the_tool_as_the_machine_does(name: str) -> None:
     machine, sampled = shipped(name), workspace_poses(name, 3)
     h, frames = 1e-6, frames_of(BASE, TOOL)
+    sigma = {str(machine.legs[j].prismatic): h for j in machine.motors}
     matrices = np.array([T.as_matrix() for T in sampled.poses])
     R, t = matrices[:, :3, :3], matrices[:, :3, 3]
     pairs = PosePairs(R, t, R, t, np.ones(len(t), dtype=np.bool_), 0.1)
-    found = tool_motions(motions_by_readings(machine, sampled.poses, h), frames, pairs)
+    found = tool_motions(motions_by_readings(machine, sampled.poses, sigma), frames, pairs)
     for i, T in enumerate(sampled.poses):
         direct = np.zeros((6, len(machine.motors)))
         for column, j in enumerate(machine.motors):

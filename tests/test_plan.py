@@ -1,5 +1,6 @@
 """Planned sessions: what they hold, what they promise, and what is refused."""
 
+import io
 import json
 import os
 import pickle
@@ -9,12 +10,15 @@ from concurrent.futures import Future
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from command_line import run
+from csv_rows import read_rows
+from rich.console import Console
 
 import legcal
 from legcal import planning
@@ -26,12 +30,14 @@ from legcal.machine import (
     follow,
     inverse_kinematics,
     load_mechanism,
+    random_configurations,
     slider_columns,
 )
 from legcal.planning import Setting, planner
 from legcal.planning import places as camera_places
 from legcal.planning.exchange import Session, choose
 from legcal.planning.planner import Scene, Task
+from legcal.report import plan_table
 from legcal.simulation import Level, ParameterErrors, SimulationSettings, simulate
 
 FEW = Setting(draws=3)
@@ -301,6 +307,7 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"given": "nowhere"}, DatasetError, "nowhere"),
     ({"noise": "nowhere"}, UsageError, "--noise"),
     ({"places": "nowhere.yaml"}, DatasetError, "nowhere.yaml"),
+    ({"encoder_sigma": "0.5deg"}, UsageError, "encoder sigma"),
     ({"setting": Setting(draws=0)}, UsageError, "0 draws"),
     ({"setting": Setting(shift=50.0)}, UsageError, "of 50 and"),
     ({"setting": Setting(length=0.5), "images": 4}, DidNotConverge, "--model-error"),
@@ -338,6 +345,26 @@ def test_a_machine_whose_legs_always_collide_says_so() -> None:
     assert "found 0 that the machine reaches in 300 draws" in message
     assert "excluded 300 times by collisions of legs" in message
     assert "check radii and ends of the cylinders" in message
+
+
+def test_plans_of_motors_that_turn_are_in_degrees_and_name_the_length_to_measure(
+    planned: planning.Plan, tmp_path: Path
+) -> None:
+    machine, sigma = load_mechanism("delta"), np.radians(0.5)
+    drawn = random_configurations(machine, 2, np.random.default_rng(1))
+    seen: Any = SimpleNamespace(legs_in=lambda *shape: np.ones(shape, dtype=np.bool_))
+    view = replace(planned.views[0], poses=drawn, via=("", ""), seen=seen)
+    plan = replace(planned, machine=machine, views=(view,), sigma_by_joint={"arm2": sigma})
+    planning.write_session(plan, tmp_path)
+    rows = read_rows(tmp_path / "poses.csv")
+    told = [[float(row[f"arm{j} [deg]"]) for j in (1, 2, 3)] for row in rows]
+    found = load_dataset(tmp_path, check_images=False).measurements
+    np.testing.assert_allclose(np.radians(told), found.q[:, ::2], atol=1e-6)
+    assert found.sigma_by_joint["arm2"] == pytest.approx(sigma)
+    console = Console(file=io.StringIO(), width=200)
+    console.print(plan_table(plan, tmp_path))
+    printed = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "-o OUT --length leg1.base:leg1.platform=" in printed
 
 
 def test_what_else_is_in_the_way_is_refused(

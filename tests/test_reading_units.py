@@ -1,7 +1,5 @@
 """Readings in degrees, radians and pulses of servos, stated and taken for each other."""
 
-import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +8,7 @@ import pytest
 import yaml
 from command_line import run
 from csv_rows import read_rows
+from dataset_folder import SERVOS, dataset_of_readings
 from machines import ROOT, read_table
 from photograph_files import jpeg
 
@@ -17,33 +16,9 @@ from legcal.data import load_dataset
 from legcal.errors import LegcalError, ModelError
 from legcal.machine import create_model, load_mechanism, write_model
 
-SERVOS = tuple(f"servo{j}" for j in range(1, 7))
-ARMS = ("arm1", "arm2", "arm3")
-CAMERA = ROOT / "examples/hexapod/camera_info.yaml"
 ANGLES = 0.5 * np.sin(np.arange(24.0).reshape(4, 6))  # [rad]
+BOTH_WAYS = np.concatenate([ANGLES, -ANGLES])
 PULSES = {"centre_us": 1500, "us_per_deg": 11.1}
-
-
-def dataset(
-    folder: Path,
-    readings: np.ndarray,
-    entry: Mapping[str, Any],
-    model: str = "servo-hexapod",
-    joints: tuple[str, ...] = SERVOS,
-) -> Path:
-    """Write a dataset of readings (n_rows, n_motors)."""
-    lines = ["view,image," + ",".join(joints)]
-    lines += [f"c1,{k}.png," + ",".join(f"{x:.9g}" for x in row) for k, row in enumerate(readings)]
-    (folder / "measurements.csv").write_text("\n".join(lines) + "\n")
-    document = {
-        "legcal_dataset": 1,
-        "mechanism": model,
-        "measurements": "measurements.csv",
-        "views": {"c1": {"camera": str(CAMERA)}},
-        **entry,
-    }
-    (folder / "dataset.yaml").write_text(yaml.safe_dump(document))
-    return folder
 
 
 def pulses(angles: np.ndarray, centre: float = 1500.0, per_degree: float = 11.1) -> np.ndarray:
@@ -64,7 +39,8 @@ def test_units_of_each_motor_give_joint_values_and_their_sigmas(tmp_path: Path) 
     }
     sigmas = {"servo3": 0.1, "servo4": "0.2deg", "servo5": 3.0, "servo6": "4us"}
     found = load_dataset(
-        dataset(tmp_path, given, {"readings": units, "encoder_sigma": sigmas}), check_images=False
+        dataset_of_readings(tmp_path, given, {"readings": units, "encoder_sigma": sigmas}),
+        check_images=False,
     ).measurements
     np.testing.assert_allclose(found.q, ANGLES, atol=1e-8)
     wanted = [0.5, 0.5, 0.1, 0.2, 3.0 / 11.1, 4.0 / 11.1]
@@ -90,7 +66,7 @@ def test_a_model_keeps_the_pulses_of_its_servos(tmp_path: Path) -> None:
     assert [a.pulses for a in again.actuators] == [a.pulses for a in machine.actuators]
     model = str(tmp_path / "models/servos.yaml")
     found = load_dataset(
-        dataset(tmp_path, pulses(ANGLES), {"readings": "us"}, model), check_images=False
+        dataset_of_readings(tmp_path, pulses(ANGLES), {"readings": "us"}, model), check_images=False
     ).measurements
     np.testing.assert_allclose(found.q, ANGLES, atol=1e-8)
     with pytest.raises(ModelError, match=r"actuators.servo1.*found no us_per_deg"):
@@ -108,7 +84,7 @@ IN_US = {"readings": {name: {"unit": "us", **PULSES} for name in SERVOS}}
     ("readings", "entry", "named"),
     [
         (np.degrees(ANGLES), SIGMA, ("look like degrees", "pi/180", "readings: deg")),
-        (ANGLES, DEGREES, ("% of the travel in deg", "in rad", "readings of the dataset file")),
+        (BOTH_WAYS, DEGREES, ("% of the travel in deg", "in rad", "write readings: rad")),
         (pulses(ANGLES), SIGMA, ("look like pulses", "centre_us: 1500")),
         (pulses(ANGLES), DEGREES, ("look like pulses", "centre_us: 1500")),
         (ANGLES, IN_US, ("found 0 us", "1000.5 to 1999.5 us", "look like radians")),
@@ -129,36 +105,29 @@ def test_units_that_are_taken_for_others_are_told_before_images_are_looked_at(
     readings: np.ndarray, entry: dict[str, Any], named: tuple[str, ...], tmp_path: Path
 ) -> None:
     with pytest.raises(LegcalError) as caught:
-        load_dataset(dataset(tmp_path, readings, entry))
+        load_dataset(dataset_of_readings(tmp_path, readings, entry))
     (said, *_) = caught.value.problems
     assert all(word in said for word in named), said
 
 
 @pytest.mark.parametrize(
-    ("hidden", "named"),
+    ("given", "unit", "is_noted"),
     [
-        ("leg[12]_", ("motor 'arm1'", "no cylinder along leg1, leg2", "<visual>")),
-        ("leg\\d_", ("view c1 could not be used", "found no leg", "visible cylinder")),
-        ("leg1_", ()),
+        (BOTH_WAYS[::2], "deg", True),  # as of a check
+        (0.5 * BOTH_WAYS, "deg", True),
+        (0.2 * BOTH_WAYS, "deg", False),
+        (np.radians(BOTH_WAYS), "rad", False),  # the same motions, in a unit that is not doubted
     ],
 )
-def test_arms_without_a_visible_rod_are_told_before_images_are_looked_at(
-    hidden: str, named: tuple[str, ...], tmp_path: Path
+def test_small_motions_are_not_refused_for_their_unit(
+    given: np.ndarray, unit: str, is_noted: bool, tmp_path: Path
 ) -> None:
-    urdf = (ROOT / "urdf/delta.urdf").read_text()
-    bare = re.sub(rf'(<link name="{hidden}\w*">).*?</link>', r"\1</link>", urdf, flags=re.DOTALL)
-    (tmp_path / "delta.urdf").write_text(bare)
-    model = (ROOT / "models/delta.yaml").read_text().replace("../urdf/", "")
-    (tmp_path / "delta.yaml").write_text(model)
-    entry = {"encoder_sigma": dict.fromkeys(ARMS, 1e-4)}
-    made = dataset(tmp_path, ANGLES[:, :3], entry, "delta.yaml", ARMS)
-    if not named:
-        load_dataset(made, check_images=False)
-        return
-    with pytest.raises(LegcalError) as caught:
-        load_dataset(made)
-    (said,) = caught.value.problems
-    assert all(word in said for word in named), said
+    made = dataset_of_readings(tmp_path, given, DEGREES | {"readings": unit})
+    found = load_dataset(made, check_images=False)
+    size = np.radians(1.0) if unit == "deg" else 1.0
+    np.testing.assert_allclose(found.measurements.q, size * given, atol=1e-9)
+    noted = [note for note in found.notes if "of the travel in deg" in note]
+    assert [("in rad; check their unit" in note) for note in noted] == [True] * is_noted
 
 
 def photographs(folder: Path, n: int) -> None:

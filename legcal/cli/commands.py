@@ -264,7 +264,8 @@ def locate(
         typer.Option(help="Sigma of an orientation, 0.01deg; by default from the residuals."),
     ] = None,
     encoder_sigma: Annotated[
-        str | None, typer.Option(help="Sigma of a reading, 2um; 0 by default.")
+        str | None,
+        typer.Option(help="Sigma of a reading, 2um, of motors that turn 0.01deg; 0 by default."),
     ] = None,
     tool_position: Annotated[
         str | None,
@@ -303,7 +304,7 @@ def locate(
         poses,
         position_sigma=quantity(position_sigma, LENGTH, "--position-sigma"),
         angle_sigma=quantity(angle_sigma, ANGLE, "--angle-sigma"),
-        encoder_sigma=quantity(encoder_sigma, LENGTH, "--encoder-sigma") or 0.0,
+        encoder_sigma=encoder_sigma or 0.0,
         tool_position=None if tool_position is None else _point(tool_position),
     )
     written = []

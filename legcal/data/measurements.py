@@ -43,7 +43,9 @@ from legcal.vision import Camera
 MAX_NAMED = 5  # views or other things, in one sentence
 MAX_READING_SPREAD = 10.0  # sigma by which rows of one pose may differ
 INCH = 0.0254  # [m]
-HARDLY_MOVES, SURELY_MOVES = 0.02, 0.2  # of the travel: in the unit stated, and in another
+# Parts of the travel: in the unit that is stated, and in another that may be, or surely is, meant
+HARDLY_MOVES, MAY_MOVE, SURELY_MOVES = 0.02, 0.2, 0.5
+MIN_POSES = 5  # different ones, as an arm needs (6'): fewer are a check, and may be near each other
 USUAL_PULSES = (400.0, 2700.0)  # [us], of hobby servos
 _MAX_SHOWN = 3  # readings quoted in a sentence about many
 
@@ -203,8 +205,9 @@ def readings_in(
     """Return the readings in a table (n_rows, n_motors) [m or rad], and notes on odd ones.
 
     Readings outside their travel by more than 5 % of it are refused, others are noted. Refused is
-    as well what hardly moves in its unit and makes use of the travel in another. *units* are those
-    that a dataset states, None of tables that have readings in m and rad.
+    as well what hardly moves in its unit and makes use of the travel in a larger one; where that is
+    not sure, as of few poses, it is noted. *units* are those that a dataset states, None of tables
+    in m and rad.
     """
     actuated = legs_with_readings(legs)
     given = table.numbers(str(leg.prismatic) for leg in actuated)
@@ -249,42 +252,54 @@ def readings_in(
             f"{table.path}, {of_this}: readings are outside the travel: {found}; {remedy}."
         )
     if not beyond:
-        for problem in _hardly_moving(given, readings, actuated, stated):
-            table.refuse_file(f"{table.path}, {problem}")
+        for problem, is_sure in _hardly_moving(given, readings, actuated, stated):
+            if is_sure:
+                table.refuse_file(f"{table.path}, {problem}")
+            else:
+                notes.append(f"{table.path}, {problem}")
     return readings, tuple(notes)
 
 
 def _hardly_moving(
     given: Array, readings: Array, legs: Sequence[Leg], units: Sequence[ReadingUnit]
-) -> list[str]:
-    """Return which columns hardly move in the unit that is stated, and do in a larger one."""
-    problems = list[str]()
-    if not len(given):
-        return problems
+) -> list[tuple[str, bool]]:
+    """Return which columns hardly move in their unit and do in a larger one, and whether surely.
+
+    The largest units are never doubted, so that small motions can always be written in them.
+    """
+    found = list[tuple[str, bool]]()
+    n_poses = len(np.unique(given, axis=0))
     for name in dict.fromkeys(unit.name for unit in units):
         some = [j for j, unit in enumerate(units) if unit.name == name]
         width = np.ptp([legs[j].travel for j in some], axis=1)
         sizes = ANGLE if legs[some[0]].reads_angle else LENGTH
-        if name not in sizes or not np.all((width > 0.0) & np.isfinite(width)):
+        if not n_poses or name not in sizes or not np.all((width > 0.0) & np.isfinite(width)):
             continue
         used = float(np.max(np.ptp(readings[:, some], axis=0) / width))
         for other, size in sizes.items():
             meant = size * given[:, some]
-            moved = float(np.max(np.ptp(meant, axis=0) / width))
-            if (
-                used < HARDLY_MOVES < SURELY_MOVES < moved
-                and size > sizes[name]
-                and np.all(in_travel(meant, [legs[j] for j in some]))
-            ):
-                columns = few([str(legs[j].prismatic) for j in some])
-                problems.append(
-                    f"column{'s' * (len(some) > 1)} {columns}: the readings could not be used: "
-                    f"found that they use {100 * used:.2g} % of the travel in {name}, which is "
-                    f"stated, and {100 * moved:.2g} % in {other}, needed the unit in which they "
-                    f"are; write it in readings of the dataset file."
-                )
-                break
-    return problems
+            moved = float(np.mean(np.ptp(meant, axis=0) / width))
+            if used >= HARDLY_MOVES or moved <= MAY_MOVE or size <= sizes[name]:
+                continue
+            if not np.all(in_travel(meant, [legs[j] for j in some])):
+                continue
+            columns = few([str(legs[j].prismatic) for j in some])
+            columns = f"column{'s' * (len(some) > 1)} {columns}"
+            uses = (
+                f"use {100 * used:.2g} % of the travel in {name}, which is stated, and "
+                f"{100 * moved:.2g} % in {other}"
+            )
+            is_sure = n_poses >= MIN_POSES and moved > SURELY_MOVES
+            said = (
+                f"{columns}: the unit of the readings could not be decided: found that they "
+                f"{uses}, needed the unit in which they are; write readings: {other} in the "
+                f"dataset file, and convert them first if they are in {name}."
+                if is_sure
+                else f"{columns}: readings {uses}; check their unit."
+            )
+            found.append((said, is_sure))
+            break
+    return found
 
 
 def _likely_cause(

@@ -166,6 +166,23 @@ def reading_units(
     return units
 
 
+def sigmas_of(stated: float | str, legs: Sequence[Leg]) -> dict[str, float]:
+    """Return the standard deviations of readings [m or rad] that one statement gives, by motor.
+
+    A number is that of every motor in its own unit [m or rad], a text with a unit that of the
+    motors that slide, or turn.
+
+    Raises
+    ------
+    ValueError
+        If no motor can have it; the text goes on after what could not be used.
+    """
+    motors = legs_with_readings(legs)
+    unit = split_quantity(stated)[1] if isinstance(stated, str) else ""
+    alike = [leg for leg in motors if unit in (ANGLE if leg.reads_angle else LENGTH)]
+    return {str(leg.prismatic): sigma_in(stated, default_unit(leg), leg) for leg in alike or motors}
+
+
 def sigma_in(stated: float | str, unit: ReadingUnit, leg: Leg) -> float:
     """Return a standard deviation of readings [m or rad]: a number in their unit, or with its own.
 

@@ -10,6 +10,7 @@ from pydantic import model_validator
 from legcal.files import Document, Number, Pose, SparseDocument, Triple
 from legcal.machine.leg import JointType, Leg, LegKind
 from legcal.machine.model import Machine, readings_at
+from legcal.machine.schema import motor_entries
 
 
 class ActuatorBlock(SparseDocument):
@@ -27,6 +28,14 @@ class ActuatorBlock(SparseDocument):
         if missing:
             raise ValueError(f"a {self.kind} actuator has no '{missing[0]}'")
         return self
+
+
+class InspectedActuator(ActuatorBlock):
+    """A motor as the model has it."""
+
+    gain: Number | None = None  # true motion over reading; left out where it is 1
+    centre_us: Number | None = None  # of a hobby servo: the pulse at joint value 0 [us]
+    us_per_deg: Number | None = None
 
 
 class CylinderBlock(Document):
@@ -72,7 +81,7 @@ class Inspection(SparseDocument):
     base_frame: list[str]
     home: Pose  # T_base_platform
     legs: list[InspectedLeg]
-    actuators: dict[str, ActuatorBlock] | None = None  # in the base link, with A at reading 0
+    actuators: dict[str, InspectedActuator] | None = None  # in the base link, with A at reading 0
     diagnostics: list[str]
 
 
@@ -80,7 +89,11 @@ def machine_document(machine: Machine) -> dict[str, Any]:
     """Return the document of ``legcal inspect --json``, an :class:`Inspection`."""
     kinds = [leg.kind for leg in machine.legs]
     readings = readings_at(machine, machine.home).tolist()
-    actuators = {a.joint: ActuatorBlock.model_validate(a.document()) for a in machine.actuators}
+    stated = motor_entries(machine.actuators)
+    actuators = {
+        a.joint: InspectedActuator.model_validate(a.document() | stated.get(a.joint, {}))
+        for a in machine.actuators
+    }
     return Inspection(
         name=machine.name,
         spatial=machine.spatial,

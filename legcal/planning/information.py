@@ -11,7 +11,7 @@ mechanism ties.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -35,7 +35,7 @@ from legcal.calibration import (
 from legcal.data import Measurements, Outlines, View
 from legcal.estimation import Frames, PseudoHuber, linearize
 from legcal.geometry import Array, IntArray
-from legcal.machine import Leg, Machine, reading_of_rod
+from legcal.machine import Leg, Machine, owner_of_parameter, reading_of_rod
 from legcal.vision import Camera
 
 KINEMATIC = "machine"  # names of coordinates of the machine begin so
@@ -103,6 +103,7 @@ class Predictor:
     noise: PredictedNoise
     sigma_q: float  # of a reading [m]
     choices: Choices = NO_CHOICES
+    sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
 
     @cached_property
     def legs(self) -> FittedLegs:
@@ -132,6 +133,7 @@ class Predictor:
             pose=np.arange(n, dtype=np.intp),
             q=q,
             sigma_q=self.sigma_q,
+            sigma_by_joint=self.sigma_by_joint,
         )
         problem = build_fit(self.legs, measurements, self.noise.of(outlines), choices=self.choices)
         biases = possible_biases(problem.outlines, self.legs.names)
@@ -207,10 +209,11 @@ def _names(problem: FitProblem, views: Sequence[str]) -> list[str]:
         where = problem.where(block.name)
         labels = block.labels or tuple(str(i) for i in range(block.n_unknowns))
         for i, label in zip(where.tolist(), labels, strict=True):
-            head, _, rest = label.partition(".")
+            head = owner_of_parameter(label, views)
+            rest = label.removeprefix(f"{head}.")
             if block.name == "cameras" or (block.name == "biases" and rest == "gamma"):
                 names[i] = f"camera {rest}"  # all views share one
-            elif block.name == "biases" and head in views:
+            elif block.name == "biases" and head:
                 names[i] = f"{head}: {rest}"
             else:
                 names[i] = f"{block.name} {label}"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -14,7 +14,7 @@ from legcal.brief import brief
 from legcal.calibration import KINDS, PlatformError
 from legcal.files import Document, Number, Pose, Version
 from legcal.geometry import Array, BoolArray
-from legcal.machine import Configurations, Machine
+from legcal.machine import Configurations, Leg, Machine
 from legcal.planning.goals import Goal
 from legcal.planning.information import PredictedNoise
 from legcal.planning.laid_board import LaidBoard
@@ -73,7 +73,7 @@ class Plan:
     camera: Camera
     setting: Setting
     noise: PredictedNoise
-    sigma_q: float  # [m] of a reading
+    sigma_q: float  # [m] of a reading of a motor that slides
     goal: Goal
     views: tuple[PlannedView, ...]
     value: float
@@ -88,6 +88,7 @@ class Plan:
     hand_held: bool = False
     given: str = ""  # the dataset that it adds to
     notes: tuple[str, ...] = ()
+    sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
 
     @property
     def n_images(self) -> int:
@@ -237,6 +238,17 @@ class PlanDocument(Document):
     growth: list[Growth]
     limits: dict[str, Number]  # the criterion [m] if an error were not there, or images without end
     notes: list[str]
+
+
+def rod_to_measure(machine: Machine, *, board: bool) -> tuple[Leg, str] | None:
+    """Return the rod whose length has to be measured, and what --length calls its joints.
+
+    None where readings or a board carry lengths.
+    """
+    if board or machine.readings_carry_length:
+        return None
+    rod = next(leg for leg in machine.legs if leg.actuator is not None)
+    return rod, f"{rod.name}.base:{rod.name}.platform"
 
 
 def views_in_words(views: Sequence[PlannedView]) -> str:

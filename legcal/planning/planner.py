@@ -514,6 +514,7 @@ def _judged(
         setting=task.setting,
         noise=predictor.noise,
         sigma_q=predictor.sigma_q,
+        sigma_by_joint=predictor.sigma_by_joint,
         goal=task.goal,
         views=_named(views, task),
         value=value,

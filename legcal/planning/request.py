@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from legcal.calibration import NO_CHOICES, Choices, Prior
-from legcal.data import Dataset, load_dataset
+from legcal.data import SERVO_SIGMA, Dataset, load_dataset, sigmas_of
 from legcal.errors import DatasetError, NotIdentifiable, UsageError
 from legcal.geometry import Array
 from legcal.machine import Machine, follow_each, load_mechanism, poses_at
@@ -25,7 +25,7 @@ from legcal.planning.places import (
     Setting,
     read_places,
 )
-from legcal.planning.planned_session import Plan
+from legcal.planning.planned_session import Plan, rod_to_measure
 from legcal.planning.planner import Candidates, Task, plan_session
 from legcal.progress import Progress, Report, shown_progress
 from legcal.vision import (
@@ -61,7 +61,7 @@ def plan(
     parameters: Sequence[str] = (),
     camera: str | Path | Camera | None = None,
     noise: PredictedNoise | str | Path = DEFAULT_NOISE,
-    encoder_sigma: float | None = None,
+    encoder_sigma: float | str | None = None,
     bounds: Array | None = None,
     places: str | Path | None = None,
     given: str | Path | Dataset | None = None,
@@ -96,8 +96,10 @@ def plan(
         dataset that is given.
     noise : PredictedNoise or path
         Errors of outlines; an earlier result, or a document of ``legcal noise --json``.
-    encoder_sigma : float, optional
-        One standard deviation of a reading [m]; 2 um by default, or that of the dataset.
+    encoder_sigma : float or str, optional
+        One standard deviation of a reading: a number [m, of motors that turn rad], or a text with
+        its unit ('0.5deg'), which is that of the motors that slide, or turn. By default 2 um,
+        0.1 mrad and 0.5 deg of hobby servos, or those of the dataset.
     bounds : (3, 2) array, optional
         Lowest and highest x, y, z of cameras in the base link [m].
     places : path, optional
@@ -148,12 +150,22 @@ def plan(
         chosen = sample_camera() if shot is None else shot.measurements.views[0].camera
     else:
         chosen = camera if isinstance(camera, Camera) else read_camera(Path(camera))
-    if encoder_sigma is None:
-        encoder_sigma = SIGMA_Q if shot is None else shot.measurements.sigma_q
+    sigma_q = SIGMA_Q
+    sigma_by_joint = {a.joint: SERVO_SIGMA for a in machine.actuators if a.pulses is not None}
+    if encoder_sigma is not None:
+        try:
+            sigma_by_joint |= sigmas_of(encoder_sigma, machine.legs)
+        except ValueError as error:
+            raise UsageError(f"The encoder sigma could not be used: {error}") from error
+        sliding = [str(leg.prismatic) for leg in machine.legs if not leg.reads_angle]
+        sigma_q = min((s for name, s in sigma_by_joint.items() if name in sliding), default=SIGMA_Q)
+    elif shot is not None:
+        sigma_q = shot.measurements.sigma_q
+        sigma_by_joint = dict(shot.measurements.sigma_by_joint)
     errors = noise if isinstance(noise, PredictedNoise) else read_noise(Path(noise))
     lengths, counted = _measured_length(machine, board=board is not None)
     task = Task(
-        Predictor(machine, chosen, errors, encoder_sigma, lengths),
+        Predictor(machine, chosen, errors, sigma_q, lengths, sigma_by_joint),
         n_images,
         n_views,
         Goal(criterion),
@@ -178,10 +190,10 @@ def plan(
 
 def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[str, ...]]:
     """Return the length that a plan counts on where readings carry none, and a note on it."""
-    if board or machine.readings_carry_length:
+    found = rod_to_measure(machine, board=board)
+    if found is None:
         return NO_CHOICES, ()
-    rod = next(leg for leg in machine.legs if leg.actuator is not None)
-    ends = f"{rod.name}.base:{rod.name}.platform"
+    rod, ends = found
     return Choices(priors={f"{rod.name}.length": Prior(rod.q0, LENGTH_SIGMA)}), (
         f"Readings of motors that turn carry no length: the plan counts on the rod of {rod.name} "
         f"measured to {1e3 * LENGTH_SIGMA:g} mm (legcal calibrate --length "

@@ -18,6 +18,7 @@ from legcal.calibration import PLAN_NAME
 from legcal.data import SIGMA_ANGLE, reading_columns
 from legcal.errors import UsageError
 from legcal.files import (
+    SHOWN_IN,
     OutputKind,
     check_destination,
     format_table,
@@ -129,12 +130,19 @@ def _dataset(plan: Plan, model: str) -> str:
 
 
 def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
-    """Return the standard deviation of readings [m], by motor [m or rad] where one turns."""
-    machine = plan.machine
-    if not any(actuator.turns for actuator in machine.actuators):
-        return plan.sigma_q
-    legs = [machine.legs[j] for j in machine.motors]
-    return {str(leg.prismatic): SIGMA_ANGLE if leg.reads_angle else plan.sigma_q for leg in legs}
+    """Return the standard deviation of readings [m], by motor [m or rad] where they differ."""
+    legs = [plan.machine.legs[j] for j in plan.machine.motors]
+    found = {
+        str(leg.prismatic): float(
+            plan.sigma_by_joint.get(
+                str(leg.prismatic), SIGMA_ANGLE if leg.reads_angle else plan.sigma_q
+            )
+        )
+        for leg in legs
+    }
+    if any(leg.reads_angle for leg in legs) or set(found.values()) - {plan.sigma_q}:
+        return found
+    return plan.sigma_q
 
 
 def _measurements(plan: Plan) -> str:
@@ -151,17 +159,22 @@ def _measurements(plan: Plan) -> str:
 def _poses(plan: Plan) -> str:
     """Return ``poses.csv``."""
     motors, rows = list(plan.machine.motors), []
+    shown = [SHOWN_IN[plan.machine.legs[j].reading_unit] for j in motors]
+    scale = np.array([size for size, _ in shown])
     for name, image, label, v, k in images_of(plan):
         view = plan.views[v]
         T, via = view.poses.poses[k], view.via[k]
         if via and via != HOME:  # an earlier pose of the view, by its number
             via = images_of(plan)[sum(len(w.poses.poses) for w in plan.views[:v]) + int(via) - 1][2]
         angles = np.degrees(roll_pitch_yaw(T.rotation.as_matrix()))
-        numbers = [*(1e3 * view.poses.readings[k, motors]), *(1e3 * T.translation), *angles]
+        numbers = [*(scale * view.poses.readings[k, motors]), *(1e3 * T.translation), *angles]
         where = 1e3 * view.T_base_camera.translation
         rows.append([name, label, image, via, *(f"{x:z.4f}" for x in numbers),
                      *(f"{x:z.0f}" for x in where)])  # fmt: skip
-    joints = [f"{column.name} [mm]" for column in reading_columns(plan.machine.legs)]
+    joints = [
+        f"{column.name} [{unit}]"
+        for column, (_, unit) in zip(reading_columns(plan.machine.legs), shown, strict=True)
+    ]
     pose = [*(f"{x} [mm]" for x in "xyz"), *(f"{x} [deg]" for x in ("roll", "pitch", "yaw"))]
     camera = [f"camera {x} [mm]" for x in "xyz"]
     header = ["view", "pose", "image", "on the way", *joints, *pose, *camera]

@@ -111,6 +111,11 @@ def _motors(description: dict[str, Any]) -> RenderableType:
         )
         if turns:
             rows.append(("", "", f"at {_points([motor['point']])[0]} mm", "", ""))
+        if "us_per_deg" in motor:
+            pulses = f"{motor['centre_us']:g} us at 0, {motor['us_per_deg']:g} us/deg"
+            rows.append(("", "", pulses, "", ""))
+        if "gain" in motor:
+            rows.append(("", "", f"gain {motor['gain']:.6g}", "", ""))
     columns = ("motor", "legs", "moves", ">travel", ">at home")
     return table(*columns, rows=rows)
 

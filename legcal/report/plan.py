@@ -18,7 +18,7 @@ from legcal.files import SHOWN_IN
 from legcal.geometry import Array
 from legcal.machine import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR, vectors_A_to_B
 from legcal.pages import Drawing, Items, Picture, Row, page_html
-from legcal.planning import LaidBoard, Plan, views_in_words
+from legcal.planning import LaidBoard, Plan, rod_to_measure, views_in_words
 from legcal.report.page.text_page import text_page
 from legcal.report.render import heading, report, table
 
@@ -77,9 +77,15 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
         [plan.sentence, *map(printable, plan.notes)],
         [] if output is None else [
             printable(f"written: {output}"),
-            printable(f"calibrate with: legcal calibrate {output} -o OUT"),
+            printable(f"calibrate with: legcal calibrate {output} -o OUT{_with_length(plan)}"),
         ],
     )  # fmt: skip
+
+
+def _with_length(plan: Plan) -> str:
+    """Return the option that a calibration needs for its scale, if any."""
+    found = rod_to_measure(plan.machine, board=plan.board is not None)
+    return "" if found is None else f" --length {found[1]}=MEASURED±SIGMAmm"
 
 
 def _told(plan: Plan) -> list[tuple[float, float]]:

@@ -161,7 +161,7 @@ class MeasurementNoise:
     # position_stated, angle_stated: whether it was stated or comes from the residuals
     position_stated: bool
     angle_stated: bool
-    reading: float  # standard deviation of a reading that was stated [m]; zero if none was
+    reading: float  # standard deviation of a reading that was stated [m or rad]; zero if none was
     model: bool  # whether the covariance of a calibrated model was counted in
 
 

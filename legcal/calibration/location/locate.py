@@ -28,8 +28,9 @@ from legcal.calibration.location.tool_poses import (
     read_tool_poses,
     tool_measurements,
 )
+from legcal.data import sigmas_of
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
-from legcal.files import describe
+from legcal.files import describe, split_quantity
 from legcal.geometry import Array, pose_distance
 from legcal.machine import Machine, load_mechanism
 
@@ -54,7 +55,7 @@ def locate(
     *,
     position_sigma: float | None = None,
     angle_sigma: float | None = None,
-    encoder_sigma: float = 0.0,
+    encoder_sigma: float | str = 0.0,
     tool_position: Sequence[float] | None = None,
 ) -> Location:
     """Return where the base stands in the world and the tool in the platform.
@@ -72,8 +73,9 @@ def locate(
     position_sigma, angle_sigma : float, optional
         Standard deviations of the measurement, a component [m], [rad]; where neither they nor the
         table are given, they are estimated from the residuals.
-    encoder_sigma : float
-        Standard deviation of a reading [m].
+    encoder_sigma : float or str
+        Standard deviation of a reading: a number [m, of motors that turn rad], or a text with its
+        unit ('0.01deg'), which is that of the motors that slide, or turn; the others are exact.
     tool_position : (3,) sequence of float, optional
         Position of the tool in the platform [m], taken where the machine leaves it open; the
         origin without it.
@@ -89,8 +91,9 @@ def locate(
     NotIdentifiable
         If the poses leave open what other poses of the machine would determine.
     """
-    _check_numbers(position_sigma, angle_sigma, encoder_sigma, tool_position)
+    _check_numbers(position_sigma, angle_sigma, tool_position)
     machine = model if isinstance(model, Machine) else load_mechanism(model)
+    sigma_q = _sigmas_of_readings(encoder_sigma, machine)
     name = "The tool poses" if isinstance(poses, ToolPoses) else str(poses)
     measured = poses if isinstance(poses, ToolPoses) else read_tool_poses(Path(poses), machine)
     measurements = tool_measurements(
@@ -99,7 +102,7 @@ def locate(
         name,
         position_sigma=position_sigma,
         angle_sigma=angle_sigma,
-        encoder_sigma=encoder_sigma,
+        encoder_sigma=sigma_q,
     )
     candidates = search(measurements.pairs, measurements.fewest)
     _check_plausible(measurements, candidates, name)
@@ -114,17 +117,25 @@ def locate(
     return _judge(measurements, name, inliers, determined, at, is_given=tool_position is not None)
 
 
+def _sigmas_of_readings(stated: float | str, machine: Machine) -> dict[str, float]:
+    """Return what is stated of readings by motor [m or rad]: nothing where they are exact."""
+    if (split_quantity(stated)[0] if isinstance(stated, str) else stated) == 0.0:
+        return {}
+    try:
+        return sigmas_of(stated, machine.legs)
+    except ValueError as error:
+        raise UsageError(f"The encoder sigma could not be used: {error}") from error
+
+
 def _check_numbers(
     position_sigma: float | None,
     angle_sigma: float | None,
-    encoder_sigma: float,
     tool_position: Sequence[float] | None,
 ) -> None:
     """Refuse numbers that cannot be meant."""
     for what, value, least, most, unit in (
         ("position sigma", position_sigma, MIN_SIGMA, _MAX_SIGMA, "m"),
         ("angle sigma", angle_sigma, MIN_SIGMA, MAX_ANGLE_SIGMA, "rad"),
-        ("encoder sigma", encoder_sigma, 0.0, _MAX_SIGMA, "m"),
     ):
         if value is not None and not least <= value <= most:
             raise UsageError(

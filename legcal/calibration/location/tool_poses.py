@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,6 +32,7 @@ from legcal.geometry import Array, BoolArray, IntArray, cross_matrices, whitener
 from legcal.machine import (
     RESULT_YAML,
     Machine,
+    first_rods,
     forward_kinematics_many,
     freedoms,
     geometries,
@@ -40,6 +41,7 @@ from legcal.machine import (
     platforms_in_base,
     pose_equations,
     pose_sensitivity,
+    readings_of_rods,
 )
 
 MIN_SIGMA = 1e-9  # [m, rad]; nobody measures better, and files round
@@ -98,7 +100,7 @@ _ANGLES = re.compile(r"[rw][xyz]|[abc]|roll|pitch|yaw|phi|theta|psi", re.IGNOREC
 class ToolPoses:
     """What a laser tracker, a CMM or a camera measured, one row a pose."""
 
-    q: Array  # (n, n_legs): readings in the order of the legs [m]; NaN for legs without a motor
+    q: Array  # (n, n_legs): readings in the order of the legs [m or rad]; NaN without a motor
     position: Array  # (n, 3): of the tool in the world [m]
     rotation: Array  # (n, 3, 3): T_world_tool; the identity where only the position was measured
     oriented: BoolArray  # (n,): where the orientation was measured too
@@ -252,7 +254,7 @@ class ToolMeasurements:
     poses: ToolPoses  # as measured
     pairs: PosePairs  # beside the platform poses at the readings
     noise: PoseNoise  # of the measurement
-    encoder_sigma: float  # of a reading [m]; zero if none was stated
+    encoder_sigma: float  # the largest of a reading [m or rad]; zero if none was stated
     # by_readings, by_model: (n, 6, k): platform motions (see tool_motions) by independent errors of
     # one standard deviation; None if nothing is known of them
     by_readings: Array | None
@@ -291,7 +293,7 @@ def tool_measurements(
     # has them or residuals are to give them
     position_sigma: float | None,
     angle_sigma: float | None,
-    encoder_sigma: float,
+    encoder_sigma: Mapping[str, float],  # by motor [m or rad], of those that are not exact
 ) -> ToolMeasurements:
     """Return measured poses beside those of the platform, with what is known of their errors.
 
@@ -320,7 +322,7 @@ def tool_measurements(
         poses=poses,
         pairs=pairs,
         noise=_noise(poses, position_sigma, angle_sigma, pairs.length, name),
-        encoder_sigma=encoder_sigma,
+        encoder_sigma=max(encoder_sigma.values(), default=0.0),
         by_readings=motions_by_readings(machine, T, encoder_sigma) if encoder_sigma else None,
         by_model=by_model,
         fewest=fewest,
@@ -378,15 +380,25 @@ def _noise(
 def motions_by_readings(
     machine: Machine,
     poses: Sequence[RigidTransform],
-    sigma_q: float,  # standard deviation of a reading [m]
+    sigma: Mapping[str, float],  # standard deviations of readings by motor [m or rad]
 ) -> Array:
     """Return the platform motions (n, 6, k) by an error of each reading at some poses."""
     R, t = _joint_frames(machine, poses)
-    equations = pose_equations(geometries(machine), R, t)
+    legs = geometries(machine)
+    equations = pose_equations(legs, R, t, by_local=False, q=readings_of_rods(legs, R, t))
     columns = list(freedoms(machine.frame_legs))
-    inverse = np.linalg.pinv(equations.by_pose[:, :, columns])[:, :, equations.measured]
-    moved = np.zeros((len(poses), 6, inverse.shape[2]))
-    moved[:, columns] = sigma_q * inverse  # the sign of a reading does not matter
+    inverse = np.linalg.pinv(equations.by_pose[:, :, columns])
+    of_leg = np.array([sigma.get(str(leg.prismatic), 0.0) for leg in machine.legs])
+    hangs = np.array([leg.actuator is not None for leg in legs], dtype=np.bool_)
+    own = equations.measured & ~hangs[equations.leg]
+    moved = np.zeros((len(poses), 6, own.sum() + equations.by_q.shape[2]))
+    moved[:, columns] = np.concatenate(  # the sign of a reading does not matter
+        [
+            inverse[:, :, own] * of_leg[equations.leg[own]],
+            inverse @ equations.by_q * of_leg[first_rods(legs)],
+        ],
+        axis=2,
+    )
     return _of_link(machine, poses, moved)
 
 
