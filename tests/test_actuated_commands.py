@@ -40,6 +40,8 @@ def test_commands_know_that_joints_at_A_move(
         assert 0.0 < abs(float(value) - 1e3 * distance) < 0.5
     known = ["--prior", f"leg1.length={truth.legs[0].q0!r}+-0.00005"] * (name == "delta")
     assert "where their motors read 0" in said("calibrate", session, "-o", out, "-q", *known)
+    compared = said("evaluate", f"{out}/calibrated.yaml", name)
+    assert "where their motors read 0" in " ".join(compared.split())
     scene = (tmp_path / "out" / "report.html").read_text()
     ends = np.array(json.JSONDecoder().raw_decode(scene.split('"standing": ')[1])[0])
     assert ends.shape == (2, 4 * len(truth.actuators), 3)  # rim and rails or axes, of both models

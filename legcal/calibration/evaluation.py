@@ -68,6 +68,8 @@ class Evaluation:
         Poses of the dataset that are not compared, since one of the models does not reach them.
     unreached : tuple of UnreachedRow
         The rows of the dataset with these poses, and who does not reach them.
+    joints_move : bool
+        Whether motors move joints of the base, which are compared where these read 0.
     """
 
     displacement: Array
@@ -79,6 +81,7 @@ class Evaluation:
     links: dict[Link, ComparedLink]
     n_left_out: int = 0
     unreached: tuple[UnreachedRow, ...] = ()
+    joints_move: bool = False
 
     def document(self) -> dict[str, Any]:
         """Return the document that ``legcal evaluate --json`` prints."""
@@ -171,6 +174,7 @@ def evaluate(
         compared_joints(machine, truth),
         n_left_out,
         unreached,
+        bool(machine.actuators),
     )
 
 

@@ -31,6 +31,7 @@ from legcal.calibration.documents import (
 from legcal.files import Pose
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis, turned_axis
 from legcal.machine import (
+    AT_ZERO,
     SHOWN,
     LegColumns,
     Machine,
@@ -126,8 +127,9 @@ class _LinkFrame:
 
 def joints_title(side: str, link: str, joints_move: bool) -> str:
     """Return the title of a table of joints, of which those at A may move with readings."""
-    at_zero = ", where their motors read 0" * (joints_move and side == "base")
-    return f"Joints of the {side} in the link {link}{at_zero} [mm]"
+    return (
+        f"Joints of the {side} in the link {link}{AT_ZERO * (joints_move and side == 'base')} [mm]"
+    )
 
 
 def joints_in_links(

@@ -134,6 +134,7 @@ from .parameters import turns_between as turns_between
 from .parameters import twist_after as twist_after
 from .parameters import vector_of as vector_of
 from .parameters import with_numbers as with_numbers
+from .rods import AT_ZERO as AT_ZERO
 from .rods import actuator_index as actuator_index
 from .rods import actuators_of as actuators_of
 from .rods import ends_at_poses as ends_at_poses

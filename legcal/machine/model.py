@@ -22,7 +22,14 @@ from legcal.machine.leg import (
     parameters_of_legs,
     with_platform_points,
 )
-from legcal.machine.rods import actuators_of, reading_legs, reading_of_rod
+from legcal.machine.rods import (
+    AT_ZERO,
+    actuators_of,
+    first_rods,
+    joints_at,
+    reading_legs,
+    reading_of_rod,
+)
 from legcal.machine.urdf import Urdf
 
 if TYPE_CHECKING:
@@ -93,6 +100,11 @@ class Machine:
         """What moves joints at A, each once, in the base link."""
         return actuators_of(self.legs)
 
+    @property
+    def at_zero(self) -> str:
+        """What is said of its joints A after their name: where they are told, if they move."""
+        return AT_ZERO if self.actuators else ""
+
     @cached_property
     def motor_names(self) -> tuple[str, ...]:
         """The URDF joints of the motors."""
@@ -126,15 +138,10 @@ class Machine:
     def A_at(self, q: Array) -> Array:
         """Return the base joint centres (..., n_legs, 3) [m] at joint values q (..., n_legs)."""
         q = np.asarray(q, dtype=np.float64)
-        A = np.broadcast_to(self._arrays[0], (*q.shape, 3))
         if not self.actuators:
-            return A
-        A, rows = A.copy(), q.reshape(-1, self.n_legs)
-        flat = A.reshape(-1, self.n_legs, 3)
-        for j, leg in enumerate(self.legs):
-            if leg.actuator is not None:
-                flat[:, j] = leg.actuator.at(leg.A, rows[:, j])
-        return A
+            return np.broadcast_to(self._arrays[0], (*q.shape, 3))
+        A = joints_at(self.legs, q.reshape(-1, self.n_legs)[:, first_rods(self.legs)])
+        return A.reshape(*q.shape, 3)
 
     def at_readings(self, readings: Array) -> Array:
         """Return joint values (..., n_legs) with those of motors (..., n_motors); others are 0."""

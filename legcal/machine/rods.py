@@ -14,6 +14,8 @@ from legcal.geometry import Array, cross
 from legcal.machine.actuator import Actuator
 from legcal.machine.leg import Leg
 
+AT_ZERO = ", where their motors read 0"  # what is said of joints A that move, after their name
+
 
 def actuators_of(legs: Sequence[Leg]) -> tuple[Actuator, ...]:
     """Return the actuators of legs, each once, in the order of their first legs."""

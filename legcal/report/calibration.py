@@ -127,8 +127,7 @@ def _joint_tables(evaluation: Evaluation) -> list[RenderableType]:
             for joint in block.joints
             for k, axis in enumerate("xyz")
         ]
-        moves = any(name.endswith((".direction.1", ".axis_point.1")) for name in evaluation.names)
-        title = joints_title(side, block.link, moves)
+        title = joints_title(side, block.link, evaluation.joints_move)
         columns = ("leg", "axis", ">model", ">reference", ">difference", "")
         found.append(table(*columns, rows=rows, title=title))
         apart, frame = block.frames_apart, FRAMES[side]

@@ -144,10 +144,9 @@ def _legend(machine: Machine, scale: float) -> Iterator[str]:
     yield _text((18 + step * scale, y + 4), f"{1e3 * step:g} mm")
     frame = ", ".join(str(j + 1) for j in machine.frame_legs)
     y += _LINE
-    at_zero = ", where their motors read 0" if machine.actuators else ""
     yield _text(
         (12, y + 6),
-        f"Rings: the joints of legs {frame} define R_b (base{at_zero}) and R_e (platform).",
+        f"Rings: the joints of legs {frame} define R_b (base{machine.at_zero}) and R_e (platform).",
     )
     for k in range(0, machine.n_legs, 4):
         y += _LINE

@@ -67,7 +67,8 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
         table(
             "lens of", *(f">to A{j + 1} [mm]" for j in _measured(plan)), ">above these [mm]",
             rows=[tuple(map(printable, row)) for row in distances],
-            title="Distances to measure, from the middle of the lens to joints of the base",
+            title="Distances to measure, from the middle of the lens to joints of the base"
+            + plan.machine.at_zero,
         ),
         table("parameter", ">sigma", "unit", rows=parameters, title="Known worst"),
         table(

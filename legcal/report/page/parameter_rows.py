@@ -61,17 +61,16 @@ def parameter_tables(calibration: Calibration) -> list[Table]:
     links = [block.link for block in (calibration.result.links or {}).values()]
     others = [row for row in rows if not row.name.endswith(_COORDINATES)]
     machine = calibration.dataset.machine
-    at_zero = ", where their motors read 0" * bool(machine.actuators)
     motors = ""
     if any(motor.turns for motor in machine.actuators):
         motors = "; axis_point is how far the axis of an arm has moved across itself"
     elif machine.actuators:
         motors = "; directions of carriages too"
     note = (
-        f"A are joints of the base in the link {links[0]}{at_zero}, B those of the platform in "
-        f"{links[-1]}, as in calibrated.urdf; axes are turns from the nominal ones{motors}. Sigma "
-        "is one standard deviation; coordinates without one define where R_b or R_e stands, which "
-        "cannot be seen in photographs of legs. A click on a heading sorts."
+        f"A are joints of the base in the link {links[0]}{machine.at_zero}, B those of the "
+        f"platform in {links[-1]}, as in calibrated.urdf; axes are turns from the nominal ones"
+        f"{motors}. Sigma is one standard deviation; coordinates without one define where R_b or "
+        "R_e stands, which cannot be seen in photographs of legs. A click on a heading sorts."
     )
     return [
         Table(columns, [row.cells for row in (*of_links, *others)], note=note),
