@@ -217,9 +217,13 @@ def half_radius(session: Session, _: np.random.Generator) -> Session:
 
 
 def tube_and_rod(session: Session, _: np.random.Generator) -> Session:
-    """Exchange the radii of tubes and rods."""
-    radii = sorted({c.radius for leg in session.dataset.machine.legs for c in leg.cylinders})
-    return _with_radii(session, lambda radius: radii[0] + radii[-1] - radius)
+    """Exchange the radii of tube and rod of each leg."""
+    machine = session.dataset.machine
+    cylinders = [
+        [replace(c, radius=other.radius) for c, other in zip(own, own[::-1], strict=True)]
+        for own in (leg.cylinders for leg in machine.legs)
+    ]
+    return _with_machine(session, machine.with_cylinders(cylinders))
 
 
 def handedness(session: Session, _: np.random.Generator) -> Session:

@@ -59,6 +59,7 @@ _ONE_ROW = (1, -1)  # by which readings stand late from a row on
 _FINER = (0.5, 0.25)  # steps of an amount between those that are tried
 _SYMMETRIC = 0.03  # of the size of the machine, and the sine of angles
 _SAME = 0.03  # in the share of legs: no more than the lens makes of mirrored images
+_NEARLY = 0.8  # of the support of things as they are, near their cameras: others may suit better
 _ALIKE = 0.9  # of the best support: as good, where images do not tell them apart
 _MIN_SHARE = 0.5  # of the images, that agree then
 _MIN_GAIN, _SURE_GAIN = 0.1, 0.05  # in the share of legs that images show, on average
@@ -294,13 +295,14 @@ class _Judge:
                 break
         # Less than this is gained by chance, also by what is wrong with the images of one group.
         least = _SURE_GAIN * min(float(one.expected.sum()) for one in seen)
-        found, amounts = list[int](), set[str]()
+        found = [k for k, one in enumerate(tried) if one.of_few]  # their own images found them
+        amounts = set[str]()
         left_for = {True: _FINALISTS, False: _FINALISTS // 2}  # whether of all views, or of some
         for k in np.argsort(-gain, kind="stable").tolist():
             if gain[k] <= max(_NEAR_BEST * gain.max(), least):
                 break
             of_all = not any(tried[k].true.is_as(self.given, g.rows) for g in self.groups)
-            if tried[k].amount_of not in amounts and left_for[of_all]:
+            if tried[k].amount_of not in amounts and left_for[of_all] and k not in found:
                 found.append(k)
                 left_for[of_all] -= 1
                 amounts |= {tried[k].amount_of} - {""}
@@ -334,6 +336,8 @@ class _Judge:
         own = self.of_groups[g]
         if own.mean >= _SUITS and (T_own := own.cameras[0]) is not None:
             look(some, (), self._alike(T_own))  # cameras stand about there
+            nearly = [k for k in some if support[k] >= _NEARLY * float(before.support.sum())]
+            look([k for k in nearly if not tried[k].is_small], starts)  # or where mirrored ones do
         elif not _suits(support.max(), before):
             look([k for k in some if not tried[k].is_small], starts)
             look([k for k in some if tried[k].is_small], ())

@@ -487,22 +487,20 @@ def _of_radii(given: Assumed) -> Iterator[Mistake]:
                     replace(given, machine=given.machine.with_cylinders(cylinders)),
                     is_small=True,
                 )
-    if len(kinds) == 2:
-        exchanged = {kinds[0]: kinds[1], kinds[1]: kinds[0]}
-
-        def other(radius: float) -> float:
-            return next(
-                (new for old, new in exchanged.items() if abs(old - radius) <= _SAME_RADIUS * old),
-                radius,
-            )
-
+    cylinders = [list(one.cylinders) for one in given.machine.legs]
+    pairs = {}  # of radii: those of legs with two
+    for own in cylinders:
+        if len(of_leg := sorted({c.radius for c in own})) == 2:
+            thin, thick = of_leg
+            own[:] = [replace(c, radius=thick if c.radius == thin else thin) for c in own]
+            pairs[f"{1e3 * thin:g} and {1e3 * thick:g} mm"] = None
+    if pairs:
         yield Mistake(
             "tube and rod exchanged",
-            f"the radii of tube and rod look exchanged ({1e3 * kinds[0]:g} and "
-            f"{1e3 * kinds[1]:g} mm)",
+            f"the radii of tube and rod look exchanged ({', '.join(pairs)})",
             "with them exchanged",
             "exchange them in the <visual> cylinders of the model",
-            replace(given, machine=_with_radii(given.machine, other)),
+            replace(given, machine=given.machine.with_cylinders(cylinders)),
         )
 
 
