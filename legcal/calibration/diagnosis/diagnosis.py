@@ -275,7 +275,11 @@ class _Judge:
         return found
 
     def finalists(self, tried: Sequence[Mistake]) -> list[int]:
-        """Return the mistakes that a few images of the views that disagree most speak for."""
+        """Return the mistakes that some images of the views that disagree most speak for.
+
+        These are all images of views that nearly agree, whose cameras are known about, and a few of
+        others.
+        """
         missing = [float((one.expected - one.support).sum()) for one in self.of_groups]
         left = np.argsort(-np.array(missing), kind="stable").tolist()
         gain, seen = np.zeros(len(tried)), list[Agreement]()
@@ -284,9 +288,9 @@ class _Judge:
             n_images = 0
             while left and n_images < _FEW:
                 g = left.pop(0)
-                some = self.groups[g].some
-                seen.append(self.of_groups[g].at(some))
-                n_images += len(some)
+                asked = self._asked(g)
+                seen.append(self.of_groups[g].at(asked))
+                n_images += 0 if self._nearly_agrees(g) else len(asked)
                 gain += self._gains(tried, g, starts)
                 done += len(tried)
                 self.data.progress(STAGE, min(done, total - 1), total)
@@ -308,14 +312,24 @@ class _Judge:
                 amounts |= {tried[k].amount_of} - {""}
         return found
 
-    def _gains(self, tried: Sequence[Mistake], g: int, starts: Sequence[int]) -> Array:
-        """Return how many more legs a few images of a group show without each mistake.
+    def _nearly_agrees(self, g: int) -> bool:
+        """Say whether the images of a group show half of the legs as things are, or more."""
+        return self.of_groups[g].mean >= _SUITS
 
-        Cameras are tried where they are known roughly, and searched for where that suits none and
-        where images do not agree with the one that things as they are have.
+    def _asked(self, g: int) -> Sequence[int]:
+        """Return the rows of a group that say which mistakes are worth a closer look."""
+        group = self.groups[g]
+        return group.rows if self._nearly_agrees(g) else group.some
+
+    def _gains(self, tried: Sequence[Mistake], g: int, starts: Sequence[int]) -> Array:
+        """Return how many more legs some images of a group show without each mistake.
+
+        Cameras are tried where they are known roughly, or about where those of images that nearly
+        agree are. They are searched for where that suits none, or suits as well as things as they
+        are: a symmetric machine nearly agrees with its mirror image.
         """
-        group, found = self.groups[g], np.zeros(len(tried))
-        before = self.of_groups[g].at(group.some)
+        group, found, asked = self.groups[g], np.zeros(len(tried)), self._asked(g)
+        before = self.of_groups[g].at(asked)
         some = [k for k, one in enumerate(tried) if not one.true.is_as(self.given, group.rows)]
         found[some] = -float(before.support.sum())
         support = np.zeros(len(tried))
@@ -324,7 +338,7 @@ class _Judge:
             which: Sequence[int], starts: Sequence[int], known: Sequence[RigidTransform] = ()
         ) -> None:
             which_true = [tried[k].true for k in which]
-            agreements = self._compare(which_true, g, group.some, starts, known)
+            agreements = self._compare(which_true, g, asked, starts, known)
             for k, one in zip(which, agreements, strict=True):
                 if (now := float(one.support.sum())) > support[k]:
                     support[k], cameras[k] = now, one.cameras[0]
@@ -332,15 +346,16 @@ class _Judge:
             self.pool[g] += [T for k in best if k in which and (T := cameras.get(k)) is not None]
 
         cameras: dict[int, RigidTransform | None] = {}
-        look(some, ())
-        own = self.of_groups[g]
-        if own.mean >= _SUITS and (T_own := own.cameras[0]) is not None:
-            look(some, (), self._alike(T_own))  # cameras stand about there
+        T_own = self.of_groups[g].cameras[0]
+        if self._nearly_agrees(g) and T_own is not None:
+            look(some, (), self._alike(T_own))
             nearly = [k for k in some if support[k] >= _NEARLY * float(before.support.sum())]
-            look([k for k in nearly if not tried[k].is_small], starts)  # or where mirrored ones do
-        elif not _suits(support.max(), before):
-            look([k for k in some if not tried[k].is_small], starts)
-            look([k for k in some if tried[k].is_small], ())
+            look([k for k in nearly if not tried[k].is_small], starts)
+        else:
+            look(some, ())
+            if not _suits(support.max(), before):
+                look([k for k in some if not tried[k].is_small], starts)
+                look([k for k in some if tried[k].is_small], ())
         best = int(np.argmax(support))
         is_better = support[best] >= float(before.support.sum()) + _MIN_GAIN * before.expected.sum()
         if is_better and (T_best := cameras[best]) is not None:
@@ -511,9 +526,9 @@ def _explains(one: Agreement, own: Agreement) -> bool:
     gain = one.share - own.share
     if one.images < 2 or one.images <= own.images:
         return False
-    some = gain[gain != 0.0]
-    size, sigmas = float(some.mean()), _signed_ranks(gain)
-    if one.images < _MIN_SHARE * len(one.row):  # images show little, whatever is true
+    changed = gain != 0.0
+    size, sigmas = float(gain[changed].mean()), _signed_ranks(gain)
+    if np.mean(one.agrees[changed]) < _MIN_SHARE:  # images show little, whatever is true
         return size >= _MIN_GAIN and sigmas >= _SURE_SIGMAS
     is_sure = size >= _SURE_GAIN and sigmas >= _SURE_SIGMAS
     is_plain = size >= _PLAIN_GAIN and sigmas >= _FEW_SIGMAS

@@ -488,7 +488,7 @@ def _of_radii(given: Assumed) -> Iterator[Mistake]:
                     is_small=True,
                 )
     cylinders = [list(one.cylinders) for one in given.machine.legs]
-    pairs = {}  # of radii: those of legs with two
+    pairs: dict[str, None] = {}  # of radii: those of legs with two
     for own in cylinders:
         if len(of_leg := sorted({c.radius for c in own})) == 2:
             thin, thick = of_leg
