@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -23,6 +24,16 @@ os.environ.setdefault("HYPOTHESIS_NO_PLUGINS", "1")
 
 LEFT = ("observations.csv", ".legcal-cache.json")  # beside a dataset, for the next run
 STAGES = "stages.txt"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _temporary_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Have temporary folders, also of other processes, made where pytest deletes them."""
+    folder = str(tmp_path_factory.mktemp("temporary"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tempfile, "tempdir", folder)
+        patch.setenv("TMPDIR", folder)
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
