@@ -18,6 +18,7 @@ import pytest
 import yaml
 from command_line import run
 from csv_rows import read_rows
+from fit_sessions import machine_session
 from rich.console import Console
 
 import legcal
@@ -27,6 +28,7 @@ from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisi
 from legcal.machine import (
     Cylinder,
     Feasibility,
+    Pulses,
     follow,
     inverse_kinematics,
     load_mechanism,
@@ -365,6 +367,38 @@ def test_plans_of_motors_that_turn_are_in_degrees_and_name_the_length_to_measure
     console.print(plan_table(plan, tmp_path))
     printed = console.file.getvalue()  # type: ignore[attr-defined]
     assert "-o OUT --length leg1.base:leg1.platform=" in printed
+
+
+def test_each_motor_counts_with_its_own_standard_deviation(monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[planning.Predictor] = []
+
+    def told(task: Task, *_: object) -> planning.Plan:
+        found.append(task.predictor)
+        raise DidNotConverge("It was told.")
+
+    monkeypatch.setattr("legcal.planning.request.plan_session", told)
+    delta = load_mechanism("delta")
+    legs = tuple(
+        replace(leg, actuator=replace(leg.actuator, pulses=Pulses(1500.0, 11.1)))
+        for leg in delta.legs
+        if leg.actuator is not None
+    )
+    for machine, stated in ((delta, None), (delta, "0.2deg"), (replace(delta, legs=legs), None)):
+        with pytest.raises(DidNotConverge, match="told"):
+            legcal.plan(machine, images=6, encoder_sigma=stated)
+    session = machine_session("delta", n_views=1, n_poses=4)
+    T_base_camera = delta.T_base_Rb * session.truth.T_camera_Rb[0].inv()
+    known = [
+        predictor.contributions(
+            {"c1": T_base_camera},
+            session.measurements.view,
+            session.truth.T_Rb_Re,
+            session.outlines,
+        ).rows
+        for predictor in found
+    ]
+    default, rough, servo = (np.linalg.norm(rows) for rows in known)
+    assert default > 1.1 * rough > 1.1 * servo
 
 
 def test_what_else_is_in_the_way_is_refused(

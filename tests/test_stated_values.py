@@ -291,6 +291,15 @@ def test_a_leg_most_of_whose_outlines_disagree_is_named(noisy: MachineSession) -
     assert not {"leg.3", "leg.2.offset"} & set(note.rstrip(".").replace(",", "").split())
 
 
+def test_readings_of_a_rough_encoder_count_as_little_as_is_stated(noisy: MachineSession) -> None:
+    m, q = noisy.measurements, noisy.measurements.q.copy()
+    q[:, 0] += np.random.default_rng(3).normal(scale=1e-3, size=len(q))
+    rough = replace(m, q=q, sigma_by_joint={"leg1_prismatic": 1e-3})
+    found = fitted(replace(noisy, measurements=rough))
+    off = [abs(a.q0 - b.q0) for a, b in zip(found.legs, noisy.truth.legs, strict=True)]
+    assert max(off[1:]) < 2e-4
+
+
 @pytest.mark.slow
 def test_a_fit_that_priors_keep_from_converging_names_them() -> None:
     session = machine_session("3-upu")

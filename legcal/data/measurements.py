@@ -20,10 +20,10 @@ from scipy.spatial.transform import RigidTransform
 from legcal.brief import brief
 from legcal.data.reading_units import (
     PULSES,
-    SIGMA_ANGLE,
     ReadingUnit,
     default_unit,
     legs_with_readings,
+    usual_sigma,
 )
 from legcal.files import (
     ANGLE,
@@ -102,14 +102,9 @@ class Measurements:
 
     def sigma_of(self, legs: Sequence[Leg]) -> Array:
         """Return the standard deviation of the reading of each leg, (n_legs,) [m or rad]."""
+        known = self.sigma_by_joint
         return np.array(
-            [
-                self.sigma_by_joint.get(
-                    str(leg.prismatic),
-                    SIGMA_ANGLE if leg.reads_angle else self.sigma_q,
-                )
-                for leg in legs
-            ]
+            [known.get(str(leg.prismatic), usual_sigma(leg, self.sigma_q)) for leg in legs]
         )
 
 

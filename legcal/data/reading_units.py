@@ -166,6 +166,16 @@ def reading_units(
     return units
 
 
+def usual_sigma(leg: Leg, sigma_q: float) -> float:
+    """Return the standard deviation [m or rad] of readings of which none is stated.
+
+    *sigma_q* is that of motors that slide [m].
+    """
+    if leg.actuator is None or not leg.actuator.turns:
+        return sigma_q
+    return SIGMA_ANGLE if leg.actuator.pulses is None else SERVO_SIGMA
+
+
 def sigmas_of(stated: float | str, legs: Sequence[Leg]) -> dict[str, float]:
     """Return the standard deviations of readings [m or rad] that one statement gives, by motor.
 

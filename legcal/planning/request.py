@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from legcal.calibration import NO_CHOICES, Choices, Prior
-from legcal.data import SERVO_SIGMA, Dataset, load_dataset, sigmas_of
+from legcal.data import Dataset, load_dataset, sigmas_of
 from legcal.errors import DatasetError, NotIdentifiable, UsageError
 from legcal.geometry import Array
 from legcal.machine import Machine, follow_each, load_mechanism, poses_at
@@ -150,11 +150,10 @@ def plan(
         chosen = sample_camera() if shot is None else shot.measurements.views[0].camera
     else:
         chosen = camera if isinstance(camera, Camera) else read_camera(Path(camera))
-    sigma_q = SIGMA_Q
-    sigma_by_joint = {a.joint: SERVO_SIGMA for a in machine.actuators if a.pulses is not None}
+    sigma_q, sigma_by_joint = SIGMA_Q, dict[str, float]()
     if encoder_sigma is not None:
         try:
-            sigma_by_joint |= sigmas_of(encoder_sigma, machine.legs)
+            sigma_by_joint = sigmas_of(encoder_sigma, machine.legs)
         except ValueError as error:
             raise UsageError(f"The encoder sigma could not be used: {error}") from error
         sliding = [str(leg.prismatic) for leg in machine.legs if not leg.reads_angle]

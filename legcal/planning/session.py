@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from legcal.calibration import PLAN_NAME
-from legcal.data import SIGMA_ANGLE, reading_columns
+from legcal.data import reading_columns, usual_sigma
 from legcal.errors import UsageError
 from legcal.files import (
     SHOWN_IN,
@@ -134,9 +134,7 @@ def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
     legs = [plan.machine.legs[j] for j in plan.machine.motors]
     found = {
         str(leg.prismatic): float(
-            plan.sigma_by_joint.get(
-                str(leg.prismatic), SIGMA_ANGLE if leg.reads_angle else plan.sigma_q
-            )
+            plan.sigma_by_joint.get(str(leg.prismatic), usual_sigma(leg, plan.sigma_q))
         )
         for leg in legs
     }

@@ -80,7 +80,7 @@ def whitened_leg_equations(predicted: PredictedObservations) -> WhitenedEquation
     equations = pose_equations(predicted.legs, predicted.R, predicted.t, q=q)
     # The readings that move rods are rows of their own
     read = equations.measured & (predicted.carried_by < 0)[equations.leg]
-    sigma = np.where(read, predicted.sigma_q, SIGMA_EXACT)[:, None]
+    sigma = np.where(read, predicted.sigma_of_legs[equations.leg], SIGMA_EXACT)[:, None]
     columns = list(freedoms(predicted.frame_legs))
     by_pose = (equations.by_pose / sigma * pose_unit(predicted))[:, :, columns]
     by_parameters = equations.by_parameters(predicted.parametrization) / sigma * predicted.unit

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.ordered_dataset import nominal_poses
-from legcal.data import SIGMA_ANGLE, Dataset
+from legcal.data import Dataset, usual_sigma
 from legcal.estimation import Frames
 from legcal.geometry import Array, BoolArray, IntArray, components, cross
 from legcal.machine import (
@@ -30,6 +30,7 @@ from legcal.machine import (
     actuators_of,
     by_step,
     ends_at_poses,
+    first_rods,
     freedoms,
     geometries,
     independent,
@@ -180,16 +181,18 @@ class PredictedObservations:
         turns = np.array([actuator.turns for actuator in self.actuators], dtype=np.bool_)
         return np.where(turns, 1.0 / self.mean_length, 1.0)
 
+    @cached_property
+    def sigma_of_legs(self) -> Array:
+        """Standard deviation of the reading of each leg, (n_legs,) [m or rad]."""
+        known = self.sigma_by_joint
+        return np.array(
+            [known.get(str(leg.prismatic), usual_sigma(leg, self.sigma_q)) for leg in self.legs]
+        )
+
     @property
     def sigma_of_q(self) -> Array:
-        """Standard deviations of their readings, (n_actuators,) [m or rad]."""
-        by_default = (SIGMA_ANGLE if a.turns else self.sigma_q for a in self.actuators)
-        return np.array(
-            [
-                self.sigma_by_joint.get(a.joint, sigma)
-                for a, sigma in zip(self.actuators, by_default, strict=True)
-            ]
-        )
+        """Those of the readings of actuators, (n_actuators,) [m or rad]."""
+        return self.sigma_of_legs[first_rods(self.legs)]
 
     @property
     def on_actuators(self) -> tuple[tuple[tuple[int, ...], bool], ...]:

@@ -377,7 +377,8 @@ def _end_variance(
     gradient = B.gradient[image, leg]
     size = np.maximum(np.sum(gradient**2, axis=2), 1e-30)
     across = np.sum((np.einsum("ki,kri->kr", n, gradient) / size) ** 2, axis=1)
-    along = np.einsum("ki,ki->k", n, predicted.u[predicted.pose[image], leg]) * predicted.sigma_q
+    along = np.einsum("ki,ki->k", n, predicted.u[predicted.pose[image], leg])
+    along *= predicted.sigma_of_legs[leg]
     return np.asarray(across + along**2)
 
 

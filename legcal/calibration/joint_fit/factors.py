@@ -443,7 +443,7 @@ class Readings:
     leg: IntArray  # (n,) indices
     pose: IntArray  # (n,) indices
     length: Array  # (n,) sign * q: the leg length without its offset [m]
-    sigma: float  # standard deviation [m]
+    sigma: Array  # (n,) standard deviations [m]
     n_legs: int  # of the mechanism
     memory: Memory = field(default_factory=Memory, repr=False)
 
@@ -484,7 +484,8 @@ class Readings:
         """Return the factor of readings; no camera matters to them."""
         del keys
         touches = (("legs", self.leg, slice(0, 7)),)
-        return Factor("readings", self.rows, touches, len(self), 1, self.pose, 1.0 / self.sigma)
+        whitening = 1.0 / self.sigma[:, None, None]
+        return Factor("readings", self.rows, touches, len(self), 1, self.pose, whitening)
 
 
 def observed_readings(measurements: Measurements, legs: FittedLegs) -> Readings:
@@ -495,7 +496,8 @@ def observed_readings(measurements: Measurements, legs: FittedLegs) -> Readings:
     length = legs.sign * measurements.q_of_poses
     actuated = np.array([leg.kind is LegKind.ACTUATED for leg in legs.nominal], dtype=np.bool_)
     leg, pose = np.nonzero((np.isfinite(length) & actuated).T)
-    return Readings(leg, pose, length[pose, leg], measurements.sigma_q, legs.n_legs)
+    sigma = measurements.sigma_of(legs.nominal)[leg]
+    return Readings(leg, pose, length[pose, leg], sigma, legs.n_legs)
 
 
 @dataclass(frozen=True, eq=False)

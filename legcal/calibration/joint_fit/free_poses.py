@@ -93,12 +93,12 @@ def _softened(problem: FitProblem, part: float) -> FitProblem:
     """Return the problem with a part of the errors of a nominal model added to the noise."""
     noise = NoiseModel(1.0, part * _MODEL_PX, part * _MODEL_PX)
     readings, of_actuators = problem.factor("readings"), problem.factor("actuator_readings")
-    sigma = float(np.hypot(problem.readings.sigma, part * _MODEL_LENGTH))
+    sigma = np.hypot(problem.readings.sigma, part * _MODEL_LENGTH)
     read, legs = problem.observed.actuator_readings, problem.legs.nominal
     off = np.array([legs[j].reading_of(part * _MODEL_LENGTH) for j in first_rods(legs)])
     own = np.hypot(read.sigma, off[read.actuator] if len(read) else 0.0)
     softer = (
-        replace(readings, whitening=1.0 / sigma),
+        replace(readings, whitening=1.0 / sigma[:, None, None]),
         replace(of_actuators, whitening=1.0 / own[:, None, None]),
     )
     return problem.weighted(noise).with_parts((), softer)

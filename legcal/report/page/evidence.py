@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from legcal.calibration import DEFAULT_SETTINGS, UNITS, Calibration, ranks_of_dataset
-from legcal.data import OBSERVATIONS_NAME
+from legcal.data import OBSERVATIONS_NAME, Dataset
 from legcal.errors import LegcalError
 from legcal.pages import Cell, Drawing, Facts, Items, Table, Text, matrix, number
 from legcal.report.identify import CONDITIONS
@@ -171,7 +171,7 @@ def reproducibility_blocks(calibration: Calibration, command: str, when: str) ->
         "Command": command or "from Python",
         "Time": when,
         "Dataset": str(dataset.folder),
-        "Encoder sigma": f"{1e6 * dataset.measurements.sigma_q:g} um",
+        "Encoder sigma": _encoder_sigma(dataset),
         "Start of the fit": f"{calibration.result.start}, {calibration.solution.iterations} "
         "iterations",
         "Chosen parameters": _chosen(calibration) or "none",
@@ -184,6 +184,22 @@ def reproducibility_blocks(calibration: Calibration, command: str, when: str) ->
     rows, note = _hashes(calibration)
     columns = ("file", ">bytes", "SHA-256")
     return [Facts(facts), Table(columns, rows, "Files that went in", note, folded=True)]
+
+
+def _encoder_sigma(dataset: Dataset) -> str:
+    """Return the standard deviation of readings, by motor where they differ."""
+    machine = dataset.machine
+    sigma = dataset.measurements.sigma_of(machine.legs)
+    found = {
+        str(machine.legs[j].prismatic): f"{np.degrees(sigma[j]):.3g} deg"
+        if machine.legs[j].reads_angle
+        else f"{1e6 * sigma[j]:g} um"
+        for j in machine.motors
+    }
+    alike = set(found.values())
+    if len(alike) < 2:
+        return next(iter(alike), "no encoder")
+    return ", ".join(f"{name} {words}" for name, words in found.items())
 
 
 def _chosen(calibration: Calibration) -> str:
