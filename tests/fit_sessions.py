@@ -331,14 +331,19 @@ def irregular_hexapod(
     seed: int = 0,
     shared_poses: bool = False,
     n_views: int = 3,
+    repeats: int = 1,
 ) -> HexapodSession:
-    """Return a session of a non-coplanar hexapod: views around it, every image its own pose."""
+    """Return a session of a non-coplanar hexapod: views around it, every image its own pose.
+
+    The platform comes to each place so many times in succession, with a pose of its own each time.
+    """
     rng = np.random.default_rng(seed)
     T_cameras = tuple(_camera_around(angle) for angle in 0.4 + 2.1 * np.arange(n_views))
     n_rows = n_views * n_poses_per_view
     view = np.repeat(np.arange(n_views), n_poses_per_view)
     pose = np.tile(np.arange(n_poses_per_view), n_views) if shared_poses else np.arange(n_rows)
     poses = [_pose(rng) for _ in range(int(pose.max()) + 1)]
+    poses = [poses[k - k % repeats] for k in range(len(poses))]
     A, B = TRUTH.base_joints, TRUTH.platform_joints
     lengths = np.array([np.linalg.norm(T.apply(B) - A, axis=1) for T in poses])
     names = tuple(f"leg{i + 1}" for i in range(6))

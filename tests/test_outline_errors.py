@@ -56,6 +56,7 @@ from legcal.calibration.joint_fit.gammas import (
 from legcal.calibration.joint_fit.outline_errors import (
     LIMB_SIGMA,
     N_KINDS,
+    PLACES,
     RECOVERED_SHARE,
     EdgeBiases,
     EstimatedGamma,
@@ -359,6 +360,25 @@ def test_shared_errors_are_found_and_weighed(session: HexapodSession) -> None:
         assert {"bias", "tilt", "bias_x"} <= {name.rsplit(".", 1)[1] for name in found.biases}
     assert np.mean(sizes) == pytest.approx(1.0, abs=0.1)
     assert 0.7 < np.mean(normalised) < 1.5
+
+
+def test_errors_that_come_back_with_a_place_widen_the_covariance() -> None:
+    session, n, sigma = irregular_hexapod(20, legs_seen=5, sigma_px=0.03, repeats=4), 4, 0.08
+    start, normalised, found_px = disturbed_start(session), [], []
+    observed = observed_outlines(session.outlines, session.measurements, session.legs)
+    edge = 2 * observed.radius + (observed.epsilon < 0.0)
+    place = (observed.pose // n) * (int(edge.max()) + 1) + edge
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        shift = np.zeros((len(observed), 2))
+        shift[observed.index] = sigma * rng.standard_normal(int(place.max()) + 1)[place, None]
+        outlines = moved_outlines(noisy_outlines(session, rng), PINHOLE, shift)
+        found = refine(session.legs, noisy_readings(session, rng), outlines, start)
+        error = joint_errors(found.parameters)
+        normalised.append(error @ np.linalg.solve(found.kinematic_covariance, error) / len(error))
+        found_px.append(found.shared_px[PLACES[0]])
+    assert 0.7 < np.mean(normalised) < 1.2
+    assert np.mean(found_px) == pytest.approx(sigma, rel=0.3)
 
 
 def test_edges_that_lie_inwards_together_are_noted(session: HexapodSession) -> None:

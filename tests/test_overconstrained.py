@@ -19,7 +19,9 @@ from scipy.spatial.transform import Rotation
 from thinned import thinned
 
 from legcal import identifiability
-from legcal.calibration.joint_fit import refine
+from legcal.calibration.joint_fit import DEFAULT_SETTINGS, refine
+from legcal.calibration.joint_fit.diagnostics import refuse_contradicted_values
+from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.variables import LegConstraints, start_from
 from legcal.errors import OutOfClass
@@ -127,6 +129,18 @@ def test_true_machines_close_and_fits_find_them(kind: str, tmp_path: Path) -> No
     assert keeps_its_plane(found.legs) < 1e-9
     for leg, exact in zip(found.legs, session.truth.legs, strict=True):
         assert np.abs(np.concatenate([leg.A - exact.A, leg.B - exact.B])).max() < 1e-7
+
+
+def test_a_prior_of_what_is_tied_is_not_asked_of_the_measurements(tmp_path: Path) -> None:
+    machine = written("exechon", LAYOUTS[0], tmp_path)
+    session = wrong_but_tied(machine_session(str(machine.yaml_path)), machine)
+    names = [n for n in session.legs.parametrization.names if n.endswith(".twist")]
+    choices = Choices(priors=dict.fromkeys(names, Prior(0.0, 0.1)))
+    measured = session.measurements, session.outlines
+    problem = build_fit(session.legs, *measured, choices=choices)
+    assert set(names) - set(problem.named)
+    state = problem.begin(session.start)
+    refuse_contradicted_values(problem, session.start, state, DEFAULT_SETTINGS, with_priors=True)
 
 
 def test_axes_that_must_stay_parallel_turn_together(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from legcal.calibration.documents import (
 from legcal.calibration.fit_overlays import draw_overlays, earlier_overlays
 from legcal.calibration.joint_fit import (
     KINDS,
+    PLACES,
     KnownIntrinsics,
 )
 from legcal.calibration.link_joints import joints_in_links
@@ -223,9 +224,10 @@ def load_result(given: str | Path) -> EarlierResult:
     _check_covariance(path, estimated, np.array([row.sigma for row in estimated]), document)
     _check_same_model(path, document, values, machine, nominal_legs)
     covariance, held = _kinematic(path, estimated, document, known.names)
-    others = [name for name in document.residuals.shared_px if name not in KINDS]
+    known_errors = (*KINDS, *PLACES)
+    others = [name for name in document.residuals.shared_px if name not in known_errors]
     if others:
-        raise unreadable(path, f"the shared errors '{others[0]}'", ", ".join(KINDS))
+        raise unreadable(path, f"the shared errors '{others[0]}'", ", ".join(known_errors))
     fixed = {row.name for row in document.parameters if row.status == "fixed"}
     kept = [i for i, name in enumerate(known.names) if name not in fixed]
     turns = turns_between(known, legs, nominal_legs)

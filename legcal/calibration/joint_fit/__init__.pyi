@@ -12,6 +12,7 @@ from .held_out import PlatformPair as PlatformPair
 from .held_out import Posterior as Posterior
 from .held_out import compare_held_out as compare_held_out
 from .outline_errors import KINDS as KINDS
+from .outline_errors import PLACES as PLACES
 from .outline_errors import NoiseModel as NoiseModel
 from .outline_errors import possible_biases as possible_biases
 from .parameter_choices import NO_CHOICES as NO_CHOICES

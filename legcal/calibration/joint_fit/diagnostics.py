@@ -227,6 +227,10 @@ def refuse_contradicted_values(
         choices, fixed=choices.fixed - wide.keys(), priors={**choices.priors, **wide}
     )
     wider = problem.with_choices(wider_choices, settings)
+    # What ties hold wholly stays fixed: nothing measured says anything of it.
+    stated = {name: known for name, known in stated.items() if name in wider.named}
+    if not stated:
+        return
     comparisons: list[_Comparison] = []
     for begin in (wider.begin(start), state):
         try:

@@ -14,6 +14,11 @@ joints. What shows must therefore say how large both are. If edges erred indepen
 variances would be equal; light from one side makes one edge of a leg brighter and the other
 darker, and sideways biases count twice (:data:`SIDEWAYS`).
 
+**Places.** An edge that comes back to the same place of a view has the same light and the same
+background there, and errs alike again, which residuals hardly show where the fit follows. Poses at
+the ends of travel come back to few places of each leg, the fewer the less legs there are. These
+errors are not estimated with the others: what they do to the fit is added to its covariance.
+
 **Gammas.** Where the gamma of a camera is not given, its outlines move together, each by its own
 amount, with the logarithm of that gamma over the one with which they were measured. A fit recovers
 only a share of a wrong gamma: how far each outline moves is known roughly, and common-mode biases
@@ -53,10 +58,12 @@ KINDS = (
     "change of that bias over the image",
     "change of that tilt over the image",
 )
+PLACES = ("bias of an edge at a place", "tilt of an edge at a place")  # not estimated
 GAMMA, GAMMA_SUFFIX = len(KINDS), ".gamma"  # one more kind, and the end of the names of its shifts
 N_KINDS = len(KINDS) + 1
 GAMMA_SIGMA = 0.5  # of the logarithm: photographs are linear, or near 2.2
 SIDEWAYS = np.sqrt(2.0)  # standard deviation of sideways biases, those inwards being one
+_MAX_PLACES = 100  # where most outlines stand
 _MIN_BIAS_GAIN = 6.0  # one set of white residuals in ten to twenty gains that much
 _MODES = (("bias", (1.0, 1.0)), ("tilt", (-1.0, 1.0)))  # shifts of both ends
 
@@ -444,6 +451,45 @@ def expected_biases(
     found = expected_variances(Effects(z, K, possible.kind), biases.sigma**2, kinds)
     expected = possible.of_sizes(np.maximum(np.sqrt(found), least))
     return replace(expected, shown=biases.shown, likeliest_sigma=biases.sigma)
+
+
+def shifts_at_places(outlines: ObservedOutlines, used: BoolArray) -> Array:
+    """Return how errors at places shift both ends of outlines, (n, 2, 2 n_places) [px].
+
+    By one unit of bias at each place, then of tilt. At a place a used outline of an edge in a view
+    has others within a width of the part: the first place is that with most, the next one that with
+    most of those that are left.
+    """
+    o, width = outlines, outlines.width_px
+    edge = 2 * (o.series[o.view] * len(o.parts) + o.radius) + (o.epsilon < 0.0)
+    middle, found = o.pixels.mean(axis=1), list[IntArray]()
+    for key in np.unique(edge[used]).tolist() if np.isfinite(width) else []:
+        own = np.flatnonzero(used & (edge == key))
+        near = np.linalg.norm(middle[own, None] - middle[own], axis=-1) <= width
+        counts, left = np.count_nonzero(near, axis=1), np.ones(len(own), dtype=np.bool_)
+        while counts.max() > 1:
+            here = near[int(np.argmax(counts))] & left
+            found.append(own[here])
+            left &= ~here
+            counts = (counts - np.count_nonzero(near[:, here], axis=1)) * left
+    found = sorted(found, key=len, reverse=True)[:_MAX_PLACES]
+    shifts = np.zeros((len(o), len(_MODES[0][1]), len(PLACES), len(found)))
+    for k, members in enumerate(found):
+        shifts[members, :, :, k] = np.transpose([ends for _, ends in _MODES])
+    return shifts.reshape(*shifts.shape[:2], -1)
+
+
+def sigmas_at_places(z: Array, K: Array) -> Array:
+    """Return the standard deviations (2,) of bias and tilt at places, as they are expected [px].
+
+    Zero where residuals show none. *z* (c,) and *K* (c, c) are scores of those of
+    :func:`shifts_at_places`, and their covariance.
+    """
+    effects = Effects(z, K, np.repeat(np.arange(len(PLACES)), len(z) // len(PLACES)))
+    likeliest, _ = estimate_variances(effects, _MIN_BIAS_GAIN)
+    if not likeliest.any():
+        return np.zeros(len(PLACES))
+    return np.asarray(np.sqrt(expected_variances(effects, likeliest, range(len(PLACES)))))
 
 
 def notes_on_blur(biases: EdgeBiases, claimed: Array) -> tuple[str, ...]:

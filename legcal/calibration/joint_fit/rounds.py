@@ -18,6 +18,7 @@ from legcal.calibration.joint_fit.outline_errors import (
     KINDS,
     MEDIAN_OF_2,
     N_KINDS,
+    PLACES,
     EdgeBiases,
     NoiseModel,
     estimate_noise,
@@ -25,6 +26,8 @@ from legcal.calibration.joint_fit.outline_errors import (
     expected_biases,
     noise_of_the_median,
     possible_biases,
+    shifts_at_places,
+    sigmas_at_places,
     with_gamma,
 )
 from legcal.calibration.joint_fit.problem import FitProblem
@@ -41,7 +44,10 @@ from legcal.estimation import (
     information,
     linearize,
     minimise,
+    normal_equations,
+    response,
     robust_cost,
+    score_test,
     scores_of_block,
 )
 from legcal.geometry import Array, BoolArray, IntArray
@@ -59,6 +65,14 @@ _MAX_CHANGED = 0.05  # of the accepted outlines
 
 
 @dataclass(frozen=True, eq=False)
+class AtPlaces:
+    """Errors of edges that come back to places, which are not estimated."""
+
+    sigma: Array  # (2,) of ``PLACES`` [px]
+    covariance: Array  # (n_kept, n_kept) what they add to that of the kept unknowns
+
+
+@dataclass(frozen=True, eq=False)
 class Fit:
     """A minimum with the errors and the outlines that it was fitted with."""
 
@@ -67,6 +81,7 @@ class Fit:
     noise: NoiseModel
     edge_biases: EdgeBiases
     accepted: BoolArray  # (n_outlines,)
+    at_places: AtPlaces | None  # errors that outlines share there, None where residuals show none
     iterations: int
     notes: tuple[str, ...]  # what the last round still changed, if it did not converge
 
@@ -74,6 +89,12 @@ class Fit:
     def state(self) -> State:
         """Where the fit ended."""
         return self.minimum.state
+
+    @property
+    def shared_px(self) -> dict[str, float]:
+        """Standard deviations of errors that outlines share, by what they are [px]."""
+        there = () if self.at_places is None else self.at_places.sigma.tolist()
+        return self.edge_biases.sizes | dict(zip(PLACES, there, strict=False))
 
 
 def first_minimum(
@@ -190,8 +211,29 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
             "agree; check the camera poses, the readings, and the units (rad, m) of axes and their "
             "sigmas."
         )
+    at_places = _at_places(problem, minimum, accepted, settings) if biases.are_shown else None
     notes = check_convergence(changes, claimed, settings)
-    return Fit(problem, minimum, noise, biases, accepted, minimum.iterations, notes)
+    return Fit(problem, minimum, noise, biases, accepted, at_places, minimum.iterations, notes)
+
+
+def _at_places(
+    problem: FitProblem, minimum: Minimum[State], accepted: BoolArray, settings: RefinementSettings
+) -> AtPlaces | None:
+    """Return the errors at places that the residuals of a fit show, and what they add."""
+    state, linear = minimum.state, minimum.linear
+    shifts = shifts_at_places(problem.outlines, accepted)
+    if not shifts.size:
+        return None
+    columns = {"outlines": problem.factor("outlines").whitening @ shifts}
+    plain = normal_equations(problem, state, linear)
+    sigma = sigmas_at_places(*score_test(problem, linear, plain, columns))
+    if not sigma.any():
+        return None
+    normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
+    moved = response(problem, linear, normal, columns) * np.repeat(
+        sigma, shifts.shape[2] // len(sigma)
+    )
+    return AtPlaces(sigma, moved @ moved.T)
 
 
 def _passed(

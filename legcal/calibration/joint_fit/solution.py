@@ -145,6 +145,8 @@ def assemble_solution(
     problem, state, linear = fit.problem, fit.state, fit.minimum.linear
     loss = PseudoHuber(settings.loss_width)
     kept = normal.kept_covariance()
+    if fit.at_places is not None:
+        kept = kept + fit.at_places.covariance
     covariance = named_covariance(problem, state, kept)
     values, status = _values(problem, state), _status(problem, held)
     names = tuple(name for name in values if status[name] == "estimated")
@@ -235,7 +237,7 @@ def assemble_solution(
         noise=fit.noise,
         gammas=gammas,
         biases={n: v for n, v in biases if not n.endswith(GAMMA_SUFFIX)},
-        shared_px=fit.edge_biases.sizes,
+        shared_px=fit.shared_px,
         sensitivities=sensitivities(problem, state, linear, by_camera, normal, loss, distorted),
         outlines=_with_rejections(outlines, problem, state, fit.accepted, offsets),
         start=label,
