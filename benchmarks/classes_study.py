@@ -201,7 +201,8 @@ def standing_where_held(design: Design, session: OutlineSession, solution: Solut
     if not solution.held:
         return design
     true = design.legs
-    free = frozenset(radius_name(true.names[leg], part) for leg, part in solution.radii)
+    radii = (radius_name(true.names[leg], part) for leg, part in solution.radii)
+    free = frozenset([*radii, *design.arms.names])
     exact = refine(
         replace(true, nominal=solution.legs, radii={**true.radii, **solution.radii}),
         replace(session.measurements, q=design.q[design.pose]),

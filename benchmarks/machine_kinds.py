@@ -27,7 +27,16 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from bound import ERRORS
 from classes_study import errors_of_fit
-from outline_sessions import CARRIED, Noise, design_of, draw_session, kinds, made, one_fit
+from outline_sessions import (
+    CARRIED,
+    ROUND_ARMS,
+    Noise,
+    design_of,
+    draw_session,
+    kinds,
+    made,
+    one_fit,
+)
 from outline_study import failures_of
 
 from legcal import LegcalError, calibrate, evaluate, load_mechanism
@@ -139,7 +148,7 @@ def main() -> None:
     parser.add_argument("--level", type=Level, default=Level.OUTLINES, choices=list(Level))
     parser.add_argument("--keep", type=Path, help="folder that keeps datasets for the next run")
     options = parser.parse_args()
-    known = (*kinds(), *CARRIED)
+    known = (*kinds(), *ROUND_ARMS, *CARRIED)
     if unknown := set(options.kinds) - set(known):
         parser.error(f"found {', '.join(sorted(unknown))}, needed some of {', '.join(known)}")
     chosen = options.kinds or list(known)

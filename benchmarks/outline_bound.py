@@ -14,6 +14,7 @@ import numpy as np
 from outline_sessions import (
     Design,
     Noise,
+    arm_sigmas,
     moved_poses,
 )
 from scipy.linalg import null_space
@@ -25,6 +26,7 @@ from legcal.geometry import Array
 from legcal.machine import (
     Leg,
     actuator_index,
+    arms_at,
     by_step,
     freedoms,
     independent,
@@ -47,7 +49,7 @@ _TOGETHER = 10  # runs: what is believed of the spread of coverage before any, s
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """The bound of a design: the kinematic parameters, then the radii that are observed."""
+    """The bound of a design: the kinematic parameters, then radii and arms that are observed."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]  # m or rad
@@ -62,7 +64,7 @@ class Bound:
 def bound_of(design: Design, sigma_q: float, radius_sigma: float) -> Bound:
     """Return the bound of all outlines, all readings and what is known of the radii."""
     rows = information_of(design, sigma_q, radius_sigma)
-    units = (*design.parametrization.units, *("m" for _ in design.parts))
+    units = (*design.parametrization.units, *("m" for _ in design.parts), *design.arms.units)
     information = rows.T @ rows
     diagonal = np.diagonal(information)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
@@ -79,7 +81,7 @@ def bound_of(design: Design, sigma_q: float, radius_sigma: float) -> Bound:
 
 
 def information_of(design: Design, sigma_q: float, radius_sigma: float) -> Array:
-    """Return whitened rows (m, n) of parameters, then radii; cameras and poses are unknown.
+    """Return whitened rows (m, n) of parameters, radii, arms; cameras and poses are unknown.
 
     Their squares are the Fisher matrix [1/m], [1/rad].
     """
@@ -113,8 +115,9 @@ def information_of(design: Design, sigma_q: float, radius_sigma: float) -> Array
         shared[:, parameters] -= own @ np.linalg.pinv(F[constraints], rcond=_RANK) @ G[constraints]
         rows.append(_without(own @ right[rank:].T, shared))
     radius = np.array([design.legs.radii[part] for part in design.parts])
-    known = np.zeros((len(radius), n_cameras + n_parameters + len(radius)))
-    known[:, n_cameras + n_parameters :] = np.diag(1.0 / (radius_sigma * radius))
+    sigmas = np.concatenate([radius_sigma * radius, arm_sigmas(design.arms)])
+    known = np.zeros((len(sigmas), n_cameras + n_parameters + len(sigmas)))
+    known[:, n_cameras + n_parameters :] = np.diag(1.0 / sigmas)
     together = np.concatenate([*rows, known])
     return _without(together[:, :n_cameras], together[:, n_cameras:])
 
@@ -145,7 +148,7 @@ def _outline_rows(design: Design) -> tuple[Array, Array]:
 
     The former are (n, 2, 6 + n_actuators), the latter (n, 2, m).
 
-    The others are six motions of each camera, then the kinematic parameters, then the radii.
+    The others are six motions of each camera, then the kinematic parameters, radii and arms.
     """
     place = design.parametrization.place
     truth = _Numbers(
@@ -174,6 +177,9 @@ def _outline_rows(design: Design) -> tuple[Array, Array]:
     def with_legs(step: Array) -> _Numbers:
         return replace(truth, legs=moved_legs(truth.legs, place, step))
 
+    def with_arms(step: Array) -> _Numbers:
+        return replace(truth, legs=moved_legs(truth.legs, design.arms.place, step))
+
     def with_radius(part: tuple[int, str], step: Array) -> _Numbers:
         return replace(truth, radii={**truth.radii, part: truth.radii[part] + float(step[0])})
 
@@ -192,6 +198,7 @@ def _outline_rows(design: Design) -> tuple[Array, Array]:
         ),
         *derivatives(with_legs, len(design.parametrization)),
         *(d for part in design.parts for d in derivatives(partial(with_radius, part), 1)),
+        *derivatives(with_arms, len(design.arms)),
     ]
     of_postures = derivatives(with_poses, 6 + truth.q.shape[1])
     return np.concatenate(of_postures, axis=-1), np.concatenate(of_others, axis=-1)
@@ -202,7 +209,11 @@ def _offsets(design: Design, ends: Array, numbers: _Numbers) -> Array:
     shown, legs, cameras = design.outlines, numbers.legs, numbers.T_Rb_camera
     pose, view, leg = design.pose[shown.row], design.view[shown.row], shown.leg
     A, B = joints_at(legs, numbers.q)[pose, leg], np.array([x.B for x in legs])[leg]
-    along = np.einsum("nij,nj->ni", numbers.R[pose], B) + numbers.t[pose] - A
+    B = np.einsum("nij,nj->ni", numbers.R[pose], B) + numbers.t[pose]
+    for j, arm in arms_at(legs, numbers.q).items():
+        of_arm = [i == j and legs[j].is_arm(part) for i, part in zip(leg, shown.part, strict=True)]
+        A[of_arm], B[of_arm] = np.moveaxis(arm[pose[of_arm]], 1, 0)
+    along = B - A
     u = along / np.linalg.norm(along, axis=1)[:, None]
     turn = np.array([T.rotation.as_matrix().T for T in cameras])[view]
     centre = np.array([T.translation for T in cameras])[view]

@@ -18,6 +18,7 @@ import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration import (
+    DEFAULT_SETTINGS,
     FittedLegs,
     RefinementSettings,
     Solution,
@@ -32,11 +33,13 @@ from legcal.errors import DidNotConverge
 from legcal.files import read_yaml
 from legcal.geometry import Array, IntArray
 from legcal.machine import (
+    ActuatorColumns,
     Leg,
     LegKind,
     Machine,
     Parametrization,
     actuator_index,
+    arms_at,
     create_model,
     description_of,
     ends_at_poses,
@@ -87,6 +90,8 @@ SHIPPED = (
     "3-rpr",
     *CARRIED,
 )
+# Machines of families whose arms are cylinders, of this radius [mm], and are seen
+ROUND_ARMS = {"delta-round-arms": ("delta", 8.0), "servo-round-arms": ("servo-hexapod", 3.0)}
 KINDS = Path(__file__).with_name("machine_kinds.yaml")
 _MANY_LEGS, _MOST_LEGS = 6, 4  # of six or more that a view is said to see, as in the paper
 _SEED = 2002  # of what is the same in all runs
@@ -98,8 +103,8 @@ WAY = (0.25, 0.5, 0.75)  # parts of the way from home to readings
 
 
 def true_machine(name: str) -> Machine:
-    """Return a true machine of the studies: of ``MACHINES``, of ``kinds()``, or a shipped model."""
-    if name in kinds():
+    """Return a true machine of the studies: one that is made for them, or a shipped model."""
+    if name in kinds() or name in ROUND_ARMS:
         with tempfile.TemporaryDirectory(prefix="legcal-study-") as folder:
             return made(name, Path(folder))
     if name not in (COPLANAR, NONCOPLANAR):
@@ -125,6 +130,11 @@ def kinds() -> dict[str, dict[str, Any]]:
 def made(kind: str, folder: Path) -> Machine:
     """Write a machine that is not shipped as a model and load it."""
     folder.mkdir(parents=True, exist_ok=True)
+    if kind in ROUND_ARMS:
+        family, radius = ROUND_ARMS[kind]
+        size = {"arm_radius": radius}
+        described = description_of(None, family=family, unit="mm", name=kind, dimensions=size)
+        return create_model(described, folder, force=True).machine
     table = folder / f"{kind}-table.yaml"
     text = {"legcal_table": 1, "name": kind, "unit": "mm", **kinds()[kind]}
     table.write_text(yaml.safe_dump(text, sort_keys=False))
@@ -160,6 +170,17 @@ class Design:
         return parametrize(self.legs.names, self.legs.nominal, self.legs.frame_legs)
 
     @property
+    def arms(self) -> Parametrization:
+        """The lines of the arms that are observed."""
+        every = self.legs.parametrization
+        seen = {j for j, part in self.parts if self.legs.nominal[j].is_arm(part)}
+        place = np.full_like(every.place, -1)
+        own = every.place[sorted(seen), ActuatorColumns.ARM]
+        place[sorted(seen), ActuatorColumns.ARM] = np.arange(own.size).reshape(own.shape)
+        names, units = (tuple(of[i] for i in own.ravel()) for of in (every.names, every.units))
+        return Parametrization(names, units, place)
+
+    @property
     def parts(self) -> tuple[tuple[int, str], ...]:
         """Leg and part of each radius that is observed, by leg and name."""
         shown = zip(self.outlines.leg.tolist(), self.outlines.part, strict=True)
@@ -167,9 +188,9 @@ class Design:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of what is to be found: the kinematic parameters, then the radii observed."""
+        """Names of what is to be found: kinematic parameters, then radii and arms observed."""
         radii = (radius_name(self.legs.names[leg], part) for leg, part in self.parts)
-        return (*self.parametrization.names, *radii)
+        return (*self.parametrization.names, *radii, *self.arms.names)
 
     @property
     def poses(self) -> tuple[RigidTransform, ...]:
@@ -199,7 +220,13 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
     A_base, B_base = (
         np.array([machine.T_base_Rb.apply(points) for points in ends]) for ends in (A, B)
     )
-    outlines = outlines_of(Scene(A_base, B_base, views, images), OutlineNoise(sigma_px, None))
+    arms = arms_at(legs, readings_of_rods(legs, R, t))
+    in_base = {
+        j: machine.T_base_Rb.apply(ends.reshape(-1, 3)).reshape(ends.shape)
+        for j, ends in arms.items()
+    }
+    scene = Scene(A_base, B_base, views, images, in_base)
+    outlines = outlines_of(scene, OutlineNoise(sigma_px, None))
     most = _MOST_LEGS if machine.n_legs >= _MANY_LEGS else machine.n_legs
     seen = []
     for v in range(n_views):
@@ -339,6 +366,9 @@ def draw_session(
     )
     outlines = noisy_outlines(design.outlines, design.camera, rng)
     nominal = moved_legs(true.nominal, design.parametrization.place, step)
+    arms = design.arms
+    if len(arms):
+        nominal = moved_legs(nominal, arms.place, arm_sigmas(arms) * rng.normal(size=len(arms)))
     radii = {
         part: radius * float(1.0 + noise.radius_sigma * rng.normal())
         for part, radius in true.radii.items()
@@ -354,6 +384,12 @@ def draw_session(
         home = RigidTransform.from_components(at.t[0], Rotation.from_matrix(at.R[0]))
     legs = replace(true, nominal=nominal, radii=radii, home=home)
     return OutlineSession(legs, measurements, outlines, home)
+
+
+def arm_sigmas(arms: Parametrization) -> Array:
+    """Return how well lines of arms are known before [rad, m]: as the joint fit takes them."""
+    known = {"rad": DEFAULT_SETTINGS.arm_axis_sigma, "m": DEFAULT_SETTINGS.arm_point_sigma}
+    return np.array([known[unit] for unit in arms.units])
 
 
 def _parameter_errors(

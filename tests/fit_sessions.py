@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from outline_sessions import closed_poses, moved_poses
+from outline_sessions import closed_poses, moved_poses, true_machine
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import simulation
@@ -27,11 +27,11 @@ from legcal.machine import (
     LegKind,
     Machine,
     actuator_index,
+    arms_at,
     ends_at_poses,
     free_coordinates,
     from_vector,
     geometries,
-    load_mechanism,
     measured_readings,
     moved_legs,
     parameters_of_legs,
@@ -127,7 +127,7 @@ def machine_session(
     camera: Camera = LENS,
     seed: int = 0,
 ) -> MachineSession:
-    """Return a session of a shipped model, which is the truth.
+    """Return a session of a shipped model, or of one that is made, which is the truth.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def machine_session(
         Of poses and errors.
     """
     rng = np.random.default_rng(seed)
-    machine = load_mechanism(name)
+    machine = true_machine(name)
     legs, fitted = geometries(machine), fitted_legs(machine)
     R, t = _poses(machine, legs, n_views * n_poses, rng)
     fitted = replace(fitted, home=platform_in_base(machine, machine.home))
@@ -250,7 +250,9 @@ def shown_outlines(
         Viewpoint(view.name, view.camera, T.inv())
         for view, T in zip(m.views, truth.T_camera_Rb, strict=True)
     ]
-    scene = plain_scene(A, ends, views, m.view, m.pose, radii)
+    arms = {} if read is None else arms_at(truth.legs, read)
+    of_parts = {(j, arm.link): arms[j] for j in arms if (arm := truth.legs[j].arm) is not None}
+    scene = plain_scene(A, ends, views, m.view, m.pose, radii, arms=of_parts)
     return outlines_of(scene, OutlineNoise(0.2, 150))
 
 

@@ -13,16 +13,23 @@ from legcal.errors import LegcalError, ModelError, UsageError
 from legcal.exports import Subject, export
 from legcal.geometry import Array
 from legcal.machine import (
+    ARM_KINDS,
     Machine,
     create_model,
     description_of,
     forward_kinematics,
+    geometries,
+    home_of_legs,
     inverse_kinematics,
+    kind_of_parameter,
     load_mechanism,
+    moved_legs,
     parametrization_of,
     random_configurations,
+    vector_of,
     write_model,
 )
+from legcal.simulation import write_model_with
 
 TABLES = ROOT / "models" / "tables"
 COUNTS = {  # parameters with radii known, of the motors alone, and those that define the frames
@@ -56,6 +63,38 @@ def test_the_family_is_what_is_shipped_and_has_the_unknowns_of_its_class(
     assert (len(names), len(of_motors)) == COUNTS[name]
     assert {leg.actuator.joint for leg in machine.legs if leg.actuator} == set(machine.motor_names)
     assert all(len(leg.cylinders) == 1 for leg in machine.legs)  # arms and rails are no cylinders
+
+
+@pytest.mark.parametrize(
+    ("name", "first"), [("delta", ("leg1", "leg3", "leg5")), ("servo-hexapod", ())]
+)
+def test_an_arm_that_is_a_cylinder_is_a_line_of_the_first_rod_on_it(
+    name: str, first: tuple[str, ...], tmp_path: Path
+) -> None:
+    machine, bare = family(tmp_path, name, arm_radius=4.0), load_mechanism(name)
+    assert parametrization_of(machine).names == parametrization_of(bare).names
+    arms = [leg.arm for leg in machine.legs if leg.arm is not None]
+    assert tuple(arm.leg for arm in arms) == (first or machine.leg_names)
+    for actuator, arm in zip(machine.actuators, arms, strict=True):
+        assert actuator.arm is arm
+        assert arm.radius == 0.004
+        joints = [leg.A for leg in machine.legs if leg.prismatic == actuator.joint]
+        near, far = arm.ends
+        np.testing.assert_allclose(far, np.mean(joints, axis=0), atol=1e-6)
+        np.testing.assert_allclose(np.cross(near - actuator.point, actuator.axis), 0.0, atol=1e-6)
+
+    legs, found = geometries(machine), parametrization_of(machine, twists=True)
+    step = np.random.default_rng(1).uniform(-1e-3, 1e-3, len(found))
+    step[[n.endswith(".gain") for n in found.names]] = 0.0
+    moved = moved_legs(legs, found.place, step)
+    home = home_of_legs(machine, moved, 0.2)
+    assert home is not None
+    again = load_mechanism(write_model_with(machine, moved, home, tmp_path / "moved", {}))
+    apart = vector_of(found, geometries(again), legs) - vector_of(found, moved, legs)
+    np.testing.assert_allclose(apart, 0.0, atol=1e-12)
+    of_arms = [i for i, n in enumerate(found.names) if kind_of_parameter(n) in ARM_KINDS]
+    assert len(of_arms) == 4 * len(arms)
+    assert np.abs(vector_of(found, moved, legs)[of_arms]).min() > 1e-7
 
 
 @pytest.mark.parametrize("name", COUNTS)
@@ -235,6 +274,18 @@ def _arm1(**changes: Any) -> dict[str, Any]:
         (_arm1(axis=None), ("actuators.arm1", "found point", "direction of a carriage")),
         (_arm1(travel_deg=None, travel=[0, 1]), ("actuators.arm1", "found travel", "travel_deg")),
         (_arm1(travel_deg=[70, -30]), ("arm1", "lower reading first")),
+        (_arm1(arm_radius=0), ("actuators.arm1", "arm_radius", "0")),
+        (
+            _arm1(
+                axis=None,
+                point=None,
+                travel_deg=None,
+                direction=[1, 0, 0],
+                travel=[0, 1],
+                arm_radius=8,
+            ),
+            ("actuators.arm1", "arm_radius of a carriage"),
+        ),
         (_arm1(axis=[0, 0, 0]), ("arm1", "direction of three numbers")),
         ({"type": "6-PSS"}, ("'leg1'", "which turns", "begins with R")),
         ({"type": "6-SS"}, ("'leg1'", "the type SS", "PSS, RSS, PRS")),
@@ -266,11 +317,13 @@ def test_what_a_table_of_motors_cannot_say(
     [
         ("delta", {"tilt": 5.0}, ("--tilt", "--arm-length")),
         ("hexaglide", {"arm_length": 20.0}, ("--arm-length", "--rod-length")),
+        ("linear-delta", {"arm_radius": 5.0}, ("--arm-radius", "--rod-length")),
         ("delta", {"rod_length": 100.0}, ("rods of 100 mm", "--rod-length")),
         ("delta", {"rod_length": 100.0, "unit": None}, ("no unit", "--unit mm")),
         ("3-prs", {"rod_length": -1.0}, ("--rod-length -1", "positive")),
         ("orthoglide", {"travel": (5.0, 1.0)}, ("--travel 5 1",)),
         ("6-UPS", {"rod_length": 100.0}, ("--rod-length",)),
+        ("6-UPS", {"arm_radius": 5.0}, ("--arm-radius", "without arms")),
         ("5-PSS", {}, ("'5-PSS'", "hexaglide")),
     ],
 )

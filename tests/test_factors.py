@@ -62,6 +62,7 @@ from legcal.perception.placement import Search, group_views
 from legcal.perception.view_fit import fit_view
 from legcal.vision import Camera, intrinsic_names, outlines_of_axis
 
+CARRIED = ("delta", "delta-round-arms", "3-prs")  # whose joints at A move
 K = 0.1
 LOSS = PseudoHuber(K**-0.5)
 CHOICES = {
@@ -73,6 +74,11 @@ CHOICES = {
     "3-rps": Choices(priors={"leg1.base_axis.1": Prior(0.01, 2e-3)}),
     "tricept": Choices(priors={"centre.platform_axis.2": Prior(0.0, 1e-3)}),
     "3-upu-tilted": Choices(free=frozenset({"leg2.twist"})),
+    "delta-round-arms": Choices(
+        free=frozenset({"arm2.gain", "arm1.arm_axis.1"}),
+        fixed=frozenset({"arm3.arm_axis.1", "leg3.radius.arm2_link"}),
+        priors={"leg1.length": Prior(0.4, 1e-4), "arm2.arm_point.1": Prior(1e-3, 1e-3)},
+    ),
     "delta": Choices(
         free=frozenset({"arm2.gain"}),
         fixed=frozenset({"arm1.axis.1"}),
@@ -209,9 +215,9 @@ def test_corners_are_where_the_camera_projects_them() -> None:
     thinned(
         [
             *("hexapod", "nategh-agheli", "6-sps", "3-rps", "3-upu-tilted", "hexapod-rod"),
-            *("tricept", "delta", "3-prs"),
+            *("tricept", "delta", "3-prs", "delta-round-arms"),
         ],
-        ["hexapod", "nategh-agheli", "6-sps", "tricept", "delta", "3-prs"],
+        ["hexapod", "nategh-agheli", "6-sps", "tricept", "delta-round-arms", "3-prs"],
     ),
 )
 def test_all_factors_have_the_derivatives_of_finite_differences(name: str) -> None:
@@ -224,9 +230,7 @@ def test_all_factors_have_the_derivatives_of_finite_differences(name: str) -> No
     size = np.abs(expected).max(axis=0)
     # What acts on the constraints alone: axes, twists, constant lengths.
     idle = [problem.named[i] for i in np.flatnonzero(size[: problem.n_named] == 0.0)]
-    assert all(
-        "axis" in n or n.endswith((".twist", ".length")) or name in ("delta", "3-prs") for n in idle
-    )
+    assert all("axis" in n or n.endswith((".twist", ".length")) or name in CARRIED for n in idle)
     # Differences of an angle with a prior are rounded by 1e-16 rad over its sigma and the step.
     assert np.abs((J - expected) / np.maximum(size, 0.1)).max() < 1e-6
 

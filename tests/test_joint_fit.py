@@ -59,8 +59,10 @@ from legcal.data import LegAxes, Measurements, View, axes_from_outlines, no_outl
 from legcal.estimation import Frames, information, linearize
 from legcal.geometry import Array
 from legcal.machine import (
+    ARM_KINDS,
     Leg,
     LegKind,
+    kind_of_parameter,
     moved_legs,
     parameters_of_legs,
     parametrize,
@@ -100,7 +102,9 @@ def fit_of_everything(session: MachineSession, *, known_radii: bool) -> Solution
     """Return the fit with true radii, or without knowing any: a prior would pull on them."""
     legs = session.legs if known_radii else shaken_radii(session)
     names = frozenset(radius_name(legs.names[j], part) for j, part in legs.radii)
-    choices = Choices(fixed=names) if known_radii else Choices(free=names)
+    every = legs.parametrization.names
+    arms = frozenset(name for name in every if kind_of_parameter(name) in ARM_KINDS)
+    choices = Choices(fixed=names, free=arms) if known_radii else Choices(free=names | arms)
     return refine(legs, session.measurements, session.outlines, session.start, choices=choices)
 
 
@@ -128,7 +132,8 @@ def starts_far_away(session: MachineSession) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("name", "known_radii"), [*((name, False) for name in SHIPPED), ("3-upu", True)]
+    ("name", "known_radii"),
+    [*((name, False) for name in SHIPPED), ("3-upu", True), ("delta-round-arms", True)],
 )
 def test_exact_outlines_give_the_truth_from_3_mm_and_1_degree_away(
     name: str, known_radii: bool

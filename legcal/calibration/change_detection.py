@@ -240,7 +240,7 @@ def _of_actuator(actuator: Actuator) -> list[_Possible]:
         )
 
     def axis_moved(leg: Leg, k: int, step: float) -> Leg:
-        change = np.zeros(5)
+        change = np.zeros(9)
         change[k] = step
         return replace(leg, actuator=actuator.moved(change))
 

@@ -11,7 +11,7 @@ from legcal.brief import brief
 from legcal.calibration.board import BoardViews, Poses, in_one_camera
 from legcal.calibration.joint_fit import Start, start_from
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
-from legcal.data import Order, Outlines, axes_from_outlines, few_views, inverse
+from legcal.data import Order, Outlines, along_legs, axes_from_outlines, few_views, inverse
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.machine import Leg, geometries, machine_ties, on_ties, parametrization_of, reframed
 from legcal.paper import nominal_machine, run_base_steps, run_platform_steps
@@ -52,8 +52,9 @@ def four_steps(
     try:
         nominal = nominal_machine(data.machine)
         if axes is None:
-            radii = {p: r for leg in data.machine.legs for p, r in leg.radius_of_part.items()}
-            axes = axes_from_outlines(outlines, measurements, radii)
+            legs = data.machine.legs
+            radii = {part: r for leg in legs for part, r in leg.radius_along.items()}
+            axes = axes_from_outlines(along_legs(outlines, legs), measurements, radii)
         joined = board is not None and any(T is not None for T in board.T_board_camera)
         if board is not None and joined:
             axes, measurements, T_first_camera, new_view = in_one_camera(

@@ -56,6 +56,7 @@ from legcal.data import (
     Measurements,
     Outlines,
     Override,
+    along_legs,
     compression_note,
     dataset_at,
     few,
@@ -70,12 +71,19 @@ from legcal.data import (
 )
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.files import check_destination, output_path
-from legcal.geometry import IntArray, components
-from legcal.machine import Machine, ends_in_base, measured_readings
+from legcal.geometry import Array, IntArray, components
+from legcal.machine import (
+    Machine,
+    arms_at,
+    cylinder_of_arm,
+    ends_in_base,
+    measured_readings,
+)
 from legcal.paper import Criteria, Transformation
 from legcal.perception import (
     MeasuredImages,
     Photographs,
+    PlacedArm,
     Placement,
     detection_settings,
     given_outlines,
@@ -504,7 +512,27 @@ def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredIm
         None if known is None else T_base_Rb * T.inv()
         for known, T in zip(seen.placement.T_base_camera, solution.T_camera_Rb, strict=True)
     )
-    return Placement.of_fit(A[pose], B[pose], cameras, seen.blur)
+    arms = {
+        j: replace(arm, ends=T_base_Rb.apply(arm.ends.reshape(-1, 3)).reshape(-1, 2, 3)[pose])
+        for j, arm in _arms_of_fit(solution, q).items()
+    }
+    return Placement.of_fit(A[pose], B[pose], cameras, seen.blur, arms)
+
+
+def _arms_of_fit(solution: Solution, q: Array) -> dict[int, PlacedArm]:
+    """Return the arms that are cylinders in R_b, at readings of actuators (n_poses, n_actuators).
+
+    One of which the fit has seen nothing is where the model has it.
+    """
+    found = {}
+    for j, ends in arms_at(solution.legs, q).items():
+        actuator = solution.legs[j].actuator
+        if actuator is not None and actuator.arm is not None:
+            seen = solution.radii.get((j, actuator.arm.link))
+            arm = actuator.arm if seen is None else replace(actuator.arm, radius=seen)
+            error = DEFAULT_SETTINGS.arm_point_sigma if seen is None else 0.0
+            found[j] = PlacedArm(actuator.joint, cylinder_of_arm(arm), ends, error)
+    return found
 
 
 def _not_found_again(first: Estimate, again: Estimate) -> list[str]:
@@ -569,7 +597,8 @@ def _refuse_unseen_legs(fitted: OrderedDataset, outlines: Outlines) -> None:
 
 def unseen_legs(machine: Machine, measurements: Measurements, outlines: Outlines) -> list[str]:
     """Return the legs that views should show, and of which no outline is used."""
-    shown = set(outlines.leg[outlines.used].tolist())
+    along = along_legs(outlines, machine.legs)
+    shown = set(along.leg[along.used].tolist())
     views = [measurements.views[v] for v in np.unique(measurements.view).tolist()]
     return [
         leg.name

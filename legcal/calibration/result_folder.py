@@ -36,12 +36,14 @@ from legcal.errors import DatasetError, DidNotConverge, ModelError, OutOfClass, 
 from legcal.files import result_folder
 from legcal.geometry import Array
 from legcal.machine import (
+    ARM_KINDS,
     RESULT_YAML,
     Leg,
     Machine,
     calibrated_axis,
     geometries,
     home_of_legs,
+    kind_of_parameter,
     load_mechanism,
     nominal_axes,
     parametrization_of,
@@ -342,7 +344,8 @@ def _check_same_model(
         for name, number in numbers.items()
         if "_axis." not in name and not abs(values.get(name, number) - number) <= ROUNDING
     ]
-    other += [name for name in numbers if name not in values and not name.endswith(".twist")]
+    later = ("twist", *ARM_KINDS)  # what results of earlier versions do not have
+    other += [n for n in numbers if n not in values and kind_of_parameter(n) not in later]
     for side, axes in nominal_axes(machine.leg_names, legs).items():
         for leg, axis in axes.items():
             nominal = document.nominal_axes.get(side, {}).get(leg)

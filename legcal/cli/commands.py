@@ -401,6 +401,9 @@ def new(
     arm_length: Annotated[
         float | None, typer.Option(help="Length of the arms of a delta, or horns of servos.")
     ] = None,
+    arm_radius: Annotated[
+        float | None, typer.Option(help="Radius of arms that are cylinders; boxes without it.")
+    ] = None,
     rod_length: Annotated[
         float | None, typer.Option(help="Length of rods on carriages or arms.")
     ] = None,
@@ -448,6 +451,7 @@ def new(
         "max_length": max_length,
         "leg_radius": leg_radius,
         "arm_length": arm_length,
+        "arm_radius": arm_radius,
         "rod_length": rod_length,
         "rod_spacing": rod_spacing,
         "type": type_of_legs,

@@ -157,6 +157,13 @@ def merge_edited(detected: Outlines, table: Outlines) -> Outlines:
     return join_outlines([detected.choose(kept), edited])
 
 
+def along_legs(outlines: Outlines, legs: Sequence[Leg]) -> Outlines:
+    """Return the outlines of what lies along legs: without those of arms."""
+    parts = zip(outlines.leg.tolist(), outlines.part, strict=True)
+    arms = np.array([legs[j].is_arm(part) for j, part in parts], dtype=np.bool_)
+    return outlines.choose(~arms) if arms.any() else outlines
+
+
 def reject_unused_legs(
     outlines: Outlines, measurements: Measurements, leg_names: Sequence[str]
 ) -> Outlines:
@@ -229,7 +236,7 @@ def read_observations(
     dataset. Raises DatasetError with one sentence for each thing that is wrong.
     """
     leg_names = [leg.name for leg in legs]
-    parts = [[cylinder.link for cylinder in leg.cylinders] for leg in legs]
+    parts = [list(leg.radius_of_part) for leg in legs]
     remedy = "delete the file to have it written again"
     table = read_table(path, "table of observations", "outline", OUTLINE_COLUMNS, remedy=remedy)
     if skip_stale:

@@ -1,7 +1,9 @@
 from .actuator import Actuator as Actuator
 from .actuator import ActuatorColumns as ActuatorColumns
 from .actuator import ActuatorKind as ActuatorKind
+from .actuator import Arm as Arm
 from .actuator import JointMotion as JointMotion
+from .actuator import Line as Line
 from .actuator import Pulses as Pulses
 from .configurations import MIN_SINGULARITY as MIN_SINGULARITY
 from .configurations import TRAVEL_TOLERANCE as TRAVEL_TOLERANCE
@@ -88,6 +90,7 @@ from .leg import KinematicParameters as KinematicParameters
 from .leg import Leg as Leg
 from .leg import LegColumns as LegColumns
 from .leg import LegKind as LegKind
+from .leg import cylinder_of_arm as cylinder_of_arm
 from .leg import main_cylinders as main_cylinders
 from .leg import parameters_of_legs as parameters_of_legs
 from .leg import point_like_legs as point_like_legs
@@ -112,11 +115,13 @@ from .model_writer import reload_and_check as reload_and_check
 from .model_writer import write_calibrated_yaml as write_calibrated_yaml
 from .model_writer import write_model as write_model
 from .model_writer import write_urdf as write_urdf
+from .parameters import ARM_KINDS as ARM_KINDS
 from .parameters import Parametrization as Parametrization
 from .parameters import calibrated_axis as calibrated_axis
 from .parameters import free_coordinates as free_coordinates
 from .parameters import from_vector as from_vector
 from .parameters import geometries as geometries
+from .parameters import is_held_by_default as is_held_by_default
 from .parameters import kind_of_parameter as kind_of_parameter
 from .parameters import legs_in_links as legs_in_links
 from .parameters import moved_legs as moved_legs
@@ -137,6 +142,7 @@ from .parameters import with_numbers as with_numbers
 from .rods import AT_ZERO as AT_ZERO
 from .rods import actuator_index as actuator_index
 from .rods import actuators_of as actuators_of
+from .rods import arms_at as arms_at
 from .rods import ends_at_poses as ends_at_poses
 from .rods import ends_in_base as ends_in_base
 from .rods import first_rods as first_rods

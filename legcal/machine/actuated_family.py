@@ -89,6 +89,10 @@ def describe_actuated_family(
         Actuator(f"{family.motor}{i}", kind, axis, point, ends, f"{family.motor}{i}_link")
         for i, (point, axis) in enumerate(made.motors, start=1)
     ]
+    for i, motor in enumerate(motors) if "arm_radius" in size else ():
+        on_it = [j for j, rod in enumerate(made.rods) if rod.motor == i]
+        A = np.array([made.rods[j].A for j in on_it])
+        motors[i] = motor.with_arm(A, size["arm_radius"], f"leg{on_it[0] + 1}")
     radius = size["leg_radius"]
     legs = tuple(
         LegEntry(
@@ -283,5 +287,6 @@ FAMILIES = {
         _servo_hexapod,
     ),
 }  # fmt: skip
-OPTIONAL = {"delta": ("height",), "servo-hexapod": ("height",)}  # what follows where not given
+# What follows where not given: heights from the lengths, and arms are boxes
+OPTIONAL = {"delta": ("height", "arm_radius"), "servo-hexapod": ("height", "arm_radius")}
 ALIASES = {"6-pss": "hexaglide", "6-rss": "servo-hexapod"}  # what else people call them

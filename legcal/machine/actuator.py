@@ -6,7 +6,8 @@ A rod of constant length hangs at A, which moves with the reading q of the motor
     revolute   A(q) = c + Rot(w, g q)(a - c)    c a point of the axis, w its direction
 
 a is A at reading 0, and the gain g is 1 unless it is estimated. Several rods may hang on one motor
-(the arm of a Delta carries two): each has the same :class:`Actuator`, known by its joint.
+(the arm of a Delta carries two): each has the same :class:`Actuator`, known by its joint. An arm
+that is a cylinder (:class:`Arm`) is seen itself: its line turns with A and need not meet it.
 """
 
 from __future__ import annotations
@@ -40,6 +41,8 @@ class ActuatorColumns:
     """Where the numbers of an actuator stand in those of its legs, after their own twelve."""
 
     AXIS, POINT, GAIN = slice(12, 14), slice(14, 16), 16
+    ARM_AXIS, ARM_POINT = slice(17, 19), slice(19, 21)
+    LINE, ARM = slice(12, 16), slice(17, 21)  # what the axis is, and the line of the arm
 
 
 class JointMotion(NamedTuple):
@@ -104,6 +107,79 @@ class Pulses:
 
 
 @dataclass(frozen=True, eq=False)
+class Line:
+    """A line in space, whose four numbers are two turns of its axis and two places across it."""
+
+    point: Array  # (3,) any point of it [m]
+    axis: Array  # (3,) unit
+
+    def moved(self, step: Array) -> Line:
+        """Return the line after a step (4,): turns of its axis, and displacements across it."""
+        point = self.point + step[2:] @ normal_basis(self.axis)
+        return Line(point, turned_axis(self.axis, step[:2]))
+
+    def in_frame(self, T_to_from: Array) -> Line:
+        """Return the same in another frame, T_to_from (4, 4)."""
+        return Line(matrix_applied(T_to_from, self.point), T_to_from[:3, :3] @ self.axis)
+
+    def numbers(self, nominal: Line) -> Array:
+        """Return its four numbers: turns of the axis from the nominal one, and its place.
+
+        The place is where the line meets the plane across the nominal axis at the nominal point,
+        from that point.
+        """
+        crossing = self._crossing(nominal)[0] - nominal.point
+        place = normal_basis(nominal.axis) @ crossing
+        return np.array([*axis_angles(self.axis, nominal.axis), *place])
+
+    def numbers_slope(self, nominal: Line) -> Array:
+        """Return the derivative (4, 4) of :meth:`numbers` by a step of :meth:`moved`."""
+        slope, basis, w0 = np.zeros((4, 4)), normal_basis(self.axis), nominal.axis
+        _, s, along = self._crossing(nominal)
+        onto = normal_basis(w0) @ (np.eye(3) - np.outer(self.axis, w0) / along)
+        slope[:2, :2] = axis_angles_slope(self.axis, w0)
+        slope[2:, :2] = s * onto @ cross(basis, self.axis).T
+        slope[2:, 2:] = onto @ basis.T
+        return slope
+
+    def _crossing(self, nominal: Line) -> tuple[Array, float, float]:
+        """Return where the line crosses the nominal plane, how far along it, and w . w0."""
+        along = float(self.axis @ nominal.axis)
+        s = float((nominal.point - self.point) @ nominal.axis) / along
+        return self.point + s * self.axis, s, along
+
+    @staticmethod
+    def with_numbers(nominal: Line, numbers: Array) -> Line:
+        """Return the line that has these four numbers; the inverse of :meth:`numbers`."""
+        point = nominal.point + numbers[2:] @ normal_basis(nominal.axis)
+        return Line(point, turned_axis(nominal.axis, numbers[:2]))
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """An arm that cameras see as a cylinder, where its motor reads 0."""
+
+    line: Line  # about which it is, at its middle, in the frame of its actuator
+    length: float  # [m]
+    radius: float  # [m]
+    link: str  # the URDF link that carries the visual; it names the part in observations
+    leg: str  # the rod as a part of which observations have it: the first on its motor
+
+    @property
+    def ends(self) -> Array:
+        """Both ends of its axis (2, 3) [m]."""
+        half = np.array([[-0.5], [0.5]]) * self.length
+        return np.asarray(self.line.point + half * self.line.axis)
+
+    def ends_slope(self) -> Array:
+        """Return the derivatives of both ends (2, 3, 4) by a step of :meth:`Line.moved`."""
+        basis = normal_basis(self.line.axis)
+        half = np.array([-0.5, 0.5])[:, None, None] * self.length
+        turned = half * cross(basis, self.line.axis).T
+        return np.concatenate([turned, np.broadcast_to(basis.T, turned.shape)], axis=2)
+
+
+@dataclass(frozen=True, eq=False)
 class Actuator:
     """A motor that carries joints at A, in the frame of its legs: the base link, or R_b."""
 
@@ -115,6 +191,12 @@ class Actuator:
     link: str = ""  # the carriage or arm
     gain: float = 1.0  # true motion over reading
     pulses: Pulses | None = None  # of a hobby servo
+    arm: Arm | None = None  # where cameras see it as a cylinder
+
+    @property
+    def line(self) -> Line:
+        """The axis of a revolute."""
+        return Line(self.point, self.axis)
 
     @property
     def turns(self) -> bool:
@@ -125,6 +207,15 @@ class Actuator:
     def unit(self) -> Literal["m", "rad"]:
         """The unit of its readings."""
         return "rad" if self.turns else "m"
+
+    def with_arm(self, A: Array, radius: float, leg: str) -> Actuator:
+        """Return it with a round arm from its axis to the middle of joints (n, 3) at reading 0."""
+        middle = A.mean(axis=0)
+        along = middle - self.point
+        along = along - (along @ self.axis) * self.axis
+        length = float(np.linalg.norm(along))
+        line = Line(middle - 0.5 * along, along / length)
+        return replace(self, arm=Arm(line, length, radius, self.link, leg))
 
     def rotations(self, q: Array) -> Array:
         """Return how directions fixed in the carriage or arm turn at readings, (k, 3, 3)."""
@@ -172,71 +263,74 @@ class Actuator:
         )
 
     def moved(self, step: Array) -> Actuator:
-        """Return the actuator after a step (5,): turns of its axis, its point, and its gain."""
-        basis = normal_basis(self.axis)
+        """Return it after a step (9,): turns of its axis, its point, its gain, and its arm."""
+        line = self.line.moved(step[:4])
+        arm = self.arm
         return replace(
             self,
-            axis=turned_axis(self.axis, step[:2]),
-            point=self.point + step[2:4] @ basis,
+            axis=line.axis,
+            point=line.point,
             gain=self.gain + float(step[4]),
+            arm=None if arm is None else replace(arm, line=arm.line.moved(step[5:])),
         )
 
     def in_frame(self, T_to_from: Array) -> Actuator:
         """Return the same in another frame, T_to_from (4, 4)."""
-        return replace(
-            self, axis=T_to_from[:3, :3] @ self.axis, point=matrix_applied(T_to_from, self.point)
-        )
+        line, arm = self.line.in_frame(T_to_from), self.arm
+        moved = None if arm is None else replace(arm, line=arm.line.in_frame(T_to_from))
+        return replace(self, axis=line.axis, point=line.point, arm=moved)
 
     def numbers(self, nominal: Actuator) -> Array:
-        """Return its five numbers: turns of the axis from the nominal one, its place, its gain.
+        """Return its nine numbers: those of its axis, its gain, and those of the line of its arm.
 
-        The place is where the axis meets the plane across the nominal axis at the nominal point,
-        from that point.
+        They are :meth:`Line.numbers`; a prismatic has no place, and without an arm its are zero.
         """
-        crossing = self._crossing(nominal)[0] - nominal.point
-        place = normal_basis(nominal.axis) @ crossing if self.turns else np.zeros(2)
-        return np.array([*axis_angles(self.axis, nominal.axis), *place, self.gain])
+        axis, arm = self.line.numbers(nominal.line), np.zeros(4)
+        if not self.turns:
+            axis[2:] = 0.0
+        if self.arm is not None and nominal.arm is not None:
+            arm = self.arm.line.numbers(nominal.arm.line)
+        return np.array([*axis, self.gain, *arm])
 
     def numbers_slope(self, nominal: Actuator) -> Array:
-        """Return the derivative (5, 5) of :meth:`numbers` by a step of :meth:`moved`."""
-        slope = np.eye(5)
-        slope[:2, :2] = axis_angles_slope(self.axis, nominal.axis)
+        """Return the derivative (9, 9) of :meth:`numbers` by a step of :meth:`moved`."""
+        slope = np.eye(9)
+        slope[:4, :4] = self.line.numbers_slope(nominal.line)
         if not self.turns:
-            return slope
-        basis, w0 = normal_basis(self.axis), nominal.axis
-        _, s, along = self._crossing(nominal)
-        onto = normal_basis(w0) @ (np.eye(3) - np.outer(self.axis, w0) / along)
-        slope[2:4, :2] = s * onto @ cross(basis, self.axis).T
-        slope[2:4, 2:4] = onto @ basis.T
+            slope[2:4, :4] = np.eye(4)[2:]
+        if self.arm is not None and nominal.arm is not None:
+            slope[5:, 5:] = self.arm.line.numbers_slope(nominal.arm.line)
         return slope
 
     def with_numbers(self, nominal: Actuator, numbers: Array) -> Actuator:
-        """Return the actuator that has these five numbers; the inverse of :meth:`numbers`."""
-        axis = turned_axis(nominal.axis, numbers[:2])
-        point = self.point
-        if self.turns:
-            point = nominal.point + numbers[2:4] @ normal_basis(nominal.axis)
-        return replace(self, axis=axis, point=point, gain=float(numbers[4]))
-
-    def _crossing(self, nominal: Actuator) -> tuple[Array, float, float]:
-        """Return where the axis crosses the nominal plane, how far along it, and w . w0."""
-        along = float(self.axis @ nominal.axis)
-        s = float((nominal.point - self.point) @ nominal.axis) / along
-        return self.point + s * self.axis, s, along
+        """Return the actuator that has these nine numbers; the inverse of :meth:`numbers`."""
+        line, arm = Line.with_numbers(nominal.line, numbers[:4]), self.arm
+        if arm is not None and nominal.arm is not None:
+            arm = replace(arm, line=Line.with_numbers(nominal.arm.line, numbers[5:]))
+        point = line.point if self.turns else self.point
+        return replace(self, axis=line.axis, point=point, gain=float(numbers[4]), arm=arm)
 
     def placed(self, document: Mapping[str, Any]) -> Actuator:
         """Return it where a result has it; the inverse of :meth:`document`."""
-        if self.turns:
-            axis, point = np.array(document["axis"]), np.array(document["point"])
-            return replace(self, axis=axis, point=point)
-        return replace(self, axis=np.array(document["direction"]))
+        if not self.turns:
+            return replace(self, axis=np.array(document["direction"]))
+        axis, point, arm = np.array(document["axis"]), np.array(document["point"]), self.arm
+        if arm is not None and (there := document.get("arm")) is not None:
+            line = Line(np.array(there["point"]), np.array(there["axis"]))
+            arm = replace(arm, line=line)
+        return replace(self, axis=axis, point=point, arm=arm)
 
-    def document(self) -> dict[str, object]:
+    def document(self) -> dict[str, Any]:
         """Return it as result files have it, in its frame."""
-        if self.turns:
-            return {
-                "kind": self.kind.value,
-                "point": self.point.tolist(),
-                "axis": self.axis.tolist(),
-            }
-        return {"kind": self.kind.value, "direction": self.axis.tolist()}
+        if not self.turns:
+            return {"kind": self.kind.value, "direction": self.axis.tolist()}
+        found: dict[str, Any] = {
+            "kind": self.kind.value,
+            "point": self.point.tolist(),
+            "axis": self.axis.tolist(),
+        }
+        if self.arm is None:
+            return found
+        line = self.arm.line
+        arm = {"link": self.arm.link, "point": line.point.tolist(), "axis": line.axis.tolist()}
+        return found | {"arm": arm}

@@ -1,4 +1,4 @@
-"""The visible cylinders of a file, which of them lie along legs, and the heights of planar legs.
+"""The visible cylinders of a file: those along legs, those that are arms, heights of planar legs.
 
 In a plane the kinematics say nothing of heights, and joint origins may stand anywhere along their
 axes. A camera sees the legs where their cylinders are.
@@ -10,7 +10,15 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from legcal.geometry import Array, cross, matrix_applied, matrix_product
+from legcal.geometry import (
+    Array,
+    cross,
+    distance_to_line,
+    matrix_applied,
+    matrix_inverse,
+    matrix_product,
+)
+from legcal.machine.actuator import Actuator, Arm, Line
 from legcal.machine.bodies import Bodies
 from legcal.machine.leg import Cylinder, JointType, Leg, LegChain, Step
 from legcal.machine.urdf import Urdf, origins_of, parse_robot
@@ -44,6 +52,49 @@ def with_cylinders(
         leg if leg.chain is None else replace(leg, cylinders=_along(leg, leg.chain, shown, bodies))
         for leg in legs
     )
+
+
+def with_arms(
+    legs: Sequence[Leg], shown: Sequence[VisualCylinder], bodies: Bodies, T_body_base: Array
+) -> tuple[Leg, ...]:
+    """Return the legs with the arms of their motors that are cylinders, at T_body_base (4, 4).
+
+    It is the longest cylinder on what a motor turns that is not about the motor's own axis.
+    """
+    arms: dict[str, Actuator] = {}
+    for leg in legs:
+        actuator, chain = leg.actuator, leg.chain
+        if actuator is None or chain is None or not actuator.turns or actuator.joint in arms:
+            continue
+        T = matrix_product(matrix_inverse(T_body_base), matrix_inverse(chain.poses[0]))
+        T_base_arm = matrix_product(T, chain.poses[1])
+        found = [
+            _arm(cylinder, matrix_applied(T_base_arm, _ends(cylinder, bodies)), actuator, leg.name)
+            for cylinder in shown
+            if bodies.body_of[cylinder.link] == chain.bodies[0]
+        ]
+        seen = [arm for arm in found if _from_axis(arm.ends, actuator).max() > COAXIAL]
+        longest = max(seen, key=lambda arm: (arm.length, arm.radius), default=None)
+        arms[actuator.joint] = replace(actuator, arm=longest)
+    return tuple(
+        replace(leg, actuator=arms[leg.actuator.joint])
+        if leg.actuator is not None and leg.actuator.joint in arms
+        else leg
+        for leg in legs
+    )
+
+
+def _arm(cylinder: VisualCylinder, ends: Array, actuator: Actuator, leg: str) -> Arm:
+    """Return a cylinder with ends (2, 3) as an arm, from the axis of its motor outwards."""
+    near, far = _from_axis(ends, actuator)
+    first, last = ends if near <= far + COAXIAL else ends[::-1]
+    line = Line(0.5 * (first + last), (last - first) / cylinder.length)
+    return Arm(line, cylinder.length, cylinder.radius, cylinder.link, leg)
+
+
+def _from_axis(points: Array, actuator: Actuator) -> Array:
+    """Return how far points (n, 3) are from the axis of a motor [m]."""
+    return distance_to_line(points, actuator.axis, actuator.point)
 
 
 def at_visible_heights(

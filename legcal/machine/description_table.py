@@ -250,6 +250,7 @@ class ActuatorEntry(FileSchema):
     travel_us: Ends | None = None  # of a hobby servo, with the two numbers of its pulses
     centre_us: Number | None = None
     us_per_deg: Number | None = None
+    arm_radius: Annotated[Number, Field(gt=0.0)] | None = None  # of an arm that is a cylinder
 
     @property
     def turns(self) -> bool:
@@ -311,7 +312,7 @@ _NUMBERS = (
     *(f"{side}_axis_{i}" for side in ("base", "platform") for i in _XYZ),
     *(f"{what}_{i}" for what in ("direction", "point", "axis") for i in _XYZ),
     *(f"{travel}_{end}" for travel in ("travel_deg", "travel_us") for end in ("low", "high")),
-    *("centre_us", "us_per_deg", "home_reading", "home_reading_deg"),
+    *("centre_us", "us_per_deg", "arm_radius", "home_reading", "home_reading_deg"),
 )
 COLUMNS = (
     *(Column(name, "text", required=False) for name in ("leg", "type", "kind", "unit", "hangs_on")),
@@ -376,7 +377,7 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         **{key: vectors(key) for key in _MOTIONS},
         "travel": travel[:],
         **{key: pairs(key) for key in ("travel_deg", "travel_us")},
-        **{key: numbers(key) for key in ("centre_us", "us_per_deg", *_AT_HOME)},
+        **{key: numbers(key) for key in ("centre_us", "us_per_deg", "arm_radius", *_AT_HOME)},
     }
     for row, motor in enumerate(hangs_on):
         said = {key: values[row] for key, values in said_of_motors.items()}
@@ -613,6 +614,11 @@ def _wrong_actuators(file: TableFile, source: str, names: list[str]) -> list[str
         except ValueError as error:
             problems.append(f"{where}: {error}")
             continue
+        if entry.arm_radius is not None and not entry.turns:
+            problems.append(
+                f"{where}: found arm_radius of a carriage, needed that of an arm that turns; leave "
+                "it out."
+            )
         travels = [key for key in _TRAVELS if getattr(entry, key) is not None]
         right = ["travel_deg", "travel_us"] if entry.turns else ["travel"]
         if (
@@ -692,6 +698,11 @@ def _actuators(file: TableFile) -> dict[str, Actuator]:
             f"{name}_link",
             pulses=pulses,
         )
+        if entry.arm_radius is not None:
+            joints = np.array([[in_metres(x, file.unit) for x in joint] for joint in A])
+            first = (file.legs or [f"leg{j + 1}" for j in range(len(motors))])[motors.index(name)]
+            radius = in_metres(entry.arm_radius, file.unit)
+            found[name] = found[name].with_arm(joints, radius, first)
     return found
 
 

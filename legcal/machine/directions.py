@@ -61,9 +61,11 @@ _NOUN_OF_ACTUATOR = {
     "direction": ("direction of", "directions of"),
     "axis": ("axis of", "axes of"),
     "axis_point": ("place of the axis of", "places of the axes of"),
+    "arm_axis": ("direction of the arm of", "directions of the arms of"),
+    "arm_point": ("place of the arm of", "places of the arms of"),
     "gain": ("gain of", "gains of"),
 }
-_OF_ACTUATOR = re.compile(r"(.+)\.(?:(direction|axis|axis_point)\.[12]|(gain))")
+_OF_ACTUATOR = re.compile(r"(.+)\.(?:(direction|axis|axis_point|arm_axis|arm_point)\.[12]|(gain))")
 
 
 def list_in_words(words: Sequence[str]) -> str:

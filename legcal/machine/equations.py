@@ -38,7 +38,7 @@ class PoseEquations:
 
     values: Array  # (k, m) residuals [m]; |AB| - q0 for a length, to equal s q
     by_pose: Array  # (k, m, 6) derivative by rotation [rad] and displacement [m]
-    by_local: Array  # (k, m, 17) by the numbers of the row's leg (LegColumns), axes by turns about
+    by_local: Array  # (k, m, 21) by the numbers of the row's leg (LegColumns), axes by turns about
     # their normal_basis, exact where residuals are zero; or (k, m, 0)
     leg: IntArray  # (m,) the leg of each row, -1 for the plane
     kinds: tuple[EquationKind, ...]  # (m,) what each row is about
@@ -217,7 +217,7 @@ def _of_alike(
     """Return the equations of n legs with the same joints and equations; n is 1 on an actuator.
 
     They are lengths (k, n), and of m rows values (k, n, m) and derivatives (k, n, m, 6) by the
-    pose, (k, n, m, 17) by the numbers of the legs and (k, n, m, 1) by the readings q (k,).
+    pose, (k, n, m, 21) by the numbers of the legs and (k, n, m, 1) by the readings q (k,).
     """
     A, B = np.array([leg.A for leg in legs]), np.array([leg.B for leg in legs])
     arm = B @ np.swapaxes(R, 1, 2)
@@ -262,7 +262,7 @@ def _back(moved: JointMotion | None, vectors: Array) -> Array:
 
 
 def _write_actuator(moved: JointMotion, by_leg: Array, local: Array) -> None:
-    """Write derivatives by the numbers of an actuator, through the joint at A, into (k, 17)."""
+    """Write derivatives by the numbers of an actuator, through the joint at A, into (k, 21)."""
     columns = ActuatorColumns
     local[:, columns.AXIS] = -np.einsum("kij,ki->kj", moved.by_axis, by_leg)
     local[:, columns.POINT] = -np.einsum("kij,ki->kj", moved.by_point, by_leg)
@@ -272,7 +272,7 @@ def _write_actuator(moved: JointMotion, by_leg: Array, local: Array) -> None:
 def _by_actuator(leg: Leg, moved: JointMotion, row: _EquationRow, local: Array) -> Array:
     """Return the derivative (k,) of a row by the reading; write those by the actuator's numbers.
 
-    They go into *local* (k, 17), which may have no columns.
+    They go into *local* (k, 21), which may have no columns.
     """
     by_leg = row.by_leg[:, 0]
     by_q, columns = -_dot(moved.by_q, by_leg), ActuatorColumns

@@ -48,6 +48,7 @@ class Family:
     tilt: float = 0.0  # of axes out of the horizontal; those at the platform the other way
     name: str | None = None  # name of the model; the family in small letters by default
     arm_length: float | None = None  # of the arms, of families that have some
+    arm_radius: float | None = None  # of arms that are cylinders; boxes by default
     rod_length: float | None = None  # of rods on carriages or arms
     rod_spacing: float | None = None  # of the two rods of a parallelogram
 
@@ -124,8 +125,9 @@ def _describe_named(name: str, family: ActuatedFamily, given: Family) -> Descrip
     known = (*family.dimensions, *OPTIONAL.get(name, ()))
     stated = {
         key: value
-        for key in ("base_radius", "platform_radius", "height", "arm_length", "rod_length",
-                    "rod_spacing", "leg_radius", "base_spread", "platform_spread", "offset", "turn")
+        for key in ("base_radius", "platform_radius", "height", "arm_length", "arm_radius",
+                    "rod_length", "rod_spacing", "leg_radius", "base_spread", "platform_spread",
+                    "offset", "turn")
         if (value := getattr(given, key)) is not None
     } | ({"tilt": given.tilt} if given.tilt else {})  # fmt: skip
     problems = [
@@ -255,6 +257,7 @@ def _unused_dimensions(given: Family, count: int, of_legs: LegType) -> list[str]
         "--offset": not of_legs.has_slider and given.offset is not None and "legs without P",
         "--travel": not of_legs.has_slider and given.travel is not None and "legs without P",
         "--arm-length": given.arm_length is not None and "legs without arms",
+        "--arm-radius": given.arm_radius is not None and "legs without arms",
         "--rod-length": given.rod_length is not None and "legs on no motor",
         "--rod-spacing": given.rod_spacing is not None and "legs on no motor",
     }

@@ -13,6 +13,14 @@ from legcal.machine.model import Machine, readings_at
 from legcal.machine.schema import motor_entries
 
 
+class ArmBlock(Document):
+    """The line of an arm that is a cylinder, where its motor reads 0 [m]."""
+
+    link: str  # that carries its visual
+    point: Triple  # its middle
+    axis: Triple  # from the motor outwards
+
+
 class ActuatorBlock(SparseDocument):
     """A motor that moves joints at A, in R_b or the base link at reading 0 [m]."""
 
@@ -20,6 +28,7 @@ class ActuatorBlock(SparseDocument):
     direction: Triple | None = None  # of a prismatic
     point: Triple | None = None  # of the axis of a revolute
     axis: Triple | None = None
+    arm: ArmBlock | None = None  # of a revolute, where it is seen as a cylinder
 
     @model_validator(mode="after")
     def _has_its_motion(self) -> ActuatorBlock:

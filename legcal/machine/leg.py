@@ -18,7 +18,7 @@ import numpy as np
 
 from legcal.brief import brief
 from legcal.geometry import Array, BoolArray, distance_to_line, matrix_inverse
-from legcal.machine.actuator import Actuator
+from legcal.machine.actuator import Actuator, Arm
 from legcal.machine.bodies import Connection
 
 TRAVEL_MARGIN = 0.05  # of the travel: as good as inside
@@ -33,7 +33,7 @@ class LegColumns:
     A, B, LENGTH = slice(0, 3), slice(3, 6), 6
     BASE_AXIS, PLATFORM_AXIS, TWIST = slice(7, 9), slice(9, 11), 11
     OWN = 12  # the leg's own; those of its actuator follow (ActuatorColumns)
-    COUNT = 17
+    COUNT = 21
 
 
 class LegKind(StrEnum):
@@ -129,6 +129,11 @@ def main_cylinders(cylinders: Sequence[Cylinder]) -> dict[str, Cylinder]:
     for cylinder in sorted(cylinders, key=lambda c: (c.end - c.start, c.radius)):
         found[cylinder.link] = cylinder
     return found
+
+
+def cylinder_of_arm(arm: Arm) -> Cylinder:
+    """Return an arm as a cylinder along its own line, from its near end."""
+    return Cylinder(arm.link, arm.radius, "base", 0.0, arm.length)
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,9 +327,25 @@ class Leg:
         return f"{first}{self.base_joint}{slider}{self.platform_joint}"
 
     @property
-    def radius_of_part(self) -> dict[str, float]:
-        """Radius [m] of each part that outlines are found of, by its URDF link."""
+    def arm(self) -> Arm | None:
+        """The arm of its motor that outlines have as a part of this rod, None on any other."""
+        arm = None if self.actuator is None else self.actuator.arm
+        return arm if arm is not None and arm.leg == self.name else None
+
+    def is_arm(self, part: str) -> bool:
+        """Say whether one of its parts is not along the leg but the arm of its motor."""
+        return self.arm is not None and self.arm.link == part
+
+    @property
+    def radius_along(self) -> dict[str, float]:
+        """Radius [m] of each part along the leg that outlines are found of, by its URDF link."""
         return {link: c.radius for link, c in main_cylinders(self.cylinders).items()}
+
+    @property
+    def radius_of_part(self) -> dict[str, float]:
+        """The same with the arm that is one of its parts."""
+        arm = {} if self.arm is None else {self.arm.link: self.arm.radius}
+        return self.radius_along | arm
 
     @property
     def is_fixed_to_platform(self) -> bool:

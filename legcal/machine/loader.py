@@ -20,7 +20,12 @@ from legcal.machine.actuator import Actuator, Pulses
 from legcal.machine.bodies import Bodies, rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.classification import CONCURRENT, PERPENDICULAR, actuator_of, leg_of
-from legcal.machine.cylinders import at_visible_heights, visual_cylinders, with_cylinders
+from legcal.machine.cylinders import (
+    at_visible_heights,
+    visual_cylinders,
+    with_arms,
+    with_cylinders,
+)
 from legcal.machine.diagnostics import mechanism_notes, proposal_notes
 from legcal.machine.equations import constraints_at, leg_equations, n_pose_constraints
 from legcal.machine.formats import read_source
@@ -229,7 +234,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         base=block.base,
         platform=block.platform,
         platform_joint=block.platform_joint,
-        legs=with_cylinders(legs, shown, bodies),
+        legs=with_arms(with_cylinders(legs, shown, bodies), shown, bodies, ends[0]),
         frame_legs=tuple(names.index(name) for name in base_frame),
         spatial=normals is None,
         home=RigidTransform.identity() if home is None else home,

@@ -26,7 +26,7 @@ from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine, readings_at
-from legcal.machine.origins import moved_origins
+from legcal.machine.origins import moved_arms, moved_origins
 from legcal.machine.rods import actuators_of
 from legcal.machine.schema import mechanism_yaml, motor_entries
 from legcal.machine.urdf import UrdfPatch
@@ -111,8 +111,8 @@ def write_urdf(machine: Machine, legs: Sequence[Leg], destination: Path) -> None
     """Write the mechanism's URDF with other numbers of its legs, of whatever class.
 
     Loading it again gives these numbers to 1e-12 m and rad, with R_b and R_e where they were.
-    Radii are not written: they absorb the bias of edges. Nor is home looked at: with other rods
-    or axes the mechanism may close elsewhere.
+    The visuals of arms move with their lines. Radii are not written: they absorb the bias of edges.
+    Nor is home looked at: with other rods or axes the mechanism may close elsewhere.
     A gain other than 1 of a motor that carries rods has its place in the YAML alone.
     """
     patch = UrdfPatch(machine.urdf.content)
@@ -123,6 +123,8 @@ def write_urdf(machine: Machine, legs: Sequence[Leg], destination: Path) -> None
         rpy = roll_pitch_yaw(after.rotation.as_matrix()) if is_turned else None
         if rpy is not None or not stays:
             patch.set_origin(name, None if stays else xyz, rpy)
+    for arm, T in moved_arms(machine, legs):
+        patch.move_cylinder(arm.link, (arm.radius, arm.length), T)
     destination.write_bytes(patch.content())
 
 

@@ -1,7 +1,8 @@
 """What is seen of the motors of a new model: rails and carriages, motors and arms.
 
-Sizes follow from the radius of the rods. None of it lies along a rod: these are shapes that cameras
-see and nothing is measured of.
+Sizes follow from the radius of the rods, but for arms that are cylinders of a stated radius. None
+of it lies along a rod: these are shapes that cameras see, and only of such arms anything is
+measured.
 """
 
 from __future__ import annotations
@@ -44,8 +45,13 @@ def _turning(
     frame = np.column_stack([x, cross(w, x), w])
     motor = visual_xml(_at(foot, frame), _rounded(MOTOR_RADIUS * r), _rounded(MOTOR_LENGTH * r))
     length = float(np.linalg.norm(middle - foot))
-    arm = 0.5 * (foot + middle) - actuator.point, np.array([length, WIDE * r, THICK * r])
-    return [motor], [_box(*arm, frame), *_bar(A - actuator.point, frame, r)]
+    place = 0.5 * (foot + middle) - actuator.point
+    if actuator.arm is None:
+        arm = _box(place, np.array([length, WIDE * r, THICK * r]), frame)
+    else:
+        along = np.column_stack([frame[:, 1], frame[:, 2], x])
+        arm = visual_xml(_at(place, along), actuator.arm.radius, _rounded(length))
+    return [motor], [arm, *_bar(A - actuator.point, frame, r)]
 
 
 def _sliding(

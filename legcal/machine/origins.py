@@ -19,7 +19,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import OutOfClass
 from legcal.geometry import Array, matrix_inverse, matrix_product, rotation_between
-from legcal.machine.actuator import Actuator
+from legcal.machine.actuator import Actuator, Arm
 from legcal.machine.bodies import Bodies, frame_link, rigid_bodies
 from legcal.machine.chain import Closure
 from legcal.machine.leg import Leg, LegChain, Step
@@ -67,6 +67,26 @@ def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[Rigi
             at_base = carried.onward(leg, wanted, handles.at_zero(chain, machine.base, base))
         move(handles.of(first, first.near, base, leg.name), at_base, base)
         move(handles.of(last, last.far, platform, leg.name), at_platform, platform)
+    return found
+
+
+def moved_arms(machine: Machine, legs: Sequence[Leg]) -> list[tuple[Arm, RigidTransform]]:
+    """Return each arm that is not where the URDF draws it, and how its visual moves in its link."""
+    handles = Handles(machine.urdf, machine.chain.closures, machine.platform_joint)
+    found = []
+    for leg, wanted in zip(machine.legs, legs_in_links(machine, legs), strict=True):
+        arm, other, chain = leg.arm, wanted.arm, leg.urdf_chain
+        if arm is None or other is None or chain.actuator is None:
+            continue
+        T_base_link = handles.at_zero(chain, machine.base, arm.link)
+        carried = _carried(leg.actuator, wanted.actuator).motion
+        before = arm.line.in_frame(T_base_link.inv().as_matrix())
+        line = other.line.in_frame(carried.of(T_base_link).inv().as_matrix())
+        along = (before.point - line.point) @ line.axis  # where on its line it stands is no number
+        shift = line.point + along * line.axis - before.point
+        motion = Motion(shift, before.point, _turn(before.axis, line.axis, directed=True))
+        if motion.turn is not None or np.abs(shift).max() > _ROUNDING:
+            found.append((arm, motion.of(RigidTransform.identity())))
     return found
 
 

@@ -36,9 +36,13 @@ from legcal.machine.leg import (
 from legcal.machine.model import Machine
 from legcal.machine.rods import actuators_of
 
+ARM_KINDS = ("arm_axis", "arm_point")  # of parameters: the line of an arm
 _STEP = 1e-6  # [m or rad], of numerical derivatives
 # Of LegColumns, in this order
-_BLOCKS = (range(3), range(3, 6), (6,), (7, 8), (9, 10), (11,), (12, 13), (14, 15), (16,))
+_BLOCKS = (
+    *(range(3), range(3, 6), (6,), (7, 8), (9, 10), (11,)),
+    *((12, 13), (14, 15), (16,), (17, 18), (19, 20)),  # of its actuator
+)
 _COORDINATES = ("x", "y", "z", "1", "2")  # of what is more than one number
 _LOCAL_NAMES = (
     *(f"{side}.{axis}" for side in ("base", "platform") for axis in "xyz"),
@@ -54,7 +58,7 @@ class Parametrization:
 
     names: tuple[str, ...]  # leg2.base.x, leg1.offset, leg1.length, leg1.base_axis.1, leg1.twist
     units: tuple[str, ...]  # m or rad
-    # (n_legs, 17) of each leg's numbers (LegColumns); -1 for no parameter. Those of an actuator are
+    # (n_legs, 21) of each leg's numbers (LegColumns); -1 for no parameter. Those of an actuator are
     # shared by all legs on it
     place: IntArray
 
@@ -62,7 +66,7 @@ class Parametrization:
         return len(self.names)
 
     def scatter(self, by_local: Array, leg: int) -> Array:
-        """Return derivatives (..., 17) by a leg's numbers as derivatives by all parameters."""
+        """Return derivatives (..., 21) by a leg's numbers as derivatives by all parameters."""
         place = self.place[leg]
         wide = np.zeros((*by_local.shape[:-1], len(self)))
         wide[..., place[place >= 0]] = by_local[..., place >= 0]
@@ -74,7 +78,7 @@ def parametrize(
 ) -> Parametrization:
     """Return the parameters of legs in R_b and R_e.
 
-    Without *twists* these are fixed, and so are the gains of actuators.
+    Without *twists* these are fixed, and so are the gains of actuators and the lines of arms.
     """
     columns = LegColumns
     free = np.zeros((len(legs), columns.COUNT), dtype=np.bool_)
@@ -88,6 +92,8 @@ def parametrize(
             free[j, ActuatorColumns.AXIS] = True
             free[j, ActuatorColumns.POINT] = leg.actuator.turns
             free[j, ActuatorColumns.GAIN] = twists
+            has_arm = twists and leg.actuator.arm is not None
+            free[j, ActuatorColumns.ARM_AXIS] = free[j, ActuatorColumns.ARM_POINT] = has_arm
         if j not in frame_legs and leg.is_fixed_to_platform and leg.platform_axis is not None:
             # B is anywhere on the line
             free[j, columns.B.start + int(np.argmax(np.abs(leg.platform_axis)))] = False
@@ -139,10 +145,25 @@ def _name_of_actuator(actuator: Actuator | None, column: int) -> tuple[str, str]
         raise ValueError("a leg that hangs on no actuator has no numbers of one")
     if column == ActuatorColumns.GAIN:
         return f"{actuator.joint}.gain", ""
-    if column >= ActuatorColumns.POINT.start:
-        return f"{actuator.joint}.axis_point.{column - ActuatorColumns.POINT.start + 1}", "m"
-    what = "axis" if actuator.turns else "direction"
-    return f"{actuator.joint}.{what}.{column - ActuatorColumns.AXIS.start + 1}", "rad"
+    what, columns, unit = next(
+        (what, columns, unit)
+        for what, columns, unit in (
+            ("axis" if actuator.turns else "direction", ActuatorColumns.AXIS, "rad"),
+            ("axis_point", ActuatorColumns.POINT, "m"),
+            ("arm_axis", ActuatorColumns.ARM_AXIS, "rad"),
+            ("arm_point", ActuatorColumns.ARM_POINT, "m"),
+        )
+        if columns.start <= column < columns.stop
+    )
+    return f"{actuator.joint}.{what}.{column - columns.start + 1}", unit
+
+
+def is_held_by_default(name: str) -> bool:
+    """Say whether a parameter is known unless somebody frees it: a twist, a gain, a line of an arm.
+
+    That of an arm which is seen is estimated about where the model draws it.
+    """
+    return kind_of_parameter(name) in ("twist", "gain", *ARM_KINDS)
 
 
 def parametrization_of(machine: Machine, *, twists: bool = False) -> Parametrization:
@@ -236,7 +257,7 @@ def vector_of(
 
 
 def numbers_of(legs: Sequence[Leg], nominal: Sequence[Leg]) -> Array:
-    """Return the numbers of legs, (n_legs, 17), in the order of :class:`LegColumns` [m, rad].
+    """Return the numbers of legs, (n_legs, 21), in the order of :class:`LegColumns` [m, rad].
 
     Axes are :func:`~legcal.geometry.axis_angles` from the nominal ones, zero for legs without one.
     """
@@ -256,7 +277,7 @@ def numbers_of(legs: Sequence[Leg], nominal: Sequence[Leg]) -> Array:
 def with_numbers(
     legs: Sequence[Leg], nominal: Sequence[Leg], numbers: Array, given: BoolArray
 ) -> tuple[Leg, ...]:
-    """Return legs of which some numbers, *given* (n_legs, 17), are those of :func:`numbers_of`.
+    """Return legs of which some numbers, *given* (n_legs, 21), are those of :func:`numbers_of`.
 
     Where an axis at the platform or a twist is given the leg has its twist as given.
     """

@@ -40,6 +40,19 @@ def joints_at(legs: Sequence[Leg], q: Array) -> Array:
     return A
 
 
+def arms_at(legs: Sequence[Leg], q: Array) -> dict[int, Array]:
+    """Return the ends (k, 2, 3) [m] of arms at readings of actuators (k, n_actuators).
+
+    They are by the legs that have them as parts (:attr:`Leg.arm`), in the frame of A.
+    """
+    on, found = actuator_index(legs), dict[int, Array]()
+    for j, leg in enumerate(legs):
+        if leg.actuator is not None and leg.arm is not None:
+            ends = [leg.actuator.at(end, q[:, on[j]]) for end in leg.arm.ends]
+            found[j] = np.stack(ends, axis=1)
+    return found
+
+
 def ends_at_poses(
     legs: Sequence[Leg], R: Array, t: Array, q: Array | None = None
 ) -> tuple[Array, Array]:

@@ -504,15 +504,34 @@ class UrdfPatch:
 
     def set_radius(self, link: str, number: int, radius: float) -> None:
         """Write the radius [m] of one of the visual cylinders of a link, counted from 0."""
-        cylinders = [
-            shape
+        self._write(self._cylinders(link)[number][1], radius=np.array([radius]))
+
+    def move_cylinder(self, link: str, size: tuple[float, float], T: RigidTransform) -> None:
+        """Move the visual cylinder of a link that has a radius and a length [m] in the link."""
+        visual = next(
+            visual
+            for visual, shape in self._cylinders(link)
+            if size == (float(shape.get("radius", "")), float(shape.get("length", "")))
+        )
+        before = RigidTransform(origins_of([visual])[0], normalize=False, copy=False)
+        origin, after = visual.find("origin"), T * before
+        if origin is None:
+            origin = etree.Element("origin")
+            visual.insert(0, origin)
+        rpy = roll_pitch_yaw(after.rotation.as_matrix())
+        self._write(origin, xyz=np.asarray(after.translation), rpy=rpy)
+
+    def _cylinders(self, link: str) -> list[tuple[etree._Element, etree._Element]]:
+        """Return the visuals of a link that are cylinders, with their shapes."""
+        return [
+            (visual, shape)
             for element in self._robot.findall("link")
             if element.get("name") == link
-            for geometry in element.findall("visual/geometry")
+            for visual in element.findall("visual")
+            for geometry in visual.findall("geometry")
             for shape in list(geometry.iterchildren(etree.Element))[:1]
             if shape.tag == "cylinder"
         ]
-        self._write(cylinders[number], radius=np.array([radius]))
 
     def add_frame(self, parent: str, child: str, link: str, joint: str, T: RigidTransform) -> None:
         """Add a link, and a fixed joint between parent and child, of which it is one."""

@@ -74,7 +74,8 @@ class Carrier:
         columns = CarrierColumns
         A = self.A + step[columns.A]
         v = turned_axis(self.v, step[columns.V]) if self.v.any() else self.v
-        actuator = self.actuator.moved(np.array([*step[columns.AXIS], *step[columns.POINT], 0.0]))
+        line = (*step[columns.AXIS], *step[columns.POINT])
+        actuator = self.actuator.moved(np.array([*line, *(0.0,) * 5]))  # nor gain and arm
         if actuator.turns:
             along = float((A - actuator.point) @ actuator.axis)
             actuator = replace(actuator, point=actuator.point + along * actuator.axis)

@@ -64,11 +64,18 @@ def _of_image(
         window += placement.window[row]
     wanted = [leg for leg in np.flatnonzero(~np.isnan(window)).tolist() if search.cylinders[leg]]
     predicted: list[PredictedLeg] = []
+    arms = placement.arms
     if T is not None:
-        A, B = placement.A_base[row], placement.B_base[row]
-        predicted = predict_legs(camera, T, A, B, search.cylinders, row)
+        A, B = (
+            np.concatenate([ends[row], *(arm.ends[row, k : k + 1] for arm in arms.values())])
+            for k, ends in enumerate((placement.A_base, placement.B_base))
+        )
+        cylinders = [*search.cylinders, *([arm.cylinder] for arm in arms.values())]
+        predicted = predict_legs(camera, T, A, B, cylinders, row)
+    window = np.concatenate([window, window[list(arms)]])
     if placement.window is None:
         error = np.broadcast_to(placement.joint_error, search.wanted.shape)[view]
+        error = np.concatenate([error, [arm.error for arm in arms.values()]])
         for leg in predicted:
             window[leg.leg] += placement.pixel_error + error[leg.leg] * _pixels_per_metre(leg)
     known = placement.blur[view] if placement.blur else np.nan
@@ -78,11 +85,12 @@ def _of_image(
         np.zeros((0, 0), dtype=np.float32) if T is None else search.load(row),
         camera,
         predicted,
-        search.leg_names,
+        [*search.leg_names, *(arm.name for arm in arms.values())],
         window,
         guided=placement.window is not None,
         blur=blur or None,
         near_fit=not np.isnan(known),
+        arms=tuple(arms),
     )
     found, blur = (no_outlines(), np.nan) if T is None else method(one)
     seen = {leg.leg for leg in predicted}

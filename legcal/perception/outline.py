@@ -55,6 +55,13 @@ class ImageSearch:
     guided: bool = False  # whether a fit to other legs predicts them: one edge is enough
     blur: float | None = None  # as other images show it, or roughly [px]
     near_fit: bool = False  # whether outlines are known to tenths of a pixel, and the blur as well
+    # The legs of which arms are parts: they follow the legs, and no fit knows their widths
+    arms: tuple[int, ...] = ()
+
+    @property
+    def n_legs(self) -> int:
+        """Number of legs, arms left out."""
+        return len(self.names) - len(self.arms)
 
 
 Method = Callable[[ImageSearch], tuple[Outlines, float]]
@@ -101,7 +108,8 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
             search.grey, search.camera, edges, together, search.blur, near_fit=near
         )
         for part, one, two in zip(parts, measured[::2], measured[1::2], strict=True):
-            found.append(_with_verdict(part, (one, two), near_fit=near))
+            of_leg = near and part.leg.leg < search.n_legs
+            found.append(_with_verdict(part, (one, two), near_fit=of_leg))
     return outline_table(search, found), blur
 
 
@@ -186,7 +194,9 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
 
 def outline_table(search: ImageSearch, parts: Sequence[PartLines]) -> Outlines:
     """Return both outlines of all parts of an image, NaN where there is no line."""
-    parts = sorted(parts, key=lambda part: (part.leg, part.part))
+    legs = [*range(search.n_legs), *search.arms]
+    parts = [part._replace(leg=legs[part.leg]) for part in parts]
+    parts.sort(key=lambda part: (part.leg, part.part))
     n = 2 * len(parts)
     h, ends, quality = np.full((n, 3), np.nan), np.full((n, 2, 2), np.nan), np.full((n, 4), np.nan)
     covariance = np.full((n, 2, 2), np.nan)

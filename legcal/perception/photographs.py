@@ -54,7 +54,7 @@ from legcal.progress import Report
 from legcal.vision import look_alike, shared_cameras
 from legcal.workers import Run
 
-DETECTOR_VERSION = 7  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 8  # raise it whenever outlines or notes that are kept come out differently
 MEASURING = "Measuring outlines"  # a stage of progress
 TOO_SHORT = "px in the image"  # end of the reason for parts that are not looked for
 MIN_VIEWS = 2  # in which a part must show another radius than the model's
@@ -397,7 +397,7 @@ def _parts_not_found(legs: Sequence[Leg], outlines: Outlines) -> list[LegRadius]
     part = np.array(outlines.part)
     parts = []
     for j, leg in enumerate(legs):
-        for link, radius in leg.radius_of_part.items():
+        for link, radius in leg.radius_along.items():
             own = visible & (outlines.leg == j) & (part == link)
             is_seen = own.any() or not visible.any()
             if is_seen and used[own].sum() <= MAX_USED_SHARE * own.sum():
@@ -424,7 +424,7 @@ def _images_with_more(
     """
     found = {}
     for leg, radius in radii.factor:
-        links = [link for link, r in legs[leg].radius_of_part.items() if look_alike(r, radius)]
+        links = [link for link, r in legs[leg].radius_along.items() if look_alike(r, radius)]
         gain = Counter[int]()
         for outlines, sign in ((before, -1), (after, 1)):
             is_part = np.isin(outlines.part, links) & (outlines.leg == leg) & outlines.used

@@ -88,6 +88,16 @@ def sensor_extent(camera: Camera) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
+class PlacedArm:
+    """An arm that is a cylinder, where a joint fit has it."""
+
+    name: str  # its motor, for reasons
+    cylinder: Cylinder  # along its line, from its near end
+    ends: Array  # (n_rows, 2, 3) in the base link [m]
+    error: float  # how far it may be from there: where only the model has it [m]
+
+
+@dataclass(frozen=True, eq=False)
 class Placement:
     """Where cameras and joint centres are estimated to be, and how far outlines may be from there.
 
@@ -106,6 +116,8 @@ class Placement:
     radii: RadiusFactors = NO_RADIUS_FACTORS  # that images contradict; cameras are placed by theirs
     unplaced: dict[str, str] = field(default_factory=dict)  # why views have no camera, by name
     notes: tuple[str, ...] = ()  # what else a reader should know
+    # by the legs that have them as parts; looked for near a joint fit alone
+    arms: Mapping[int, PlacedArm] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if len(self.shift) == 0:  # of A and B in each view against the nominal model [m]
@@ -119,10 +131,11 @@ class Placement:
         B_base: Array,
         T_base_camera: Sequence[RigidTransform | None],
         blur: Sequence[float] = (),
+        arms: Mapping[int, PlacedArm] | None = None,
     ) -> "Placement":
         """Return the placement of a joint fit, with the usual blur of each view [px]."""
-        cameras = tuple(T_base_camera)
-        return cls(A_base, B_base, cameras, 0.0, NEAR_FIT_PX, blur=tuple(blur))
+        cameras, arms = tuple(T_base_camera), {} if arms is None else arms
+        return cls(A_base, B_base, cameras, 0.0, NEAR_FIT_PX, blur=tuple(blur), arms=arms)
 
     def shifted(self, search: Search, shift: Array) -> "Placement":
         """Return joint centres where views see them, (n_views, n_legs, 2, 3) from the model [m]."""

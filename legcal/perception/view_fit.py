@@ -386,14 +386,16 @@ class _Lines:
 
 def _lines_of(search: Search, group: Group, outlines: Outlines) -> _Lines | None:
     """Return the used outlines of a group."""
-    used = np.flatnonzero(outlines.used & np.isin(outlines.row, group.rows))
+    of_leg = [main_cylinders(cylinders) for cylinders in search.cylinders]
+    parts = zip(outlines.leg.tolist(), outlines.part, strict=True)
+    along = np.array([part in of_leg[j] for j, part in parts], dtype=np.bool_)  # no arm
+    used = np.flatnonzero(outlines.used & along & np.isin(outlines.row, group.rows))
     if len(used) == 0:
         return None
     used = used[np.lexsort([outlines.leg[used], outlines.row[used]])]
     row, leg = outlines.row[used], outlines.leg[used]
-    of_leg = [main_cylinders(cylinders) for cylinders in search.cylinders]
-    parts = zip(leg.tolist(), used.tolist(), strict=True)
-    radius = np.array([of_leg[j][outlines.part[i]].radius for j, i in parts])
+    places = zip(leg.tolist(), used.tolist(), strict=True)
+    radius = np.array([of_leg[j][outlines.part[i]].radius for j, i in places])
     view = search.measurements.view[row]
     ends, metric = np.empty((len(used), 2, 2)), np.empty((len(used), 2, 2, 2))
     for v in np.unique(view).tolist():

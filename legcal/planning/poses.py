@@ -19,6 +19,7 @@ from legcal.machine import (
     Machine,
     feasible_poses,
     follow,
+    is_held_by_default,
     motor_travel,
     moved_legs,
     platforms_in_base,
@@ -104,7 +105,7 @@ def drawn_legs(legs: FittedLegs, setting: Setting, rng: np.random.Generator) -> 
     """Return legs as they may be, within the prior errors of the machine."""
     found = legs.parametrization
     size = np.where([unit == "m" for unit in found.units], setting.length, setting.angle)
-    size = size * np.array([not name.endswith((".twist", ".gain")) for name in found.names])
+    size = size * np.array([not is_held_by_default(name) for name in found.names])
     return moved_legs(legs.nominal, found.place, size * rng.uniform(-1.0, 1.0, len(size)))
 
 

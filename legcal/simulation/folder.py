@@ -41,7 +41,7 @@ from legcal.files import (
     result_folder,
     with_schema,
 )
-from legcal.machine import Machine, main_cylinders
+from legcal.machine import Machine
 from legcal.simulation.board import documents
 from legcal.simulation.session import SimulatedSession
 from legcal.simulation.settings import SimulationSettings
@@ -123,10 +123,7 @@ def write_truth(
         "legcal": __version__,
         "model": f"models/{truth.yaml_path.name}",
         "settings": _plain(asdict(settings)),
-        "radii": {
-            leg.name: {part: c.radius for part, c in main_cylinders(leg.cylinders).items()}
-            for leg in truth.legs
-        },
+        "radii": {leg.name: leg.radius_of_part for leg in truth.legs},
         "views": {
             view.name: {"T_base_camera": motion_to_xyz_quat(view.T_base_camera)}
             for view in session.scene.views

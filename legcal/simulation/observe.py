@@ -8,7 +8,7 @@ view is said to see shows the middle of its length (:func:`plain_scene`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import NamedTuple
 
@@ -34,6 +34,8 @@ class Scene:
     B: Array  # (n_poses, n_legs, 3) platform joint centres in L [m]
     views: tuple[Viewpoint, ...]  # with T_L_camera
     images: Images
+    # (n_poses, 2, 3) ends of arms in L, by the legs that have them as parts [m]
+    arms: Mapping[int, Array] = field(default_factory=dict)
 
     def leg_in_camera(self, row: int, leg: int) -> tuple[Array, Array]:
         """Return direction u (3,) and base joint A (3,) [m] of a leg in the camera of an image."""
@@ -52,21 +54,34 @@ def plain_scene(
     radii: Mapping[tuple[int, str], float],  # of each (leg, part) [m]
     seen: Sequence[Sequence[int]] | None = None,  # legs of each row; None for all
     span: tuple[float, float] = (0.15, 0.85),  # of the length of a leg that is seen
+    arms: Mapping[tuple[int, str], Array] | None = None,  # which parts are arms: their ends
 ) -> Scene:
     """Return a scene in which nothing is hidden: images show legs over one part of their length."""
-    length = np.linalg.norm(B - A, axis=-1)
+    length, arms = np.linalg.norm(B - A, axis=-1), arms or {}
     shown = []
     for row, k in enumerate(pose.tolist()):
         stretches: list[list[Stretch]] = [[] for _ in length[k]]
+        of_arms: list[Stretch | None] = [None for _ in length[k]]
         for (j, part), radius in radii.items():
-            if seen is None or j in seen[row]:
-                start, end = (float(part_of * length[k, j]) for part_of in span)
-                stretches[j].append(Stretch(j, part, radius, start, end))
+            if seen is not None and j not in seen[row]:
+                continue
+            whole = length[k, j]
+            if (j, part) in arms:
+                whole = np.linalg.norm(np.diff(arms[j, part][k], axis=0))
+            start, end = (float(part_of * whole) for part_of in span)
+            stretch = Stretch(j, part, radius, start, end)
+            if (j, part) in arms:
+                of_arms[j] = stretch
+            else:
+                stretches[j].append(stretch)
         shown.append(
-            tuple(LegView((span[1] - span[0]) * bool(s), 0.0, tuple(s)) for s in stretches)
+            tuple(
+                LegView((span[1] - span[0]) * bool(s), 0.0, tuple(s), arm)
+                for s, arm in zip(stretches, of_arms, strict=True)
+            )
         )
     images = Images(view, pose, np.zeros(len(view), dtype=np.intp), tuple(shown))
-    return Scene(A, B, tuple(views), images)
+    return Scene(A, B, tuple(views), images, {j: ends for (j, _), ends in arms.items()})
 
 
 # Outlines
@@ -95,6 +110,8 @@ def outlines_of(
 ) -> Outlines:
     """Return the outlines of all visible stretches by row, leg and edge; exact without *rng*.
 
+    Those of arms follow those of the legs that have them as parts.
+
     They carry the covariance of the noise in either case.
     """
     claimed = replace(noise, sigma_px=max(noise.sigma_px, EXACT_PX))
@@ -103,10 +120,17 @@ def outlines_of(
     for row in range(len(images)):
         view = scene.views[images.view[row]]
         T = view.T_base_camera.inv()
-        for leg in images.seen(row):
-            A, B = (joints[images.pose[row], leg] for joints in (scene.A, scene.B))
-            u = (B - A) / np.linalg.norm(B - A)
-            for stretch in images.shown[row][leg].stretches:
+        pose = images.pose[row]
+        for leg, shown in enumerate(images.shown[row]):
+            of_leg = shown.stretches if shown.is_seen else ()
+            of_arm = () if shown.arm is None else (shown.arm,)
+            for stretch in (*of_leg, *of_arm):
+                A, B = (
+                    scene.arms[leg][pose]
+                    if of_arm and stretch is shown.arm
+                    else (scene.A[pose, leg], scene.B[pose, leg])
+                )
+                u = (B - A) / np.linalg.norm(B - A)
                 axis = T.apply(A + np.array([[stretch.start], [stretch.end]]) * u)
                 line, offsets = silhouette(
                     T.as_matrix()[:3, :3] @ u, axis[0], np.asarray(stretch.radius)

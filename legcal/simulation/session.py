@@ -176,7 +176,8 @@ def simulate_session(
     if groups:
         kept, views, groups = _numbered(kept, views, groups)
     A, B = (np.array([getattr(m, joint) for m in posed_machines]) for joint in "AB")
-    scene = Scene(A, B, views, kept)
+    arms = {j: np.array([m.arms[j] for m in posed_machines]) for j in posed_machines[0].arms}
+    scene = Scene(A, B, views, kept, arms)
     outlines = axes = corners = None
     if settings.level is Level.OUTLINES:
         noise = OutlineNoise(settings.sigma_px, n_points=None)

@@ -130,6 +130,8 @@ ERRORS_OF = {  # kind of parameter, as in its name
     "direction": "axes",
     "axis": "axes",
     "axis_point": "base_joints",
+    "arm_axis": "axes",
+    "arm_point": "base_joints",
 }
 
 

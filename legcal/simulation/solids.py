@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -31,6 +31,8 @@ from legcal.machine import (
     Configurations,
     Leg,
     Machine,
+    arms_at,
+    first_rods,
     joint_values,
     number_list,
     origins_of,
@@ -459,6 +461,8 @@ class PosedMachine:
     vertices: Array  # vertices, faces: (n, 3) the same as triangles, in the base link [m]
     faces: IntArray
     boards: tuple[Any, ...] = ()  # the ``PlacedBoard`` of each calibration board among the solids
+    # Ends (2, 3) of the arms that are cylinders, by the legs that have them as parts [m]
+    arms: Mapping[int, Array] = field(default_factory=dict)
 
     def hidden(self, centre: Array, points: Array, margin: Array) -> BoolArray:
         """Return which points something stands before, seen from a centre."""
@@ -508,8 +512,11 @@ def pose_machine(
         here = placed(solids, link_poses(machine, configuration))
         vertices = [p.T_base_solid.apply(m.vertices) for p, m in zip(here, meshes, strict=True)]
         B = np.asarray(T.apply(machine.B_platform))
-        A = machine.A_at(joint_values(machine, configuration))
-        posed_machines.append(PosedMachine(A, B, here, np.concatenate(vertices), stacked))
+        q = joint_values(machine, configuration)
+        arms = arms_at(machine.legs, q[None, first_rods(machine.legs)])
+        of_legs = {j: ends[0] for j, ends in arms.items()}
+        A, triangle = machine.A_at(q), np.concatenate(vertices)
+        posed_machines.append(PosedMachine(A, B, here, triangle, stacked, arms=of_legs))
     return tuple(posed_machines)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 
@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import NotVisible, UsageError
 from legcal.geometry import Array, BoolArray, IntArray, cross, matrix_applied
-from legcal.machine import Cylinder, Leg, main_cylinders
+from legcal.machine import Cylinder, Leg, cylinder_of_arm, main_cylinders
 from legcal.progress import Report, no_progress
 from legcal.simulation.solids import PosedMachine
 from legcal.vision import Camera
@@ -78,6 +78,7 @@ class LegView:
     share: float  # the longest unbroken stretch, as part of the leg's length
     length_px: float  # its length in the image [px]
     stretches: tuple[Stretch, ...]  # the longest stretch of each cylinder, from base to platform
+    arm: Stretch | None = None  # that of the arm which the leg has as a part, along the arm
 
     @property
     def is_seen(self) -> bool:
@@ -94,17 +95,29 @@ def legs_in_image(
     samples: int = SAMPLES,
 ) -> tuple[LegView, ...]:
     """Return what an image shows of every leg."""
-    length, skins = _skins(legs, posed, samples)
+    arms = {j: leg.arm for j, leg in enumerate(legs) if leg.arm is not None and j in posed.arms}
+    A, B = (
+        np.concatenate([ends, *(posed.arms[j][None, k] for j in arms)])
+        for k, ends in enumerate((posed.A, posed.B))
+    )
+    cylinders = [*(leg.cylinders for leg in legs), *((cylinder_of_arm(a),) for a in arms.values())]
     T = T_base_camera.as_matrix()
-    axis, offsets, radius, pixels, tested = _sampled(posed, length, skins, camera, T)
+    length, skins = _skins(A, B, cylinders, samples)
+    axis, offsets, radius, pixels, tested = _sampled(A, B, skins, camera, T)
     beside = axis[:, :, None] + (1.0 + _BESIDE) * offsets
     margin = np.broadcast_to(_IN_FRONT * radius[..., None], tested.shape)
     free = tested.copy()
     free[tested] = ~posed.hidden(T[:3, 3], matrix_applied(T, beside[tested]), margin[tested])
     both = np.all(free, axis=-1)
     middle = pixels.mean(axis=-2)
+    views = [
+        _leg_view(j, *skin, both[i], middle[i], float(length[i]))
+        for i, (j, skin) in enumerate(zip([*range(len(legs)), *arms], skins, strict=True))
+    ]
+    of_arms = {j: view for j, view in zip(arms, views[len(legs) :], strict=True) if view.is_seen}
     return tuple(
-        _leg_view(j, *skin, both[j], middle[j], float(length[j])) for j, skin in enumerate(skins)
+        replace(view, arm=of_arms[j].stretches[0]) if j in of_arms else view
+        for j, view in enumerate(views[: len(legs)])
     )
 
 
@@ -120,8 +133,8 @@ def longest_in_images(
 
     They are those from the first to the last sample in the image, as if nothing hid any.
     """
-    length, skins = _skins(legs, posed, samples)
-    *_, pixels, tested = _sampled(posed, length, skins, camera, T_base_camera)
+    _, skins = _skins(posed.A, posed.B, [leg.cylinders for leg in legs], samples)
+    *_, pixels, tested = _sampled(posed.A, posed.B, skins, camera, T_base_camera)
     inside = np.all(tested, axis=-1)
     steps = np.linalg.norm(np.diff(pixels.mean(axis=-2), axis=-2), axis=-1)
     begun = np.logical_or.accumulate(inside, axis=-1)[..., :-1]
@@ -130,18 +143,21 @@ def longest_in_images(
 
 
 def _skins(
-    legs: Sequence[Leg], posed: PosedMachine, samples: int
+    A: Array,  # (n, 3) both ends of legs and arms [m]
+    B: Array,
+    cylinders: Sequence[tuple[Cylinder, ...]],
+    samples: int,
 ) -> tuple[Array, list[tuple[Array, Array, tuple[str, ...]]]]:
-    """Return the lengths of legs (n_legs,) [m], and the skin of each."""
-    length = np.linalg.norm(posed.B - posed.A, axis=-1)
+    """Return the lengths of legs and arms (n,) [m], and the skin of each."""
+    length = np.linalg.norm(B - A, axis=-1)
     return length, [
-        _skin(leg.cylinders, L, samples) for leg, L in zip(legs, length.tolist(), strict=True)
+        _skin(own, L, samples) for own, L in zip(cylinders, length.tolist(), strict=True)
     ]
 
 
 def _sampled(
-    posed: PosedMachine,
-    length: Array,
+    A: Array,  # (n, 3) both ends of legs and arms [m]
+    B: Array,
     skins: Sequence[tuple[Array, Array, tuple[str, ...]]],
     camera: Camera,
     T_base_camera: Array,  # (..., 4, 4)
@@ -153,7 +169,8 @@ def _sampled(
     """
     s, radius = (np.array([skin[k] for skin in skins]) for k in (0, 1))
     R, t = T_base_camera[..., :3, :3], T_base_camera[..., None, :3, 3]
-    u_camera, A_camera = (posed.B - posed.A) / length[:, None] @ R, (posed.A - t) @ R
+    length = np.linalg.norm(B - A, axis=-1)
+    u_camera, A_camera = (B - A) / length[:, None] @ R, (A - t) @ R
     axis = A_camera[..., None, :] + s[..., None] * u_camera[..., None, :]
     from_axis = np.linalg.norm(cross(u_camera, A_camera), axis=-1)
     radius = np.where(from_axis[..., None] > _END_ON * radius, radius, 0.0)

@@ -38,6 +38,7 @@ from legcal.machine import (
     JointType,
     Machine,
     geometries,
+    is_held_by_default,
     legs_outside,
     load_mechanism,
     singularity_note,
@@ -207,7 +208,7 @@ def ranks_of_dataset(
 def _analysis_of(dataset: Dataset, choices: Choices) -> Analysis:
     """Return the analysis of what a dataset records."""
     chosen = (*choices.free, *choices.priors)
-    twists = any(name.endswith((".twist", ".gain")) for name in chosen)
+    twists = any(is_held_by_default(name) for name in chosen)
     return Analysis(recorded_observations(dataset, twists=twists), choices)
 
 

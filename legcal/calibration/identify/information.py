@@ -35,7 +35,13 @@ from legcal.estimation import (
     marginal_rows,
 )
 from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
-from legcal.machine import EquationKind, LegColumns, freedoms, pose_equations
+from legcal.machine import (
+    EquationKind,
+    LegColumns,
+    freedoms,
+    is_held_by_default,
+    pose_equations,
+)
 
 SIGMA_EXACT = 1e-7  # [m]: of what the mechanism itself demands
 INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -136,7 +142,7 @@ def prior_of(predicted: PredictedObservations, choices: Choices) -> GaussianPrio
     for i, name in enumerate(predicted.parametrization.names):
         if name in choices.priors:
             sigma[i] = choices.priors[name].sigma
-        elif choices.holds(name, by_default=name.endswith((".twist", ".gain"))):
+        elif choices.holds(name, by_default=is_held_by_default(name)):
             sigma[i] = SIGMA_EXACT * predicted.unit[i]
     known, values = np.array(list(sigma), dtype=np.intp), np.array(list(sigma.values()))
     return GaussianPrior(known, np.zeros(len(sigma)), values)

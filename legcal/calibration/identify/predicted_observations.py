@@ -155,7 +155,7 @@ class PredictedObservations:
 
     @cached_property
     def A_by_local(self) -> Array:
-        """Their derivatives by the numbers of the legs (LegColumns), (k, n_legs, 3, 17)."""
+        """Their derivatives by the numbers of the legs (LegColumns), (k, n_legs, 3, 21)."""
         found = np.zeros((len(self.t), self.n_legs, 3, LegColumns.COUNT))
         found[..., LegColumns.A] = np.eye(3)
         for j, actuator, a in self._carried():

@@ -406,7 +406,8 @@ def doubted_cameras(
 def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
     """Return a note where many outlines, or most of a leg or of a view, disagree with the fit."""
     o = problem.outlines
-    legs = _mostly_rejected(o.leg, problem.legs.names, o.index, accepted)
+    names, leg = problem.legs.names, np.where(o.on_arm, len(problem.legs.names) + o.leg, o.leg)
+    legs = _mostly_rejected(leg, (*names, *_arm_names(problem)), o.index, accepted)
     views = _mostly_rejected(o.view, o.views, o.index, accepted)
     n, n_rejected = len(accepted), int(np.sum(~accepted))
     of = [f"{rejected} of {total} of {name}" for name, (rejected, total) in (legs | views).items()]
@@ -434,6 +435,7 @@ def legs_left_out(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
     They do so in several images of the view: what is wrong in one is a matter of chance.
     """
     o, names = problem.outlines, problem.legs.names
+    accepted = accepted | o.on_arm  # an arm that is no cylinder says nothing of its rod
     together = o.leg * len(o.views) + o.view
     shown = [f"{leg} in view {view}" for leg in names for view in o.views]
     return tuple(
@@ -443,6 +445,12 @@ def legs_left_out(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
         > _MOST_REJECTED * (total := int(np.sum(together == k)))
         and len(np.unique(o.pose[own])) >= _MIN_COUNT
     )
+
+
+def _arm_names(problem: FitProblem) -> tuple[str, ...]:
+    """Return what messages call the arm of each leg."""
+    arms = [leg.arm for leg in problem.legs.nominal]
+    return tuple("" if arm is None else f"{arm.leg}.{arm.link}" for arm in arms)
 
 
 def scale_notes(problem: FitProblem, state: State, settings: RefinementSettings) -> tuple[str, ...]:

@@ -2,9 +2,10 @@
 
 Each kind is a class of arrays, one row a measurement, with the :class:`legcal.estimation.Factor`
 that it is in the fit; :class:`Observed` registers the kinds. A measurement in an image depends on
-both ends of a leg in the camera frame; these depend on joints, camera and platform pose. Rotations
-change by Cayley's map from the left: a camera turns in its own frame, a platform about the origin
-of R_e in the directions of R_b. Residuals are written with their derivatives, which go backwards
+both ends of a leg in the camera frame; these depend on joints, camera and platform pose. Ends of an
+arm stand in their place where that is seen, and depend on its motor. Rotations change by Cayley's
+map from the left: a camera turns in its own frame, a platform about the origin of R_e in the
+directions of R_b. Residuals are written with their derivatives, which go backwards
 from each to the ends of the leg and on to the variables. Where there are many measurements, as of
 outlines and readings, arrays have these last: NumPy then works along them.
 """
@@ -24,7 +25,7 @@ from legcal.data import Corners, LegAxes, Measurements, Outlines, join_axes
 from legcal.errors import DatasetError
 from legcal.estimation import Factor, Residuals, Touch
 from legcal.geometry import Array, BoolArray, IntArray, cross, whitener
-from legcal.machine import LegColumns, LegKind, actuator_index
+from legcal.machine import JointMotion, LegColumns, LegKind, actuator_index
 from legcal.vision import (
     EPSILON,
     LINKS,
@@ -39,6 +40,7 @@ from legcal.vision import (
 _SAME_GAMMA = 1e-6  # relative difference of gammas that count as one
 _SIX, _ALL, _ONE = slice(0, 6), slice(None), slice(0, 1)
 _OF_ACTUATOR = slice(LegColumns.OWN, LegColumns.COUNT)
+_N_ACTUATOR = LegColumns.COUNT - LegColumns.OWN
 
 
 class Observed(NamedTuple):
@@ -151,6 +153,7 @@ class ObservedOutlines:
     series: IntArray
     cameras: tuple[str, ...]  # the view that stands for the camera of each view
     on_actuators: bool = False  # whether some joints at A move
+    arms: frozenset[tuple[int, str]] = frozenset()  # which parts of the machine are arms
     memory: Memory = field(default_factory=Memory, repr=False)  # of the predicted offsets
 
     @property
@@ -169,6 +172,11 @@ class ObservedOutlines:
         return float(np.median(np.abs(away[is_pair]))) if is_pair.any() else np.inf
 
     @property
+    def on_arm(self) -> BoolArray:
+        """Whether each is of an arm, and not along its leg, (n,)."""
+        return np.array([part in self.arms for part in self.parts], dtype=np.bool_)[self.radius]
+
+    @property
     def epsilon(self) -> Array:
         """+1 or -1 of eq (5), (n,)."""
         return np.asarray(self.constants[:, 8])
@@ -179,7 +187,7 @@ class ObservedOutlines:
     def at(self, which: IntArray) -> ObservedOutlines:
         """Return some of the outlines, by index, without biases."""
         bare = self.without_biases()
-        shared = ("parts", "views", "series", "cameras", "on_actuators", "memory")
+        shared = ("parts", "views", "series", "cameras", "on_actuators", "arms", "memory")
         chosen = {
             f.name: getattr(bare, f.name)[which] for f in fields(self) if f.name not in shared
         }
@@ -239,7 +247,7 @@ class ObservedOutlines:
         """
 
         def predicted() -> tuple[Array, Array, _EndsInCamera, Array]:
-            ends = _ends_in_camera(state, self.leg, self.view, self.pose)
+            ends = _ends_in_camera(state, self.leg, self.view, self.pose, self.on_arm)
             xy, by_key = self._feet, None
             if keys:
                 moved, slopes = _on_sensor(state.cameras, keys, self.view, self.feet, self.pixels)
@@ -350,6 +358,7 @@ def observed_outlines(
         _series(measurements),
         cameras,
         legs.n_actuators > 0,
+        frozenset((j, leg.arm.link) for j, leg in enumerate(legs.nominal) if leg.arm is not None),
     )
 
 
@@ -605,7 +614,8 @@ class ObservedAxes:
 
     def rows(self, state: State) -> Residuals:
         """Return alpha and beta (n, 4) with their derivatives."""
-        ends = _ends_in_camera(state, self.leg, self.view, self.pose)
+        arm = np.zeros(len(self), dtype=np.bool_)
+        ends = _ends_in_camera(state, self.leg, self.view, self.pose, arm)
         r, slope = axis_offsets(ends.A, ends.B, self.M.T, self.basis.T)
         return Residuals(r.T, slope.T, ends.chain)
 
@@ -962,7 +972,7 @@ class _EndsInCamera:
         intrinsics. Those by the numbers of actuators come after them.
         """
         by_ends, moved = slope.T, self.moved
-        n_own, n_q = (0, 0) if moved is None else (5, moved.n_q)
+        n_own, n_q = (0, 0) if moved is None else (_N_ACTUATOR, moved.n_q)
         by_A, by_B, others = by_ends[:3], by_ends[3:6], 6 + len(by_ends)
         m = others + n_own
         J = np.empty((m + 6 + n_q, *by_ends.shape[1:]))
@@ -974,6 +984,11 @@ class _EndsInCamera:
             np.einsum("jin,jqn->iqn", moved.by_numbers, a, out=J[others:m])
             np.einsum("jin,jqn->iqn", moved.by_q, a, out=J[m + 6 :])
         np.einsum("jin,jqn->iqn", self.R_camera, by_B, out=b)
+        if moved is not None and len(moved.arms):
+            of_arms = b[:, :, moved.arms]
+            J[others:m, :, moved.arms] += np.einsum("jin,jqn->iqn", moved.far_numbers, of_arms)
+            J[m + 6 :, :, moved.arms] += np.einsum("jin,jqn->iqn", moved.far_q, of_arms)
+            b[:, :, moved.arms] = 0.0  # nothing of them is on the platform
         np.einsum("jin,jqn->iqn", self.R_pose, b, out=J[3:6])
         J[6:9] = _cross(self.A_turned[:, None], by_A)
         J[6:9] += _cross(self.B_turned[:, None], by_B)
@@ -985,11 +1000,17 @@ class _EndsInCamera:
 
 @dataclass(frozen=True, eq=False)
 class _Moved:
-    """How the joints at A of measurements move with numbers of actuators and with readings."""
+    """How the joints at A of measurements move with numbers of actuators and with readings.
+
+    Of an arm it is its near end that does, and its far end as well.
+    """
 
     by_A: Array  # (3, 3, n) by A at reading 0
-    by_numbers: Array  # (3, 5, n) by the numbers of the actuator
+    by_numbers: Array  # (3, 9, n) by the numbers of the actuator
     by_q: Array  # (3, n_actuators, n)
+    arms: IntArray  # (m,) the measurements of arms
+    far_numbers: Array  # (3, 9, m)
+    far_q: Array  # (3, n_actuators, m)
 
     @property
     def n_q(self) -> int:
@@ -997,37 +1018,75 @@ class _Moved:
         return int(self.by_q.shape[1])
 
 
-def _moved(state: State, leg: IntArray, pose: IntArray) -> _Moved | None:
-    """Return how the joints at A of legs at poses move, None where no actuator carries any."""
+def _moved(state: State, leg: IntArray, pose: IntArray, arm: BoolArray) -> _Moved | None:
+    """Return how the joints at A of legs at poses move, None where no actuator carries any.
+
+    Where *arm* says so it is the ends of the arm of the leg that do.
+    """
     n_poses, n_q = state.platform_pose.q.shape
     if not n_q:
         return None
     shape = len(state.legs), n_poses
     by_A = np.broadcast_to(np.eye(3), (*shape, 3, 3)).copy()
-    by_numbers, by_q = np.zeros((*shape, 3, 5)), np.zeros((*shape, 3, n_q))
+    ends = np.zeros((3, *shape, 3, _N_ACTUATOR)), np.zeros((3, *shape, 3, n_q))
     on = actuator_index(state.legs)
     for j, motion in state.actuated.items():
         by_A[j] = motion.by_A
-        by_numbers[j, :, :, :2], by_numbers[j, :, :, 2:4] = motion.by_axis, motion.by_point
-        by_numbers[j, :, :, 4], by_q[j, :, :, on[j]] = motion.by_gain, motion.by_q
-    tables = (np.moveaxis(table[leg, pose], 0, -1) for table in (by_A, by_numbers, by_q))
-    return _Moved(*(np.ascontiguousarray(table) for table in tables))
+        _write_motion(motion, on[j], *(table[0, j] for table in ends))
+    for j, motions in state.arm_ends.items():
+        carried = state.legs[j].arm
+        slopes = np.zeros((0, 3, 4)) if carried is None else carried.ends_slope()
+        for end, (motion, slope) in enumerate(zip(motions, slopes, strict=True), start=1):
+            _write_motion(motion, on[j], *(table[end, j] for table in ends))
+            ends[0][end, j, :, :, 5:] = motion.by_A @ slope
+    by_numbers, by_q = (table[arm.astype(np.intp), leg, pose] for table in ends)
+    arms = np.flatnonzero(arm)
+    far_numbers, far_q = (table[2, leg[arms], pose[arms]] for table in ends)
+    return _Moved(
+        _last(np.where(arm[:, None, None], 0.0, by_A[leg, pose])),
+        _last(by_numbers),
+        _last(by_q),
+        arms,
+        _last(far_numbers),
+        _last(far_q),
+    )
 
 
-def _ends_in_camera(state: State, leg: IntArray, view: IntArray, pose: IntArray) -> _EndsInCamera:
-    """Return both ends of legs in the camera frames of views at poses."""
+def _write_motion(motion: JointMotion, actuator: int, by_numbers: Array, by_q: Array) -> None:
+    """Write how a point moves with its actuator into (n_poses, 3, 9) and (n_poses, 3, n_q)."""
+    by_numbers[:, :, :2], by_numbers[:, :, 2:4] = motion.by_axis, motion.by_point
+    by_numbers[:, :, 4], by_q[:, :, actuator] = motion.by_gain, motion.by_q
+
+
+def _last(table: Array) -> Array:
+    """Return a table (n, ...) with its first axis last."""
+    return np.ascontiguousarray(np.moveaxis(table, 0, -1))
+
+
+def _ends_in_camera(
+    state: State, leg: IntArray, view: IntArray, pose: IntArray, arm: BoolArray
+) -> _EndsInCamera:
+    """Return both ends of legs in the camera frames of views at poses; of their arms where *arm*.
+
+    Ends of arms stand in place of A and B.
+    """
     n_legs = len(state.A)
     R_camera, t = _by_measurement(state.camera_pose.R, view), state.camera_pose.t.T[:, view]
-    moved = _moved(state, leg, pose)
+    moved = _moved(state, leg, pose, arm)
+    to_B, end = (table[:, pose * n_legs + leg] for table in state.ends_at_poses)
     if moved is None:
         of_views = (state.camera_pose.R.transpose(1, 0, 2) @ state.A.T).reshape(3, -1)
         A = of_views[:, view * n_legs + leg]
     else:
-        A = np.einsum("ijn,nj->in", R_camera, state.A_at_poses[pose, leg])
-    arm, end = (table[:, pose * n_legs + leg] for table in state.ends_at_poses)
+        near = state.A_at_poses[pose, leg]
+        for j, motions in state.arm_ends.items():
+            of_arm = np.flatnonzero(arm & (leg == j))
+            near[of_arm], far = (motion.A[pose[of_arm]] for motion in motions)
+            end[:, of_arm] = far.T
+        A = np.einsum("ijn,nj->in", R_camera, near)
     B = np.einsum("ijn,jn->in", R_camera, end)
     R_pose = _by_measurement(state.platform_pose.R, pose)
-    return _EndsInCamera(A + t, B + t, A, B, arm, R_camera, R_pose, moved)
+    return _EndsInCamera(A + t, B + t, A, B, to_B, R_camera, R_pose, moved)
 
 
 def _by_measurement(R: Array, which: IntArray) -> Array:

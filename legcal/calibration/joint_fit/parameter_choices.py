@@ -20,6 +20,7 @@ from legcal.machine import (
     Machine,
     free_coordinates,
     geometries,
+    is_held_by_default,
     parametrization_of,
     radius_name,
     vector_of,
@@ -306,7 +307,7 @@ def resolve(overrides: Sequence[Override], known: KnownParameters) -> Choices:
         (note,) if given_way else (),
     )
     names = [name for name, p in known.by_name.items() if p.kind == "kinematic"]
-    if all(choices.holds(n, by_default=n.endswith((".twist", ".gain"))) for n in names):
+    if all(choices.holds(n, by_default=is_held_by_default(n)) for n in names):
         raise UsageError(
             "The mechanism could not be calibrated: found all of its parameters fixed, needed one "
             "at least that is not; fix fewer of them."

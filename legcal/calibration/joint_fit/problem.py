@@ -63,7 +63,15 @@ from legcal.estimation import (
     fixed_at_start,
 )
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Leg, freedoms, radius_name, readings_of_rods, wholly_tied
+from legcal.machine import (
+    ActuatorColumns,
+    Leg,
+    freedoms,
+    is_held_by_default,
+    radius_name,
+    readings_of_rods,
+    wholly_tied,
+)
 from legcal.vision import (
     LINKS,
     Camera,
@@ -327,22 +335,29 @@ def _built(
     outlines, boards = observed.outlines, observed.boards
     parametrization = legs.parametrization
     names, units = parametrization.names, parametrization.units
+    arms = _arm_priors(legs, outlines, choices, settings)
     free = np.array(
-        [not choices.holds(n, by_default=n.endswith((".twist", ".gain"))) for n in names],
+        [not choices.holds(n, by_default=is_held_by_default(n) and n not in arms) for n in names],
         dtype=np.bool_,
     )
     parameters = LegParameters(legs, free, choices.values)
     if parameters.n_tied:
         free[free] &= ~wholly_tied(parameters.tie_rows(legs.nominal)[1])
         parameters = LegParameters(legs, free, choices.values)
+    unknown = tuple(n for n, is_free in zip(names, free, strict=True) if is_free)
     kinematic = Variables(
         "legs",
         parameters.unknown,
         parameters.retract,
-        tuple(n for n, is_free in zip(names, free, strict=True) if is_free),
+        unknown,
         tuple(u for u, is_free in zip(units, free, strict=True) if is_free),
         parameters.coordinates,
         parameters.jacobian if parameters.turns else None,
+        prior=GaussianPrior(
+            np.array([unknown.index(name) for name in arms], dtype=np.intp),
+            np.zeros(len(arms)),
+            np.array(list(arms.values())),
+        ),
     )
     seen = np.concatenate([outlines.view, *(corners.view for corners in boards)])
     shown = {owners[v] for v in np.unique(seen).tolist()}
@@ -386,6 +401,25 @@ def _built(
         keys=keys,
         images=images,
     )
+
+
+def _arm_priors(
+    legs: FittedLegs, outlines: ObservedOutlines, choices: Choices, settings: RefinementSettings
+) -> dict[str, float]:
+    """Return how well the lines of arms that are seen are known [rad, m], by parameter.
+
+    Those are left out of which something was chosen.
+    """
+    sigmas = (settings.arm_axis_sigma,) * 2 + (settings.arm_point_sigma,) * 2
+    names, place = legs.parametrization.names, legs.parametrization.place[:, ActuatorColumns.ARM]
+    chosen = {*choices.fixed, *choices.free, *choices.priors}
+    return {
+        names[i]: sigma
+        for leg, part in outlines.parts
+        if (leg, part) in outlines.arms
+        for i, sigma in zip(place[leg].tolist(), sigmas, strict=True)
+        if names[i] not in chosen
+    }
 
 
 def _poses(n_poses: int, n_actuators: int) -> Variables:

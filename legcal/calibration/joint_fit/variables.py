@@ -20,6 +20,7 @@ from legcal.errors import DatasetError, DidNotConverge
 from legcal.estimation import Frames, Problem, Tangent
 from legcal.geometry import Array, BoolArray, IntArray, axis_angles_slope
 from legcal.machine import (
+    ActuatorColumns,
     JointMotion,
     Leg,
     LegColumns,
@@ -57,6 +58,8 @@ class RefinementSettings:
     """Settings of the joint fit; distances of outlines and axes are whitened."""
 
     radius_sigma: float = 0.02  # of the prior on radii, as a part of the radius
+    arm_axis_sigma: float = 0.02  # of that on the line of an arm where the model draws it [rad],
+    arm_point_sigma: float = 4e-3  # and across it [m]
     board_scale_sigma: float = 0.001  # of the dimensions of a board: what printers and paper do
     loss_width: float = 3.0  # where the loss of an outline turns from quadratic to linear
     rejection: float = 4.5  # beyond, an outline is rejected; a right one in 25,000 is
@@ -141,6 +144,16 @@ class State:
             j: leg.actuator.motion(leg.A, q[:, on[j]])
             for j, leg in enumerate(self.legs)
             if leg.actuator is not None
+        }
+
+    @cached_property
+    def arm_ends(self) -> dict[int, tuple[JointMotion, ...]]:
+        """How both ends of the arm move at all poses, by the leg that has it as a part."""
+        on, q = actuator_index(self.legs), self.platform_pose.q
+        return {
+            j: tuple(leg.actuator.motion(end, q[:, on[j]]) for end in leg.arm.ends)
+            for j, leg in enumerate(self.legs)
+            if leg.actuator is not None and leg.arm is not None
         }
 
     @cached_property
@@ -293,10 +306,10 @@ class LegParameters:
                 if is_fixed.sum() == 1:
                     number = int(own[axis][is_fixed][0])
                     found[number] = self.fixed[number]
-            line = slice(LegColumns.OWN, LegColumns.COUNT - 1)
-            is_fixed = (own[line] >= 0) & (unknown[line] < 0)
-            if np.any(unknown[line] >= 0):
-                found |= {int(i): self.fixed[int(i)] for i in own[line][is_fixed]}
+            for columns in (ActuatorColumns.LINE, ActuatorColumns.ARM):
+                is_fixed = (own[columns] >= 0) & (unknown[columns] < 0)
+                if np.any(unknown[columns] >= 0):
+                    found |= {int(i): self.fixed[int(i)] for i in own[columns][is_fixed]}
         return found
 
     def at_fixed(self, geometry: tuple[Leg, ...]) -> tuple[Leg, ...]:
@@ -304,7 +317,7 @@ class LegParameters:
         return self.tied(with_values(geometry, self.legs, self.fixed))
 
     def retract(self, geometry: tuple[Leg, ...], change: Array) -> tuple[Leg, ...]:
-        """Return legs after a change (n_legs, 17) of their numbers."""
+        """Return legs after a change (n_legs, 21) of their numbers."""
         place = np.arange(change.size, dtype=np.intp).reshape(change.shape)
         return self.tied(moved_legs(geometry, place, change.ravel()))
 

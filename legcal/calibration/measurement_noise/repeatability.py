@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaincinv
 
-from legcal.data import LegAxes, Measurements, Outlines, axes_from_outlines
+from legcal.data import LegAxes, Measurements, Outlines, along_legs, axes_from_outlines
 from legcal.errors import NotVisible
 from legcal.files import Document
 from legcal.geometry import Array, BoolArray, IntArray, cross
@@ -228,7 +228,8 @@ def leg_orientations(
     repeats: Sequence[Repeats],
 ) -> list[LegOrientation]:
     """Return what the outlines in all repeated images say of every leg that they show."""
-    radii = {part: r for leg in legs for part, r in leg.radius_of_part.items()}
+    radii = {part: r for leg in legs for part, r in leg.radius_along.items()}
+    outlines = along_legs(outlines, legs)
     try:
         axes = axes_from_outlines(outlines, measurements, radii)
     except NotVisible:
@@ -250,7 +251,7 @@ def leg_orientations(
                 chosen = (axes.leg == j) & np.isin(axes.row, group.rows)
                 n_axes = int(np.count_nonzero(chosen))
                 if n_axes > 1:
-                    radius = max(leg.radius_of_part.values())
+                    radius = max(leg.radius_along.values())
                     quantities, inclination = _axis_samples(axes, chosen, radius)
             found.append(
                 LegOrientation(

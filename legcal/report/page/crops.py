@@ -13,7 +13,8 @@ from markupsafe import Markup
 from legcal.calibration import Calibration
 from legcal.data import row_names
 from legcal.errors import LegcalError
-from legcal.geometry import Array, Image
+from legcal.geometry import Array, Image, components
+from legcal.machine import arms_at, ends_at_poses, measured_readings
 from legcal.pages import Crop
 from legcal.vision import Camera, outlines_of_axis
 
@@ -127,10 +128,16 @@ def _crop(
     i, measurements = piece.outline, dataset.measurements
     row, j = int(outlines.row[i]), int(outlines.leg[i])
     v, pose = int(measurements.view[row]), int(measurements.pose[row])
-    T, leg = solution.T_camera_Rb[v], solution.legs[j]
-    A, B = T.apply(leg.A), (T * solution.T_Rb_Re[pose]).apply(leg.B)
+    leg, part = solution.legs[j], outlines.part[i]
+    R, t = components([solution.T_Rb_Re[pose]])
+    q = measured_readings(solution.legs, R, t, measurements.q_of_poses[pose : pose + 1])
+    if leg.is_arm(part):
+        ends = arms_at(solution.legs, q)[j][0]
+    else:
+        ends = np.stack([of_legs[0, j] for of_legs in ends_at_poses(solution.legs, R, t, q)])
+    A, B = solution.T_camera_Rb[v].apply(ends)
     u = (B - A) / np.linalg.norm(B - A)
-    fit = outlines_of_axis(u, A, solution.radii[j, outlines.part[i]])[int(outlines.edge[i]) - 1]
+    fit = outlines_of_axis(u, A, solution.radii[j, part])[int(outlines.edge[i]) - 1]
     given = measurements.views[v].camera
     origin = np.array(piece.corner) - 0.5  # pixel (0, 0) is the centre of the first one
     lines = [

@@ -64,6 +64,8 @@ def parameter_tables(calibration: Calibration) -> list[Table]:
     motors = ""
     if any(motor.turns for motor in machine.actuators):
         motors = "; axis_point is how far the axis of an arm has moved across itself"
+        if any(motor.arm is not None for motor in machine.actuators):
+            motors += ", arm_point how far its own line has"
     elif machine.actuators:
         motors = "; directions of carriages too"
     note = (
