@@ -25,7 +25,6 @@ from legcal.calibration.joint_fit import (
     fitted_legs,
     platform_poses,
     refine,
-    refine_from_best,
     start_from,
 )
 from legcal.data import LegAxes, Outlines, View, no_outlines
@@ -177,10 +176,10 @@ def test_a_start_far_away_is_refused(session: HexapodSession) -> None:
     with pytest.raises(DidNotConverge, match=r"still falls by|outlines disagree with it"):
         refine(session.legs, session.measurements, session.outlines, far)
     with pytest.raises(DidNotConverge, match=r"still falls|disagree") as refused:
-        refine_from_best(session.legs, session.measurements, session.outlines, [far, far])
+        refine(session.legs, session.measurements, session.outlines, [far, far])
     assert len(refused.value.problems) == 1
     with pytest.raises(DidNotConverge, match="needs at least one"):
-        refine_from_best(session.legs, session.measurements, session.outlines, [])
+        refine(session.legs, session.measurements, session.outlines, [])
 
 
 def test_the_start_of_the_lowest_cost_is_refined_wherever_it_stands(
@@ -194,7 +193,7 @@ def test_the_start_of_the_lowest_cost_is_refined_wherever_it_stands(
         return replace(unwatched(problem, start, settings), cost=costs[start.label])
 
     monkeypatch.setattr(fit, "_first", with_cost)
-    found = refine_from_best(session.legs, session.measurements, session.outlines, starts)
+    found = refine(session.legs, session.measurements, session.outlines, starts)
     assert found.start == "first"
 
 

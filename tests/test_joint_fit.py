@@ -50,7 +50,6 @@ from legcal.calibration.joint_fit import (
     bound,
     build_fit,
     refine,
-    refine_from_best,
 )
 from legcal.calibration.joint_fit.determinacy import open_directions
 from legcal.calibration.joint_fit.rounds import first_minimum
@@ -427,7 +426,7 @@ def test_the_better_start_wins_and_is_named_and_between_equal_ones_the_first(
     bad = replace(disturbed_start(small, joints=0.1, camera=0.5, angle=2.0), label="staged")
     settings = RefinementSettings(max_iterations=40)
     for starts in ([good, bad], [bad, good]):
-        found = refine_from_best(small.legs, *noisy, starts, settings)
+        found = refine(small.legs, *noisy, starts, settings)
         assert found.start == "nominal"
         said = (*found.notes, *found.details)
         assert any("the four steps" in note for note in said)
@@ -435,8 +434,8 @@ def test_the_better_start_wins_and_is_named_and_between_equal_ones_the_first(
         assert any(note.startswith(start) for note in found.details)
         assert not any(note.startswith(start) for note in found.notes)
     equal = replace(disturbed_start(small, seed=9), label="staged")
-    assert refine_from_best(small.legs, *noisy, [good, equal]).start == "nominal"
-    assert refine_from_best(small.legs, *noisy, [equal, good]).start == "staged"
+    assert refine(small.legs, *noisy, [good, equal]).start == "nominal"
+    assert refine(small.legs, *noisy, [equal, good]).start == "staged"
 
 
 def test_a_leg_that_one_view_takes_for_another_is_left_out_and_named(small: HexapodSession) -> None:

@@ -42,7 +42,7 @@ from legcal.calibration.joint_fit import (
     known_gammas,
     known_parameters,
     loses_outlines,
-    refine_from_best,
+    refine,
     resolve,
 )
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
@@ -415,7 +415,7 @@ def _fit(
     choices = options.choices
     if any(fitted.measurements.image) and "detected" in seen.source:
         choices = replace(choices, least_shared_px={**LIMB_BIAS, **choices.least_shared_px})
-    solution = refine_from_best(
+    solution = refine(
         fitted.fitted_legs,
         fitted.measurements,
         seen,

@@ -4,7 +4,6 @@ from .factors import known_gammas as known_gammas
 from .factors import observed_outlines as observed_outlines
 from .fit import bound as bound
 from .fit import refine as refine
-from .fit import refine_from_best as refine_from_best
 from .gammas import GammaTrials as GammaTrials
 from .gammas import loses_outlines as loses_outlines
 from .held_out import HeldOut as HeldOut

@@ -70,7 +70,7 @@ def refine(
     legs: FittedLegs,
     measurements: Measurements,
     outlines: Outlines,
-    start: Start,
+    start: Start | Sequence[Start],
     settings: RefinementSettings = DEFAULT_SETTINGS,
     *,
     axes: LegAxes | None = None,
@@ -78,6 +78,9 @@ def refine(
     choices: Choices = NO_CHOICES,
 ) -> Solution:
     """Fit kinematic parameters, cameras, platform poses and radii to all data at once.
+
+    Of several starts the first minima are compared; only the lowest is refined, the next one if
+    that fails. A start that fails is skipped with a note; between equal costs the earlier one wins.
 
     Parameters
     ----------
@@ -87,7 +90,7 @@ def refine(
         Views, poses and readings [m].
     outlines : Outlines
         Outlines in pixels; only the used ones enter.
-    start : Start
+    start : Start or sequence of Start
         Starting values.
     settings : RefinementSettings
         Settings of the fit.
@@ -106,15 +109,20 @@ def refine(
     Raises
     ------
     NotIdentifiable
-        If the data do not determine the parameters.
+        If the data do not determine the parameters, from no start.
     DidNotConverge
-        If the solver stops early, or most outlines or axes disagree with what it found.
+        If the solver stops early from all starts, or most outlines or axes disagree with what it
+        found.
     DatasetError
         If an outline or an axis cannot be used.
     """
-    return refine_from_best(
-        legs, measurements, outlines, (start,), settings, axes=axes, board=board, choices=choices
+    problem = build_fit(
+        legs, measurements, outlines, settings, axes=axes, board=board, choices=choices
     )
+    problem.require_determined()
+    starts = [start] if isinstance(start, Start) else start
+    with naming_missing_lengths(problem):
+        return _best(problem, outlines, starts, settings)
 
 
 def _called(start: Start) -> str:
@@ -123,39 +131,10 @@ def _called(start: Start) -> str:
     return known.get(start.label, f"the start '{start.label}'")
 
 
-def refine_from_best(
-    legs: FittedLegs,
-    measurements: Measurements,
-    outlines: Outlines,
-    starts: Sequence[Start],
-    settings: RefinementSettings = DEFAULT_SETTINGS,
-    *,
-    axes: LegAxes | None = None,
-    board: BoardCorners | None = None,
-    choices: Choices = NO_CHOICES,
-) -> Solution:
-    """Fit everything from several starts and keep the lowest cost.
-
-    The first minima are compared; only the lowest is refined, the next one if that fails. A
-    start that fails is skipped with a note; between equal costs the earlier start wins.
-
-    Raises
-    ------
-    NotIdentifiable, DidNotConverge
-        If no start leads to a fit.
-    """
-    problem = build_fit(
-        legs, measurements, outlines, settings, axes=axes, board=board, choices=choices
-    )
-    problem.require_determined()
-    with naming_missing_lengths(problem):
-        return _best(problem, outlines, starts, settings)
-
-
 def _best(
     problem: FitProblem, outlines: Outlines, starts: Sequence[Start], settings: RefinementSettings
 ) -> Solution:
-    """Return the fit from the start with the least cost; see :func:`refine_from_best`."""
+    """Return the fit from the start with the least cost."""
     candidates: list[tuple[Start, Minimum[State]]] = []
     notes, details = list[str](), list[str]()
     failures: list[LegcalError] = []
