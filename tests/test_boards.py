@@ -37,12 +37,14 @@ from legcal.perception import (
     search_board,
     shown_board,
 )
+from legcal.perception.corner_lattice import Lattice, find_lattice
 from legcal.progress import no_progress
 from legcal.simulation.board import INK, BoardPrint
 from legcal.vision import (
     Board,
     Camera,
     FixedBoard,
+    Grey,
     board_document,
     charuco_board,
     parse_board,
@@ -303,6 +305,31 @@ def test_corners_of_a_tag_that_is_not_decoded_are_measured() -> None:
     number, px, _ = find_corners(APRILGRID, image)
     assert {14, 15, 20, 21} <= set(number.tolist())
     assert np.abs(px - seen_at(APRILGRID, T)[number]).max() < 0.3
+
+
+def test_corners_are_found_from_a_few_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search sees three columns of a chessboard, and one tag of a grid."""
+
+    def first_columns(grey: Grey) -> Lattice:
+        found = find_lattice(grey)
+        first = found.ij[:, 0] < 3
+        return Lattice(found.ij[first], found.px[first], found.black[first])
+
+    grid, T, image = plain_picture("aprilgrid")
+    corners, columns, image = seen_at(grid, T), grid.grid[0], image.copy()
+    for first in (2 * i + 2 * j * columns for j in range(grid.rows) for i in range(grid.columns)):
+        tag = corners[[first, first + 1, first + columns + 1, first + columns]]
+        if first:
+            inside = tag.mean(axis=0) + 0.75 * (tag - tag.mean(axis=0))
+            image = cv2.fillConvexPoly(image, np.rint(inside).astype(np.int32), float(image.min()))
+    number, px, _ = find_corners(grid, image)
+    assert np.array_equal(number, np.arange(grid.n_corners))
+    assert np.abs(px - corners).max() < 0.1
+    board, T, image = plain_picture("chessboard")
+    monkeypatch.setattr("legcal.perception.board_corners.find_lattice", first_columns)
+    number, px, _ = find_corners(board, image)
+    assert np.array_equal(number, np.arange(board.n_corners))
+    assert np.abs(px - seen_at(board, T)).max() < 0.1
 
 
 def test_a_part_of_a_chessboard_is_placed_on_it_but_not_for_certain() -> None:

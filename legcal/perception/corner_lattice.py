@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception.saddles import MIN_CONTRAST, Saddles, fit_saddles
+from legcal.perception.saddles import MAX_SHIFT_PX, MIN_CONTRAST, Saddles, fit_saddles, near_saddles
 from legcal.vision import Grey
 
 _BLUR = 1.2  # [px] before derivatives are taken
@@ -291,7 +291,7 @@ def expected(
     if without_own:
         square[np.arange(len(at)), np.arange(len(at))] = np.inf
     others = min(8, len(xy) - without_own)
-    nearest = np.sort(square, axis=1)[:, :others].mean(axis=1, keepdims=True)
+    nearest = np.partition(square, others - 1, axis=1)[:, :others].mean(axis=1, keepdims=True)
     reach = np.maximum(nearest, 0.5 * _NEAR**2)
     weight = np.exp(-0.5 * square / reach) + np.where(np.isfinite(square), 1e-6, 0.0)
     x, y = away[..., 0], away[..., 1]
@@ -307,34 +307,29 @@ def expected(
 
 
 def measured(
-    grey: Grey, board: Print, ij: IntArray, px: Array, *, grow: bool = True
+    grey: Grey, board: Print, ij: IntArray, px: Array, blur: float = 0.0, *, grow: bool = True
 ) -> tuple[IntArray, Saddles]:
     """Fit corners near some pixels, and those beside them.
 
-    Columns and rows ij (k, 2), px (k, 2). Returns columns and rows, and where they are: of those
-    that look like most of them and are where the others put them.
+    Columns and rows ij (k, 2), px (k, 2), the blur of such corners [px] or 0. Returns columns and
+    rows, and where they are: of those that look like most of them and are where the others put
+    them.
     """
     none = np.zeros((0, 2), dtype=np.intp)
     if len(ij) < _MIN_KNOWN:
         return none, fit_saddles(grey, np.zeros((0, 2)), np.zeros((0, 2, 2)), 1.0, 1.0)
     _, axes = expected(board.xy(ij), px, board.xy(ij), board.pitch)
-    found = fit_saddles(grey, px, axes, board.length, board.band)
+    px = near_saddles(grey, px, axes, board.band)
+    found = fit_saddles(grey, px, axes, board.length, board.band, blur)
     ij, found = _alike(board, ij, found)
     tried: set[tuple[int, int]] = set()
-    for _ in range(_MAX_ROUNDS if grow and len(ij) >= _MIN_KNOWN else 0):
-        beside = _beside(board, ij, tried)
+    while grow and len(ij) >= _MIN_KNOWN:
+        beside, start = _grown(grey, board, ij, found, tried)
         if not len(beside):
             break
-        tried |= set(map(tuple, beside.tolist()))
-        start, axes = expected(board.xy(ij), found.px, board.xy(beside), board.pitch)
-        if board.x is None:  # beyond the rim of a chessboard is none
-            usual = float(np.median(np.abs(found.contrast)))
-            step = _quadrants(grey, board, start, axes) * _sign(ij, found) * _parity(beside)
-            seems = step > _MIN_QUADRANTS * usual
-            if not seems.any():
-                break
-            beside, start, axes = beside[seems], start[seems], axes[seems]
-        more = fit_saddles(grey, start, axes, board.length, board.band)
+        known, places = np.concatenate([ij, beside]), np.concatenate([found.px, start])
+        _, axes = expected(board.xy(known), places, board.xy(beside), board.pitch)
+        more = fit_saddles(grey, start, axes, board.length, board.band, blur)
         n = len(ij)
         both = replace(
             found,
@@ -343,12 +338,35 @@ def measured(
                 for name, value in vars(found).items()
             },
         )
-        ij, found = _alike(board, np.concatenate([ij, beside]), both)
-        known = set(map(tuple, ij.tolist()))
-        tried = {at for at in tried if at not in known}
+        ij, found = _alike(board, known, both)
+        tried = (tried | set(map(tuple, beside.tolist()))) - set(map(tuple, ij.tolist()))
         if len(ij) <= n:
             break
     return ij, found
+
+
+def _grown(
+    grey: Grey, board: Print, ij: IntArray, found: Saddles, tried: set[tuple[int, int]]
+) -> tuple[IntArray, Array]:
+    """Return columns and rows (k, 2) that seem to go on from those that are known, px (k, 2).
+
+    One line after the other is expected from those before it, and looked at.
+    """
+    known, places = ij, found.px
+    sign, usual = _sign(ij, found), float(np.median(np.abs(found.contrast)))
+    refused = set(tried)
+    for _ in range(_MAX_ROUNDS):
+        beside = _beside(board, known, refused)
+        if not len(beside):
+            break
+        start, axes = expected(board.xy(known), places, board.xy(beside), board.pitch)
+        start = near_saddles(grey, start, axes, board.band, MAX_SHIFT_PX)
+        step = _quadrants(grey, board, start, axes) * sign * _parity(beside)
+        seems = step > _MIN_QUADRANTS * usual
+        refused |= set(map(tuple, beside[~seems].tolist()))
+        known = np.concatenate([known, beside[seems]])
+        places = np.concatenate([places, start[seems]])
+    return known[len(ij) :], places[len(ij) :]
 
 
 _MIN_KNOWN = 4  # corners from which others are expected
@@ -375,14 +393,15 @@ def _sign(ij: IntArray, found: Saddles) -> float:
 def _quadrants(grey: Grey, board: Print, px: Array, axes: Array) -> Array:
     """Return by how much two opposite quadrants are brighter than both others, (k,).
 
-    Positive where they are those between the axes; zero where the four are not in turn.
+    Positive where they are those beside the axes, as contrasts are; zero where the four are not in
+    turn.
     """
     d = 0.5 * min(board.length, board.band)
     corners = d * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
     level = _sampled(grey, px[:, None] + np.einsum("kab,cb->kca", axes, corners))
     between, beside = level[:, :2], level[:, 2:]
-    up = between.min(axis=1) - beside.max(axis=1)
-    down = beside.min(axis=1) - between.max(axis=1)
+    up = beside.min(axis=1) - between.max(axis=1)
+    down = between.min(axis=1) - beside.max(axis=1)
     return 0.5 * np.where(up > 0.0, up, np.where(down > 0.0, -down, 0.0))
 
 

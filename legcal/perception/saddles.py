@@ -17,6 +17,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,6 +38,8 @@ _MIN_AREA = 1e-6  # [px^2 / unit^2] between axes that are not one line
 _MIN_PIXELS = 24  # pixels that a fit needs
 _AT_ONCE = 40  # crossings whose functions stay in the cache of a processor
 _ITERATIONS = 12
+_ROUGH_PART, _ROUGH_HALF = 0.9, (2, 7)  # window of the first guess: part of what is free, [px]
+_ROUGH_ENDS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 12, 0.02)  # its steps, [px]
 _ROUGHLY_PX, _CONVERGED_PX = 0.1, 4e-3
 _MAX_STEP = np.array([1.0, 1.0, 0.2, 0.2, 0.4])  # [px, px, rad, rad, 1]
 _START_BLUR = 0.8  # [px]
@@ -45,11 +48,10 @@ _RIDGE = 1e-4  # on overshoot and blur, which explain edges almost alike; contra
 _MANY_PIXELS = 200  # fewer do not tell overshoot from other shapes of an edge
 _OVERSHOOT = [6, 7, 8, 10, 11, 12]  # functions of it, and of tones
 _BLUR_RIDGE = 1e-3
-_STIFF, _STIFF_STEPS = 100.0, 2  # times that, in the first steps
 _OTHER_PX = 0.3  # by which the strip beside the edges is another that is used again
 _BLUR_SIGMAS = 1.5  # standard deviations of the blur that reach beside an edge
 _MIN_BAND = 0.5  # of what is free beside an edge that is used at least
-_MAX_SHIFT_PX = 2.5  # of the result from the start
+MAX_SHIFT_PX = 2.5  # of the result from the start
 _MAX_TURN = 0.3  # [rad] of an edge from where it should point
 _BLURS = (0.3, 4.0)  # [px]
 _MAX_MISFIT = 0.35  # residual, as a part of the contrast
@@ -86,6 +88,7 @@ def fit_saddles(
     axes: Array,  # (n, 2, 2) the steps in the image along both edges [px / unit]
     length: float,  # how far both edges are straight on either side of the crossing [unit]
     band: float,  # how far from the edges nothing else is printed [unit]
+    blur: float = 0.0,  # of crossings of this image, if it is known [px]
 ) -> Saddles:
     """Return where two edges cross near some pixels."""
     if not len(start):
@@ -104,16 +107,18 @@ def fit_saddles(
     def free(blur: Array) -> Array:
         return np.asarray(np.maximum(band - (0.5 + _BLUR_SIGMAS * blur) / steps, _MIN_BAND * band))
 
-    none = np.zeros((len(start), 2))
-    x = np.column_stack([none, turns, np.full(len(start), np.log(_START_BLUR))])
-    at_first = free(np.full(len(start), _START_BLUR))
+    at_first = np.full(len(start), blur or _START_BLUR)
+    x = np.column_stack([np.zeros((len(start), 2)), turns, np.log(at_first)])
+    at_first = free(at_first)
     weight = window.weight(length, at_first)
-    x = _fit(window, weight, x, _ROUGHLY_PX)
+    c = np.zeros((len(start), _N_LINEAR))
+    c[:, 3] = window.contrast(weight, turns)
+    _fit(window, weight, x, c, _ROUGHLY_PX)
     # The first fit gives how far blur reaches from what else is printed, and where the edges are.
     now = free(np.exp(x[:, 4]))
     other = np.abs(now - at_first) * steps > _OTHER_PX
     other |= (np.linalg.norm(x[:, :2], axis=1) > _OTHER_PX) & (now * steps < reach)
-    other &= np.linalg.norm(x[:, :2], axis=1) < _MAX_SHIFT_PX
+    other &= np.linalg.norm(x[:, :2], axis=1) < MAX_SHIFT_PX
     if other.any():
         start = start.copy()
         start[other] += x[other, :2]
@@ -121,8 +126,29 @@ def fit_saddles(
         part = _Window.around(grey, start[other], axes[other], reach)
         window.put(other, part)
         weight[other] = part.weight(length, now[other])
-    x = _fit(window, weight, x, _CONVERGED_PX)
-    return _judged(window, weight, x, start, turns)
+    _fit(window, weight, x, c, _CONVERGED_PX)
+    return _judged(window, weight, x, c, start, turns)
+
+
+def near_saddles(
+    grey: Grey,  # (height, width) grey levels
+    start: Array,  # (n, 2) where crossings should be [px]
+    axes: Array,  # (n, 2, 2) the steps in the image along both edges [px / unit]
+    band: float,  # how far from the edges nothing else is printed [unit]
+    most: float = np.inf,  # by which they are moved at most [px], if not the half of a window
+) -> Array:
+    """Return about where crossings are (n, 2), by the gradients in a window around [px]."""
+    with np.errstate(invalid="ignore"):
+        free = band * np.linalg.norm(axes, axis=1).min(axis=1)
+        half = int(np.clip(_ROUGH_PART * np.nanmedian(free), *_ROUGH_HALF)) if len(free) else 0
+        height, width = grey.shape
+        inside = np.all((start > half) & (start < [width - half - 1, height - half - 1]), axis=1)
+    found = start.copy()
+    if inside.any():
+        at = np.ascontiguousarray(start[inside], dtype=np.float32)
+        found[inside] = cv2.cornerSubPix(grey, at, (half, half), (-1, -1), _ROUGH_ENDS)
+    moved = np.linalg.norm(found - start, axis=1)
+    return np.where((moved < most)[:, None], found, start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +190,12 @@ class _Window:
         near = (self.on_board.max(axis=1) <= length) & (self.on_board.min(axis=1) <= free[:, None])
         return np.asarray(near & self.inside, dtype=np.float64)
 
+    def contrast(self, weight: Array, angles: Array) -> Array:
+        """Return about the contrast (n,), by which sides of edges at angles (n, 2) are bright."""
+        c, s = np.cos(angles)[:, :, None], np.sin(angles)[:, :, None]
+        sides = np.sign(c * self.v[:, None] - s * self.u[:, None]).prod(axis=1) * weight
+        return np.asarray(np.sum(sides * self.levels, axis=1) / np.maximum(weight.sum(axis=1), 1.0))
+
     def put(self, rows: BoolArray, part: _Window) -> None:
         """Put the pixels around other places in some rows."""
         for name, value in vars(part).items():
@@ -171,17 +203,20 @@ class _Window:
                 getattr(self, name)[rows] = value
 
 
-def _fit(window: _Window, weight: Array, x: Array, tolerance: float) -> Array:
-    """Fit the model by Gauss-Newton: place less the start, angles and blur (n, 5)."""
-    x = x.copy()
+def _fit(window: _Window, weight: Array, x: Array, c: Array, tolerance: float) -> None:
+    """Fit the model by Gauss-Newton, from what *x* and *c* hold to what it finds.
+
+    Place less the start, angles and logarithm of the blur x (n, 5); coefficients c (n, 13).
+    """
     usable = np.flatnonzero(weight.sum(axis=1) >= _MIN_PIXELS)
     for start in range(0, len(usable), _AT_ONCE):
-        _fit_some(window, weight, x, usable[start : start + _AT_ONCE], tolerance)
-    return x
+        _fit_some(window, weight, x, c, usable[start : start + _AT_ONCE], tolerance)
 
 
-def _fit_some(window: _Window, weight: Array, x: Array, open_: IntArray, tolerance: float) -> None:
-    """Fit the model to some crossings, and put what is found into x (n, 5)."""
+def _fit_some(
+    window: _Window, weight: Array, x: Array, c: Array, open_: IntArray, tolerance: float
+) -> None:
+    """Fit the model to some crossings."""
     count = weight[open_].sum(axis=1)
     # The pixels that are used, first; single precision is enough for steps.
     used = np.argsort(-weight[open_], axis=1, kind="stable")[:, : int(count.max())]
@@ -190,31 +225,27 @@ def _fit_some(window: _Window, weight: Array, x: Array, open_: IntArray, toleran
         for pixels in (window.u, window.v, window.levels, weight)
     )
     levels *= w
-    c, rough = np.zeros((len(open_), _N_LINEAR)), tolerance > _CONVERGED_PX
-    for iteration in range(_ITERATIONS):
+    for _ in range(_ITERATIONS):
         here = x[open_]
-        stiff = _STIFF if rough and iteration < _STIFF_STEPS else 1.0
-        if iteration == 0:
-            c = _solve(_functions(u, v, here, None) * w[:, None], levels, count, c, stiff)
-        A = _functions(u, v, here, c) * w[:, None]
+        A = _functions(u, v, here, c[open_]) * w[:, None]
         expected = np.zeros((len(here), _N_LINEAR + _N_PLACED))
         expected[:, -1] = np.log(_START_BLUR) - here[:, 4]
-        solution = _solve(A, levels, count, expected, stiff)
-        c, step = solution[:, :_N_LINEAR], solution[:, _N_LINEAR:]
+        solution = _solve(A, levels, count, expected)
+        c[open_], step = solution[:, :_N_LINEAR], solution[:, _N_LINEAR:]
         step = np.clip(step, -_MAX_STEP, _MAX_STEP)
         here = here + step
         here[:, 4] = np.clip(here[:, 4], *np.log(_BLURS))
         x[open_] = here
-        more = (np.abs(step[:, :2]).max(axis=1) >= tolerance) | (stiff > 1.0)
-        more &= np.abs(here[:, :2]).max(axis=1) <= 2.0 * _MAX_SHIFT_PX
+        more = np.abs(step[:, :2]).max(axis=1) >= tolerance
+        more &= np.abs(here[:, :2]).max(axis=1) <= 2.0 * MAX_SHIFT_PX
         if not more.any():
             break
         if not more.all():
-            open_, c, count = open_[more], c[more], count[more]
+            open_, count = open_[more], count[more]
             u, v, levels, w = u[more], v[more], levels[more], w[more]
 
 
-def _solve(A: _Levels, levels: _Levels, count: Array, expected: Array, stiff: float = 1.0) -> Array:
+def _solve(A: _Levels, levels: _Levels, count: Array, expected: Array) -> Array:
     """Return the coefficients (n, k) of functions (n, k, m) by least squares.
 
     Those of overshoot and tones are near zero where *count* (n,) pixels are few.
@@ -222,7 +253,7 @@ def _solve(A: _Levels, levels: _Levels, count: Array, expected: Array, stiff: fl
     n, k, _ = A.shape
     ridge = np.full((n, k), 1e-9)
     few = np.maximum(_MANY_PIXELS / np.maximum(count, 1.0), 1.0) ** 4
-    ridge[:, _OVERSHOOT] = (stiff * _RIDGE * few)[:, None]
+    ridge[:, _OVERSHOOT] = (_RIDGE * few)[:, None]
     if k > _N_LINEAR:
         ridge[:, -1] = _BLUR_RIDGE
     N = (A @ np.swapaxes(A, 1, 2)).astype(np.float64)
@@ -232,8 +263,8 @@ def _solve(A: _Levels, levels: _Levels, count: Array, expected: Array, stiff: fl
     return np.asarray(np.linalg.solve(N, rhs[:, :, None])[:, :, 0])
 
 
-def _functions(u: _Levels, v: _Levels, x: Array, c: Array | None) -> _Levels:
-    """Return the linear functions (n, k, m), with coefficients their derivatives after them."""
+def _functions(u: _Levels, v: _Levels, x: Array, c: Array) -> _Levels:
+    """Return the linear functions (n, 18, m), the derivatives of their sum after them."""
     x = x.astype(u.dtype)
     dx, dy = u - x[:, :1], v - x[:, 1:2]
     n, m = dx.shape
@@ -247,15 +278,13 @@ def _functions(u: _Levels, v: _Levels, x: Array, c: Array | None) -> _Levels:
     # Edges at a slant share their blur, which to first order adds a product of bells.
     slant = (2.0 / math.pi) * np.cos(x[:, 2] - x[:, 3])[:, None]
     both = slant * G[:, 0] * G[:, 1]
-    A = np.empty((n, _N_LINEAR + (_N_PLACED if c is not None else 0), m), dtype=u.dtype)
+    A = np.empty((n, _N_LINEAR + _N_PLACED, m), dtype=u.dtype)
     A[:, 0], A[:, 1], A[:, 2] = 1.0, dx, dy
     P = S[:, 0] * S[:, 1] + both
     A[:, 3], A[:, 4], A[:, 5] = P, P * dx, P * dy
     A[:, 6], A[:, 7], A[:, 8] = T[:, 0] * S[:, 1], S[:, 0] * T[:, 1], T[:, 0] * T[:, 1]
     A[:, 9], A[:, 10] = G.sum(axis=1), P * P
     A[:, 11:13] = H
-    if c is None:
-        return A
     c = c.astype(u.dtype)
     k = (c[:, 3:4] + c[:, 4:5] * dx + c[:, 5:6] * dy)[:, None]
     over, Q = c[:, 6:8, None], c[:, 8, None, None]
@@ -285,22 +314,25 @@ def _blurred_step(t: _Levels, bell: _Levels) -> _Levels:
     return np.copysign(1.0 - rest * bell, t)
 
 
-def _judged(window: _Window, weight: Array, x: Array, start: Array, turns: Array) -> Saddles:
+def _judged(
+    window: _Window, weight: Array, x: Array, c: Array, start: Array, turns: Array
+) -> Saddles:
     """Return the crossings with what their residuals are worth."""
     n, k = len(x), _N_LINEAR + _N_PLACED
     count, levels = weight.sum(axis=1), window.levels * weight
-    c, contrast = np.zeros((n, _N_LINEAR)), np.zeros(n)
+    c, contrast = c.copy(), np.zeros(n)
     residual, pull = np.zeros_like(levels), np.zeros((n, 2, levels.shape[1]))
     u, v, w = (part.astype(np.float32) for part in (window.u, window.v, weight))
     for first in range(0, n, _AT_ONCE):
         at = slice(first, first + _AT_ONCE)
-        L = _functions(u[at], v[at], x[at], None) * w[at, None]
+        A = _functions(u[at], v[at], x[at], c[at]) * w[at, None]
+        L = A[:, :_N_LINEAR]
         c[at] = _solve(L, levels[at], count[at], np.zeros_like(c[at]))
         residual[at] = levels[at] - (c[at, None] @ L)[:, 0]
         P = L[:, 3]
         contrast[at] = np.sum(P * (levels[at] - c[at, :1] * L[:, 0]), axis=1)
         contrast[at] /= np.maximum(np.sum(P * P, axis=1), 1e-9)
-        pull[at] = _pull(_functions(u[at], v[at], x[at], c[at]) * w[at, None])
+        pull[at] = _pull(A)
     rms = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(count - k, 1.0))
     size = np.maximum(np.abs(contrast), 1e-9)
     turn = np.abs(np.angle(np.exp(1j * (x[:, 2:4] - turns)))).max(axis=1)
@@ -309,14 +341,14 @@ def _judged(window: _Window, weight: Array, x: Array, start: Array, turns: Array
     slope = narrow / s + (0.5 * (c[:, 6] + c[:, 7]) + c[:, 8]) / np.hypot(s, _MASK_RADIUS)
     slope /= np.where(contrast == 0.0, 1.0, contrast)
     found = count >= _MIN_PIXELS
-    found &= np.linalg.norm(x[:, :2], axis=1) < _MAX_SHIFT_PX
+    found &= np.linalg.norm(x[:, :2], axis=1) < MAX_SHIFT_PX
     found &= (turn < _MAX_TURN) & (size * window.scale > MIN_CONTRAST)
     found &= (rms < _MAX_MISFIT * size) & (slope > 1.0 / _BLURS[1])
     variance = np.zeros(n)
     if found.any():
         used = weight[found] > 0.0
         variance[found] = _variance(pull[found], used, residual[found], rms[found], window.side)
-    found &= variance < _MAX_SHIFT_PX**2
+    found &= variance < MAX_SHIFT_PX**2
     return Saddles(
         start + x[:, :2],
         np.hypot(np.sqrt(variance), _MIN_SIGMA_PX),
@@ -345,18 +377,22 @@ def _variance(pull: Array, used: BoolArray, residual: Array, rms: Array, side: i
     Neighbouring residuals are alike where colours are filled in, a JPEG is coarse or the model is
     not all; the correlation is that of all crossings of the image.
     """
-    n = len(pull)
-    g = pull.reshape(n, 2, side, side)
-    r = (residual / np.maximum(rms, 1e-12)[:, None]).reshape(n, side, side)
-    used = used.reshape(n, side, side)
-    total = np.zeros(n)
+    n, wide = len(pull), side + _LAGS
+    padded = np.zeros((3, n, wide, wide), dtype=np.float32)  # lags do not reach the next crossing
+    padded[:2, :, :side, :side] = np.moveaxis(pull, 1, 0).reshape(2, n, side, side)
+    padded[2, :, :side, :side] = (residual / np.maximum(rms, 1e-12)[:, None]).reshape(n, side, side)
+    inside = np.zeros((n, wide, wide), dtype=np.float32)
+    inside[:, :side, :side] = used.reshape(n, side, side)
+    r, there = padded[2].ravel(), inside.ravel()
+    alike = np.zeros((2 * _LAGS + 1, 2 * _LAGS + 1))
     for i in range(_LAGS + 1):
         for j in range(-_LAGS if i else 0, _LAGS + 1):
-            a = (slice(0, side - i), slice(max(-j, 0), side - max(j, 0)))
-            b = (slice(i, side), slice(max(j, 0), side + min(j, 0)))
-            pairs = float(np.sum(used[:, *a] & used[:, *b]))
-            alike = float(np.sum(r[:, *a] * r[:, *b])) / max(pairs, 1.0) if i or j else 1.0
-            twice = 2.0 if i or j else 1.0
-            total += twice * alike * np.sum(g[:, :, *a] * g[:, :, *b], axis=(1, 2, 3))
+            lag = i * wide + j
+            pairs = float(there[lag:] @ there[: len(there) - lag])
+            of_lag = float(r[lag:] @ r[: len(r) - lag]) / max(pairs, 1.0) if lag else 1.0
+            alike[_LAGS + i, _LAGS + j] = alike[_LAGS - i, _LAGS - j] = of_lag
+    g = padded[:2].reshape(-1, wide)
+    near = cv2.filter2D(g, cv2.CV_32F, alike, borderType=cv2.BORDER_CONSTANT)
+    total = np.sum((g * near).reshape(2, n, -1), axis=(0, 2), dtype=np.float64)
     alone = np.sum(pull**2, axis=(1, 2))
     return np.asarray(0.5 * np.maximum(total, alone) * rms**2)
