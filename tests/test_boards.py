@@ -391,6 +391,7 @@ def test_squares_or_inner_corners_are_told_by_all_images(
         (replace(APRILGRID, columns=2), "aprilgrid", "tags with numbers up to 5"),
         (replace(CHARUCO, dictionary="DICT_5X5_50"), "charuco", "markers of DICT_4X4"),
         (replace(CHESSBOARD, columns=6, rows=5), "chessboard", "a chessboard of 6 x 7 squares"),
+        (APRILGRID, "chessboard", "squares without such tags"),
     ],
 )
 def test_a_board_of_other_dimensions_is_named(stated: Board, kind: str, words: str) -> None:

@@ -306,10 +306,12 @@ def test_undetermined_cameras_are_refused_with_figures() -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Pictures of a chessboard, and one that shows nothing."""
+    """Pictures of a chessboard, one that shows nothing, one twice, and what macOS leaves."""
     path = tmp_path_factory.mktemp("boards")
     drawings(path, PINHOLE, N_IMAGES)
     cv2.imwrite(str(path / "empty.png"), np.full((336, 448), 90, dtype=np.uint8))
+    (path / "same.png").write_bytes((path / "b00.png").read_bytes())
+    (path / "._b00.png").write_bytes(b"Mac OS X")
     return path
 
 
@@ -325,6 +327,7 @@ def test_pictures_give_the_camera_that_took_them(found: CameraCalibration) -> No
     assert found.rms_px < 0.03
     said = " ".join(found.warnings)
     assert "empty.png left out: the board was not found." in said
+    assert "same.png left out: the same photograph as b00.png." in said
     assert f"{N_IMAGES} images are few" in said
     document = found.document()
     tilts = [image["tilt_rad"] for image in document["images"]]
@@ -467,6 +470,8 @@ def test_the_picture_shows_where_corners_were_seen_and_replaces_only_itself(
          ("nothing like the board", "1 image", "ChArUco")),
         (lambda f: [f / "b00.png", f / "b01.png"], SPEC, NotIdentifiable,
          ("2 images", "b00.png", "b01.png")),
+        (lambda f: [f / "b00.png", f / "b01.png", f / "same.png"], SPEC, NotIdentifiable,
+         ("2 images", "same.png: the same photograph as b00.png")),
         (lambda f: [f / "b00.png"], "chessboard:8x6", NotVisible, ("found a chessboard of",)),
     ],
 )  # fmt: skip

@@ -503,18 +503,25 @@ def describe_image(
 ) -> str | None:
     """Return what an image shows instead of a board, in words that go after "found"."""
     grey = np.ascontiguousarray(image, dtype=np.float32)
-    if board.kind != "chessboard":
-        return _other_markers(board, grey)
-    extent, most = search_board(board, grey).extent, _extent(board)
+    if board.kind != "chessboard" and (markers := _other_markers(board, grey)):
+        return markers
+    seen = search_board(replace(board, kind="chessboard"), grey)
+    extent, most = seen.extent, _extent(board)
     if extent[1] < _MIN_SIDE:
         return None
+    if board.kind != "chessboard":
+        return f"{_squares(board, extent)} without such {_things(board)}"
     part = extent[0] <= most[0] and extent[1] <= most[1]
     return _squares(board, extent) + (" or that part of one" if part else "")
 
 
+def _things(board: Board) -> str:
+    return "tags" if board.kind == "aprilgrid" else "markers"
+
+
 def _other_markers(board: Board, grey: Grey) -> str | None:
     """Return which markers or tags are seen."""
-    thing = "tags" if board.kind == "aprilgrid" else "markers"
+    thing = _things(board)
     count = board.columns * board.rows
     own = count if board.kind == "aprilgrid" else count // 2
     scale = possible_scale(grey, 1.0, _MAX_PIXELS)

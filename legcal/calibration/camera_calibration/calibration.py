@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
@@ -144,8 +144,11 @@ def calibrate_camera(
         shown = [k for k, corners in enumerate(found) if len(corners.number) >= MIN_CORNERS]
         if not shown:
             raise _not_visible(stated, _shown_instead(stated, paths, size))
+        copies = _copies(found, shown, paths)
+        shown = [k for k in shown if k not in copies]
         if len(shown) < MIN_IMAGES:
-            raise too_few_images(len(shown), [paths[k].name for k in shown])
+            others = [f"{paths[k].name}: {why}" for k, why in copies.items()]
+            raise too_few_images(len(shown), [paths[k].name for k in shown], others)
         report("Adjusting the camera", 0, 1)
         table = _table(flat_board, [found[k] for k in shown])
         lens = chosen_lens(table, size) if model is None else given_lens(table, size, model)
@@ -159,7 +162,7 @@ def calibrate_camera(
     refuse_divided(fitted, [paths[k].name for k in shown])
     left_out = [f"{paths[shown[k]].name}: {why}" for k, why in fitted.left_out.items()]
     refuse_undetermined(fitted, [paths[shown[k]].name for k in fitted.images], left_out)
-    result = _result(flat_board, paths, found, shown, lens, note)
+    result = _result(flat_board, paths, found, shown, copies, lens, note)
     used = [k for k, image in enumerate(result.images) if image.used]
     changes = _changes([paths[k] for k in used], [facts[k] for k in used], size)
     result = replace(
@@ -232,11 +235,21 @@ def _not_visible(board: Board, instead: str) -> NotVisible:
     )
 
 
+def _copies(
+    found: Sequence[NumberedCorners], shown: Sequence[int], paths: Sequence[Path]
+) -> dict[int, str]:
+    """Return the images whose corners are to the last digit those of one before, and which."""
+    first: dict[bytes, int] = {}
+    before = {k: first.setdefault(found[k].px.tobytes(), k) for k in shown}
+    return {k: f"the same photograph as {paths[i].name}" for k, i in before.items() if i != k}
+
+
 def _result(
     board: Board,
     paths: Sequence[Path],
     found: Sequence[NumberedCorners],
     shown: Sequence[int],
+    copies: Mapping[int, str],
     lens: ChosenLens,
     note: str,
 ) -> CameraCalibration:
@@ -244,7 +257,7 @@ def _result(
     fitted = lens.fit
     adjusted, seen = fitted.adjusted, fitted.seen
     used = {shown[k]: i for i, k in enumerate(fitted.images)}
-    left_out = {shown[k]: why for k, why in fitted.left_out.items()}
+    left_out = {**copies, **{shown[k]: why for k, why in fitted.left_out.items()}}
     square = np.sum(adjusted.residual**2, axis=1)
     tilt = tilts(fitted)
     images = []
@@ -317,7 +330,8 @@ def _matching(name: str) -> list[Path]:
         return []
     path, suffixes = Path(name), image_suffixes()
     if path.is_dir():
-        return [p for p in sorted(path.iterdir()) if p.suffix.lower() in suffixes and p.is_file()]
+        shown = (p for p in sorted(path.iterdir()) if not p.name.startswith("."))
+        return [p for p in shown if p.suffix.lower() in suffixes and p.is_file()]
     if os.path.lexists(path):
         return [path]
     hits = [Path(hit) for hit in sorted(glob.glob(name, recursive=True))]
