@@ -3,6 +3,7 @@
 import json
 import re
 import tomllib
+from functools import cache
 from importlib.metadata import distribution, requires
 from importlib.resources import files
 from pathlib import Path, PurePath
@@ -47,12 +48,19 @@ def test_documents_name_files_and_functions_that_exist(document: Path) -> None:
         if not target.exists() or (part and part not in headings[target]):
             lost.append(link)
     words = " ".join(re.findall(r"`([^`\n]+)`", text))
-    lost += [name for name in re.findall(r"\b\w+\.py\b", words) if not [*ROOT.rglob(name)]]
+    lost += sorted({*re.findall(r"\b\w+\.py\b", words)} - _names_of_modules())
     paths = re.findall(r"(?<![\w/.])(?:legcal|benchmarks|tests|docs|examples)/[\w./-]+", words)
     lost += [path for path in paths if not (ROOT / path).exists()]
     for name in re.findall(r"\blegcal\.([A-Za-z_]+)\(", text):
         lost += [] if hasattr(legcal, name) else [f"legcal.{name}"]
     assert lost == []
+
+
+@cache
+def _names_of_modules() -> set[str]:
+    """Return the names of the Python files of the project, and not of what is installed in it."""
+    folders = ("legcal", "benchmarks", "tests", "docs", "examples")
+    return {path.name for folder in folders for path in (ROOT / folder).rglob("*.py")}
 
 
 def _headings(path: Path) -> set[str]:
