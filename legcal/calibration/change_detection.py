@@ -20,6 +20,7 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, frame_on_points, normal_basis, whitener
 from legcal.machine import (
     Actuator,
+    ActuatorColumns,
     Leg,
     LegKind,
     Machine,
@@ -240,7 +241,7 @@ def _of_actuator(actuator: Actuator) -> list[_Possible]:
         )
 
     def axis_moved(leg: Leg, k: int, step: float) -> Leg:
-        change = np.zeros(9)
+        change = np.zeros(ActuatorColumns.COUNT)
         change[k] = step
         return replace(leg, actuator=actuator.moved(change))
 

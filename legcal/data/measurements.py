@@ -23,7 +23,7 @@ from legcal.data.reading_units import (
     ReadingUnit,
     default_unit,
     legs_with_readings,
-    usual_sigma,
+    sigmas_of_legs,
 )
 from legcal.files import (
     ANGLE,
@@ -102,10 +102,7 @@ class Measurements:
 
     def sigma_of(self, legs: Sequence[Leg]) -> Array:
         """Return the standard deviation of the reading of each leg, (n_legs,) [m or rad]."""
-        known = self.sigma_by_joint
-        return np.array(
-            [known.get(str(leg.prismatic), usual_sigma(leg, self.sigma_q)) for leg in legs]
-        )
+        return sigmas_of_legs(legs, self.sigma_q, self.sigma_by_joint)
 
 
 def row_names(measurements: Measurements) -> tuple[str, ...]:

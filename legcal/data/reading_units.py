@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import numpy as np
 from pydantic import GetJsonSchemaHandler, model_validator
 
-from legcal.errors import DatasetError
+from legcal.errors import DatasetError, UsageError
 from legcal.files import ANGLE, LENGTH, FileSchema, Number, closest, describe, split_quantity
 from legcal.geometry import Array
 from legcal.machine import Leg, Pulses
@@ -166,11 +167,16 @@ def reading_units(
     return units
 
 
-def usual_sigma(leg: Leg, sigma_q: float) -> float:
-    """Return the standard deviation [m or rad] of readings of which none is stated.
+def sigmas_of_legs(legs: Sequence[Leg], sigma_q: float, stated: Mapping[str, float]) -> Array:
+    """Return the standard deviation of the reading of each leg, (n_legs,) [m or rad].
 
-    *sigma_q* is that of motors that slide [m].
+    It is what is stated of its motor, or the usual one: *sigma_q* [m] of motors that slide.
     """
+    return np.array([stated.get(str(leg.prismatic), _usual_sigma(leg, sigma_q)) for leg in legs])
+
+
+def _usual_sigma(leg: Leg, sigma_q: float) -> float:
+    """Return the standard deviation [m or rad] of readings of which none is stated."""
     if leg.actuator is None or not leg.actuator.turns:
         return sigma_q
     return SIGMA_ANGLE if leg.actuator.pulses is None else SERVO_SIGMA
@@ -184,13 +190,17 @@ def sigmas_of(stated: float | str, legs: Sequence[Leg]) -> dict[str, float]:
 
     Raises
     ------
-    ValueError
-        If no motor can have it; the text goes on after what could not be used.
+    UsageError
+        If no motor can have it.
     """
     motors = legs_with_readings(legs)
     unit = split_quantity(stated)[1] if isinstance(stated, str) else ""
     alike = [leg for leg in motors if unit in (ANGLE if leg.reads_angle else LENGTH)]
-    return {str(leg.prismatic): sigma_in(stated, default_unit(leg), leg) for leg in alike or motors}
+    some = alike or motors
+    try:
+        return {str(leg.prismatic): sigma_in(stated, default_unit(leg), leg) for leg in some}
+    except ValueError as error:
+        raise UsageError(f"The encoder sigma could not be used: {error}") from error
 
 
 def sigma_in(stated: float | str, unit: ReadingUnit, leg: Leg) -> float:

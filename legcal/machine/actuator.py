@@ -43,6 +43,7 @@ class ActuatorColumns:
     AXIS, POINT, GAIN = slice(12, 14), slice(14, 16), 16
     ARM_AXIS, ARM_POINT = slice(17, 19), slice(19, 21)
     LINE, ARM = slice(12, 16), slice(17, 21)  # what the axis is, and the line of the arm
+    COUNT = 9
 
 
 class JointMotion(NamedTuple):
@@ -294,7 +295,7 @@ class Actuator:
 
     def numbers_slope(self, nominal: Actuator) -> Array:
         """Return the derivative (9, 9) of :meth:`numbers` by a step of :meth:`moved`."""
-        slope = np.eye(9)
+        slope = np.eye(ActuatorColumns.COUNT)
         slope[:4, :4] = self.line.numbers_slope(nominal.line)
         if not self.turns:
             slope[2:4, :4] = np.eye(4)[2:]

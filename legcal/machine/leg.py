@@ -18,7 +18,7 @@ import numpy as np
 
 from legcal.brief import brief
 from legcal.geometry import Array, BoolArray, distance_to_line, matrix_inverse
-from legcal.machine.actuator import Actuator, Arm
+from legcal.machine.actuator import Actuator, ActuatorColumns, Arm
 from legcal.machine.bodies import Connection
 
 TRAVEL_MARGIN = 0.05  # of the travel: as good as inside
@@ -33,7 +33,7 @@ class LegColumns:
     A, B, LENGTH = slice(0, 3), slice(3, 6), 6
     BASE_AXIS, PLATFORM_AXIS, TWIST = slice(7, 9), slice(9, 11), 11
     OWN = 12  # the leg's own; those of its actuator follow (ActuatorColumns)
-    COUNT = 21
+    COUNT = OWN + ActuatorColumns.COUNT
 
 
 class LegKind(StrEnum):

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.geometry import Array, IntArray, cross, normal_basis, turned_axis
-from legcal.machine import Actuator
+from legcal.machine import Actuator, ActuatorColumns
 
 MIN_IMAGES = {False: 3, True: 5}  # of one view, by whether the actuator turns
 _SAME = 1e-9  # of the normalised information of (6'): smaller eigenvalues are rounding
@@ -74,8 +74,9 @@ class Carrier:
         columns = CarrierColumns
         A = self.A + step[columns.A]
         v = turned_axis(self.v, step[columns.V]) if self.v.any() else self.v
-        line = (*step[columns.AXIS], *step[columns.POINT])
-        actuator = self.actuator.moved(np.array([*line, *(0.0,) * 5]))  # nor gain and arm
+        of_axis = np.zeros(ActuatorColumns.COUNT)
+        of_axis[:4] = *step[columns.AXIS], *step[columns.POINT]
+        actuator = self.actuator.moved(of_axis)
         if actuator.turns:
             along = float((A - actuator.point) @ actuator.axis)
             actuator = replace(actuator, point=actuator.point + along * actuator.axis)

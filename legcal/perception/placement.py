@@ -8,6 +8,7 @@ again is measuring with a better placement.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -131,10 +132,10 @@ class Placement:
         B_base: Array,
         T_base_camera: Sequence[RigidTransform | None],
         blur: Sequence[float] = (),
-        arms: Mapping[int, PlacedArm] | None = None,
+        arms: Mapping[int, PlacedArm] = MappingProxyType({}),
     ) -> "Placement":
         """Return the placement of a joint fit, with the usual blur of each view [px]."""
-        cameras, arms = tuple(T_base_camera), {} if arms is None else arms
+        cameras = tuple(T_base_camera)
         return cls(A_base, B_base, cameras, 0.0, NEAR_FIT_PX, blur=tuple(blur), arms=arms)
 
     def shifted(self, search: Search, shift: Array) -> "Placement":

@@ -152,10 +152,7 @@ def plan(
         chosen = camera if isinstance(camera, Camera) else read_camera(Path(camera))
     sigma_q, sigma_by_joint = SIGMA_Q, dict[str, float]()
     if encoder_sigma is not None:
-        try:
-            sigma_by_joint = sigmas_of(encoder_sigma, machine.legs)
-        except ValueError as error:
-            raise UsageError(f"The encoder sigma could not be used: {error}") from error
+        sigma_by_joint = sigmas_of(encoder_sigma, machine.legs)
         sliding = [str(leg.prismatic) for leg in machine.legs if not leg.reads_angle]
         sigma_q = min((s for name, s in sigma_by_joint.items() if name in sliding), default=SIGMA_Q)
     elif shot is not None:

@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from legcal.calibration import PLAN_NAME
-from legcal.data import reading_columns, usual_sigma
+from legcal.data import reading_columns, sigmas_of_legs
 from legcal.errors import UsageError
 from legcal.files import (
     SHOWN_IN,
@@ -132,12 +132,8 @@ def _dataset(plan: Plan, model: str) -> str:
 def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
     """Return the standard deviation of readings [m], by motor [m or rad] where they differ."""
     legs = [plan.machine.legs[j] for j in plan.machine.motors]
-    found = {
-        str(leg.prismatic): float(
-            plan.sigma_by_joint.get(str(leg.prismatic), usual_sigma(leg, plan.sigma_q))
-        )
-        for leg in legs
-    }
+    sigma = sigmas_of_legs(legs, plan.sigma_q, plan.sigma_by_joint).tolist()
+    found = {str(leg.prismatic): own for leg, own in zip(legs, sigma, strict=True)}
     if any(leg.reads_angle for leg in legs) or set(found.values()) - {plan.sigma_q}:
         return found
     return plan.sigma_q

@@ -220,6 +220,8 @@ def test_cached_fresh_and_parallel_runs_agree(name: str, tmp_path: Path) -> None
     for one, other in zip(first["parameters"], cached["parameters"], strict=True):
         if one["sigma"]:  # from another start
             assert abs(one["value"] - other["value"]) <= 1e-5 * one["sigma"]
+        elif one["status"] == "fixed":
+            assert one["value"] == other["value"]
 
 
 def test_what_is_recorded_holds_no_sentence() -> None:

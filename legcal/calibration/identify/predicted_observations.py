@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.ordered_dataset import nominal_poses
-from legcal.data import Dataset, usual_sigma
+from legcal.data import Dataset, sigmas_of_legs
 from legcal.estimation import Frames
 from legcal.geometry import Array, BoolArray, IntArray, components, cross
 from legcal.machine import (
@@ -184,10 +184,7 @@ class PredictedObservations:
     @cached_property
     def sigma_of_legs(self) -> Array:
         """Standard deviation of the reading of each leg, (n_legs,) [m or rad]."""
-        known = self.sigma_by_joint
-        return np.array(
-            [known.get(str(leg.prismatic), usual_sigma(leg, self.sigma_q)) for leg in self.legs]
-        )
+        return sigmas_of_legs(self.legs, self.sigma_q, self.sigma_by_joint)
 
     @property
     def sigma_of_q(self) -> Array:

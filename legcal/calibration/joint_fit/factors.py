@@ -25,7 +25,7 @@ from legcal.data import Corners, LegAxes, Measurements, Outlines, join_axes
 from legcal.errors import DatasetError
 from legcal.estimation import Factor, Residuals, Touch
 from legcal.geometry import Array, BoolArray, IntArray, cross, whitener
-from legcal.machine import JointMotion, LegColumns, LegKind, actuator_index
+from legcal.machine import ActuatorColumns, JointMotion, LegColumns, LegKind, actuator_index
 from legcal.vision import (
     EPSILON,
     LINKS,
@@ -40,7 +40,6 @@ from legcal.vision import (
 _SAME_GAMMA = 1e-6  # relative difference of gammas that count as one
 _SIX, _ALL, _ONE = slice(0, 6), slice(None), slice(0, 1)
 _OF_ACTUATOR = slice(LegColumns.OWN, LegColumns.COUNT)
-_N_ACTUATOR = LegColumns.COUNT - LegColumns.OWN
 
 
 class Observed(NamedTuple):
@@ -972,7 +971,7 @@ class _EndsInCamera:
         intrinsics. Those by the numbers of actuators come after them.
         """
         by_ends, moved = slope.T, self.moved
-        n_own, n_q = (0, 0) if moved is None else (_N_ACTUATOR, moved.n_q)
+        n_own, n_q = (0, 0) if moved is None else (ActuatorColumns.COUNT, moved.n_q)
         by_A, by_B, others = by_ends[:3], by_ends[3:6], 6 + len(by_ends)
         m = others + n_own
         J = np.empty((m + 6 + n_q, *by_ends.shape[1:]))
@@ -1028,7 +1027,7 @@ def _moved(state: State, leg: IntArray, pose: IntArray, arm: BoolArray) -> _Move
         return None
     shape = len(state.legs), n_poses
     by_A = np.broadcast_to(np.eye(3), (*shape, 3, 3)).copy()
-    ends = np.zeros((3, *shape, 3, _N_ACTUATOR)), np.zeros((3, *shape, 3, n_q))
+    ends = np.zeros((3, *shape, 3, ActuatorColumns.COUNT)), np.zeros((3, *shape, 3, n_q))
     on = actuator_index(state.legs)
     for j, motion in state.actuated.items():
         by_A[j] = motion.by_A

@@ -121,10 +121,7 @@ def _sigmas_of_readings(stated: float | str, machine: Machine) -> dict[str, floa
     """Return what is stated of readings by motor [m or rad]: nothing where they are exact."""
     if (split_quantity(stated)[0] if isinstance(stated, str) else stated) == 0.0:
         return {}
-    try:
-        return sigmas_of(stated, machine.legs)
-    except ValueError as error:
-        raise UsageError(f"The encoder sigma could not be used: {error}") from error
+    return sigmas_of(stated, machine.legs)
 
 
 def _check_numbers(
