@@ -36,6 +36,7 @@ _STEP_SCALE = 0.3275911 / math.sqrt(2.0)
 _STEP = (1.061405429, -1.453152027, 1.421413741, -0.284496736, 0.254829592)
 _MIN_AREA = 1e-6  # [px^2 / unit^2] between axes that are not one line
 _MIN_PIXELS = 24  # pixels that a fit needs
+_SPARSE = 0.8  # part of the pixels of a window below which those that are used are picked out
 _AT_ONCE = 40  # crossings whose functions stay in the cache of a processor
 _ITERATIONS = 12
 _ROUGH_PART, _ROUGH_HALF = 0.9, (2, 7)  # window of the first guess: part of what is free, [px]
@@ -153,15 +154,15 @@ def near_saddles(
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """The pixels around places: columns and rows (n, m) less the place, levels (n, m)."""
+    """The pixels around places in single precision: columns and rows less the place, levels."""
 
     side: int  # pixels along a side; m is its square
-    u: Array
-    v: Array
-    levels: Array  # normalised: by half of their range, about their mean
-    scale: Array  # (n,) that half [grey levels]
+    u: _Levels  # (n, m)
+    v: _Levels
+    levels: _Levels  # normalised: by half of their range, about their mean
+    scale: _Levels  # (n,) that half [grey levels]
     inside: BoolArray  # (n, m) whether a pixel is in the image
-    on_board: Array  # (n, 2, m) how far along the axes [unit], without sign
+    on_board: _Levels  # (n, 2, m) how far along the axes [unit], without sign
 
     @classmethod
     def around(cls, grey: Grey, start: Array, axes: Array, reach: int) -> _Window:
@@ -172,12 +173,16 @@ class _Window:
         middle = np.rint(start).astype(np.intp)
         column, row = middle[:, :1] + columns, middle[:, 1:] + rows
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        levels = grey[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)].astype(np.float64)
-        low, high = np.quantile(levels, [0.05, 0.95], axis=1)
-        scale = np.maximum(0.5 * (high - low), 1e-3)
+        levels = grey[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+        levels = levels.astype(np.float32)
+        few = int(0.05 * levels.shape[1])
+        ends = np.partition(levels, (few, -1 - few), axis=1)
+        low, high = ends[:, few], ends[:, -1 - few]
+        scale = np.maximum(0.5 * (high - low), np.float32(1e-3))
         levels = (levels - 0.5 * (high + low)[:, None]) / scale[:, None]
-        u, v = column - start[:, :1], row - start[:, 1:]
-        (a, b), (c, d) = (axes[:, k, :, None].swapaxes(0, 1) for k in range(2))
+        u = (column - start[:, :1]).astype(np.float32)
+        v = (row - start[:, 1:]).astype(np.float32)
+        (a, b), (c, d) = (axes[:, k, :, None].swapaxes(0, 1).astype(np.float32) for k in range(2))
         area = a * d - b * c
         on_board = np.abs(np.stack([d * u - b * v, a * v - c * u], axis=1))
         is_line = np.abs(area) < _MIN_AREA  # nothing is on the board
@@ -185,12 +190,12 @@ class _Window:
         on_board[is_line[:, 0]] = np.inf
         return cls(len(near), u, v, levels, scale, inside, on_board)
 
-    def weight(self, length: float, free: Array) -> Array:
+    def weight(self, length: float, free: Array) -> _Levels:
         """Return 1 for pixels (n, m) that are used, else 0."""
         near = (self.on_board.max(axis=1) <= length) & (self.on_board.min(axis=1) <= free[:, None])
-        return np.asarray(near & self.inside, dtype=np.float64)
+        return np.asarray(near & self.inside, dtype=np.float32)
 
-    def contrast(self, weight: Array, angles: Array) -> Array:
+    def contrast(self, weight: _Levels, angles: Array) -> Array:
         """Return about the contrast (n,), by which sides of edges at angles (n, 2) are bright."""
         c, s = np.cos(angles)[:, :, None], np.sin(angles)[:, :, None]
         sides = np.sign(c * self.v[:, None] - s * self.u[:, None]).prod(axis=1) * weight
@@ -203,64 +208,64 @@ class _Window:
                 getattr(self, name)[rows] = value
 
 
-def _fit(window: _Window, weight: Array, x: Array, c: Array, tolerance: float) -> None:
+def _fit(window: _Window, weight: _Levels, x: Array, c: Array, tolerance: float) -> None:
     """Fit the model by Gauss-Newton, from what *x* and *c* hold to what it finds.
 
-    Place less the start, angles and logarithm of the blur x (n, 5); coefficients c (n, 13).
+    Place less the start, angles and logarithm of the blur x (n, 5); coefficients c (n, 13); the
+    tolerance of a place [px].
     """
-    usable = np.flatnonzero(weight.sum(axis=1) >= _MIN_PIXELS)
-    for start in range(0, len(usable), _AT_ONCE):
-        _fit_some(window, weight, x, c, usable[start : start + _AT_ONCE], tolerance)
-
-
-def _fit_some(
-    window: _Window, weight: Array, x: Array, c: Array, open_: IntArray, tolerance: float
-) -> None:
-    """Fit the model to some crossings."""
-    count = weight[open_].sum(axis=1)
-    # The pixels that are used, first; single precision is enough for steps.
-    used = np.argsort(-weight[open_], axis=1, kind="stable")[:, : int(count.max())]
-    u, v, levels, w = (
-        np.take_along_axis(pixels[open_], used, axis=1).astype(np.float32)
-        for pixels in (window.u, window.v, window.levels, weight)
-    )
-    levels *= w
+    count = weight.sum(axis=1, dtype=np.float64)
+    open_ = np.flatnonzero(count >= _MIN_PIXELS)
+    if not len(open_):
+        return
+    pixels = [window.u, window.v, window.levels, weight]
+    most = np.full(len(count), weight.shape[1])
+    if np.median(count[open_]) < _SPARSE * weight.shape[1]:
+        used = np.argsort(-weight, axis=1, kind="stable")  # the pixels that are used, first
+        pixels = [np.take_along_axis(part, used, axis=1) for part in pixels]
+        most = count.astype(np.intp)
+        open_ = open_[np.argsort(most[open_], kind="stable")]
     for _ in range(_ITERATIONS):
-        here = x[open_]
-        A = _functions(u, v, here, c[open_]) * w[:, None]
-        expected = np.zeros((len(here), _N_LINEAR + _N_PLACED))
-        expected[:, -1] = np.log(_START_BLUR) - here[:, 4]
-        solution = _solve(A, levels, count, expected)
-        c[open_], step = solution[:, :_N_LINEAR], solution[:, _N_LINEAR:]
-        step = np.clip(step, -_MAX_STEP, _MAX_STEP)
-        here = here + step
-        here[:, 4] = np.clip(here[:, 4], *np.log(_BLURS))
-        x[open_] = here
-        more = np.abs(step[:, :2]).max(axis=1) >= tolerance
-        more &= np.abs(here[:, :2]).max(axis=1) <= 2.0 * MAX_SHIFT_PX
-        if not more.any():
+        going = []
+        for first in range(0, len(open_), _AT_ONCE):
+            at = open_[first : first + _AT_ONCE]
+            u, v, levels, w = (part[at, : most[at].max()] for part in pixels)
+            here = x[at]
+            A = _functions(u, v, here, c[at])  # in single precision: enough for steps
+            A *= w[:, None]
+            N = (A @ np.swapaxes(A, 1, 2)).astype(np.float64)
+            rhs = (A @ (levels * w)[:, :, None])[:, :, 0]
+            expected = np.zeros((len(at), _N_LINEAR + _N_PLACED))
+            expected[:, -1] = np.log(_START_BLUR) - here[:, 4]
+            solution = _solve(N, rhs, count[at], expected)
+            c[at], step = solution[:, :_N_LINEAR], solution[:, _N_LINEAR:]
+            step = np.clip(step, -_MAX_STEP, _MAX_STEP)
+            here = here + step
+            here[:, 4] = np.clip(here[:, 4], *np.log(_BLURS))
+            x[at] = here
+            more = np.abs(step[:, :2]).max(axis=1) >= tolerance
+            more &= np.abs(here[:, :2]).max(axis=1) <= 2.0 * MAX_SHIFT_PX
+            going.append(at[more])
+        open_ = np.concatenate(going)
+        if not len(open_):
             break
-        if not more.all():
-            open_, count = open_[more], count[more]
-            u, v, levels, w = u[more], v[more], levels[more], w[more]
 
 
-def _solve(A: _Levels, levels: _Levels, count: Array, expected: Array) -> Array:
-    """Return the coefficients (n, k) of functions (n, k, m) by least squares.
+def _solve(N: Array, rhs: _Levels, count: Array, expected: Array) -> Array:
+    """Return the coefficients (n, k) of functions by normal equations N (n, k, k), rhs (n, k).
 
     Those of overshoot and tones are near zero where *count* (n,) pixels are few.
     """
-    n, k, _ = A.shape
+    n, k, _ = N.shape
     ridge = np.full((n, k), 1e-9)
     few = np.maximum(_MANY_PIXELS / np.maximum(count, 1.0), 1.0) ** 4
     ridge[:, _OVERSHOOT] = (_RIDGE * few)[:, None]
     if k > _N_LINEAR:
         ridge[:, -1] = _BLUR_RIDGE
-    N = (A @ np.swapaxes(A, 1, 2)).astype(np.float64)
     ridge *= np.maximum(np.trace(N, axis1=1, axis2=2) / k, 1e-9)[:, None]
+    N = N.copy()
     N[:, np.arange(k), np.arange(k)] += ridge
-    rhs = (A @ levels[:, :, None])[:, :, 0] + ridge * expected
-    return np.asarray(np.linalg.solve(N, rhs[:, :, None])[:, :, 0])
+    return np.asarray(np.linalg.solve(N, (rhs + ridge * expected)[:, :, None])[:, :, 0])
 
 
 def _functions(u: _Levels, v: _Levels, x: Array, c: Array) -> _Levels:
@@ -315,24 +320,27 @@ def _blurred_step(t: _Levels, bell: _Levels) -> _Levels:
 
 
 def _judged(
-    window: _Window, weight: Array, x: Array, c: Array, start: Array, turns: Array
+    window: _Window, weight: _Levels, x: Array, c: Array, start: Array, turns: Array
 ) -> Saddles:
     """Return the crossings with what their residuals are worth."""
     n, k = len(x), _N_LINEAR + _N_PLACED
-    count, levels = weight.sum(axis=1), window.levels * weight
+    count, levels = weight.sum(axis=1, dtype=np.float64), window.levels * weight
     c, contrast = c.copy(), np.zeros(n)
     residual, pull = np.zeros_like(levels), np.zeros((n, 2, levels.shape[1]))
-    u, v, w = (part.astype(np.float32) for part in (window.u, window.v, weight))
     for first in range(0, n, _AT_ONCE):
         at = slice(first, first + _AT_ONCE)
-        A = _functions(u[at], v[at], x[at], c[at]) * w[at, None]
+        A = _functions(window.u[at], window.v[at], x[at], c[at])
+        A *= weight[at, None]
+        A = A.astype(np.float64)  # products of single precision would be no better than the ridge
+        N = A @ np.swapaxes(A, 1, 2)
         L = A[:, :_N_LINEAR]
-        c[at] = _solve(L, levels[at], count[at], np.zeros_like(c[at]))
+        rhs = (L @ levels[at, :, None])[:, :, 0]
+        c[at] = _solve(N[:, :_N_LINEAR, :_N_LINEAR], rhs, count[at], np.zeros_like(c[at]))
         residual[at] = levels[at] - (c[at, None] @ L)[:, 0]
         P = L[:, 3]
         contrast[at] = np.sum(P * (levels[at] - c[at, :1] * L[:, 0]), axis=1)
         contrast[at] /= np.maximum(np.sum(P * P, axis=1), 1e-9)
-        pull[at] = _pull(A)
+        pull[at] = _pull(A, N)
     rms = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(count - k, 1.0))
     size = np.maximum(np.abs(contrast), 1e-9)
     turn = np.abs(np.angle(np.exp(1j * (x[:, 2:4] - turns)))).max(axis=1)
@@ -359,12 +367,11 @@ def _judged(
     )
 
 
-def _pull(A: _Levels) -> Array:
+def _pull(A: _Levels, N: Array) -> Array:
     """Return how levels move the place, (n, 2, m), by all derivatives of the model (n, k, m)."""
     n, k, _ = A.shape
-    A = A.astype(np.float64)  # products of single precision would be no better than the ridge
-    N = A @ np.swapaxes(A, 1, 2)
     size = np.maximum(np.trace(N, axis1=1, axis2=2) / k, 1e-9)
+    N = N.copy()
     N[:, np.arange(k), np.arange(k)] += 1e-9 * size[:, None]
     columns = np.zeros((n, k, 2))
     columns[:, [_N_LINEAR, _N_LINEAR + 1], [0, 1]] = 1.0
