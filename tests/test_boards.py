@@ -368,6 +368,7 @@ def _shows(columns: int, rows: int) -> SeenBoard:
         ((9, 6), [(6, 9)] * 2 + [(12, 3)], (10, 7), "10x7 squares (9x6 inner corners)"),
         ((9, 6), [(5, 4), (8, 3)], (9, 6), ""),
         ((9, 6), [(7, 5)] * 3, (9, 6), "8 x 6 squares or that part of one is seen in 3 of its 3"),
+        ((11, 8), [(6, 9)] * 2 + [(5, 4)], (10, 7), "was taken for the smaller one"),
         ((9, 6), [(10, 7)] * 2 + [(8, 5)], None, "a chessboard of 11 x 8 squares in 2 of its 3"),
         ((9, 6), [], (9, 6), ""),
     ],

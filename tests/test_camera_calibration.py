@@ -171,10 +171,32 @@ ZOOMED = replace(
 )
 
 
+def shifted(seen: BoardImages) -> BoardImages:
+    """Return corners of photographs that stabilisation has put aside."""
+    return replace(seen, px=seen.px + np.array([12.0, 5.0]))
+
+
 def rolled(seen: BoardImages) -> BoardImages:
     """Return corners of a camera that turned while it read out its rows."""
     moved = 4.0 * (seen.px[:, 1:] / SIZE.height - 0.5) * [1.0, -0.5]
     return replace(seen, px=seen.px + moved * (1.0 + seen.image[:, None]))
+
+
+def turned(seen: BoardImages) -> BoardImages:
+    """Return corners of photographs that were turned by half a turn."""
+    return replace(seen, px=[SIZE.width - 1.0, SIZE.height - 1.0] - seen.px)
+
+
+def mirrored(seen: BoardImages) -> BoardImages:
+    """Return corners of photographs that were mirrored, numbered as those of a board are."""
+    px = np.where([True, False], SIZE.width - 1.0 - seen.px, seen.px)
+    return replace(seen, px=px, points=seen.points * [-1.0, 1.0, 1.0] + [0.21, 0.0, 0.0])
+
+
+def corrected(seen: BoardImages) -> BoardImages:
+    """Return corners of photographs whose distortion a program has taken out."""
+    xy = np.column_stack([TRUTH.undistort(seen.px), np.ones(len(seen.px))])
+    return replace(seen, px=(xy @ TRUTH.K.T)[:, :2])
 
 
 @pytest.mark.parametrize(
@@ -184,8 +206,12 @@ def rolled(seen: BoardImages) -> BoardImages:
             (seen_corners(ZOOMED, 5, 8, sheet=SHEET), "focal length about 4 % longer"),
             (seen_corners(TRUTH, 5, 8, sheet=SHEET + np.array([4e-3, 0, 0, 0])), "bent otherwise"),
             (rolled(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "moved while its rows were read out"),
+            (turned(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "turned by half a turn"),
+            (mirrored(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "mirrored"),
+            (corrected(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "another distortion of the lens"),
+            (shifted(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "beside that of the others"),
         ],
-        lambda others, why: why.startswith("moved"),
+        lambda others, why: why.startswith(("moved", "turned", "another", "beside")),
         "system",
     ),
 )
@@ -197,6 +223,15 @@ def test_a_third_of_the_images_wrong_alike_is_named_and_moves_nothing(
     assert sum(why in reason for reason in found.left_out.values()) >= 3
     assert np.abs(pulls(found)).max() < 3.0
     refuse_divided(found, [str(k) for k in range(15)])
+
+
+def test_a_richer_lens_model_does_not_take_in_images_that_are_wrong() -> None:
+    """Its residuals, with them, are so large that nothing contradicts it."""
+    good = seen_corners(TRUTH, 8, 2, sheet=SHEET)
+    chosen = chosen_lens(together(shifted(seen_corners(TRUTH, 4, 8, sheet=SHEET)), good), SIZE)
+    assert chosen is not None
+    assert chosen.fit.adjusted.camera.model == "plumb_bob"
+    assert set(chosen.fit.left_out) == set(range(4))
 
 
 def test_two_groups_of_one_size_are_refused_and_named() -> None:
@@ -306,11 +341,14 @@ def test_undetermined_cameras_are_refused_with_figures() -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Pictures of a chessboard, one that shows nothing, one twice, and what macOS leaves."""
+    """Pictures of a chessboard, one twice, one that stands still, one of nothing, and of macOS."""
     path = tmp_path_factory.mktemp("boards")
     drawings(path, PINHOLE, N_IMAGES)
     cv2.imwrite(str(path / "empty.png"), np.full((336, 448), 90, dtype=np.uint8))
     (path / "same.png").write_bytes((path / "b00.png").read_bytes())
+    first = cv2.imread(str(path / "b00.png"))
+    assert first is not None
+    cv2.imwrite(str(path / "still.png"), np.roll(first, 1, axis=1))
     (path / "._b00.png").write_bytes(b"Mac OS X")
     return path
 
@@ -328,6 +366,7 @@ def test_pictures_give_the_camera_that_took_them(found: CameraCalibration) -> No
     said = " ".join(found.warnings)
     assert "empty.png left out: the board was not found." in said
     assert "same.png left out: the same photograph as b00.png." in said
+    assert "still.png left out: the board stands as in b00.png." in said
     assert f"{N_IMAGES} images are few" in said
     document = found.document()
     tilts = [image["tilt_rad"] for image in document["images"]]
@@ -470,8 +509,9 @@ def test_the_picture_shows_where_corners_were_seen_and_replaces_only_itself(
          ("nothing like the board", "1 image", "ChArUco")),
         (lambda f: [f / "b00.png", f / "b01.png"], SPEC, NotIdentifiable,
          ("2 images", "b00.png", "b01.png")),
-        (lambda f: [f / "b00.png", f / "b01.png", f / "same.png"], SPEC, NotIdentifiable,
-         ("2 images", "same.png: the same photograph as b00.png")),
+        (lambda f: [f / "b00.png", f / "b01.png", f / "same.png", f / "still.png"], SPEC,
+         NotIdentifiable, ("2 images", "2 more", "same.png: the same photograph as b00.png",
+                           "still.png: the board stands as in b00.png", "tilted to all sides")),
         (lambda f: [f / "b00.png"], "chessboard:8x6", NotVisible, ("found a chessboard of",)),
     ],
 )  # fmt: skip

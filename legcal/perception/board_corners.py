@@ -474,10 +474,15 @@ def shown_board(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | None, 
         )
     usual = max(extents, key=extents.count)
     if most not in extents and 2 * extents.count(usual) > len(seen):
-        return shown, (
+        # Turned by half a turn it has its black squares where its images have them.
+        fits = sum(usual) % 2 == 1
+        fits &= all(one[0] <= usual[0] and one[1] <= usual[1] for one in extents)
+        x, y = _turned_as(board, usual)
+        return replace(board, columns=x + 1, rows=y + 1) if fits else shown, (
             f"{_squares(board, usual).capitalize()} or that part of one is seen in "
-            f"{extents.count(usual)} {in_all}, and the whole of {board_in_words(board)} in none; "
-            "correct --board, or uncover the board."
+            f"{extents.count(usual)} {in_all}, and the whole of {board_in_words(board)} in none"
+            f"{': the board was taken for the smaller one' if fits else ''}; correct --board, or "
+            "uncover the board."
         )
     return shown, ""
 
@@ -487,13 +492,18 @@ def _extent(board: Board) -> tuple[int, int]:
     return max(board.grid), min(board.grid)
 
 
-def _squares(board: Board, extent: tuple[int, int]) -> str:
-    """Return which chessboard has so many corners, turned as the board is."""
+def _turned_as(board: Board, extent: tuple[int, int]) -> tuple[int, int]:
+    """Return columns and rows of corners, turned as the board is."""
     (a, b), (nx, ny) = extent, board.grid
-    x, y = min(
+    return min(
         ((b, a), (a, b)),
         key=lambda side: (abs(side[0] - nx) + abs(side[1] - ny), abs(side[0] - nx)),
     )
+
+
+def _squares(board: Board, extent: tuple[int, int]) -> str:
+    """Return which chessboard has so many corners, turned as the board is."""
+    x, y = _turned_as(board, extent)
     return f"a chessboard of {x + 1} x {y + 1} squares"
 
 

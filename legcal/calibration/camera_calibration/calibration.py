@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
@@ -64,6 +64,7 @@ from legcal.workers import Run, Workers, worker_pool
 
 _STAGE = "Searching the board"
 _N_DESCRIBED = 2  # images of which it is said what they show instead
+_SAME_PLACE = 0.01  # of the diagonal of the board, by which it moved from an image to the next
 
 
 def calibrate_camera(
@@ -147,8 +148,8 @@ def calibrate_camera(
         copies = _copies(found, shown, paths)
         shown = [k for k in shown if k not in copies]
         if len(shown) < MIN_IMAGES:
-            others = [f"{paths[k].name}: {why}" for k, why in copies.items()]
-            raise too_few_images(len(shown), [paths[k].name for k in shown], others)
+            same = _by_reason((paths[k].name, why) for k, why in copies.items())
+            raise too_few_images(len(shown), [paths[k].name for k in shown], copies=same)
         report("Adjusting the camera", 0, 1)
         table = _table(flat_board, [found[k] for k in shown])
         lens = chosen_lens(table, size) if model is None else given_lens(table, size, model)
@@ -238,10 +239,29 @@ def _not_visible(board: Board, instead: str) -> NotVisible:
 def _copies(
     found: Sequence[NumberedCorners], shown: Sequence[int], paths: Sequence[Path]
 ) -> dict[int, str]:
-    """Return the images whose corners are to the last digit those of one before, and which."""
-    first: dict[bytes, int] = {}
-    before = {k: first.setdefault(found[k].px.tobytes(), k) for k in shown}
-    return {k: f"the same photograph as {paths[i].name}" for k, i in before.items() if i != k}
+    """Return the images that show what one before shows, and which.
+
+    Errors of corners that lens and print make are the same in all images of one place of the board.
+    """
+    copies: dict[int, str] = {}
+    kept: list[int] = []
+    for k in shown:
+        for i in kept:
+            _, a, b = np.intersect1d(found[i].number, found[k].number, return_indices=True)
+            if 2 * len(a) < max(len(found[i].number), len(found[k].number)):
+                continue
+            moved = found[k].px[b] - found[i].px[a]
+            size = float(np.linalg.norm(np.ptp(found[i].px, axis=0)))
+            if not moved.any():
+                copies[k] = f"the same photograph as {paths[i].name}"
+            elif np.sqrt(np.mean(np.sum(moved**2, axis=1))) < _SAME_PLACE * size:
+                copies[k] = f"the board stands as in {paths[i].name}"
+            else:
+                continue
+            break
+        else:
+            kept.append(k)
+    return copies
 
 
 def _result(
@@ -297,11 +317,16 @@ def _result(
 
 def _left_out(images: Sequence[ImageResult]) -> list[str]:
     """Return a sentence for each reason for which images were left out."""
-    by_reason: dict[str, list[str]] = {}
-    for image in images:
-        if image.reason:
-            by_reason.setdefault(image.reason, []).append(image.name)
+    by_reason = _by_reason((image.name, image.reason) for image in images if image.reason)
     return [f"{', '.join(names)} left out: {why}." for why, names in by_reason.items()]
+
+
+def _by_reason(left_out: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    """Return the names of images by the reasons for which they were left out."""
+    found: dict[str, list[str]] = {}
+    for name, why in left_out:
+        found.setdefault(why, []).append(name)
+    return found
 
 
 def _listed_images(named: Sequence[str | Path]) -> list[Path]:

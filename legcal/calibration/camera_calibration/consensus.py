@@ -10,9 +10,10 @@ are wrong alike, as a third that was taken at another zoom, cannot move it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtri
 
 from legcal.calibration.camera_calibration.starts import again, from_scratch, part_of
@@ -221,52 +222,113 @@ def _zoom(adjusted: AdjustedBoard) -> Array:
     return np.concatenate([intrinsic_values(adjusted.camera)[:2], np.zeros(k - 2)])[:, None]
 
 
+@dataclass(frozen=True, eq=False)
+class _Fault:
+    """What may be the matter with an image."""
+
+    n_unknowns: int
+    gain: float  # part of what is wrong with the image that it explains
+    change: Array  # (2,) of both focal lengths, as parts, or of the principal point [px]
+
+
 def _reasons(adjusted: AdjustedBoard, seen: BoardImages, group: BoolArray) -> dict[int, str]:
     """Return what is the matter with images outside of a group, before the camera of the group."""
     usual = float(np.median(_costs(adjusted, seen)[group]))
-    zooms: dict[int, float] = {}
-    reasons = {}
+    likely: dict[int, dict[str, _Fault]] = {}
     for i in np.flatnonzero(~group).tolist():
-        own = seen.image == i
-        points = seen.points[own]
-        placed = points if adjusted.sheet is None else adjusted.sheet.placed(points)[0]
-        only = np.zeros(len(points), dtype=np.intp)
-        image = BoardImages(only, placed, seen.px[own], seen.sigma_px[own])
-        start = adjusted.camera, [adjusted.T_camera_board[i]], image
-        plain, zoomed = adjust_board(*start), adjust_board(*start, ("fx", "fy"))
-        bent = adjust_board(*start, (), Sheet.flat(seen.points))
-        gain = {"zoom": 0.0, "sheet": 0.0, "motion": 0.0}
-        if plain is not None:
-            wrong = max(plain.cost - 0.5 * usual * max(2 * len(points) - 6, 1), 1e-300)
-            gain["zoom"] = 0.0 if zoomed is None else (plain.cost - zoomed.cost) / wrong
-            gain["sheet"] = 0.0 if bent is None else (plain.cost - bent.cost) / wrong
-            gain["motion"] = _gain_of_motion(plain, image) / wrong
-        most = max(gain.values())
-        change = np.zeros(2)
-        if zoomed is not None:
-            change = np.diag(zoomed.camera.K)[:2] / np.diag(adjusted.camera.K)[:2] - 1.0
-        both = abs(change[0] - change[1]) < _ALIKE * abs(change.sum())
-        if both and gain["zoom"] > max(_EXPLAINED, _ALMOST * most):
-            zooms[i] = float(change.mean())
-        elif gain["sheet"] > max(_EXPLAINED, _ALMOST * most):
-            reasons[i] = "the board is bent otherwise in it than in the others"
-        elif gain["motion"] > _EXPLAINED:
+        faults = _faults(adjusted, seen, i, usual)
+        most = max(fault.gain for fault in faults.values())
+        likely[i] = {
+            name: fault
+            for name, fault in faults.items()
+            if fault.gain > max(_EXPLAINED, _ALMOST * most)
+        }
+    # The simplest; of equally simple ones that which would explain most images.
+    names = [name for faults in likely.values() for name in faults]
+    found = {
+        i: min(faults, key=lambda name: (faults[name].n_unknowns, -names.count(name)))
+        for i, faults in likely.items()
+        if faults
+    }
+    reasons = {}
+    for i in likely:
+        name = found.get(i, "")
+        alike = [likely[k][name].change for k, other in found.items() if other == name]
+        if name == "zoom":
+            longer = likely[i][name].change.mean() > 0.0
+            zooms = [change.mean() for change in alike if (change.mean() > 0.0) == longer]
             reasons[i] = (
-                "camera or board moved while its rows were read out, or stabilisation bent it"
+                f"another zoom or focus, with a focal length about "
+                f"{100.0 * abs(np.median(zooms)):.2g} % {'longer' if longer else 'shorter'} than "
+                "in the others"
             )
+        elif name == "shift":
+            x, y = np.rint(np.median(alike, axis=0)).astype(np.intp)
+            reasons[i] = (
+                f"its picture lies about ({x}, {y}) px beside that of the others, as with "
+                "stabilisation or another crop"
+            )
+        elif name:
+            reasons[i] = _IN_WORDS[name]
         else:
-            rms = [adjusted.rms_px(which) for which in (own, group[seen.image])]
+            rms = [adjusted.rms_px(which) for which in (seen.image == i, group[seen.image])]
             reasons[i] = (
                 f"its corners are {rms[0]:.2f} px off (rms) before the camera of the others, whose "
                 f"own are {rms[1]:.2f} px off"
             )
-    for i, zoom in zooms.items():
-        alike = [other for other in zooms.values() if other * zoom > 0.0]
-        reasons[i] = (
-            f"another zoom or focus, with a focal length about {100.0 * abs(np.median(alike)):.2g} "
-            f"% {'longer' if zoom > 0.0 else 'shorter'} than in the others"
-        )
     return reasons
+
+
+_IN_WORDS = {
+    "turned": "turned by half a turn after it was taken",
+    "mirrored": "mirrored",
+    "lens": "another distortion of the lens than in the others, as where a program corrects it",
+    "sheet": "the board is bent otherwise in it than in the others",
+    "motion": "camera or board moved while its rows were read out, or stabilisation bent it",
+}
+
+
+def _faults(adjusted: AdjustedBoard, seen: BoardImages, i: int, usual: float) -> dict[str, _Fault]:
+    """Return what each fault explains of an image, of the usual cost of a degree of freedom."""
+    camera, T, own = adjusted.camera, adjusted.T_camera_board[i], seen.image == i
+    points, sheet = seen.points[own], adjusted.sheet or Sheet.flat(seen.points)
+    only = np.zeros(len(points), dtype=np.intp)
+    image = BoardImages(only, sheet.placed(points)[0], seen.px[own], seen.sigma_px[own])
+    plain = adjust_board(camera, [T], image)
+    if plain is None:
+        return {"motion": _Fault(0, 0.0, np.zeros(2))}
+    wrong = max(plain.cost - 0.5 * usual * max(2 * len(points) - 6, 1), 1e-300)
+
+    def fault(n_unknowns: int, found: AdjustedBoard | None, change: Array | None = None) -> _Fault:
+        gain = 0.0 if found is None else (plain.cost - found.cost) / wrong
+        return _Fault(n_unknowns, gain, np.zeros(2) if change is None else change)
+
+    faults = {}
+    # The image turned or mirrored back shows the board so, numbered as if it were mirrored.
+    far = np.array([camera.width - 1.0, camera.height - 1.0])
+    for name, sides in (("turned", [-1.0, -1.0, 1.0]), ("mirrored", [-1.0, 1.0, 1.0])):
+        side = np.array(sides)
+        flip = np.array([side.prod(), 1.0, 1.0])
+        to_there = sheet.middle[0] * (1.0 - flip)
+        R = T.rotation.as_matrix()
+        t = side * (T.translation + R @ to_there)
+        pose = RigidTransform.from_components(t, Rotation.from_matrix(side[:, None] * R * flip))
+        px = np.where(side[:2] < 0.0, far - image.px, image.px)
+        back = replace(image, points=sheet.placed(points * flip + to_there)[0], px=px)
+        faults[name] = fault(0, adjust_board(camera, [pose], back))
+    for name, free in (("zoom", ("fx", "fy")), ("shift", ("cx", "cy")), ("lens", ("k1", "k2"))):
+        found = adjust_board(camera, [T], image, free)
+        change = np.zeros(2)
+        if found is not None and name == "zoom":
+            change = np.diag(found.camera.K)[:2] / np.diag(camera.K)[:2] - 1.0
+            if abs(change[0] - change[1]) >= _ALIKE * abs(change.sum()):
+                found = None
+        elif found is not None and name == "shift":
+            change = found.camera.K[:2, 2] - camera.K[:2, 2]
+        faults[name] = fault(2, found, change)
+    faults["sheet"] = fault(4, adjust_board(camera, [T], image, (), Sheet.flat(seen.points)))
+    faults["motion"] = _Fault(6, _gain_of_motion(plain, image) / wrong, np.zeros(2))
+    return faults
 
 
 def _gain_of_motion(adjusted: AdjustedBoard, seen: BoardImages) -> float:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -105,8 +106,16 @@ def refuse_divided(found: RobustFit, names: Sequence[str]) -> None:
         )
 
 
-def too_few_images(n: int, names: Sequence[str], left_out: Sequence[str] = ()) -> NotIdentifiable:
-    """Return the refusal of so few images with the board, saying why others were left out."""
+def too_few_images(
+    n: int,
+    names: Sequence[str],
+    left_out: Sequence[str] = (),
+    copies: Mapping[str, Sequence[str]] = MappingProxyType({}),
+) -> NotIdentifiable:
+    """Return the refusal of so few images with the board, saying why others were left out.
+
+    *copies* are the names of images that show what one of these shows, by which.
+    """
     found = f"{n} images" if n != 1 else "1 image"
     which = f" ({', '.join(names)})" if names else ""
     others, mend = "", ""
@@ -114,6 +123,10 @@ def too_few_images(n: int, names: Sequence[str], left_out: Sequence[str] = ()) -
         reasons = "; ".join(left_out)
         others = f" that agree{which}, and {len(left_out)} more that had to be left out ({reasons})"
         mend = "see that the board is flat and does not move while it is photographed, and "
+    elif copies:
+        reasons = "; ".join(f"{few(same)}: {why}" for why, same in copies.items())
+        n_more = sum(map(len, copies.values()))
+        others = f"{which}, and {n_more} more that show the same ({reasons})"
     return NotIdentifiable(
         f"The camera could not be calibrated: found {found} with the board{others or which}, "
         f"needed {MIN_IMAGES} at least and better {_FEW_IMAGES}; {mend}take more, with the "

@@ -27,7 +27,8 @@ _OF_RING = 3  # corners of an image in a ring
 _SIGNIFICANCE = 1e-3  # of a lean
 _LEAN_OF_SCATTER = 0.3  # of the scatter of corners, from which a lean is warned of
 _LEAD = 3.0  # standard errors by which a richer model must predict better
-_MORE_IMAGES = 1.25  # times as many images that agree are a lead of their own
+_MORE_IMAGES = 1.25  # times as many images that agree are a lead of their own,
+_MUCH_WORSE = 1.5  # unless those of both agree on it with so many times larger residuals
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,15 +142,19 @@ def _lead(simple: ChosenLens, rich: ChosenLens) -> str:
     """Return why a richer model is taken; "" if it is not."""
     model, other = rich.fit.adjusted.camera.model, simple.fit.adjusted.camera.model
     n, n_other = len(rich.fit.images), len(simple.fit.images)
-    if n >= _MORE_IMAGES * n_other:
-        return f"{model}: {n} images agree on it, {n_other} on {other}"
     if n_other >= _MORE_IMAGES * n:
         return ""
     one, two = _squares(simple), _squares(rich)
     both = sorted(one.keys() & two.keys())
+    difference = np.array([one[k] - two[k] for k in both])
+    if n >= _MORE_IMAGES * n_other:
+        # Nothing contradicts a model whose residuals are so large that all images fit in.
+        worse = len(both) >= 4 and np.sum([two[k] for k in both]) > _MUCH_WORSE**2 * np.sum(
+            [one[k] for k in both]
+        )
+        return "" if worse else f"{model}: {n} images agree on it, {n_other} on {other}"
     if len(both) < 4:
         return ""
-    difference = np.array([one[k] - two[k] for k in both])
     error = float(difference.std(ddof=1)) / np.sqrt(len(both))
     if difference.mean() <= _LEAD * error:
         return ""
