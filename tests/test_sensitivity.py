@@ -185,6 +185,23 @@ def test_a_focal_length_wrong_by_one_percent_is_noticed(camera: Camera, factor: 
     assert f"given {1290.0 * factor:.1f} px" in note
 
 
+def test_a_view_at_another_zoom_than_the_others_of_its_camera_is_named() -> None:
+    """Digital zoom: all distances from the principal point of its camera are longer."""
+    session = irregular_hexapod(6)
+    rng = np.random.default_rng(0)
+    measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
+    camera = measurements.views[0].camera
+    zoomed = measurements.view[outlines.row] == 1
+    centre = camera.K[:2, 2]
+    ends = np.where(zoomed[:, None, None], centre + 1.03 * (outlines.ends - centre), outlines.ends)
+    data = with_camera(measurements, replace(outlines, ends=ends), camera)
+    solution = refine(session.legs, *data, disturbed_start(session))
+    (note,) = notes_on_focal_lengths(solution)
+    assert note.startswith("The focal length of view c2 does not agree with the other views")
+    assert solution.focal_error == pytest.approx(0.03, abs=0.012)
+    assert solution.contradicted_cameras == ("c2",)
+
+
 def test_a_right_focal_length_is_left_alone() -> None:
     session = irregular_hexapod(8)
     for seed in range(4):

@@ -23,7 +23,7 @@ from legcal.estimation import (
     response,
     score_test,
 )
-from legcal.geometry import Array, IntArray
+from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import LegColumns
 from legcal.vision import Camera, shared_cameras
 
@@ -226,6 +226,11 @@ class _TestedIntrinsic:
         """Whether the measurements disagree with what was given."""
         return self.apart > _SIGNIFICANT
 
+    @property
+    def camera(self) -> str:
+        """The first view by name that has this camera."""
+        return self.view
+
 
 class FocalLength(_TestedIntrinsic):
     """A focal length: ``given`` is fx [px], ``change`` that of fx and fy, as a part of them."""
@@ -239,6 +244,27 @@ class FocalLength(_TestedIntrinsic):
             "nothing of it; calibrate the camera again at the same focus and zoom, look for "
             "pictures that were scaled or focused anew, or let the fit find it "
             f"(--free {self.view}.fx --free {self.view}.fy)."
+        )
+
+
+@dataclass(frozen=True)
+class ZoomedView(FocalLength):
+    """The focal length of a view against that of the other views with its camera file."""
+
+    of_others: str = ""  # the first view by name that has this camera
+
+    @property
+    def camera(self) -> str:
+        """The first view by name that has this camera."""
+        return self.of_others
+
+    def __str__(self) -> str:
+        return (
+            f"The focal length of view {self.view} does not agree with the other views of its "
+            f"camera: found it {1e2 * self.change:+.2f} +- {1e2 * self.sigma:.2f} % apart from "
+            f"theirs, {self.apart:.0f} standard deviations; the stated uncertainty knows nothing "
+            "of it; look for photographs of that view that were zoomed, scaled, cropped or focused "
+            "anew, and calibrate its camera as it was there."
         )
 
 
@@ -278,6 +304,39 @@ def focal_lengths(
     )
 
 
+def zoomed_views(
+    problem: FitProblem, state: State, linear: Linearization, by_camera: Mapping[str, Array]
+) -> tuple[ZoomedView, ...]:
+    """Return of each camera the view whose focal length differs most from the others'.
+
+    Digital zoom, and a focus that was set anew for one place of the camera. Views of a camera of
+    which something was chosen, or of which another view says nothing, are not compared; arguments
+    as those of :func:`sensitivities`.
+    """
+    error = _camera_error(state, _FOCAL, {})
+    known, owners = _known_views(problem, error)
+    views = [v for v in known if sum(owners[k] == owners[v] for k in known) > 1]
+    if not views:
+        return ()
+    each = [np.arange(len(owners)) == v for v in views]
+    seen, change, covariance = _scores(problem, state, linear, by_camera, error, each)
+    found = []
+    for owner in sorted({owners[v] for v in views}):
+        own = [i for i, k in enumerate(seen.tolist()) if owners[views[k]] == owner]
+        weight = np.linalg.pinv(covariance[np.ix_(own, own)], rcond=_ROUNDING, hermitian=True)
+        tests = []
+        for i, k in enumerate(own if len(own) > 1 else []):
+            X = np.column_stack([np.ones(len(own)), np.arange(len(own)) == i])
+            spread = np.linalg.inv(X.T @ weight @ X)
+            apart = float((spread @ X.T @ weight @ change[own])[1])
+            view = views[int(seen[k])]
+            given = intrinsic_of(problem.first_cameras[view], "fx")
+            name, sigma = problem.outlines.views[view], float(np.sqrt(spread[1, 1]))
+            tests.append(ZoomedView(name, given, apart, sigma, owner))
+        found += sorted(tests, key=lambda test: test.apart)[-1:]
+    return tuple(found)
+
+
 def lens_distortions(
     problem: FitProblem, state: State, linear: Linearization, by_camera: Mapping[str, Array]
 ) -> tuple[LensDistortion, ...]:
@@ -304,29 +363,47 @@ def _tested(
     They come with the view that stands for each camera of which nothing was chosen, and with the
     camera of its file.
     """
+    known, owners = _known_views(problem, error)
+    tested = sorted({owners[v] for v in known})
+    if not tested:
+        return []
+    which = [
+        np.array([v in known and owners[v] == owner for v in range(len(owners))])
+        for owner in tested
+    ]
+    seen, change, covariance = _scores(problem, state, linear, by_camera, error, which)
+    return [
+        (tested[i], problem.first_cameras[owners.index(tested[i])], float(d), float(s))
+        for i, d, s in zip(seen.tolist(), change, np.sqrt(np.diagonal(covariance)), strict=True)
+    ]
+
+
+def _known_views(problem: FitProblem, error: Array) -> tuple[list[int], tuple[str, ...]]:
+    """Return views whose intrinsics with an error are as files say, and whose camera each has."""
     wrong = np.flatnonzero(np.any(error, axis=0))
     of_files = np.append(problem.calibrated, problem.n_kept)
     is_known = np.all(np.isin(_places_of_cameras(problem)[:, wrong], of_files), axis=1)
     known = [v for v in np.unique(problem.outlines.view).tolist() if is_known[v]]
-    owners = shared_cameras(problem.outlines.views, problem.first_cameras)
-    tested = sorted({owners[v] for v in known})
-    if not tested:
-        return []
-    changes = [
-        _changes_by_cameras(problem, by_camera, error * of_owner[:, None])
-        for of_owner in (
-            np.array([v in known and owners[v] == owner for v in range(len(owners))])
-            for owner in tested
-        )
-    ]
+    return known, shared_cameras(problem.outlines.views, problem.first_cameras)
+
+
+def _scores(
+    problem: FitProblem,
+    state: State,
+    linear: Linearization,
+    by_camera: Mapping[str, Array],
+    error: Array,
+    which: Sequence[BoolArray],
+) -> tuple[IntArray, Array, Array]:
+    """Return how much of an error the residuals show in some views, for c such choices together.
+
+    Which of these the residuals say anything of, (k,), how much of the error, (k,), its covariance.
+    """
+    changes = [_changes_by_cameras(problem, by_camera, error * own[:, None]) for own in which]
     columns = {name: np.stack([change[name] for change in changes], axis=-1) for name in by_camera}
     normal = normal_equations(problem, state, linear)
     score, information = score_test(problem, linear, normal, columns)
     whole = sum(np.sum(of_kind**2, axis=(0, 1)) for of_kind in columns.values())
     seen = np.flatnonzero(np.diagonal(information) > _ROUNDING * whole)
     covariance = np.linalg.pinv(information[np.ix_(seen, seen)], rcond=_ROUNDING, hermitian=True)
-    change, sigma = -covariance @ score[seen], np.sqrt(np.diagonal(covariance))
-    return [
-        (tested[i], problem.first_cameras[owners.index(tested[i])], float(d), float(s))
-        for i, d, s in zip(seen.tolist(), change, sigma, strict=True)
-    ]
+    return seen, -covariance @ score[seen], np.asarray(covariance, dtype=np.float64)

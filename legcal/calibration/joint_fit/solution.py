@@ -36,6 +36,7 @@ from legcal.calibration.joint_fit.sensitivity import (
     focal_lengths,
     lens_distortions,
     sensitivities,
+    zoomed_views,
 )
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
 from legcal.data import Dataset, Order, Outlines, inverse, reorder_measurements
@@ -171,9 +172,10 @@ def assemble_solution(
     # One mistake in a camera looks like others: of each camera the test that sees most counts.
     tests: list[FocalLength | LensDistortion] = [
         *focal_lengths(problem, state, linear, by_camera),
+        *zoomed_views(problem, state, linear, by_camera),
         *lens_distortions(problem, state, linear, by_camera),
     ]
-    clearest = {test.view: test for test in sorted(tests, key=lambda test: test.apart)}
+    clearest = {test.camera: test for test in sorted(tests, key=lambda test: test.apart)}
     disagreeing = [test for test in clearest.values() if test.is_contradicted]
     contradicted = [test for test in disagreeing if isinstance(test, FocalLength)]
     distorted = [test for test in disagreeing if isinstance(test, LensDistortion)]
