@@ -28,6 +28,7 @@ from legcal.data import Corners, Measurements, View, found_corners, join_corners
 from legcal.errors import DatasetError, NotVisible
 from legcal.perception import (
     SeenBoard,
+    board_in_words,
     camera_poses_by_board,
     describe_image,
     detect_corners,
@@ -397,6 +398,56 @@ def test_squares_or_inner_corners_are_told_by_all_images(
 )
 def test_a_board_of_other_dimensions_is_named(stated: Board, kind: str, words: str) -> None:
     assert words in str(describe_image(stated, plain_picture(kind)[2]))
+
+
+def _tags_of(board: Board) -> SeenBoard:
+    """Return the tags of an AprilGrid as a camera sees them."""
+    corners = board.points.reshape(board.rows, 2, board.columns, 2, 3)
+    middles = corners.mean(axis=(1, 3)).reshape(-1, 3)
+    px = LENS.project(before(board, 1.0, np.array([0.4, -0.3, 0.2])).apply(middles))
+    nothing = np.zeros((0, 2), dtype=np.intp), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.intp)
+    return SeenBoard("aprilgrid", *nothing, np.arange(len(px)), px)
+
+
+@pytest.mark.parametrize(
+    ("board", "changes", "words"),
+    [
+        (replace(APRILGRID, columns=6, rows=5), {}, ""),
+        (replace(APRILGRID, columns=6, rows=5), {"columns": 5, "rows": 6}, "found"),
+        (replace(APRILGRID, columns=6, rows=5), {"columns": 7, "rows": 6}, "found"),
+        (replace(APRILGRID, columns=6, rows=5), {"rows": 4}, "found"),
+        (replace(APRILGRID, columns=6, rows=5), {"rows": 7}, "or that part of one is seen in 3 of"),
+        (CHARUCO, {}, ""),
+        (CHARUCO, {"columns": CHARUCO.rows, "rows": CHARUCO.columns}, "found"),
+        (CHARUCO, {"columns": CHARUCO.columns - 1}, "found"),
+    ],
+)
+def test_numbers_of_tags_say_how_many_columns_and_rows_there_are(
+    board: Board, changes: dict[str, int], words: str
+) -> None:
+    stated = replace(board, **changes)  # type: ignore[arg-type]
+    is_charuco = board.kind == "charuco"
+    seen = search_board(stated, plain_picture("charuco")[2]) if is_charuco else _tags_of(board)
+    shown, said = shown_board(stated, [seen] * 3)
+    if words == "found":
+        assert shown is None
+        assert said == f"{board_in_words(board)} in 3 of its 3 images"
+    else:
+        assert shown is stated
+        assert words in said
+        assert bool(words) == bool(said)
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_the_older_pattern_of_a_charuco_board_is_told_by_its_markers(legacy: bool) -> None:
+    board = Board("charuco", 5, 4, 0.04, marker=0.03, dictionary="DICT_4X4_50", legacy=legacy)
+    paper = np.asarray(charuco_board(board).generateImage((400, 320), marginSize=20))
+    seen = search_board(board, paper.astype(np.float64))
+    assert len(seen.tags) == 10
+    assert shown_board(board, [seen]) == (board, "")
+    shown, said = shown_board(replace(board, legacy=not legacy), [seen])
+    assert shown is None
+    assert ("without :legacy" if not legacy else "of the older pattern (:legacy)") in said
 
 
 def _measurements(per_view: tuple[int, ...], camera: Camera = LENS) -> Measurements:

@@ -7,7 +7,7 @@ shows the board, :func:`require_board` says what they show instead.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 
 import cv2
@@ -29,6 +29,7 @@ from legcal.vision import (
     charuco_board,
     dictionary,
     possible_scale,
+    quiet_opencv,
     reduced,
     rescaled,
 )
@@ -63,6 +64,10 @@ class SeenBoard:
         Where they are, and the standard deviation of either coordinate [px].
     black : (k,) array of int
         1 where the square at greater column and row is black, else -1.
+    tags : (m,) array of int
+        Numbers of markers or tags of the dictionary, also those that are not on the board.
+    tags_px : (m, 2) array
+        Their middles [px].
     """
 
     kind: str
@@ -70,6 +75,8 @@ class SeenBoard:
     px: Array
     sigma_px: Array
     black: IntArray
+    tags: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    tags_px: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     @property
     def extent(self) -> tuple[int, int]:
@@ -142,12 +149,13 @@ def search_board(
 ) -> SeenBoard:
     """Return what an image shows of a board; of a chessboard of any extent."""
     grey = np.ascontiguousarray(image, dtype=np.float32)
+    tags = np.zeros(0, dtype=np.intp), np.zeros((0, 2))
     if board.kind == "chessboard":
         ij, found = _chessboard(grey)
     else:
-        ij, found = _tags_and_corners(board, grey)
+        (ij, found), tags = _tags_and_corners(board, grey)
     black = np.where(found.contrast > 0.0, 1, -1)
-    return SeenBoard(board.kind, ij, found.px, found.sigma_px, black)
+    return SeenBoard(board.kind, ij, found.px, found.sigma_px, black, *tags)
 
 
 def _chessboard(grey: Grey) -> tuple[IntArray, Saddles]:
@@ -242,12 +250,20 @@ _ENLARGED = 2.0  # modules may be only a few pixels wide
 _FIRST_TAG = 0xD5D628584  # of the family 36h11, its modules row by row from the top left
 
 
-def _tags_and_corners(board: Board, grey: Grey) -> tuple[IntArray, Saddles]:
-    """Return columns and rows of the corners beside markers or tags, and where they are."""
+def _tags_and_corners(
+    board: Board, grey: Grey
+) -> tuple[tuple[IntArray, Saddles], tuple[IntArray, Array]]:
+    """Return columns and rows of the corners beside markers or tags, and where they are.
+
+    With them the numbers of the markers or tags, and their middles [px].
+    """
     board_print = _print(board)
     best: tuple[IntArray, Saddles] | None = None
+    most: tuple[IntArray, Array] = np.zeros(0, dtype=np.intp), np.zeros((0, 2))
     for scale, is_blurred, windows in _marker_searches(grey):
         tags, places = _search_tags(board, grey, scale, is_blurred=is_blurred, windows=windows)
+        if len(tags) > len(most[0]):
+            most = tags, places.mean(axis=1)
         xy, px = _anchors(board, tags, places)
         if not len(xy):
             continue
@@ -258,11 +274,9 @@ def _tags_and_corners(board: Board, grey: Grey) -> tuple[IntArray, Saddles]:
             best = found
         if len(best[0]) >= MIN_CORNERS:
             break
-    return (
-        best
-        if best is not None
-        else measured(grey, board_print, np.zeros((0, 2), np.intp), np.zeros((0, 2)))
-    )
+    if best is None:
+        best = measured(grey, board_print, np.zeros((0, 2), np.intp), np.zeros((0, 2)))
+    return best, most
 
 
 def _marker_searches(grey: Grey) -> list[tuple[float, bool, tuple[int, int]]]:
@@ -455,8 +469,10 @@ def shown_board(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | None, 
     Of a chessboard squares are stated, and most people count its inner corners: it is the reading
     that more images show. None where they show a larger one: which one goes after "found".
     """
+    if board.kind != "chessboard":
+        return _shown_by_tags(board, seen)
     extents = [one.extent for one in seen if one.extent[1] >= _MIN_SIDE]
-    if board.kind != "chessboard" or not extents:
+    if not extents:
         return board, ""
     counted = replace(board, columns=board.columns + 1, rows=board.rows + 1)
     shown = max(board, counted, key=lambda one: extents.count(_extent(one)))
@@ -478,13 +494,91 @@ def shown_board(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | None, 
         fits = sum(usual) % 2 == 1
         fits &= all(one[0] <= usual[0] and one[1] <= usual[1] for one in extents)
         x, y = _turned_as(board, usual)
-        return replace(board, columns=x + 1, rows=y + 1) if fits else shown, (
-            f"{_squares(board, usual).capitalize()} or that part of one is seen in "
-            f"{extents.count(usual)} {in_all}, and the whole of {board_in_words(board)} in none"
-            f"{': the board was taken for the smaller one' if fits else ''}; correct --board, or "
-            "uncover the board."
-        )
+        taken = ": the board was taken for the smaller one" if fits else ""
+        n_usual = f"{extents.count(usual)} {in_all}"
+        said = _smaller(board, _squares(board, usual), n_usual, taken)
+        return replace(board, columns=x + 1, rows=y + 1) if fits else shown, said
     return shown, ""
+
+
+def _smaller(board: Board, found: str, n_images: str, taken: str = "") -> str:
+    """Return what is said where a smaller board is seen than was stated."""
+    return (
+        f"{found[0].upper()}{found[1:]} or that part of one is seen in {n_images}, and the whole "
+        f"of {board_in_words(board)} in none{taken}; correct --board, or uncover the board."
+    )
+
+
+_MIN_TAGS = 6  # of an image that says how tags are laid out
+_MISLAID = 0.2  # of the step from a tag to the nearest, by which they are off (rms): wrong,
+_BETTER = 0.5  # where otherwise laid out it is less than this part
+
+
+def _shown_by_tags(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | None, str]:
+    """Return the board with tags or markers that images show, by how their numbers lie.
+
+    Arguments and result are those of :func:`shown_board`.
+    """
+    telling = [one for one in seen if len(one.tags) >= _MIN_TAGS]
+    if not telling:
+        return board, ""
+    # Markers of a ChArUco board are on white squares; in the older pattern the first may be one.
+    usual = 0 if board.kind == "charuco" and board.legacy and board.rows % 2 == 0 else 1
+    stated = np.array([_mislaid(board, board.columns, usual, one) for one in telling])
+    number, times = np.unique(np.concatenate([one.tags for one in telling]), return_counts=True)
+    last = int(number[times >= min(2, len(telling))].max(initial=0))
+    n_agree, columns, parity = len(telling), board.columns, usual
+    if 2 * np.count_nonzero(stated > _MISLAID) > len(telling):
+        patterns = (1, 0) if board.kind == "charuco" else (1,)
+        off = {
+            (n, k): np.array([_mislaid(board, n, k, one) for one in telling])
+            for n in range(2, last + 2)
+            for k in patterns
+        }
+        columns, parity = min(off, key=lambda way: float(np.minimum(off[way], 1.0).sum()))
+        n_agree = int(np.sum(off[columns, parity] < _BETTER * np.minimum(stated, 1.0)))
+        if 2 * n_agree <= len(telling):
+            return board, ""
+    rows = int(_middles(board, columns, parity, np.array([last]))[0, 1]) + 1
+    what = board_in_words(replace(board, columns=columns, rows=rows))
+    if parity != usual:
+        what += " of the older pattern (:legacy)" if parity == 0 else " without :legacy"
+    in_all = f"{n_agree} of its {len(seen)} image{'s' * (len(seen) != 1)}"
+    if (columns, parity) != (board.columns, usual) or rows > board.rows:
+        return None, f"{what} in {in_all}"
+    return board, _smaller(board, what, in_all) if rows < board.rows else ""
+
+
+def _n_tags(board: Board) -> int:
+    """Return how many tags or markers a board has."""
+    count = board.columns * board.rows
+    return count if board.kind == "aprilgrid" else count // 2
+
+
+def _middles(board: Board, columns: int, parity: int, tags: IntArray) -> Array:
+    """Return columns and rows (n, 2) of tags, or of the squares of markers, in so many columns."""
+    if board.kind == "aprilgrid":
+        return np.column_stack([tags % columns, tags // columns]).astype(np.float64)
+    n_rows = 2 * (int(tags.max()) + 1) // columns + 3
+    y, x = np.indices((n_rows, columns))
+    marked = (x + y) % 2 == parity
+    return np.column_stack([x[marked], y[marked]])[tags].astype(np.float64)
+
+
+def _mislaid(board: Board, columns: int, parity: int, seen: SeenBoard) -> float:
+    """Return how far tags are off if they lie in so many columns (rms), by the step to the next."""
+    at = _middles(board, columns, parity, seen.tags)
+    with quiet_opencv():
+        H, _ = cv2.findHomography(at, seen.tags_px)
+    if H is None:
+        return np.inf
+    back = np.column_stack([at, np.ones(len(at))]) @ np.asarray(H, dtype=np.float64).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = np.linalg.norm(back[:, :2] / back[:, 2:] - seen.tags_px, axis=1)
+    apart = np.linalg.norm(seen.tags_px[:, None] - seen.tags_px, axis=2)
+    apart[np.diag_indices(len(apart))] = np.inf
+    found = float(np.sqrt(np.mean(off**2)) / np.median(apart.min(axis=1)))
+    return found if np.isfinite(found) else np.inf
 
 
 def _extent(board: Board) -> tuple[int, int]:
@@ -532,8 +626,7 @@ def _things(board: Board) -> str:
 def _other_markers(board: Board, grey: Grey) -> str | None:
     """Return which markers or tags are seen."""
     thing = _things(board)
-    count = board.columns * board.rows
-    own = count if board.kind == "aprilgrid" else count // 2
+    own = _n_tags(board)
     scale = possible_scale(grey, 1.0, _MAX_PIXELS)
     numbers, _ = _search_tags(board, grey, scale)
     beyond = np.unique(numbers[numbers >= own])
@@ -546,7 +639,7 @@ def _other_markers(board: Board, grey: Grey) -> str | None:
             (replace(board, columns=board.rows, rows=board.columns), "squares_x and squares_y"),
             (replace(board, legacy=not board.legacy), "legacy_pattern"),
         ):
-            if len(_tags_and_corners(turned, grey)[0]) > 3:
+            if len(_tags_and_corners(turned, grey)[0][0]) > 3:
                 return f"its {thing}, as of a board with another {what}"
     if len(numbers):
         return f"only {len(numbers)} of its {own} {thing}"
