@@ -37,6 +37,7 @@ from legcal.perception import (
     require_board,
     search_board,
     shown_board,
+    tags_are_mirrored,
 )
 from legcal.perception.corner_lattice import Lattice, find_lattice
 from legcal.progress import no_progress
@@ -398,6 +399,14 @@ def test_squares_or_inner_corners_are_told_by_all_images(
 )
 def test_a_board_of_other_dimensions_is_named(stated: Board, kind: str, words: str) -> None:
     assert words in str(describe_image(stated, plain_picture(kind)[2]))
+
+
+@pytest.mark.parametrize("kind", ["aprilgrid", "charuco"])
+def test_tags_of_a_mirrored_picture_are_named(kind: str) -> None:
+    board, _, image = plain_picture(kind)
+    assert not tags_are_mirrored(board, image)
+    assert tags_are_mirrored(board, image[:, ::-1])
+    assert "mirrored" in str(describe_image(board, image[:, ::-1]))
 
 
 def _tags_of(board: Board) -> SeenBoard:

@@ -176,6 +176,11 @@ def shifted(seen: BoardImages) -> BoardImages:
     return replace(seen, px=seen.px + np.array([12.0, 5.0]))
 
 
+def stretched(seen: BoardImages) -> BoardImages:
+    """Return corners of photographs that were made higher."""
+    return replace(seen, px=seen.px * [1.0, 1.04] - [0.0, 10.0])
+
+
 def rolled(seen: BoardImages) -> BoardImages:
     """Return corners of a camera that turned while it read out its rows."""
     moved = 4.0 * (seen.px[:, 1:] / SIZE.height - 0.5) * [1.0, -0.5]
@@ -210,8 +215,9 @@ def corrected(seen: BoardImages) -> BoardImages:
             (mirrored(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "mirrored"),
             (corrected(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "another distortion of the lens"),
             (shifted(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "beside that of the others"),
+            (stretched(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "along y than those"),
         ],
-        lambda others, why: why.startswith(("moved", "turned", "another", "beside")),
+        lambda others, why: why.startswith(("moved", "turned", "another", "beside", "along")),
         "system",
     ),
 )
@@ -308,6 +314,7 @@ def test_a_board_that_is_not_as_stated_is_named_and_what_to_add() -> None:
     bent = fitted(seen_corners(TRUTH, 12, 2, sheet=np.array([9e-3, 0.0, 0.0, 0.0])))
     assert "bent by 9 mm" in " ".join(warnings(bent))
     seen = seen_corners(TRUTH, 12, 4)
+    assert "along y" in " ".join(warnings(fitted(stretched(seen))))
     left = (seen.px[:, 0] < 300.0) & (seen.px[:, 1] < 300.0)
     keep = left & (np.bincount(seen.image[left], minlength=12)[seen.image] >= 12)
     _, image = np.unique(seen.image[keep], return_inverse=True)

@@ -18,6 +18,7 @@ from .board_corners import find_corners as find_corners
 from .board_corners import require_board as require_board
 from .board_corners import search_board as search_board
 from .board_corners import shown_board as shown_board
+from .board_corners import tags_are_mirrored as tags_are_mirrored
 from .board_poses import board_poses_in_images as board_poses_in_images
 from .board_poses import camera_poses_by_board as camera_poses_by_board
 from .board_poses import plane_poses as plane_poses

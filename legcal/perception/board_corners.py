@@ -623,12 +623,24 @@ def _things(board: Board) -> str:
     return "tags" if board.kind == "aprilgrid" else "markers"
 
 
+def tags_are_mirrored(
+    board: Board,
+    image: NDArray[np.generic],  # (height, width) grey levels, 0 to 255
+) -> bool:
+    """Whether an image shows tags or markers of a board with left and right exchanged."""
+    grey = np.ascontiguousarray(np.asarray(image, dtype=np.float32)[:, ::-1])
+    scale = possible_scale(grey, 1.0, _MARKERS_SEARCHED)
+    return len(_search_tags(board, grey, scale)[0]) >= _MIN_MARKERS
+
+
 def _other_markers(board: Board, grey: Grey) -> str | None:
     """Return which markers or tags are seen."""
     thing = _things(board)
     own = _n_tags(board)
     scale = possible_scale(grey, 1.0, _MAX_PIXELS)
     numbers, _ = _search_tags(board, grey, scale)
+    if len(numbers) < _MIN_MARKERS and tags_are_mirrored(board, grey):
+        return f"its {thing} mirrored (left and right exchanged)"
     beyond = np.unique(numbers[numbers >= own])
     if len(beyond):
         return (

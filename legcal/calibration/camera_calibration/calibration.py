@@ -42,6 +42,7 @@ from legcal.perception import (
     describe_image,
     search_board,
     shown_board,
+    tags_are_mirrored,
 )
 from legcal.progress import Progress, Report, shown_progress
 from legcal.vision import (
@@ -150,6 +151,12 @@ def calibrate_camera(
         if len(shown) < MIN_IMAGES:
             same = _by_reason((paths[k].name, why) for k, why in copies.items())
             raise too_few_images(len(shown), [paths[k].name for k in shown], copies=same)
+        missing = {
+            k: "mirrored, left and right exchanged"
+            for k in range(len(paths) if flat_board.kind != "chessboard" else 0)
+            if len(found[k].number) < MIN_CORNERS
+            and tags_are_mirrored(flat_board, _read(paths[k], size))
+        }
         report("Adjusting the camera", 0, 1)
         table = _table(flat_board, [found[k] for k in shown])
         lens = chosen_lens(table, size) if model is None else given_lens(table, size, model)
@@ -163,7 +170,7 @@ def calibrate_camera(
     refuse_divided(fitted, [paths[k].name for k in shown])
     left_out = [f"{paths[shown[k]].name}: {why}" for k, why in fitted.left_out.items()]
     refuse_undetermined(fitted, [paths[shown[k]].name for k in fitted.images], left_out)
-    result = _result(flat_board, paths, found, shown, copies, lens, note)
+    result = _result(flat_board, paths, found, shown, copies | missing, lens, note)
     used = [k for k, image in enumerate(result.images) if image.used]
     changes = _changes([paths[k] for k in used], [facts[k] for k in used], size)
     result = replace(
@@ -269,7 +276,7 @@ def _result(
     paths: Sequence[Path],
     found: Sequence[NumberedCorners],
     shown: Sequence[int],
-    copies: Mapping[int, str],
+    unused: Mapping[int, str],
     lens: ChosenLens,
     note: str,
 ) -> CameraCalibration:
@@ -277,7 +284,7 @@ def _result(
     fitted = lens.fit
     adjusted, seen = fitted.adjusted, fitted.seen
     used = {shown[k]: i for i, k in enumerate(fitted.images)}
-    left_out = {**copies, **{shown[k]: why for k, why in fitted.left_out.items()}}
+    left_out = {**unused, **{shown[k]: why for k, why in fitted.left_out.items()}}
     square = np.sum(adjusted.residual**2, axis=1)
     tilt = tilts(fitted)
     images = []

@@ -228,7 +228,7 @@ class _Fault:
 
     n_unknowns: int
     gain: float  # part of what is wrong with the image that it explains
-    change: Array  # (2,) of both focal lengths, as parts, or of the principal point [px]
+    change: Array  # (2,) of both focal lengths, as parts, or (shift) of the principal point [px]
 
 
 def _reasons(adjusted: AdjustedBoard, seen: BoardImages, group: BoolArray) -> dict[int, str]:
@@ -262,6 +262,12 @@ def _reasons(adjusted: AdjustedBoard, seen: BoardImages, group: BoolArray) -> di
                 f"{100.0 * abs(np.median(zooms)):.2g} % {'longer' if longer else 'shorter'} than "
                 "in the others"
             )
+        elif name == "stretch":
+            wider, higher = np.median(alike, axis=0)
+            reasons[i] = (
+                f"its picture is stretched, {100.0 * abs(wider - higher):.2g} % more "
+                f"{'along x' if wider > higher else 'along y'} than those of the others"
+            )
         elif name == "shift":
             x, y = np.rint(np.median(alike, axis=0)).astype(np.intp)
             reasons[i] = (
@@ -279,9 +285,16 @@ def _reasons(adjusted: AdjustedBoard, seen: BoardImages, group: BoolArray) -> di
     return reasons
 
 
+_FREE = {
+    "zoom": ("fx", "fy"),
+    "shift": ("cx", "cy"),
+    "lens": ("k1", "k2"),
+    "crop": ("fx", "fy", "cx", "cy"),
+}
 _IN_WORDS = {
     "turned": "turned by half a turn after it was taken",
     "mirrored": "mirrored",
+    "crop": "a part of the picture that was cut out and scaled",
     "lens": "another distortion of the lens than in the others, as where a program corrects it",
     "sheet": "the board is bent otherwise in it than in the others",
     "motion": "camera or board moved while its rows were read out, or stabilisation bent it",
@@ -316,16 +329,17 @@ def _faults(adjusted: AdjustedBoard, seen: BoardImages, i: int, usual: float) ->
         px = np.where(side[:2] < 0.0, far - image.px, image.px)
         back = replace(image, points=sheet.placed(points * flip + to_there)[0], px=px)
         faults[name] = fault(0, adjust_board(camera, [pose], back))
-    for name, free in (("zoom", ("fx", "fy")), ("shift", ("cx", "cy")), ("lens", ("k1", "k2"))):
+    for name, free in _FREE.items():
         found = adjust_board(camera, [T], image, free)
         change = np.zeros(2)
-        if found is not None and name == "zoom":
-            change = np.diag(found.camera.K)[:2] / np.diag(camera.K)[:2] - 1.0
-            if abs(change[0] - change[1]) >= _ALIKE * abs(change.sum()):
-                found = None
-        elif found is not None and name == "shift":
+        if found is not None and name == "shift":
             change = found.camera.K[:2, 2] - camera.K[:2, 2]
-        faults[name] = fault(2, found, change)
+        elif found is not None:
+            change = np.diag(found.camera.K)[:2] / np.diag(camera.K)[:2] - 1.0
+        both = abs(change[0] - change[1]) < _ALIKE * abs(change.sum())
+        if name == "crop" and not both:
+            continue
+        faults["stretch" if name == "zoom" and not both else name] = fault(len(free), found, change)
     faults["sheet"] = fault(4, adjust_board(camera, [T], image, (), Sheet.flat(seen.points)))
     faults["motion"] = _Fault(6, _gain_of_motion(plain, image) / wrong, np.zeros(2))
     return faults

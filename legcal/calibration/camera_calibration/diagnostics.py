@@ -26,6 +26,7 @@ _MANY_LEFT_OUT = 0.05  # of all corners
 _OVERFIT = 0.01  # probability from which on the gain of more coefficients may be chance
 _FOLDED_PX = 0.1
 _MAX_RATIO = 25.0  # of squared errors to what corners scatter
+_MAX_PIXEL_RATIO = 0.01  # pixels of sensors are square
 _MAX_PRINT_RATIO, _MAX_BEND = 0.015, 0.02  # three and two standard deviations of the priors
 _SIGNIFICANT = 4.0  # standard deviations
 _OPEN_PRIOR = 0.5  # part of the prior of the print ratio that is left where images say little
@@ -160,6 +161,15 @@ def warnings(found: RobustFit) -> list[str]:
             f"extrapolated; bring the board to {_unseen_parts(found)} of the image."
         )
     sentences += _sheet(found)
+    ratio = float(camera.K[1, 1] / camera.K[0, 0] - 1.0)
+    error = float(np.hypot(sigma[0], sigma[1])) / camera.K[0, 0]
+    if abs(ratio) > _MAX_PIXEL_RATIO and abs(ratio) > _SIGNIFICANT * error:
+        sentences.append(
+            f"The focal lengths along x and y differ by {100.0 * abs(ratio):.2g} %, and pixels of "
+            f"sensors are square: the images look stretched along {'y' if ratio > 0.0 else 'x'}, "
+            "or the proportions of the board are wrong; take the files as the camera writes them, "
+            "and measure the board."
+        )
     if found.ratio > _MAX_RATIO:
         sentences.append(
             f"Images disagree on the camera {np.sqrt(found.ratio):.0f} times as much as corners "
