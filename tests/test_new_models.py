@@ -111,7 +111,7 @@ def test_published_machines_have_their_published_values() -> None:
 
 TYPES = (
     *("SPU", "UPS", "SPS", "UPU", "RPS", "SPR", "RPU", "UPR", "SU", "US", "SS", "RS", "SR", "UU"),
-    "UP",
+    *("UP", "RP", "SP"),
 )
 
 

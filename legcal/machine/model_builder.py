@@ -163,6 +163,12 @@ class _Branch:
         """Add the joint that a leg hangs from, and return the frame of the leg there."""
         y = _unit(cross(u, axis))
         along = np.column_stack([cross(y, u), y, u])
+        if joint is JointType.FIXED:
+            root = f"{self._leg.name}_rod"
+            self._tree.link(root)
+            _joint(self._tree, f"{root}_frame", "fixed", (self._link, root), at, along)
+            self._link = root
+            return along
         first = np.column_stack([axis, y, cross(axis, y)]) if joint.inner_is_across else along
         for number, name in enumerate("xyz"[: joint.n_freedoms], start=1):
             place, frame = (at, first) if number == 1 else (None, None)

@@ -1,0 +1,47 @@
+"""Types, mobility, constraints and motors of every layout, against the screws of the joints."""
+
+from itertools import product
+from pathlib import Path
+
+import pytest
+from layouts import Layout, LegLayout, MachineSpec, write_machine
+from leg_screws import freedoms_of
+from machines import exechon, four_upu, of_types, two_upr_two_sps
+
+from legcal.machine import geometries, load_mechanism
+
+A, P = "actuated", "passive"
+KINDS: dict[str, MachineSpec] = {
+    "Exechon": exechon(),
+    "2-UPR + 2-SPS": two_upr_two_sps(),
+    "4-UPU": four_upu(),
+    "TriVariant": of_types(["SS", "SS", "U"]),
+    "Tricept": of_types(["US", "US", "US", "U"], [A, A, A, P]),
+    "SP": of_types(["SS", "US", "SS", "S", "SS"], [A, A, A, A, P]),
+    "RP": of_types(["SS", "R", "SS"], [A, A, P]),
+    "5-SPS": of_types(["SS"] * 5),
+    "3-SPS + passive UPS": of_types(["SS"] * 3 + ["US"], [A, A, A, P]),
+}
+LAYOUTS = {
+    "hung from the base": Layout(),
+    "cut behind the slider": Layout((LegLayout(cut="mid"),)),
+    "hung from the platform": Layout((LegLayout(hung="platform", slid=0.05, seed=3),)),
+}
+
+
+@pytest.mark.parametrize(("kind", "layout"), [*product(KINDS, LAYOUTS)])
+def test_freedoms_are_those_of_the_screws_of_the_joints(
+    kind: str, layout: str, tmp_path: Path
+) -> None:
+    drawn = KINDS[kind]
+    expected = freedoms_of(drawn)
+    machine = load_mechanism(write_machine(tmp_path, drawn, LAYOUTS[layout]))
+    assert [leg.type for leg in machine.legs] == [f"{x.type[0]}P{x.type[1:]}" for x in drawn.legs]
+    assert machine.mobility == expected.mobility
+    assert sum(leg.n_constraints for leg in geometries(machine)) == expected.n_constraints
+    assert len(machine.motors) == [leg.kind for leg in drawn.legs].count(A)
+    assert machine.is_determined == (expected.left_by_motors == 0)
+    said = [note for note in machine.diagnostics if "overconstrained" in note]
+    of = f"{expected.n_redundant} of the {expected.n_constraints}"
+    assert len(said) == (expected.n_redundant > 0)
+    assert all(of in note for note in said)
