@@ -2,6 +2,7 @@
 
     OMP_NUM_THREADS=1 python benchmarks/machine_kinds.py [KIND ...] [--runs 200] [--seed 0]
                          [--datasets 0] [--level axes|outlines|photographs] [--keep FOLDER]
+                         [--record FILE]
 
 KIND: a table of ``machine_kinds.yaml`` (all of them without), which is a table of joints without
 version, name and unit (mm). Two things are asked:
@@ -13,16 +14,18 @@ version, name and unit (mm). Two things are asked:
   is off by up to 2 mm, calibrated by ``legcal calibrate``: how many are, the platform error of
   eq (20) at their readings before and after, and how the latter compares with the predicted sigma
   (mean over seeds). Where motors do not determine the pose, cameras have hints, and errors are
-  those of the parameters in metres (root mean square).
+  those of the parameters in metres (root mean square), with their normalised squared error.
 """
 
 import argparse
+import json
 import math
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from bound import ERRORS
@@ -40,18 +43,27 @@ from outline_sessions import (
 from outline_study import failures_of
 
 from legcal import LegcalError, calibrate, evaluate, load_mechanism
-from legcal.calibration import Evaluation
+from legcal.calibration import Evaluation, Solution
 from legcal.simulation import Level, SimulationSettings, failure_of, simulate
 
 N_VIEWS, N_POSES = 3, 15
 LENGTH_SIGMA = 0.05  # [mm] of the distance of two joints that motors which turn need
 
 
-def sessions(kind: str, runs: int, seed: int) -> str:
+def sessions(kind: str, runs: int, seed: int, record: Path | None) -> str:
     """Return a line on the joint fit in many sessions of outlines."""
-    noise, records = Noise(), []
+    noise, records = Noise(), list[dict[str, Any]]()
     design = design_of(kind, N_VIEWS, N_POSES, noise.sigma_px)
-    for child in np.random.SeedSequence(seed).spawn(runs):
+    known = {}
+    if record is not None and record.exists():
+        read = [json.loads(line) for line in record.read_text().splitlines()]
+        known = {
+            row["run"]: row["found"] for row in read if (row["kind"], row["seed"]) == (kind, seed)
+        }
+    for run, child in enumerate(np.random.SeedSequence(seed).spawn(runs)):
+        if run in known:
+            records.append(known[run])
+            continue
         session = draw_session(design, noise, ERRORS, np.random.default_rng(child))
         try:
             solution = one_fit(session, noise.radius_sigma)
@@ -59,6 +71,10 @@ def sessions(kind: str, runs: int, seed: int) -> str:
         except LegcalError as error:
             records.append({"failure": failure_of(error)})
             print(f"{kind}: {error}", file=sys.stderr)
+        if record is not None:
+            with record.open("a") as file:
+                row = {"kind": kind, "seed": seed, "run": run, "found": records[-1]}
+                file.write(json.dumps(row) + "\n")
     fits = [record for record in records if "failure" not in record]
     line = f"{kind:20}{len(fits):6} of {runs}"
     if fits:
@@ -76,6 +92,7 @@ def datasets(kind: str, level: Level, seeds: Sequence[int], scratch: Path) -> st
     """Print a line a dataset, and return one on all that were calibrated."""
     machine = load_mechanism(kind) if kind in CARRIED else made(kind, scratch / "nominal")
     model, found, hints = machine.yaml_path, [], not machine.is_determined
+    squared = list[float]()
     for seed in seeds:
         folder = scratch / f"{kind}-{level}-{seed}"
         result = scratch / f"{folder.name}-result"
@@ -103,14 +120,29 @@ def datasets(kind: str, level: Level, seeds: Sequence[int], scratch: Path) -> st
                 if name.split(".")[1] in ("base", "platform", "offset", "length")
             ]
             predicted = math.sqrt(float(np.mean(lengths)))
+            squared.append(normalised_error(both[1], solution))
         else:
             before, after = (one.displacement.mean() for one in both)
             predicted = platform.sigma.mean_displacement
         found.append((before, after, predicted))
         seconds = time.perf_counter() - begin
-        print(f"{kind:20}{seed:4}{numbers(found[-1])}{seconds:6.0f} s", flush=True)
+        nse = "" if platform is not None else f", nse {squared[-1]:5.2f}"
+        print(f"{kind:20}{seed:4}{numbers(found[-1])}{nse}{seconds:6.0f} s", flush=True)
     line = f"{kind:20}{len(found):4} of {len(seeds)} from {level}"
-    return line + (numbers(np.mean(found, axis=0)) if found else "")
+    line += numbers(np.mean(found, axis=0)) if found else ""
+    return line + (f", nse {np.mean(squared):5.2f}" if squared else "")
+
+
+def normalised_error(found: Evaluation, solution: Solution) -> float:
+    """Return the normalised squared error of all parameters that the fit estimates."""
+    names = solution.parametrization.names
+    at = [found.names.index(name) for name in names]
+    error, covariance = (found.values - found.references)[at], solution.value_covariance
+    value, vector = np.linalg.eigh(covariance / np.sqrt(np.outer(*[np.diagonal(covariance)] * 2)))
+    unit = np.sqrt(np.diagonal(covariance))
+    kept = value > 1e-9
+    along = vector[:, kept].T @ (error / unit)
+    return float(np.mean(along**2 / value[kept]))
 
 
 def measured_length(truth: Path) -> list[str]:
@@ -147,6 +179,7 @@ def main() -> None:
     parser.add_argument("--datasets", type=int, default=0, help="simulated and calibrated; none")
     parser.add_argument("--level", type=Level, default=Level.OUTLINES, choices=list(Level))
     parser.add_argument("--keep", type=Path, help="folder that keeps datasets for the next run")
+    parser.add_argument("--record", type=Path, help="JSON lines of sessions, to go on from later")
     options = parser.parse_args()
     known = (*kinds(), *ROUND_ARMS, *CARRIED)
     if unknown := set(options.kinds) - set(known):
@@ -155,7 +188,7 @@ def main() -> None:
     if options.runs:
         print(f"{'':20}{'converged':>12}{'determined':>12}{'error/bound':>14}{'nse':>8}")
         for kind in chosen:
-            print(sessions(kind, options.runs, options.seed), flush=True)
+            print(sessions(kind, options.runs, options.seed, options.record), flush=True)
     if options.datasets:
         seeds = range(options.seed, options.seed + options.datasets)
         with TemporaryDirectory() as temporary:
