@@ -12,7 +12,9 @@ from fit_sessions import machine_session, with_boards
 from layouts import Layout, LegLayout, MachineSpec, write_machine
 from leg_pictures import clutter, edges, segments
 from machines import ROOT, SHIPPED_URDF, SHIPPED_YAML, of_types, read_table
+from outline_sessions import made
 from scipy.spatial.transform import RigidTransform, Rotation
+from simulated import settings, small_camera
 
 import legcal
 from legcal.calibration import build_fit, refine
@@ -21,12 +23,13 @@ from legcal.calibration.joint_fit.diagnostics import naming_missing_lengths
 from legcal.data import Measurements, View
 from legcal.errors import LegcalError, NotIdentifiable, UsageError
 from legcal.geometry import Array, look_at
-from legcal.machine import Machine, create_model, load_mechanism
+from legcal.machine import Machine, create_model, geometries, load_mechanism, vector_of
 from legcal.perception import require_standing_joints
 from legcal.perception.candidate_pairs import find_candidate_pairs
 from legcal.perception.free_poses import find_free_poses
 from legcal.perception.pair_matching import leg_segments
 from legcal.perception.placement import Search
+from legcal.simulation import Level, simulate
 from legcal.vision import Camera, outlines_of_axis
 from legcal.workers import in_turn
 
@@ -224,7 +227,7 @@ def test_poses_are_found_near_rough_cameras(n_motors: int, tmp_path: Path) -> No
         X = np.concatenate([A[row], B[row]])
         camera = found.T_base_camera[view[row]]
         assert camera is not None
-        B_found = found.T_base_platform[int(pose[row])].apply(machine.B_platform)
+        B_found = found.T_base_platform[int(pose[row])][0].apply(machine.B_platform)
         seen = CAMERA.project(camera.inv().apply(np.concatenate([A[row], B_found])))
         truth = CAMERA.project(true[view[row]].inv().apply(X))
         B_home = machine.home.apply(machine.B_platform)
@@ -266,6 +269,22 @@ def test_poses_between_which_few_lines_leave_a_choice_are_found_by_the_fit(
     assert max(distances(found.T_Rb_Re, session.truth.T_Rb_Re)) < 1e-6
 
 
+def test_images_that_leave_a_pose_open_are_left_out(tmp_path: Path) -> None:
+    """One leg and three readings let a platform slide, which no fit comes to the end of."""
+    path = write_machine(tmp_path, drawn("3-SPS + passive UPS"), Layout())
+    session = machine_session(str(path), n_views=2, n_poses=10)
+    pose = session.measurements.pose[session.outlines.row]
+    few = session.outlines.choose((pose > 3) | (session.outlines.leg == 0))
+    found = refine(session.legs, session.measurements, few, session.start)
+    for leg, true in zip(found.legs, session.truth.legs, strict=True):
+        assert np.abs(np.concatenate([leg.A - true.A, leg.B - true.B])).max() < 1e-7
+    open_ones = session.measurements.pose[few.row] < 4
+    np.testing.assert_array_equal(found.outlines.used, ~open_ones)
+    assert {why for why, out in zip(found.outlines.reason, open_ones, strict=True) if out} == {
+        "shows too few legs to place the platform"
+    }
+
+
 def five_carriages(folder: Path) -> Machine:
     """A Hexaglide that has lost a carriage, so that its motors leave a freedom."""
     table = yaml.safe_load((ROOT / "models/tables/hexaglide.yaml").read_text()) | {"type": "5-PSS"}
@@ -286,6 +305,26 @@ def test_poses_that_carriages_leave_open_are_looked_for_with_their_readings(
     found = free_poses.with_better_poses(problem, begin).platform_pose
     assert max(distances(found.motions, session.truth.T_Rb_Re)) < 1e-4
     np.testing.assert_allclose(found.q, session.measurements.q, atol=1e-4)
+
+
+@pytest.mark.system
+def test_photographs_of_a_platform_that_motors_leave_a_freedom_are_calibrated(
+    tmp_path: Path,
+) -> None:
+    machine = made("5-sps", tmp_path / "model")
+    camera = small_camera(tmp_path, 640, 480)
+    photographs = settings(level=Level.PHOTOGRAPHS, seed=4, poses=6, hints=True, camera=camera)
+    folder = tmp_path / "set"
+    simulate(machine.yaml_path, folder, photographs)
+    found = legcal.calibrate(folder)
+    assert found.platform is None
+    assert "no platform error can be predicted" in found.verdict.sentence
+    true = load_mechanism(folder / "truth/models/5-sps.yaml")
+    solution, legs = found.solution, geometries(true)
+    both = (vector_of(solution.parametrization, g, legs) for g in (solution.legs, legs))
+    error = np.subtract(*both)
+    squared = error @ np.linalg.solve(solution.value_covariance, error) / len(error)
+    assert 0.3 < squared < 2.2  # 28 numbers
 
 
 # --- refusals -----------------------------------------------------------------------------------

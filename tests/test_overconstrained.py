@@ -12,9 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bound import ERRORS
 from fit_sessions import MachineSession, machine_session
 from layouts import Layout, LegLayout, MachineSpec, write_machine
 from machines import exechon, four_upu, two_upr_two_sps
+from outline_sessions import Noise, design_of, draw_session, one_fit
 from scipy.spatial.transform import Rotation
 from thinned import thinned
 
@@ -129,6 +131,18 @@ def test_true_machines_close_and_fits_find_them(kind: str, tmp_path: Path) -> No
     assert keeps_its_plane(found.legs) < 1e-9
     for leg, exact in zip(found.legs, session.truth.legs, strict=True):
         assert np.abs(np.concatenate([leg.A - exact.A, leg.B - exact.B])).max() < 1e-7
+
+
+@pytest.mark.slow
+def test_a_wrong_minimum_that_light_would_have_to_explain_is_left() -> None:
+    """From this start the first view ends up behind the machine, its edges 7 px off together."""
+    noise = Noise()
+    design = design_of("2-upr-2-sps", 3, 15, noise.sigma_px)
+    rng = np.random.default_rng(np.random.SeedSequence(0).spawn(164)[163])
+    session = draw_session(design, noise, ERRORS, rng)
+    found = one_fit(session, noise.radius_sigma)
+    for leg, true in zip(found.legs, design.legs.nominal, strict=True):
+        assert np.abs(np.concatenate([leg.A - true.A, leg.B - true.B])).max() < 1e-3
 
 
 def test_a_prior_of_what_is_tied_is_not_asked_of_the_measurements(tmp_path: Path) -> None:

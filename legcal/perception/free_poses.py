@@ -5,6 +5,10 @@ every image. Base joints stay where they are, so that a rough camera pose says w
 begins: poses drawn from the workspace are judged by the edge pairs of their images, the better ones
 improved by Gauss-Newton steps, and cameras and poses of all images fitted to their pairs in turn.
 Readings and the constraints of legs hold as far as the nominal model has them.
+
+From far a platform that tilts towards the camera looks like one that tilts away from it, and pairs
+do not tell them apart. So the best poses that differ are kept of every image: the outlines that
+can be measured at each of them decide.
 """
 
 from __future__ import annotations
@@ -65,13 +69,16 @@ CAMERA_SIGMA = 0.03, 0.03  # of a rough pose: angle, part of the distance
 TURN_SIGMA, PLACE_SIGMA = 0.1, 0.1  # of a pose that its images do not determine [rad], leg lengths
 MAX_STEP = 3.0  # of these, in one step
 ROUNDS = 2  # of a search in each image and a fit of all
+CHOICES, APART = 3, 0.12  # poses of an image that are kept, as far apart [leg lengths of joints]
+ALL_ALIKE = 30  # so many or fewer poses in a step of the search differ
 
 
 @dataclass(frozen=True, eq=False)
 class FreePoses:
     """Where platforms and cameras are by the edge pairs of the images."""
 
-    T_base_platform: dict[int, RigidTransform]  # of every pose that images show
+    # Of every pose that images show, the likeliest first
+    T_base_platform: dict[int, tuple[RigidTransform, ...]]
     T_base_camera: tuple[RigidTransform | None, ...]  # of every view
 
 
@@ -193,14 +200,18 @@ def find_free_poses(
         image = _Image(view, pairs, sensor_extent(m.views[view].camera))
         images.setdefault(int(m.pose[row]), []).append(image)
     scene = _Scene.of(machine, search.wanted, m.q_of_poses, images)
-    poses, cameras = dict[int, Array](), tuple(hints)
+    every, cameras = dict[int, Array](), tuple(hints)
     for _ in range(ROUNDS):
         for k, found in zip(images, run(partial(_searched, scene, cameras), images), strict=True):
-            poses[k] = found
+            every[k] = found
             for _ in images[k]:
                 progress(k)
-        poses, cameras = _fitted(scene, poses, cameras)
-    return FreePoses({k: motion_of(at[:, :3], at[:, 3]) for k, at in poses.items()}, cameras)
+        best, cameras = _fitted(scene, {k: found[0] for k, found in every.items()}, cameras)
+    for k, found in every.items():
+        others = _stepped_often(scene, cameras, k, found[1:], FITTED[1:])
+        every[k] = _apart(scene.machine, np.concatenate([best[k][None], others]), CHOICES)
+    T = {k: tuple(motion_of(at[:, :3], at[:, 3]) for at in found) for k, found in every.items()}
+    return FreePoses(T, cameras)
 
 
 def require_standing_joints(machine: Machine) -> None:
@@ -228,16 +239,42 @@ def require_rough_cameras(
 
 
 def _searched(scene: _Scene, cameras: Sequence[RigidTransform | None], k: int) -> Array:
-    """Return the pose (3, 4) at which the images of pose *k* show most legs."""
+    """Return the poses (n, 3, 4) at which the images of pose *k* show most legs, best first."""
     poses, targets = scene.drawn, list(scene.targets)
     for kept, tolerance in zip(KEPT, TOLERANCES, strict=True):
         score = _scores(scene, cameras, k, poses, targets, tolerance)
-        best = np.argsort(-score, kind="stable")[:kept]
-        poses, targets = poses[best], [targets[i] for i in best]
-        poses = _stepped(scene, cameras, k, poses, targets, tolerance)
+        poses = poses[np.argsort(-score, kind="stable")]
+        poses = _apart(scene.machine, poses, kept) if kept <= ALL_ALIKE else poses[:kept]
+        poses = _stepped_often(scene, cameras, k, poses, [tolerance] * (1 + (kept <= ALL_ALIKE)))
         targets = _targets(scene.machine, poses)
     score = _scores(scene, cameras, k, poses, targets, TOLERANCES[-1])
-    return np.asarray(poses[int(np.argmax(score))])
+    return _apart(scene.machine, poses[np.argsort(-score, kind="stable")], CHOICES)
+
+
+def _apart(machine: Machine, poses: Array, n: int) -> Array:
+    """Return the first n poses (m, 3, 4) that are not near an earlier one."""
+    ends = machine.B_platform @ poses[:, :, :3].swapaxes(1, 2) + poses[:, None, :, 3]
+    off = np.linalg.norm(ends[:, None] - ends, axis=3)
+    near = np.sqrt(np.mean(off**2, axis=2)) < APART * leg_scale(machine, machine.home)
+    kept = list[int]()
+    for i in range(len(poses)):
+        if len(kept) < n and not near[i, kept].any():
+            kept.append(i)
+    return poses[kept]
+
+
+def _stepped_often(
+    scene: _Scene,
+    cameras: Sequence[RigidTransform | None],
+    k: int,
+    poses: Array,
+    tolerances: Sequence[float],
+) -> Array:
+    """Return poses (n, 3, 4) after a Gauss-Newton step with each tolerance."""
+    for tolerance in tolerances if len(poses) else ():
+        targets = _targets(scene.machine, poses)
+        poses = _stepped(scene, cameras, k, poses, targets, tolerance)
+    return poses
 
 
 def _scores(

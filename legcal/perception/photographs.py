@@ -54,8 +54,10 @@ from legcal.progress import Report
 from legcal.vision import look_alike, shared_cameras
 from legcal.workers import Run
 
-DETECTOR_VERSION = 8  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 9  # raise it whenever outlines or notes that are kept come out differently
 MEASURING = "Measuring outlines"  # a stage of progress
+CHOICE_ROUNDS = 2  # in which outlines decide between poses that readings leave open
+FreePosesOf = Mapping[int, tuple[RigidTransform, ...]]  # T_base_platform of poses, likeliest first
 TOO_SHORT = "px in the image"  # end of the reason for parts that are not looked for
 MIN_VIEWS = 2  # in which a part must show another radius than the model's
 MAX_USED_SHARE = 0.3  # of the outlines of a part that should be seen
@@ -188,8 +190,12 @@ def place_and_measure(
     photographs.edge_pairs.update(pairs)
     usable = np.array([row for row in photographs.detect if row not in defects], dtype=np.intp)
     nominal, free_poses = _with_free_poses(photographs, nominal, pairs, usable, report)
-    search = photographs.search(nominal, pairs, rough)
     hints = nominal.T_base_camera
+    if any(len(choices) > 1 for choices in free_poses.values()):
+        nominal, free_poses = _decided_by_outlines(
+            photographs, nominal, free_poses, usable, report, joined
+        )
+    search = photographs.search(nominal, pairs, rough)
 
     def recognised(suspects: Collection[LegRadius] = ()) -> Placement:
         return _recognised(photographs, search, usable, hints, report, joined, suspects)
@@ -246,7 +252,8 @@ def place_and_measure(
     of_views = [blur[known & (view == v)] for v in range(len(photographs.measurements.views))]
     usual = tuple(float(np.median(own)) if len(own) else np.nan for own in of_views)
     outlines = reject_images(outlines, reasons)
-    return MeasuredImages(photographs, placement, outlines, reasons, usual, free_poses)
+    seen_poses = {pose: choices[0] for pose, choices in free_poses.items()}
+    return MeasuredImages(photographs, placement, outlines, reasons, usual, seen_poses)
 
 
 def recognise_and_place(
@@ -264,9 +271,9 @@ def _with_free_poses(
     pairs: Mapping[int, CandidatePairs],
     rows: IntArray,
     report: Report,
-) -> tuple[Placement, Mapping[int, RigidTransform]]:
+) -> tuple[Placement, FreePosesOf]:
     """Return where a model has the legs, with poses found in images where readings give none."""
-    machine, measurements = photographs.machine, photographs.measurements
+    machine = photographs.machine
     if machine.is_determined or len(rows) == 0:
         return nominal, {}
     found = find_free_poses(
@@ -277,10 +284,59 @@ def _with_free_poses(
         photographs.run,
         _counted(report, "Looking for platform poses", ROUNDS * len(rows)),
     )
+    nominal = replace(nominal, T_base_camera=found.T_base_camera)
+    first = {pose: choices[0] for pose, choices in found.T_base_platform.items()}
+    return _at_poses(photographs, nominal, first), found.T_base_platform
+
+
+def _at_poses(
+    photographs: Photographs, nominal: Placement, T_base_platform: Mapping[int, RigidTransform]
+) -> Placement:
+    """Return where a model has the legs with the platform at other poses, by their number."""
     B_base = nominal.B_base.copy()
-    for pose, T in found.T_base_platform.items():
-        B_base[measurements.pose == pose] = T.apply(machine.B_platform)
-    return replace(nominal, B_base=B_base, T_base_camera=found.T_base_camera), found.T_base_platform
+    for pose, T in T_base_platform.items():
+        B_base[photographs.measurements.pose == pose] = T.apply(photographs.machine.B_platform)
+    return replace(nominal, B_base=B_base)
+
+
+def _decided_by_outlines(
+    photographs: Photographs,
+    nominal: Placement,
+    choices: FreePosesOf,
+    rows: IntArray,
+    report: Report,
+    joined: Joined,
+) -> tuple[Placement, FreePosesOf]:
+    """Return the legs at those of several poses at which most outlines can be measured.
+
+    They are measured at the likeliest poses of all images first, then at others before cameras
+    that these have placed; twice, since cameras stand better with better poses.
+    """
+    hints = nominal.T_base_camera
+    for _ in range(CHOICE_ROUNDS):
+        search = photographs.search(nominal)
+        placement = _recognised(photographs, search, rows, hints, report, joined)
+        most = dict.fromkeys(choices, -1)
+        chosen = dict[int, int]()
+        for n in range(max(map(len, choices.values()))):
+            there = {pose: every[n] for pose, every in choices.items() if len(every) > n}
+            search = photographs.search(_at_poses(photographs, nominal, there))
+            shown = placement.shifted(search, placement.shift)
+            outlines, _ = _measured(photographs, search, shown, report, together=False)
+            pose = photographs.measurements.pose[outlines.row[outlines.used]]
+            for own in there:
+                n_used = int(np.sum(pose == own))
+                if n_used > most[own]:
+                    most[own], chosen[own] = n_used, n
+        if not any(chosen.values()):
+            break
+        choices = {
+            pose: (every[chosen[pose]], *every[: chosen[pose]], *every[chosen[pose] + 1 :])
+            for pose, every in choices.items()
+        }
+        first = {pose: every[0] for pose, every in choices.items()}
+        nominal = _at_poses(photographs, nominal, first)
+    return nominal, choices
 
 
 def measure_photographs(

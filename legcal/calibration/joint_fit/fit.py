@@ -159,8 +159,9 @@ def _best(
             failures.append(failure)
             notes.append(f"The joint fit started from {_called(start)} was given up. {failure}")
             continue
-        if found.left_out:
+        if found.left_out or _shifted_px(found) > settings.largest_rms_px:
             found = _from_other_starts(problem, outlines, start, minimum, found, settings)
+        _refuse_shifted(found, settings)
         return dataclasses.replace(found, notes=(*found.notes, *notes), details=tuple(details))
     if failures and all(isinstance(failure, NotIdentifiable) for failure in failures):
         raise failures[0]
@@ -178,7 +179,7 @@ def _from_other_starts(
     found: Solution,
     settings: RefinementSettings,
 ) -> Solution:
-    """Return what a fit that left out a leg of a view finds from other models, if that is better.
+    """Return what a fit that left out or moved a leg of a view finds from other models, if better.
 
     Outlines of one leg in one view are not wrong together by chance: they are of another leg, or
     the fit is at a wrong minimum, where it may pass through all others without an error. So nominal
@@ -202,10 +203,27 @@ def _from_other_starts(
             found = _refined(problem, outlines, start, minimum, settings)
         except (DidNotConverge, NotIdentifiable):
             continue
-        if not found.left_out:
+        if not found.left_out and _shifted_px(found) <= settings.largest_rms_px:
             break
         first, n_same = minimum, 0
     return found
+
+
+def _shifted_px(found: Solution) -> float:
+    """Return how far a fit moves outlines together, one standard deviation [px]."""
+    return max(found.shared_px.values(), default=0.0)
+
+
+def _refuse_shifted(found: Solution, settings: RefinementSettings) -> None:
+    """Raise DidNotConverge if a fit explains by light and blur what these cannot have done."""
+    shifted = _shifted_px(found)
+    if shifted > settings.largest_rms_px:
+        kind = max(found.shared_px, key=found.shared_px.__getitem__)
+        raise DidNotConverge(
+            f"The joint fit ended where outlines are off together ({kind}) by {shifted:.1f} px, "
+            f"needed at most {settings.largest_rms_px:g} px, which is more than light and blur "
+            "do; check camera poses, readings and outlines, or start nearer to the truth."
+        )
 
 
 def _first(
@@ -228,22 +246,25 @@ def _first_of_free_poses(
 ) -> Minimum[State]:
     """Return the first minimum, with other poses where some suit their images badly."""
 
-    def minimum(state: State) -> Minimum[State]:
-        return first_minimum(*_held_at_start(problem, state), settings=settings)
+    def minimum(state: State, must_converge: bool = True) -> Minimum[State]:
+        return first_minimum(
+            *_held_at_start(problem, state), settings=settings, must_converge=must_converge
+        )
 
     try:
         found = minimum(begin)
         if not have_outliers(problem, found.state):
             return found
     except DidNotConverge:
-        found = minimum(with_free_poses(problem, problem.projected(begin)))
-    else:
-        again = minimum(with_free_poses(problem, problem.projected(begin)))
-        found = again if again.cost < found.cost else found
+        found = None
+    # Poses that suit nothing slide on for ever: what comes before the last minimum need not end.
+    again = minimum(with_free_poses(problem, problem.projected(begin)), must_converge=False)
+    found = again if found is None or again.cost < found.cost else found
     for k in range(_POSE_ROUNDS):
         if not have_outliers(problem, found.state):
             break
-        again = minimum(with_better_poses(problem, found.state, _PART_OF_MODEL, seed=k))
+        state = with_better_poses(problem, found.state, _PART_OF_MODEL, seed=k)
+        again = minimum(state, must_converge=False)
         found = again if again.cost < found.cost else found
     return found
 

@@ -22,9 +22,10 @@ from legcal.estimation import (
     minimise,
     normal_equations,
 )
-from legcal.geometry import Array
+from legcal.geometry import Array, BoolArray
 from legcal.machine import first_rods, freedoms, pose_equations
 
+TOO_FEW_LEGS = "shows too few legs to place the platform"  # a reason
 _SEED, _DRAWN = 1965, 16  # places from which every pose is looked for, beside where it is
 _TURN, _SHIFT = 0.4, 0.3  # of these from there [rad, mean leg lengths], one standard deviation
 _STEPS = 25  # of a pose
@@ -33,6 +34,7 @@ _MODEL_PX, _MODEL_LENGTH = 2.0, 2e-3  # errors of the nominal model [px], [m] an
 _WIDTH = 3.0  # of the loss, in medians
 _RANK = 1e-6  # of the largest singular value
 _OUTLYING = 10.0  # medians of what the measurements of a pose cost
+_OPEN = 0.1  # mean leg lengths [m, rad]: a pose no better known is not determined
 _BETTER = 0.5  # of the cost of a pose, below which another one is better
 
 
@@ -43,6 +45,26 @@ def are_free(problem: FitProblem, state: State) -> bool:
     rows = pose_equations(state.legs, R, t, by_local=False, q=q if q.shape[1] else None)
     by_pose = rows.by_pose[0][:, columns] / np.where(np.array(columns) < 3, state.mean_length, 1.0)
     return len(by_pose) == 0 or int(np.linalg.matrix_rank(by_pose, tol=_RANK)) < len(columns)
+
+
+def of_determined_poses(problem: FitProblem, state: State, accepted: BoolArray) -> BoolArray:
+    """Return which of the accepted outlines (n,) are of poses that these and readings determine.
+
+    A platform that readings leave free slides along what few legs leave open, for ever. What such
+    an image shows of the machine is little, and it is left out.
+    """
+    element = problem.factor("outlines").element
+    if element is None or not are_free(problem, state):
+        return accepted
+    return np.asarray(accepted & _are_determined(problem, state)[element])
+
+
+def _are_determined(problem: FitProblem, state: State) -> BoolArray:
+    """Return which poses their measurements determine, (n_poses,)."""
+    V = normal_equations(problem, state, linearize(problem, state)).V
+    moving = np.any(np.einsum("kff->kf", V) > 0.0, axis=0)
+    least = np.linalg.eigvalsh(V[:, moving][:, :, moving])[:, 0]
+    return np.asarray(least * (_OPEN * state.mean_length) ** 2 > 1.0)
 
 
 def with_free_poses(problem: FitProblem, state: State) -> State:
@@ -86,7 +108,8 @@ def have_outliers(problem: FitProblem, state: State) -> bool:
     """Say whether a pose at a minimum suits its measurements far worse than most do theirs."""
     loss = PseudoHuber(_width(problem, state))
     cost = _costs(problem, linearize(problem, state), loss, len(state.platform_pose.t))
-    return bool(np.any(cost > _OUTLYING * np.median(cost)))
+    judged = cost[_are_determined(problem, state)]
+    return bool(np.any(judged > _OUTLYING * np.median(cost)))
 
 
 def _softened(problem: FitProblem, part: float) -> FitProblem:

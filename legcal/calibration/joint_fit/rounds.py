@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from legcal.calibration.joint_fit.free_poses import of_determined_poses
 from legcal.calibration.joint_fit.outline_errors import (
     KINDS,
     MEDIAN_OF_2,
@@ -103,6 +104,7 @@ def first_minimum(
     known: Mapping[str, Residuals] | None = None,
     *,
     settings: RefinementSettings,
+    must_converge: bool = True,
 ) -> Minimum[State]:
     """Solve with all observations and claimed covariances, regularised towards the nominal model.
 
@@ -110,8 +112,11 @@ def first_minimum(
     only translates end half a radian off, where other directions seem to be known. No nominal
     model is wrong by a large part of a leg. The cost and the derivatives that are returned are
     without that knowledge. *known* are rows of factors at the begin, with claimed covariances.
+    Without *must_converge* the best state is returned where the steps do not come to an end.
     """
-    problem, loss = problem.weighted(NoiseModel()), PseudoHuber(settings.loss_width)
+    claimed, every = problem.weighted(NoiseModel()), np.ones(len(problem.outlines), dtype=np.bool_)
+    chosen = of_determined_poses(claimed, begin, every)
+    problem, loss = claimed.weighted(NoiseModel(), chosen), PseudoHuber(settings.loss_width)
     legs, n = problem.legs, problem.n_kinematic
     nominal = legs.vector(legs.nominal)[problem.free]
     length = begin.mean_length
@@ -126,9 +131,13 @@ def first_minimum(
         max_iterations=settings.max_iterations,
         tolerance=_PASSING,
         relative_tolerance=_REJECTION_TOLERANCE,
-        known=known,
+        known=known if chosen.all() else None,
+        must_converge=must_converge,
     )
-    linear = linearize(problem, found.state, found.linear.rows)
+    there = of_determined_poses(claimed, found.state, every)
+    problem = claimed.weighted(NoiseModel(), there)
+    same = bool(np.array_equal(there, chosen))
+    linear = linearize(problem, found.state, found.linear.rows if same else None)
     return Minimum(found.state, linear, robust_cost(problem, linear, loss), found.iterations)
 
 
@@ -313,9 +322,10 @@ def _noise(
 def _accepted(
     problem: FitProblem, state: State, noise: NoiseModel, settings: RefinementSettings
 ) -> BoolArray:
-    """Return which outlines agree with a fit."""
+    """Return which outlines agree with a fit, and are of images that have a pose of their own."""
     s = noise.squared_norms(problem.offsets(state), problem.outlines.covariance)
-    return np.asarray(s <= settings.rejection**2)
+    accepted = np.asarray(s <= settings.rejection**2)
+    return of_determined_poses(problem.weighted(noise, accepted), state, accepted)
 
 
 def _refuse_disagreement(offsets: Array, accepted: BoolArray, settings: RefinementSettings) -> None:

@@ -18,6 +18,7 @@ from legcal.calibration.joint_fit.diagnostics import (
     rejected_notes,
     scale_notes,
 )
+from legcal.calibration.joint_fit.free_poses import TOO_FEW_LEGS, of_determined_poses
 from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.outline_errors import (
     GAMMA_SUFFIX,
@@ -49,7 +50,7 @@ from legcal.estimation import (
     robust_cost,
     worst_directions,
 )
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, IntArray
 from legcal.machine import (
     KinematicParameters,
     Leg,
@@ -241,7 +242,7 @@ def assemble_solution(
         biases={n: v for n, v in biases if not n.endswith(GAMMA_SUFFIX)},
         shared_px=fit.shared_px,
         sensitivities=sensitivities(problem, state, linear, by_camera, normal, loss, distorted),
-        outlines=_with_rejections(outlines, problem, state, fit.accepted, offsets),
+        outlines=_with_rejections(outlines, fit, offsets),
         start=label,
         iterations=fit.iterations,
         posterior=Posterior(problem, state, fit.edge_biases, fit.noise, kept),
@@ -333,16 +334,16 @@ def _misfit_of_axes(chi2: float, dof: int) -> tuple[str, ...]:
     )
 
 
-def _with_rejections(
-    outlines: Outlines, problem: FitProblem, state: State, accepted: BoolArray, offsets: Array
-) -> Outlines:
+def _with_rejections(outlines: Outlines, fit: Fit, offsets: Array) -> Outlines:
     """Return the table with what the fit rejected, and why."""
-    used, reason = outlines.used.copy(), list(outlines.reason)
-    rejected = np.flatnonzero(~accepted)
-    words = rejection_reasons(problem, state, rejected, offsets)
-    for row, why in zip(problem.outlines.index[rejected].tolist(), words, strict=True):
+    used, reason, problem = outlines.used.copy(), list(outlines.reason), fit.problem
+    rejected = np.flatnonzero(~fit.accepted)
+    words = rejection_reasons(problem, fit.state, rejected, offsets)
+    every = np.ones_like(fit.accepted)
+    placed = of_determined_poses(problem.weighted(fit.noise), fit.state, every)[rejected]
+    for row, why, has_pose in zip(problem.outlines.index[rejected], words, placed, strict=True):
         used[row] = False
-        reason[row] = why
+        reason[row] = why if has_pose else TOO_FEW_LEGS
     return replace(outlines, used=used, reason=tuple(reason))
 
 
