@@ -49,7 +49,7 @@ CAMERA = Camera(
     960,
     np.array([-0.25, 0.1, 1e-3, -5e-4, -0.02]),
 )
-WRONG = ("zoom", "rolling", "bent", "noise")
+WRONG = ("zoom", "rolling", "bent", "noise", "shift")
 _UNEVEN, _SHARED = 0.7, 0.4  # lengths over which sheets and errors of corners vary, in half boards
 _FEWEST = 8  # images of a half
 
@@ -119,6 +119,8 @@ def with_wrong(
     if kind == "noise":
         look = replace(look, noise=1.0)
     other = corners(look, n_wrong, rng, CAMERA, sheet)
+    if kind == "shift":
+        other = replace(other, px=other.px + np.array([12.0, 5.0]))
     if kind == "rolling":
         row = other.px[:, 1:] / CAMERA.height - 0.5
         drift = rng.normal(0.0, 6.0, (n_wrong, 2))[other.image]

@@ -2,10 +2,10 @@
 
 An image says little of a camera alone; it contradicts a group of images by its score and
 information (:class:`legcal.estimation.Clusters`), along all numbers of the camera and of the sheet,
-along the focal length, and along the sheet. The group begins as the half of the images that is
-cheapest together (least trimmed squares from many random starts, on the quadratic costs of all
-images), takes in whatever does not contradict it, and is fitted again until it stays. Images that
-are wrong alike, as a third that was taken at another zoom, cannot move it.
+along the focal length, the principal point, and along the sheet. The group begins as the half of
+the images that is cheapest together (least trimmed squares from many random starts, on the
+quadratic costs of all images), takes in whatever does not contradict it, and is fitted again until
+it stays. Images that are wrong alike, as a third that was taken at another zoom, cannot move it.
 """
 
 from __future__ import annotations
@@ -168,7 +168,8 @@ def _grown(adjusted: AdjustedBoard, group: BoolArray) -> BoolArray:
     for _ in range(_ROUNDS):
         before = group
         moved = clusters.moved(clusters.choose(group).best())
-        group = group & ~_of_another_zoom(adjusted, moved, group)
+        for direction in _whole_picture(adjusted).T:
+            group = group & ~_of_two_kinds(direction, moved, group)
         moved = clusters.moved(clusters.choose(group).best())
         ratio = max(first * moved.choose(group).ratio(), 1.0)
         group, first = ~_contradicting(adjusted, moved, group, ratio), 1.0
@@ -182,7 +183,13 @@ def _contradicting(
 ) -> BoolArray:
     """Return which images contradict a group at its minimum."""
     k = clusters.score.shape[1]
-    limits = [(None, k), (_zoom(adjusted), 1), (np.eye(k)[:, k - len(SHEET) :], len(SHEET))]
+    whole = _whole_picture(adjusted)
+    limits = [
+        (None, k),
+        (whole[:, :1], 1),
+        (whole[:, 1:], 2),
+        (np.eye(k)[:, k - len(SHEET) :], len(SHEET)),
+    ]
     wrong = np.zeros(len(group), dtype=np.bool_)
     for directions, dof in limits:
         limit = float(chdtri(dof, _SIGNIFICANCE))
@@ -190,15 +197,15 @@ def _contradicting(
     return wrong
 
 
-def _of_another_zoom(adjusted: AdjustedBoard, clusters: Clusters, group: BoolArray) -> BoolArray:
-    """Return which images of a group are the fewer ones of two focal lengths.
+def _of_two_kinds(direction: Array, clusters: Clusters, group: BoolArray) -> BoolArray:
+    """Return which images of a group are the fewer ones of two kinds along a change (k,).
 
-    Errors are judged with the focal length of each image free, so that these do not hide it.
+    Errors are judged with that change free in each image, so that these do not hide it.
     """
     others, n = np.zeros(len(group), dtype=np.bool_), int(np.count_nonzero(group))
     if n < _FEW:
         return others
-    left, change, own = clusters.choose(group).freed(_zoom(adjusted)[:, 0])
+    left, change, own = clusters.choose(group).freed(direction)
     weight = own / max(left.ratio(), 1.0)
     order = np.argsort(change)
     w, z = weight[order], change[order]
@@ -216,10 +223,11 @@ def _of_another_zoom(adjusted: AdjustedBoard, clusters: Clusters, group: BoolArr
     return others
 
 
-def _zoom(adjusted: AdjustedBoard) -> Array:
-    """Return the change (k, 1) of kept unknowns that enlarges the image."""
+def _whole_picture(adjusted: AdjustedBoard) -> Array:
+    """Return changes (k, 3) of kept unknowns: the picture larger, moved along x and along y."""
     k = adjusted.clusters.score.shape[1]
-    return np.concatenate([intrinsic_values(adjusted.camera)[:2], np.zeros(k - 2)])[:, None]
+    zoom = np.concatenate([intrinsic_values(adjusted.camera)[:2], np.zeros(k - 2)])
+    return np.column_stack([zoom, np.eye(k)[:, 2:4]])
 
 
 @dataclass(frozen=True, eq=False)
