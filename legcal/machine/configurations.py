@@ -8,7 +8,6 @@ manifold of closed configurations.
 
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,10 +21,9 @@ from legcal.machine.kinematics import (
     consistent_readings,
     follow,
     follow_poses,
-    reading_span,
     solve_poses,
 )
-from legcal.machine.leg import Leg, LegKind
+from legcal.machine.leg import Leg
 from legcal.machine.mobility import free_motions, project, singularities, singularity
 from legcal.machine.model import (
     Machine,
