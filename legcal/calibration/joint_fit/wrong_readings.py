@@ -271,5 +271,5 @@ def _used(problem: FitProblem, name: str) -> BoolArray:
     return np.asarray(np.asarray(problem.factor(name).whitening)[:, 0, 0] > 0.0)
 
 
-def _readings(problem: FitProblem) -> tuple[Readings, ActuatorReadings]:
+def _readings(problem: FitProblem) -> tuple[Readings | ActuatorReadings, ...]:
     return problem.readings, problem.observed.actuator_readings
