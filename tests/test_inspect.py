@@ -178,7 +178,7 @@ def test_an_evaluation_leaves_out_what_a_machine_does_not_have(tmp_path: Path) -
     assert document["poses"] == 0
     assert len(document["parameters"]) > 30
     text = _printed(accuracy_table(evaluation))
-    assert "Parameters only: readings do not give one pose" in text
+    assert "Parameters only: the motors of a model do not determine its pose" in text
 
 
 def test_readings_that_one_model_does_not_reach_are_left_out_and_named(tmp_path: Path) -> None:

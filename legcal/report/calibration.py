@@ -89,7 +89,7 @@ def _amount(explanation: Explanation) -> str:
 def accuracy_table(evaluation: Evaluation) -> RenderableType:
     """Return the platform errors and the parameters of two models, in mm and degrees."""
     dX, dE = 1e3 * evaluation.displacement, np.degrees(evaluation.rotation)
-    headline = "Parameters only: readings do not give one pose where mobility and motors differ."
+    headline = "Parameters only: the motors of a model do not determine its pose."
     if len(dX):
         headline = (
             f"Platform error over {len(dX)} poses: displacement {dX.mean():.4f} mm "
