@@ -41,11 +41,15 @@ def seen_corners(
     seed: int,
     *,
     tilt: float = 0.6,
+    lean: float = 0.0,
+    roll: float = 0.6,
     noise: float = NOISE_PX,
     sheet: Array | None = None,
     smooth: float = 0.0,
 ) -> BoardImages:
     """Return the corners of a board in random places, all over the image.
+
+    All boards lean alike by an angle about x [rad], apart from their own tilt and roll.
 
     The board is bent and printed as the numbers of a sheet say; errors that neighbouring corners of
     an image share have a standard deviation *smooth* [px].
@@ -64,7 +68,8 @@ def seen_corners(
     points, px = [], []
     while len(image) < n_images:
         xy = camera.undistort(rng.uniform(0.15 * size, 0.85 * size))
-        turn = Rotation.from_euler("xyz", [*rng.uniform(-tilt, tilt, 2), rng.uniform(-0.6, 0.6)])
+        turn = Rotation.from_euler("xyz", [*rng.uniform(-tilt, tilt, 2), rng.uniform(-roll, roll)])
+        turn = Rotation.from_euler("x", lean) * turn
         T = RigidTransform.from_components(rng.uniform(near, far) * np.array([*xy, 1.0]), turn)
         P = (T * middle).apply(real)
         if P[:, 2].min() < 0.03:

@@ -75,6 +75,17 @@ def test_every_number_of_the_camera_is_recovered_within_its_sigma(model: Distort
     assert np.abs(again - corners).max() < 3.0
 
 
+@pytest.mark.parametrize(("n_images", "seed"), [(5, 31), (10, 36)])
+def test_boards_that_all_lean_alike_give_the_camera_within_its_sigma(
+    n_images: int, seed: int
+) -> None:
+    # From a guess of the focal length by homographies alone both end at 2 to 10 times its value.
+    seen = seen_corners(CAMERAS["plumb_bob"], n_images, seed, tilt=0.03, lean=0.4, roll=0.03)
+    found = fitted(seen)
+    assert np.abs(pulls(found)).max() < 4.0
+    assert 0.5 < sigmas(found)[0] < 30.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_sigmas_are_the_spread_of_many_calibrations(model: DistortionModel) -> None:

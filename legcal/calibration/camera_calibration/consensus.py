@@ -109,6 +109,8 @@ def _settled(
     settled: tuple[AdjustedBoard, BoolArray] | None = None
     for _ in range(_ROUNDS):
         if group is not None:
+            if np.count_nonzero(group) < _OF_START:
+                return None
             part, images = part_of(seen, group[seen.image], n)
             fitted = again(near, [poses[k] for k in images], part)
             if fitted is None:
@@ -126,12 +128,10 @@ def _settled(
             cost = _costs(held, seen)
             group = cost <= np.sort(cost)[n // 2]
         group = _grown(held, group)
-        if np.count_nonzero(group) < _OF_START:
-            return None
         settled = held, group
         if before is not None and np.array_equal(before, group):
             break
-    return settled
+    return settled if settled is not None and np.count_nonzero(settled[1]) >= _OF_START else None
 
 
 def _costs(adjusted: AdjustedBoard, seen: BoardImages) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import pairwise
 
 import cv2
@@ -100,21 +101,34 @@ def _bounds(seen: BoardImages) -> IntArray:
 def _by_opencv(
     seen: BoardImages, size: ImageSize, model: DistortionModel
 ) -> tuple[Camera, list[RigidTransform]] | None:
-    """Return the camera that OpenCV calibrates, with two coefficients of distortion."""
+    """Return the camera that OpenCV calibrates, with two coefficients of distortion.
+
+    Boards that are tilted alike leave its own first guess of the focal length open, so that it is
+    asked again with a usual one; the answer with the smaller residuals is taken.
+    """
     pieces = list(pairwise(_bounds(seen)))
+    points = [seen.points[a:b].astype(np.float32) for a, b in pieces]
+    px = [seen.px[a:b].astype(np.float32) for a, b in pieces]
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    try:
-        with quiet_opencv():
-            _, K, distortion, turns, shifts = cv2.calibrateCamera(
-                [seen.points[a:b].astype(np.float32) for a, b in pieces],
-                [seen.px[a:b].astype(np.float32) for a, b in pieces],
-                (size.width, size.height),
-                np.eye(3),
-                np.zeros(5),
-                flags=flags,
+    f = float(max(size.width, size.height))
+    K = np.array([[f, 0.0, 0.5 * size.width], [0.0, f, 0.5 * size.height], [0.0, 0.0, 1.0]])
+    answers = []
+    for guess in (0, cv2.CALIB_USE_INTRINSIC_GUESS):
+        with suppress(cv2.error), quiet_opencv():
+            answers.append(
+                cv2.calibrateCamera(
+                    points,
+                    px,
+                    (size.width, size.height),
+                    K.copy(),
+                    np.zeros(5),
+                    flags=flags | guess,
+                )
             )
-    except cv2.error:
+    answers = [answer for answer in answers if np.isfinite(answer[0])]
+    if not answers:
         return None
+    _, K, distortion, turns, shifts = min(answers, key=lambda answer: float(answer[0]))
     numbers = np.concatenate([np.ravel(K), np.ravel(distortion), np.ravel(turns), np.ravel(shifts)])
     if not np.all(np.isfinite(numbers)) or min(K[0, 0], K[1, 1]) < 1.0:
         return None
