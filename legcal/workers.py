@@ -16,6 +16,7 @@ from functools import partial
 from itertools import islice
 from multiprocessing import connection, get_context, resource_tracker
 from threading import Thread
+from types import MappingProxyType
 from typing import Any, Protocol, SupportsIndex, TypeGuard, TypeVar, cast
 from uuid import uuid4
 from weakref import WeakValueDictionary, finalize
@@ -40,7 +41,12 @@ def _reduced(motion: RigidTransform) -> tuple[Any, ...]:
     return partial(RigidTransform, normalize=False), (motion.as_matrix(),)
 
 
+def _read_only(mapping: dict[Any, Any]) -> MappingProxyType[Any, Any]:
+    return MappingProxyType(mapping)
+
+
 copyreg.pickle(RigidTransform, _reduced)
+copyreg.pickle(MappingProxyType, lambda mapping: (_read_only, (dict(mapping),)))
 
 Workers = int | str | Submitter
 """A number of processes; the address of a Dask scheduler; or a Dask client or another executor."""

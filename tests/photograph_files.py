@@ -22,7 +22,7 @@ _OF_CAMERA = ("make", "model", "orientation", "software")  # in the first direct
 
 
 def exif(order: str = "<", **said: Said) -> bytes:
-    """Return an EXIF block: texts, whole numbers as shorts, other numbers as rationals."""
+    """Return an EXIF block: texts, whole numbers as shorts, others as rationals, NumPy doubles."""
     first = {TAGS[name]: x for name, x in said.items() if name in _OF_CAMERA}
     second = {TAGS[name]: x for name, x in said.items() if name not in _OF_CAMERA}
     head = {"<": b"II*\0", ">": b"MM\0*"}[order] + struct.pack(order + "I", 8)
@@ -43,6 +43,8 @@ def _directory(order: str, at: int, values: Mapping[int, Said]) -> bytes:
         elif isinstance(value, int):
             kind, count = (4, 1) if tag == 0x8769 else (3, 1)
             data = struct.pack(order + ("I" if kind == 4 else "H"), value)
+        elif isinstance(value, np.float64):
+            kind, count, data = 12, 1, struct.pack(order + "d", value)
         else:
             ratio = Fraction(value).limit_denominator(10_000)
             kind, count, data = 5, 1, struct.pack(order + "II", *ratio.as_integer_ratio())

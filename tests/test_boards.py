@@ -366,7 +366,7 @@ def _shows(columns: int, rows: int) -> SeenBoard:
     ("stated", "extents", "shown", "words"),
     [
         ((9, 6), [(8, 5)] * 2 + [(9, 6)], (9, 6), ""),
-        ((9, 6), [(9, 6)] * 3 + [(8, 5), (4, 3)], (10, 7), "write --board chessboard:10x7"),
+        ((9, 6), [(9, 6)] * 3 + [(8, 5), (4, 3)], (10, 7), "write --board chessboard:10x7:30mm."),
         ((9, 6), [(6, 9)] * 2 + [(12, 3)], (10, 7), "10x7 squares (9x6 inner corners)"),
         ((9, 6), [(5, 4), (8, 3)], (9, 6), ""),
         ((9, 6), [(7, 5)] * 3, (9, 6), "8 x 6 squares or that part of one is seen in 3 of its 3"),

@@ -1,7 +1,10 @@
 """What lossy compression adds to the errors of outlines is found from the compressed images."""
 
 import math
-from dataclasses import replace
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from multiprocessing.reduction import ForkingPickler
 
 import cv2
 import numpy as np
@@ -14,17 +17,29 @@ from legcal.data import Outlines
 from legcal.perception import Photographs, Placement, measure_photographs
 from legcal.progress import no_progress
 from legcal.vision import Grey, ImageFacts
+from legcal.workers import in_turn
+
+
+@dataclass(frozen=True)
+class Stored:
+    """Reads photographs as a camera would have stored them."""
+
+    load: Callable[[int], Grey]
+    quality: int
+
+    def __call__(self, row: int) -> Grey:
+        grey = np.rint(self.load(row)).astype(np.uint8)
+        _, file = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, self.quality])
+        return np.asarray(cv2.imdecode(file, cv2.IMREAD_GRAYSCALE), dtype=np.float32)
 
 
 def compressed(photographs: Photographs, quality: int) -> Photographs:
-    """Return the photographs as a camera would have stored them."""
-
-    def load(row: int) -> Grey:
-        grey = np.rint(photographs.load(row)).astype(np.uint8)
-        _, file = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])
-        return np.asarray(cv2.imdecode(file, cv2.IMREAD_GRAYSCALE), dtype=np.float32)
-
-    return replace(photographs, load=load)
+    """Return the photographs as a camera would have stored them, searched as in processes."""
+    return replace(
+        photographs,
+        load=Stored(photographs.load, quality),
+        run=lambda task, rows: in_turn(pickle.loads(ForkingPickler.dumps(task)), rows),
+    )
 
 
 def apart(one: Outlines, other: Outlines, photographs: Photographs) -> float:

@@ -20,6 +20,10 @@ KINDS: dict[str, MachineSpec] = {
     "SP": of_types(["SS", "US", "SS", "S", "SS"], [A, A, A, A, P]),
     "RP": of_types(["SS", "R", "SS"], [A, A, P]),
     "5-SPS": of_types(["SS"] * 5),
+    "7-UPS": of_types(["US"] * 7),
+    "3-RPS + SPS": of_types(["RS"] * 3 + ["SS"]),
+    "5-UPS + RPS": of_types(["US"] * 5 + ["RS"]),
+    "2-RPS + 2-SPS + passive SPS": of_types(["RS", "RS", "SS", "SS", "SS"], [A] * 4 + [P]),
     "3-SPS + passive UPS": of_types(["SS"] * 3 + ["US"], [A, A, A, P]),
 }
 LAYOUTS = {
@@ -41,6 +45,8 @@ def test_freedoms_are_those_of_the_screws_of_the_joints(
     assert sum(leg.n_constraints for leg in geometries(machine)) == expected.n_constraints
     assert len(machine.motors) == [leg.kind for leg in drawn.legs].count(A)
     assert machine.is_determined == (expected.left_by_motors == 0)
+    more = len(machine.motors) > expected.mobility
+    assert machine.is_redundant == (more and expected.left_by_motors == 0)
     said = [note for note in machine.diagnostics if "overconstrained" in note]
     of = f"{expected.n_redundant} of the {expected.n_constraints}"
     assert len(said) == (expected.n_redundant > 0)

@@ -68,6 +68,8 @@ def test_facts_are_those_that_were_written(order: str) -> None:
     for content in (jpeg(PICTURE, 90, block), png(PICTURE, block), block):
         found = read_facts(content)
         assert {name: getattr(found, name) for name in expected} == expected
+    assert read_facts(exif(order, focal=np.float64(4.25))).focal_length == 4.25
+    assert read_facts(exif(order, focal=np.float64("inf"))).focal_length is None
     other = exif(order, make="Acme", model="Two", zoom=0.0, focal=0.0, orientation=9)
     found = read_facts(jpeg(PICTURE, 90, other, XMP % (1, b"False")))
     assert (found.device, found.digital_zoom) == ("Acme Two", 1.0)
@@ -158,6 +160,20 @@ def test_an_image_unlike_the_others_is_named_with_the_difference(
         del folder.entry["views"]["c2"]
     (note,) = notes(folder, {1: content})
     assert [word for word in [*ONE, *words] if word not in note] == []
+
+
+def test_what_is_written_only_where_it_is_so_differs_from_silence(folder: Folder) -> None:
+    silent = {key: value for key, value in PHONE.items() if key not in ("zoom", "software")}
+    files = dict.fromkeys(range(4), jpeg(PICTURE, 95, exif(**silent)))
+    assert notes(folder, files) == []
+    for said, word in (({"zoom": 1.1}, "digital zoom of 1.1"), ({"software": "GIMP"}, "'GIMP'")):
+        (note,) = notes(folder, files | {1: jpeg(PICTURE, 95, exif(**silent | said))})
+        assert f"{word} ({NAMES[1]}) and images that say nothing of it ({NAMES[0]}," in note
+
+
+def test_portrait_mode_is_said_once_for_all_views(folder: Folder) -> None:
+    (note,) = notes(folder, dict.fromkeys((1, 2), phone(rendered=8)))
+    assert f"Outlines in {NAMES[1]}, {NAMES[2]} of views c1, c2" in note
 
 
 def test_a_refusal_names_what_may_be_its_cause(folder: Folder) -> None:

@@ -41,7 +41,7 @@ from legcal.machine import (
     solve_poses,
 )
 from legcal.machine.mobility import generic_configurations
-from legcal.simulation import simulate
+from legcal.simulation import Level, SimulationSettings, simulate
 from legcal.simulation.poses import given_poses
 
 
@@ -215,6 +215,48 @@ def test_carriages_may_be_redundant(tmp_path: Path) -> None:
     wrong[6] += 0.06
     with pytest.raises(DidNotConverge, match=r"motor 'rail\d' \(or as likely one of rail.* mm"):
         forward_kinematics(machine, wrong)
+
+
+@pytest.mark.system
+def test_redundant_carriages_calibrate_with_a_platform_error(tmp_path: Path) -> None:
+    machine, folder = made("7-pss", tmp_path), tmp_path / "dataset"
+    simulate(machine.yaml_path, folder, SimulationSettings(level=Level.AXES, seed=4))
+    found = legcal.calibrate(folder)
+    assert found.verdict.trustworthy
+    assert found.platform is not None
+    assert found.platform.workspace is not None
+    assert found.solution.redundant_readings is not None
+    assert found.solution.redundant_readings.wrong == ()
+
+
+@pytest.mark.parametrize(("kind", "off"), [("7-ups", 1e-3), ("7-pss", -2e-3)])
+def test_a_wrong_reading_is_named_with_its_amount_and_does_no_harm(
+    kind: str, off: float, tmp_path: Path
+) -> None:
+    session = machine_session(str(made(kind, tmp_path).yaml_path), n_poses=12)
+    m, leg, row = session.measurements, 3, 7
+    q = m.q.copy()
+    q[row, leg] += off
+    wrong = dataclasses.replace(m, q=q)
+    found = refine(session.legs, wrong, session.outlines, session.start)
+    assert found.redundant_readings is not None
+    (one,) = found.redundant_readings.wrong
+    assert (one.leg, one.pose, one.image) == (leg, row, m.image[row])
+    assert one.off == pytest.approx(off, abs=1e-6)
+    assert found.redundant_readings.doubts == ()
+    values = np.array([found.values[name] for name in found.parametrization.names])
+    np.testing.assert_allclose(values, session.legs.vector(session.truth.legs), atol=1e-6)
+
+
+@pytest.mark.system
+def test_a_motor_of_another_scale_is_named_and_not_trusted(tmp_path: Path) -> None:
+    session = machine_session(str(made("7-ups", tmp_path).yaml_path), n_poses=12)
+    q = session.measurements.q.copy()
+    q[:, 2] *= 0.99
+    wrong = dataclasses.replace(session.measurements, q=q)
+    found = refine(session.legs, wrong, session.outlines, session.start)
+    assert found.redundant_readings is not None
+    assert any(session.legs.names[2] in why for why in found.redundant_readings.doubts)
 
 
 @pytest.mark.system

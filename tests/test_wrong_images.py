@@ -59,6 +59,12 @@ def _upside_down(picture: Picture) -> Picture:
     return picture[::-1, ::-1]
 
 
+def _zoomed(picture: Picture) -> Any:
+    height, width = picture.shape
+    M = cv2.getRotationMatrix2D((0.5 * (width - 1), 0.5 * (height - 1)), 0.0, 1.08)
+    return cv2.warpAffine(picture, M, (width, height), flags=cv2.INTER_CUBIC)
+
+
 def _blurred(picture: Picture) -> Any:
     return cv2.GaussianBlur(picture, (0, 0), 3.0)
 
@@ -85,6 +91,7 @@ CHANGED: dict[tuple[str, int], tuple[Callable[[Picture], Any], str]] = {
     ("c1", 1): (lambda picture: 0 * picture, "the image is black, at most 0 of 255"),
     ("c1", 2): (lambda picture: 0 * picture + 255, "the image is overexposed, at least 255"),
     ("c1", 4): (_mirror, "the image is mirrored; replace it"),
+    ("c1", 5): (_zoomed, r"it shows the legs about 1\.0[6-9] times as large as the others"),
     ("c2", 1): (_blurred, r"the image is blurred by \d\.\d.* px, the others of its view by \d"),
     ("c2", 2): (_moved, r"the image is blurred by \d\.\d.* px, the others of its view by \d"),
     ("c2", 4): (_upside_down, "the image is upside down"),

@@ -8,7 +8,7 @@ outlines are measured again. How far these move is about how far they had moved 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -58,11 +58,11 @@ class CompressionEffect:
 class _CompressedAgain:
     """Reads photographs and compresses each once more."""
 
-    photographs: Photographs
+    load: Callable[[int], Grey]  # the photographs themselves cannot travel to other processes
     quality: Mapping[int, int]  # by row
 
     def __call__(self, row: int) -> Grey:
-        grey = np.clip(np.rint(self.photographs.load(row)), 0.0, 255.0).astype(np.uint8)
+        grey = np.clip(np.rint(self.load(row)), 0.0, 255.0).astype(np.uint8)
         shifted = np.pad(grey, ((_SHIFT, 0), (_SHIFT, 0)), mode="edge")
         _, file = cv2.imencode(".jpg", shifted, [cv2.IMWRITE_JPEG_QUALITY, self.quality[row]])
         again = np.asarray(cv2.imdecode(file, cv2.IMREAD_GRAYSCALE))
@@ -105,9 +105,8 @@ def compression_effect(
     every = np.array(list(quality), dtype=np.intp)
     chosen = np.linspace(0, len(every) - 1, min(_MAX_IMAGES, len(every))).round().astype(np.intp)
     rows = every[chosen]
-    again = replace(
-        photographs, load=_CompressedAgain(photographs, quality), detect=rows, keep=no_outlines()
-    )
+    load = _CompressedAgain(photographs.load, quality)
+    again = replace(photographs, load=load, detect=rows, keep=no_outlines())
     moved = measure_photographs(again, placement, report, stage=STAGE)
     offsets, claimed = _between(outlines, moved, photographs)
     if len(offsets) < _MIN_OUTLINES:

@@ -221,12 +221,31 @@ class FitQuality(Document):
     rms_px: Number | None
 
 
-class ResidualsBlock(FitQuality):
+class WrongReadingBlock(Document):
+    """A reading that all other measurements contradict, left out of the fit."""
+
+    motor: str
+    view: str
+    image: str
+    off: Number  # how far it is above what all else shows
+    unit: Literal["m", "rad"]
+
+
+class RedundantReadings(Document):
+    """How readings of more motors than freedoms agree with each other and with the rest."""
+
+    rms: NotNegative  # of residuals over their standard deviations
+    rms_m: NotNegative  # of residuals, as far as they move joints
+    wrong: list[WrongReadingBlock]
+
+
+class ResidualsBlock(FitQuality, SparseDocument):
     """The same of a calibration, with the noise that they show."""
 
     rms_axes: Number | None
     noise: NoiseBlock
     shared_px: dict[str, NotNegative]
+    redundant_readings: RedundantReadings | None = None  # left out where readings cannot disagree
 
 
 class NamedImage(Document):

@@ -60,6 +60,7 @@ from legcal.data import (
     compression_note,
     dataset_at,
     few,
+    few_views,
     fingerprint,
     image_notes,
     load_dataset,
@@ -699,13 +700,17 @@ def exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
     names, cameras = [view.name for view in views], [view.camera for view in views]
     chosen = {name.rsplit(".", 1)[0] for name in (*choices.free, *choices.priors, *choices.fixed)}
     known = {*chosen, *stated_covariances(names, cameras)}
-    exact = [name for name in dict.fromkeys(shared_cameras(names, cameras)) if name not in known]
+    owners = shared_cameras(names, cameras)
+    exact = [name for name, owner in zip(names, owners, strict=True) if owner not in known]
     if not exact:
         return []
-    state = "their camera files state" if len(exact) > 1 else "its camera file states"
+    many = len({owner for owner in owners if owner not in known}) > 1
+    whose, state = (
+        ("cameras", "their camera files state") if many else ("camera", "its file states")
+    )
     return [
-        f"The intrinsics of {few(exact)} are taken as exact, since {state} no covariance; "
-        "calibrate with legcal camera, or state what is known with a prior."
+        f"The intrinsics of the {whose} of {few_views(exact)} are taken as exact, since {state} no "
+        "covariance; calibrate with legcal camera, or state what is known with a prior."
     ]
 
 

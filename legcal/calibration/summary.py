@@ -383,6 +383,12 @@ def _fit_line(result: Result) -> str:
         parts.append(f"{found.rms_px:.3f} px rms")
     if found.rms_axes is not None:
         parts.append(f"axes off by {found.rms_axes:.3f} of their standard deviations, rms")
+    if found.redundant_readings is not None:
+        redundant = found.redundant_readings
+        parts.append(
+            f"readings of redundant motors off by {1e3 * redundant.rms_m:.4f} mm, "
+            f"{redundant.rms:.2f} of their standard deviations, rms"
+        )
     line = (
         f"The joint fit started from the {result.start} model: chi2 {found.chi2:.1f} "
         f"for {', '.join(parts)}."

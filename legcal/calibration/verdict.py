@@ -44,12 +44,17 @@ def judge(
     minimum.
     """
     machine, measurements = dataset.machine, dataset.measurements
+    q = measurements.q_of_poses.copy()
+    readings = solution.redundant_readings
+    for wrong in () if readings is None else readings.wrong:
+        motor = machine.reads[wrong.leg]
+        q[wrong.pose, [j for j in range(machine.n_legs) if machine.reads[j] == motor]] = np.nan
     platform = platform_accuracy(
         machine,
         solution.legs,
         solution.parametrization,
         solution.kinematic_covariance + solution.held_covariance,
-        measurements.q_of_poses,
+        q,
         solution.T_Rb_Re,
         solution.sensitivities,
     )
@@ -60,6 +65,11 @@ def judge(
     if diagnosis:
         why = f"{diagnosis[0].sentence} As it is, {found}."
         verdict = Verdict(False, f"Do not load this into the controller: {why}")
+    elif readings is not None and readings.doubts:
+        verdict = Verdict(
+            False,
+            f"Do not load this into the controller: {found}, but {', and '.join(readings.doubts)}.",
+        )
     elif solution.left_out:
         verdict = Verdict(
             False,

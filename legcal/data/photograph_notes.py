@@ -46,6 +46,7 @@ def notes_on_photographs(
     for path, views in views_of.items():
         images = {v: _images(measurements, v, facts) for v in views}
         notes += _against_camera(measurements, path, images)
+        notes += [PhotographNote(what, False) for what in _in_modes(measurements, images)]
         for v in views:
             notes += [PhotographNote(what, False) for what in _of_view(measurements, v, images[v])]
     return notes
@@ -89,6 +90,24 @@ def _against_camera(
         yield PhotographNote(start + rest, len(found.images) > 1 or bool(found.needed))
 
 
+def _in_modes(
+    measurements: Measurements, images: Mapping[int, list[tuple[str, ImageFacts]]]
+) -> Iterator[str]:
+    """Yield which photographs were taken in a mode that does not show what the lens saw."""
+    modes: dict[str, dict[str, int]] = {}
+    for v, of_view in images.items():
+        for image, facts in of_view:
+            if facts.mode:
+                modes.setdefault(facts.mode, {})[image] = v
+    for mode, view_of in modes.items():
+        views = few_views([measurements.views[v].name for v in dict.fromkeys(view_of.values())])
+        yield (
+            f"Outlines in {few(list(view_of))} of {views} may not lie where the lens put them: "
+            f"found {mode}, as their files say, needed photographs in the plain mode of the "
+            "camera; take them again, or leave them out."
+        )
+
+
 def _in_words(found: Difference) -> str:
     """Return the images of a difference, and how they are."""
     return " and ".join(f"images {how} ({few(names)})" for how, names in found.images.items())
@@ -101,22 +120,12 @@ def _of_view(
     name = measurements.views[view].name
     shown = [image for image, facts in images if facts.is_screenshot]
     nameless = [image for image, facts in images if not facts.device and image not in shown]
-    modes: dict[str, list[str]] = {}
-    for image, facts in images:
-        if facts.mode:
-            modes.setdefault(facts.mode, []).append(image)
     devices = [facts.device for _, facts in images if facts.device]
     remedy = "needed the files that the camera wrote; copy them from the camera."
     if shown:
         yield (
             f"Images {few(shown)} of view {name} may be cropped or rescaled: found screenshots, as "
             f"their files say, {remedy}"
-        )
-    for mode, names in modes.items():
-        yield (
-            f"Outlines in images {few(names)} of view {name} may not lie where the lens put them: "
-            f"found {mode}, as their files say, needed photographs in the plain mode of the "
-            "camera; take them again, or leave them out."
         )
     if nameless and len(devices) >= _MOST * len(nameless):
         yield (

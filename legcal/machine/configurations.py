@@ -8,7 +8,6 @@ manifold of closed configurations.
 
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,10 +21,9 @@ from legcal.machine.kinematics import (
     consistent_readings,
     follow,
     follow_poses,
-    reading_span,
     solve_poses,
 )
-from legcal.machine.leg import Leg, LegKind
+from legcal.machine.leg import Leg
 from legcal.machine.mobility import free_motions, project, singularities, singularity
 from legcal.machine.model import (
     Machine,
@@ -192,17 +190,16 @@ def _drawn_poses(
     """Yield readings (n_legs,) and pose (3, 4) of what :func:`_drawn` yields.
 
     Draws to come are followed together as if none were in vain, which is so for most machines. With
-    redundant motors many are: readings are drawn of as many motors as there are freedoms, those of
-    one share followed together, and the others' must lie in their travel.
+    redundant motors many are: those of one share are followed together, to the poses that miss the
+    drawn readings least, and the motors stand where these poses have them.
     """
     drawn = 0
     if machine.is_redundant:
-        driven = _by_fewest_motors(machine)
         for share in SHARES:
             if drawn == count:
                 return
-            q = _random_readings(driven, generator, np.full(count - drawn, share))
-            for readings, pose, is_reached in _reached(driven, q):
+            q = _random_readings(machine, generator, np.full(count - drawn, share))
+            for readings, pose, is_reached in _reached(machine, q):
                 drawn += is_reached
                 if is_reached:
                     yield readings, pose
@@ -227,20 +224,6 @@ def _drawn_poses(
             drawn += 1
             yield readings, pose
             break
-
-
-def _by_fewest_motors(machine: Machine) -> Machine:
-    """Return a redundant machine with as many motors as freedoms, the other legs passive.
-
-    They are those that tell most of the pose at home.
-    """
-    _, _, order = qr(reading_span(machine, machine.home).T, mode="economic", pivoting=True)
-    idle = {machine.motors[k] for k in order[machine.mobility :].tolist()}
-    legs = (
-        replace(leg, kind=LegKind.PASSIVE) if j in idle else leg
-        for j, leg in enumerate(machine.legs)
-    )
-    return replace(machine, legs=tuple(legs))
 
 
 def _random_readings(
@@ -280,8 +263,9 @@ def _reached(machine: Machine, q: Array) -> Iterator[tuple[Array, Array, bool]]:
     poses, part = follow_poses(machine, machine.home, home, q, MIN_STEP)
     readings = readings_at_poses(machine, poses)
     readings[:, [not leg.has_value for leg in machine.legs]] = 0.0
-    read = [leg.is_motor for leg in machine.legs]
-    readings[:, read] = machine.at_readings(q)[:, read]
+    if not machine.is_redundant:
+        read = [leg.is_motor for leg in machine.legs]
+        readings[:, read] = machine.at_readings(q)[:, read]
     least = MIN_SINGULARITY * singularity(machine, machine.home)
     usable = (part == 1.0) & ~_outside(machine, readings).any(axis=1)
     usable &= singularities(machine, poses) >= least

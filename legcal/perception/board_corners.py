@@ -486,7 +486,7 @@ def shown_board(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | None, 
         word = f"{shown.columns}x{shown.rows}"
         return shown, (
             f"The board has {word} squares ({board.columns}x{board.rows} inner corners); write "
-            f"--board chessboard:{word}."
+            f"--board chessboard:{word}:{1e3 * board.side:g}mm."
         )
     usual = max(extents, key=extents.count)
     if most not in extents and 2 * extents.count(usual) > len(seen):

@@ -389,6 +389,17 @@ def flipped(pairs: CandidatePairs, corners: Array, flip: Array) -> CandidatePair
     return replace(pairs, middle=middle + flip * (pairs.middle - middle), along=flip * pairs.along)
 
 
+def shrunk(pairs: CandidatePairs, corners: Array, factor: float) -> CandidatePairs:
+    """Return the pairs of the image before it was made larger by a factor about its middle."""
+    middle = corners.mean(axis=0)
+    return replace(
+        pairs,
+        middle=middle + (pairs.middle - middle) / factor,
+        half_length=pairs.half_length / factor,
+        width=pairs.width / factor,
+    )
+
+
 def mirrored(pictures: Sequence[Picture]) -> list[Picture]:
     """Return the pictures with left and right exchanged."""
     return [replace(p, pairs=flipped(p.pairs, p.corners, LEFT_RIGHT)) for p in pictures]

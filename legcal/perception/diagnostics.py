@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data import Measurements, Outlines, by_cause, image_notes, images_in_words, is_edited
 from legcal.geometry import BoolArray, IntArray, pose_distance
-from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped
+from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped, shrunk
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.detection import NOT_PLACED
 from legcal.perception.outline import HIDDEN, OUTSIDE
@@ -40,6 +40,8 @@ ONE_READING = 3.0  # how many times more than any other one it differs, if it al
 AMBIGUOUS = 0.85  # of the best explanation: then another one is about as good
 MIRRORED = "the image is mirrored"  # reasons
 TURNED = "the image is upside down"
+_ORIGINAL = "replace it by the original"  # a remedy
+_ZOOMS = [1.02**k for k in range(-12, 36) if k]  # of images that are zoomed, or cut out and scaled
 _FLIPS = ((LEFT_RIGHT, MIRRORED), (UP_DOWN, MIRRORED), (UPSIDE_DOWN, TURNED))
 
 MAX_SHARE_OF_OTHERS = 0.5  # found, against other images
@@ -257,7 +259,15 @@ def explain(
         )
         for flip, why in _FLIPS
     ]
-    tried = [(share, why, "replace it by the original") for share, why in others]
+    tried = [(share, why, _ORIGINAL) for share, why in others]
+    zooms = [
+        (_share(replace(picture, pairs=shrunk(pairs, picture.corners, z)), placement, view), z)
+        for z in _ZOOMS
+    ]
+    share = max(share for share, _ in zooms)
+    zoom = float(np.median([z for own, z in zooms if own == share]))
+    why = f"it shows the legs about {zoom:.2f} times as large as the others: zoom, or a crop scaled"
+    tried.append((share, why, _ORIGINAL))
     rows = _other_readings(search, row)
     readings = [
         (_share(_picture(search, pairs, other, view), placement, view), other) for other in rows

@@ -12,7 +12,7 @@ Value = tuple[float, ...] | bytes
 
 _MAGIC = {b"II*\0": "<", b"MM\0*": ">"}
 _EXIF_DIRECTORY = 0x8769
-_NUMBERS = {3: "H", 4: "I"}  # struct's letters by the type numbers of TIFF
+_NUMBERS = {3: "H", 4: "I", 11: "f", 12: "d"}  # struct's letters by the type numbers of TIFF
 _TEXTS, _RATIONAL = (1, 2, 7), 5
 _MOST_ENTRIES = 1000  # of a directory
 _MOST_BYTES = 65_536  # of a value
@@ -73,4 +73,5 @@ def _value(block: bytes, order: str, at: int, kind: int, count: int) -> Value | 
         pairs = zip(unpacked[::2], unpacked[1::2], strict=True)
         numbers = tuple(a / b for a, b in pairs if b)
         return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else None
-    return tuple(float(x) for x in unpacked)
+    numbers = tuple(float(x) for x in unpacked)
+    return numbers if all(map(math.isfinite, numbers)) else None

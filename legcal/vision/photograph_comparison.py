@@ -2,7 +2,8 @@
 
 A calibration holds for one camera with one lens, focal length, focus and size of image, and for one
 way of processing. What cannot move an edge in the image (exposure, the quality of a JPEG, how the
-camera was held) is not compared, and neither is what a file does not say.
+camera was held) is not compared, and neither is what a file does not say, but for what is only
+written where something was done to the picture.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ class Fact:
     words: Callable[[Any, Size], str]  # of a value: how images of a size are that have it
     differ: Callable[[Any, Any, ImageFacts], bool]  # value, another value, the image of the first
     plain: object = None  # value that needs no calibration of its own
+    where_so: bool = False  # whether cameras and programs write it only where it is not plain
 
 
 def _not_equal(a: object, b: object, _: ImageFacts) -> bool:
@@ -105,13 +107,14 @@ FACTS = (
          _plainly("taken with a focal length of {:.4g} mm"), _far),
     Fact("focal_length_35mm", "focal_length_35mm", "field of view",
          _plainly("taken with the field of view of {:.4g} mm on 35 mm film"), _far_35mm),
-    Fact("digital_zoom", "digital_zoom", "digital zoom", _zoom, _far, 1.0),
+    Fact("digital_zoom", "digital_zoom", "digital zoom", _zoom, _far, 1.0, True),
     Fact("focus_distance_m", "focus_distance", "focus",
          _plainly("taken with the focus at {:.3g} m"), _refocused),
     Fact("taken_size", "taken_size", _PROCESSING, _processed, _not_equal),
-    Fact("software", "software", _PROCESSING, _plainly("written by '{}'"), _other_program),
-    Fact("lens_corrected", "lens_corrected", _PROCESSING, _corrected, _not_equal, False),
-    Fact("cropped", "cropped", _PROCESSING, _cropped, _not_equal, False),
+    Fact("software", "software", _PROCESSING, _plainly("written by '{}'"), _other_program,
+         where_so=True),
+    Fact("lens_corrected", "lens_corrected", _PROCESSING, _corrected, _not_equal, False, True),
+    Fact("cropped", "cropped", _PROCESSING, _cropped, _not_equal, False, True),
 )  # fmt: skip
 _RECORDED_TOO = ("form", "jpeg_quality", "orientation")
 
@@ -177,9 +180,17 @@ def differences(
             if like is None:
                 groups.append((value, like := []))
             like.append(name)
-        is_odd = board is not None and plain is not None and any(v != plain for v, _ in groups)
-        if len(groups) > 1 or is_odd:
+        is_odd = any(v != plain for v, _ in groups)
+        silent = [
+            name
+            for name, one in named
+            if is_odd and fact.where_so and one.device and getattr(one, fact.name) in (None, "")
+        ]
+        if len(groups) > 1 or silent or (is_odd and plain is not None and board is not None):
             by_words = {fact.words(value, size): names for value, names in groups}
+            if silent:
+                by_words["that say nothing of it"] = silent
+            by_words = dict(sorted(by_words.items(), key=lambda one: len(one[1])))
             if not _said(found, by_words):
                 found.append(Difference(fact, by_words, ""))
     return found

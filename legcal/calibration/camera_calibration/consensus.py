@@ -10,7 +10,9 @@ it stays. Images that are wrong alike, as a third that was taken at another zoom
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -31,7 +33,8 @@ _CLEAR = 0.6  # part of the images, from which a group is not searched further
 _MORE_STARTS = 4  # fits of random images, then
 _EXPLAINED = 0.6  # part of what is wrong with an image, from which it is the reason
 _ALMOST = 0.9  # part of the best explanation, from which a simpler one is the reason
-_ALIKE = 0.2  # part by which changes of both focal lengths may differ from their mean
+_ALIKE = 0.2  # part by which changes of both focal lengths, or in images, may differ from a mean
+_PAIR = 2  # images that have a change in common by chance
 _TWO = 0.85  # part of the scatter between two values, of a normal distribution 0.64
 _RIVAL = 4  # images that make another group
 
@@ -251,13 +254,19 @@ def _reasons(adjusted: AdjustedBoard, seen: BoardImages, group: BoolArray) -> di
             for name, fault in faults.items()
             if fault.gain > max(_EXPLAINED, _ALMOST * most)
         }
-    # The simplest; of equally simple ones that which would explain most images.
+    # The simplest; of equally simple ones that which would explain most images. What most images
+    # have in common is no unknown of each.
     names = [name for faults in likely.values() for name in faults]
-    found = {
-        i: min(faults, key=lambda name: (faults[name].n_unknowns, -names.count(name)))
-        for i, faults in likely.items()
-        if faults
+    shared = {
+        name: _shared([f[name].change for f in likely.values() if name in f]) for name in names
     }
+
+    def complexity(i: int, name: str) -> tuple[int, int]:
+        fault = likely[i][name]
+        n_known = len(fault.change) if _near(fault.change, shared[name]) else 0
+        return fault.n_unknowns - n_known, -names.count(name)
+
+    found = {i: min(faults, key=partial(complexity, i)) for i, faults in likely.items() if faults}
     reasons = {}
     for i in likely:
         name = found.get(i, "")
@@ -291,6 +300,18 @@ def _reasons(adjusted: AdjustedBoard, seen: BoardImages, group: BoolArray) -> di
                 f"own are {rms[1]:.2f} px off"
             )
     return reasons
+
+
+def _shared(changes: Sequence[Array]) -> Array:
+    """Return the change (2,) that most of some images have in common; zero if there is none."""
+    middle = np.median(changes, axis=0)
+    alike = sum(_near(change, middle) for change in changes)
+    return np.asarray(middle if alike > max(_PAIR, len(changes) // 2) else np.zeros(2))
+
+
+def _near(change: Array, other: Array) -> bool:
+    """Say whether a change is another one, which is none if it is zero."""
+    return bool(np.linalg.norm(change - other) < _ALIKE * np.linalg.norm(other))
 
 
 _FREE = {

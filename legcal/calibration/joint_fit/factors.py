@@ -450,6 +450,7 @@ class Readings:
 
     leg: IntArray  # (n,) indices
     pose: IntArray  # (n,) indices
+    sign: Array  # (n,) of the reading in the length
     length: Array  # (n,) sign * q: the leg length without its offset [m]
     sigma: Array  # (n,) standard deviations [m]
     n_legs: int  # of the mechanism
@@ -457,6 +458,10 @@ class Readings:
 
     def __len__(self) -> int:
         return len(self.leg)
+
+    def wrong_by(self, rows: Residuals) -> Array:
+        """Return how far readings are above those of a state, (n,) [m]."""
+        return -self.sign * rows.r[:, 0]
 
     def rows(self, state: State) -> Residuals:
         """Return the closures of legs (n, 1) [m], |AB| - sign q - q0, with their derivatives."""
@@ -505,7 +510,8 @@ def observed_readings(measurements: Measurements, legs: FittedLegs) -> Readings:
     actuated = np.array([leg.kind is LegKind.ACTUATED for leg in legs.nominal], dtype=np.bool_)
     leg, pose = np.nonzero((np.isfinite(length) & actuated).T)
     sigma = measurements.sigma_of(legs.nominal)[leg]
-    return Readings(leg, pose, length[pose, leg], sigma, legs.n_legs)
+    sign = legs.sign[leg].astype(np.float64)
+    return Readings(leg, pose, sign, length[pose, leg], sigma, legs.n_legs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -516,9 +522,14 @@ class ActuatorReadings:
     pose: IntArray  # (n,) indices
     reading: Array  # (n,) [m or rad]
     sigma: Array  # (n,) standard deviations in the same unit
+    leg: IntArray  # (n,) indices of the first rod on each actuator
 
     def __len__(self) -> int:
         return len(self.pose)
+
+    def wrong_by(self, rows: Residuals) -> Array:
+        """Return how far readings are above those of a state, (n,) [m or rad]."""
+        return -rows.r[:, 0]
 
     def rows(self, state: State) -> Residuals:
         """Return how far readings are from those of the state, (n, 1), with their derivatives."""
@@ -542,7 +553,8 @@ def observed_actuator_readings(measurements: Measurements, legs: FittedLegs) -> 
     q = measurements.q_of_poses[:, first]
     actuator, pose = np.nonzero(np.isfinite(q).T)
     sigma = measurements.sigma_of(legs.nominal)[first]
-    return ActuatorReadings(actuator, pose, q[pose, actuator], sigma[actuator])
+    leg = np.array(first, dtype=np.intp)[actuator]
+    return ActuatorReadings(actuator, pose, q[pose, actuator], sigma[actuator], leg)
 
 
 @dataclass(frozen=True, eq=False)

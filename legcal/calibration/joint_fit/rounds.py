@@ -33,6 +33,11 @@ from legcal.calibration.joint_fit.outline_errors import (
 )
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
+from legcal.calibration.joint_fit.wrong_readings import (
+    like_readings,
+    with_judged_readings,
+    with_rough_readings,
+)
 from legcal.data import few
 from legcal.errors import DidNotConverge
 from legcal.estimation import (
@@ -56,6 +61,7 @@ from legcal.vision import EPSILON
 
 _NOMINAL_SIGMA = 0.1  # of the mean leg length, angles at it
 _BOARD_ROUNDS = 3
+_READING_ROUNDS = 8  # in which one reading of each pose is left out at most
 _REJECTION_TOLERANCE = 0.005  # relative, of the cost, in rounds that reject outliers
 _PASSING = 1e-6  # squared sigmas from a minimum that rounds pass through and do not end at
 _MIN_REDUNDANCY = 0.05  # of the equations of corners, beyond what the fit absorbs
@@ -114,7 +120,9 @@ def first_minimum(
     without that knowledge. *known* are rows of factors at the begin, with claimed covariances.
     Without *must_converge* the best state is returned where the steps do not come to an end.
     """
-    claimed, every = problem.weighted(NoiseModel()), np.ones(len(problem.outlines), dtype=np.bool_)
+    given, every = problem, np.ones(len(problem.outlines), dtype=np.bool_)
+    is_rough = problem.legs.is_redundant
+    claimed = with_rough_readings(problem.weighted(NoiseModel()))
     chosen = of_determined_poses(claimed, begin, every)
     problem, loss = claimed.weighted(NoiseModel(), chosen), PseudoHuber(settings.loss_width)
     legs, n = problem.legs, problem.n_kinematic
@@ -131,14 +139,18 @@ def first_minimum(
         max_iterations=settings.max_iterations,
         tolerance=_PASSING,
         relative_tolerance=_REJECTION_TOLERANCE,
-        known=known if chosen.all() else None,
+        known=known if chosen.all() and not is_rough else None,
         must_converge=must_converge,
     )
     there = of_determined_poses(claimed, found.state, every)
-    problem = claimed.weighted(NoiseModel(), there)
-    same = bool(np.array_equal(there, chosen))
+    problem = given.weighted(NoiseModel(), there)
+    same = bool(np.array_equal(there, chosen)) and not is_rough
     linear = linearize(problem, found.state, found.linear.rows if same else None)
-    return Minimum(found.state, linear, robust_cost(problem, linear, loss), found.iterations)
+    cost = robust_cost(problem, linear, loss)
+    if is_rough:  # one wrong reading would outweigh all else
+        rough = with_rough_readings(problem)
+        cost = robust_cost(rough, linearize(rough, found.state), loss)
+    return Minimum(found.state, linear, cost, found.iterations)
 
 
 def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: RefinementSettings) -> Fit:
@@ -160,6 +172,7 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
     least[: len(KINDS)] = [problem.choices.least_shared_px.get(kind, 0.0) for kind in KINDS]
     biases = possible.of_sizes(with_gamma(np.zeros(N_KINDS)))
     problem, minimum = _with_edge_biases(problem, first, biases)
+    problem, minimum = _without_wrong_readings(problem, minimum, settings)
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before = accepted
         noise = noise_of_the_median(problem.offsets(minimum.state)[before], claimed[before])
@@ -173,6 +186,8 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
     for _ in range(_BOARD_ROUNDS if any(map(len, problem.boards)) else 0):
         problem = _with_judged_corners(problem, minimum.state, settings)
         minimum = _passed(problem, minimum, settings, _REJECTION_TOLERANCE)
+    if problem.legs.is_redundant:
+        problem, minimum = _judged_again(problem, minimum, settings)
     with_possible, changes, are_white = problem.with_biases(possible), NO_CHANGES, False
 
     def scores_of_biases() -> tuple[Array, Array]:
@@ -223,6 +238,37 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
     at_places = _at_places(problem, minimum, accepted, settings) if biases.are_shown else None
     notes = check_convergence(changes, claimed, settings)
     return Fit(problem, minimum, noise, biases, accepted, at_places, minimum.iterations, notes)
+
+
+def _without_wrong_readings(
+    problem: FitProblem, first: Minimum[State], settings: RefinementSettings
+) -> tuple[FitProblem, Minimum[State]]:
+    """Return problem and minimum without wrong readings, before these bend the fit.
+
+    *first* is the minimum with rough readings.
+    """
+    if not problem.legs.is_redundant:
+        return problem, first
+    rough, minimum, is_wrong = with_rough_readings(problem), first, True
+    for _ in range(_READING_ROUNDS):
+        rough, is_wrong = with_judged_readings(rough, minimum.state, settings)
+        if not is_wrong:
+            break
+        minimum = _passed(rough, minimum, settings, _REJECTION_TOLERANCE)
+    problem = like_readings(problem, rough)
+    return problem, _passed(problem, minimum, settings, _REJECTION_TOLERANCE)
+
+
+def _judged_again(
+    problem: FitProblem, minimum: Minimum[State], settings: RefinementSettings
+) -> tuple[FitProblem, Minimum[State]]:
+    """Return problem and minimum without readings that are wrong by their standard deviations."""
+    for _ in range(_READING_ROUNDS):
+        minimum = _passed(problem, minimum, settings)
+        problem, is_wrong = with_judged_readings(problem, minimum.state, settings)
+        if not is_wrong:
+            break
+    return problem, minimum
 
 
 def _at_places(

@@ -40,6 +40,11 @@ from legcal.calibration.joint_fit.sensitivity import (
     zoomed_views,
 )
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
+from legcal.calibration.joint_fit.wrong_readings import (
+    JudgedReadings,
+    judged_readings,
+    reading_notes,
+)
 from legcal.data import Dataset, Order, Outlines, inverse, reorder_measurements
 from legcal.estimation import (
     NormalEquations,
@@ -122,6 +127,7 @@ class Solution:
     contradicted_cameras: tuple[str, ...] = ()  # views that stand for such cameras
     left_out: tuple[str, ...] = ()  # legs of views most of whose outlines disagree, unconfirmed
     camera_notes: tuple[str, ...] = ()  # those of the notes that are about these
+    redundant_readings: JudgedReadings | None = None  # None where readings cannot disagree
 
     @property
     def parameters(self) -> KinematicParameters:
@@ -156,7 +162,8 @@ def assemble_solution(
     estimated = covariance[np.ix_(where, where)]
     offsets, cost = problem.offsets(state), comparable_cost(problem, state, settings)
     used = offsets[fit.accepted]
-    n_rejected = offsets.size - used.size
+    readings = judged_readings(problem, state, normal, settings)
+    n_rejected = offsets.size - used.size + (0 if readings is None else len(readings.wrong))
     n_residuals = problem.n_equations + len(problem.priors.mean) - n_rejected
     chi2 = float(np.sum(linear.prior_r**2)) + sum(
         float(np.sum(rows.r**2)) for rows in linear.rows.values()
@@ -250,10 +257,12 @@ def assemble_solution(
         contradicted_cameras=(*of_tests, *(camera.view for camera in doubted)),
         left_out=legs_left_out(problem, fit.accepted),
         camera_notes=camera_notes,
+        redundant_readings=readings,
         notes=(
             *fit.notes,
             *rejected_notes(problem, fit.accepted),
             *corner_notes(problem),
+            *reading_notes(readings),
             *map(str, gammas),
             *notes_on_blur(fit.edge_biases, problem.outlines.covariance[fit.accepted]),
             *(scale or contradicted_radii(problem, state, normal)),
@@ -377,6 +386,8 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     parametrization = parametrize(names_of_legs, geometry, frame_legs, twists=True)
     where = _places(names, solution.names)
     steps = _places(parametrization.names, solution.parametrization.names)
+    readings = solution.redundant_readings
+    file_pose = {worked: pose for pose, worked in enumerate(_poses(order, dataset).tolist())}
     return replace(
         solution,
         legs=geometry,
@@ -397,6 +408,14 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         held_basis=solution.held_basis[:, steps],
         sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),
         outlines=order.restore(solution.outlines),
+        redundant_readings=readings
+        and replace(
+            readings,
+            wrong=tuple(
+                replace(one, leg=int(order.legs[one.leg]), pose=file_pose[one.pose])
+                for one in readings.wrong
+            ),
+        ),
     )
 
 

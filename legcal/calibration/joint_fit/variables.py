@@ -218,6 +218,7 @@ class FittedLegs:
     frame_legs: tuple[int, ...]  # whose joint centres define R_b and R_e: three, two in a plane
     radii: dict[tuple[int, str], float]  # of the model [m], for each (leg index, part)
     home: RigidTransform | None = None  # T_Rb_Re; without it constraints tie no parameters
+    is_redundant: bool = False  # whether readings can contradict each other
 
     @property
     def n_legs(self) -> int:
@@ -264,6 +265,7 @@ def fitted_legs(machine: Machine) -> FittedLegs:
             for part, r in leg.radius_of_part.items()
         },
         machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re,
+        machine.is_redundant,
     )
 
 
