@@ -11,10 +11,11 @@ version, name and unit (mm). Two things are asked:
   1 deg in everything, and from rough cameras; its errors beside the Cramer-Rao bound and the
   normalised squared error on all that is determined, as ``classes_study.py`` counts them;
 - datasets (``--datasets``) of ``legcal simulate`` without hints at ``--level``, whose true machine
-  is off by up to 2 mm, calibrated by ``legcal calibrate``: how many converge and how many of these
-  the verdict trusts, and of those that converge the platform error of eq (20) at their readings before and after, and how the latter compares with the predicted sigma
-  (mean over seeds). Where motors do not determine the pose, cameras have hints, and errors are
-  those of the parameters in metres (root mean square), with their normalised squared error.
+  is off by up to 2 mm, calibrated by ``legcal calibrate``: how many converge, and how many of these
+  the verdict trusts; of all that converge the platform error of eq (20) at their readings before
+  and after, and how the latter compares with the predicted sigma (mean over seeds). Where motors do
+  not determine the pose, cameras have hints, and errors are those of the parameters in metres (root
+  mean square), with their normalised squared error.
 """
 
 import argparse
