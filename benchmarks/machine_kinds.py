@@ -11,10 +11,11 @@ version, name and unit (mm). Two things are asked:
   1 deg in everything, and from rough cameras; its errors beside the Cramer-Rao bound and the
   normalised squared error on all that is determined, as ``classes_study.py`` counts them;
 - datasets (``--datasets``) of ``legcal simulate`` without hints at ``--level``, whose true machine
-  is off by up to 2 mm, calibrated by ``legcal calibrate``: how many are, the platform error of
-  eq (20) at their readings before and after, and how the latter compares with the predicted sigma
-  (mean over seeds). Where motors do not determine the pose, cameras have hints, and errors are
-  those of the parameters in metres (root mean square), with their normalised squared error.
+  is off by up to 2 mm, calibrated by ``legcal calibrate``: how many converge, and how many of these
+  the verdict trusts; of all that converge the platform error of eq (20) at their readings before
+  and after, and how the latter compares with the predicted sigma (mean over seeds). Where motors do
+  not determine the pose, cameras have hints, and errors are those of the parameters in metres (root
+  mean square), with their normalised squared error.
 """
 
 import argparse
@@ -92,7 +93,7 @@ def datasets(kind: str, level: Level, seeds: Sequence[int], scratch: Path) -> st
     """Print a line a dataset, and return one on all that were calibrated."""
     machine = load_mechanism(kind) if kind in CARRIED else made(kind, scratch / "nominal")
     model, found, hints = machine.yaml_path, [], not machine.is_determined
-    squared = list[float]()
+    squared, n_trusted = list[float](), 0
     for seed in seeds:
         folder = scratch / f"{kind}-{level}-{seed}"
         result = scratch / f"{folder.name}-result"
@@ -125,10 +126,13 @@ def datasets(kind: str, level: Level, seeds: Sequence[int], scratch: Path) -> st
             before, after = (one.displacement.mean() for one in both)
             predicted = platform.sigma.mean_displacement
         found.append((before, after, predicted))
+        trusted = calibration.verdict.trustworthy
+        n_trusted += trusted
         seconds = time.perf_counter() - begin
         nse = "" if platform is not None else f", nse {squared[-1]:5.2f}"
-        print(f"{kind:20}{seed:4}{numbers(found[-1])}{nse}{seconds:6.0f} s", flush=True)
-    line = f"{kind:20}{len(found):4} of {len(seeds)} from {level}"
+        print(f"{kind:20}{seed:4}{numbers(found[-1])}{nse}{seconds:6.0f} s", end="")
+        print("" if trusted else f", not trusted: {calibration.verdict.sentence}", flush=True)
+    line = f"{kind:20}{len(found):4} of {len(seeds)} converge from {level}, {n_trusted} trusted"
     line += numbers(np.mean(found, axis=0)) if found else ""
     return line + (f", nse {np.mean(squared):5.2f}" if squared else "")
 

@@ -32,7 +32,9 @@ from legcal.geometry import Array, cross
 from legcal.machine import (
     Leg,
     Machine,
+    follow_poses,
     geometries,
+    inverse_kinematics,
     load_mechanism,
     machine_ties,
     moved_legs,
@@ -209,3 +211,14 @@ def test_free_poses_that_the_legs_cannot_follow_stay(tmp_path: Path) -> None:
     assert moved[2] > 1e-3
     assert moved[3:].max() < 1e-9
     assert np.isfinite(moved).all()
+
+
+def test_ways_of_dependent_constraints_need_no_short_steps(tmp_path: Path) -> None:
+    machine = written("2-UPR + 2-SPS", LAYOUTS[0], tmp_path)
+    home = inverse_kinematics(machine, machine.home)
+    lower, upper = np.array([leg.travel for leg in machine.legs]).T
+    q = home + 0.4 * (np.random.default_rng(1).uniform(lower, upper, (30, len(home))) - home)
+    _, quickly = follow_poses(machine, machine.home, home, q, 1.0 / 16.0)
+    _, slowly = follow_poses(machine, machine.home, home, q, 1.0 / 256.0)
+    assert np.sum(slowly == 1.0) > 5
+    np.testing.assert_array_equal(quickly == 1.0, slowly == 1.0)

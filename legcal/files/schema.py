@@ -418,9 +418,12 @@ def _sentence(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: 
                 "needed more; add what is missing."
             )
         case "missing":
+            known = _annotation_at(schema, loc)
+            words = typing.get_args(known) if typing.get_origin(known) is Literal else ()
+            value = " or ".join(map(str, words))
             return (
-                f"{path}: {place} could not be read: found no such key, needed it; add "
-                f"'{loc[-1]}: ...' to the file."
+                f"{path}: {place} could not be read: found no such key, needed {value or 'it'}; "
+                f"add '{loc[-1]}: {value or '...'}' to the file."
             )
         case "value_error":
             return f"{path}: {place} could not be used: {context['error']}"
@@ -446,6 +449,14 @@ def _sentence(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: 
 
 def _keys_at(schema: type[BaseModel], loc: Iterable[int | str]) -> list[str]:
     """Return the keys that a schema knows at a place."""
+    here = _annotation_at(schema, loc)
+    if isinstance(here, type) and issubclass(here, BaseModel):
+        return [f.alias or name for name, f in here.model_fields.items()]
+    return []
+
+
+def _annotation_at(schema: type[BaseModel], loc: Iterable[int | str]) -> Any:
+    """Return the type that a schema demands at a place, of several the first with keys."""
     here: Any = schema
     for step in loc:
         if isinstance(here, type) and issubclass(here, BaseModel):
@@ -457,6 +468,4 @@ def _keys_at(schema: type[BaseModel], loc: Iterable[int | str]) -> list[str]:
         models = [o for o in options if isinstance(o, type) and issubclass(o, BaseModel)]
         is_container = typing.get_origin(here) in (dict, list, tuple)
         here = here if is_container or not models else models[0]
-    if isinstance(here, type) and issubclass(here, BaseModel):
-        return [f.alias or name for name, f in here.model_fields.items()]
-    return []
+    return here

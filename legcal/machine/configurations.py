@@ -8,6 +8,7 @@ manifold of closed configurations.
 
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -152,6 +153,7 @@ def _require(machine: Machine, count: int, found: int) -> None:
         )
 
 
+@lru_cache(maxsize=2)  # verdict and report of a calibration need the same
 def workspace(machine: Machine) -> tuple[Array, list[RigidTransform]]:
     """Return the readings and poses that stand for the workspace, the same at every call.
 

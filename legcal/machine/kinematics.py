@@ -35,9 +35,9 @@ from legcal.machine.equations import (
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.mobility import (
     CLOSED,
-    determinant_sign,
     dimensionless,
     excludes_singularity,
+    is_on_same_side,
     leg_scale,
 )
 from legcal.machine.model import (
@@ -583,20 +583,17 @@ def follow(
     free = np.delete(np.arange(machine.chain.nv), v_columns)
     first = configuration[q_columns]
     known = machine.chain.linearize(configuration)[1][:, free]
-    here: float | None = None
 
     def attempt(part: float) -> bool:
-        nonlocal configuration, known, here
+        nonlocal configuration, known
         trial = configuration.copy()
         trial[q_columns] = readings if part == 1.0 else first + part * (readings - first)
         reached, jacobian = _closed_from(machine, trial, free)
         if reached is None or _is_flipped(machine, reached):
             return False
         if not excludes_singularity(known, jacobian):
-            if here is None:
-                here = determinant_sign(machine, configuration)
-            there = determinant_sign(machine, reached)
-            if not here == there != 0.0:  # not square: only ways on which little changes
+            both = (platform_pose(machine, c).as_matrix() for c in (configuration, reached))
+            if not is_on_same_side(*dimensionless(machine, np.array(list(both)))):
                 return False
         configuration, known = reached, jacobian
         return True
@@ -690,9 +687,7 @@ def follow_poses(
         good &= ~_is_reversed(machine, found.points)
         for i in np.flatnonzero(good):
             if not excludes_singularity(known[rows[i]], jacobian[i]):
-                both = np.array([known[rows[i]], jacobian[i]])
-                signs = np.sign(np.linalg.det(both)) if both.shape[1] == 6 else np.zeros(2)
-                good[i] = signs[0] == signs[1] != 0.0
+                good[i] = is_on_same_side(known[rows[i]], jacobian[i])
         reached = rows[good]
         poses[reached], known[reached] = found.points[good], jacobian[good]
         done[reached] = part[good]

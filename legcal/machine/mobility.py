@@ -158,16 +158,6 @@ def singularities(machine: Machine, poses: Array) -> Array:
     return np.asarray(np.linalg.svd(jacobian, compute_uv=False)[:, 5])
 
 
-def determinant_sign(machine: Machine, configuration: Array) -> float:
-    """Return the sign of the determinant of the legs' equations where they are square, else 0.
-
-    Between two configurations of different sign lies a singularity.
-    """
-    R, t = machine.chain.placement(configuration, machine.base, machine.platform)
-    (rows,) = dimensionless(machine, np.column_stack([R, t])[None])
-    return float(np.sign(np.linalg.det(rows))) if len(rows) == 6 else 0.0
-
-
 def dimensionless(machine: Machine, poses: Array) -> Array:
     """Return the Jacobians of :func:`singularity`, (k, n_rows, 6): rotation, displacement.
 
@@ -186,6 +176,16 @@ def dimensionless(machine: Machine, poses: Array) -> Array:
     motors = list(machine.motors)  # lines alone; of rods one hangs on each
     u = (vectors / lengths[..., None])[:, motors]
     return np.concatenate([cross((turned - centre)[:, motors] / scale, u), u], axis=2)
+
+
+def is_on_same_side(known: Array, jacobian: Array) -> bool:
+    """Say whether two Jacobians of :func:`dimensionless` are on the same side of singularities.
+
+    Determinants of square ones have the same sign then. The sum of the products of all minors,
+    det(J0' J1), says so too where there are more rows, because constraints follow from each other.
+    Motors that do not determine the pose leave it zero.
+    """
+    return len(known) >= known.shape[1] and bool(np.linalg.det(known.T @ jacobian) > 0.0)
 
 
 def excludes_singularity(known: Array, jacobian: Array) -> bool:
