@@ -54,7 +54,7 @@ def test_extreme_poses_of_shipped_machines_are_poses_of_theirs(name: str) -> Non
     assert len(poses.poses) == 4
     lower, upper = np.array([leg.travel for leg in machine.legs]).T
     least = MIN_SINGULARITY * singularity(machine, machine.home)
-    at_home = determinant_sign(machine, machine.home_configuration)
+    at_home = determinant_sign(machine, machine.home_configuration, machine.motors)
     for configuration, readings, T in zip(
         poses.configurations, poses.readings, poses.poses, strict=True
     ):
@@ -62,7 +62,7 @@ def test_extreme_poses_of_shipped_machines_are_poses_of_theirs(name: str) -> Non
         np.testing.assert_allclose(readings, inverse_kinematics(machine, T), atol=1e-10)
         assert np.all((readings >= lower - 1e-9) & (readings <= upper + 1e-9))
         assert singularity(machine, T) >= least
-        assert determinant_sign(machine, configuration) == at_home
+        assert determinant_sign(machine, configuration, machine.motors) == at_home
     part = _parts(machine, poses)
     assert np.ptp(part, axis=0).max() > 0.4
     if name != LONG_TRAVEL:
