@@ -159,7 +159,7 @@ def singularities(machine: Machine, poses: Array) -> Array:
 
 
 def determinant_sign(machine: Machine, configuration: Array, motors: Sequence[int]) -> float:
-    """Return the sign of the determinant of the equations with some motors where they are square, else 0.
+    """Return the sign of the determinant of equations with some motors if square, else 0.
 
     Between two configurations of different sign lies a singularity.
     """
