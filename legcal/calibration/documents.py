@@ -235,6 +235,7 @@ class RedundantReadings(Document):
     """How readings of more motors than freedoms agree with each other and with the rest."""
 
     rms: NotNegative  # of residuals over their standard deviations
+    rms_expected: NotNegative  # of right readings: below 1, because the fit follows each in part
     rms_m: NotNegative  # of residuals, as far as they move joints
     wrong: list[WrongReadingBlock]
 

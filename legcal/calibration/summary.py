@@ -387,7 +387,8 @@ def _fit_line(result: Result) -> str:
         redundant = found.redundant_readings
         parts.append(
             f"readings of redundant motors off by {1e3 * redundant.rms_m:.4f} mm, "
-            f"{redundant.rms:.2f} of their standard deviations, rms"
+            f"{redundant.rms:.2f} of their standard deviations, rms "
+            f"(expected {redundant.rms_expected:.2f})"
         )
     line = (
         f"The joint fit started from the {result.start} model: chi2 {found.chi2:.1f} "

@@ -68,6 +68,7 @@ from .inspection import machine_document as machine_document
 from .kinematics import Follower as Follower
 from .kinematics import consistent_readings as consistent_readings
 from .kinematics import contradiction as contradiction
+from .kinematics import determining_readings as determining_readings
 from .kinematics import equations_of_readings as equations_of_readings
 from .kinematics import follow as follow
 from .kinematics import follow_each as follow_each

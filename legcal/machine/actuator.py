@@ -234,6 +234,12 @@ class Actuator:
             return np.asarray(A + self.gain * q[:, None] * self.axis)
         return np.asarray(self.point + self.rotations(q) @ (A - self.point))
 
+    def by_reading(self, A: Array) -> Array:
+        """Return how joint centres that are at A (k, 3) move with the reading, (k, 3)."""
+        if not self.turns:
+            return np.broadcast_to(self.gain * self.axis, A.shape)
+        return np.asarray(self.gain * cross(self.axis, A - self.point))
+
     def motion(self, A: Array, q: Array) -> JointMotion:
         """Return the same with its derivatives."""
         q = np.asarray(q, dtype=np.float64)
@@ -246,20 +252,20 @@ class Actuator:
                 self.gain * q[:, None, None] * across.T,
                 np.zeros((k, 3, 2)),
                 q[:, None] * self.axis,
-                np.broadcast_to(self.gain * self.axis, (k, 3)),
+                self.by_reading(self.at(A, q)),
                 np.zeros(k),
             )
         R, arm = self.rotations(q), A - self.point
         turned = R @ arm
         by_axis = np.stack([cross(e, turned) - R @ cross(e, arm) for e in basis], axis=2)
-        by_angle = cross(self.axis, turned)
+        at = self.point + turned
         return JointMotion(
-            self.point + turned,
+            at,
             R,
             by_axis,
             (np.eye(3) - R) @ basis.T,
-            q[:, None] * by_angle,
-            self.gain * by_angle,
+            q[:, None] * cross(self.axis, turned),
+            self.by_reading(at),
             self.gain * q,
         )
 

@@ -19,7 +19,7 @@ from legcal.errors import DidNotConverge
 from legcal.geometry import Array, BoolArray, motions_of
 from legcal.machine.equations import PoseEquations, equations_at_readings, freedoms, pose_equations
 from legcal.machine.kinematics import (
-    consistent_readings,
+    determining_readings,
     follow,
     follow_poses,
     solve_poses,
@@ -192,8 +192,8 @@ def _drawn_poses(
     """Yield readings (n_legs,) and pose (3, 4) of what :func:`_drawn` yields.
 
     Draws to come are followed together as if none were in vain, which is so for most machines. With
-    redundant motors many are: those of one share are followed together, to the poses that miss the
-    drawn readings least, and the motors stand where these poses have them.
+    redundant motors many are, where motors that follow leave their travel: those of one share are
+    followed together.
     """
     drawn = 0
     if machine.is_redundant:
@@ -235,7 +235,7 @@ def _random_readings(
     motors = list(machine.motors)
     lower, upper = np.array([machine.legs[j].travel for j in motors]).T
     home = machine.home_configuration[slider_columns(machine, motors)[0]]
-    q = consistent_readings(machine, generator.uniform(lower, upper, (len(shares), len(motors))))
+    q = determining_readings(machine, generator.uniform(lower, upper, (len(shares), len(motors))))
     share = np.asarray(shares)[:, None]
     return np.where(share < 1.0, np.clip(home + share * (q - home), lower, upper), q)
 

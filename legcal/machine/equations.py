@@ -449,13 +449,12 @@ def _lengths(
 ) -> PoseEquations:
     """Return the lengths of all legs at once."""
     A = np.array([leg.A for leg in legs]).reshape(-1, 3)
-    on, moved = actuator_index(legs), dict[int, JointMotion]()
+    on = actuator_index(legs)
+    hung = {} if q is None else {j: leg.actuator for j, leg in enumerate(legs) if leg.actuator}
     if q is not None:
         A = np.repeat(A[None], len(t), axis=0)
-        for j, leg in enumerate(legs):
-            if leg.actuator is not None:
-                moved[j] = leg.actuator.motion(leg.A, q[:, on[j]])
-                A[:, j] = moved[j].A
+        for j, actuator in hung.items():
+            A[:, j] = actuator.at(legs[j].A, q[:, on[j]])
     arms = np.array([leg.B for leg in legs]).reshape(-1, 3) @ np.swapaxes(R, 1, 2)
     vectors = arms + t[:, None] - A
     lengths = np.sqrt(np.einsum("knx,knx->kn", vectors, vectors))
@@ -465,9 +464,10 @@ def _lengths(
         local[..., LegColumns.A], local[..., LegColumns.B] = -u, u @ R
         local[..., LegColumns.LENGTH] = -1.0
     by_q = np.zeros((*lengths.shape, 0 if q is None else q.shape[1]))
-    for j, motion in moved.items():
-        by_q[:, j, on[j]] = -_dot(motion.by_q, u[:, j])
-        if by_local:
+    for j, actuator in hung.items():
+        by_q[:, j, on[j]] = -_dot(actuator.by_reading(A[:, j]), u[:, j])
+        if q is not None and by_local:
+            motion = actuator.motion(legs[j].A, q[:, on[j]])
             local[:, j, LegColumns.A] = -_back(motion, u[:, j])
             _write_actuator(motion, u[:, j], local[:, j])
     return PoseEquations(

@@ -23,7 +23,7 @@ from legcal.machine.configurations import (
     beyond_travel,
     random_walk,
 )
-from legcal.machine.kinematics import consistent_readings, follow
+from legcal.machine.kinematics import determining_readings, follow
 from legcal.machine.mobility import singularity
 from legcal.machine.model import (
     Machine,
@@ -260,7 +260,7 @@ def _followed(
         part = rng.random(len(home))
         if extreme:
             part = near_ends(rng.integers(0, 2, len(home)), part)
-        q = consistent_readings(machine, (lower + part * (upper - lower))[None])[0]
+        q = determining_readings(machine, (lower + part * (upper - lower))[None])[0]
         return np.asarray(q if shrink == 1.0 else np.clip(home + shrink * (q - home), lower, upper))
 
     while True:

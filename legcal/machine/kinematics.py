@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
@@ -312,6 +313,20 @@ def consistent_readings(
     return np.asarray(here + (readings - here) @ span @ span.T)
 
 
+def determining_readings(machine: Machine, readings: Array) -> Array:
+    """Return readings (k, n_motors) near given ones, NaN of motors beyond the freedoms.
+
+    The others are those that tell most of the pose at home. What readings contradict each other by
+    far from home would have to be shared out among all, which takes many steps.
+    """
+    if not machine.is_redundant:
+        return readings
+    found = consistent_readings(machine, readings)
+    _, _, order = qr(reading_span(machine, machine.home).T, mode="economic", pivoting=True)
+    found[:, order[machine.mobility :]] = np.nan
+    return found
+
+
 def reading_span(machine: Machine, T: RigidTransform) -> Array:
     """Return a basis (n_motors, mobility) of how lengths change together near a pose."""
     equations = equations_at(machine, T)
@@ -573,42 +588,46 @@ def follow(
     than a part *min_step* of the way. *on_the_chain* stops where the joints of the chain do: soon,
     but in a place that depends on the spanning tree. *which* names the readings in the message. Of
     redundant motors the pose is followed that misses the readings least, and sliders stand there.
+    Motors whose readings are NaN are free; the others must determine the pose.
 
     Raises
     ------
     DidNotConverge
         If the steps stop contracting or reach a singularity, even tiny ones.
     """
-    q_columns, v_columns = slider_columns(machine, machine.motors)
+    given = np.isfinite(readings)
+    is_redundant = machine.is_redundant and bool(given.all())
+    motors = [j for j, is_given in zip(machine.motors, given, strict=True) if is_given]
+    q_columns, v_columns = slider_columns(machine, motors)
     free = np.delete(np.arange(machine.chain.nv), v_columns)
-    first = configuration[q_columns]
+    first, last = configuration[q_columns], readings[given]
     known = machine.chain.linearize(configuration)[1][:, free]
 
     def attempt(part: float) -> bool:
         nonlocal configuration, known
         trial = configuration.copy()
-        trial[q_columns] = readings if part == 1.0 else first + part * (readings - first)
+        trial[q_columns] = last if part == 1.0 else first + part * (last - first)
         reached, jacobian = _closed_from(machine, trial, free)
         if reached is None or _is_flipped(machine, reached):
             return False
         if not excludes_singularity(known, jacobian):
             both = (platform_pose(machine, c).as_matrix() for c in (configuration, reached))
-            if not is_on_same_side(*dimensionless(machine, np.array(list(both)))):
+            if not is_on_same_side(*dimensionless(machine, np.array(list(both)), motors)):
                 return False
         configuration, known = reached, jacobian
         return True
 
-    done = 0.0 if machine.is_redundant else walk_in_steps(attempt, min_step)
+    done = 0.0 if is_redundant else walk_in_steps(attempt, min_step)
     if done == 1.0:
         return configuration
     T = platform_pose(machine, configuration)
     part = 0.0
-    if machine.is_redundant or not on_the_chain:
-        now = configuration[q_columns]
+    if is_redundant or not on_the_chain:
+        now = configuration[slider_columns(machine, machine.motors)[0]]
         (pose,), (part,) = follow_poses(machine, T, now, readings[None], min_step)
         T = motion_of(pose[:, :3], pose[:, 3])
     if part < 1.0:
-        if machine.is_redundant:
+        if is_redundant:
             failure = _disagreement(machine, _nearest(machine, T, readings), readings, which)
             if failure is not None:
                 raise failure
@@ -618,7 +637,8 @@ def follow(
             "legs meet no more or the mechanism is singular, needed a regular path; check the "
             "readings and legcal.home."
         )
-    closed = _closed_at(machine, T, configuration, readings, free)
+    sliders = dict(zip(q_columns, last.tolist(), strict=True)) if not is_redundant else {}
+    closed = _closed_at(machine, T, configuration, sliders, free)
     if closed is None:
         raise DidNotConverge(
             f"{machine.yaml_path}: the pose at the readings{which} could not be reached: found a "
@@ -706,9 +726,9 @@ def _closed_from(
 
 
 def _closed_at(
-    machine: Machine, T: RigidTransform, start: Array, readings: Array, free: IntArray
+    machine: Machine, T: RigidTransform, start: Array, sliders: dict[int, float], free: IntArray
 ) -> Array | None:
-    """Return the closed configuration at readings whose pose is known, None if joints forbid it.
+    """Return the closed configuration at a pose with some columns set, None if joints forbid it.
 
     The platform is free only where axes that are a little off leave no other way.
     """
@@ -723,9 +743,7 @@ def _closed_at(
             trial = close_at(machine, T, there, FEW_RESTARTS, exact=exact)
         except DidNotConverge:
             continue
-        if machine.is_redundant:
-            return trial
-        trial[slider_columns(machine, machine.motors)[0]] = readings
+        trial[list(sliders)] = list(sliders.values())
         closed, _ = _closed_from(machine, trial, free)
         if closed is not None:
             return closed

@@ -158,11 +158,12 @@ def singularities(machine: Machine, poses: Array) -> Array:
     return np.asarray(np.linalg.svd(jacobian, compute_uv=False)[:, 5])
 
 
-def dimensionless(machine: Machine, poses: Array) -> Array:
+def dimensionless(machine: Machine, poses: Array, motors: Sequence[int] | None = None) -> Array:
     """Return the Jacobians of :func:`singularity`, (k, n_rows, 6): rotation, displacement.
 
-    Poses are matrices T_base_platform (k, 3 or 4, 4).
+    Poses are matrices T_base_platform (k, 3 or 4, 4). All motors count, or some.
     """
+    motors = list(machine.motors if motors is None else motors)
     R, t = poses[:, :3, :3], poses[:, :3, 3]
     turned = machine.B_platform @ np.swapaxes(R, 1, 2)
     vectors = vectors_at(machine, poses)
@@ -170,11 +171,12 @@ def dimensionless(machine: Machine, poses: Array) -> Array:
     scale = lengths.mean(axis=1)[:, None, None]
     centre = turned.mean(axis=1, keepdims=True)
     if is_constrained(machine):
-        jacobian = machine_equations(machine, R, t).by_pose
+        equations = machine_equations(machine, R, t)
+        counts = ~equations.measured | np.isin(equations.leg, motors)
+        jacobian = equations.by_pose[:, counts]
         gradient, moment = jacobian[:, :, 3:], jacobian[:, :, :3]
         return np.concatenate([(moment - cross(centre, gradient)) / scale, gradient], axis=2)
-    motors = list(machine.motors)  # lines alone; of rods one hangs on each
-    u = (vectors / lengths[..., None])[:, motors]
+    u = (vectors / lengths[..., None])[:, motors]  # lines alone; of rods one hangs on each
     return np.concatenate([cross((turned - centre)[:, motors] / scale, u), u], axis=2)
 
 

@@ -175,12 +175,14 @@ def _workspace_poses(machine: Machine, legs: Sequence[Leg]) -> Sequence[RigidTra
     reached = np.ones(len(poses), dtype=np.bool_)  # some legs have some lengths nowhere
     for leg, q in zip(legs, readings.T, strict=True):
         if leg.kind is LegKind.ACTUATED:
-            length = np.linalg.norm(R @ leg.B + t - leg.A, axis=1)
-            most = _REACHED_BY_ALL * length if machine.is_redundant else _REACHED
-            reached &= np.abs(length - (leg.sign * q + leg.q0)) < most
+            A, wanted = leg.A, leg.sign * q + leg.q0
         elif leg.actuator is not None:
-            length = np.linalg.norm(R @ leg.B + t - leg.actuator.at(leg.A, q), axis=1)
-            reached &= np.abs(length - leg.q0) < _REACHED
+            A, wanted = leg.actuator.at(leg.A, q), leg.q0
+        else:
+            continue
+        length = np.linalg.norm(R @ leg.B + t - A, axis=1)
+        most = _REACHED_BY_ALL * length if machine.is_redundant else _REACHED
+        reached &= np.abs(length - wanted) < most
     return [poses[k] for k in np.flatnonzero(reached)] or None
 
 

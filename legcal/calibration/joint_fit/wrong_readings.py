@@ -56,6 +56,7 @@ class JudgedReadings:
 
     wrong: tuple[WrongReading, ...]
     rms: float  # of the residuals of the others, over their standard deviations
+    rms_expected: float  # the same if they are right: the fit follows each in part
     rms_m: float  # the same as far as they move joints [m]
     doubts: tuple[str, ...]  # why the result cannot be trusted, a sentence each
 
@@ -145,7 +146,9 @@ def judged_readings(
     distance = np.array([1.0 / legs[j].reading_of(1.0) for j in tests.leg.tolist()])
     moved = tests.r * sigma[used] * distance
     rms, rms_m = (float(np.sqrt(np.mean(x**2))) for x in (tests.r, moved))
-    return JudgedReadings(tuple(wrong), rms, rms_m, _doubts(problem, tests, wrong, settings))
+    expected = float(np.sqrt(np.mean(tests.redundancy)))
+    doubts = _doubts(problem, tests, wrong, settings)
+    return JudgedReadings(tuple(wrong), rms, expected, rms_m, doubts)
 
 
 def reading_notes(judged: JudgedReadings | None) -> tuple[str, ...]:
