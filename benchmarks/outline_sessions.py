@@ -257,6 +257,7 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
             machine.frame_legs,
             radii,
             platform_in_base(machine, machine.home),
+            machine.is_redundant,
         ),
         home=platform_in_base(machine, machine.home),
         R=R,
