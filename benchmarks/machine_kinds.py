@@ -9,7 +9,8 @@ version, name and unit (mm). Two things are asked:
 
 - sessions of outlines (``--runs``): the joint fit from a model that is wrong by up to 2 mm and
   1 deg in everything, and from rough cameras; its errors beside the Cramer-Rao bound and the
-  normalised squared error on all that is determined, as ``classes_study.py`` counts them;
+  normalised squared error on all that is determined, as ``classes_study.py`` counts them; of
+  redundant machines also how many of their readings, which are right, are called wrong;
 - datasets (``--datasets``) of ``legcal simulate`` without hints at ``--level``, whose true machine
   is off by up to 2 mm, calibrated by ``legcal calibrate``: how many converge, and how many of these
   the verdict trusts; of all that converge the platform error of eq (20) at their readings before
@@ -69,6 +70,8 @@ def sessions(kind: str, runs: int, seed: int, record: Path | None) -> str:
         try:
             solution = one_fit(session, noise.radius_sigma)
             records.append(errors_of_fit(design, session, solution, noise))
+            if (readings := solution.redundant_readings) is not None:
+                records[-1]["readings"] = len(readings.wrong), len(readings.doubts)
         except LegcalError as error:
             records.append({"failure": failure_of(error)})
             print(f"{kind}: {error}", file=sys.stderr)
@@ -86,6 +89,10 @@ def sessions(kind: str, runs: int, seed: int, record: Path | None) -> str:
         )
         determined = f"{rank.min()} of {len(design.parametrization)}"
         line += f"{determined:>12}{math.sqrt(ratio):14.3f}{nse:8.3f}"
+    judged = [fit["readings"] for fit in fits if "readings" in fit]
+    if judged:
+        n_wrong, n_doubts = np.sum(judged, axis=0).tolist()
+        line += f"  {n_wrong} right readings left out, {n_doubts} doubts"
     return f"{line}  {failures_of(records) or ''}"
 
 
