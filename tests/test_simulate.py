@@ -217,9 +217,9 @@ def test_the_python_of_the_description_of_simulated_datasets_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = (Path(__file__).parents[1] / "docs" / "simulate.md").read_text()
-    code = text[
-        text.index("    settings = legcal.Sim") : text.index("Metres and radians; `errors`")
-    ]
+    code = next(
+        block for block in text.split("\n\n") if block.startswith("    settings = legcal.Sim")
+    )
     assert "poses=20" in code
     code = code.replace("poses=20", "poses=2")
     monkeypatch.chdir(tmp_path)
