@@ -700,17 +700,16 @@ def exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
     names, cameras = [view.name for view in views], [view.camera for view in views]
     chosen = {name.rsplit(".", 1)[0] for name in (*choices.free, *choices.priors, *choices.fixed)}
     known = {*chosen, *stated_covariances(names, cameras)}
-    owners = shared_cameras(names, cameras)
-    exact = [name for name, owner in zip(names, owners, strict=True) if owner not in known]
+    owner_of = dict(zip(names, shared_cameras(names, cameras), strict=True))
+    exact = {name: owner for name, owner in owner_of.items() if owner not in known}
     if not exact:
         return []
-    many = len({owner for owner in owners if owner not in known}) > 1
-    whose, state = (
-        ("cameras", "their camera files state") if many else ("camera", "its file states")
-    )
+    whose, state = "camera", "its file states"
+    if len(set(exact.values())) > 1:
+        whose, state = "cameras", "their camera files state"
     return [
-        f"The intrinsics of the {whose} of {few_views(exact)} are taken as exact, since {state} no "
-        "covariance; calibrate with legcal camera, or state what is known with a prior."
+        f"The intrinsics of the {whose} of {few_views(list(exact))} are taken as exact, since "
+        f"{state} no covariance; calibrate with legcal camera, or state what is known with a prior."
     ]
 
 

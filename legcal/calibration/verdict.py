@@ -47,8 +47,7 @@ def judge(
     q = measurements.q_of_poses.copy()
     readings = solution.redundant_readings
     for wrong in () if readings is None else readings.wrong:
-        motor = machine.reads[wrong.leg]
-        q[wrong.pose, [j for j in range(machine.n_legs) if machine.reads[j] == motor]] = np.nan
+        q[wrong.pose, np.equal(machine.reads, machine.reads[wrong.leg])] = np.nan
     platform = platform_accuracy(
         machine,
         solution.legs,

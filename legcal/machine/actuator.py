@@ -252,20 +252,20 @@ class Actuator:
                 self.gain * q[:, None, None] * across.T,
                 np.zeros((k, 3, 2)),
                 q[:, None] * self.axis,
-                self.by_reading(self.at(A, q)),
+                np.broadcast_to(self.gain * self.axis, (k, 3)),
                 np.zeros(k),
             )
         R, arm = self.rotations(q), A - self.point
         turned = R @ arm
         by_axis = np.stack([cross(e, turned) - R @ cross(e, arm) for e in basis], axis=2)
-        at = self.point + turned
+        by_angle = cross(self.axis, turned)
         return JointMotion(
-            at,
+            self.point + turned,
             R,
             by_axis,
             (np.eye(3) - R) @ basis.T,
-            q[:, None] * cross(self.axis, turned),
-            self.by_reading(at),
+            q[:, None] * by_angle,
+            self.gain * by_angle,
             self.gain * q,
         )
 

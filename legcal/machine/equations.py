@@ -449,12 +449,14 @@ def _lengths(
 ) -> PoseEquations:
     """Return the lengths of all legs at once."""
     A = np.array([leg.A for leg in legs]).reshape(-1, 3)
-    on = actuator_index(legs)
+    on, moved = actuator_index(legs), dict[int, JointMotion]()
     hung = {} if q is None else {j: leg.actuator for j, leg in enumerate(legs) if leg.actuator}
     if q is not None:
         A = np.repeat(A[None], len(t), axis=0)
         for j, actuator in hung.items():
-            A[:, j] = actuator.at(legs[j].A, q[:, on[j]])
+            if by_local:
+                moved[j] = actuator.motion(legs[j].A, q[:, on[j]])
+            A[:, j] = moved[j].A if by_local else actuator.at(legs[j].A, q[:, on[j]])
     arms = np.array([leg.B for leg in legs]).reshape(-1, 3) @ np.swapaxes(R, 1, 2)
     vectors = arms + t[:, None] - A
     lengths = np.sqrt(np.einsum("knx,knx->kn", vectors, vectors))
@@ -465,11 +467,11 @@ def _lengths(
         local[..., LegColumns.LENGTH] = -1.0
     by_q = np.zeros((*lengths.shape, 0 if q is None else q.shape[1]))
     for j, actuator in hung.items():
-        by_q[:, j, on[j]] = -_dot(actuator.by_reading(A[:, j]), u[:, j])
-        if q is not None and by_local:
-            motion = actuator.motion(legs[j].A, q[:, on[j]])
-            local[:, j, LegColumns.A] = -_back(motion, u[:, j])
-            _write_actuator(motion, u[:, j], local[:, j])
+        by_reading = moved[j].by_q if by_local else actuator.by_reading(A[:, j])
+        by_q[:, j, on[j]] = -_dot(by_reading, u[:, j])
+    for j, motion in moved.items():
+        local[:, j, LegColumns.A] = -_back(motion, u[:, j])
+        _write_actuator(motion, u[:, j], local[:, j])
     return PoseEquations(
         lengths - np.array([leg.q0 for leg in legs]),
         np.concatenate([cross(arms, u), u], axis=2),

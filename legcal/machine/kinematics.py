@@ -8,6 +8,7 @@ and the chain closed where it ends.
 """
 
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -322,9 +323,15 @@ def determining_readings(machine: Machine, readings: Array) -> Array:
     if not machine.is_redundant:
         return readings
     found = consistent_readings(machine, readings)
-    _, _, order = qr(reading_span(machine, machine.home).T, mode="economic", pivoting=True)
-    found[:, order[machine.mobility :]] = np.nan
+    found[:, _surplus_motors(machine)] = np.nan
     return found
+
+
+@lru_cache(maxsize=8)
+def _surplus_motors(machine: Machine) -> IntArray:
+    """Return which motors of a redundant machine tell least of the pose at home, by number."""
+    _, _, order = qr(reading_span(machine, machine.home).T, mode="economic", pivoting=True)
+    return np.asarray(order[machine.mobility :])
 
 
 def reading_span(machine: Machine, T: RigidTransform) -> Array:
@@ -611,8 +618,8 @@ def follow(
         if reached is None or _is_flipped(machine, reached):
             return False
         if not excludes_singularity(known, jacobian):
-            both = (platform_pose(machine, c).as_matrix() for c in (configuration, reached))
-            if not is_on_same_side(*dimensionless(machine, np.array(list(both)), motors)):
+            ends = [platform_pose(machine, c).as_matrix() for c in (configuration, reached)]
+            if not is_on_same_side(*dimensionless(machine, np.array(ends), motors)):
                 return False
         configuration, known = reached, jacobian
         return True

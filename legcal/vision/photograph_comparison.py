@@ -180,12 +180,11 @@ def differences(
             if like is None:
                 groups.append((value, like := []))
             like.append(name)
-        is_odd = any(v != plain for v, _ in groups)
-        silent = [
-            name
-            for name, one in named
-            if is_odd and fact.where_so and one.device and getattr(one, fact.name) in (None, "")
-        ]
+        is_odd, silent = any(v != plain for v, _ in groups), list[str]()
+        if is_odd and fact.where_so:
+            silent = [
+                name for name, one in named if one.device and getattr(one, fact.name) in (None, "")
+            ]
         if len(groups) > 1 or silent or (is_odd and plain is not None and board is not None):
             by_words = {fact.words(value, size): names for value, names in groups}
             if silent:

@@ -82,7 +82,8 @@ def _largest(
         group = _grown(first, _cheapest(first, seen, rng))
         if group.all():
             return first, group
-        best = _settled(first, first, group, seen)
+        if np.count_nonzero(group) >= _OF_START:
+            best = _settled(first, first, group, seen)
     for _ in range(_MORE_STARTS if n >= _FEW else 0):
         if best is not None and np.count_nonzero(best[1]) >= _CLEAR * n:
             break
@@ -109,8 +110,6 @@ def _settled(
     settled: tuple[AdjustedBoard, BoolArray] | None = None
     for _ in range(_ROUNDS):
         if group is not None:
-            if np.count_nonzero(group) < _OF_START:
-                return None
             part, images = part_of(seen, group[seen.image], n)
             fitted = again(near, [poses[k] for k in images], part)
             if fitted is None:
@@ -128,10 +127,12 @@ def _settled(
             cost = _costs(held, seen)
             group = cost <= np.sort(cost)[n // 2]
         group = _grown(held, group)
+        if np.count_nonzero(group) < _OF_START:
+            return None
         settled = held, group
         if before is not None and np.array_equal(before, group):
             break
-    return settled if settled is not None and np.count_nonzero(settled[1]) >= _OF_START else None
+    return settled
 
 
 def _costs(adjusted: AdjustedBoard, seen: BoardImages) -> Array:

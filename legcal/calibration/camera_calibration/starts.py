@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception import AdjustedBoard, BoardImages, Sheet, adjust_board, plane_poses
 from legcal.vision import (
     DISTORTION_MODELS,
@@ -59,12 +59,10 @@ def _by_straight_lines(
     seen: BoardImages, size: ImageSize, model: DistortionModel
 ) -> tuple[Camera, list[RigidTransform]] | None:
     """Return the camera without distortion before which boards are flattest, of several."""
-    centre = 0.5 * (size.width - 1.0), 0.5 * (size.height - 1.0)
     no_distortion = np.zeros(len(DISTORTION_MODELS[model].coefficients))
     cameras = []
     for part in np.geomspace(*_FOCAL_LENGTHS).tolist():
-        f = part * max(size.width, size.height)
-        K = np.array([[f, 0.0, centre[0]], [0.0, f, centre[1]], [0.0, 0.0, 1.0]])
+        K = _matrix(part, size)
         cameras.append(Camera(K, size.width, size.height, no_distortion, model))
     best = min(cameras, key=lambda camera: _non_flatness(camera, seen))
     poses = []
@@ -74,6 +72,13 @@ def _by_straight_lines(
             return None
         poses.append(found[0].T_camera_plane)
     return best, poses
+
+
+def _matrix(part: float, size: ImageSize) -> Array:
+    """Return the matrix of a camera (3, 3) whose focal length is a part of the longer side."""
+    f = part * max(size.width, size.height)
+    u, v = 0.5 * (size.width - 1.0), 0.5 * (size.height - 1.0)
+    return np.array([[f, 0.0, u], [0.0, f, v], [0.0, 0.0, 1.0]])
 
 
 def _non_flatness(camera: Camera, seen: BoardImages) -> float:
@@ -110,8 +115,6 @@ def _by_opencv(
     points = [seen.points[a:b].astype(np.float32) for a, b in pieces]
     px = [seen.px[a:b].astype(np.float32) for a, b in pieces]
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    f = float(max(size.width, size.height))
-    K = np.array([[f, 0.0, 0.5 * size.width], [0.0, f, 0.5 * size.height], [0.0, 0.0, 1.0]])
     answers = []
     for guess in (0, cv2.CALIB_USE_INTRINSIC_GUESS):
         with suppress(cv2.error), quiet_opencv():
@@ -120,7 +123,7 @@ def _by_opencv(
                     points,
                     px,
                     (size.width, size.height),
-                    K.copy(),
+                    _matrix(1.0, size),
                     np.zeros(5),
                     flags=flags | guess,
                 )

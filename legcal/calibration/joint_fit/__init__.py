@@ -15,6 +15,7 @@ that reject outlines and estimate their noise, checks of the result, its assembl
 ``fit``               the order of all of it
 ``determinacy``       open directions: refused, or held at nominal
 ``rounds``            rejection of outliers and estimation of noise
+``outlier_readings``  wrong readings of redundant motors: found and left out
 ``diagnostics``       stated priors and fixed values against the measurements
 ``sensitivity``       errors of what counts as known; focal lengths tested
 ``held_out``          what a fit predicts of images that were not fitted

@@ -15,6 +15,11 @@ from typing import Any
 import numpy as np
 
 from legcal.calibration.joint_fit.free_poses import of_determined_poses
+from legcal.calibration.joint_fit.outlier_readings import (
+    like_readings,
+    with_judged_readings,
+    with_rough_readings,
+)
 from legcal.calibration.joint_fit.outline_errors import (
     KINDS,
     MEDIAN_OF_2,
@@ -33,11 +38,6 @@ from legcal.calibration.joint_fit.outline_errors import (
 )
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
-from legcal.calibration.joint_fit.wrong_readings import (
-    like_readings,
-    with_judged_readings,
-    with_rough_readings,
-)
 from legcal.data import few
 from legcal.errors import DidNotConverge
 from legcal.estimation import (
@@ -172,7 +172,12 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
     least[: len(KINDS)] = [problem.choices.least_shared_px.get(kind, 0.0) for kind in KINDS]
     biases = possible.of_sizes(with_gamma(np.zeros(N_KINDS)))
     problem, minimum = _with_edge_biases(problem, first, biases)
-    problem, minimum = _without_wrong_readings(problem, minimum, settings)
+    # Wrong readings go before they bend the fit: the first minimum is one with rough readings.
+    if problem.legs.is_redundant:
+        rough, tolerance = with_rough_readings(problem), _REJECTION_TOLERANCE
+        rough, minimum = _without_wrong_readings(rough, minimum, settings, tolerance)
+        problem = like_readings(problem, rough)
+        minimum = _passed(problem, minimum, settings, tolerance)
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before = accepted
         noise = noise_of_the_median(problem.offsets(minimum.state)[before], claimed[before])
@@ -187,7 +192,8 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
         problem = _with_judged_corners(problem, minimum.state, settings)
         minimum = _passed(problem, minimum, settings, _REJECTION_TOLERANCE)
     if problem.legs.is_redundant:
-        problem, minimum = _judged_again(problem, minimum, settings)
+        minimum = _passed(problem, minimum, settings)
+        problem, minimum = _without_wrong_readings(problem, minimum, settings)
     with_possible, changes, are_white = problem.with_biases(possible), NO_CHANGES, False
 
     def scores_of_biases() -> tuple[Array, Array]:
@@ -241,33 +247,17 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
 
 
 def _without_wrong_readings(
-    problem: FitProblem, first: Minimum[State], settings: RefinementSettings
+    problem: FitProblem,
+    minimum: Minimum[State],
+    settings: RefinementSettings,
+    relative_tolerance: float = 0.0,
 ) -> tuple[FitProblem, Minimum[State]]:
-    """Return problem and minimum without wrong readings, before these bend the fit.
-
-    *first* is the minimum with rough readings.
-    """
-    if not problem.legs.is_redundant:
-        return problem, first
-    rough, minimum, is_wrong = with_rough_readings(problem), first, True
+    """Return problem and minimum without readings that all else contradicts, from a minimum."""
     for _ in range(_READING_ROUNDS):
-        rough, is_wrong = with_judged_readings(rough, minimum.state, settings)
-        if not is_wrong:
-            break
-        minimum = _passed(rough, minimum, settings, _REJECTION_TOLERANCE)
-    problem = like_readings(problem, rough)
-    return problem, _passed(problem, minimum, settings, _REJECTION_TOLERANCE)
-
-
-def _judged_again(
-    problem: FitProblem, minimum: Minimum[State], settings: RefinementSettings
-) -> tuple[FitProblem, Minimum[State]]:
-    """Return problem and minimum without readings that are wrong by their standard deviations."""
-    for _ in range(_READING_ROUNDS):
-        minimum = _passed(problem, minimum, settings)
         problem, is_wrong = with_judged_readings(problem, minimum.state, settings)
         if not is_wrong:
             break
+        minimum = _passed(problem, minimum, settings, relative_tolerance)
     return problem, minimum
 
 

@@ -20,6 +20,11 @@ from legcal.calibration.joint_fit.diagnostics import (
 )
 from legcal.calibration.joint_fit.free_poses import TOO_FEW_LEGS, of_determined_poses
 from legcal.calibration.joint_fit.held_out import Posterior
+from legcal.calibration.joint_fit.outlier_readings import (
+    JudgedReadings,
+    judged_readings,
+    reading_notes,
+)
 from legcal.calibration.joint_fit.outline_errors import (
     GAMMA_SUFFIX,
     EstimatedGamma,
@@ -40,11 +45,6 @@ from legcal.calibration.joint_fit.sensitivity import (
     zoomed_views,
 )
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
-from legcal.calibration.joint_fit.wrong_readings import (
-    JudgedReadings,
-    judged_readings,
-    reading_notes,
-)
 from legcal.data import Dataset, Order, Outlines, inverse, reorder_measurements
 from legcal.estimation import (
     NormalEquations,
@@ -162,7 +162,7 @@ def assemble_solution(
     estimated = covariance[np.ix_(where, where)]
     offsets, cost = problem.offsets(state), comparable_cost(problem, state, settings)
     used = offsets[fit.accepted]
-    readings = judged_readings(problem, state, normal, settings)
+    readings = judged_readings(problem, state, linear, normal, settings)
     n_rejected = offsets.size - used.size + (0 if readings is None else len(readings.wrong))
     n_residuals = problem.n_equations + len(problem.priors.mean) - n_rejected
     chi2 = float(np.sum(linear.prior_r**2)) + sum(

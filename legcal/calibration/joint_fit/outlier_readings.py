@@ -1,9 +1,10 @@
-"""Readings of redundant motors that contradict all other measurements: found, named, left out.
+"""Outliers among the readings of redundant motors: found, named, left out.
 
 Every reading is tested by its residual over the standard deviation that this has if the reading is
-right; the largest of a pose names the wrong one, unless another one explains as much. The first
-fits have rough readings, so that single wrong ones stand out; with the stated standard deviations
-they would bend the model, and outlines would seem to be wrong in their place.
+right, the root of its redundancy (Baarda's data snooping); the largest of a pose names the wrong
+one, unless another one explains as much. The first fits have rough readings, so that single wrong
+ones stand out; with the stated standard deviations they would bend the model, and outlines would
+seem to be wrong in their place.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from legcal.estimation import (
 from legcal.files import SHOWN_IN
 from legcal.geometry import Array, BoolArray, IntArray
 
-FACTORS = "readings", "actuator_readings"
+_FACTORS = "readings", "actuator_readings"
 _ROUGH = 6e-5  # standard deviation of rough readings, as far as they move a joint [m]
 _MIN_REDUNDANCY = 1e-3  # of a reading that something else says anything about
 _AS_LIKELY = 25.0  # difference of squared tests from which one reading is clearly the wrong one
@@ -65,7 +66,7 @@ class JudgedReadings:
 class _Tests:
     """Readings that are used, of both factors, and how well each agrees."""
 
-    factor: IntArray  # (n,) index in FACTORS
+    factor: IntArray  # (n,) index in _FACTORS
     number: IntArray  # (n,) in its factor
     leg: IntArray  # (n,)
     pose: IntArray  # (n,)
@@ -84,7 +85,7 @@ def with_rough_readings(problem: FitProblem) -> FitProblem:
     if not problem.legs.is_redundant:
         return problem
     rough = []
-    for name, readings in zip(FACTORS, _readings(problem), strict=True):
+    for name, readings in zip(_FACTORS, _readings(problem), strict=True):
         factor = problem.factor(name)
         least = np.array([problem.legs.nominal[j].reading_of(_ROUGH) for j in readings.leg])
         used = np.asarray(factor.whitening)[:, 0, 0] > 0.0
@@ -96,7 +97,7 @@ def with_rough_readings(problem: FitProblem) -> FitProblem:
 def like_readings(problem: FitProblem, other: FitProblem) -> FitProblem:
     """Return a problem that leaves out the readings that another one leaves out."""
     found = []
-    for name in FACTORS:
+    for name in _FACTORS:
         factor = problem.factor(name)
         used = np.asarray(other.factor(name).whitening) > 0.0
         found.append(replace(factor, whitening=used * np.asarray(factor.whitening)))
@@ -107,7 +108,9 @@ def with_judged_readings(
     problem: FitProblem, state: State, settings: RefinementSettings
 ) -> tuple[FitProblem, bool]:
     """Return the problem without the clearly wrong reading of every pose; say if there was one."""
-    tests = _tests(problem, state, settings)
+    linear = linearize(problem, state)
+    normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
+    tests = _tests(problem, linear, normal)
     out: list[list[int]] = [[], []]
     scale = max(1.0, _scale(tests))
     for pose in np.unique(tests.pose).tolist():
@@ -117,7 +120,7 @@ def with_judged_readings(
     if not any(out):
         return problem, False
     changed = []
-    for name, numbers in zip(FACTORS, out, strict=True):
+    for name, numbers in zip(_FACTORS, out, strict=True):
         factor = problem.factor(name)
         whitening = np.array(factor.whitening)
         whitening[numbers] = 0.0
@@ -126,23 +129,26 @@ def with_judged_readings(
 
 
 def judged_readings(
-    problem: FitProblem, state: State, normal: NormalEquations, settings: RefinementSettings
+    problem: FitProblem,
+    state: State,
+    linear: Linearization,
+    normal: NormalEquations,
+    settings: RefinementSettings,
 ) -> JudgedReadings | None:
     """Return which readings a fit left out, and how the others agree; None if they always do."""
     if not problem.legs.is_redundant:
         return None
-    linear = linearize(problem, state)
     legs, wrong = problem.legs.nominal, list[WrongReading]()
-    for name, readings in zip(FACTORS, _readings(problem), strict=True):
+    for name, readings in zip(_FACTORS, _readings(problem), strict=True):
         off = readings.wrong_by(problem.factor(name).rows(state))
         for k in np.flatnonzero(~_used(problem, name)).tolist():
             leg, pose = int(readings.leg[k]), int(readings.pose[k])
             where, unit = _first_image(problem, pose), legs[leg].reading_unit
-            motor = _label(problem, leg)
+            motor = legs[leg].motor_label
             wrong.append(WrongReading(leg, pose, motor, *where, float(off[k]), unit))
-    tests = _of(problem, linear, normal)
+    tests = _tests(problem, linear, normal)
     sigma = np.concatenate([readings.sigma for readings in _readings(problem)])
-    used = np.concatenate([_used(problem, name) for name in FACTORS])
+    used = np.concatenate([_used(problem, name) for name in _FACTORS])
     distance = np.array([1.0 / legs[j].reading_of(1.0) for j in tests.leg.tolist()])
     moved = tests.r * sigma[used] * distance
     rms, rms_m = (float(np.sqrt(np.mean(x**2))) for x in (tests.r, moved))
@@ -155,7 +161,7 @@ def reading_notes(judged: JudgedReadings | None) -> tuple[str, ...]:
     """Return a sentence on readings that were left out, if any."""
     if judged is None or not judged.wrong:
         return ()
-    named = few([in_words(wrong) for wrong in judged.wrong])
+    named = few([_in_words(wrong) for wrong in judged.wrong])
     n = len(judged.wrong)
     reading, was = ("readings", "were") if n > 1 else ("reading", "was")
     return (
@@ -164,15 +170,10 @@ def reading_notes(judged: JudgedReadings | None) -> tuple[str, ...]:
     )
 
 
-def in_words(wrong: WrongReading) -> str:
+def _in_words(wrong: WrongReading) -> str:
     """Return whose reading it is, of which image, and by how much it is wrong."""
     size, unit = SHOWN_IN[wrong.unit]
     return f"{wrong.motor} in {wrong.view}, image {wrong.image} by {size * wrong.off:+.3g} {unit}"
-
-
-def _label(problem: FitProblem, leg: int) -> str:
-    actuator = problem.legs.nominal[leg].actuator
-    return problem.legs.names[leg] if actuator is None else actuator.joint
 
 
 def _first_image(problem: FitProblem, pose: int) -> tuple[str, str]:
@@ -185,15 +186,15 @@ def _doubts(
     problem: FitProblem, tests: _Tests, wrong: list[WrongReading], settings: RefinementSettings
 ) -> tuple[str, ...]:
     """Return why readings leave a result in doubt."""
-    doubts = list[str]()
+    legs, doubts = problem.legs.nominal, list[str]()
     for leg in dict.fromkeys(one.leg for one in wrong):
         of_motor = [one for one in wrong if one.leg == leg]
         n = len(of_motor) + int(np.sum(tests.leg == leg))
         if len(of_motor) >= max(_MIN_COUNT, _MOST_OF_MOTOR * n):
             worst = max(of_motor, key=lambda one: abs(one.off))
             doubts.append(
-                f"{len(of_motor)} of {n} readings of {_label(problem, leg)} contradict the other "
-                f"measurements, most {in_words(worst)}, which is no accident; check the "
+                f"{len(of_motor)} of {n} readings of {legs[leg].motor_label} contradict the other "
+                f"measurements, most {_in_words(worst)}, which is no accident; check the "
                 "scale, the zero and the slip of that motor"
             )
     alike = list[str]()
@@ -211,11 +212,11 @@ def _doubts(
     if found > expected + _SIGNIFICANT * np.sqrt(2.0 * expected):
         times = np.sqrt(found / max(expected, 1.0))
         squared = tests.squared
-        legs = np.unique(tests.leg)
-        leg = int(legs[np.argmax([squared[tests.leg == j].mean() for j in legs])])
+        motors = np.unique(tests.leg)
+        leg = int(motors[np.argmax([squared[tests.leg == j].mean() for j in motors])])
         doubts.append(
             f"the readings of redundant motors contradict each other and the images {times:.1f} "
-            f"times as much as their standard deviations allow, those of {_label(problem, leg)} "
+            f"times as much as their standard deviations allow, those of {legs[leg].motor_label} "
             "most; check the scale, the zero and the slip of the motors, or state the standard "
             "deviations of their readings"
         )
@@ -227,7 +228,7 @@ def _as_likely(problem: FitProblem, tests: _Tests, pose: int) -> list[str]:
     own = np.flatnonzero(tests.pose == pose)
     squared = tests.squared[own]
     return [
-        _label(problem, int(tests.leg[own[k]]))
+        problem.legs.nominal[int(tests.leg[own[k]])].motor_label
         for k in np.argsort(-squared).tolist()
         if squared.max() - squared[k] < _AS_LIKELY
     ]
@@ -249,16 +250,10 @@ def _scale(tests: _Tests) -> float:
     return float(np.sqrt(np.median(tests.squared[told])) / 0.6745) if told.any() else 0.0
 
 
-def _tests(problem: FitProblem, state: State, settings: RefinementSettings) -> _Tests:
-    linear = linearize(problem, state)
-    normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
-    return _of(problem, linear, normal)
-
-
-def _of(problem: FitProblem, linear: Linearization, normal: NormalEquations) -> _Tests:
+def _tests(problem: FitProblem, linear: Linearization, normal: NormalEquations) -> _Tests:
     """Return the tests of the readings that are used."""
     parts = []
-    for i, (name, readings) in enumerate(zip(FACTORS, _readings(problem), strict=True)):
+    for i, (name, readings) in enumerate(zip(_FACTORS, _readings(problem), strict=True)):
         used = np.flatnonzero(_used(problem, name))
         if not len(readings):
             continue
