@@ -137,3 +137,15 @@ def test_lists_and_words_that_make_no_fleet_are_refused(
         calibrate_fleet([FleetMachine("a", tmp_path)], mine)
     with pytest.raises(DatasetError):
         fleet.read_fleet(tmp_path / "none.csv")
+
+
+def test_a_terminal_shows_every_failure_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    places = [tmp_path / "machines of the east" / name for name in ("first", "second")]
+    for place in places:
+        place.mkdir(parents=True)
+    monkeypatch.setenv("COLUMNS", "50")
+    run_command(monkeypatch, "calibrate", *places, "-o", tmp_path / "out")
+    told = " ".join(capsys.readouterr().out.split())
+    assert told.count("give the folder of a dataset.") == len(places)

@@ -176,7 +176,8 @@ def print_table(renderable: RenderableType) -> None:
 
         renderable = report(renderable)
     with _writing_to_stdout():
-        Console(highlight=False).print(renderable)
+        # What must not wrap, a path to copy, is wider than some terminals, and is not cut there.
+        Console(highlight=False).print(renderable, crop=False)
         sys.stdout.flush()
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from rich.console import RenderableType
-from rich.text import Text
 
 from legcal.calibration import FleetDocument, fleet_cells, fleet_columns
 from legcal.report.render import report, table
@@ -27,4 +26,4 @@ def fleet_table(document: FleetDocument, output: Path) -> RenderableType:
     lines += [f"Note: {note}" for note in document.notes]
     counts = ", ".join(f"{n} {status}" for status, n in sorted(document.counts.items()))
     lines.append(f"{len(document.machines)} machines: {counts}. All of it: {output}/summary.csv.")
-    return report(table(*headings, rows=rows), [Text(line, overflow="ignore") for line in lines])
+    return report(table(*headings, rows=rows), lines)
