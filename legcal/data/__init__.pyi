@@ -69,7 +69,4 @@ from .photograph_notes import notes_on_photographs as notes_on_photographs
 from .reading_units import SIGMA_ANGLE as SIGMA_ANGLE
 from .reading_units import sigmas_of as sigmas_of
 from .reading_units import sigmas_of_legs as sigmas_of_legs
-from .readings_sheet import Headings as Headings
-from .readings_sheet import readings_of as readings_of
-from .readings_sheet import unit_of as unit_of
-from .readings_sheet import units_in_words as units_in_words
+from .readings_sheet import ReadingsSheet as ReadingsSheet

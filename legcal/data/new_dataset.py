@@ -32,10 +32,9 @@ from legcal.data.reading_units import (
     PULSES,
     SERVO_SIGMA,
     SIGMA_ANGLE,
-    ReadingUnit,
     sigma_in,
 )
-from legcal.data.readings_sheet import Headings, readings_of, unit_of, units_in_words
+from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
 from legcal.errors import DatasetError, UsageError
 from legcal.files import (
     LENGTH,
@@ -48,7 +47,6 @@ from legcal.files import (
     format_table,
     is_name,
     parse_quantity,
-    read_table,
     result_folder,
     with_schema,
 )
@@ -246,19 +244,12 @@ def plan_new_dataset(
     machine = load_mechanism(model)
     _check_place(folder, destination)
     photographs = find_photographs(folder, [view.strip("/") for view in views], view_pattern)
-    headings = Headings(path, [machine.legs[j] for j in machine.motors])
-    table = read_table(
-        path, "table of readings", "row", headings.columns(), needed="one row for each photograph",
-        reshape=headings.reshape,
-    )  # fmt: skip
-    table.check()
-    pulses = read_servos(servos, headings.motors)
-    units, unit_from = unit_of(table, headings, unit, lengths, pulses)
-    q, digits = readings_of(table, headings, units, lengths)
+    sheet = ReadingsSheet(path, machine, "photograph")
+    found = sheet.readings(unit, lengths=lengths, servos=read_servos(servos, sheet.motors))
     rows = tuple(
         Row(where, *texts)
         for where, *texts in zip(
-            table.where, *(table.text(name) for name in ("image", "view", "time")), strict=True
+            sheet.where, *(sheet.text(name) for name in ("image", "view", "time")), strict=True
         )
     )
     matching = match(rows, photographs, str(path), by=by)
@@ -274,8 +265,8 @@ def plan_new_dataset(
         raise DatasetError(problems)
     read = {camera: read_camera(camera) for camera in dict.fromkeys(of_views.values())}
     _check_photographs(matching, [read[of_views[view]] for view in view_of])
-    sigma, note = _sigmas(encoder_sigma, headings.motors, units, digits)
-    notes = [*headings.notes, *matching.notes, *note]
+    sigma, note = _sigmas(encoder_sigma, sheet.motors, found)
+    notes = [*sheet.notes, *matching.notes, *note]
     if set(view_of) == {ONE_VIEW} and not any(row.view for row in rows):
         likely = likely_pattern([photograph for _, photograph in matching.pairs])
         remedy = "put those of each place in a folder, add a column view, or give --view-pattern"
@@ -291,15 +282,15 @@ def plan_new_dataset(
         folder=folder,
         table=path,
         destination=destination,
-        columns=headings.taken,
-        unit=units_in_words(units),
-        unit_from=unit_from,
+        columns=sheet.taken,
+        unit=found.unit,
+        unit_from=found.unit_from,
         are_lengths=lengths,
         rows=rows,
-        poses=table.text("pose") if "pose" in table else (),
+        poses=sheet.text("pose") if "pose" in sheet else (),
         matching=matching,
         views=view_of,
-        readings=q,
+        readings=found.q,
         cameras=of_views,
         encoder_sigma=sigma,
         notes=tuple(notes),
@@ -412,19 +403,18 @@ def read_servos(texts: Sequence[str], motors: Sequence[Leg]) -> dict[str, Pulses
 def _sigmas(
     given: float | str | Mapping[str, float] | None,
     motors: Sequence[Leg],
-    units: Sequence[ReadingUnit],
-    digits: Array,
+    readings: SheetReadings,
 ) -> tuple[float | dict[str, float], list[str]]:
     """Return the standard deviation of readings [m], by joint [m or rad] where a motor turns."""
     if not any(leg.reads_angle for leg in motors):
         if isinstance(given, str):
             given = parse_quantity(given, LENGTH, "--encoder-sigma")
         if not isinstance(given, Mapping):
-            return _sigma(given, float(digits.min()))
+            return _sigma(given, float(readings.digits.min()))
     if isinstance(given, Mapping):
         return dict(given), []
     found, notes = dict[str, float](), list[str]()
-    for leg, unit, digit in zip(motors, units, digits.tolist(), strict=True):
+    for leg, unit, digit in zip(motors, readings.units, readings.digits.tolist(), strict=True):
         name = str(leg.prismatic)
         if given is not None:
             try:
@@ -443,7 +433,7 @@ def _sigmas(
             for leg, (name, sigma) in zip(motors, found.items(), strict=True)
         ]
         why = "the last digit of the table, at least that of a good encoder"
-        if any(unit.name == PULSES for unit in units):
+        if any(unit.name == PULSES for unit in readings.units):
             why = "half a degree of what a hobby servo makes of its pulses"
         notes.append(
             f"encoder_sigma is {few(said)}, {why}: give --encoder-sigma if readings are known "

@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 
@@ -19,9 +21,18 @@ import numpy as np
 from legcal.data.measurements import few, in_travel, reading_columns, readings_of_lengths
 from legcal.data.reading_units import PULSES, ReadingUnit, unit_named
 from legcal.errors import DatasetError, UsageError
-from legcal.files import ANGLE, LENGTH, SHOWN_IN, Column, Lines, Table, describe, split_heading
+from legcal.files import (
+    ANGLE,
+    LENGTH,
+    SHOWN_IN,
+    Column,
+    Lines,
+    describe,
+    read_table,
+    split_heading,
+)
 from legcal.geometry import Array
-from legcal.machine import Leg, Pulses
+from legcal.machine import Leg, Machine, Pulses
 
 LEAST_USED = 0.01  # of the travel: less is the use that is made of it in a larger unit
 # units that are tried where none is stated, of motors that slide and that turn
@@ -39,7 +50,168 @@ _TIME = re.compile(rf"(?:{'|'.join(_HEADINGS['time'])}|t)({'|'.join(_SECONDS)})"
 _NUMBERED = re.compile(r"([^\W\d]*?)0*(\d{1,3})([^\W\d]*)")
 
 
-class Headings:
+@dataclass(frozen=True, eq=False)
+class SheetReadings:
+    """The readings of a sheet, and the units in which they are written there."""
+
+    q: Array  # (n_rows, n_motors) [m or rad]
+    digits: Array  # (n_motors,) the size of the last digit [m or rad]
+    units: tuple[ReadingUnit, ...]  # of each motor
+    unit_from: str  # where they were found, in words
+
+    @property
+    def unit(self) -> str:
+        """The units in words, each once."""
+        return " and ".join(dict.fromkeys(unit.name for unit in self.units))
+
+
+class ReadingsSheet:
+    """A table of readings, one row for each of what *each* names (a photograph, a time).
+
+    Attributes
+    ----------
+    motors : list of Leg
+        The legs whose readings it holds.
+    taken : dict
+        What each heading that is used is taken for: a joint, view, image, pose or time.
+    notes : list of str
+        What is odd, or was left out.
+
+    Raises
+    ------
+    DatasetError
+        If the file, a heading or a cell cannot be read.
+    """
+
+    def __init__(self, path: Path, machine: Machine, each: str) -> None:
+        self.path = path
+        self.motors = [machine.legs[j] for j in machine.motors]
+        headings = _Headings(path, self.motors)
+        self._table = read_table(
+            path, "table of readings", "row", headings.columns(), needed=f"one row for each {each}",
+            reshape=headings.reshape,
+        )  # fmt: skip
+        self._table.check()
+        self._joints, self._heading_units = headings.joints, headings.units
+        self.taken, self.notes = headings.taken, headings.notes
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._table
+
+    def text(self, name: str) -> tuple[str, ...]:
+        """Return the cells of a column of texts, one a row, empty where there is no such column."""
+        return self._table.text(name)
+
+    @property
+    def where(self) -> list[str]:
+        """The place of each row in the file, for messages."""
+        return self._table.where
+
+    def readings(
+        self,
+        unit: str | None = None,
+        *,
+        lengths: bool = False,
+        servos: Mapping[str, Pulses] = MappingProxyType({}),
+    ) -> SheetReadings:
+        """Return the readings in m and rad, lengths by their decimal digits.
+
+        Parameters
+        ----------
+        unit : str, optional
+            Of the motors of its kind, those that slide or turn; by default that of the headings,
+            else the one in which readings lie in the travel.
+        lengths : bool
+            Whether the columns are whole lengths of legs.
+        servos : mapping
+            Pulses by joint, of servos of which the model does not know them.
+
+        Raises
+        ------
+        DatasetError, UsageError
+            If the unit cannot be decided, or with a sentence for each reading outside its travel.
+        """
+        units, unit_from = self._units(unit, lengths, servos)
+        texts = [self._table.text(joint) for joint in self._joints]
+        values = np.array(
+            [_exactly(column, unit) for column, unit in zip(texts, units, strict=True)]
+        ).T
+        q = values
+        if lengths:
+            q = np.round(readings_of_lengths(values, self.motors), 12) + 0.0
+        for row, j in np.argwhere(~in_travel(q, self.motors)).tolist():
+            leg = self.motors[j]
+            size, shown = SHOWN_IN[leg.reading_unit]
+            low, high = (size * x for x in leg.travel)
+            self._table.refuse(
+                row,
+                f"{texts[j][row]} {units[j].name}, which is the reading "
+                f"{size * q[row, j]:.6g} {shown}",
+                f"one in the travel of leg '{leg.name}', {low:g} to {high:g} {shown}; correct the "
+                "reading or the limits of the model",
+                next(text for text, name in self.taken.items() if name == self._joints[j]),
+                what="reading",
+            )
+        self._table.check()
+        digits = [min(int(Decimal(x).as_tuple().exponent) for x in column) for column in texts]
+        last = [
+            _scaled(Decimal(1).scaleb(digit), unit)
+            for digit, unit in zip(digits, units, strict=True)
+        ]
+        return SheetReadings(q, np.array(last), units, unit_from)
+
+    def _units(
+        self, given: str | None, lengths: bool, servos: Mapping[str, Pulses]
+    ) -> tuple[tuple[ReadingUnit, ...], str]:
+        """Return the unit of the readings of each motor, and where they were found."""
+        self._refuse_options(given, lengths)
+        found, where = dict[int, ReadingUnit](), list[str]()
+        for turning in (False, True):
+            some = [j for j, leg in enumerate(self.motors) if leg.reads_angle is turning]
+            if not some:
+                continue
+            legs, joints = [self.motors[j] for j in some], [self._joints[j] for j in some]
+            stated = {unit for x in joints if (unit := self._heading_units.get(x, ""))}
+            of_kind = _MotorsOfKind(
+                self.path,
+                legs,
+                joints,
+                self._table.numbers(joints),
+                sorted(stated),
+                lengths,
+                servos,
+            )
+            own = given if given is not None and (given in LENGTH) is not turning else None
+            unit, how = of_kind.unit(own)
+            found |= dict(zip(some, of_kind.units(unit), strict=True))
+            where.append(how)
+        units = tuple(found[j] for j in range(len(self.motors)))
+        return units, " and ".join(dict.fromkeys(where))
+
+    def _refuse_options(self, given: str | None, lengths: bool) -> None:
+        """Refuse a unit that no motor has, and lengths of legs that have none."""
+        known = [*LENGTH, *READING_ANGLES]
+        if given is not None and given not in known:
+            raise UsageError(
+                f"The unit could not be used: found '{given}', needed one of {', '.join(known)}; "
+                "correct --unit."
+            )
+        if given is not None and not any(
+            leg.reads_angle is (given not in LENGTH) for leg in self.motors
+        ):
+            does = "slides" if given in LENGTH else "turns"
+            raise UsageError(
+                f"The unit could not be used: found '{given}' and no motor that {does}, needed one "
+                f"of {', '.join(READING_ANGLES if given in LENGTH else LENGTH)}; correct --unit."
+            )
+        if lengths and any(leg.actuator is not None for leg in self.motors):
+            raise UsageError(
+                "The table could not be read: found --lengths and motors that move joints at A, "
+                "needed readings of these; leave out --lengths."
+            )
+
+
+class _Headings:
     """What the headings of a table of readings mean."""
 
     def __init__(self, path: Path, motors: Sequence[Leg]) -> None:
@@ -141,136 +313,119 @@ def _dated(cell: str, size: float | None) -> str:
         return cell
 
 
-def unit_of(
-    table: Table,
-    headings: Headings,
-    given: str | None,
-    lengths: bool,
-    servos: Mapping[str, Pulses] = MappingProxyType({}),
-) -> tuple[tuple[ReadingUnit, ...], str]:
-    """Return the unit of the readings of each motor, and where they were found.
+@dataclass(frozen=True, eq=False)
+class _MotorsOfKind:
+    """The motors of a sheet that all slide, or all turn: their readings have one unit."""
 
-    *given* is that of the motors of its kind, those that slide or turn. *servos* are the pulses of
-    those of which the model does not know them.
-    """
-    motors = headings.motors
-    known = [*LENGTH, *READING_ANGLES]
-    if given is not None and given not in known:
-        raise UsageError(
-            f"The unit could not be used: found '{given}', needed one of {', '.join(known)}; "
-            "correct --unit."
+    path: Path
+    legs: list[Leg]
+    joints: list[str]
+    values: Array  # (n_rows, n_legs) as written
+    stated: list[str]  # the units that their headings state
+    lengths: bool  # whether the values are taken for whole lengths of legs
+    servos: Mapping[str, Pulses]
+
+    @property
+    def turning(self) -> bool:
+        """Whether they turn."""
+        return self.legs[0].reads_angle
+
+    @cached_property
+    def has_pulses(self) -> bool:
+        """Whether the pulses of all of them are known."""
+        return all(
+            joint in self.servos or (leg.actuator is not None and leg.actuator.pulses is not None)
+            for leg, joint in zip(self.legs, self.joints, strict=True)
         )
-    if given is not None and not any(leg.reads_angle is (given not in LENGTH) for leg in motors):
-        does = "slides" if given in LENGTH else "turns"
-        raise UsageError(
-            f"The unit could not be used: found '{given}' and no motor that {does}, needed one of "
-            f"{', '.join(READING_ANGLES if given in LENGTH else LENGTH)}; correct --unit."
-        )
-    if lengths and any(leg.actuator is not None for leg in motors):
-        raise UsageError(
-            "The table could not be read: found --lengths and motors that move joints at A, needed "
-            "readings of these; leave out --lengths."
-        )
-    found, where = dict[int, ReadingUnit](), list[str]()
-    for turning in (False, True):
-        some = [j for j, leg in enumerate(motors) if leg.reads_angle is turning]
-        if some:
-            own = given if given is not None and (given in LENGTH) is not turning else None
-            units, how = _unit_of_kind(table, headings, some, own, lengths, servos)
-            found |= dict(zip(some, units, strict=True))
-            where.append(how)
-    return tuple(found[j] for j in range(len(motors))), " and ".join(dict.fromkeys(where))
 
+    @property
+    def possible(self) -> list[str]:
+        """The units that their readings can have."""
+        if not self.turning:
+            return [*LENGTH]
+        return [unit for unit in READING_ANGLES if unit != PULSES or self.has_pulses]
 
-def units_in_words(units: Sequence[ReadingUnit]) -> str:
-    """Return the units of readings, each once."""
-    return " and ".join(dict.fromkeys(unit.name for unit in units))
-
-
-def _unit_of_kind(
-    table: Table,
-    headings: Headings,
-    some: Sequence[int],
-    given: str | None,
-    lengths: bool,
-    servos: Mapping[str, Pulses],
-) -> tuple[list[ReadingUnit], str]:
-    """Return the unit of the readings of motors that all slide, or all turn, and where it was."""
-    motors = [headings.motors[j] for j in some]
-    joints, turning = [headings.joints[j] for j in some], motors[0].reads_angle
-    stated = sorted({unit for joint in joints if (unit := headings.units.get(joint, ""))})
-    if len(stated) > 1 or (given and stated and stated != [given]):
-        raise DatasetError(
-            f"{table.path}: the unit could not be decided: found "
-            f"{' and '.join(dict.fromkeys([*([given] if given else []), *stated]))}, needed the "
-            "same for all readings; correct the headings or --unit."
-        )
-    values = table.numbers(joints)
-
-    def units_of(name: str) -> list[ReadingUnit]:
+    def units(self, name: str) -> list[ReadingUnit]:
+        """Return the unit of each of them by its name."""
         return [
-            unit_named(name, leg, servos.get(joint))
-            for leg, joint in zip(motors, joints, strict=True)
+            unit_named(name, leg, self.servos.get(joint))
+            for leg, joint in zip(self.legs, self.joints, strict=True)
         ]
 
-    def fits(unit: str, as_lengths: bool, *, moving: bool = True) -> bool:
-        """Say whether most readings lie in the travel, and use a part of it."""
-        q = np.column_stack(
-            [one.values(column) for one, column in zip(units_of(unit), values.T, strict=True)]
-        )
-        q = readings_of_lengths(q, motors) if as_lengths else q
-        moves = np.ptp(q, axis=0) > LEAST_USED * np.ptp([leg.travel for leg in motors], axis=1)
-        return bool(2 * in_travel(q, motors).mean() >= 1.0 and (not moving or moves.any()))
+    def fits(self, unit: str, lengths: bool, *, moving: bool = True) -> bool:
+        """Say whether most values lie in the travel, and where *moving* use a part of it."""
+        columns = zip(self.units(unit), self.values.T, strict=True)
+        q = np.column_stack([one.values(column) for one, column in columns])
+        q = readings_of_lengths(q, self.legs) if lengths else q
+        travel = np.ptp([leg.travel for leg in self.legs], axis=1)
+        moves = np.ptp(q, axis=0) > LEAST_USED * travel
+        return bool(2 * in_travel(q, self.legs).mean() >= 1.0 and (not moving or moves.any()))
 
-    has_pulses = all(
-        joint in servos or (leg.actuator is not None and leg.actuator.pulses is not None)
-        for leg, joint in zip(motors, joints, strict=True)
-    )
-    every = [x for x in READING_ANGLES if x != PULSES or has_pulses] if turning else [*LENGTH]
-    known = stated[0] if stated else given
-    tried = (known,) if known else tuple(x for x in GUESSED[turning] if x in every)
-    where = "as the heading says" if stated else "as given"
-    if known is None:
-        where = "the unit in which the readings lie in the travel of the legs"
-    elif known not in every and known != PULSES:
-        does = "turns" if turning else "slides"
+    def unit(self, given: str | None) -> tuple[str, str]:
+        """Return their unit, and where it was found: as given or stated, or by the travel."""
+        known = self._known(given)
+        tried = (known,) if known else tuple(x for x in GUESSED[self.turning] if x in self.possible)
+        where = "as the heading says" if self.stated else "as given"
+        if known is None:
+            where = "the unit in which the readings lie in the travel of the legs"
+        for unit in tried:
+            if self.fits(unit, self.lengths):
+                return unit, where
+        self._refuse_other(tried)
+        for unit in tried:
+            if self.fits(unit, self.lengths, moving=False):
+                return unit, where
         raise DatasetError(
-            f"{table.path}: the unit could not be used: found {known} of '{joints[0]}', which "
-            f"{does}, needed one of {', '.join(every)}; correct the heading."
+            f"{self._start}, needed {_needed(self.legs[0], has_pulses=self.has_pulses)}; correct "
+            "the travel of the model, or the table."
         )
-    elif known == PULSES and not has_pulses:
-        raise DatasetError(
-            f"{table.path}: the readings could not be used: found pulses of servos of which "
-            "neither centre nor us for one degree is known, needed both; give --servo 1500,11.1 "
-            "for all (JOINT=1500,-11.1 for one that turns the other way), or centre_us and "
-            "us_per_deg in legcal.motors of the model, with your numbers."
-        )
-    for unit in tried:
-        if fits(unit, lengths):
-            return units_of(unit), where
-    words = ("lengths of legs", "readings") if lengths else ("readings", "lengths of legs")
-    low, high = float(values.min()), float(values.max())
-    for unit in (*tried, *(unit for unit in every if unit not in tried)):
-        for other in (lengths, not lengths):
-            if (other and motors[0].actuator is not None) or not fits(unit, other):
-                continue
-            remedies = []
-            if other is not lengths:
-                remedies.append("leave out --lengths" if lengths else "add --lengths")
-            if unit not in tried:
-                remedies.append(f"give the unit {unit}")
+
+    def _known(self, given: str | None) -> str | None:
+        """Return the unit that a heading states or that is given; refuse one they cannot have."""
+        if len(self.stated) > 1 or (given and self.stated and self.stated != [given]):
             raise DatasetError(
-                f"{table.path}: the {words[0]} could not be used: found {low:g} to {high:g}, which "
-                f"look like {words[other is not lengths]} in {unit}; {' and '.join(remedies)}."
+                f"{self.path}: the unit could not be decided: found "
+                f"{' and '.join(dict.fromkeys([*([given] if given else []), *self.stated]))}, "
+                "needed the same for all readings; correct the headings or --unit."
             )
-    for unit in tried:
-        if fits(unit, lengths, moving=False):
-            return units_of(unit), where
-    raise DatasetError(
-        f"{table.path}: the {words[0]} could not be used: found {low:g} to {high:g}, needed "
-        f"{_needed(motors[0], has_pulses=has_pulses)}; correct the travel of the model, or the "
-        "table."
-    )
+        known = self.stated[0] if self.stated else given
+        if known is not None and known not in self.possible and known != PULSES:
+            does = "turns" if self.turning else "slides"
+            raise DatasetError(
+                f"{self.path}: the unit could not be used: found {known} of '{self.joints[0]}', "
+                f"which {does}, needed one of {', '.join(self.possible)}; correct the heading."
+            )
+        if known == PULSES and not self.has_pulses:
+            raise DatasetError(
+                f"{self.path}: the readings could not be used: found pulses of servos of which "
+                "neither centre nor us for one degree is known, needed both; give --servo "
+                "1500,11.1 for all (JOINT=1500,-11.1 for one that turns the other way), or "
+                "centre_us and us_per_deg in legcal.motors of the model, with your numbers."
+            )
+        return known
+
+    @property
+    def _start(self) -> str:
+        """How a refusal of what was found begins."""
+        low, high = float(self.values.min()), float(self.values.max())
+        what = "lengths of legs" if self.lengths else "readings"
+        return f"{self.path}: the {what} could not be used: found {low:g} to {high:g}"
+
+    def _refuse_other(self, tried: Sequence[str]) -> None:
+        """Refuse values that fit in a unit that was not *tried*, or as lengths or as readings."""
+        for unit in (*tried, *(unit for unit in self.possible if unit not in tried)):
+            for other in (self.lengths, not self.lengths):
+                if (other and self.legs[0].actuator is not None) or not self.fits(unit, other):
+                    continue
+                remedies = []
+                if other is not self.lengths:
+                    remedies.append("leave out --lengths" if self.lengths else "add --lengths")
+                if unit not in tried:
+                    remedies.append(f"give the unit {unit}")
+                raise DatasetError(
+                    f"{self._start}, which look like {'lengths of legs' if other else 'readings'} "
+                    f"in {unit}; {' and '.join(remedies)}."
+                )
 
 
 def _needed(leg: Leg, *, has_pulses: bool) -> str:
@@ -290,37 +445,6 @@ def _needed(leg: Leg, *, has_pulses: bool) -> str:
         f"readings in the travel of the model ({travel}) or lengths ({min(at):g} to {max(at):g} "
         "mm, with --lengths)"
     )
-
-
-def readings_of(
-    table: Table, headings: Headings, units: Sequence[ReadingUnit], lengths: bool
-) -> tuple[Array, Array]:
-    """Return readings (n_rows, n_motors) and the size of the last digit of each motor [m or rad].
-
-    Raises DatasetError with a sentence for each reading outside its travel.
-    """
-    texts = [table.text(joint) for joint in headings.joints]
-    values = np.array([_exactly(column, unit) for column, unit in zip(texts, units, strict=True)]).T
-    q = values
-    if lengths:
-        q = np.round(readings_of_lengths(values, headings.motors), 12) + 0.0
-    inside = in_travel(q, headings.motors)
-    for row, j in np.argwhere(~inside).tolist():
-        leg, unit = headings.motors[j], units[j]
-        size, shown = SHOWN_IN[leg.reading_unit]
-        low, high = (size * x for x in leg.travel)
-        table.refuse(
-            row,
-            f"{texts[j][row]} {unit.name}, which is the reading {size * q[row, j]:.6g} {shown}",
-            f"one in the travel of leg '{leg.name}', {low:g} to {high:g} {shown}; correct the "
-            "reading or the limits of the model",
-            next(text for text, name in headings.taken.items() if name == headings.joints[j]),
-            what="reading",
-        )
-    table.check()
-    digits = [min(int(Decimal(x).as_tuple().exponent) for x in column) for column in texts]
-    of_unit = zip(digits, units, strict=True)
-    return q, np.array([_scaled(Decimal(1).scaleb(digit), unit) for digit, unit in of_unit])
 
 
 def _exactly(texts: Sequence[str], unit: ReadingUnit) -> list[float]:

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.data import Headings, reading_columns, readings_of, unit_of, units_in_words
+from legcal.data import ReadingsSheet, reading_columns
 from legcal.errors import DatasetError
-from legcal.files import describe, read_table
+from legcal.files import describe
 from legcal.geometry import Array
 from legcal.machine import Machine
 
@@ -58,31 +58,17 @@ class Series:
 
 def read_series(path: Path, machine: Machine, unit: str | None, lengths: bool) -> Series:
     """Return the readings of a CSV with a column of times, in the order of these."""
-    headings = Headings(path, [machine.legs[j] for j in machine.motors])
-    table = read_table(
-        path, "table of readings", "row", headings.columns(), needed="one row for each time",
-        reshape=headings.reshape,
-    )  # fmt: skip
-    table.check()
-    if "time" not in table:
+    sheet = ReadingsSheet(path, machine, "time")
+    if "time" not in sheet:
         raise DatasetError(
             f"{path}: the readings could not be used: found no column 'time', needed one in "
             "seconds or as dates; add it or call it so, or use legcal init for photographs of "
-            f"poses that were held. {' '.join(headings.notes)}".rstrip()
+            f"poses that were held. {' '.join(sheet.notes)}".rstrip()
         )
-    units, where = unit_of(table, headings, unit, lengths)
-    q, _ = readings_of(table, headings, units, lengths)
-    times = _seconds(table.text("time"), path)
-    return _in_order(
-        Series(
-            str(path),
-            times,
-            q,
-            headings.taken,
-            f"{units_in_words(units)}, {where}",
-            tuple(headings.notes),
-        )
-    )
+    found = sheet.readings(unit, lengths=lengths)
+    times = _seconds(sheet.text("time"), path)
+    in_words = f"{found.unit}, {found.unit_from}"
+    return _in_order(Series(str(path), times, found.q, sheet.taken, in_words, tuple(sheet.notes)))
 
 
 def series_of_joints(
