@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from uuid import uuid4
 
 import numpy as np
@@ -17,7 +17,7 @@ from legcal.data import Corners, Measurements, Outlines, View
 from legcal.errors import NotVisible, UsageError
 from legcal.machine import Configurations, Machine
 from legcal.progress import Report, no_progress
-from legcal.simulation.board import chosen_board, placed_at
+from legcal.simulation.board import PlacedBoard, chosen_board, placed_at
 from legcal.simulation.cameras import (
     MAX_HAND_DRAWS,
     board_and_cameras,
@@ -39,7 +39,7 @@ from legcal.simulation.observe import (
     corners_in_images,
     outlines_of,
 )
-from legcal.simulation.planned import read_plan
+from legcal.simulation.planned import PlannedSession, read_plan
 from legcal.simulation.poses import commanded_poses, given_poses
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.scene import RenderedView, prepare_view
@@ -47,7 +47,7 @@ from legcal.simulation.request import Level
 from legcal.simulation.settings import Distribution, SimulationSettings
 from legcal.simulation.solids import PlacedSolid, PosedMachine, dressed, pose_machine
 from legcal.simulation.visibility import Images, Viewpoint, take_images
-from legcal.vision import Camera, FixedBoard
+from legcal.vision import Board, Camera, FixedBoard
 from legcal.workers import Workers, worker_pool
 
 Streams = Mapping[str, np.random.Generator]
@@ -92,164 +92,243 @@ def simulate_session(
     progress: Report = no_progress,
 ) -> SimulatedSession:
     """Return a session of a true machine of which the nominal model is known."""
-    planned = None if settings.plan is None else read_plan(settings.plan, nominal)
-    cameras, given = _cameras(settings)
-    if planned is not None:
-        cameras = {view.name: view.camera for view in planned.measurements.views}
-    shared = settings.shared_poses or not isinstance(settings.poses, int)
-    n_sets = 1 if shared else len(cameras)
-    if planned is not None:
-        poses = planned.poses(truth)
-    elif isinstance(settings.poses, int):
-        n_poses = settings.poses * n_sets
-        poses = commanded_poses(truth, nominal, n_poses, rngs["poses"], settings.sampling, progress)
-    else:
-        poses = given_poses(truth, settings.poses)
-    settings.check_images(len(cameras), len(poses.poses) // n_sets)
-    # Meshes lie beside the nominal URDF, of which that of the true machine is a copy.
-    shown = replace(truth, urdf=replace(truth.urdf, path=nominal.urdf.path))
-    posed_machines = pose_machine(truth, dressed(shown), poses)
-    placed = None if planned is None else planned.board
-    if placed is not None and settings.board is not None:
-        raise UsageError(
-            "The plan could not be shot: found --board and a plan with a board, needed one of "
-            "them; leave out --board."
-        )
-    if planned is not None:
-        if placed is not None:
-            posed_machines = tuple(placed.beside(posed) for posed in posed_machines)
-        given = planned.viewpoints(rngs["cameras"], posed_machines)
-    board = chosen_board(settings.board, posed_machines)
-    on_platform = chosen_board(settings.platform_board, posed_machines, "platform")
-    boards: tuple[FixedBoard, ...] = ()
-    if on_platform is not None:
-        T = board_on_platform(on_platform, truth, posed_machines, poses.poses, given)
-        first = 0 if board is None else board.n_corners
-        boards = (FixedBoard(on_platform, "platform", T, first),)
-        posed_machines = tuple(
-            placed_at(boards[0], T).beside(posed)
-            for T, posed in zip(poses.poses, posed_machines, strict=True)
-        )
-    groups = () if planned is None or not planned.hand else (planned.hand,) * len(given)
-    if board is None:
-        views = given
-        if not given:
-            views, least = cameras_around(truth, posed_machines, cameras, rngs["cameras"], progress)
-            if boards and least <= 0.0:
-                raise NotVisible(
-                    "The cameras could not be placed: found no place for one of them from which it "
-                    "sees the board on the platform in most poses, needed one for each; use fewer "
-                    "views, or a smaller board."
-                )
-    elif given:
-        placed, views = board_before(board, truth, posed_machines, given), given
-    else:
-        in_turn = [
-            posed_machines[p]
-            for v in range(len(cameras))
-            for p in _poses_of(v, n_sets, posed_machines)
-        ]
-        bodies = in_turn if settings.hand_held else posed_machines
-        placed, views = board_and_cameras(board, truth, bodies, cameras, rngs["cameras"], progress)
-    if placed is not None:
+    simulator = _Simulator(truth, nominal, settings, rngs, progress)
+    setup = simulator.set_up(simulator.poses())
+    return simulator.observe(*simulator.shoot(setup))
+
+
+@dataclass(frozen=True, eq=False)
+class _Setup:
+    """The true machine in its poses, among boards and cameras."""
+
+    poses: Configurations
+    posed_machines: tuple[PosedMachine, ...]  # in every pose, with the boards
+    boards: tuple[FixedBoard, ...]
+    views: tuple[Viewpoint, ...]
+    groups: tuple[str, ...]  # view of the dataset of each camera in the hand; empty if they stand
+
+
+@dataclass(frozen=True, eq=False)
+class _Simulator:
+    """What sessions are simulated from, and the steps: poses, set-up, images, measurements."""
+
+    truth: Machine
+    nominal: Machine
+    settings: SimulationSettings
+    rngs: Streams
+    progress: Report
+
+    @cached_property
+    def plan(self) -> PlannedSession | None:
+        """The plan that is shot, if one is."""
+        return None if self.settings.plan is None else read_plan(self.settings.plan, self.nominal)
+
+    @cached_property
+    def given_views(self) -> tuple[dict[str, Camera], tuple[Viewpoint, ...]]:
+        """The camera of each view, and where all of them stand if settings give that."""
+        settings = self.settings
+        camera = mild_lens() if settings.camera is None else read_lens(settings.camera)
+        if isinstance(settings.views, int):
+            return {f"c{v + 1}": camera for v in range(settings.views)}, ()
+        given = read_cameras(settings.views, camera)
+        cameras = {name: lens for name, (lens, _) in given.items()}
+        return cameras, tuple(Viewpoint(name, lens, T) for name, (lens, T) in given.items())
+
+    @cached_property
+    def cameras(self) -> dict[str, Camera]:
+        """The camera of each view."""
+        plan, (cameras, _) = self.plan, self.given_views
+        if plan is not None:
+            return {view.name: view.camera for view in plan.measurements.views}
+        return cameras
+
+    @property
+    def n_sets(self) -> int:
+        """How many sets of poses there are: one for each view unless they share them."""
+        shared = self.settings.shared_poses or not isinstance(self.settings.poses, int)
+        return 1 if shared else len(self.cameras)
+
+    def poses_of(self, view: int, n_poses: int) -> range:
+        """Return the poses that a view sees: all of them, or those of its own set."""
+        own = n_poses // self.n_sets
+        return range(own) if self.n_sets == 1 else range(view * own, (view + 1) * own)
+
+    def poses(self) -> Configurations:
+        """Return the poses of the true machine: of the plan, given, or drawn."""
+        settings, n_views, n_sets = self.settings, len(self.cameras), self.n_sets
+        if self.plan is not None:
+            poses = self.plan.poses(self.truth)
+        elif isinstance(settings.poses, int):
+            poses = commanded_poses(
+                self.truth, self.nominal, settings.poses * n_sets, self.rngs["poses"],
+                settings.sampling, self.progress,
+            )  # fmt: skip
+        else:
+            poses = given_poses(self.truth, settings.poses)
+        settings.check_images(n_views, len(poses.poses) // n_sets)
+        return poses
+
+    def set_up(self, poses: Configurations) -> _Setup:
+        """Return boards and cameras around the machine: where plan and settings have them."""
+        # Meshes lie beside the nominal URDF, of which that of the true machine is a copy.
+        urdf = replace(self.truth.urdf, path=self.nominal.urdf.path)
+        posed = pose_machine(self.truth, dressed(replace(self.truth, urdf=urdf)), poses)
+        on_base, (_, views), groups = None, self.given_views, tuple[str, ...]()
+        if self.plan is not None:
+            on_base = self._board_of_plan(self.plan)
+            posed = _beside(on_base, posed)
+            views = self.plan.viewpoints(self.rngs["cameras"], posed)
+            groups = (self.plan.hand,) * len(views) if self.plan.hand else ()
+        board = chosen_board(self.settings.board, posed)
+        board_of_platform = chosen_board(self.settings.platform_board, posed, "platform")
+        boards: tuple[FixedBoard, ...] = ()
+        if board_of_platform is not None:
+            T = board_on_platform(board_of_platform, self.truth, posed, poses.poses, views)
+            first = 0 if board is None else board.n_corners
+            boards = (FixedBoard(board_of_platform, "platform", T, first),)
+            posed = tuple(
+                placed_at(boards[0], T).beside(one)
+                for T, one in zip(poses.poses, posed, strict=True)
+            )
         if board is not None:
-            posed_machines = tuple(placed.beside(posed) for posed in posed_machines)
-        boards = (FixedBoard(placed.board, "base", placed.T_base_board), *boards)
-    if placed is not None and settings.hand_held:
-        views, groups = _in_hand(truth, posed_machines, n_sets, cameras, rngs, progress)
-    if settings.level is Level.PHOTOGRAPHS:
-        views = _encoding(views, settings.appearance.gamma, settings.tell_gamma)
-    poses_of: list[Sequence[int]] = [
-        [v % len(posed_machines)] if groups else _poses_of(v, n_sets, posed_machines)
-        for v in range(len(views))
-    ]
-    if planned is not None:
-        poses_of = list(planned.poses_of)
-    images = take_images(
-        truth.legs, posed_machines, views, poses_of, settings.images, progress,
-        each=planned is None or not planned.hand,
-    )  # fmt: skip
-    rows = list(range(len(images)))
-    if settings.level is not Level.PHOTOGRAPHS:
-        rows = [row for row in rows if images.seen(row)]
-    kept = images.chosen(rows)
-    if groups:
-        kept, views, groups = _numbered(kept, views, groups)
-    A, B = (np.array([getattr(m, joint) for m in posed_machines]) for joint in "AB")
-    arms = {j: np.array([m.arms[j] for m in posed_machines]) for j in posed_machines[0].arms}
-    scene = Scene(A, B, views, kept, arms)
-    outlines = axes = corners = None
-    if settings.level is Level.OUTLINES:
-        noise = OutlineNoise(settings.sigma_px, n_points=None)
-        outlines = outlines_of(scene, noise, rngs["observations"])
-    elif settings.level is Level.AXES:
-        axes = axes_in_images(scene, settings.table, rngs["observations"])
-    if boards and settings.level is not Level.PHOTOGRAPHS:
-        corners = corners_in_images(scene, posed_machines, settings.sigma_px, rngs["corners"])
-    width = max(2, len(str(len(poses.poses))))
-    labels = tuple(f"p{k + 1:0{width}d}" for k in range(len(poses.poses)))
-    measurements = _recorded(
-        truth, poses, labels, scene, settings, rngs, hints=settings.hints and not groups
-    )
-    if (
-        planned is not None and settings.hints and not groups
-    ):  # they are where the tripods should stand
-        both = zip(measurements.views, planned.measurements.views, strict=True)
-        hinted = tuple(replace(view, T_base_camera=p.T_base_camera) for view, p in both)
-        measurements = replace(measurements, views=hinted)
-    return SimulatedSession(
-        measurements, outlines, axes, corners, truth, poses, labels, posed_machines, scene,
-        len(images) - len(rows), boards, groups,
-    )  # fmt: skip
+            on_base, views = self._with_board(board, posed, views)
+            posed = _beside(on_base, posed)
+        elif not views:
+            views = self._cameras_around(posed, with_board=bool(boards))
+        if on_base is not None:
+            boards = (FixedBoard(on_base.board, "base", on_base.T_base_board), *boards)
+            if self.settings.hand_held:
+                views, groups = self._in_hand(posed)
+        if self.settings.level is Level.PHOTOGRAPHS:
+            views = _encoding(views, self.settings.appearance.gamma, self.settings.tell_gamma)
+        return _Setup(poses, posed, boards, views, groups)
+
+    def _board_of_plan(self, plan: PlannedSession) -> PlacedBoard | None:
+        """Return the board of a plan; refuse another beside it."""
+        if plan.board is not None and self.settings.board is not None:
+            raise UsageError(
+                "The plan could not be shot: found --board and a plan with a board, needed one of "
+                "them; leave out --board."
+            )
+        return plan.board
+
+    def _with_board(
+        self, board: Board, posed: tuple[PosedMachine, ...], given: tuple[Viewpoint, ...]
+    ) -> tuple[PlacedBoard, tuple[Viewpoint, ...]]:
+        """Return a board on the base before the given cameras, or with cameras before it."""
+        if given:
+            return board_before(board, self.truth, posed, given), given
+        bodies: Sequence[PosedMachine] = posed
+        if self.settings.hand_held:
+            views = range(len(self.cameras))
+            bodies = [posed[p] for v in views for p in self.poses_of(v, len(posed))]
+        return board_and_cameras(
+            board, self.truth, bodies, self.cameras, self.rngs["cameras"], self.progress
+        )
+
+    def _cameras_around(
+        self, posed: tuple[PosedMachine, ...], *, with_board: bool
+    ) -> tuple[Viewpoint, ...]:
+        """Return cameras around the machine; *with_board* they must see the one on the platform."""
+        views, least = cameras_around(
+            self.truth, posed, self.cameras, self.rngs["cameras"], self.progress
+        )
+        if with_board and least <= 0.0:
+            raise NotVisible(
+                "The cameras could not be placed: found no place for one of them from which it "
+                "sees the board on the platform in most poses, needed one for each; use fewer "
+                "views, or a smaller board."
+            )
+        return views
+
+    def _in_hand(
+        self, posed: tuple[PosedMachine, ...]
+    ) -> tuple[tuple[Viewpoint, ...], tuple[str, ...]]:
+        """Return a place for each image from which it shows board and legs, and its view."""
+        views: list[Viewpoint] = []
+        groups: list[str] = []
+        n_images = len(self.cameras) * len(posed) // self.n_sets
+        for v, (name, camera) in enumerate(self.cameras.items()):
+            for k, pose in enumerate(self.poses_of(v, len(posed))):
+                self.progress("Camera places", len(views), n_images)
+                T = camera_in_hand(self.truth, posed[pose], camera, self.rngs["cameras"])
+                if T is None:
+                    raise NotVisible(
+                        f"view {name}: a camera in the hand could not be placed: found none of "
+                        f"{MAX_HAND_DRAWS} places from which image {k + 1} shows the board and a "
+                        "leg, needed one; use a smaller board."
+                    )
+                views.append(Viewpoint(f"{name}-{k + 1}", camera, T))
+                groups.append(name)
+        self.progress("Camera places", n_images, n_images)
+        return tuple(views), tuple(groups)
+
+    def shoot(self, setup: _Setup) -> tuple[_Setup, Images, int]:
+        """Return what images show, and how many are left out: tables have no row without a leg.
+
+        The set-up comes with it: of cameras in the hand those are left out that show nothing.
+        """
+        plan, n_poses = self.plan, len(setup.posed_machines)
+        poses_of: Sequence[Sequence[int]] = [
+            [v % n_poses] if setup.groups else self.poses_of(v, n_poses)
+            for v in range(len(setup.views))
+        ]
+        if plan is not None:
+            poses_of = plan.poses_of
+        images = take_images(
+            self.truth.legs, setup.posed_machines, setup.views, poses_of, self.settings.images,
+            self.progress, each=plan is None or not plan.hand,
+        )  # fmt: skip
+        rows = list(range(len(images)))
+        if self.settings.level is not Level.PHOTOGRAPHS:
+            rows = [row for row in rows if images.seen(row)]
+        kept = images.chosen(rows)
+        if setup.groups:
+            kept, views, groups = _numbered(kept, setup.views, setup.groups)
+            setup = replace(setup, views=views, groups=groups)
+        return setup, kept, len(images) - len(rows)
+
+    def observe(self, setup: _Setup, images: Images, left_out: int) -> SimulatedSession:
+        """Return the session: readings and tables with their errors, and the truth."""
+        settings, rngs, posed = self.settings, self.rngs, setup.posed_machines
+        A, B = (np.array([getattr(m, joint) for m in posed]) for joint in "AB")
+        arms = {j: np.array([m.arms[j] for m in posed]) for j in posed[0].arms}
+        scene = Scene(A, B, setup.views, images, arms)
+        outlines = axes = corners = None
+        if settings.level is Level.OUTLINES:
+            noise = OutlineNoise(settings.sigma_px, n_points=None)
+            outlines = outlines_of(scene, noise, rngs["observations"])
+        elif settings.level is Level.AXES:
+            axes = axes_in_images(scene, settings.table, rngs["observations"])
+        if setup.boards and settings.level is not Level.PHOTOGRAPHS:
+            corners = corners_in_images(scene, posed, settings.sigma_px, rngs["corners"])
+        n_poses = len(setup.poses.poses)
+        width = max(2, len(str(n_poses)))
+        labels = tuple(f"p{k + 1:0{width}d}" for k in range(n_poses))
+        hints = settings.hints and not setup.groups
+        measurements = _recorded(
+            self.truth, setup.poses, labels, scene, settings, rngs, hints=hints
+        )
+        if self.plan is not None and hints:  # they are where the tripods should stand
+            both = zip(measurements.views, self.plan.measurements.views, strict=True)
+            hinted = tuple(replace(view, T_base_camera=p.T_base_camera) for view, p in both)
+            measurements = replace(measurements, views=hinted)
+        return SimulatedSession(
+            measurements, outlines, axes, corners, self.truth, setup.poses, labels, posed, scene,
+            left_out, setup.boards, setup.groups,
+        )  # fmt: skip
+
+
+def _beside(
+    board: PlacedBoard | None, posed_machines: tuple[PosedMachine, ...]
+) -> tuple[PosedMachine, ...]:
+    """Return machines with a board beside them, if there is one."""
+    return posed_machines if board is None else tuple(map(board.beside, posed_machines))
 
 
 def exact_outlines(scene: Scene) -> Outlines:
     """Return the outlines of a scene as they are, with next to no noise claimed."""
     return outlines_of(scene, replace(EVERY_PIXEL, sigma_px=0.0))
-
-
-def _cameras(settings: SimulationSettings) -> tuple[dict[str, Camera], tuple[Viewpoint, ...]]:
-    """Return the camera of each view, and where all of them stand if that is given."""
-    camera = mild_lens() if settings.camera is None else read_lens(settings.camera)
-    if isinstance(settings.views, int):
-        return {f"c{v + 1}": camera for v in range(settings.views)}, ()
-    given = read_cameras(settings.views, camera)
-    cameras = {name: lens for name, (lens, _) in given.items()}
-    return cameras, tuple(Viewpoint(name, lens, T) for name, (lens, T) in given.items())
-
-
-def _poses_of(view: int, n_sets: int, posed_machines: Sequence[PosedMachine]) -> range:
-    """Return the poses that a view sees: all of them, or those of its own set."""
-    own = len(posed_machines) // n_sets
-    return range(own) if n_sets == 1 else range(view * own, (view + 1) * own)
-
-
-def _in_hand(
-    truth: Machine,
-    posed_machines: Sequence[PosedMachine],  # with the board
-    n_sets: int,
-    cameras: Mapping[str, Camera],
-    rngs: Streams,
-    progress: Report,
-) -> tuple[tuple[Viewpoint, ...], tuple[str, ...]]:
-    """Return a place for each image from which it shows board and legs, and the view of each."""
-    views: list[Viewpoint] = []
-    groups: list[str] = []
-    n_images = len(cameras) * len(posed_machines) // n_sets
-    for v, (name, camera) in enumerate(cameras.items()):
-        for k, pose in enumerate(_poses_of(v, n_sets, posed_machines)):
-            progress("Camera places", len(views), n_images)
-            T = camera_in_hand(truth, posed_machines[pose], camera, rngs["cameras"])
-            if T is None:
-                raise NotVisible(
-                    f"view {name}: a camera in the hand could not be placed: found none of "
-                    f"{MAX_HAND_DRAWS} places from which image {k + 1} shows the board and a leg, "
-                    "needed one; use a smaller board."
-                )
-            views.append(Viewpoint(f"{name}-{k + 1}", camera, T))
-            groups.append(name)
-    progress("Camera places", n_images, n_images)
-    return tuple(views), tuple(groups)
 
 
 def _numbered(
