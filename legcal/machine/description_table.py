@@ -6,7 +6,6 @@ become a :class:`Description` in metres, whose legs are checked against their ty
 one value for all legs, or a list with one (or null) for each leg.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from decimal import Decimal
 from pathlib import Path
@@ -18,18 +17,15 @@ from scipy.spatial.transform import Rotation
 
 from legcal.errors import DatasetError, ModelError
 from legcal.files import (
-    Column,
     FileSchema,
     Number,
     PlainName,
     Quaternion,
-    Table,
     Vector,
     Version,
     closest,
     describe,
     is_plain_name,
-    read_table,
     read_yaml,
     validate,
 )
@@ -47,10 +43,8 @@ from legcal.machine.description import (
     legs_in_words,
     look_like_base,
 )
+from legcal.machine.description_csv import MAX_NUMBER, MOTIONS, UNITS, WHAT, read_columns
 from legcal.machine.leg import MAX_LEGS, LegKind
-from legcal.machine.table_headings import UNITS, one_row_a_leg
-
-MAX_NUMBER = 1e9  # of any number, whatever its unit
 
 
 def _is_number(value: object) -> bool:
@@ -257,6 +251,47 @@ class ActuatorEntry(FileSchema):
         """Whether it is an arm."""
         return self.axis is not None
 
+    @property
+    def pulses(self) -> Pulses | None:
+        """The pulses of a hobby servo. Raises ValueError if what is stated is none."""
+        return Pulses.stated(self.centre_us, self.us_per_deg, turns=self.turns)
+
+    def problem(self, unit: str) -> str | None:
+        """Return what does not fit together, None if all does; *unit* is that of lengths."""
+        given = [key for key in MOTIONS if getattr(self, key) is not None]
+        if given not in (["direction"], ["point", "axis"]):
+            return (
+                f"found {' and '.join(given) or 'no motion'}, needed the direction of a "
+                "carriage, or a point and the axis of an arm; correct it."
+            )
+        try:
+            pulses = self.pulses
+        except ValueError as error:
+            return str(error)
+        if self.arm_radius is not None and not self.turns:
+            return "found arm_radius of a carriage, needed that of an arm that turns; leave it out."
+        travels = [key for key in _TRAVELS if getattr(self, key) is not None]
+        right = ["travel_deg", "travel_us"] if self.turns else ["travel"]
+        if len(travels) == 1 and travels[0] in right and (travels != ["travel_us"] or pulses):
+            return None
+        what = f"a carriage, in {unit}"
+        if self.turns:
+            what = "an arm, in degrees, or travel_us with centre_us and us_per_deg of a servo"
+        return (
+            f"found {' and '.join(travels) or 'no travel'}, needed {right[0]}, the lowest and "
+            f"highest reading of {what}; correct it."
+        )
+
+    def travel_in_metres(self, unit: str) -> tuple[float, float]:
+        """Return the lowest and the highest reading [m or rad]; *unit* is that of lengths."""
+        if self.travel_us and (pulses := self.pulses):
+            low, high = sorted(pulses.angles(np.array(self.travel_us)).tolist())
+            return low, high
+        low, high = self.travel_deg or self.travel or [0.0, 0.0]
+        if self.turns:
+            return float(np.radians(low)), float(np.radians(high))
+        return in_metres(low, unit), in_metres(high, unit)
+
 
 class TableFile(FileSchema):
     """A table in YAML. All lengths are in ``unit``; directions have no length."""
@@ -288,8 +323,20 @@ class TableFile(FileSchema):
     platform_in: Literal["base", "platform"] | None = None
     base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
 
+    @property
+    def leg_names(self) -> list[str]:
+        """The names of the legs, their numbers by default."""
+        return self.legs or [f"leg{j + 1}" for j in range(len(self.base_joints))]
 
-WHAT = "table"
+    @property
+    def motors_of_legs(self) -> list[str | None]:
+        """The motor that each leg hangs on: as stated, or in the order of the motors."""
+        n, motors = len(self.base_joints), list(self.actuators or ())
+        if self.hangs_on is None:
+            return [*motors] if len(motors) == n else [None] * n
+        return self.hangs_on
+
+
 OPTIONS = {
     "type": "--type",
     "offsets": "--offset",
@@ -300,151 +347,7 @@ OPTIONS = {
     "home": "--height",
     "platform_in": "--platform-in",
 }
-_XYZ = ("x", "y", "z")
 _TRAVELS = ("travel", "travel_deg", "travel_us")
-_MOTIONS = ("direction", "point", "axis")  # of what rods hang on
-_RADII = ("radius", "tube", "rod")
-_AT_HOME = {"home_reading": "home_readings", "home_reading_deg": "home_readings_deg"}
-_POINTS = tuple(f"{side}_{i}" for side in ("base", "platform") for i in _XYZ)
-_NUMBERS = (
-    *("offset", "length", "min_length", "max_length", "travel_low", "travel_high"),
-    *_RADII,
-    *(f"{side}_axis_{i}" for side in ("base", "platform") for i in _XYZ),
-    *(f"{what}_{i}" for what in ("direction", "point", "axis") for i in _XYZ),
-    *(f"{travel}_{end}" for travel in ("travel_deg", "travel_us") for end in ("low", "high")),
-    *("centre_us", "us_per_deg", "arm_radius", "home_reading", "home_reading_deg"),
-)
-COLUMNS = (
-    *(Column(name, "text", required=False) for name in ("leg", "type", "kind", "unit", "hangs_on")),
-    *(
-        Column(
-            name,
-            least=-MAX_NUMBER,
-            most=MAX_NUMBER,
-            needed=f"a number below {MAX_NUMBER:g}",
-            remedy="correct the cell",
-            required=name in _POINTS and not name.endswith("z"),
-            blank=name not in _POINTS or name.endswith("z"),
-        )
-        for name in (*_POINTS, *_NUMBERS)
-    ),
-)
-
-
-def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
-    """Return a CSV as the mapping that the same table would be in YAML.
-
-    ``unit`` is that of its lengths, unless a column states it. Raises DatasetError with one
-    sentence for each wrong column or cell.
-    """
-    needed = "one row for each leg; add them"
-    names = [column.name for column in COLUMNS]
-    table = read_table(
-        path,
-        WHAT,
-        "leg",
-        COLUMNS,
-        needed=needed,
-        reshape=lambda lines: one_row_a_leg(lines, names, path),
-    )
-    filled = [np.array([text != "" for text in table.text(name)], dtype=bool) for name in _RADII]
-    for row in np.flatnonzero(filled[0] & (filled[1] | filled[2])).tolist():
-        needed = "one of them; empty the others"
-        table.refuse(row, "radius beside tube or rod", needed, *_RADII, what="radius")
-    table.check()
-
-    def texts(name: str) -> list[Any]:
-        return [text or None for text in table.text(name)]
-
-    def numbers(name: str) -> list[Any]:
-        return [None if math.isnan(x) else x for x in table.number(name).tolist()]
-
-    def points(side: str) -> list[Any]:
-        x, y, z = (table.number(f"{side}_{i}") for i in _XYZ)
-        return np.column_stack([x, y, np.nan_to_num(z)]).tolist()  # type: ignore[no-any-return]
-
-    def vectors(name: str) -> list[Any]:
-        found = zip(*(numbers(f"{name}_{i}") for i in _XYZ), strict=True)
-        return [None if vector == (None,) * 3 else list(vector) for vector in found]
-
-    def pairs(name: str) -> list[Any]:
-        found = zip(numbers(f"{name}_low"), numbers(f"{name}_high"), strict=True)
-        return [None if pair == (None, None) else list(pair) for pair in found]
-
-    hangs_on, travel = texts("hangs_on"), pairs("travel")
-    actuators = dict[str, dict[str, Any]]()
-    said_of_motors = {
-        **{key: vectors(key) for key in _MOTIONS},
-        "travel": travel[:],
-        **{key: pairs(key) for key in ("travel_deg", "travel_us")},
-        **{key: numbers(key) for key in ("centre_us", "us_per_deg", "arm_radius", *_AT_HOME)},
-    }
-    for row, motor in enumerate(hangs_on):
-        said = {key: values[row] for key, values in said_of_motors.items()}
-        if motor is None:
-            continue
-        travel[row] = None
-        entry = actuators.setdefault(motor, said)
-        for key, value in said.items():
-            if entry[key] is None:
-                entry[key] = value
-            elif value is not None and value != entry[key]:
-                needed = f"the same {key} in all rows of '{motor}'; correct it, or leave it empty"
-                table.refuse(row, f"another {key}", needed, "hangs_on", what="hangs_on")
-    table.check()
-    document: dict[str, Any] = {
-        "legcal_table": 1,
-        "name": path.stem,
-        "unit": _unit(table, unit),
-        "types": texts("type") if "type" in table else None,
-        "base_joints": points("base"),
-        "platform_joints": points("platform"),
-        "travel": travel,
-        "radius": [
-            {k: x for k, x in (("tube", tube), ("rod", rod)) if x is not None} or radius
-            for radius, tube, rod in zip(*map(numbers, _RADII), strict=True)
-        ],
-    }
-    optional: dict[str, Any] = {
-        "legs": texts("leg"),
-        "kinds": texts("kind"),
-        "offsets": numbers("offset"),
-        "lengths": numbers("length"),
-        "min_length": numbers("min_length"),
-        "max_length": numbers("max_length"),
-        "base_axes": vectors("base_axis"),
-        "platform_axes": vectors("platform_axis"),
-        "hangs_on": hangs_on,
-    }
-    if actuators:
-        document["actuators"] = {
-            name: {
-                k: value for k, value in entry.items() if value is not None and k not in _AT_HOME
-            }
-            for name, entry in actuators.items()
-        }
-        for column, key in _AT_HOME.items():
-            stated = {name: entry[column] for name, entry in actuators.items()}
-            optional[key] = {k: value for k, value in stated.items() if value is not None} or [None]
-    return document | {
-        key: column for key, column in optional.items() if any(x is not None for x in column)
-    }
-
-
-def _unit(table: Table, given: str | None) -> str:
-    """Return the unit of the column, or the given one."""
-    stated = sorted(set(filter(None, table.text("unit"))))
-    if len(stated) > 1:
-        raise DatasetError(
-            f"{table.path}: the unit could not be decided: found {' and '.join(stated)}, needed "
-            "the same in all lines; correct the column 'unit'."
-        )
-    if not stated and given is None:
-        raise DatasetError(
-            f"{table.path}: the lengths could not be read: found no unit, needed m or mm; "
-            "add a column 'unit', or give --unit mm."
-        )
-    return stated[0] if stated else str(given)
 
 
 def read_description(
@@ -563,12 +466,12 @@ def _conflicting_entries(file: TableFile, source: str) -> list[str]:
             f"{source}: base_joints could not be used: found {n} {'leg' if n == 1 else 'legs'}, "
             f"needed 2 to {MAX_LEGS}; {remedy}."
         )
-    names = file.legs or [f"leg{j + 1}" for j in range(n)]
+    names = file.leg_names
     problems += [
         f"{source}: legs could not be used: found '{leg}' twice, needed unique names; rename it."
         for leg in sorted({leg for leg in names if names.count(leg) > 1})
     ]
-    problems += _useless_entries(file, source, names)
+    problems += _useless_entries(file, source)
     frame = file.base_frame or []
     problems += [
         f"{source}: base_frame could not be used: found '{leg}', which is not a leg; "
@@ -582,58 +485,20 @@ def _conflicting_entries(file: TableFile, source: str) -> list[str]:
             "correct it."
         )
     problems += _wrong_home(file, source)
-    problems += _wrong_actuators(file, source, names)
+    problems += _wrong_actuators(file, source)
     problems += _wrong_home_readings(file, source)
-    problems += _wrong_lengths(file, source, names)
+    problems += _wrong_lengths(file, source)
     return problems
 
 
-def _hangs_on(file: TableFile) -> list[str | None]:
-    """Return the motor that each leg hangs on: as stated, or in the order of the motors."""
-    n, motors = len(file.base_joints), list(file.actuators or ())
-    if file.hangs_on is None:
-        return [*motors] if len(motors) == n else [None] * n
-    return file.hangs_on
-
-
-def _wrong_actuators(file: TableFile, source: str, names: list[str]) -> list[str]:
-    """Return what does not fit together of motors that rods hang on."""
-    problems = []
-    known = file.actuators or {}
-    for name, entry in known.items():
-        where = f"{source}: actuators.{name} could not be used"
-        given = [key for key in _MOTIONS if getattr(entry, key) is not None]
-        if given not in (["direction"], ["point", "axis"]):
-            problems.append(
-                f"{where}: found {' and '.join(given) or 'no motion'}, needed the direction of a "
-                "carriage, or a point and the axis of an arm; correct it."
-            )
-            continue
-        try:
-            pulses = Pulses.stated(entry.centre_us, entry.us_per_deg, turns=entry.turns)
-        except ValueError as error:
-            problems.append(f"{where}: {error}")
-            continue
-        if entry.arm_radius is not None and not entry.turns:
-            problems.append(
-                f"{where}: found arm_radius of a carriage, needed that of an arm that turns; leave "
-                "it out."
-            )
-        travels = [key for key in _TRAVELS if getattr(entry, key) is not None]
-        right = ["travel_deg", "travel_us"] if entry.turns else ["travel"]
-        if (
-            len(travels) != 1
-            or travels[0] not in right
-            or (travels == ["travel_us"] and not pulses)
-        ):
-            what = f"a carriage, in {file.unit}"
-            if entry.turns:
-                what = "an arm, in degrees, or travel_us with centre_us and us_per_deg of a servo"
-            problems.append(
-                f"{where}: found {' and '.join(travels) or 'no travel'}, needed {right[0]}, the "
-                f"lowest and highest reading of {what}; correct it."
-            )
-    motors = _hangs_on(file)
+def _wrong_actuators(file: TableFile, source: str) -> list[str]:
+    """Return what does not fit together of motors that rods hang on, and of these rods."""
+    names, motors, known = file.leg_names, file.motors_of_legs, file.actuators or {}
+    problems = [
+        f"{source}: actuators.{name} could not be used: {problem}"
+        for name, entry in known.items()
+        if (problem := entry.problem(file.unit)) is not None
+    ]
     for leg, type_, motor in zip(names, _types(file, len(names)), motors, strict=False):
         where = f"{source}: leg '{leg}' could not be used"
         if motor is not None and motor not in known:
@@ -676,32 +541,24 @@ def _wrong_actuators(file: TableFile, source: str, names: list[str]) -> list[str
 
 def _actuators(file: TableFile) -> dict[str, Actuator]:
     """Return the motors that rods hang on, in the base link."""
-    found, motors = {}, _hangs_on(file)
+    found, motors = {}, file.motors_of_legs
     for name, entry in (file.actuators or {}).items():
         along = np.array(entry.axis or entry.direction, dtype=float)
         A = [file.base_joints[j] for j, motor in enumerate(motors) if motor == name]
         at = entry.point or np.mean(A, axis=0).tolist()
-        pulses = Pulses.stated(entry.centre_us, entry.us_per_deg, turns=entry.turns)
-        ends = entry.travel_deg or entry.travel or [0.0, 0.0]
-        if entry.travel_us and pulses:
-            travel = sorted(pulses.angles(np.array(entry.travel_us)).tolist())
-        elif entry.turns:
-            travel = [float(np.radians(end)) for end in ends]
-        else:
-            travel = [in_metres(end, file.unit) for end in ends]
         found[name] = Actuator(
             name,
             ActuatorKind.REVOLUTE if entry.turns else ActuatorKind.PRISMATIC,
             np.asarray(along / np.linalg.norm(along)),
             np.array([in_metres(x, file.unit) for x in at]),
-            (travel[0], travel[1]),
+            entry.travel_in_metres(file.unit),
             f"{name}_link",
-            pulses=pulses,
+            pulses=entry.pulses,
         )
         if entry.arm_radius is not None:
             joints = np.array([[in_metres(x, file.unit) for x in joint] for joint in A])
-            first = (file.legs or [f"leg{j + 1}" for j in range(len(motors))])[motors.index(name)]
             radius = in_metres(entry.arm_radius, file.unit)
+            first = file.leg_names[motors.index(name)]
             found[name] = found[name].with_arm(joints, radius, first)
     return found
 
@@ -756,12 +613,12 @@ def _wrong_home(file: TableFile, source: str) -> list[str]:
     return problems
 
 
-def _wrong_lengths(file: TableFile, source: str, names: list[str]) -> list[str]:
+def _wrong_lengths(file: TableFile, source: str) -> list[str]:
     """Return lengths of legs of which one is missing, too much or wrong."""
     problems = []
     n = len(file.base_joints)
     for name, low, high, _, travel in zip(
-        names, *(_of_each(value, n) for value in _laws(file)), strict=False
+        file.leg_names, *(_of_each(value, n) for value in _laws(file)), strict=False
     ):
         if low is None and high is None:
             continue
@@ -793,8 +650,9 @@ def _of_each(value: Any, n: int) -> list[Any]:
     return value if isinstance(value, list) else [value] * n
 
 
-def _useless_entries(file: TableFile, source: str, names: list[str]) -> list[str]:
+def _useless_entries(file: TableFile, source: str) -> list[str]:
     """Return which entries are for legs that have no use for them."""
+    names = file.leg_names
     has_slider = [leg.has_slider for leg in _types(file, len(names))]
     problems = []
     for key, of_sliders in (
@@ -831,8 +689,7 @@ def _description(file: TableFile, source: str) -> Description:
     def per_leg(value: Any) -> list[Any]:
         return _of_each(value, n)
 
-    names = file.legs or [f"leg{j + 1}" for j in range(n)]
-    actuators, motors = _actuators(file), _hangs_on(file)
+    names, actuators, motors = file.leg_names, _actuators(file), file.motors_of_legs
     laws = [_of_each(value, n) for value in _laws(file)]
     notes = list[str]()
     legs = []
