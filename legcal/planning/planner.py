@@ -210,52 +210,41 @@ def plan_session(
     Raises DidNotConverge, NotVisible or NotIdentifiable if there are no poses, no places, or too
     few images.
     """
-    predictor, machine, rng = task.predictor, task.machine, np.random.default_rng(task.seed)
-    legs = predictor.legs
+    machine, legs, rng = task.machine, task.predictor.legs, np.random.default_rng(task.seed)
     n_poses = min(MOST_POSES, MIN_POSES + POSES_EACH * task.n_images)
     poses = candidate_poses(machine, legs, task.setting, n_poses, rng, progress)
     task = _with_laid_board(task, poses)
-    scene, places = Scene.nominal(task), _places(task, poses)
-    shown = _probed(scene, places, poses, rng, progress, run)
+    scene = Scene.nominal(task)
+    shown = _probed(scene, _places(task, poses), poses, rng, progress, run)
     before = [scene.of(one, is_shot=True) for one in task.given]
-    given = [found for found in before if found is not None]
-    work = workspace_of(machine, legs)
-    criterion = criterion_of(task.goal, work, legs, shown[0][1].basis, task.named)
-    n_places = min(N_HANDS, len(shown)) if task.hand_held else task.n_views
-    chosen = choose_places([c for _, c in shown], n_places, task.n_images, criterion, given)
-    current = [scene.showing(Candidates(shown[i][0], poses)) for i in chosen]
-    count = [len(own.poses.poses) for own in current]
-    if sum(count) < task.n_images:
-        raise NotVisible(
-            f"{machine.yaml_path}: no session could be planned: found {sum(count)} images from "
-            f"{len(current)} places that show legs and the board, needed {task.n_images}; plan "
-            "fewer --images, more --cameras, or a board of another size."
-        )
-    least = 0 if task.hand_held else max(1, int(MIN_SHARE * task.n_images / task.n_views))
-    least = min([least, *count])
-    session = Session(_required(scene, current, run), given)
-    images = choose(session, task.n_images, criterion, rng, least, task.n_images, progress=progress)
-    images = exchange(
-        session, images, criterion, rng, least, task.n_images, progress=progress, stop=stop
+    work, basis = workspace_of(machine, legs), shown[0][1].basis
+    search = _Search(
+        scene,
+        [found for found in before if found is not None],
+        work,
+        basis,
+        criterion_of(task.goal, work, legs, basis, task.named),
+        rng,
+        progress,
+        stop,
+        run,
     )
-    _refuse_undetermined(task, session, criterion, given, work, shown[0][1].basis)
-    current = _of_images(current, images)
-    value = images.value
+    current, least, value = search.chosen(shown, poses)
     target = _framed(task, poses)
     middle = 0.5 * (target.min(axis=0) + target.max(axis=0))
-    notes = []
     for turn in range(ROUNDS):
         if stop():
             break
         step = 0.5**turn
-        current = _better_places(scene, current, given, criterion, rng, step, middle, stop)
-        current, value = _better_poses(
-            scene, current, given, criterion, rng, step, least, run, stop
-        )
+        current = search.better_places(current, step, middle)
+        current, value = search.better_poses(current, step, least)
         progress("Polishing", turn + 1, ROUNDS)
-    if stop():
-        notes.append("The search was stopped: this is the best plan that it had found.")
-    return _judged(scene, current, given, criterion, work, value, notes, progress, run)
+    was_stopped = stop()
+    plan = search.judged(current, value)
+    if was_stopped:
+        note = "The search was stopped: this is the best plan that it had found."
+        plan = replace(plan, notes=(note, *plan.notes))
+    return plan
 
 
 def _places(task: Task, poses: Configurations) -> list[Place]:
@@ -342,13 +331,6 @@ def _probed(
     return found
 
 
-def _required(
-    scene: Scene, candidates: Sequence[Candidates], run: Run = in_turn
-) -> list[Contributions]:
-    """Return what images of candidates add, all of which see legs."""
-    return [one for one in run(scene.of, candidates) if one is not None]
-
-
 def choose_places(
     shown: Sequence[Contributions],
     n_views: int,
@@ -409,127 +391,213 @@ def _of_images(current: Sequence[Candidates], images: Chosen) -> list[Candidates
     ]
 
 
-def _with_all(slots: Sequence[Contributions], given: Sequence[Contributions]) -> Session:
-    """Return the session with all images of all slots."""
-    return Session([], [*slots, *given])
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The search for a session, and what each of its steps needs."""
 
+    scene: Scene  # the nominal machine
+    given: Sequence[Contributions]  # of images that were shot already
+    work: Workspace | None  # None where readings give no pose
+    basis: Array  # of the coordinates of the machine
+    criterion: Criterion
+    rng: np.random.Generator
+    progress: Report
+    stop: Callable[[], bool]
+    run: Run
 
-def _better_places(
-    scene: Scene,
-    current: list[Candidates],
-    given: Sequence[Contributions],
-    criterion: Criterion,
-    rng: np.random.Generator,
-    step: float,
-    target: Array,
-    stop: Callable[[], bool],
-) -> list[Candidates]:
-    """Return the same poses seen from places nearby, where that is better."""
-    task, up = scene.task, scene.task.machine.upward
-    current, known = list(current), _required(scene, current)
-    value = float(criterion(_with_all(known, given).machine[None])[0])
-    for v, own in enumerate(current):
-        for _ in range(0 if own.place.fixed else N_NEAR_PLACES):
-            if stop():
-                break
-            place = near(current[v].place, target, up, PLACE_STEP * step, rng)
-            trial = replace(own, place=place)
-            found = scene.of(trial) if place.is_inside(task.bounds) else None
-            if found is None or scene.showing(trial) is not trial:
-                continue
-            others = [*known[:v], found, *known[v + 1 :]]
-            there = float(criterion(_with_all(others, given).machine[None])[0])
-            if there < value:
-                current[v], known[v], value = trial, found, there
-    return current
+    @property
+    def task(self) -> Task:
+        """What is asked."""
+        return self.scene.task
 
+    def added(self, candidates: Sequence[Candidates]) -> list[Contributions]:
+        """Return what images of candidates add, all of which see legs."""
+        return [one for one in self.run(self.scene.of, candidates) if one is not None]
 
-def _better_poses(
-    scene: Scene,
-    current: list[Candidates],
-    given: Sequence[Contributions],
-    criterion: Criterion,
-    rng: np.random.Generator,
-    step: float,
-    least: int,
-    run: Run,
-    stop: Callable[[], bool],
-) -> tuple[list[Candidates], float]:
-    """Return places and poses after exchanges with poses nearby, and the criterion."""
-    task, far = scene.task, POSE_STEP * step
-    widened = []
-    for own in current:
-        poses = own.poses
-        if not stop():
-            poses = poses_near(task.machine, task.predictor.legs, task.setting, poses, far, rng)
-        widened.append(scene.showing(replace(own, poses=poses)))
-    session = Session(_required(scene, widened, run), given)
-    images = [(v, k) for v, own in enumerate(current) for k in range(len(own.poses.poses))]
-    for slot, image in images:
-        session.changed(slot, image, 1.0)
-    session.renewed()
-    better = exchange(session, Chosen(images), criterion, rng, least, len(images), stop=stop)
-    return _of_images(widened, better), better.value
+    def with_all(self, slots: Sequence[Contributions]) -> Session:
+        """Return the session with all images of all slots."""
+        return Session([], [*slots, *self.given])
 
+    def value(self, slots: Sequence[Contributions]) -> float:
+        """Return the criterion with all images of all slots."""
+        return float(self.criterion(self.with_all(slots).machine[None])[0])
 
-def _judged(
-    scene: Scene,
-    current: Sequence[Candidates],
-    given: Sequence[Contributions],
-    criterion: Criterion,
-    work: Workspace | None,
-    value: float,
-    notes: list[str],
-    progress: Report,
-    run: Run,
-) -> Plan:
-    """Return the plan with what sessions as they will be are expected to give."""
-    task, predictor, machine = scene.task, scene.task.predictor, scene.task.machine
-    legs, found = predictor.legs, _required(scene, current)
-    session = _with_all(found, given)
-    n, covariances = task.setting.draws, []
-    rngs = np.random.default_rng(task.seed + 1).spawn(n)
-    for drawn in run(partial(drawn_covariance, task, current), rngs):
-        covariances.append(drawn)
-        progress("Draws", len(covariances), n)
-    covariance = np.mean(covariances, axis=0)
-    views, blocked = [], 0
-    for own in current:
-        order = in_short_order(machine, own.poses)
-        poses = some_of(own.poses, order)
-        via, missing = ways(machine, poses)
-        blocked += missing
-        T, in_Rb = own.place.T_base_camera, platforms_in_base(machine, poses.poses)
-        views.append(PlannedView(own.place.name, T, poses, via, scene.seen(T, in_Rb, surely=False)))
-    if blocked:
-        notes.append(
-            f"No free way was found to {blocked} of the poses, not even by home: lead the machine "
-            "there by hand, away from singularities and collisions."
+    def chosen(
+        self, shown: Sequence[tuple[Place, Contributions]], poses: Configurations
+    ) -> tuple[list[Candidates], int, float]:
+        """Return places and poses to begin with, the least images of each, and the criterion.
+
+        Raises NotVisible or NotIdentifiable if the images are too few.
+        """
+        task, machine = self.task, self.task.machine
+        n_places = min(N_HANDS, len(shown)) if task.hand_held else task.n_views
+        of_places = [contributions for _, contributions in shown]
+        chosen = choose_places(of_places, n_places, task.n_images, self.criterion, self.given)
+        current = [self.scene.showing(Candidates(shown[i][0], poses)) for i in chosen]
+        count = [len(own.poses.poses) for own in current]
+        if sum(count) < task.n_images:
+            raise NotVisible(
+                f"{machine.yaml_path}: no session could be planned: found {sum(count)} images from "
+                f"{len(current)} places that show legs and the board, needed {task.n_images}; plan "
+                "fewer --images, more --cameras, or a board of another size."
+            )
+        least = 0 if task.hand_held else max(1, int(MIN_SHARE * task.n_images / task.n_views))
+        least = min([least, *count])
+        session = Session(self.added(current), self.given)
+        images = choose(
+            session, task.n_images, self.criterion, self.rng, least, task.n_images,
+            progress=self.progress,
+        )  # fmt: skip
+        images = exchange(
+            session, images, self.criterion, self.rng, least, task.n_images,
+            progress=self.progress, stop=self.stop,
+        )  # fmt: skip
+        self._refuse_undetermined(session)
+        return _of_images(current, images), least, images.value
+
+    def _refuse_undetermined(self, session: Session) -> None:
+        """Refuse a session that leaves a direction open that matters; say how many images do."""
+        task, work, basis = self.task, self.work, self.basis
+        most = max(task.setting.length, _LEAST_ERROR)
+
+        def off(S: Array) -> Array:
+            """Return the error of the platform, or the criterion where readings give no pose."""
+            if work is None:
+                return self.criterion(S)
+            errors = [work.error(basis @ one @ basis.T).mean_displacement for one in S]
+            return np.array(errors)
+
+        if float(off(session.machine[None])[0]) < most:
+            return
+        more = choose(
+            Session(session.slots, self.given),
+            _MOST_NEEDED,
+            off,
+            np.random.default_rng(task.seed),
+            0,
+            _MOST_NEEDED,
+            is_enough=lambda error: error < most,
         )
-    if task.goal in (Goal.MEAN, Goal.WORST) and not machine.is_determined:
-        notes.append(f"Readings do not give the pose: {machine.undetermined}.")
-    return Plan(
-        machine=machine,
-        camera=predictor.camera,
-        setting=task.setting,
-        noise=predictor.noise,
-        sigma_q=predictor.sigma_q,
-        sigma_by_joint=predictor.sigma_by_joint,
-        goal=task.goal,
-        views=_named(views, task),
-        value=value,
-        error=None if work is None else work.error(covariance),
-        sigma=np.sqrt(np.maximum(np.diagonal(covariance), 0.0)),
-        names=legs.parametrization.names,
-        units=legs.parametrization.units,
-        growth=_growth(found, given, criterion),
-        limits=_limits(session, criterion),
-        seed=task.seed,
-        board=task.laid,
-        hand_held=task.hand_held,
-        given=task.given_name,
-        notes=tuple(notes),
-    )
+        n = max(len(more.images), task.n_images + 1)
+        places = f"{task.n_views} place{'s' * (task.n_views != 1)}"
+        remedy = (
+            f"plan {n} --images or more" if more.value < most else "plan more --cameras, or --board"
+        )
+        needed = f"at least {n}" if more.value < most else "more places"
+        raise NotIdentifiable(
+            f"{task.machine.yaml_path}: no session could be planned: found that {task.n_images} "
+            f"images from {places} tell less of the machine than its model does, needed {needed}; "
+            f"{remedy}."
+        )
+
+    def better_places(
+        self, current: Sequence[Candidates], step: float, target: Array
+    ) -> list[Candidates]:
+        """Return the same poses seen from places nearby, where that is better."""
+        current, known = list(current), self.added(current)
+        value = self.value(known)
+        for v, own in enumerate(current):
+            for _ in range(0 if own.place.fixed else N_NEAR_PLACES):
+                if self.stop():
+                    break
+                up = self.task.machine.upward
+                place = near(current[v].place, target, up, PLACE_STEP * step, self.rng)
+                trial = replace(own, place=place)
+                found = self.scene.of(trial) if place.is_inside(self.task.bounds) else None
+                if found is None or self.scene.showing(trial) is not trial:
+                    continue
+                there = self.value([*known[:v], found, *known[v + 1 :]])
+                if there < value:
+                    current[v], known[v], value = trial, found, there
+        return current
+
+    def better_poses(
+        self, current: Sequence[Candidates], step: float, least: int
+    ) -> tuple[list[Candidates], float]:
+        """Return places and poses after exchanges with poses nearby, and the criterion."""
+        task, far = self.task, POSE_STEP * step
+        widened = []
+        for own in current:
+            poses = own.poses
+            if not self.stop():
+                legs = task.predictor.legs
+                poses = poses_near(task.machine, legs, task.setting, poses, far, self.rng)
+            widened.append(self.scene.showing(replace(own, poses=poses)))
+        session = Session(self.added(widened), self.given)
+        images = [(v, k) for v, own in enumerate(current) for k in range(len(own.poses.poses))]
+        for slot, image in images:
+            session.changed(slot, image, 1.0)
+        session.renewed()
+        better = exchange(
+            session, Chosen(images), self.criterion, self.rng, least, len(images), stop=self.stop
+        )
+        return _of_images(widened, better), better.value
+
+    def judged(self, current: Sequence[Candidates], value: float) -> Plan:
+        """Return the plan with what sessions as they will be are expected to give."""
+        task, predictor, machine = self.task, self.task.predictor, self.task.machine
+        found = self.added(current)
+        covariance = self._expected_covariance(current)
+        views, blocked = [], 0
+        for own in current:
+            order = in_short_order(machine, own.poses)
+            poses = some_of(own.poses, order)
+            via, missing = ways(machine, poses)
+            blocked += missing
+            T, in_Rb = own.place.T_base_camera, platforms_in_base(machine, poses.poses)
+            seen = self.scene.seen(T, in_Rb, surely=False)
+            views.append(PlannedView(own.place.name, T, poses, via, seen))
+        notes = []
+        if blocked:
+            notes.append(
+                f"No free way was found to {blocked} of the poses, not even by home: lead the "
+                "machine there by hand, away from singularities and collisions."
+            )
+        if task.goal in (Goal.MEAN, Goal.WORST) and not machine.is_determined:
+            notes.append(f"Readings do not give the pose: {machine.undetermined}.")
+        parametrization = predictor.legs.parametrization
+        return Plan(
+            machine=machine,
+            camera=predictor.camera,
+            setting=task.setting,
+            noise=predictor.noise,
+            sigma_q=predictor.sigma_q,
+            sigma_by_joint=predictor.sigma_by_joint,
+            goal=task.goal,
+            views=_named(views, task),
+            value=value,
+            error=None if self.work is None else self.work.error(covariance),
+            sigma=np.sqrt(np.maximum(np.diagonal(covariance), 0.0)),
+            names=parametrization.names,
+            units=parametrization.units,
+            growth=self._growth(found),
+            limits=_limits(self.with_all(found), self.criterion),
+            seed=task.seed,
+            board=task.laid,
+            hand_held=task.hand_held,
+            given=task.given_name,
+            notes=tuple(notes),
+        )
+
+    def _expected_covariance(self, current: Sequence[Candidates]) -> Array:
+        """Return the mean covariance (p, p) of the parameters in sessions as they may be."""
+        n, covariances = self.task.setting.draws, []
+        rngs = np.random.default_rng(self.task.seed + 1).spawn(n)
+        for drawn in self.run(partial(drawn_covariance, self.task, current), rngs):
+            covariances.append(drawn)
+            self.progress("Draws", len(covariances), n)
+        return np.asarray(np.mean(covariances, axis=0))
+
+    def _growth(self, found: Sequence[Contributions]) -> Array:
+        """Return numbers of images and the criterion with so many, (n, 2), beyond those planned."""
+        n = sum(len(part.rows) for part in found)
+        session = Session(found, self.given)
+        order = choose(session, n, self.criterion, np.random.default_rng(0), 0, n)
+        rows = [(k + 1.0, value) for k, value in enumerate(order.history)]
+        for times in _CONTINUED:
+            more = [replace(part, rows=part.rows * np.sqrt(times)) for part in found]
+            rows.append((round(times * n), self.value(more)))
+        return np.array(rows)
 
 
 def _named(views: Sequence[PlannedView], task: Task) -> tuple[PlannedView, ...]:
@@ -551,48 +619,6 @@ def _named(views: Sequence[PlannedView], task: Task) -> tuple[PlannedView, ...]:
     return tuple(view if view.name else replace(view, name=next(free)) for view in views)
 
 
-def _refuse_undetermined(
-    task: Task,
-    session: Session,
-    criterion: Criterion,
-    given: Sequence[Contributions],
-    work: Workspace | None,
-    basis: Array,
-) -> None:
-    """Refuse a session that leaves a direction open that matters, and say how many images do."""
-    most = max(task.setting.length, _LEAST_ERROR)
-
-    def off(S: Array) -> Array:
-        """Return the error of the platform, or the criterion where readings give no pose."""
-        if work is None:
-            return criterion(S)
-        errors = [work.error(basis @ one @ basis.T).mean_displacement for one in S]
-        return np.array(errors)
-
-    if float(off(session.machine[None])[0]) < most:
-        return
-    more = choose(
-        Session(session.slots, given),
-        _MOST_NEEDED,
-        off,
-        np.random.default_rng(task.seed),
-        0,
-        _MOST_NEEDED,
-        is_enough=lambda error: error < most,
-    )
-    n = max(len(more.images), task.n_images + 1)
-    places = f"{task.n_views} place{'s' * (task.n_views != 1)}"
-    remedy = (
-        f"plan {n} --images or more" if more.value < most else "plan more --cameras, or --board"
-    )
-    needed = f"at least {n}" if more.value < most else "more places"
-    raise NotIdentifiable(
-        f"{task.machine.yaml_path}: no session could be planned: found that {task.n_images} "
-        f"images from {places} tell less of the machine than its model does, needed {needed}; "
-        f"{remedy}."
-    )
-
-
 def drawn_covariance(task: Task, current: Sequence[Candidates], rng: np.random.Generator) -> Array:
     """Return the covariance (p, p) of the parameters in a session as it may be."""
     there, machine, parts = Scene.drawn(task, rng), task.machine, []
@@ -609,19 +635,6 @@ def drawn_covariance(task: Task, current: Sequence[Candidates], rng: np.random.G
     session = Session([], parts)
     basis = parts[0].basis
     return np.asarray(basis @ session.machine @ basis.T)
-
-
-def _growth(
-    found: Sequence[Contributions], given: Sequence[Contributions], criterion: Criterion
-) -> Array:
-    """Return numbers of images and the criterion with so many, (n, 2), and beyond those planned."""
-    n = sum(len(part.rows) for part in found)
-    order = choose(Session(found, given), n, criterion, np.random.default_rng(0), 0, n)
-    rows = [(k + 1.0, value) for k, value in enumerate(order.history)]
-    for times in _CONTINUED:
-        more = [replace(part, rows=part.rows * np.sqrt(times)) for part in found]
-        rows.append((round(times * n), float(criterion(_with_all(more, given).machine[None])[0])))
-    return np.array(rows)
 
 
 _LIMITS = {
