@@ -18,7 +18,6 @@ from fit_sessions import (
 
 from legcal.calibration.joint_fit import (
     FitProblem,
-    RefinementSettings,
     Start,
     cameras_from_hints,
     fit,
@@ -189,8 +188,8 @@ def test_the_start_of_the_lowest_cost_is_refined_wherever_it_stands(
     costs = {"first": 1.0, "second": 2.0, "third": 3.0}
     unwatched = fit._first
 
-    def with_cost(problem: FitProblem, start: Start, settings: RefinementSettings) -> object:
-        return replace(unwatched(problem, start, settings), cost=costs[start.label])
+    def with_cost(problem: FitProblem, start: Start) -> object:
+        return replace(unwatched(problem, start), cost=costs[start.label])
 
     monkeypatch.setattr(fit, "_first", with_cost)
     found = refine(session.legs, session.measurements, session.outlines, starts)

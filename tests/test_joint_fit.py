@@ -38,7 +38,6 @@ from thinned import thinned
 from legcal.calibration.identify.predicted_observations import PredictedObservations
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.joint_fit import (
-    DEFAULT_SETTINGS,
     Choices,
     FittedLegs,
     Prior,
@@ -184,7 +183,7 @@ def test_a_first_fit_stays_near_the_nominal_model_where_nothing_is_known() -> No
     session = machine_session("3-upu")
     problem = build_fit(session.legs, *session.noisy(1))
     begin = problem.begin(session.start)
-    first = first_minimum(problem, begin, settings=DEFAULT_SETTINGS)
+    first = first_minimum(problem, begin)
     turned = [
         np.arccos(abs(np.asarray(leg.base_axis) @ np.asarray(nominal.base_axis)))
         for leg, nominal in zip(first.state.legs, session.legs.nominal, strict=True)

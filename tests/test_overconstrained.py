@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from thinned import thinned
 
 from legcal import identifiability
-from legcal.calibration.joint_fit import DEFAULT_SETTINGS, refine
+from legcal.calibration.joint_fit import refine
 from legcal.calibration.joint_fit.diagnostics import refuse_contradicted_values
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import build_fit
@@ -156,7 +156,7 @@ def test_a_prior_of_what_is_tied_is_not_asked_of_the_measurements(tmp_path: Path
     problem = build_fit(session.legs, *measured, choices=choices)
     assert set(names) - set(problem.named)
     state = problem.begin(session.start)
-    refuse_contradicted_values(problem, session.start, state, DEFAULT_SETTINGS, with_priors=True)
+    refuse_contradicted_values(problem, session.start, state, with_priors=True)
 
 
 def test_axes_that_must_stay_parallel_turn_together(tmp_path: Path) -> None:

@@ -21,11 +21,10 @@ from legcal.calibration.joint_fit.determinacy import (
 from legcal.calibration.joint_fit.parameter_choices import Prior, board_scale
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
-from legcal.calibration.joint_fit.variables import RefinementSettings, Start, State, intrinsic_of
+from legcal.calibration.joint_fit.variables import Start, State, intrinsic_of
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation import (
     NormalEquations,
-    PseudoHuber,
     information,
     inverse_on_range,
     marginal,
@@ -87,9 +86,7 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
         raise DidNotConverge(problems)
 
 
-def refuse_other_board(
-    problem: FitProblem, state: State, normal: NormalEquations, settings: RefinementSettings
-) -> None:
+def refuse_other_board(problem: FitProblem, state: State, normal: NormalEquations) -> None:
     """Refuse a calibration board of other dimensions than the dataset says, without a stated prior.
 
     Encoders and radii carry the scale too; a board that was taken for larger than it is puts
@@ -98,14 +95,13 @@ def refuse_other_board(
     for link in LINKS:
         name = board_scale(link)
         if name in problem.named and name not in problem.choices.priors:
-            _refuse_other_size(problem, state, normal, settings, link)
+            _refuse_other_size(problem, state, normal, link)
 
 
 def _refuse_other_size(
     problem: FitProblem,
     state: State,
     normal: NormalEquations,
-    settings: RefinementSettings,
     link: Link,
 ) -> None:
     """Refuse the calibration board on a link if it has other dimensions than the dataset says."""
@@ -118,7 +114,7 @@ def _refuse_other_size(
             continue
         choices = replace(problem.choices, free=problem.choices.free | {name})
         try:
-            free = first_minimum(problem.with_choices(choices, settings), state, settings=settings)
+            free = first_minimum(problem.with_choices(choices), state)
             size = f"{free.state.board_scale[LINKS.index(link)]:.4g} times as large as"
         except (DidNotConverge, NotIdentifiable):
             size = "of another size than"
@@ -188,7 +184,6 @@ def refuse_contradicted_values(
     problem: FitProblem,
     start: Start,
     state: State,
-    settings: RefinementSettings,
     *,
     with_priors: bool = False,
 ) -> None:
@@ -204,7 +199,6 @@ def refuse_contradicted_values(
         Without anything held, and without edge biases.
     start, state
         Where the fit began, and a minimum with the values fixed or where it is looked for.
-    settings : RefinementSettings
     with_priors : bool
         Whether stated priors are tested as well.
 
@@ -226,7 +220,7 @@ def refuse_contradicted_values(
     wider_choices = replace(
         choices, fixed=choices.fixed - wide.keys(), priors={**choices.priors, **wide}
     )
-    wider = problem.with_choices(wider_choices, settings)
+    wider = problem.with_choices(wider_choices)
     # What ties hold wholly stays fixed: nothing measured says anything of it.
     stated = {name: known for name, known in stated.items() if name in wider.named}
     if not stated:
@@ -234,10 +228,10 @@ def refuse_contradicted_values(
     comparisons: list[_Comparison] = []
     for begin in (wider.begin(start), state):
         try:
-            fit, held = _fitted(wider, begin, settings)
+            fit, held = _fitted(wider, begin)
         except (DidNotConverge, NotIdentifiable):
             continue
-        comparisons = _compared(fit, held, stated, wide, settings)
+        comparisons = _compared(fit, held, stated, wide)
         break
     found = [comparison for comparison in comparisons if comparison.together > _SIGNIFICANT]
     found = found or [comparison for comparison in comparisons if comparison.alone > _SIGNIFICANT]
@@ -279,18 +273,16 @@ def _wide_prior(problem: FitProblem, state: State, name: str, value: float, sigm
     return Prior(value, max(float(wide), sigma))
 
 
-def _fitted(
-    problem: FitProblem, state: State, settings: RefinementSettings
-) -> tuple[Fit, HeldDirections]:
+def _fitted(problem: FitProblem, state: State) -> tuple[Fit, HeldDirections]:
     """Return the fit with what was fixed free, and what it holds."""
-    first = first_minimum(problem, state, settings=settings)
-    normal = information(problem, first.state, first.linear, PseudoHuber(settings.loss_width))
+    first = first_minimum(problem, state)
+    normal = information(problem, first.state, first.linear, problem.loss)
     held = open_directions(problem, first.state, normal)
     if len(held.basis):
         problem, state = held_at_nominal(problem, first.state, held)
-        there = first_minimum(problem, state, settings=settings)
+        there = first_minimum(problem, state)
         first = replace(there, iterations=first.iterations + there.iterations)
-    return fit_in_rounds(problem, first, settings), held
+    return fit_in_rounds(problem, first), held
 
 
 def _compared(
@@ -298,7 +290,6 @@ def _compared(
     held: HeldDirections,
     stated: Mapping[str, tuple[float, float]],
     wide: Mapping[str, Prior],
-    settings: RefinementSettings,
 ) -> list[_Comparison]:
     """Return every stated value beside that of the measurements, where these have any.
 
@@ -307,7 +298,7 @@ def _compared(
     M f - P w - K m at what was stated, m.
     """
     problem, state = fit.problem, fit.state
-    normal = information(problem, state, fit.minimum.linear, PseudoHuber(settings.loss_width))
+    normal = information(problem, state, fit.minimum.linear, problem.loss)
     of_all = named_information(problem, state, normal) + _held_information(
         problem, held, state.mean_length
     )
@@ -453,7 +444,7 @@ def _arm_names(problem: FitProblem) -> tuple[str, ...]:
     return tuple("" if arm is None else f"{arm.leg}.{arm.link}" for arm in arms)
 
 
-def scale_notes(problem: FitProblem, state: State, settings: RefinementSettings) -> tuple[str, ...]:
+def scale_notes(problem: FitProblem, state: State) -> tuple[str, ...]:
     """Return a note where all radii come out larger or smaller than the model's by one factor."""
     free = problem.block("radii").unknown[:, 0] >= 0
     nominal = np.array([problem.legs.radii[part] for part in problem.outlines.parts])
@@ -462,7 +453,7 @@ def scale_notes(problem: FitProblem, state: State, settings: RefinementSettings)
         return ()
     common = float(np.median(change))
     alike = bool(np.all(np.abs(change - common) < _RADIUS_SPREAD * abs(common)))
-    if not alike or abs(common) < _RADIUS_SIGMAS * settings.radius_sigma:
+    if not alike or abs(common) < _RADIUS_SIGMAS * problem.settings.radius_sigma:
         return ()
     way = "smaller" if common < 0.0 else "larger"
     return (

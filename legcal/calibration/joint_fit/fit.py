@@ -47,7 +47,6 @@ from legcal.data import LegAxes, Measurements, Outlines
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation import (
     Minimum,
-    PseudoHuber,
     Residuals,
     information,
     linearize,
@@ -122,7 +121,7 @@ def refine(
     problem.require_determined()
     starts = [start] if isinstance(start, Start) else start
     with naming_missing_lengths(problem):
-        return _best(problem, outlines, starts, settings)
+        return _best(problem, outlines, starts)
 
 
 def _called(start: Start) -> str:
@@ -131,9 +130,7 @@ def _called(start: Start) -> str:
     return known.get(start.label, f"the start '{start.label}'")
 
 
-def _best(
-    problem: FitProblem, outlines: Outlines, starts: Sequence[Start], settings: RefinementSettings
-) -> Solution:
+def _best(problem: FitProblem, outlines: Outlines, starts: Sequence[Start]) -> Solution:
     """Return the fit from the start with the least cost."""
     candidates: list[tuple[Start, Minimum[State]]] = []
     notes, details = list[str](), list[str]()
@@ -141,7 +138,7 @@ def _best(
     for start in starts:
         begun = _called(start)
         try:
-            minimum = _first(problem, start, settings)
+            minimum = _first(problem, start)
         except (DidNotConverge, NotIdentifiable) as failure:
             failures.append(failure)
             notes.append(f"The joint fit could not start from {begun}. {failure}")
@@ -154,14 +151,14 @@ def _best(
         candidates.insert(place, (start, minimum))
     for start, minimum in candidates:
         try:
-            found = _refined(problem, outlines, start, minimum, settings)
+            found = _refined(problem, outlines, start, minimum)
         except (DidNotConverge, NotIdentifiable) as failure:
             failures.append(failure)
             notes.append(f"The joint fit started from {_called(start)} was given up. {failure}")
             continue
-        if found.left_out or _shifted_px(found) > settings.largest_rms_px:
-            found = _from_other_starts(problem, outlines, start, minimum, found, settings)
-        _refuse_shifted(found, settings)
+        if found.left_out or _shifted_px(found) > problem.settings.largest_rms_px:
+            found = _from_other_starts(problem, outlines, start, minimum, found)
+        _refuse_shifted(found, problem.settings.largest_rms_px)
         return dataclasses.replace(found, notes=(*found.notes, *notes), details=tuple(details))
     if failures and all(isinstance(failure, NotIdentifiable) for failure in failures):
         raise failures[0]
@@ -177,7 +174,6 @@ def _from_other_starts(
     start: Start,
     first: Minimum[State],
     found: Solution,
-    settings: RefinementSettings,
 ) -> Solution:
     """Return what a fit that left out or moved a leg of a view finds from other models, if better.
 
@@ -194,16 +190,16 @@ def _from_other_starts(
         step = np.zeros(problem.size)
         step[:n] = _OTHER_MODEL * unit * rng.normal(size=n)
         try:
-            minimum = _first(problem, start, settings, problem.moved(begin, step))
+            minimum = _first(problem, start, problem.moved(begin, step))
             if minimum.cost > (1.0 - _SAME_COST) * first.cost:
                 n_same += minimum.cost < (1.0 + _SAME_COST) * first.cost
                 if n_same == _ENOUGH_STARTS:
                     return dataclasses.replace(found, left_out=())
                 continue
-            found = _refined(problem, outlines, start, minimum, settings)
+            found = _refined(problem, outlines, start, minimum)
         except (DidNotConverge, NotIdentifiable):
             continue
-        if not found.left_out and _shifted_px(found) <= settings.largest_rms_px:
+        if not found.left_out and _shifted_px(found) <= problem.settings.largest_rms_px:
             break
         first, n_same = minimum, 0
     return found
@@ -214,42 +210,36 @@ def _shifted_px(found: Solution) -> float:
     return max(found.shared_px.values(), default=0.0)
 
 
-def _refuse_shifted(found: Solution, settings: RefinementSettings) -> None:
+def _refuse_shifted(found: Solution, most_px: float) -> None:
     """Raise DidNotConverge if a fit explains by light and blur what these cannot have done."""
     shifted = _shifted_px(found)
-    if shifted > settings.largest_rms_px:
+    if shifted > most_px:
         kind = max(found.shared_px, key=found.shared_px.__getitem__)
         raise DidNotConverge(
             f"The joint fit ended where outlines are off together ({kind}) by {shifted:.1f} px, "
-            f"needed at most {settings.largest_rms_px:g} px, which is more than light and blur "
+            f"needed at most {most_px:g} px, which is more than light and blur "
             "do; check camera poses, readings and outlines, or start nearer to the truth."
         )
 
 
-def _first(
-    problem: FitProblem, start: Start, settings: RefinementSettings, begin: State | None = None
-) -> Minimum[State]:
+def _first(problem: FitProblem, start: Start, begin: State | None = None) -> Minimum[State]:
     """Return the first minimum that a start leads to, or another begin near it."""
     begin = problem.begin(start) if begin is None else begin
     try:
         if are_free(problem, begin):
-            return _first_of_free_poses(problem, begin, settings)
-        return first_minimum(*_held_at_start(problem, begin), settings=settings)
+            return _first_of_free_poses(problem, begin)
+        return first_minimum(*_held_at_start(problem, begin))
     except DidNotConverge as failure:
-        refuse_contradicted_values(problem, start, begin, settings, with_priors=True)
+        refuse_contradicted_values(problem, start, begin, with_priors=True)
         _refuse_undetermined(problem, begin)
         raise naming_stated_values(problem, failure) from None
 
 
-def _first_of_free_poses(
-    problem: FitProblem, begin: State, settings: RefinementSettings
-) -> Minimum[State]:
+def _first_of_free_poses(problem: FitProblem, begin: State) -> Minimum[State]:
     """Return the first minimum, with other poses where some suit their images badly."""
 
     def minimum(state: State, must_converge: bool = True) -> Minimum[State]:
-        return first_minimum(
-            *_held_at_start(problem, state), settings=settings, must_converge=must_converge
-        )
+        return first_minimum(*_held_at_start(problem, state), must_converge=must_converge)
 
     try:
         found = minimum(begin)
@@ -289,36 +279,34 @@ def _refined(
     outlines: Outlines,
     start: Start,
     first: Minimum[State],
-    settings: RefinementSettings,
 ) -> Solution:
     """Refine a first minimum: held directions, rounds, checks, result."""
-    refuse_contradicted_values(problem, start, first.state, settings)
-    loss = PseudoHuber(settings.loss_width)
-    normal = information(problem, first.state, first.linear, loss)
+    refuse_contradicted_values(problem, start, first.state)
+    normal = information(problem, first.state, first.linear, problem.loss)
     held = open_directions(problem, first.state, normal)
-    refuse_other_board(problem, first.state, normal, settings)
+    refuse_other_board(problem, first.state, normal)
     free, state = problem, first.state
     try:
         if len(held.basis):
             problem, state = held_at_nominal(problem, state, held)
-            there = first_minimum(problem, state, settings=settings)
+            there = first_minimum(problem, state)
             state = there.state
             first = dataclasses.replace(there, iterations=first.iterations + there.iterations)
-        fit = fit_in_rounds(problem, first, settings)
-        normal = information(fit.problem, fit.state, fit.minimum.linear, loss)
+        fit = fit_in_rounds(problem, first)
+        normal = information(fit.problem, fit.state, fit.minimum.linear, problem.loss)
         refuse_undetermined_inliers(fit.problem, fit.state, normal, held)
         _refuse_other_radii(problem, fit.state)
     except (DidNotConverge, NotIdentifiable) as failure:
-        refuse_contradicted_values(free, start, state, settings, with_priors=True)
+        refuse_contradicted_values(free, start, state, with_priors=True)
         _refuse_contradicted(free, state)
         _refuse_undetermined(free, state)
         if isinstance(failure, DidNotConverge):
             raise naming_stated_values(free, failure) from None
         raise
     if rejected_notes(fit.problem, fit.accepted):
-        refuse_contradicted_values(free, start, state, settings, with_priors=True)
+        refuse_contradicted_values(free, start, state, with_priors=True)
     refuse_contradicted_priors(fit.problem, fit.state, normal)
-    return assemble_solution(fit, normal, held, outlines, start.label, settings)
+    return assemble_solution(fit, normal, held, outlines, start.label)
 
 
 def _refuse_undetermined(problem: FitProblem, state: State) -> None:

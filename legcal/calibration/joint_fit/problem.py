@@ -58,6 +58,7 @@ from legcal.estimation import (
     Frames,
     GaussianPrior,
     Problem,
+    PseudoHuber,
     Variables,
     all_free,
     fixed_at_start,
@@ -99,7 +100,13 @@ class FitProblem(Problem[State]):
     first_board_scale: Array  # (2,)
     keys: tuple[str, ...]  # what the unknown intrinsics are
     images: Mapping[tuple[int, int], str]  # the name of an image of a view and a pose
+    settings: RefinementSettings
     rejected_corners: tuple[tuple[int, int, int], ...] = ()  # view, pose (-1: all), number
+
+    @property
+    def loss(self) -> PseudoHuber:
+        """The loss of outlines."""
+        return PseudoHuber(self.settings.loss_width)
 
     @property
     def legs(self) -> FittedLegs:
@@ -251,7 +258,7 @@ class FitProblem(Problem[State]):
             factors=observed.factors(self.keys),
         )
 
-    def with_choices(self, choices: Choices, settings: RefinementSettings) -> FitProblem:
+    def with_choices(self, choices: Choices) -> FitProblem:
         """Return a problem with the same measurements and cameras, and other unknowns."""
         owners = shared_cameras(self.outlines.views, self.first_cameras)
         observed = self.observed._replace(outlines=self.outlines.without_biases())
@@ -262,7 +269,7 @@ class FitProblem(Problem[State]):
             self.first_cameras,
             owners,
             self.n_elements,
-            settings,
+            self.settings,
             self.images,
         )
 
@@ -400,6 +407,7 @@ def _built(
         first_board_scale=np.array([choices.values.get(board_scale(k), 1.0) for k in LINKS]),
         keys=keys,
         images=images,
+        settings=settings,
     )
 
 

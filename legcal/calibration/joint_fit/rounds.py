@@ -44,7 +44,6 @@ from legcal.estimation import (
     GaussianPrior,
     Linearization,
     Minimum,
-    PseudoHuber,
     Residuals,
     explained_share,
     information,
@@ -109,7 +108,6 @@ def first_minimum(
     begin: State,
     known: Mapping[str, Residuals] | None = None,
     *,
-    settings: RefinementSettings,
     must_converge: bool = True,
 ) -> Minimum[State]:
     """Solve with all observations and claimed covariances, regularised towards the nominal model.
@@ -124,7 +122,7 @@ def first_minimum(
     is_rough = problem.legs.is_redundant
     claimed = with_rough_readings(problem.weighted(NoiseModel()))
     chosen = of_determined_poses(claimed, begin, every)
-    problem, loss = claimed.weighted(NoiseModel(), chosen), PseudoHuber(settings.loss_width)
+    problem, loss = claimed.weighted(NoiseModel(), chosen), claimed.loss
     legs, n = problem.legs, problem.n_kinematic
     nominal = legs.vector(legs.nominal)[problem.free]
     length = begin.mean_length
@@ -136,7 +134,7 @@ def first_minimum(
         regularised,
         begin,
         loss,
-        max_iterations=settings.max_iterations,
+        max_iterations=problem.settings.max_iterations,
         tolerance=_PASSING,
         relative_tolerance=_REJECTION_TOLERANCE,
         known=known if chosen.all() and not is_rough else None,
@@ -153,7 +151,7 @@ def first_minimum(
     return Minimum(found.state, linear, cost, found.iterations)
 
 
-def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: RefinementSettings) -> Fit:
+def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     """Reject outliers until hardly any changes, then estimate the noise and solve, in rounds.
 
     Of axes the claimed covariances are taken as they are, and the robust loss alone guards against
@@ -165,7 +163,7 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
         If a solve fails, most outlines or axes disagree with the fit, or the rounds do not
         converge.
     """
-    claimed, noise = problem.outlines.covariance, NoiseModel()
+    claimed, noise, settings = problem.outlines.covariance, NoiseModel(), problem.settings
     accepted = np.ones(len(claimed), dtype=np.bool_)
     possible = possible_biases(problem.outlines, problem.legs.names)
     least = np.zeros(N_KINDS)
@@ -175,25 +173,25 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
     # Wrong readings go before they bend the fit: the first minimum is one with rough readings.
     if problem.legs.is_redundant:
         rough, tolerance = with_rough_readings(problem), _REJECTION_TOLERANCE
-        rough, minimum = _without_wrong_readings(rough, minimum, settings, tolerance)
+        rough, minimum = _without_wrong_readings(rough, minimum, tolerance)
         problem = like_readings(problem, rough)
-        minimum = _passed(problem, minimum, settings, tolerance)
+        minimum = _passed(problem, minimum, tolerance)
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before = accepted
         noise = noise_of_the_median(problem.offsets(minimum.state)[before], claimed[before])
-        accepted = _accepted(problem, minimum.state, noise, settings)
+        accepted = _accepted(problem, minimum.state, noise)
         if np.sum(before != accepted) <= settings.error_tolerance * accepted.sum():
             break  # rounds of noise reject these
         problem = problem.weighted(noise, accepted)
-        minimum = _passed(problem, minimum, settings, _REJECTION_TOLERANCE)
+        minimum = _passed(problem, minimum, _REJECTION_TOLERANCE)
     _refuse_disagreement(problem.offsets(minimum.state), accepted, settings)
     problem = problem.weighted(noise, accepted)
     for _ in range(_BOARD_ROUNDS if any(map(len, problem.boards)) else 0):
-        problem = _with_judged_corners(problem, minimum.state, settings)
-        minimum = _passed(problem, minimum, settings, _REJECTION_TOLERANCE)
+        problem = _with_judged_corners(problem, minimum.state)
+        minimum = _passed(problem, minimum, _REJECTION_TOLERANCE)
     if problem.legs.is_redundant:
-        minimum = _passed(problem, minimum, settings)
-        problem, minimum = _without_wrong_readings(problem, minimum, settings)
+        minimum = _passed(problem, minimum)
+        problem, minimum = _without_wrong_readings(problem, minimum)
     with_possible, changes, are_white = problem.with_biases(possible), NO_CHANGES, False
 
     def scores_of_biases() -> tuple[Array, Array]:
@@ -204,8 +202,8 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
     linear = linearize(problem, minimum.state)
     for _ in range(settings.noise_rounds if len(claimed) else 1):
         errors_before, accepted_before = _sizes(noise, biases), accepted
-        noise = _noise(problem, minimum.state, linear, noise, accepted, settings)
-        accepted = _accepted(problem, minimum.state, noise, settings)
+        noise = _noise(problem, minimum.state, linear, noise, accepted)
+        accepted = _accepted(problem, minimum.state, noise)
         n_changed = int(np.sum(accepted != accepted_before))
         changes = Changes(errors_before, _sizes(noise, biases), n_changed, int(accepted.sum()))
         problem = problem.weighted(noise, accepted)
@@ -219,7 +217,7 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
             are_white = not len(biases) and not len(minimum.state.biases)
             if not are_white:
                 problem, minimum = _with_edge_biases(problem, minimum, biases)
-        minimum = _passed(problem, minimum, settings)
+        minimum = _passed(problem, minimum)
         linear = minimum.linear
         if not accepted.any():
             break
@@ -230,7 +228,7 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
     if biases.are_shown:
         biases, known = expected_biases(possible, *scores_of_biases(), biases, least), None
         problem, minimum = _with_edge_biases(problem, minimum, biases)
-    minimum = _solved(problem, minimum, settings, known=known)
+    minimum = _solved(problem, minimum, known=known)
     state = minimum.state
     _refuse_disagreement(problem.offsets(state), accepted, settings)
     wrong = int(np.sum(minimum.linear["axes"].squared_norms > settings.axis_disagreement**2))
@@ -241,28 +239,25 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
             "agree; check the camera poses, the readings, and the units (rad, m) of axes and their "
             "sigmas."
         )
-    at_places = _at_places(problem, minimum, accepted, settings) if biases.are_shown else None
+    at_places = _at_places(problem, minimum, accepted) if biases.are_shown else None
     notes = check_convergence(changes, claimed, settings)
     return Fit(problem, minimum, noise, biases, accepted, at_places, minimum.iterations, notes)
 
 
 def _without_wrong_readings(
-    problem: FitProblem,
-    minimum: Minimum[State],
-    settings: RefinementSettings,
-    relative_tolerance: float = 0.0,
+    problem: FitProblem, minimum: Minimum[State], relative_tolerance: float = 0.0
 ) -> tuple[FitProblem, Minimum[State]]:
     """Return problem and minimum without readings that all else contradicts, from a minimum."""
     for _ in range(_READING_ROUNDS):
-        problem, is_wrong = with_judged_readings(problem, minimum.state, settings)
+        problem, is_wrong = with_judged_readings(problem, minimum.state, problem.settings)
         if not is_wrong:
             break
-        minimum = _passed(problem, minimum, settings, relative_tolerance)
+        minimum = _passed(problem, minimum, relative_tolerance)
     return problem, minimum
 
 
 def _at_places(
-    problem: FitProblem, minimum: Minimum[State], accepted: BoolArray, settings: RefinementSettings
+    problem: FitProblem, minimum: Minimum[State], accepted: BoolArray
 ) -> AtPlaces | None:
     """Return the errors at places that the residuals of a fit show, and what they add."""
     state, linear = minimum.state, minimum.linear
@@ -274,7 +269,7 @@ def _at_places(
     sigma = sigmas_at_places(*score_test(problem, linear, plain, columns))
     if not sigma.any():
         return None
-    normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
+    normal = information(problem, state, linear, problem.loss)
     moved = response(problem, linear, normal, columns) * np.repeat(
         sigma, shifts.shape[2] // len(sigma)
     )
@@ -282,32 +277,26 @@ def _at_places(
 
 
 def _passed(
-    problem: FitProblem,
-    near: Minimum[State],
-    settings: RefinementSettings,
-    relative_tolerance: float = 0.0,
+    problem: FitProblem, near: Minimum[State], relative_tolerance: float = 0.0
 ) -> Minimum[State]:
     """Pass through the minimum of a problem *near* that of one with other weights."""
     return _solved(
         problem,
         near,
-        settings,
         tolerance=_PASSING,
         relative_tolerance=relative_tolerance,
         rate=near.rate,
     )
 
 
-def _solved(
-    problem: FitProblem, near: Minimum[State], settings: RefinementSettings, **options: Any
-) -> Minimum[State]:
+def _solved(problem: FitProblem, near: Minimum[State], **options: Any) -> Minimum[State]:
     """Return the minimum of a problem near another one, with the iterations of both."""
     found = minimise(
         problem,
         near.state,
-        PseudoHuber(settings.loss_width),
+        problem.loss,
         is_near=True,
-        max_iterations=settings.max_iterations,
+        max_iterations=problem.settings.max_iterations,
         **options,
     )
     return replace(found, iterations=near.iterations + found.iterations)
@@ -341,13 +330,12 @@ def _noise(
     linear: Linearization,
     noise: NoiseModel,
     accepted: BoolArray,
-    settings: RefinementSettings,
 ) -> NoiseModel:
     """Return the noise of the accepted outlines at a fit with another noise."""
     if not accepted.any():
         return noise
     claimed = problem.outlines.covariance
-    normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
+    normal = information(problem, state, linear, problem.loss)
     L = np.linalg.cholesky(noise.covariance(claimed))
     share = explained_share(problem, linear, normal, "outlines")
     explained = L @ share @ np.swapaxes(L, -1, -2)
@@ -355,12 +343,10 @@ def _noise(
     return estimate_noise(offsets[accepted], explained[accepted], claimed[accepted])
 
 
-def _accepted(
-    problem: FitProblem, state: State, noise: NoiseModel, settings: RefinementSettings
-) -> BoolArray:
+def _accepted(problem: FitProblem, state: State, noise: NoiseModel) -> BoolArray:
     """Return which outlines agree with a fit, and are of images that have a pose of their own."""
     s = noise.squared_norms(problem.offsets(state), problem.outlines.covariance)
-    accepted = np.asarray(s <= settings.rejection**2)
+    accepted = np.asarray(s <= problem.settings.rejection**2)
     return of_determined_poses(problem.weighted(noise, accepted), state, accepted)
 
 
@@ -376,12 +362,10 @@ def _refuse_disagreement(offsets: Array, accepted: BoolArray, settings: Refineme
         )
 
 
-def _with_judged_corners(
-    problem: FitProblem, state: State, settings: RefinementSettings
-) -> FitProblem:
+def _with_judged_corners(problem: FitProblem, state: State) -> FitProblem:
     """Return a problem whose corners have errors by their residuals, outliers left out."""
-    linear = linearize(problem, state)
-    normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
+    linear, settings = linearize(problem, state), problem.settings
+    normal = information(problem, state, linear, problem.loss)
     judged = problem
     for board in problem.boards:
         if not len(board):

@@ -44,11 +44,10 @@ from legcal.calibration.joint_fit.sensitivity import (
     sensitivities,
     zoomed_views,
 )
-from legcal.calibration.joint_fit.variables import RefinementSettings, State
+from legcal.calibration.joint_fit.variables import State
 from legcal.data import Dataset, Order, Outlines, inverse, reorder_measurements
 from legcal.estimation import (
     NormalEquations,
-    PseudoHuber,
     WorstDirection,
     linearize,
     named_covariance,
@@ -141,7 +140,6 @@ def assemble_solution(
     held: HeldDirections,
     outlines: Outlines,
     label: str,
-    settings: RefinementSettings,
 ) -> Solution:
     """Put together what was found; *normal* is the information where the fit ended.
 
@@ -151,7 +149,6 @@ def assemble_solution(
         If the outlines that are left do not determine the parameters.
     """
     problem, state, linear = fit.problem, fit.state, fit.minimum.linear
-    loss = PseudoHuber(settings.loss_width)
     kept = normal.kept_covariance()
     if fit.at_places is not None:
         kept = kept + fit.at_places.covariance
@@ -160,9 +157,9 @@ def assemble_solution(
     names = tuple(name for name in values if status[name] == "estimated")
     where = [problem.named.index(name) for name in names]
     estimated = covariance[np.ix_(where, where)]
-    offsets, cost = problem.offsets(state), comparable_cost(problem, state, settings)
+    offsets, cost = problem.offsets(state), comparable_cost(problem, state)
     used = offsets[fit.accepted]
-    readings = judged_readings(problem, state, linear, normal, settings)
+    readings = judged_readings(problem, state, linear, normal, problem.settings)
     n_rejected = offsets.size - used.size + (0 if readings is None else len(readings.wrong))
     n_residuals = problem.n_equations + len(problem.priors.mean) - n_rejected
     chi2 = float(np.sum(linear.prior_r**2)) + sum(
@@ -194,7 +191,7 @@ def assemble_solution(
     of_files = {named[i] for i in problem.calibrated.tolist()}
     shown = [i for i, name in enumerate(names) if name not in of_files]
     gammas = _gammas(problem, state, kept, outlines)
-    scale = scale_notes(problem, state, settings)
+    scale = scale_notes(problem, state)
     return Solution(
         legs=state.legs,
         T_camera_Rb=state.camera_pose.motions,
@@ -248,7 +245,9 @@ def assemble_solution(
         gammas=gammas,
         biases={n: v for n, v in biases if not n.endswith(GAMMA_SUFFIX)},
         shared_px=fit.shared_px,
-        sensitivities=sensitivities(problem, state, linear, by_camera, normal, loss, distorted),
+        sensitivities=sensitivities(
+            problem, state, linear, by_camera, normal, problem.loss, distorted
+        ),
         outlines=_with_rejections(outlines, fit, offsets),
         start=label,
         iterations=fit.iterations,
@@ -272,10 +271,10 @@ def assemble_solution(
     )
 
 
-def comparable_cost(problem: FitProblem, state: State, settings: RefinementSettings) -> float:
+def comparable_cost(problem: FitProblem, state: State) -> float:
     """Return the robust cost of all observations with their claimed covariances."""
-    claimed, loss = problem.weighted(NoiseModel()), PseudoHuber(settings.loss_width)
-    return robust_cost(claimed, linearize(claimed, state), loss)
+    claimed = problem.weighted(NoiseModel())
+    return robust_cost(claimed, linearize(claimed, state), claimed.loss)
 
 
 def _gammas(
