@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from legcal.calibration.joint_fit.variables import LegConstraints, State, intrin
 from legcal.estimation import (
     Linearization,
     NormalEquations,
-    PseudoHuber,
     normal_equations,
     residual_changes,
     response,
@@ -50,30 +50,8 @@ class Sensitivity:
     steps: Array  # (p, c) steps of all of them [m, rad], for each independent part of the error
 
 
-def derivatives_by_cameras(problem: FitProblem, state: State) -> dict[str, Array]:
-    """Return derivatives (n, q, 5) of whitened residuals by intrinsics, known or not.
-
-    They are of outlines and corners, by focal lengths, principal point and first coefficient of
-    distortion of the view of each.
-    """
-    outlines = problem.outlines.by_intrinsics(_KEYS, problem.keys, state)
-    whitening = np.asarray(problem.factor("outlines").whitening)
-    return {
-        "outlines": np.einsum("nij,njk->nik", whitening, outlines),
-    } | {
-        corners.name: corners.by_intrinsics(_KEYS, state) / corners.sigma[:, None, None]
-        for corners in problem.boards
-    }
-
-
 def sensitivities(
-    problem: FitProblem,
-    state: State,
-    linear: Linearization,
-    by_camera: Mapping[str, Array],
-    normal: NormalEquations,
-    loss: PseudoHuber,
-    distorted: Sequence[LensDistortion] = (),
+    cameras: CameraResiduals, normal: NormalEquations, distorted: Sequence[LensDistortion] = ()
 ) -> tuple[Sensitivity, ...]:
     """Return how errors of cameras, radii and fixed twists would change the parameters.
 
@@ -82,16 +60,14 @@ def sensitivities(
 
     Parameters
     ----------
-    problem, state, linear
+    cameras : CameraResiduals
         Where the fit ended.
-    by_camera : mapping
-        By :func:`derivatives_by_cameras`.
     normal : NormalEquations
         The information there.
-    loss : PseudoHuber
     distorted : sequence of LensDistortion
         Those that the measurements contradict: what they have instead is one more error.
     """
+    problem, state, linear = cameras.problem, cameras.state, cameras.linear
     radii = np.array([problem.legs.radii[part] for part in problem.outlines.parts])
     of_cameras = _places_of_cameras(problem)
     errors = {
@@ -112,7 +88,7 @@ def sensitivities(
         pull = of_prior[problem.priors.unknown]
         fixed = np.where(place == problem.n_kept, error, 0.0)
         if place is of_cameras:
-            change = _changes_by_cameras(problem, by_camera, fixed)
+            change = cameras.changes(fixed)
         else:
             change = residual_changes(problem, linear, "radii", fixed)
         if change["outlines"].any() or pull.any():
@@ -122,7 +98,7 @@ def sensitivities(
     found: list[Sensitivity] = []
     if names:
         moved = {
-            factor.name: _efficiency(problem, loss, factor.name)
+            factor.name: _efficiency(problem, factor.name)
             * np.stack([change[factor.name] for change in changes], axis=-1)
             for factor in problem.factors
             if factor.name in changes[0]
@@ -135,7 +111,7 @@ def sensitivities(
     place = problem.legs.parametrization.place[:, LegColumns.TWIST]
     twisted = [j for j, x in enumerate(place) if x >= 0 and not problem.free[x]]
     if twisted:
-        columns = [_of_twist(problem, state, linear, normal, loss, j) for j in twisted]
+        columns = [_of_twist(problem, state, linear, normal, j) for j in twisted]
         what = "twists that are fixed, each 0.1 deg off,"
         found.append(Sensitivity(what, np.column_stack(columns)))
     return tuple(found)
@@ -150,19 +126,10 @@ def _places_of_cameras(problem: FitProblem) -> IntArray:
     return place
 
 
-def _changes_by_cameras(
-    problem: FitProblem, by_camera: Mapping[str, Array], error: Array
-) -> dict[str, Array]:
-    """Return how whitened residuals (n, q) change with errors (n_views, 5) of cameras."""
-    views = {corners.name: corners.view for corners in problem.boards}
-    views["outlines"] = problem.outlines.view
-    return {name: np.einsum("nqk,nk->nq", by, error[views[name]]) for name, by in by_camera.items()}
-
-
-def _efficiency(problem: FitProblem, loss: PseudoHuber, name: str) -> float:
+def _efficiency(problem: FitProblem, name: str) -> float:
     """Return the information that the loss keeps of a factor."""
     factor = problem.factor(name)
-    return loss.efficiency(factor.n_rows) if factor.robust else 1.0
+    return problem.loss.efficiency(factor.n_rows) if factor.robust else 1.0
 
 
 def _camera_error(state: State, relative: Mapping[str, float], added: Mapping[str, float]) -> Array:
@@ -188,7 +155,6 @@ def _of_twist(
     state: State,
     linear: Linearization,
     normal: NormalEquations,
-    loss: PseudoHuber,
     leg: int,
 ) -> Array:
     """Return the steps (p,) of kinematic parameters if a fixed twist is off, poses following."""
@@ -196,7 +162,7 @@ def _of_twist(
         state, leg, LegColumns.TWIST
     )
     changes = {
-        factor.name: _efficiency(problem, loss, factor.name)
+        factor.name: _efficiency(problem, factor.name)
         * linear[factor.name].J_element
         @ motion[factor.element][..., None]
         for factor in problem.factors
@@ -287,123 +253,146 @@ class LensDistortion(_TestedIntrinsic):
         )
 
 
-def focal_lengths(
-    problem: FitProblem, state: State, linear: Linearization, by_camera: Mapping[str, Array]
-) -> tuple[FocalLength, ...]:
-    """Return what the measurements say of the focal lengths that camera files say.
+@dataclass(frozen=True, eq=False)
+class CameraResiduals:
+    """What the residuals of a fit say of its cameras, where it ended."""
 
-    One for each camera of which they say anything and nothing was chosen; arguments as those of
-    :func:`sensitivities`. The common-mode biases of outlines are in the problem, and so are errors
-    of intrinsics with the covariance that camera files state, so that these do not pass for a
-    focal length.
-    """
-    error = _camera_error(state, _FOCAL, {})
-    return tuple(
-        FocalLength(view, intrinsic_of(camera, "fx"), change, sigma)
-        for view, camera, change, sigma in _tested(problem, state, linear, by_camera, error)
-    )
+    problem: FitProblem
+    state: State
+    linear: Linearization
 
+    @cached_property
+    def derivatives(self) -> dict[str, Array]:
+        """Derivatives (n, q, 5) of whitened residuals by intrinsics, known or not.
 
-def zoomed_views(
-    problem: FitProblem, state: State, linear: Linearization, by_camera: Mapping[str, Array]
-) -> tuple[ZoomedView, ...]:
-    """Return of each camera the view whose focal length differs most from the others'.
+        They are of outlines and corners, by focal lengths, principal point and first coefficient
+        of distortion of the view of each.
+        """
+        problem, state = self.problem, self.state
+        outlines = problem.outlines.by_intrinsics(_KEYS, problem.keys, state)
+        whitening = np.asarray(problem.factor("outlines").whitening)
+        return {
+            "outlines": np.einsum("nij,njk->nik", whitening, outlines),
+        } | {
+            corners.name: corners.by_intrinsics(_KEYS, state) / corners.sigma[:, None, None]
+            for corners in problem.boards
+        }
 
-    Digital zoom, and a focus that was set anew for one place of the camera. Views of a camera of
-    which something was chosen, or of which another view says nothing, are not compared; arguments
-    as those of :func:`sensitivities`.
-    """
-    error = _camera_error(state, _FOCAL, {})
-    known, owners = _known_views(problem, error)
-    views = [v for v in known if sum(owners[k] == owners[v] for k in known) > 1]
-    if not views:
-        return ()
-    each = [np.arange(len(owners)) == v for v in views]
-    seen, change, covariance = _scores(problem, state, linear, by_camera, error, each)
-    found = []
-    for owner in sorted({owners[v] for v in views}):
-        own = [i for i, k in enumerate(seen.tolist()) if owners[views[k]] == owner]
-        weight = np.linalg.pinv(covariance[np.ix_(own, own)], rcond=_ROUNDING, hermitian=True)
-        tests = []
-        for i, k in enumerate(own if len(own) > 1 else []):
-            X = np.column_stack([np.ones(len(own)), np.arange(len(own)) == i])
-            spread = np.linalg.inv(X.T @ weight @ X)
-            apart = float((spread @ X.T @ weight @ change[own])[1])
-            view = views[int(seen[k])]
-            given = intrinsic_of(problem.first_cameras[view], "fx")
-            name, sigma = problem.outlines.views[view], float(np.sqrt(spread[1, 1]))
-            tests.append(ZoomedView(name, given, apart, sigma, owner))
-        found += sorted(tests, key=lambda test: test.apart)[-1:]
-    return tuple(found)
+    def changes(self, error: Array) -> dict[str, Array]:
+        """Return how whitened residuals (n, q) change with errors (n_views, 5) of cameras."""
+        views = {corners.name: corners.view for corners in self.problem.boards}
+        views["outlines"] = self.problem.outlines.view
+        return {
+            name: np.einsum("nqk,nk->nq", by, error[views[name]])
+            for name, by in self.derivatives.items()
+        }
 
+    def contradicted(self) -> list[FocalLength | LensDistortion]:
+        """Return what the measurements contradict of camera files, the clearest of each camera.
 
-def lens_distortions(
-    problem: FitProblem, state: State, linear: Linearization, by_camera: Mapping[str, Array]
-) -> tuple[LensDistortion, ...]:
-    """Return what the measurements say of the distortion that camera files say.
+        One mistake in a camera looks like others: of each camera the test that sees most counts.
+        """
+        tests: list[FocalLength | LensDistortion] = [
+            *self._focal_lengths(),
+            *self._zoomed_views(),
+            *self._lens_distortions(),
+        ]
+        clearest = {test.camera: test for test in sorted(tests, key=lambda test: test.apart)}
+        return [test for test in clearest.values() if test.is_contradicted]
 
-    It is tested as :func:`focal_lengths` are, by the coefficient that is largest in most lenses.
-    """
-    error = _camera_error(state, {}, {"k1": 1.0})
-    return tuple(
-        LensDistortion(view, intrinsic_of(camera, "k1"), change, sigma)
-        for view, camera, change, sigma in _tested(problem, state, linear, by_camera, error)
-    )
+    def _focal_lengths(self) -> list[FocalLength]:
+        """Return what the measurements say of the focal lengths that camera files say.
 
+        One for each camera of which they say anything and nothing was chosen. The common-mode
+        biases of outlines are in the problem, and so are errors of intrinsics with the covariance
+        that camera files state, so that these do not pass for a focal length.
+        """
+        return [
+            FocalLength(view, intrinsic_of(camera, "fx"), change, sigma)
+            for view, camera, change, sigma in self._tested(_camera_error(self.state, _FOCAL, {}))
+        ]
 
-def _tested(
-    problem: FitProblem,
-    state: State,
-    linear: Linearization,
-    by_camera: Mapping[str, Array],
-    error: Array,
-) -> list[tuple[str, Camera, float, float]]:
-    """Return how much of an error (n_views, 5) the residuals show, and its standard deviation.
+    def _lens_distortions(self) -> list[LensDistortion]:
+        """Return the same of distortions, by the coefficient that is largest in most lenses."""
+        error = _camera_error(self.state, {}, {"k1": 1.0})
+        return [
+            LensDistortion(view, intrinsic_of(camera, "k1"), change, sigma)
+            for view, camera, change, sigma in self._tested(error)
+        ]
 
-    They come with the view that stands for each camera of which nothing was chosen, and with the
-    camera of its file.
-    """
-    known, owners = _known_views(problem, error)
-    tested = sorted({owners[v] for v in known})
-    if not tested:
-        return []
-    which = [
-        np.array([v in known and owners[v] == owner for v in range(len(owners))])
-        for owner in tested
-    ]
-    seen, change, covariance = _scores(problem, state, linear, by_camera, error, which)
-    return [
-        (tested[i], problem.first_cameras[owners.index(tested[i])], float(d), float(s))
-        for i, d, s in zip(seen.tolist(), change, np.sqrt(np.diagonal(covariance)), strict=True)
-    ]
+    def _zoomed_views(self) -> list[ZoomedView]:
+        """Return of each camera the view whose focal length differs most from the others'.
 
+        Digital zoom, and a focus that was set anew for one place of the camera. Views of a camera
+        of which something was chosen, or of which another view says nothing, are not compared.
+        """
+        problem, error = self.problem, _camera_error(self.state, _FOCAL, {})
+        known, owners = self._known_views(error)
+        views = [v for v in known if sum(owners[k] == owners[v] for k in known) > 1]
+        if not views:
+            return []
+        each = [np.arange(len(owners)) == v for v in views]
+        seen, change, covariance = self._scores(error, each)
+        found = []
+        for owner in sorted({owners[v] for v in views}):
+            own = [i for i, k in enumerate(seen.tolist()) if owners[views[k]] == owner]
+            weight = np.linalg.pinv(covariance[np.ix_(own, own)], rcond=_ROUNDING, hermitian=True)
+            tests = []
+            for i, k in enumerate(own if len(own) > 1 else []):
+                X = np.column_stack([np.ones(len(own)), np.arange(len(own)) == i])
+                spread = np.linalg.inv(X.T @ weight @ X)
+                apart = float((spread @ X.T @ weight @ change[own])[1])
+                view = views[int(seen[k])]
+                given = intrinsic_of(problem.first_cameras[view], "fx")
+                name, sigma = problem.outlines.views[view], float(np.sqrt(spread[1, 1]))
+                tests.append(ZoomedView(name, given, apart, sigma, owner))
+            found += sorted(tests, key=lambda test: test.apart)[-1:]
+        return found
 
-def _known_views(problem: FitProblem, error: Array) -> tuple[list[int], tuple[str, ...]]:
-    """Return views whose intrinsics with an error are as files say, and whose camera each has."""
-    wrong = np.flatnonzero(np.any(error, axis=0))
-    of_files = np.append(problem.calibrated, problem.n_kept)
-    is_known = np.all(np.isin(_places_of_cameras(problem)[:, wrong], of_files), axis=1)
-    known = [v for v in np.unique(problem.outlines.view).tolist() if is_known[v]]
-    return known, shared_cameras(problem.outlines.views, problem.first_cameras)
+    def _tested(self, error: Array) -> list[tuple[str, Camera, float, float]]:
+        """Return how much of an error (n_views, 5) the residuals show, and its standard deviation.
 
+        They come with the view that stands for each camera of which nothing was chosen, and with
+        the camera of its file.
+        """
+        known, owners = self._known_views(error)
+        tested = sorted({owners[v] for v in known})
+        if not tested:
+            return []
+        which = [
+            np.array([v in known and owners[v] == owner for v in range(len(owners))])
+            for owner in tested
+        ]
+        cameras = self.problem.first_cameras
+        seen, change, covariance = self._scores(error, which)
+        return [
+            (tested[i], cameras[owners.index(tested[i])], float(d), float(s))
+            for i, d, s in zip(seen.tolist(), change, np.sqrt(np.diagonal(covariance)), strict=True)
+        ]
 
-def _scores(
-    problem: FitProblem,
-    state: State,
-    linear: Linearization,
-    by_camera: Mapping[str, Array],
-    error: Array,
-    which: Sequence[BoolArray],
-) -> tuple[IntArray, Array, Array]:
-    """Return how much of an error the residuals show in some views, for c such choices together.
+    def _known_views(self, error: Array) -> tuple[list[int], tuple[str, ...]]:
+        """Return views whose intrinsics with an error are as files say, and each view's camera."""
+        problem, wrong = self.problem, np.flatnonzero(np.any(error, axis=0))
+        of_files = np.append(problem.calibrated, problem.n_kept)
+        is_known = np.all(np.isin(_places_of_cameras(problem)[:, wrong], of_files), axis=1)
+        known = [v for v in np.unique(problem.outlines.view).tolist() if is_known[v]]
+        return known, shared_cameras(problem.outlines.views, problem.first_cameras)
 
-    Which of these the residuals say anything of, (k,), how much of the error, (k,), its covariance.
-    """
-    changes = [_changes_by_cameras(problem, by_camera, error * own[:, None]) for own in which]
-    columns = {name: np.stack([change[name] for change in changes], axis=-1) for name in by_camera}
-    normal = normal_equations(problem, state, linear)
-    score, information = score_test(problem, linear, normal, columns)
-    whole = sum(np.sum(of_kind**2, axis=(0, 1)) for of_kind in columns.values())
-    seen = np.flatnonzero(np.diagonal(information) > _ROUNDING * whole)
-    covariance = np.linalg.pinv(information[np.ix_(seen, seen)], rcond=_ROUNDING, hermitian=True)
-    return seen, -covariance @ score[seen], np.asarray(covariance, dtype=np.float64)
+    def _scores(self, error: Array, which: Sequence[BoolArray]) -> tuple[IntArray, Array, Array]:
+        """Return how much of an error the residuals show in some views, for c choices together.
+
+        Which of these the residuals say anything of, (k,), how much of the error, (k,), and its
+        covariance.
+        """
+        changes = [self.changes(error * own[:, None]) for own in which]
+        columns = {
+            name: np.stack([change[name] for change in changes], axis=-1)
+            for name in self.derivatives
+        }
+        normal = normal_equations(self.problem, self.state, self.linear)
+        score, information = score_test(self.problem, self.linear, normal, columns)
+        whole = sum(np.sum(of_kind**2, axis=(0, 1)) for of_kind in columns.values())
+        seen = np.flatnonzero(np.diagonal(information) > _ROUNDING * whole)
+        own = information[np.ix_(seen, seen)]
+        covariance = np.linalg.pinv(own, rcond=_ROUNDING, hermitian=True)
+        return seen, -covariance @ score[seen], np.asarray(covariance, dtype=np.float64)

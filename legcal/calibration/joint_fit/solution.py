@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.brief import brief
 from legcal.calibration.joint_fit.determinacy import HeldDirections, held_spread, named_units
 from legcal.calibration.joint_fit.diagnostics import (
+    DoubtedCamera,
     contradicted_radii,
     doubted_cameras,
     legs_left_out,
@@ -35,14 +36,11 @@ from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_reasons
 from legcal.calibration.joint_fit.sensitivity import (
+    CameraResiduals,
     FocalLength,
     LensDistortion,
     Sensitivity,
-    derivatives_by_cameras,
-    focal_lengths,
-    lens_distortions,
     sensitivities,
-    zoomed_views,
 )
 from legcal.calibration.joint_fit.variables import State
 from legcal.data import Dataset, Order, Outlines, inverse, reorder_measurements
@@ -166,30 +164,16 @@ def assemble_solution(
         float(np.sum(rows.r**2)) for rows in linear.rows.values()
     )
     dof = n_residuals - problem.n_unknowns + len(held.basis)
+    parametrization = problem.legs.parametrization
     units = dict(zip(problem.named, problem.units, strict=True))
-    units |= dict(
-        zip(problem.legs.parametrization.names, problem.legs.parametrization.units, strict=True)
-    )
+    units |= dict(zip(parametrization.names, parametrization.units, strict=True))
     held_values = np.zeros((len(held.basis), len(problem.free)))
     held_values[:, problem.free] = (held.basis * held.unit)[:, : problem.n_kinematic]
     biases = zip(problem.block("biases").labels, state.biases.tolist(), strict=True)
-    by_camera = derivatives_by_cameras(problem, state)
-    # One mistake in a camera looks like others: of each camera the test that sees most counts.
-    tests: list[FocalLength | LensDistortion] = [
-        *focal_lengths(problem, state, linear, by_camera),
-        *zoomed_views(problem, state, linear, by_camera),
-        *lens_distortions(problem, state, linear, by_camera),
-    ]
-    clearest = {test.camera: test for test in sorted(tests, key=lambda test: test.apart)}
-    disagreeing = [test for test in clearest.values() if test.is_contradicted]
-    contradicted = [test for test in disagreeing if isinstance(test, FocalLength)]
-    distorted = [test for test in disagreeing if isinstance(test, LensDistortion)]
-    of_tests = tuple(test.view for test in disagreeing)
-    doubted = [c for c in doubted_cameras(problem, state, kept) if c.view not in of_tests]
-    camera_notes = (*map(str, disagreeing), *map(str, doubted))
-    named = problem.named
-    of_files = {named[i] for i in problem.calibrated.tolist()}
-    shown = [i for i, name in enumerate(names) if name not in of_files]
+    cameras = CameraResiduals(problem, state, linear)
+    doubts = _CameraDoubts.of(cameras, kept)
+    prior_sigma = _prior_sigma(problem)
+    shown = [i for i, name in enumerate(names) if name not in prior_sigma]
     gammas = _gammas(problem, state, kept, outlines)
     scale = scale_notes(problem, state)
     return Solution(
@@ -198,7 +182,7 @@ def assemble_solution(
         cameras=state.cameras,
         T_Rb_Re=state.platform_pose.motions,
         radii=dict(zip(problem.outlines.parts, state.radii.tolist(), strict=True)),
-        parametrization=problem.legs.parametrization,
+        parametrization=parametrization,
         values=values,
         units={name: units.get(name, "m") for name in values},
         status=status,
@@ -214,13 +198,7 @@ def assemble_solution(
             tuple(names[i] for i in shown),
             named_units(problem, state)[where][shown],
         ),
-        prior_sigma={
-            named[i]: sigma
-            for i, sigma in zip(
-                problem.priors.unknown.tolist(), problem.priors.sigma.tolist(), strict=True
-            )
-            if named[i] in of_files
-        },
+        prior_sigma=prior_sigma,
         held=held.directions,
         cost=cost,
         chi2=chi2,
@@ -245,17 +223,15 @@ def assemble_solution(
         gammas=gammas,
         biases={n: v for n, v in biases if not n.endswith(GAMMA_SUFFIX)},
         shared_px=fit.shared_px,
-        sensitivities=sensitivities(
-            problem, state, linear, by_camera, normal, problem.loss, distorted
-        ),
+        sensitivities=sensitivities(cameras, normal, doubts.distortions),
         outlines=_with_rejections(outlines, fit, offsets),
         start=label,
         iterations=fit.iterations,
         posterior=Posterior(problem, state, fit.edge_biases, fit.noise, kept),
-        focal_error=max((abs(f.change) for f in contradicted), default=0.0),
-        contradicted_cameras=(*of_tests, *(camera.view for camera in doubted)),
+        focal_error=doubts.focal_error,
+        contradicted_cameras=doubts.views,
         left_out=legs_left_out(problem, fit.accepted),
-        camera_notes=camera_notes,
+        camera_notes=doubts.notes,
         redundant_readings=readings,
         notes=(
             *fit.notes,
@@ -266,9 +242,53 @@ def assemble_solution(
             *notes_on_blur(fit.edge_biases, problem.outlines.covariance[fit.accepted]),
             *(scale or contradicted_radii(problem, state, normal)),
             *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
-            *camera_notes,
+            *doubts.notes,
         ),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _CameraDoubts:
+    """What the measurements contradict of the cameras."""
+
+    tested: list[FocalLength | LensDistortion]  # one error of a camera, the clearest
+    others: list[DoubtedCamera]  # that are moved too far for what their files state
+
+    @classmethod
+    def of(cls, cameras: CameraResiduals, covariance: Array) -> _CameraDoubts:
+        """Return the doubts where a fit ended, with the covariance of its kept unknowns."""
+        tested = cameras.contradicted()
+        views = {test.view for test in tested}
+        doubted = doubted_cameras(cameras.problem, cameras.state, covariance)
+        return cls(tested, [camera for camera in doubted if camera.view not in views])
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """The views that stand for these cameras."""
+        return tuple(one.view for one in (*self.tested, *self.others))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A sentence on each."""
+        return tuple(str(one) for one in (*self.tested, *self.others))
+
+    @property
+    def focal_error(self) -> float:
+        """The largest relative error of a focal length."""
+        errors = (abs(test.change) for test in self.tested if isinstance(test, FocalLength))
+        return max(errors, default=0.0)
+
+    @property
+    def distortions(self) -> list[LensDistortion]:
+        """Those that are of distortions."""
+        return [test for test in self.tested if isinstance(test, LensDistortion)]
+
+
+def _prior_sigma(problem: FitProblem) -> dict[str, float]:
+    """Return the standard deviations that camera files state, by the name of the intrinsic."""
+    priors, of_files = problem.priors, set(problem.calibrated.tolist())
+    stated = zip(priors.unknown.tolist(), priors.sigma.tolist(), strict=True)
+    return {problem.named[i]: sigma for i, sigma in stated if i in of_files}
 
 
 def comparable_cost(problem: FitProblem, state: State) -> float:
