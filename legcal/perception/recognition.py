@@ -15,6 +15,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data import Measurements, Outlines
 from legcal.geometry import Array, IntArray
+from legcal.machine import Cylinder
 from legcal.perception.camera_search import (
     START_PICTURES,
     PoseCandidates,
@@ -38,8 +39,6 @@ from legcal.perception.radii import (
 )
 from legcal.perception.view_fit import ViewFit, fit_view, group_name, min_evidence, refine_views
 from legcal.workers import Run, in_turn
-
-Pictures = Mapping[int, Picture]  # by row
 
 MIN_RADII_GAIN = 1.18  # of the support, by which radii that all differ must explain more
 SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
@@ -92,14 +91,96 @@ def recognise(
     for k, of_group, one in zip(unclear, of_groups, anywhere, strict=True):
         hint = groups[k].hint
         found[k] = one if hint is None else _better(place_near(of_group, hint, n_legs), one)
-    placed, radii = [one for one in found if one is not None], NO_RADIUS_FACTORS
+    views = _PlacedViews(search, groups, pictures, [one for one in found if one is not None])
+    radii = NO_RADIUS_FACTORS
     if suspects:
-        search, pictures, placed, radii = _by_other_radii(
-            search, groups, pictures, placed, suspects, run
+        views, radii = _by_other_radii(views, suspects, run)
+    views = replace(views, placed=list(run(views.decided_by_outlines, range(len(groups)))))
+    return _gathered(views, hints, radii, run)
+
+
+@dataclass(frozen=True, eq=False)
+class _PlacedViews:
+    """Views, what their images show, and the poses at which these show most legs.
+
+    It travels to worker processes.
+    """
+
+    search: Search
+    groups: Sequence[Group]  # of views that are placed together
+    pictures: Mapping[int, Picture]  # by row
+    placed: Sequence[PoseCandidates]  # of each group
+
+    def of_group(self, g: int, rows: Sequence[int] | None = None) -> list[Picture]:
+        """Return the pictures of a group, all of them or those of some rows."""
+        group = self.groups[g]
+        return group.pictures(self.pictures, group.rows if rows is None else rows)
+
+    def by_cylinders(self, cylinders: Sequence[Sequence[Cylinder]]) -> "_PlacedViews":
+        """Return what images show and should show by other cylinders of the legs."""
+        search = replace(self.search, cylinders=cylinders)
+        pictures = {row: search.retargeted(row, one) for row, one in self.pictures.items()}
+        return replace(self, search=search, pictures=pictures)
+
+    def placed_anywhere(self, which: Sequence[int], run: Run) -> "_PlacedViews":
+        """Return some groups placed anew, by all of their pictures."""
+        placed = list(self.placed)
+        of_groups = [self.of_group(g) for g in which]
+        anywhere = _anywhere(of_groups, self.search.n_legs, START_PICTURES, run)
+        for g, one in zip(which, anywhere, strict=True):
+            placed[g] = one
+        return replace(self, placed=placed)
+
+    def placed_again(self, run: Run) -> "_PlacedViews":
+        """Return the groups placed near where they were, or anywhere if they were not."""
+        views = self.placed_anywhere(
+            [g for g, one in enumerate(self.placed) if not one.is_convincing], run
         )
-    decide = partial(_decided_by_outlines, search, groups, placed, pictures)
-    placed = list(run(decide, range(len(groups))))
-    return _gathered(search, groups, placed, pictures, hints, radii, run)
+        placed = list(views.placed)
+        for g, one in enumerate(self.placed):
+            if one.is_convincing:
+                some = self.of_group(g, self.groups[g].some)
+                near = place_near(some, one.pose(), self.search.n_legs)
+                placed[g] = near if near.is_convincing else one
+        return replace(views, placed=placed)
+
+    def for_radii(self) -> Iterator[tuple[int, list[Picture], CameraPoses]]:
+        """Return a few pictures of each group that was placed, one of each pose."""
+        for g, (group, one) in enumerate(zip(self.groups, self.placed, strict=True)):
+            if one.is_convincing:
+                rows = one_of_each_pose(self.search.measurements, group.some)
+                yield g, self.of_group(g, rows), one.poses
+
+    @property
+    def support(self) -> float:
+        """How many legs agree in a picture, over all groups that were placed."""
+        return sum(float(one.support[0].mean()) for one in self.placed if one.is_convincing)
+
+    def decided_by_outlines(self, g: int) -> PoseCandidates:
+        """Return the poses of a group, first the one of outlines if pairs are ambiguous."""
+        group, candidates = self.groups[g], self.placed[g]
+        near = candidates.hinted and candidates.is_convincing
+        n = len(candidates.poses)
+        if n == 0 or near or candidates.is_clear:
+            return candidates
+        search, few = self.search, replace(group, rows=group.some)
+        trials = [_measure_at(search, few, candidates, 0)]
+        if not (candidates.leads_clearly and _is_decided(trials, candidates, few)):
+            trials += [_measure_at(search, few, candidates, i) for i in range(1, min(N_POSES, n))]
+            if not (candidates.is_convincing and _is_decided(trials, candidates, few)):
+                by_both = candidates.score[: len(trials)] + [trial.evidence for trial in trials]
+                for i in np.argsort(-by_both, kind="stable")[:N_REFINED].tolist():
+                    one = trials[i]
+                    if one.fit is not None:
+                        again = refine_views(search, [few], one.placement, one.outlines)
+                        trials[i] = _Trial(again[0], again[1], again[2][0])
+        best = _best(trials)
+        fit = trials[best].fit
+        if fit is None or not _is_decided(trials, candidates, few):
+            return replace(candidates, by_outlines=False)
+        pose = CameraPoses.one(fit.T_base_group, fit.shift)
+        of_group = self.of_group(g, [r for r in group.rows if r in self.pictures])
+        return replace(with_first(candidates, best, pose, of_group), by_outlines=True)
 
 
 def _pictures(
@@ -138,64 +219,36 @@ def _better(near: PoseCandidates, anywhere: PoseCandidates) -> PoseCandidates:
 
 
 def _by_other_radii(
-    search: Search,
-    groups: Sequence[Group],
-    pictures: dict[int, Picture],
-    placed: list[PoseCandidates],
-    suspects: Collection[LegRadius],
-    run: Run,
-) -> tuple[Search, dict[int, Picture], list[PoseCandidates], RadiusFactors]:
-    """Return everything by the radii that the images show of suspects parts, corrected in turns."""
-    as_given = search, pictures, placed, NO_RADIUS_FACTORS
-    radii = _first_radii(search, groups, placed, pictures, run).only(suspects)
-    given, step = search.cylinders, radii
+    views: _PlacedViews, suspects: Collection[LegRadius], run: Run
+) -> tuple[_PlacedViews, RadiusFactors]:
+    """Return the views by the radii that images show of suspect parts, corrected in turns."""
+    as_given, given = views, views.search.cylinders
+    radii = step = _first_radii(views, run).only(suspects)
     for _ in range(MAX_ITERATIONS):
         if not step.factor:
             break
-        search = replace(search, cylinders=radii.corrected(given))
-        pictures = {row: search.retargeted(row, one) for row, one in pictures.items()}
-        placed = _placed_again(search, groups, placed, pictures, run)
-        few = _for_radii(search, groups, placed, pictures)
+        views = views.by_cylinders(radii.corrected(given)).placed_again(run)
+        few = views.for_radii()
         step = radii.of_the_same(estimate_radii(few, CONVERGED, alone=not radii.common))
         radii = radii.then(step)
-    if radii.common and _mean_support(placed) < MIN_RADII_GAIN * _mean_support(as_given[2]):
-        return as_given  # the scale is not known well
-    return search, pictures, placed, radii
+    if radii.common and views.support < MIN_RADII_GAIN * as_given.support:
+        return as_given, NO_RADIUS_FACTORS  # the scale is not known well
+    return views, radii
 
 
-def _first_radii(
-    search: Search,
-    groups: Sequence[Group],
-    placed: Sequence[PoseCandidates],
-    pictures: Pictures,
-    run: Run,
-) -> RadiusFactors:
+def _first_radii(views: _PlacedViews, run: Run) -> RadiusFactors:
     """Return the radii that the images contradict, as far as the views can be placed."""
-    if not any(one.is_convincing for one in placed):
-        for factor in SCALED:
-            cylinders = [
-                [replace(c, radius=factor * c.radius) for c in leg] for leg in search.cylinders
-            ]
-            scaled = replace(search, cylinders=cylinders)
-            others = {row: scaled.retargeted(row, one) for row, one in pictures.items()}
-            of_groups = [group.pictures(others, group.rows) for group in groups]
-            placed = _anywhere(of_groups, search.n_legs, START_PICTURES, run)
-            if any(one.is_clear for one in placed):
-                break
-    return estimate_radii(_for_radii(search, groups, placed, pictures))
-
-
-def _for_radii(
-    search: Search,
-    groups: Sequence[Group],
-    placed: Sequence[PoseCandidates],
-    pictures: Pictures,
-) -> Iterator[tuple[int, list[Picture], CameraPoses]]:
-    """Return a few pictures of each group that was placed, one of each pose."""
-    for g, (group, one) in enumerate(zip(groups, placed, strict=True)):
-        if one.is_convincing:
-            rows = one_of_each_pose(search.measurements, group.some)
-            yield g, group.pictures(pictures, rows), one.poses
+    if any(one.is_convincing for one in views.placed):
+        return estimate_radii(views.for_radii())
+    others = views
+    for factor in SCALED:
+        scaled = views.by_cylinders(
+            [[replace(c, radius=factor * c.radius) for c in leg] for leg in views.search.cylinders]
+        )
+        others = scaled.placed_anywhere(range(len(views.groups)), run)
+        if any(one.is_clear for one in others.placed):
+            break
+    return estimate_radii(replace(views, placed=others.placed).for_radii())
 
 
 def one_of_each_pose(measurements: Measurements, rows: Sequence[int]) -> list[int]:
@@ -210,33 +263,6 @@ def one_of_each_pose(measurements: Measurements, rows: Sequence[int]) -> list[in
     return list(first.values())
 
 
-def _mean_support(placed: Sequence[PoseCandidates]) -> float:
-    """Return how many legs agree in a picture, over all groups that were placed."""
-    return sum(float(one.support[0].mean()) for one in placed if one.is_convincing)
-
-
-def _placed_again(
-    search: Search,
-    groups: Sequence[Group],
-    placed: Sequence[PoseCandidates],
-    pictures: Pictures,
-    run: Run,
-) -> list[PoseCandidates]:
-    """Return the cameras by other radii: near where they were, or anywhere if they were not."""
-    found = list(placed)
-    unplaced_groups = [g for g, one in enumerate(placed) if not one.is_convincing]
-    of_groups = [groups[g].pictures(pictures, groups[g].rows) for g in unplaced_groups]
-    anywhere = _anywhere(of_groups, search.n_legs, START_PICTURES, run)
-    for g, one in zip(unplaced_groups, anywhere, strict=True):
-        found[g] = one
-    for g, one in enumerate(placed):
-        if one.is_convincing:
-            some = groups[g].pictures(pictures, groups[g].some)
-            near = place_near(some, one.pose(), search.n_legs)
-            found[g] = near if near.is_convincing else one
-    return found
-
-
 @dataclass(frozen=True, eq=False)
 class _Trial:
     """A pose with the outlines that were measured at it, and their fit."""
@@ -249,39 +275,6 @@ class _Trial:
     def evidence(self) -> float:
         """How much they support it."""
         return 0.0 if self.fit is None else self.fit.evidence
-
-
-def _decided_by_outlines(
-    search: Search,
-    groups: Sequence[Group],
-    placed: Sequence[PoseCandidates],
-    pictures: Pictures,
-    g: int,
-) -> PoseCandidates:
-    """Return the poses of a group, first the one that outlines support if pairs are ambiguous."""
-    group, candidates = groups[g], placed[g]
-    near = candidates.hinted and candidates.is_convincing
-    n = len(candidates.poses)
-    if n == 0 or near or candidates.is_clear:
-        return candidates
-    few = replace(group, rows=group.some)
-    trials = [_measure_at(search, few, candidates, 0)]
-    if not (candidates.leads_clearly and _is_decided(trials, candidates, few)):
-        trials += [_measure_at(search, few, candidates, i) for i in range(1, min(N_POSES, n))]
-        if not (candidates.is_convincing and _is_decided(trials, candidates, few)):
-            by_both = candidates.score[: len(trials)] + [trial.evidence for trial in trials]
-            for i in np.argsort(-by_both, kind="stable")[:N_REFINED].tolist():
-                one = trials[i]
-                if one.fit is not None:
-                    again = refine_views(search, [few], one.placement, one.outlines)
-                    trials[i] = _Trial(again[0], again[1], again[2][0])
-    best = _best(trials)
-    fit = trials[best].fit
-    if fit is None or not _is_decided(trials, candidates, few):
-        return replace(candidates, by_outlines=False)
-    pose = CameraPoses.one(fit.T_base_group, fit.shift)
-    of_group = group.pictures(pictures, [r for r in group.rows if r in pictures])
-    return replace(with_first(candidates, best, pose, of_group), by_outlines=True)
 
 
 def _measure_at(search: Search, group: Group, candidates: PoseCandidates, i: int) -> _Trial:
@@ -347,28 +340,25 @@ def _gap(one: Array, other: Array) -> float:
 
 
 def _gathered(
-    search: Search,
-    groups: Sequence[Group],
-    found: Sequence[PoseCandidates],
-    pictures: Pictures,
+    found: _PlacedViews,
     hints: Sequence[RigidTransform | None],
     radii: RadiusFactors,
     run: Run,
 ) -> Placement:
     """Put the views together, with the reasons of those that could not be placed."""
+    search, groups, placed = found.search, found.groups, found.placed
     views = search.measurements.views
     T, unplaced = list(hints), dict[str, str]()
     shift = np.zeros((len(views), search.n_legs, 2, 3))
     error: Array = np.full((len(views), search.n_legs), UNOBSERVED_ERROR)
-    unclear = [g for g, one in enumerate(found) if may_be_mirrored(one)]
+    unclear = [g for g, one in enumerate(placed) if may_be_mirrored(one)]
     flipped = []
     for g in unclear:  # those pictures by which it was placed, with left and right exchanged
-        few = found[g].hinted and found[g].support.shape[1] == len(groups[g].some)
-        rows = groups[g].some if few else groups[g].rows
-        flipped.append(mirrored(groups[g].pictures(pictures, rows)))
+        few = placed[g].hinted and placed[g].support.shape[1] == len(groups[g].some)
+        flipped.append(mirrored(found.of_group(g, groups[g].some if few else None)))
     mirrors = _anywhere(flipped, search.n_legs, MIRRORED_STARTS, run)
-    exchanged = {g for g, m in zip(unclear, mirrors, strict=True) if is_mirrored(found[g], m)}
-    for g, (group, one) in enumerate(zip(groups, found, strict=True)):
+    exchanged = {g for g, m in zip(unclear, mirrors, strict=True) if is_mirrored(placed[g], m)}
+    for g, (group, one) in enumerate(zip(groups, placed, strict=True)):
         names = [views[v].name for v in group.views]
         if g in exchanged or not one.is_convincing:
             hinted, mirror = group.hint is not None, g in exchanged
