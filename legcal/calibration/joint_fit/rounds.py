@@ -17,6 +17,7 @@ import numpy as np
 from legcal.calibration.joint_fit.free_poses import of_determined_poses
 from legcal.calibration.joint_fit.outlier_readings import (
     like_readings,
+    with_agreeing_readings,
     with_judged_readings,
     with_rough_readings,
 )
@@ -175,8 +176,8 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
     # Wrong readings go before they bend the fit: the first minimum is one with rough readings.
     if problem.legs.is_redundant:
         rough, tolerance = with_rough_readings(problem), _REJECTION_TOLERANCE
-        rough, minimum = _without_wrong_readings(rough, minimum, settings, tolerance)
-        problem = like_readings(problem, rough)
+        rough, minimum = _without_wrong_readings(rough, rough, minimum, settings, tolerance)
+        every, problem = problem, like_readings(problem, rough)
         minimum = _passed(problem, minimum, settings, tolerance)
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before = accepted
@@ -193,7 +194,7 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
         minimum = _passed(problem, minimum, settings, _REJECTION_TOLERANCE)
     if problem.legs.is_redundant:
         minimum = _passed(problem, minimum, settings)
-        problem, minimum = _without_wrong_readings(problem, minimum, settings)
+        problem, minimum = _without_wrong_readings(problem, every, minimum, settings)
     with_possible, changes, are_white = problem.with_biases(possible), NO_CHANGES, False
 
     def scores_of_biases() -> tuple[Array, Array]:
@@ -248,14 +249,22 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], settings: Refineme
 
 def _without_wrong_readings(
     problem: FitProblem,
+    every: FitProblem,
     minimum: Minimum[State],
     settings: RefinementSettings,
     relative_tolerance: float = 0.0,
 ) -> tuple[FitProblem, Minimum[State]]:
-    """Return problem and minimum without readings that all else contradicts, from a minimum."""
+    """Return problem and minimum without readings that all else contradicts, from a minimum.
+
+    Those of *every* reading that agree once the others are out come back, once.
+    """
+    may_come_back = True
     for _ in range(_READING_ROUNDS):
-        problem, is_wrong = with_judged_readings(problem, minimum.state, settings)
-        if not is_wrong:
+        problem, is_changed = with_judged_readings(problem, minimum.state, settings)
+        if not is_changed and may_come_back:
+            problem, is_changed = with_agreeing_readings(problem, every, minimum.state, settings)
+            may_come_back = False
+        if not is_changed:
             break
         minimum = _passed(problem, minimum, settings, relative_tolerance)
     return problem, minimum
