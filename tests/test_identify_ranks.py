@@ -7,6 +7,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+import outline_sessions
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -393,6 +394,14 @@ def test_remedies_were_tried_and_are_true() -> None:
     assert few.images == (1, 1, 1)
     assert few.staged.rank < 30
     assert few.remedies[0].remedy == "take 15 images a view instead of 1"
+
+
+def test_remedies_of_a_machine_with_ties_count_what_can_move(tmp_path: Path) -> None:
+    found = identifiability(outline_sessions.made("rp-2-sps", tmp_path))
+    assert found.remedies
+    for remedy in found.remedies:
+        assert remedy.staged_rank <= found.staged.of
+        assert remedy.full_rank <= found.full.of
 
 
 def test_a_direction_hides_what_moving_its_parameters_does_to_the_platform() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,9 @@ from simulated import settings
 
 import legcal
 from legcal.calibration.joint_fit import refine
+from legcal.calibration.joint_fit.outlier_readings import with_judged_readings
 from legcal.calibration.joint_fit.platform import platform_by_parameters
+from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.exports import ExportOptions, Subject, export
 from legcal.geometry import Array
@@ -247,6 +250,34 @@ def test_a_wrong_reading_is_named_with_its_amount_and_does_no_harm(
     assert found.redundant_readings.doubts == ()
     values = np.array([found.values[name] for name in found.parametrization.names])
     np.testing.assert_allclose(values, session.legs.vector(session.truth.legs), atol=1e-6)
+
+
+def test_right_readings_that_a_bent_model_contradicts_come_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = machine_session(str(made("7-ups", tmp_path).yaml_path), n_poses=12)
+    q = session.measurements.q.copy()
+    q[7, 3] += 1e-3
+    wrong = dataclasses.replace(session.measurements, q=q)
+    n_left_out = list[int]()
+
+    def too_strict(problem: FitProblem, *rest: Any) -> tuple[FitProblem, bool]:
+        """Leave out, once, most readings of a motor."""
+        problem, is_changed = with_judged_readings(problem, *rest)
+        if n_left_out:
+            return problem, is_changed
+        factor = problem.factor("readings")
+        out = (problem.readings.leg == 2) & (problem.readings.pose > 2)
+        n_left_out.append(int(np.count_nonzero(out)))
+        whitening = np.where(out[:, None, None], 0.0, factor.whitening)
+        return problem.with_factors(dataclasses.replace(factor, whitening=whitening)), True
+
+    monkeypatch.setattr("legcal.calibration.joint_fit.rounds.with_judged_readings", too_strict)
+    found = refine(session.legs, wrong, session.outlines, session.start)
+    assert n_left_out[0] > 5
+    assert found.redundant_readings is not None
+    assert [(one.leg, one.pose) for one in found.redundant_readings.wrong] == [(3, 7)]
+    assert found.redundant_readings.doubts == ()
 
 
 @pytest.mark.system

@@ -121,9 +121,14 @@ def _measured(plan: Plan) -> tuple[int, ...]:
     return plan.machine.frame_legs
 
 
+def _measured_joints(plan: Plan) -> Array:
+    """Return where they are in the base, motors at zero, of shape (3, 3) [m]."""
+    return np.asarray(plan.machine.A_base[list(_measured(plan))])
+
+
 def camera_distances(plan: Plan) -> dict[str, list[float]]:
     """Return for each view how far the lens is from joints of the base, and how high [m]."""
-    A = plan.machine.A_base[list(_measured(plan))]
+    A = _measured_joints(plan)
     found = {}
     for view in plan.views:
         where = view.T_base_camera.translation
@@ -169,7 +174,7 @@ with {plan.camera.width} x {plan.camera.height} px and a focal length of \
 
 def _board_in_words(plan: Plan, board: LaidBoard) -> str:
     """Return where the board is to lie."""
-    A = plan.machine.A_base[list(_measured(plan))]
+    A = _measured_joints(plan)
     far = 1e3 * np.linalg.norm(A - board.middle, axis=1)
     x, y, z = 1e3 * board.middle
     joints = ", ".join(
@@ -242,28 +247,35 @@ def _draw_panel(ax: Axes, plan: Plan, A: Array, B: Array, i: int, j: int) -> Non
         ax.plot(outer[:, i], outer[:, j], color=_BOARD_COLOUR, linewidth=1.5)
         ax.annotate("board", (outer[0, i], outer[0, j]), (3.0, 3.0), color=_BOARD_COLOUR,
                     textcoords="offset points", fontsize="small")  # fmt: skip
-    for view in plan.views:
+    for n, view in enumerate(plan.views):
         where = 1e3 * view.T_base_camera.translation
         sight = view.T_base_camera.rotation.as_matrix()[:, 2]
-        far = np.linalg.norm(A - view.T_base_camera.translation, axis=1)
         tip = where + 250.0 * sight
         arrow = {"arrowstyle": "->", "color": _CAMERA_COLOUR}
         ax.annotate("", (tip[i], tip[j]), (where[i], where[j]), arrowprops=arrow)
         ax.scatter(where[i], where[j], marker="s", s=40.0, color=_CAMERA_COLOUR, zorder=4)
         ax.annotate(
-            plain(view.name), (where[i], where[j]), (7.0, 7.0), color=_CAMERA_COLOUR,
-            textcoords="offset points",
+            plain(view.name), (where[i], where[j]), (7.0, -16.0 if n % 2 else 7.0),
+            color=_CAMERA_COLOUR, textcoords="offset points",
         )  # fmt: skip
-        for k in () if plan.hand_held else _measured(plan):
-            joint = 1e3 * A[k]
-            ax.plot([where[i], joint[i]], [where[j], joint[j]], color=_CAMERA_COLOUR,
-                    linewidth=0.6, linestyle=":")  # fmt: skip
-            middle = 0.62 * where + 0.38 * joint
-            ax.annotate(f"{1e3 * far[k]:.0f}", (middle[i], middle[j]), fontsize="x-small",
-                        color=_CAMERA_COLOUR, ha="center")  # fmt: skip
+        if (i, j) == (0, 1) and not plan.hand_held:
+            _draw_distances(ax, where, 1e3 * _measured_joints(plan))
     ax.set_aspect("equal")
-    ax.margins(0.1)
+    ax.margins(0.15)
     ax.grid(alpha=0.2)
+
+
+def _draw_distances(ax: Axes, lens: Array, joints: Array) -> None:
+    """Draw from above how far a lens is from joints, each distance along its line [mm]."""
+    for part, joint in zip(np.linspace(0.2, 0.6, len(joints)), joints, strict=True):
+        ax.plot([lens[0], joint[0]], [lens[1], joint[1]], color=_CAMERA_COLOUR,
+                linewidth=0.6, linestyle=":")  # fmt: skip
+        at = part * lens[:2] + (1.0 - part) * joint[:2]
+        slope = np.degrees(np.arctan2(lens[1] - joint[1], lens[0] - joint[0]))
+        ax.text(at[0], at[1], f"{np.linalg.norm(lens - joint):.0f}", color=_CAMERA_COLOUR,
+                fontsize="x-small", ha="center", va="center", rotation_mode="anchor",
+                rotation=(slope + 90.0) % 180.0 - 90.0,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8})  # fmt: skip
 
 
 def _draw_growth(plan: Plan) -> Figure:

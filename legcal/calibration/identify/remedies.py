@@ -272,7 +272,7 @@ def find_remedies(
     Only what raises a rank: what determines everything, else what is enough for the platform, else
     what helps.
     """
-    n_parameters = len(analysis.predicted.unit)
+    n_parameters = analysis.full.of
     before = _score(analysis)
     kinds: list[Iterable[tuple[str, Callable[[], _Score]]]] = [
         _more_images(analysis, replanning),
@@ -412,7 +412,7 @@ def _other_views(analysis: Analysis, replanning: Replanning | None) -> tuple[Rem
         return ()
     names = analysis.predicted.leg_names
     views = [legs_in_words([names.index(n) for n in view], names) for view in sets[0].views]
-    n_p = len(analysis.predicted.unit)
+    n_p = analysis.full.of
     return (Remedy(f"choose these views instead: {views_in_words(views)}", n_p, n_p, True),)
 
 

@@ -128,6 +128,34 @@ def with_judged_readings(
     return problem.with_factors(*changed), True
 
 
+def with_agreeing_readings(
+    problem: FitProblem, every: FitProblem, state: State, settings: RefinementSettings
+) -> tuple[FitProblem, bool]:
+    """Return the problem with the readings that agree after all; say if there was one.
+
+    They were left out near a model that was still wrong. *every* is the problem that uses all. A
+    reading that is out has the variance 1 + that of its prediction, over its own.
+    """
+    restored = problem.with_factors(*map(every.factor, _FACTORS))
+    linear = linearize(problem, state)
+    normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
+    most = settings.rejection * max(1.0, _scale(_tests(problem, linear, normal)))
+    linear, back = linearize(restored, state), list[BoolArray]()
+    for name in _FACTORS:
+        predicted = explained_share(restored, linear, normal, name)[:, 0, 0]
+        agrees = linear[name].r[:, 0] ** 2 <= most**2 * (1.0 + predicted)
+        back.append(agrees & _used(every, name) & ~_used(problem, name))
+    if not any(one.any() for one in back):
+        return problem, False
+    changed = []
+    for name, agrees in zip(_FACTORS, back, strict=True):
+        factor = every.factor(name)
+        used = _used(problem, name) | agrees
+        whitening = np.where(used[:, None, None], factor.whitening, 0.0)
+        changed.append(replace(factor, whitening=whitening))
+    return problem.with_factors(*changed), True
+
+
 def judged_readings(
     problem: FitProblem,
     state: State,

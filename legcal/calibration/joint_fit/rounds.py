@@ -17,6 +17,7 @@ import numpy as np
 from legcal.calibration.joint_fit.free_poses import of_determined_poses
 from legcal.calibration.joint_fit.outlier_readings import (
     like_readings,
+    with_agreeing_readings,
     with_judged_readings,
     with_rough_readings,
 )
@@ -173,8 +174,8 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     # Wrong readings go before they bend the fit: the first minimum is one with rough readings.
     if problem.legs.is_redundant:
         rough, tolerance = with_rough_readings(problem), _REJECTION_TOLERANCE
-        rough, minimum = _without_wrong_readings(rough, minimum, tolerance)
-        problem = like_readings(problem, rough)
+        rough, minimum = _without_wrong_readings(rough, rough, minimum, tolerance)
+        every, problem = problem, like_readings(problem, rough)
         minimum = _passed(problem, minimum, tolerance)
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before = accepted
@@ -191,7 +192,7 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
         minimum = _passed(problem, minimum, _REJECTION_TOLERANCE)
     if problem.legs.is_redundant:
         minimum = _passed(problem, minimum)
-        problem, minimum = _without_wrong_readings(problem, minimum)
+        problem, minimum = _without_wrong_readings(problem, every, minimum)
     with_possible, changes, are_white = problem.with_biases(possible), NO_CHANGES, False
 
     def scores_of_biases() -> tuple[Array, Array]:
@@ -245,12 +246,24 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
 
 
 def _without_wrong_readings(
-    problem: FitProblem, minimum: Minimum[State], relative_tolerance: float = 0.0
+    problem: FitProblem,
+    every: FitProblem,
+    minimum: Minimum[State],
+    relative_tolerance: float = 0.0,
 ) -> tuple[FitProblem, Minimum[State]]:
-    """Return problem and minimum without readings that all else contradicts, from a minimum."""
+    """Return problem and minimum without readings that all else contradicts, from a minimum.
+
+    Those of *every* reading that agree once the others are out come back, once.
+    """
+    may_come_back = True
     for _ in range(_READING_ROUNDS):
-        problem, is_wrong = with_judged_readings(problem, minimum.state, problem.settings)
-        if not is_wrong:
+        problem, is_changed = with_judged_readings(problem, minimum.state, problem.settings)
+        if not is_changed and may_come_back:
+            problem, is_changed = with_agreeing_readings(
+                problem, every, minimum.state, problem.settings
+            )
+            may_come_back = False
+        if not is_changed:
             break
         minimum = _passed(problem, minimum, relative_tolerance)
     return problem, minimum
