@@ -2,9 +2,9 @@
 
 :func:`place_and_measure` reads as the method: images are inspected, legs are recognised and the
 cameras placed, outlines are measured near there, parts that were not found are tried with other
-radii,
-views are fitted to their outlines and missing legs looked for, and what is wrong with an image is
-noted. Once a joint fit has placed everything, :func:`measure_photographs` measures near it.
+radii, views are fitted to their outlines and missing legs looked for, and what is wrong with an
+image is noted. Once a joint fit has placed everything, :func:`measure_photographs` measures near
+it.
 """
 
 from __future__ import annotations
@@ -196,49 +196,19 @@ def place_and_measure(
             photographs, nominal, free_poses, usable, report, joined
         )
     search = photographs.search(nominal, pairs, rough)
-
-    def recognised(suspects: Collection[LegRadius] = ()) -> Placement:
-        return _recognised(photographs, search, usable, hints, report, joined, suspects)
-
+    recognised = partial(_recognised, photographs, search, usable, hints, report, joined)
     placement = recognised()
     outlines, blur = _measured(photographs, search, placement, report, together=together)
-    suspects, legs = _parts_not_found(photographs.machine.legs, outlines), photographs.machine.legs
-    while suspects:
-        other = recognised(suspects)
-        if not other.radii.factor:
-            break
-        machine = photographs.machine.with_cylinders(other.radii.corrected(search.cylinders))
-        corrected = replace(photographs, machine=machine)
-        by_other = corrected.search(nominal, pairs, rough)
-        again, also = _measured(
-            corrected,
-            by_other,
-            other,
-            report,
-            together=together,
-            stage=f"{MEASURING} with other radii",
-        )
-        blur = np.where(np.isnan(also), blur, also)
-        m = photographs.measurements
-        shown = _images_with_more(legs, other.radii, m.view, outlines, again)
-        of_one = [part for part, rows in shown.items() if len(set(m.view[rows])) < MIN_VIEWS]
-        if of_one and not other.radii.common:  # what one camera sees may be light and shade
-            left = [part for part in suspects if not _is_among(part, of_one)]
-            suspects = left if len(left) < len(suspects) else []
-            continue
-        if again.used.sum() > outlines.used.sum():
-            photographs, search, placement, outlines = corrected, by_other, other, again
-            seen_in = {part: images_in_words(m, rows) for part, rows in shown.items() if rows}
-            notes = radius_notes(other.radii, search.leg_names, seen_in)
-            placement = replace(placement, notes=(*placement.notes, *notes))
-        break
+    at_nominal = _Measured(photographs, search, placement, outlines, blur)
+    measured = _with_other_radii(at_nominal, recognised, report, together=together)
+    photographs, search, outlines = measured.photographs, measured.search, measured.outlines
     groups = group_views(photographs.measurements, usable, hints, joined)
     is_own = np.isin(outlines.row, usable)
     own, others = outlines.choose(is_own), outlines.choose(~is_own)
     placement, found, _ = refine_views(
         search,
         groups,
-        placement,
+        measured.placement,
         own,
         together=together,
         run=photographs.run,
@@ -248,12 +218,70 @@ def place_and_measure(
     placement, reasons = find_wrong_images(
         search, placement, outlines, photographs.detect, defects, photographs.run
     )
-    view, known = photographs.measurements.view, ~np.isnan(blur)
-    of_views = [blur[known & (view == v)] for v in range(len(photographs.measurements.views))]
-    usual = tuple(float(np.median(own)) if len(own) else np.nan for own in of_views)
     outlines = reject_images(outlines, reasons)
     seen_poses = {pose: choices[0] for pose, choices in free_poses.items()}
-    return MeasuredImages(photographs, placement, outlines, reasons, usual, seen_poses)
+    blur_of_views = measured.blur_of_views
+    return MeasuredImages(photographs, placement, outlines, reasons, blur_of_views, seen_poses)
+
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """Images measured at a placement."""
+
+    photographs: Photographs
+    search: Search
+    placement: Placement
+    outlines: Outlines
+    blur: Array  # (n_rows,) [px]; NaN where none was measured
+
+    @property
+    def blur_of_views(self) -> tuple[float, ...]:
+        """The usual blur of each view [px]; NaN where none was measured."""
+        view, known = self.photographs.measurements.view, ~np.isnan(self.blur)
+        n_views = len(self.photographs.measurements.views)
+        of_views = [self.blur[known & (view == v)] for v in range(n_views)]
+        return tuple(float(np.median(own)) if len(own) else np.nan for own in of_views)
+
+
+def _with_other_radii(
+    found: _Measured,
+    recognised: Callable[[Collection[LegRadius]], Placement],
+    report: Report,
+    *,
+    together: bool,
+) -> _Measured:
+    """Return what is measured with other radii of parts that were not found, if it is more.
+
+    *recognised* places the cameras anew, with other radii of some parts.
+    """
+    machine, m = found.photographs.machine, found.photographs.measurements
+    suspects = _parts_not_found(machine.legs, found.outlines)
+    while suspects:
+        placement = recognised(suspects)
+        radii = placement.radii
+        if not radii.factor:
+            break
+        cylinders = radii.corrected(found.search.cylinders)
+        photographs = replace(found.photographs, machine=machine.with_cylinders(cylinders))
+        search = replace(found.search, cylinders=photographs.cylinders)
+        stage = f"{MEASURING} with other radii"
+        outlines, blur = _measured(
+            photographs, search, placement, report, together=together, stage=stage
+        )
+        found = replace(found, blur=np.where(np.isnan(blur), found.blur, blur))
+        shown = _images_with_more(machine.legs, radii, m.view, found.outlines, outlines)
+        of_one = [part for part, rows in shown.items() if len(set(m.view[rows])) < MIN_VIEWS]
+        if of_one and not radii.common:  # what one camera sees may be light and shade
+            left = [part for part in suspects if not _is_among(part, of_one)]
+            suspects = left if len(left) < len(suspects) else []
+            continue
+        if outlines.used.sum() > found.outlines.used.sum():
+            seen_in = {part: images_in_words(m, rows) for part, rows in shown.items() if rows}
+            notes = radius_notes(radii, search.leg_names, seen_in)
+            placement = replace(placement, notes=(*placement.notes, *notes))
+            found = _Measured(photographs, search, placement, outlines, found.blur)
+        break
+    return found
 
 
 def recognise_and_place(
