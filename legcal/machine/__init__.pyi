@@ -34,7 +34,6 @@ from .drawing import BASE_COLOUR as BASE_COLOUR
 from .drawing import LEG_COLOUR as LEG_COLOUR
 from .drawing import MOTOR_COLOUR as MOTOR_COLOUR
 from .drawing import PLATFORM_COLOUR as PLATFORM_COLOUR
-from .drawing import MotorLines as MotorLines
 from .drawing import around as around
 from .drawing import corners_of_base as corners_of_base
 from .drawing import motor_lines as motor_lines

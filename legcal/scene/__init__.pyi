@@ -1,8 +1,7 @@
 from .motions import FACTORS as FACTORS
+from .motions import PlacedModel as PlacedModel
 from .motions import directions as directions
-from .motions import ends_at_readings as ends_at_readings
-from .motions import motors_at as motors_at
-from .motions import step_shown as step_shown
+from .motions import placed_model as placed_model
 from .shapes import around as around
 from .shapes import ellipsoids as ellipsoids
 from .shapes import enlargement as enlargement

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -12,7 +12,6 @@ from legcal.geometry import Array, components
 from legcal.machine import (
     Leg,
     Machine,
-    MotorLines,
     Parametrization,
     ends_in_base,
     first_rods,
@@ -27,36 +26,49 @@ _SHOWN = 0.12  # of the size of the machine: how far the largest change is drawn
 _HELD = 1e-3  # [m]
 
 
-def ends_at_readings(
+class PlacedModel(NamedTuple):
+    """What is seen of a model at k poses, in the base link [m]."""
+
+    A: Array  # (k, n_legs, 3)
+    B: Array  # (k, n_legs, 3)
+    anchors: Array  # (n_motors, 3) where motors that move joints at A stand
+    standing: Array  # (n_motors, 2, 3) their rails and axes
+    moving: Array  # (k, m, 2, 3) carriages, arms, and bars between the joints of one motor
+
+    def moved_towards(self, other: PlacedModel, share: float) -> PlacedModel:
+        """Return what is seen a share of the way to another model, or beyond it."""
+        return PlacedModel(*(a + share * (b - a) for a, b in zip(self, other, strict=True)))
+
+    def first_step(self, other: PlacedModel, size: float) -> int:
+        """Return which of ``FACTORS`` shows the way to another on a machine of some size [m]."""
+        moved = max(float(np.abs(other.A - self.A).max()), float(np.abs(other.B - self.B).max()))
+        wanted = _SHOWN * size / max(moved, 1e-12)
+        return max(k for k, factor in enumerate(FACTORS) if factor <= max(wanted, 1.0))
+
+
+def placed_model(
     machine: Machine,
     legs: Sequence[Leg],
     q: Array,
     near: Sequence[RigidTransform],
     *,
     by_readings: bool = True,
-) -> tuple[Array, Array]:
-    """Return A and B (k, n, 3) of legs in the base link [m], motors and platform at readings.
+) -> PlacedModel:
+    """Return what is seen of legs in R_b and R_e, motors and platform at readings q (k, n).
 
-    Legs are in R_b and R_e, poses T_Rb_Re are looked for *near* others; the platform stays at
-    these where it is not placed *by_readings* q (k, n).
+    Poses T_Rb_Re are looked for *near* others; the platform stays at these where it is not placed
+    *by_readings*. Motors stand in the base link, also where A defines R_b.
     """
     poses = near
     if by_readings:
         from legcal.calibration import poses_at_readings  # which a model alone does not need
 
         poses = poses_at_readings(machine, legs, q, near)
-    return ends_in_base(legs, machine.T_base_Rb, *components(poses), q[:, first_rods(legs)])
-
-
-def motors_at(machine: Machine, legs: Sequence[Leg], A: Array) -> MotorLines:
-    """Return the motors of legs in R_b as lines in the base link [m], joints at A (k, n, 3) there.
-
-    Motors stand in the base link, also where A defines R_b.
-    """
     frame = machine.T_base_Rb
+    A, B = ends_in_base(legs, frame, *components(poses), q[:, first_rods(legs)])
     turn = frame.rotation.as_matrix()
     lines = motor_lines(legs, (A - frame.translation) @ turn)
-    return MotorLines(*(points @ turn.T + frame.translation for points in lines))
+    return PlacedModel(A, B, *(points @ turn.T + frame.translation for points in lines))
 
 
 def directions(
@@ -82,9 +94,3 @@ def directions(
     for words, row in zip(result.held, result.kinematic.held, strict=False):
         found.append((f"1 mm along what is held: {words}", _HELD * np.array(row)[order]))
     return found
-
-
-def step_shown(moved: float, size: float) -> int:
-    """Return which of ``FACTORS`` makes a motion [m] visible on a machine of some size [m]."""
-    wanted = _SHOWN * size / max(moved, 1e-12)
-    return max(k for k, factor in enumerate(FACTORS) if factor <= max(wanted, 1.0))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,19 +14,19 @@ from legcal.machine import (
     Machine,
     corners_of_base,
     geometries,
+    motor_lines,
     moved_legs,
     parametrization_of,
     platform_in_base,
 )
 from legcal.scene import (
     FACTORS,
+    PlacedModel,
     around,
     directions,
     ellipsoids,
-    ends_at_readings,
     enlargement,
-    motors_at,
-    step_shown,
+    placed_model,
 )
 from legcal.viewer.motion import Posture
 from legcal.viewer.source import Source
@@ -60,15 +59,6 @@ class Seen:
     beside: tuple[Array, Array] | None  # A and B of what it is compared with
     skeleton: Array | None  # (m, 2, 3) lines of that
     apart: float  # how far joints are from those beside, without exaggeration [m]
-
-
-class _Placed(NamedTuple):
-    """Joints and motors of a model at a posture, in the base link [m]."""
-
-    A: Array  # (n, 3)
-    B: Array  # (n, 3)
-    anchors: Array  # (n_motors, 3) where motors that move joints at A stand
-    motors: Array  # (m, 2, 3) their rails and axes, then carriages and arms
 
 
 class Stage:
@@ -109,7 +99,7 @@ class Stage:
         thin = _THIN * self.size
         self._radii = np.array([p[1] for p in parts] + [thin] * len(bare))
         self.n_standing = len(self.machine.actuators)
-        home = motors_at(self.machine, self._legs, A[None])
+        home = motor_lines(self.machine.legs, A[None])
         thickest = float(self._radii.max())
         self._motor_radii = thickest * np.array(
             [_STANDING] * self.n_standing + [_MOVING] * home.moving.shape[1]
@@ -144,7 +134,7 @@ class Stage:
 
     def compared(
         self, posture: Posture, motion: int | None = None
-    ) -> tuple[_Placed, _Placed] | None:
+    ) -> tuple[PlacedModel, PlacedModel] | None:
         """Return the joints before and after what is compared, at the readings of a posture.
 
         That is what the calibration changed, or one sigma along a direction, number *motion*.
@@ -165,8 +155,7 @@ class Stage:
         if compared is None:
             return FACTORS.index(1)
         before, after = compared
-        moved = max(float(np.abs(b - a).max()) for a, b in zip(before[:2], after[:2], strict=True))
-        return step_shown(moved, self.size)
+        return before.first_step(after, self.size)
 
     def seen(
         self,
@@ -193,38 +182,32 @@ class Stage:
             here, before, apart = self._placed(self._legs, posture, by_readings=False), None, 0.0
         else:
             before, after = compared
-            apart = float(np.linalg.norm(np.subtract(after[:2], before[:2]), axis=2).max())
-            share = factor * phase
-            here = _Placed(*(a + share * (b - a) for a, b in zip(before, after, strict=True)))
+            apart = float(np.linalg.norm(np.subtract(after[:2], before[:2]), axis=-1).max())
+            here = before.moved_towards(after, factor * phase)
         return Seen(
-            here.A,
-            here.B,
-            self._rods(here.A, here.B),
-            corners_of_base(here.A, here.anchors),
-            _between(here.motors, self._motor_radii),
-            None if before is None else (before.A, before.B),
+            here.A[0],
+            here.B[0],
+            self._rods(here.A[0], here.B[0]),
+            corners_of_base(here.A[0], here.anchors),
+            _between(_motors(here), self._motor_radii),
+            None if before is None else (before.A[0], before.B[0]),
             None if before is None else self._skeleton(before),
             apart,
         )
 
     def _placed(
         self, legs: Sequence[Leg], posture: Posture, *, by_readings: bool = True
-    ) -> _Placed:
-        """Return joints and motors of legs at the readings of a posture."""
+    ) -> PlacedModel:
+        """Return what is seen of legs at the readings of a posture, k = 1."""
         near = platform_in_base(self.machine, posture.T)
         by_readings = by_readings and self.machine.is_determined
-        A, B = ends_at_readings(
-            self.machine, legs, posture.q[None], [near], by_readings=by_readings
-        )
-        motors = motors_at(self.machine, legs, A)
-        lines = np.concatenate([motors.standing, motors.moving[0]])
-        return _Placed(A[0], B[0], motors.anchors, lines)
+        return placed_model(self.machine, legs, posture.q[None], [near], by_readings=by_readings)
 
-    def _skeleton(self, placed: _Placed) -> Array:
+    def _skeleton(self, placed: PlacedModel) -> Array:
         """Return legs, motors and rims as lines (m, 2, 3)."""
-        found = [np.stack([placed.A, placed.B], axis=1), placed.motors]
-        corners = corners_of_base(placed.A, placed.anchors), placed.B
-        for joints, rim in zip(corners, self.rims, strict=True):
+        A, B = placed.A[0], placed.B[0]
+        found = [np.stack([A, B], axis=1), _motors(placed)]
+        for joints, rim in zip((corners_of_base(A, placed.anchors), B), self.rims, strict=True):
             found.append(np.stack([joints[rim[:-1]], joints[rim[1:]]], axis=1))
         return np.concatenate(found)
 
@@ -239,6 +222,11 @@ class Stage:
         position = A[self.rod_legs] + ends.mean(axis=1)[:, None] * along
         scale = np.stack([self._radii, self._radii, np.ptp(ends, axis=1)], axis=1)
         return Rods(position, from_z(along), scale)
+
+
+def _motors(placed: PlacedModel) -> Array:
+    """Return motors as lines (m, 2, 3): what stands, then what moves."""
+    return np.concatenate([placed.standing, placed.moving[0]])
 
 
 def _between(ends: Array, radii: Array) -> Rods:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration import Calibration
 from legcal.data import row_names
@@ -16,14 +15,13 @@ from legcal.pages import Plot, plain
 from legcal.report.page.residual_plots import FONT
 from legcal.scene import (
     FACTORS,
+    PlacedModel,
     around,
     directions,
     ellipsoids,
-    ends_at_readings,
     enlargement,
-    motors_at,
+    placed_model,
     pyramid,
-    step_shown,
 )
 
 MAX_POSES = 60  # of the slider
@@ -38,59 +36,33 @@ _GREY, _BLUE, _AMBER, _GREEN = "#9aa1ab", "#1f5fa8", "#b26a00", "#1e7d46"
 _NO_LINES = np.zeros((0, 2, 3))
 
 
-class _Placed(NamedTuple):
-    """What is drawn of a model at k poses, in the base link [m]."""
-
-    A: Array  # (k, n_legs, 3)
-    B: Array  # (k, n_legs, 3)
-    standing: Array  # (m, 2, 3) rim of the base, rails and axes of motors that move joints at A
-    moving: Array  # (k, m, 2, 3) carriages and arms
-
-
 def machine_scene(calibration: Calibration) -> Plot:
     """Return the machine, its sliders moving pose and exaggeration of what is shown."""
-    machine, solution = calibration.dataset.machine, calibration.solution
-    measurements = calibration.dataset.measurements
-    chosen = np.unique(
-        np.linspace(0, measurements.n_poses - 1, min(MAX_POSES, measurements.n_poses)).astype(int)
-    )
-    q = measurements.q_of_poses[chosen]
-    fitted = [solution.T_Rb_Re[k] for k in chosen.tolist()]
-    turn_base = machine.T_base_Rb.rotation.as_matrix()
-    turn_platform = machine.T_platform_Re.rotation.as_matrix().T
+    machine, measurements = calibration.dataset.machine, calibration.dataset.measurements
+    n = measurements.n_poses
+    chosen = np.unique(np.linspace(0, n - 1, min(MAX_POSES, n)).astype(int))
+    T = [calibration.solution.T_Rb_Re[k] for k in chosen.tolist()]
+    q, by_readings = measurements.q_of_poses[chosen], calibration.platform is not None
 
-    rim: list[int] = []  # of where motors stand: the same for all that are compared
+    def placed(legs: Sequence[Leg]) -> PlacedModel:
+        return placed_model(machine, legs, q, T, by_readings=by_readings)
 
-    def placed(legs: Sequence[Leg], near: Sequence[RigidTransform]) -> _Placed:
-        """Return what is drawn of legs at the readings, in the base link."""
-        by_readings = calibration.platform is not None
-        A, B = ends_at_readings(machine, legs, q, near, by_readings=by_readings)
-        motors = motors_at(machine, legs, A)
-        rim[:] = rim or (around(motors.anchors) if len(motors.anchors) > 2 else [])
-        edges = motors.anchors[np.stack([rim[:-1], rim[1:]], axis=1)] if rim else _NO_LINES
-        standing = np.concatenate([edges, motors.standing])
-        return _Placed(A, B, standing, motors.moving)
-
-    found = placed(solution.legs, fitted)
+    found = placed(calibration.solution.legs)
+    # What motors stand about is the same for all models that are compared.
+    rim = around(found.anchors) if len(found.anchors) > 2 else []
     size = float(np.ptp(np.concatenate([found.A[0], found.B[0]]), axis=0).max())
-    nominal = placed(geometries(machine), fitted)
-    legend = ("nominal", "calibrated")
-    modes = [_mode("what the calibration changed", legend, nominal, found, size)]
-    parameters = solution.parametrization
-    length = float(np.mean(np.linalg.norm(found.B[0] - found.A[0], axis=1)))
-    for what, step in directions(calibration.result, parameters, length):
-        legs = moved_legs(solution.legs, parameters.place, step)
-        legend = ("calibrated", "moved along the direction")
-        modes.append(_mode(what, legend, found, placed(legs, fitted), size))
+    modes = _modes(calibration, found, placed, rim, size)
     rings, ring_factor = _rings(calibration, size)
     images = row_names(measurements)
+    turn_base = machine.T_base_Rb.rotation.as_matrix()
+    turn_platform = machine.T_platform_Re.rotation.as_matrix().T
     extra = {
         "modes": modes,
         "factors": FACTORS,
         "steps": len(FACTORS) - 1,
         "step": modes[0]["step"],
         "poses": [plain(images[row]) for row in measurements.first_rows[chosen].tolist()],
-        "turns": _rounded(turn_base @ components(fitted)[0] @ turn_platform, 6),
+        "turns": _rounded(turn_base @ components(T)[0] @ turn_platform, 6),
         "rings": rings,
         "outline": {"base": around(found.A[0]), "platform": around(found.B[0])},
         "traces": {
@@ -101,7 +73,6 @@ def machine_scene(calibration: Calibration) -> Plot:
             "motors": [7, 8],
         },
     }
-    names = [plain(name) for name in machine.leg_names]
     cameras = _cameras(calibration, 0.25 * size)
     traces = [
         _lines("nominal", _GREY, 3),
@@ -114,27 +85,10 @@ def machine_scene(calibration: Calibration) -> Plot:
         _lines("nominal motors", _GREY, 4, legend=False),
         _lines("calibrated motors", MOTOR_COLOUR, 8, legend=False),
         cameras,
-        _words(names, found.A[0], "#1d2126"),
+        _words([plain(name) for name in machine.leg_names], found.A[0], "#1d2126"),
     ]
-    hidden = {"showbackground": False, "gridcolor": "#e8ebef", "zeroline": False,
-              "title": {"text": ""}, "tickfont": {"size": 10, "color": "#667080"}}  # fmt: skip
-    seen = [[v for v in cameras[a] if v is not None] for a in "xyz"]
-    frame_of_view = _view(
-        np.concatenate([*found.A, *found.B, *found.standing]), np.array(seen).T, size
-    )
-    look = {
-        "font": FONT,
-        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
-        "showlegend": True,
-        "legend": {"x": 0, "y": 1, "bgcolor": "rgba(255,255,255,0.7)"},
-        "uirevision": "kept",
-        "scene": {
-            f"{a}axis": {**hidden, "title": {"text": f"{a} [m]"}, "range": between}
-            for a, between in zip("xyz", frame_of_view["range"], strict=True)
-        }
-        | frame_of_view["look"],
-    }
-    n = measurements.n_poses
+    seen = np.array([[v for v in cameras[a] if v is not None] for a in "xyz"]).T
+    solid = np.concatenate([*found.A, *found.B, *_standing(found, rim)])
     left_out = f" {len(chosen)} of {n} poses are shown." if len(chosen) < n else ""
     caption = (
         "Drag to turn, scroll to zoom. Grey is the nominal model, blue the calibrated one at the "
@@ -143,7 +97,52 @@ def machine_scene(calibration: Calibration) -> Plot:
         "standard deviation at the joints: those that define R_b and R_e have flat ones or none."
         f"{' Brown are arms and carriages, at the readings.' * bool(machine.actuators)}{left_out}"
     )
-    return Plot("machine-scene", traces, look, 560, caption, extra)
+    return Plot("machine-scene", traces, _layout(solid, seen, size), 560, caption, extra)
+
+
+def _modes(
+    calibration: Calibration,
+    found: PlacedModel,
+    placed: Callable[[Sequence[Leg]], PlacedModel],
+    rim: Sequence[int],
+    size: float,
+) -> list[dict[str, Any]]:
+    """Return the differences that can be shown: of the calibration, and along directions."""
+    solution = calibration.solution
+    nominal = placed(geometries(calibration.dataset.machine))
+    legend = ("nominal", "calibrated")
+    modes = [_mode("what the calibration changed", legend, nominal, found, rim, size)]
+    length = float(np.mean(np.linalg.norm(found.B[0] - found.A[0], axis=1)))
+    legend = ("calibrated", "moved along the direction")
+    for what, step in directions(calibration.result, solution.parametrization, length):
+        moved = placed(moved_legs(solution.legs, solution.parametrization.place, step))
+        modes.append(_mode(what, legend, found, moved, rim, size))
+    return modes
+
+
+def _standing(placed: PlacedModel, rim: Sequence[int]) -> Array:
+    """Return the rim of where motors stand, and rails and axes, as lines (m, 2, 3)."""
+    edges = placed.anchors[np.stack([rim[:-1], rim[1:]], axis=1)] if rim else _NO_LINES
+    return np.concatenate([edges, placed.standing])
+
+
+def _layout(machine: Array, cameras: Array, size: float) -> dict[str, Any]:
+    """Return the layout that shows points of a machine, and cameras as far as there is room."""
+    hidden = {"showbackground": False, "gridcolor": "#e8ebef", "zeroline": False,
+              "title": {"text": ""}, "tickfont": {"size": 10, "color": "#667080"}}  # fmt: skip
+    view = _view(machine, cameras, size)
+    return {
+        "font": FONT,
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "showlegend": True,
+        "legend": {"x": 0, "y": 1, "bgcolor": "rgba(255,255,255,0.7)"},
+        "uirevision": "kept",
+        "scene": {
+            f"{a}axis": {**hidden, "title": {"text": f"{a} [m]"}, "range": between}
+            for a, between in zip("xyz", view["range"], strict=True)
+        }
+        | view["look"],
+    }
 
 
 def _view(machine: Array, cameras: Array, size: float) -> dict[str, Any]:
@@ -175,18 +174,18 @@ def _view(machine: Array, cameras: Array, size: float) -> dict[str, Any]:
 def _mode(
     name: str,
     legend: tuple[str, str],
-    before: _Placed,
-    after: _Placed,
+    before: PlacedModel,
+    after: PlacedModel,
+    rim: Sequence[int],
     size: float,
 ) -> dict[str, Any]:
     """Return what is shown of a difference, exaggerated at first so that it is seen."""
-    moved = max(float(np.abs(b - a).max()) for a, b in zip(before[:2], after[:2], strict=True))
     # Joints at A that no motor moves are given once.
     poses = slice(1 if all(np.ptp(A, axis=0).max() == 0.0 for A in (before.A, after.A)) else None)
     return {
         "name": name,
         "legend": legend,
-        "step": step_shown(moved, size),
+        "step": before.first_step(after, size),
         "base": [
             [_rounded(a, 7), _rounded(b, 7)]
             for a, b in zip(before.A[poses], after.A[poses], strict=True)
@@ -194,7 +193,7 @@ def _mode(
         "platform": [
             [_rounded(a, 7), _rounded(b, 7)] for a, b in zip(before.B, after.B, strict=True)
         ],
-        "standing": [_rounded(one.standing.reshape(-1, 3), 6) for one in (before, after)],
+        "standing": [_rounded(_standing(one, rim).reshape(-1, 3), 6) for one in (before, after)],
         "motors": [
             [_rounded(one.reshape(-1, 3), 6) for one in both]
             for both in zip(before.moving[poses], after.moving[poses], strict=True)
