@@ -10,8 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.joint_fit import DISAGREES, Solution
 from legcal.data import Measurements, few
@@ -76,10 +78,8 @@ def outlier_images(
         ]
         if len(wrong) < MIN_REJECTED * len(judged) or len(legs) < MIN_REJECTED_LEGS:
             continue
-        explanation = _wrong_reading(measurements, machine, solution, row, judged)
-        if not explanation:
-            alone = _shown(measurements, machine, solution, row, judged)
-            explanation = _explanation(measurements, machine, row, alone)
+        image = _Image(measurements, machine, solution, row)
+        explanation = image.wrong_reading(judged) or image.explanation(judged)
         if not explanation and len(wrong) < MIN_REJECTED_UNEXPLAINED * len(judged):
             continue  # the outlines are wrong, not the image
         notes[row] = (
@@ -89,194 +89,216 @@ def outlier_images(
     return notes
 
 
-def _shown(
-    measurements: Measurements,
-    machine: Machine,
-    solution: Solution,
-    row: int,
-    chosen: IntArray,
-    held: Sequence[int] = (),
-) -> _Shown | None:
-    """Return what outlines of an image show, with the readings of some legs or by themselves.
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """An image that was fitted, and what its outlines say of its readings."""
 
-    None if they do not determine the pose.
-    """
-    o = solution.outlines
-    chosen = chosen[np.isfinite(o.h[chosen]).all(axis=1)]
-    legs = o.leg[chosen]
-    n = len(chosen)
-    if n + len(held) < MIN_OUTLINES or (not held and len(np.unique(legs)) < MIN_LEGS):
-        return None
-    T_camera_Rb = solution.T_camera_Rb[int(measurements.view[row])]
-    B = np.array([leg.B for leg in solution.legs])
-    on = actuator_index(solution.legs)
-    read = [on.index(a) for a in range(max(on) + 1)]
-    q_row = measurements.q[row : row + 1]
-    A = joints_at(solution.legs, q_row[:, read])[0]
-    T_here = solution.T_Rb_Re[int(measurements.pose[row])]
-    at, slope = np.zeros(len(B)), np.ones(len(B))
-    for j, leg in enumerate(solution.legs):
-        if leg.actuator is not None:  # the reading at which the rod would have its length
-            by_q = leg.actuator.motion(leg.A, q_row[:, j]).by_q[0]
-            AB = T_here.apply(leg.B) - A[j]
-            at[j], slope[j] = q_row[0, j], float(by_q @ AB) / float(np.linalg.norm(AB))
-    radius = np.array([solution.radii[int(o.leg[i]), o.part[i]] for i in chosen.tolist()])
-    signed = np.where(o.edge[chosen] == 1, radius, -radius)
-    q0 = np.array([leg.q0 for leg in solution.legs])
-    sign = np.array([leg.sign for leg in machine.legs], dtype=np.float64)
-    normal_Rb = o.h[chosen] @ T_camera_Rb.rotation.as_matrix()  # of the planes of outlines
+    measurements: Measurements
+    machine: Machine
+    solution: Solution
+    row: int
 
-    def distances(state: _State) -> Residuals:
-        arm = B @ state.pose.R[0].T
-        ends = T_camera_Rb.apply(arm + state.pose.t)[legs]
-        J = np.concatenate([cross(arm[legs], normal_Rb), normal_Rb], axis=1)
-        return Residuals.of((np.sum(o.h[chosen] * ends, axis=1) - signed)[:, None], J[:, None])
+    @property
+    def given(self) -> Array:
+        """The readings of its row, (n_legs,) [m or rad]."""
+        return np.asarray(self.measurements.q[self.row])
 
-    def readings(state: _State) -> tuple[Array, Array]:
-        arm = B @ state.pose.R[0].T
-        AB = arm + state.pose.t - A
+    @property
+    def fitted_pose(self) -> RigidTransform:
+        """T_Rb_Re where the fit has it."""
+        return self.solution.T_Rb_Re[int(self.measurements.pose[self.row])]
+
+    @cached_property
+    def _joints(self) -> tuple[Array, Array]:
+        """A and B of the fit, (n_legs, 3), in R_b and R_e [m]."""
+        legs, on = self.solution.legs, actuator_index(self.solution.legs)
+        read = [on.index(a) for a in range(max(on) + 1)]
+        return joints_at(legs, self.given[None, read])[0], np.array([leg.B for leg in legs])
+
+    @cached_property
+    def _length_laws(self) -> tuple[Array, Array]:
+        """Readings (n_legs,) from which lengths are counted, and how lengths grow from there.
+
+        Those of a rod on an actuator are linear about the reading that is given.
+        """
+        A, B = self._joints
+        at, slope = np.zeros(len(B)), np.ones(len(B))
+        for j, leg in enumerate(self.solution.legs):
+            if leg.actuator is not None:
+                by_q = leg.actuator.motion(leg.A, self.given[j : j + 1]).by_q[0]
+                AB = self.fitted_pose.apply(leg.B) - A[j]
+                at[j], slope[j] = self.given[j], float(by_q @ AB) / float(np.linalg.norm(AB))
+        return at, slope
+
+    def readings_at(self, pose: Frames) -> tuple[Array, Array]:
+        """Return the readings (n_legs,) at a pose, and their derivatives (n_legs, 6) by it."""
+        (A, B), (at, slope) = self._joints, self._length_laws
+        q0 = np.array([leg.q0 for leg in self.solution.legs])
+        sign = np.array([leg.sign for leg in self.machine.legs], dtype=np.float64)
+        arm = B @ pose.R[0].T
+        AB = arm + pose.t - A
         length = np.linalg.norm(AB, axis=1)
         u = (sign / slope)[:, None] * AB / length[:, None]
         return at + sign * (length - q0) / slope, np.concatenate([cross(arm, u), u], axis=1)
 
-    def differences(state: _State) -> Residuals:
-        q, J = readings(state)
-        r = q[list(held)] - measurements.q[row, list(held)]
-        return Residuals.of((white * r)[:, None], white[:, None, None] * J[list(held), None])
+    def _distances(self, chosen: IntArray, pose: Frames) -> Residuals:
+        """Return how far B at a pose is off the chosen outlines [m]."""
+        o, (_, B) = self.solution.outlines, self._joints
+        legs = o.leg[chosen]
+        radii = [self.solution.radii[int(o.leg[i]), o.part[i]] for i in chosen.tolist()]
+        signed = np.where(o.edge[chosen] == 1, radii, np.negative(radii))
+        T = self.solution.T_camera_Rb[int(self.measurements.view[self.row])]
+        normal_Rb = o.h[chosen] @ T.rotation.as_matrix()  # of the planes of outlines
+        arm = B @ pose.R[0].T
+        ends = T.apply(arm + pose.t)[legs]
+        J = np.concatenate([cross(arm[legs], normal_Rb), normal_Rb], axis=1)
+        return Residuals.of((np.sum(o.h[chosen] * ends, axis=1) - signed)[:, None], J[:, None])
 
-    sigma = measurements.sigma_of(machine.legs)
-    white = 1.0 / np.maximum(_by(machine, READING_NOISE), sigma)[list(held)]
-    zero, m = np.zeros(max(n, len(held)), dtype=np.intp), len(held)
-    of_outlines, of_readings = (("pose", zero[:k], slice(None)) for k in (n, m))
-    by_noise = 1.0 / MIN_NOISE
-    factors = [Factor("outlines", distances, (of_outlines,), n, 1, whitening=by_noise, robust=True)]
-    if held:
-        factors.append(Factor("readings", differences, (of_readings,), m, 1))
-    pose = Variables("pose", all_free(1, 6), Frames.moved, max_step=MAX_STEP)
-    problem, loss = Problem[_State]((pose,), None, tuple(factors)), LOSS
-    begin = _State(Frames.of([solution.T_Rb_Re[int(measurements.pose[row])]]))
-    try:
-        found = minimise(problem, begin, loss)
-    except DidNotConverge:
-        return None
-    normal = normal_equations(problem, found.state, found.linear, loss).U
-    if np.linalg.cond(normal) > 1e12:
-        return None
-    scale = max(1.0, 1.48 * float(np.median(np.abs(found.linear["outlines"].r))))
-    q, J = readings(found.state)
-    ends = (B @ found.state.pose.R[0].T + found.state.pose.t)[:, None]
-    for j, leg in enumerate(solution.legs):
-        if leg.actuator is not None:  # far from the given reading its slope is another one
-            q[j] = reading_of_rod(leg, ends[j])[0]
-    variance = scale**2 * np.einsum("ja,ab,jb->j", J, np.linalg.inv(normal), J)
-    return _Shown(q, np.sqrt(variance), scale * MIN_NOISE, found.cost / scale**2)
+    def shown(self, chosen: IntArray, held: Sequence[int] = ()) -> _Shown | None:
+        """Return what outlines show, with the readings of some legs or by themselves.
 
+        None if they do not determine the pose.
+        """
+        o, legs, held = self.solution.outlines, self.solution.legs, list(held)
+        chosen = chosen[np.isfinite(o.h[chosen]).all(axis=1)]
+        n, m = len(chosen), len(held)
+        if n + m < MIN_OUTLINES or (not held and len(np.unique(o.leg[chosen])) < MIN_LEGS):
+            return None
+        noise = np.maximum(self._by(READING_NOISE), self.measurements.sigma_of(self.machine.legs))
+        white = 1.0 / noise[held]
 
-def _wrong_reading(
-    measurements: Measurements, machine: Machine, solution: Solution, row: int, chosen: IntArray
-) -> str:
-    """Return which reading is wrong if the outlines suit all others, and no others but these."""
-    motors = list(machine.motors)
-    shown: dict[int, _Shown] = {}
-    for leg in motors:
-        held = [other for other in motors if other != leg]
-        found = _shown(measurements, machine, solution, row, chosen, held)
-        if found is None:
+        def differences(state: _State) -> Residuals:
+            q, J = self.readings_at(state.pose)
+            r = q[held] - self.given[held]
+            return Residuals.of((white * r)[:, None], white[:, None, None] * J[held, None])
+
+        zero = np.zeros(max(n, m), dtype=np.intp)
+        of_outlines, of_readings = (("pose", zero[:k], slice(None)) for k in (n, m))
+        factors: list[Factor[_State]] = [
+            Factor(
+                "outlines",
+                lambda state: self._distances(chosen, state.pose),
+                (of_outlines,),
+                n,
+                1,
+                whitening=1.0 / MIN_NOISE,
+                robust=True,
+            )
+        ]
+        if held:
+            factors.append(Factor("readings", differences, (of_readings,), m, 1))
+        pose = Variables("pose", all_free(1, 6), Frames.moved, max_step=MAX_STEP)
+        problem = Problem[_State]((pose,), None, tuple(factors))
+        try:
+            found = minimise(problem, _State(Frames.of([self.fitted_pose])), LOSS)
+        except DidNotConverge:
+            return None
+        normal = normal_equations(problem, found.state, found.linear, LOSS).U
+        if np.linalg.cond(normal) > 1e12:
+            return None
+        scale = max(1.0, 1.48 * float(np.median(np.abs(found.linear["outlines"].r))))
+        q, J = self.readings_at(found.state.pose)
+        ends = (self._joints[1] @ found.state.pose.R[0].T + found.state.pose.t)[:, None]
+        for j, leg in enumerate(legs):
+            if leg.actuator is not None:  # far from the given reading its slope is another one
+                q[j] = reading_of_rod(leg, ends[j])[0]
+        variance = scale**2 * np.einsum("ja,ab,jb->j", J, np.linalg.inv(normal), J)
+        return _Shown(q, np.sqrt(variance), scale * MIN_NOISE, found.cost / scale**2)
+
+    def wrong_reading(self, chosen: IntArray) -> str:
+        """Return which reading is wrong if outlines suit all others, and no others but these."""
+        motors = list(self.machine.motors)
+        shown: dict[int, _Shown] = {}
+        for leg in motors:
+            found = self.shown(chosen, [other for other in motors if other != leg])
+            if found is None:
+                return ""
+            shown[leg] = found
+        noise = min((each.noise for each in shown.values()), default=0.0)
+        cost = {leg: each.cost * (each.noise / noise) ** 2 for leg, each in shown.items()}
+        best, *others = sorted(motors, key=cost.__getitem__)
+        if others and cost[others[0]] - cost[best] < 0.5 * SIGNIFICANT_SIGMAS**2:
             return ""
-        shown[leg] = found
-    noise = min((each.noise for each in shown.values()), default=0.0)
-    cost = {leg: each.cost * (each.noise / noise) ** 2 for leg, each in shown.items()}
-    best, *others = sorted(motors, key=cost.__getitem__)
-    if others and cost[others[0]] - cost[best] < 0.5 * SIGNIFICANT_SIGMAS**2:
-        return ""
-    found, given = shown[best], float(measurements.q[row, best])
-    value, sigma = float(found.readings[best]), float(found.sigma[best])
-    off = np.abs(found.readings - measurements.q[row])
-    least = _least(measurements, machine)
-    if np.any((off > least)[[other for other in motors if other != best]]):
-        return ""  # it is not the only one
-    noise = machine.legs[best].reading_of(found.noise)
-    if off[best] < max(SIGNIFICANT_SIGMAS * max(sigma, noise), float(least[best])):
-        return ""
-    if not _is_in_travel(machine, best, value, sigma):
-        return ""
-    return _one_wrong(machine, best, value, sigma, given)
+        found = shown[best]
+        value, sigma = float(found.readings[best]), float(found.sigma[best])
+        off, least = np.abs(found.readings - self.given), self._least
+        if np.any((off > least)[[other for other in motors if other != best]]):
+            return ""  # it is not the only one
+        noise = self.machine.legs[best].reading_of(found.noise)
+        if off[best] < max(SIGNIFICANT_SIGMAS * max(sigma, noise), float(least[best])):
+            return ""
+        return self._one_wrong(best, value, sigma) if self._is_in_travel(best, value, sigma) else ""
 
+    def explanation(self, chosen: IntArray) -> str:
+        """Return the probable cause by the outlines alone, and what to check.
 
-def _one_wrong(machine: Machine, leg: int, shown: float, sigma: float, given: float) -> str:
-    size, unit = SHOWN_IN[machine.legs[leg].reading_unit]
-    return (
-        f"it shows a reading of {machine.legs[leg].prismatic} of {size * shown:.2f} +- "
-        f"{size * sigma:.2f} {unit}, given {size * given:.2f} {unit}; check that reading"
-    )
-
-
-def _by(machine: Machine, distance: float) -> Array:
-    """Return the readings (n_legs,) [m or rad] that move a joint so far [m]."""
-    return np.array([leg.reading_of(distance) for leg in machine.legs])
-
-
-def _least(measurements: Measurements, machine: Machine) -> Array:
-    """Return by how much readings (n_legs,) are wrong at least where they are said to be."""
-    sigma = measurements.sigma_of(machine.legs)
-    return np.maximum(_by(machine, MIN_READING_ERROR), SIGNIFICANT_SIGMAS * sigma)
-
-
-def _is_in_travel(machine: Machine, leg: int, reading: float, sigma: float) -> bool:
-    """Say whether a leg has a reading, as far as it is known."""
-    low, high = machine.legs[leg].travel
-    margin = BEYOND_TRAVEL * (high - low) + SIGNIFICANT_SIGMAS * sigma
-    return low - margin <= reading <= high + margin
-
-
-def _explanation(
-    measurements: Measurements,
-    machine: Machine,
-    row: int,
-    alone: _Shown | None,  # by its outlines alone
-) -> str:
-    """Return the probable cause and what to check; "" where the readings agree with the image."""
-    motors = list(machine.motors)
-    if alone is None or not motors:
-        return "check its reading and that nobody moved camera or machine"
-    given = measurements.q[row, motors]
-    shown, sigma = alone.readings[motors], alone.sigma[motors]
-    off = shown - given
-    least = np.maximum(SIGNIFICANT_SIGMAS * sigma, _least(measurements, machine)[motors])
-    wrong = np.flatnonzero(np.abs(off) > least)
-    if len(wrong) == 0:
-        return ""
-    distance = np.abs(measurements.q[:, motors] - shown)
-    alike = [
-        other
-        for other in range(measurements.n_rows)
-        if measurements.image[other]
-        and measurements.pose[other] != measurements.pose[row]
-        and np.all(distance[other] < np.maximum(least, _by(machine, SAME_READING)[motors]))
-    ]
-    if alike:
-        nearest = min(alike, key=lambda other: float(distance[other].max()))
+        It is "" where the readings agree with the image.
+        """
+        m, motors, alone = self.measurements, list(self.machine.motors), self.shown(chosen)
+        if alone is None or not motors:
+            return "check its reading and that nobody moved camera or machine"
+        shown, sigma, given = alone.readings[motors], alone.sigma[motors], self.given[motors]
+        least = np.maximum(SIGNIFICANT_SIGMAS * sigma, self._least[motors])
+        wrong = np.flatnonzero(np.abs(shown - given) > least)
+        if len(wrong) == 0:
+            return ""
+        distance = np.abs(m.q[:, motors] - shown)
+        same = np.maximum(least, self._by(SAME_READING)[motors])
+        alike = [
+            other
+            for other in range(m.n_rows)
+            if m.image[other]
+            and m.pose[other] != m.pose[self.row]
+            and np.all(distance[other] < same)
+        ]
+        if alike:
+            nearest = min(alike, key=lambda other: float(distance[other].max()))
+            return (
+                f"it shows the reading given for image {m.image[nearest]}; check which image "
+                "belongs to which row"
+            )
+        if not all(self._is_in_travel(motors[k], shown[k], sigma[k]) for k in wrong):
+            return (
+                "its outlines suit no pose within the travel of the legs; check that it was taken "
+                "with this reading and that nobody moved camera or machine"
+            )
+        if len(wrong) == 1:
+            k = int(wrong[0])
+            return self._one_wrong(motors[k], shown[k], sigma[k])
+        legs = [self.machine.legs[motors[k]] for k in wrong]
+        travel = np.transpose([leg.travel for leg in legs])
+        possible = np.abs(np.clip(shown[wrong], *travel) - given[wrong])
+        worst = dict[str, float]()
+        for leg, off in zip(legs, possible.tolist(), strict=True):
+            size, unit = SHOWN_IN[leg.reading_unit]
+            worst[unit] = max(worst.get(unit, 0.0), size * off)
         return (
-            f"it shows the reading given for image {measurements.image[nearest]}; check which "
-            "image belongs to which row"
+            "it shows another pose than its reading says, with readings of "
+            f"{few([str(leg.prismatic) for leg in legs])} off by up to "
+            f"{' and '.join(f'{most:.1f} {unit}' for unit, most in worst.items())}; check that it "
+            "was taken there"
         )
-    if not all(_is_in_travel(machine, motors[k], shown[k], sigma[k]) for k in wrong):
+
+    def _one_wrong(self, leg: int, shown: float, sigma: float) -> str:
+        joint, given = self.machine.legs[leg].prismatic, float(self.given[leg])
+        size, unit = SHOWN_IN[self.machine.legs[leg].reading_unit]
         return (
-            "its outlines suit no pose within the travel of the legs; check that it was taken with "
-            "this reading and that nobody moved camera or machine"
+            f"it shows a reading of {joint} of {size * shown:.2f} +- {size * sigma:.2f} {unit}, "
+            f"given {size * given:.2f} {unit}; check that reading"
         )
-    if len(wrong) == 1:
-        k = int(wrong[0])
-        return _one_wrong(machine, motors[k], shown[k], sigma[k], given[k])
-    names = [str(machine.legs[motors[k]].prismatic) for k in wrong]
-    travel = [machine.legs[motors[k]].travel for k in wrong]
-    possible = np.clip(shown[wrong], *np.transpose(travel)) - given[wrong]
-    worst = dict[str, float]()
-    for k, off_by in zip(wrong.tolist(), np.abs(possible).tolist(), strict=True):
-        size, unit = SHOWN_IN[machine.legs[motors[k]].reading_unit]
-        worst[unit] = max(worst.get(unit, 0.0), size * off_by)
-    return (
-        f"it shows another pose than its reading says, with readings of {few(names)} off by up to "
-        f"{' and '.join(f'{most:.1f} {unit}' for unit, most in worst.items())}; check that it was "
-        "taken there"
-    )
+
+    def _by(self, distance: float) -> Array:
+        """Return the readings (n_legs,) [m or rad] that move a joint so far [m]."""
+        return np.array([leg.reading_of(distance) for leg in self.machine.legs])
+
+    @property
+    def _least(self) -> Array:
+        """By how much readings (n_legs,) are wrong at least where they are said to be."""
+        sigma = self.measurements.sigma_of(self.machine.legs)
+        return np.maximum(self._by(MIN_READING_ERROR), SIGNIFICANT_SIGMAS * sigma)
+
+    def _is_in_travel(self, leg: int, reading: float, sigma: float) -> bool:
+        """Say whether a leg has a reading, as far as it is known."""
+        low, high = self.machine.legs[leg].travel
+        margin = BEYOND_TRAVEL * (high - low) + SIGNIFICANT_SIGMAS * sigma
+        return low - margin <= reading <= high + margin

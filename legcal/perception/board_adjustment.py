@@ -136,64 +136,7 @@ def adjust_board(
     printers do. None if no place near the start has all corners before the camera.
     """
     names = tuple(free)
-    where = np.array([intrinsic_names(camera).index(name) for name in names], dtype=np.intp)
-    pixel = np.array([name[0] in "fc" for name in names], dtype=np.bool_)
-    known = GaussianPrior(
-        np.arange(len(names), dtype=np.intp),
-        np.where(pixel, intrinsic_values(camera)[where], 0.0),
-        np.where(
-            pixel,
-            _PRIOR_PX * max(camera.width, camera.height),
-            DISTORTION_MODELS[camera.model].prior_sigma,
-        ),
-    )
-
-    def moved(camera: Camera, change: Array) -> Camera:
-        if not names:
-            return camera
-        values = intrinsic_values(camera)[where] + change[0]
-        return with_intrinsics(camera, dict(zip(names, values.tolist(), strict=True)))
-
-    n = len(seen.image)
-    none = np.zeros(n, dtype=np.intp)
-    kept = [
-        Variables(
-            "camera",
-            all_free(1, len(names)),
-            moved,
-            names,
-            ("",) * len(names),
-            lambda camera: intrinsic_values(camera)[where],
-            prior=known,
-        )
-    ]
-    if sheet is not None:
-        kept.append(
-            Variables(
-                "sheet",
-                all_free(1, len(SHEET)),
-                lambda sheet, change: replace(sheet, numbers=sheet.numbers + change[0]),
-                coordinates=lambda sheet: sheet.numbers,
-                prior=GaussianPrior(np.arange(len(SHEET)), np.zeros(len(SHEET)), sheet.prior_sigma),
-            )
-        )
-    problem = Problem[_State](
-        variables=tuple(kept),
-        eliminated=Variables("board_pose", all_free(len(poses), 6), Frames.moved),
-        factors=(
-            Factor(
-                "corners",
-                lambda state: _corners(state, seen, names),
-                tuple((block.name, none, slice(None)) for block in kept),
-                n,
-                2,
-                seen.image,
-                1.0 / seen.sigma_px[:, None, None],
-                robust=True,
-            ),
-        ),
-        name="calibration of the camera" if names else "pose of the board",
-    )
+    problem = _problem(camera, names, sheet, seen, len(poses))
     state = _State(camera, Frames.of(poses), sheet)
     if not np.all(np.isfinite(problem.factor("corners").rows(state).r)):
         return None
@@ -212,6 +155,71 @@ def adjust_board(
         normal.kept_covariance(),
         clustered(problem, linear, normal, LOSS),
         normal.V,
+    )
+
+
+def _problem(
+    camera: Camera, names: tuple[str, ...], sheet: Sheet | None, seen: BoardImages, n_images: int
+) -> Problem[_State]:
+    """Return the problem of the board's poses, named intrinsics and the sheet, where it is one."""
+    blocks = [_intrinsics(camera, names)]
+    if sheet is not None:
+        blocks.append(
+            Variables(
+                "sheet",
+                all_free(1, len(SHEET)),
+                lambda sheet, change: replace(sheet, numbers=sheet.numbers + change[0]),
+                coordinates=lambda sheet: sheet.numbers,
+                prior=GaussianPrior(np.arange(len(SHEET)), np.zeros(len(SHEET)), sheet.prior_sigma),
+            )
+        )
+    one = np.zeros(len(seen.image), dtype=np.intp)
+    corners: Factor[_State] = Factor(
+        "corners",
+        lambda state: _corners(state, seen, names),
+        tuple((block.name, one, slice(None)) for block in blocks),
+        len(seen.image),
+        2,
+        seen.image,
+        1.0 / seen.sigma_px[:, None, None],
+        robust=True,
+    )
+    return Problem[_State](
+        variables=tuple(blocks),
+        eliminated=Variables("board_pose", all_free(n_images, 6), Frames.moved),
+        factors=(corners,),
+        name="calibration of the camera" if names else "pose of the board",
+    )
+
+
+def _intrinsics(camera: Camera, names: tuple[str, ...]) -> Variables:
+    """Return the block of named intrinsics, with priors that say next to nothing."""
+    where = np.array([intrinsic_names(camera).index(name) for name in names], dtype=np.intp)
+    pixel = np.array([name[0] in "fc" for name in names], dtype=np.bool_)
+    prior = GaussianPrior(
+        np.arange(len(names), dtype=np.intp),
+        np.where(pixel, intrinsic_values(camera)[where], 0.0),
+        np.where(
+            pixel,
+            _PRIOR_PX * max(camera.width, camera.height),
+            DISTORTION_MODELS[camera.model].prior_sigma,
+        ),
+    )
+
+    def moved(camera: Camera, change: Array) -> Camera:
+        if not names:
+            return camera
+        values = intrinsic_values(camera)[where] + change[0]
+        return with_intrinsics(camera, dict(zip(names, values.tolist(), strict=True)))
+
+    return Variables(
+        "camera",
+        all_free(1, len(names)),
+        moved,
+        names,
+        ("",) * len(names),
+        lambda camera: intrinsic_values(camera)[where],
+        prior=prior,
     )
 
 
