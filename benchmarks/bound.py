@@ -206,6 +206,11 @@ def page(machines: Sequence[Found], readings: Sequence[str]) -> str:
     lines = [
         "# The fit beside the Cramer-Rao bound",
         "",
+        "The Cramer-Rao bound is the least standard deviation that any unbiased estimator of the "
+        "same data can\nhave. This page says, parameter by parameter, how near the joint fit comes "
+        "to it and whether the\nstandard deviations that it states are right. "
+        "[Accuracy](accuracy.md#the-cramer-rao-bound) sums it up.",
+        "",
         f"Written by `python benchmarks/bound.py` on {date.today()}.",
         "",
         "| machine | runs | error / bound, each parameter | all together "
@@ -213,11 +218,15 @@ def page(machines: Sequence[Found], readings: Sequence[str]) -> str:
         "|---|---|---|---|---|---|---|",
         *(f"| {' | '.join((found['machine'], *cells(found)))} |" for found in machines),
         "",
+        "## How the sessions are made",
+        "",
         *(f"- {line}" for line in readings),
         "",
     ]
     for found in machines:
-        lines += [f"## {found['machine']}", "", *(f"- {line}" for line in remarks(found)), ""]
+        lines += [f"## {found['machine']}", ""]
+        lines += [f"- {line.removeprefix(found['machine'] + ': ')}" for line in remarks(found)]
+        lines.append("")
         if found["runs"]:
             lines += [
                 "| parameter | bound, 1 sigma | error / bound | normalised squared error "

@@ -11,6 +11,7 @@ document and the page of docs/classes.md.
 
 from __future__ import annotations
 
+import re
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -63,6 +64,12 @@ from legcal.simulation import Record, failure_of, has_keys, is_failure, is_numbe
 NOMINAL, FIT = "nominal", "fit"
 STEPS: tuple[Criteria, ...] = ("literal", "default")
 ESTIMATORS = (NOMINAL, *STEPS, FIT)
+HEADINGS = {
+    NOMINAL: "nominal model",
+    "literal": "four steps as printed",
+    "default": "four steps, weighted",
+    FIT: "joint fit",
+}
 NSE = (0.9, 1.1)
 LARGEST_RATIO = 1.05
 _EXACT = 1e-6  # squared standard deviations
@@ -70,18 +77,19 @@ _PLATFORM = {"dX", "dE"}
 _NUMBERS = {"rank", "nse", "of_bound"}
 WORTH = ("determined", "runs", "error/bound", "nse", "covered", "verdict")
 NOTES = (
-    "determined: directions of the kinematic parameters that the fit determines; the others do not "
-    "move the platform and are held where the nominal model has them. Errors are judged on what is "
-    "determined, from the machine that shows exactly the same as the true one and stands there.",
-    "error/bound: all these errors together, in units of the Cramer-Rao bound (root mean square); "
-    "nse: normalised squared error by the covariance that the fit states, 0.9 to 1.1 is asked for; "
-    "covered: stated 95 % intervals of estimated parameters that hold the truth.",
+    "Directions determined: those of the kinematic parameters. The others do not move the platform "
+    "and are held where the nominal model has them. Errors are judged on what is determined, from "
+    "the machine that shows exactly the same as the true one and stands there.",
+    "Error / bound: these errors together, in units of the Cramer-Rao bound (root mean square).",
+    "Normalised squared error (nse): by the covariance that the fit states; 0.9 to 1.1 is asked "
+    "for.",
+    "Covered: stated 95 % intervals of estimated parameters that hold the truth.",
     "Errors of the platform: displacement [mm] and rotation [deg] at the poses measured, mean over "
     "poses and over all sessions of which the estimator made something; in brackets how many "
     "sessions it failed in.",
     "The four steps take the axes that these outlines give with the nominal radii, the readings "
-    "and the nominal model; they look at no camera pose. They take radii as true, and an error of "
-    "2 % of a radius is one of 2 % of the distance.",
+    "and the nominal model. They look at no camera pose. They take radii as true: an error of 2 % "
+    "of a radius is one of 2 % of the distance.",
 )
 
 
@@ -121,7 +129,8 @@ class ClassesStudy(OutlineStudy):
         """Return two rows a machine: what the fit is worth, and errors of the platform."""
         said = [line for found in machines for line in remarks(found)]
         worth = printed(WORTH, [(found["machine"], *worth_cells(found)) for found in machines])
-        platform = [(found["machine"], *platform_cells(found)) for found in machines]
+        platform = [(found["machine"], *platform_cells(found, "dX_mm", "dE_deg"))
+                    for found in machines]  # fmt: skip
         return report(worth, printed(ESTIMATORS, platform, [*NOTES, *said, *self.readings]))
 
     def files(self, machines: Sequence[Found]) -> dict[str, bytes]:
@@ -301,14 +310,14 @@ def worth_cells(found: Found) -> tuple[str, ...]:
     )
 
 
-def platform_cells(found: Found) -> tuple[str, ...]:
+def platform_cells(found: Found, *keys: str) -> tuple[str, ...]:
     """Return errors of the platform, in the order of ``ESTIMATORS``."""
     told = []
     for estimates in (found["estimators"][name] for name in ESTIMATORS):
         failed = f" ({estimates['failed']})" if estimates["failed"] else ""
         figures = "failed"
         if estimates["runs"]:
-            figures = f"{_three(estimates['dX_mm'])} {_three(estimates['dE_deg'])}"
+            figures = " ".join(_three(estimates[key]) for key in keys)
         told.append(f"{figures}{failed}")
     return tuple(told)
 
@@ -334,37 +343,59 @@ def remarks(found: Found) -> list[str]:
 
 def page(machines: Sequence[Found], readings: Sequence[str]) -> str:
     """Return the page."""
-    said = [line for found in machines for line in remarks(found)]
-    return "\n".join(
-        [
-            "# Machines of every class, calibrated",
-            "",
-            f"Written by `python benchmarks/classes_study.py` on {date.today()}.",
-            "",
-            "## What the fit is worth",
-            "",
-            "| machine | directions determined | runs | error / bound "
-            "| normalised squared error | 95 % intervals that hold the truth | verdict |",
-            "|---|---|---|---|---|---|---|",
-            *(f"| {' | '.join((found['machine'], *worth_cells(found)))} |" for found in machines),
-            "",
-            "## Errors of the platform, mm and deg",
-            "",
-            "| machine | nominal model | four steps as printed | four steps, legcal's criteria "
-            "| joint fit |",
-            "|---|---|---|---|---|",
-            *(
-                f"| {' | '.join((found['machine'], *platform_cells(found)))} |"
-                for found in machines
-            ),
-            "",
-            *(f"- {line}" for line in (*NOTES, *readings)),
-            "",
-            *(["## What failed, and what else is to be said", ""] if said else []),
-            *(f"- {line}" for line in said),
-            *([""] if said else []),
-        ]
-    )
+    limits, failed = dict[str, list[str]](), []
+    there = {found["machine"] for found in machines}
+    left = [name for name in SHIPPED if name not in there]
+    for found in machines:
+        name, n = found["machine"], found["estimators"][FIT]["runs"]
+        for line in figure_remarks(name, n, found["figures"]):
+            limits.setdefault(line.removeprefix(f"{name}: "), []).append(name)
+        for estimator, estimates in found["estimators"].items():
+            failed += [
+                (name, HEADINGS[estimator], f"{count}", kind, _why(estimates["reasons"][kind]))
+                for kind, count in estimates["failures"].items()
+            ]
+    worth = ("directions determined", "runs", "error / bound", "normalised squared error",
+             "95 % intervals that hold the truth", "verdict")  # fmt: skip
+    estimators = [HEADINGS[name] for name in ESTIMATORS]
+    reasons = ("estimator", "sessions", "error", "the first time")
+    blocks = [
+        "# Machines of every class, calibrated",
+        "",
+        "What is the joint fit worth on each class of machine, and what do the paper's four steps "
+        "give by\nthemselves? This page has both, for simulated machines whose truth is known. "
+        "[Accuracy](accuracy.md)\nsays what follows; [studies](studies.md#every-class-classes_"
+        "studypy) has the program.",
+        "",
+        f"Written by `python benchmarks/classes_study.py` on {date.today()}."
+        + (f" Not in these runs: {', '.join(left)}." if left else ""),
+        "",
+        "## What the fit is worth",
+        "",
+        *_markdown(worth, [(found["machine"], *worth_cells(found)) for found in machines]),
+    ]
+    for title, key in (
+        ("Displacement of the platform, mm", "dX_mm"),
+        ("Rotation of the platform, deg", "dE_deg"),
+    ):
+        rows = [(found["machine"], *platform_cells(found, key)) for found in machines]
+        blocks += [f"## {title}", "", *_markdown(estimators, rows)]
+    said = [*NOTES, *readings, *(f"{', '.join(names)}: {line}" for line, names in limits.items())]
+    blocks += ["## How the figures are made", "", *(f"- {line}" for line in said), ""]
+    if failed:
+        blocks += ["## What failed", "", *_markdown(reasons, failed)]
+    return "\n".join(blocks)
+
+
+def _markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table with a row for each machine, and an empty one."""
+    heading = [f"| machine | {' | '.join(columns)} |", f"|{'---|' * (len(columns) + 1)}"]
+    return [*heading, *(f"| {' | '.join(row)} |" for row in rows), ""]
+
+
+def _why(message: str) -> str:
+    """Return what an error found, without what was needed and what is to be done."""
+    return re.split("[,;] needed ", message)[0]
 
 
 if __name__ == "__main__":

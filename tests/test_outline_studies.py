@@ -482,7 +482,7 @@ def test_the_study_of_classes_compares_nominal_model_steps_and_fit(output: Path)
     assert by["literal"]["dX_mm"] != by["default"]["dX_mm"]
     assert found["figures"].keys() == {"ratio", "nse", "coverage"}
     page = (output / "classes" / "classes.md").read_text()
-    assert page.count("| 3-rpr |") == 2
+    assert page.count("| 3-rpr |") == 3
     told = _printed(ClassesStudy().table([found]))
     assert "…" not in told
     assert "determined" in told
