@@ -72,7 +72,7 @@ def _truth(name: str) -> Truth:
 
 
 def _compared(truth: Truth, posterior: Posterior, outlines: Outlines) -> HeldOut:
-    return compare_held_out(posterior, truth.measurements, outlines, truth.poses, 4.5)
+    return compare_held_out(posterior, truth.measurements, outlines, truth.poses)
 
 
 @pytest.mark.parametrize("name", thinned(MACHINES, ["6-spu-coplanar", "hexaglide"]))
@@ -184,7 +184,7 @@ def _held_out(session: HexapodSession, level: float, seed: int) -> HeldOut:
     largest = max(map(abs, solution.biases.values()), default=0.0)
     assert (largest > 0.02) == (level > 0.0)  # [px]; chance may show less
     poses = start_from(solution.legs, held_out, session.legs, (), near, "").T_Rb_Re
-    return compare_held_out(solution.posterior, held_out, kept, poses, 4.5)
+    return compare_held_out(solution.posterior, held_out, kept, poses)
 
 
 def _of_rows(

@@ -677,9 +677,7 @@ def _compare_held_out(data: OrderedDataset, estimate: Estimate, file_rows: IntAr
     outlines = estimate.outlines.at(held_out.rows)
     outlines = reject_unused_legs(outlines, held_out.measurements, held_out.machine.leg_names)
     poses = held_out.poses_by(solution.legs)
-    return compare_held_out(
-        solution.posterior, held_out.measurements, outlines, poses, DEFAULT_SETTINGS.rejection
-    )
+    return compare_held_out(solution.posterior, held_out.measurements, outlines, poses)
 
 
 def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:

@@ -19,7 +19,6 @@ from scipy.linalg import block_diag, null_space
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration import (
-    DEFAULT_SETTINGS,
     NO_CHOICES,
     Choices,
     FitProblem,
@@ -33,7 +32,7 @@ from legcal.calibration import (
     with_gamma,
 )
 from legcal.data import Measurements, Outlines, View
-from legcal.estimation import Frames, PseudoHuber, linearize
+from legcal.estimation import Frames, linearize
 from legcal.geometry import Array, IntArray
 from legcal.machine import Leg, Machine, owner_of_parameter, reading_of_rod
 from legcal.vision import Camera
@@ -154,7 +153,6 @@ class Predictor:
         """Return the whitened rows of every image, and the priors of all unknowns."""
         linear, n = linearize(problem, state), problem.n_elements
         tangent = problem.constraint.tangent(problem, state) if problem.constraint else None
-        loss = PseudoHuber(DEFAULT_SETTINGS.loss_width)
         blocks = []
         for factor in problem.factors:
             if not factor.n or factor.element is None:
@@ -165,7 +163,7 @@ class Predictor:
             at = np.arange(factor.n)[:, None, None], np.arange(q)[None, :, None]
             np.add.at(J, (*at, where.index[:, None, :]), found.J)
             both = np.concatenate([found.J_element, J[..., :-1]], axis=2)
-            both *= np.sqrt(loss.efficiency(q)) if factor.robust else 1.0
+            both *= np.sqrt(problem.loss.efficiency(q)) if factor.robust else 1.0
             blocks.append(_by_element(both, factor.element, n))
         stacked = np.concatenate(blocks, axis=1)
         own, kept = np.split(stacked, [stacked.shape[2] - problem.n_kept], axis=2)

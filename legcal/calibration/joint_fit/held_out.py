@@ -271,7 +271,6 @@ def compare_held_out(
     measurements: Measurements,
     outlines: Outlines,
     T_Rb_Re: Sequence[RigidTransform],
-    rejection: float,
 ) -> HeldOut:
     """Compare held-out images with the predictions of a fit of others.
 
@@ -279,7 +278,7 @@ def compare_held_out(
     errors have the noise of the outlines, that of the readings, and the covariance of the fit.
 
     Of held-out *measurements* the used *outlines* are compared, at the poses *T_Rb_Re* by the
-    fit and the readings; *rejection* is the whitened distance beyond which the fit rejects one.
+    fit and the readings.
 
     Raises
     ------
@@ -301,7 +300,7 @@ def compare_held_out(
     )
     offsets = (L @ linear["outlines"].r[..., None])[..., 0]
     norm = _norms(linear["outlines"].r, expected)
-    limit = rejection * _usual(norm)
+    limit = problem.settings.rejection * _usual(norm)
     right = norm < limit
     pixels = np.einsum("nij,njk,nik->ni", L, expected, L)
     shown = poses_by_outlines(predicted, limit)

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -262,16 +263,9 @@ class FitProblem(Problem[State]):
         """Return a problem with the same measurements and cameras, and other unknowns."""
         owners = shared_cameras(self.outlines.views, self.first_cameras)
         observed = self.observed._replace(outlines=self.outlines.without_biases())
-        return _built(
-            self.legs,
-            choices,
-            observed,
-            self.first_cameras,
-            owners,
-            self.n_elements,
-            self.settings,
-            self.images,
-        )
+        cameras, n_poses = self.first_cameras, self.n_elements
+        given = _Given(self.legs, observed, cameras, owners, n_poses, self.images, self.settings)
+        return _built(given, choices)
 
 
 def build_fit(
@@ -300,16 +294,8 @@ def build_fit(
         _with_values(camera, owner, choices) for camera, owner in zip(given, owners, strict=True)
     )
     observed = observed_arrays(measurements, legs, outlines, axes, board, cameras)
-    return _built(
-        legs,
-        choices,
-        observed,
-        cameras,
-        owners,
-        measurements.n_poses,
-        settings,
-        _images(measurements),
-    )
+    n_poses, images = measurements.n_poses, _images(measurements)
+    return _built(_Given(legs, observed, cameras, owners, n_poses, images, settings), choices)
 
 
 def _with_values(camera: Camera, owner: str, choices: Choices) -> Camera:
@@ -328,47 +314,26 @@ def _images(measurements: Measurements) -> dict[tuple[int, int], str]:
     return dict(zip(places, row_names(measurements), strict=True))
 
 
-def _built(
-    legs: FittedLegs,
-    choices: Choices,
-    observed: Observed,
-    cameras: tuple[Camera, ...],
-    owners: tuple[str, ...],
-    n_poses: int,
-    settings: RefinementSettings,
-    images: Mapping[tuple[int, int], str],
-) -> FitProblem:
+class _Given(NamedTuple):
+    """What a fit is built of, whatever is chosen of its parameters."""
+
+    legs: FittedLegs
+    observed: Observed
+    cameras: tuple[Camera, ...]  # of the views
+    owners: tuple[str, ...]  # whose camera each view has
+    n_poses: int
+    images: Mapping[tuple[int, int], str]
+    settings: RefinementSettings
+
+
+def _built(given: _Given, choices: Choices) -> FitProblem:
     """Return the problem of measurements, with the unknowns and the priors of choices."""
+    legs, observed, cameras, settings = given.legs, given.observed, given.cameras, given.settings
     outlines, boards = observed.outlines, observed.boards
-    parametrization = legs.parametrization
-    names, units = parametrization.names, parametrization.units
-    arms = _arm_priors(legs, outlines, choices, settings)
-    free = np.array(
-        [not choices.holds(n, by_default=is_held_by_default(n) and n not in arms) for n in names],
-        dtype=np.bool_,
-    )
-    parameters = LegParameters(legs, free, choices.values)
-    if parameters.n_tied:
-        free[free] &= ~wholly_tied(parameters.tie_rows(legs.nominal)[1])
-        parameters = LegParameters(legs, free, choices.values)
-    unknown = tuple(n for n, is_free in zip(names, free, strict=True) if is_free)
-    kinematic = Variables(
-        "legs",
-        parameters.unknown,
-        parameters.retract,
-        unknown,
-        tuple(u for u, is_free in zip(units, free, strict=True) if is_free),
-        parameters.coordinates,
-        parameters.jacobian if parameters.turns else None,
-        prior=GaussianPrior(
-            np.array([unknown.index(name) for name in arms], dtype=np.intp),
-            np.zeros(len(arms)),
-            np.array(list(arms.values())),
-        ),
-    )
+    parameters, kinematic = _kinematic(given, choices)
     seen = np.concatenate([outlines.view, *(corners.view for corners in boards)])
-    shown = {owners[v] for v in np.unique(seen).tolist()}
-    intrinsics, keys = _intrinsics(outlines.views, cameras, owners, shown, choices)
+    shown = {given.owners[v] for v in np.unique(seen).tolist()}
+    intrinsics, keys = _intrinsics(outlines.views, cameras, given.owners, shown, choices)
     camera_pose = fixed_at_start(len(cameras), 6)
     camera_pose[observed.views] = all_free(len(observed.views), 6)
     board_pose = fixed_at_start(len(boards), 6)
@@ -390,7 +355,7 @@ def _built(
     )
     return FitProblem(
         variables=tuple(_stated(block, choices) for block in blocks),
-        eliminated=_poses(n_poses, legs.n_actuators),
+        eliminated=_poses(given.n_poses, legs.n_actuators),
         factors=(*observed.factors(keys), measured_lengths(legs.names, choices).factor()),
         constraint=LegConstraints(parameters),
         name="joint fit",
@@ -406,9 +371,40 @@ def _built(
         first_cameras=cameras,
         first_board_scale=np.array([choices.values.get(board_scale(k), 1.0) for k in LINKS]),
         keys=keys,
-        images=images,
+        images=given.images,
         settings=settings,
     )
+
+
+def _kinematic(given: _Given, choices: Choices) -> tuple[LegParameters, Variables]:
+    """Return the kinematic parameters that are unknown, and their block."""
+    legs, names = given.legs, given.legs.parametrization.names
+    arms = _arm_priors(legs, given.observed.outlines, choices, given.settings)
+    free = np.array(
+        [not choices.holds(n, by_default=is_held_by_default(n) and n not in arms) for n in names],
+        dtype=np.bool_,
+    )
+    parameters = LegParameters(legs, free, choices.values)
+    if parameters.n_tied:
+        free[free] &= ~wholly_tied(parameters.tie_rows(legs.nominal)[1])
+        parameters = LegParameters(legs, free, choices.values)
+    unknown = tuple(n for n, is_free in zip(names, free, strict=True) if is_free)
+    units = zip(legs.parametrization.units, free, strict=True)
+    block = Variables(
+        "legs",
+        parameters.unknown,
+        parameters.retract,
+        unknown,
+        tuple(u for u, is_free in units if is_free),
+        parameters.coordinates,
+        parameters.jacobian if parameters.turns else None,
+        prior=GaussianPrior(
+            np.array([unknown.index(name) for name in arms], dtype=np.intp),
+            np.zeros(len(arms)),
+            np.array(list(arms.values())),
+        ),
+    )
+    return parameters, block
 
 
 def _arm_priors(
