@@ -28,7 +28,7 @@ from legcal.estimation.problem import (
     Tangent,
     linearize,
 )
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray
 
 _FIRST_DAMPING = 1e-6
 _MIN_DAMPING = 1e-10
@@ -246,10 +246,6 @@ class NormalEquations:
     def elements_by_kept(self) -> Array:
         """Derivative of elements at their minimum by kept unknowns, (n_elements, f, n_kept)."""
         return np.asarray(-self.V_inverse @ np.moveaxis(self.W, 0, 2))
-
-    def along_constraints(self, J_element: Array, element: IntArray) -> Array:
-        """Return derivatives (n, q, f) along what constraints leave, from (n, q, d) by elements."""
-        return J_element if self.tangent is None else J_element @ self.tangent.Z[element]
 
     def reduced(self) -> Array:
         """Return the normal matrix (n_kept, n_kept) of the kept unknowns, the others free."""

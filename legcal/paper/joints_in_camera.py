@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -119,8 +120,60 @@ def locate_joints_in_cameras(
             "machine that moves in a plane, needed a machine that moves in space; use the joint "
             "fit alone."
         )
-    key = measurements.view[axes.row] * n_legs + axes.leg
-    views, legs = np.divmod(np.unique(key), n_legs)
+    found = _joints_of_bundles(machine, axes, measurements, criteria)
+    shape = (len(measurements.views), n_legs)
+    located, axis_located = np.zeros((2, *shape), dtype=np.bool_)
+    located[found.at], axis_located[found.at] = found.good, found.good_axis
+    missing = [(j, names[j]) for j in np.flatnonzero(~located.any(axis=0)).tolist()]
+    if missing:
+        raise NotIdentifiable(
+            [
+                f"The base joint of leg {name} could not be located: found no view that shows the "
+                f"{_needed(machine, j)}, needed one; add images in which it is visible."
+                for j, name in missing
+            ]
+            + list(found.diagnostics)
+        )
+    A_camera, v_camera, covariance = (np.zeros((*shape, *n)) for n in ((3,), (3,), (5, 5)))
+    A_camera[found.at] = np.where(found.good[:, None], found.A, 0.0)
+    v_camera[found.at] = np.where(found.good_axis[:, None], found.v, 0.0)
+    covariance[found.at] = np.where(found.good[:, None, None], found.covariance, 0.0)
+    unsided = np.zeros(len(located), dtype=np.bool_)
+    joints = oriented(
+        machine,
+        JointsInCamera(
+            A_camera,
+            located,
+            v_camera,
+            axis_located,
+            covariance,
+            found.diagnostics,
+            unsided,
+            {at: carrier for at, carrier in found.carriers.items() if located[at]},
+        ),
+    )
+    return joints if machine.spatial else _sided(machine, axes, measurements, joints)
+
+
+class _JointsOfBundles(NamedTuple):
+    """Joints by the axes of one leg in one view each, n of them."""
+
+    at: tuple[IntArray, IntArray]  # views and legs, (n,) each
+    A: Array  # (n, 3)
+    v: Array  # (n, 3); zero without an axis
+    covariance: Array  # (n, 5, 5)
+    good: BoolArray  # (n,) which centres are known well enough
+    good_axis: BoolArray  # (n,) which axes are
+    carriers: Mapping[tuple[int, int], Carrier]
+    diagnostics: tuple[str, ...]
+
+
+def _joints_of_bundles(
+    machine: NominalMachine, axes: LegAxes, measurements: Measurements, criteria: Criteria
+) -> _JointsOfBundles:
+    """Return the joints of every leg in every view that its axes there determine, (6) and (7)."""
+    key = measurements.view[axes.row] * machine.n_legs + axes.leg
+    views, legs = np.divmod(np.unique(key), machine.n_legs)
     bundles = Bundles.of(key)
     information, _ = _plain_equations(axes, bundles)
     reasons = [
@@ -142,20 +195,20 @@ def locate_joints_in_cameras(
     ]
     clear = np.array([not reason for reason in reasons], dtype=np.bool_)
     at = views[clear], legs[clear]
-    A, v, C = _estimate(machine, axes, bundles.some(clear), *at, carriers, criteria)
+    A, v, covariance = _estimate(machine, axes, bundles.some(clear), *at, carriers, criteria)
     has_axis = np.any(v != 0.0, axis=1)
     axis_reasons = [""] * len(A)
     if criteria == "default":
         for k, i in enumerate(np.flatnonzero(clear)):
             if not machine.carried[legs[i]]:
-                reasons[i] = _uncertain_centre(A[k], C[k, :3, :3])
+                reasons[i] = _uncertain_centre(A[k], covariance[k, :3, :3])
             if has_axis[k] and not reasons[i]:
-                axis_reasons[k] = _uncertain_axis(C[k, 3:, 3:])
+                axis_reasons[k] = _uncertain_axis(covariance[k, 3:, 3:])
     good = np.array([not reason for reason in reasons], dtype=np.bool_)[clear]
     good_axis = good & has_axis & np.array([not reason for reason in axis_reasons], dtype=np.bool_)
     diagnostics = tuple(
-        f"The {what} of leg {names[leg]} in view {measurements.views[view].name} was left out: "
-        f"{reason}."
+        f"The {what} of leg {machine.leg_names[leg]} in view {measurements.views[view].name} was "
+        f"left out: {reason}."
         for what, places, said in (
             ("base joint", (views, legs), reasons),
             ("revolute axis", at, axis_reasons),
@@ -163,39 +216,7 @@ def locate_joints_in_cameras(
         for view, leg, reason in zip(*(place.tolist() for place in places), said, strict=True)
         if reason
     )
-    diagnostics += scales
-    shape = (len(measurements.views), n_legs)
-    located, axis_located = np.zeros((2, *shape), dtype=np.bool_)
-    located[at], axis_located[at] = good, good_axis
-    missing = [(j, names[j]) for j in np.flatnonzero(~located.any(axis=0)).tolist()]
-    if missing:
-        raise NotIdentifiable(
-            [
-                f"The base joint of leg {name} could not be located: found no view that shows the "
-                f"{_needed(machine, j)}, needed one; add images in which it is visible."
-                for j, name in missing
-            ]
-            + list(diagnostics)
-        )
-    A_camera, v_camera, covariance = (np.zeros((*shape, *n)) for n in ((3,), (3,), (5, 5)))
-    A_camera[at] = np.where(good[:, None], A, 0.0)
-    v_camera[at] = np.where(good_axis[:, None], v, 0.0)
-    covariance[at] = np.where(good[:, None, None], C, 0.0)
-    unsided = np.zeros(len(located), dtype=np.bool_)
-    found = oriented(
-        machine,
-        JointsInCamera(
-            A_camera,
-            located,
-            v_camera,
-            axis_located,
-            covariance,
-            diagnostics,
-            unsided,
-            {at: carrier for at, carrier in carriers.items() if located[at]},
-        ),
-    )
-    return found if machine.spatial else _sided(machine, axes, measurements, found)
+    return _JointsOfBundles(at, A, v, covariance, good, good_axis, carriers, diagnostics + scales)
 
 
 def _no_single_point(information: Array, n_images: int) -> str:

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 from legcal.errors import UsageError
 
-LOCAL = ("127.0.0.1", "localhost", "::1")
-
 
 @dataclass(frozen=True)
 class Address:
@@ -21,11 +19,6 @@ class Address:
     def __str__(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"http://{host}:{self.port}"
-
-    @property
-    def is_local(self) -> bool:
-        """Whether only this machine reaches it."""
-        return self.host in LOCAL
 
 
 def check_address(address: Address) -> None:
