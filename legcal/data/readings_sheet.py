@@ -16,7 +16,13 @@ from types import MappingProxyType
 
 import numpy as np
 
-from legcal.data.measurements import few, in_travel, reading_columns, readings_of_lengths
+from legcal.data.measurements import (
+    doubted_units,
+    few,
+    in_travel,
+    reading_columns,
+    readings_of_lengths,
+)
 from legcal.data.reading_units import PULSES, ReadingUnit, unit_named
 from legcal.errors import DatasetError, UsageError
 from legcal.files import ANGLE, LENGTH, SHOWN_IN, Column, Lines, Table, describe, split_heading
@@ -297,7 +303,8 @@ def readings_of(
 ) -> tuple[Array, Array]:
     """Return readings (n_rows, n_motors) and the size of the last digit of each motor [m or rad].
 
-    Raises DatasetError with a sentence for each reading outside its travel.
+    Raises DatasetError with a sentence for each reading outside its travel, and if they surely are
+    in another unit.
     """
     texts = [table.text(joint) for joint in headings.joints]
     values = np.array([_exactly(column, unit) for column, unit in zip(texts, units, strict=True)]).T
@@ -317,6 +324,14 @@ def readings_of(
             next(text for text, name in headings.taken.items() if name == headings.joints[j]),
             what="reading",
         )
+    if inside.all() and not lengths:
+        numbers = table.numbers(headings.joints)
+        for doubt in doubted_units(numbers, q, headings.motors, units):
+            if doubt.is_sure:
+                table.refuse_file(
+                    f"{doubt.in_words(table.path)}; correct the headings or --unit to "
+                    f"{doubt.other}, or convert them to it if they are in {doubt.stated}."
+                )
     table.check()
     digits = [min(int(Decimal(x).as_tuple().exponent) for x in column) for column in texts]
     of_unit = zip(digits, units, strict=True)

@@ -36,6 +36,7 @@ from legcal.machine import (
     Actuator,
     actuators_of,
     kind_of_parameter,
+    list_in_words,
     owner_of_parameter,
     radius_name,
 )
@@ -451,6 +452,19 @@ def _arm_names(problem: FitProblem) -> tuple[str, ...]:
     """Return what messages call the arm of each leg."""
     arms = [leg.arm for leg in problem.legs.nominal]
     return tuple("" if arm is None else f"{arm.leg}.{arm.link}" for arm in arms)
+
+
+def reversed_motors(problem: FitProblem, state: State) -> tuple[str, ...]:
+    """Return a note on motors whose axes or directions come out opposite to the model's."""
+    pairs = zip(actuators_of(state.legs), actuators_of(problem.legs.nominal), strict=True)
+    names = [found.joint for found, nominal in pairs if found.axis @ nominal.axis < 0.0]
+    if not names:
+        return ()
+    return (
+        f"The readings of {list_in_words(names)} count the other way than the model says: "
+        "found axes or directions that came out reversed; correct them in the model, or reverse "
+        "the readings (of a servo give us_per_deg the other sign).",
+    )
 
 
 def scale_notes(problem: FitProblem, state: State, settings: RefinementSettings) -> tuple[str, ...]:
