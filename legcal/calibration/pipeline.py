@@ -376,7 +376,15 @@ def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]
     NotIdentifiable
         If readings do not give the poses of images that are to be searched, and a view of these has
         no rough camera pose or joints at A move; nothing is searched then.
+    NotVisible
+        If they are to be searched for legs none of which is visible.
     """
+    if len(data.photographs.detect) and not any(leg.cylinders for leg in data.machine.legs):
+        raise NotVisible(
+            f"{data.machine.urdf_path}: the images could not be searched: found no <visual> "
+            "cylinder along any leg, so that nothing of the legs is visible, needed one along each "
+            "that images show; add them with their radii."
+        )
     hints = [view.T_base_camera for view in data.measurements.views]
     on_base = data.dataset.board_on("base")
     by_board = on_base is not None and (
