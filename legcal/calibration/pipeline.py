@@ -72,11 +72,9 @@ from legcal.data import (
 )
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.files import check_destination, output_path
-from legcal.geometry import Array, IntArray, components
+from legcal.geometry import IntArray, components
 from legcal.machine import (
     Machine,
-    arms_at,
-    cylinder_of_arm,
     ends_in_base,
     measured_readings,
 )
@@ -84,7 +82,6 @@ from legcal.paper import Criteria, Transformation
 from legcal.perception import (
     MeasuredImages,
     Photographs,
-    PlacedArm,
     Placement,
     detection_settings,
     given_outlines,
@@ -93,6 +90,7 @@ from legcal.perception import (
     measure_photographs,
     nominal_placement,
     place_and_measure,
+    placed_arms,
     require_rough_cameras,
     require_standing_joints,
     used_as_before,
@@ -521,27 +519,8 @@ def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredIm
         None if known is None else T_base_Rb * T.inv()
         for known, T in zip(seen.placement.T_base_camera, solution.T_camera_Rb, strict=True)
     )
-    arms = {
-        j: replace(arm, ends=T_base_Rb.apply(arm.ends.reshape(-1, 3)).reshape(-1, 2, 3)[pose])
-        for j, arm in _arms_of_fit(solution, q).items()
-    }
+    arms = placed_arms(solution.legs, q, pose, T_base=T_base_Rb, radii=solution.radii)
     return Placement.of_fit(A[pose], B[pose], cameras, seen.blur, arms)
-
-
-def _arms_of_fit(solution: Solution, q: Array) -> dict[int, PlacedArm]:
-    """Return the arms that are cylinders in R_b, at readings of actuators (n_poses, n_actuators).
-
-    One of which the fit has seen nothing is where the model has it.
-    """
-    found = {}
-    for j, ends in arms_at(solution.legs, q).items():
-        actuator = solution.legs[j].actuator
-        if actuator is not None and actuator.arm is not None:
-            seen = solution.radii.get((j, actuator.arm.link))
-            arm = actuator.arm if seen is None else replace(actuator.arm, radius=seen)
-            error = DEFAULT_SETTINGS.arm_point_sigma if seen is None else 0.0
-            found[j] = PlacedArm(actuator.joint, cylinder_of_arm(arm), ends, error)
-    return found
 
 
 def _not_found_again(first: Estimate, again: Estimate) -> list[str]:
