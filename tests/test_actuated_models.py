@@ -1,15 +1,19 @@
 """Machines whose rods hang on carriages and arms: written, loaded, refused, and by closed forms."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from dataset_folder import dataset_of_readings
 from machines import ROOT, check_same, read_family, read_table
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import LegcalError, ModelError, UsageError
+from legcal.calibration import calibrate
+from legcal.data import load_dataset
+from legcal.errors import LegcalError, ModelError, NotIdentifiable, UsageError
 from legcal.exports import Subject, export
 from legcal.geometry import Array
 from legcal.machine import (
@@ -21,11 +25,13 @@ from legcal.machine import (
     geometries,
     home_of_legs,
     inverse_kinematics,
+    joint_values,
     kind_of_parameter,
     load_mechanism,
     moved_legs,
     parametrization_of,
     random_configurations,
+    readings_at,
     vector_of,
     write_model,
 )
@@ -341,6 +347,36 @@ def test_what_a_family_of_motors_cannot_be(
 LIMITS = 'lower="-0.5235987755982988" upper="1.2217304763960306"'
 MOTORS = "name_mot:\n- arm1\n"
 A2 = '"leg1_a2" type="revolute"'
+HOME = re.findall(r"  home:\n(?:    .*\n)+", (ROOT / "models/delta.yaml").read_text())[0]
+
+
+def delta_with(folder: Path, old: str, new: str) -> Path:
+    """Write the Delta with one text of its files replaced, wherever it stands; return its YAML."""
+    texts = [(ROOT / path).read_text() for path in ("models/delta.yaml", "urdf/delta.urdf")]
+    assert sum(old in text for text in texts) == 1
+    model, urdf = (text.replace(old, new) for text in texts)
+    (folder / "delta.urdf").write_text(urdf)
+    (folder / "delta.yaml").write_text(model.replace("../urdf/", ""))
+    return folder / "delta.yaml"
+
+
+def test_a_home_above_the_base_closes_in_the_mode_of_its_readings(tmp_path: Path) -> None:
+    machine = load_mechanism(delta_with(tmp_path, "- -0.374", "- 0.374"))
+    at_home = joint_values(machine, machine.home_configuration)
+    np.testing.assert_allclose(at_home, readings_at(machine, machine.home), atol=1e-9)
+    np.testing.assert_allclose(at_home, np.radians(-20.0), atol=1e-9)
+
+
+def test_legs_that_nobody_can_see_are_named_before_images_are_searched(tmp_path: Path) -> None:
+    seen = re.search(r'<link name="leg1_a3_link">.*', (ROOT / "urdf/delta.urdf").read_text())
+    assert seen is not None
+    model = str(delta_with(tmp_path, seen[0], '<link name="leg1_a3_link"/>'))
+    q = np.radians(20.0 + 40.0 * np.sin(np.arange(45.0).reshape(15, 3)))
+    joints = ("arm1", "arm2", "arm3")
+    entry = {"encoder_sigma": dict.fromkeys(joints, 1e-4)}
+    made = dataset_of_readings(tmp_path, q, entry, model, joints)
+    with pytest.raises(NotIdentifiable, match="add a <visual> cylinder along leg 1"):
+        calibrate(load_dataset(made, check_images=False))
 
 
 @pytest.mark.parametrize(
@@ -357,6 +393,8 @@ A2 = '"leg1_a2" type="revolute"'
             ),
         ),
         ("home:\n", "home_readings: {arm7: 0.1}\n  home:\n", ("home_readings.arm7", "arm1")),
+        ("home:\n", "home_readings: {arm1: 20}\n  home:\n", ("home_readings.arm1", "20 rad")),
+        (HOME, "", ("home is ambiguous", "no legcal.home", "0.2373", "-0.3741")),
         (MOTORS, f"{MOTORS}- leg1_a2\n", ("'leg1_a2'", "one motor for each leg")),
         (MOTORS, "name_mot:\n", ("'arm1'", "carries 2 rods", "a motor in name_mot")),
         (A2, '"leg1_a2" type="prismatic"', ("slider 'leg1_a2'", "'arm1'")),
@@ -366,13 +404,8 @@ A2 = '"leg1_a2" type="revolute"'
 def test_what_files_of_motors_cannot_be(
     tmp_path: Path, old: str, new: str, named: tuple[str, ...]
 ) -> None:
-    texts = [(ROOT / path).read_text() for path in ("models/delta.yaml", "urdf/delta.urdf")]
-    assert sum(old in text for text in texts) == 1
-    model, urdf = (text.replace(old, new) for text in texts)
-    (tmp_path / "delta.urdf").write_text(urdf)
-    (tmp_path / "delta.yaml").write_text(model.replace("../urdf/", ""))
     with pytest.raises(LegcalError) as caught:
-        load_mechanism(tmp_path / "delta.yaml")
+        load_mechanism(delta_with(tmp_path, old, new))
     assert all(word in str(caught.value) for word in named), str(caught.value)
 
 

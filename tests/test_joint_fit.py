@@ -29,6 +29,7 @@ from fit_sessions import (
     noisy_readings,
     place_of_board,
     session_of_legs,
+    shifted,
     with_board,
 )
 from outline_sessions import Noise, StartErrors, design_of, draw_session, one_fit
@@ -153,6 +154,26 @@ def test_exact_outlines_give_the_truth_from_3_mm_and_1_degree_away(
             miss = (pose * first.inv()).inv() * (true * true_first.inv())
         assert np.linalg.norm(miss.translation) < 1e-8
         assert miss.rotation.magnitude() < 1e-7
+
+
+@pytest.mark.parametrize("px", [0.5, 20.0])
+def test_an_arm_that_is_no_cylinder_is_left_out_as_a_whole_and_bends_nothing(px: float) -> None:
+    session, rng = far_session("delta-round-arms"), np.random.default_rng(5)
+    seen, legs = session.outlines, session.legs
+    bent = np.array(seen.part) == "arm2_link"
+    offsets = px * bent[:, None] * rng.choice([-1.0, 1.0], (len(seen), 2))
+    moved = shifted(session, seen, offsets)
+    radii = frozenset(radius_name(legs.names[j], part) for j, part in legs.radii)
+    arms = [n for n in legs.parametrization.names if kind_of_parameter(n) in ARM_KINDS]
+    straight = frozenset(n for n in arms if not n.startswith("arm2"))
+    choices = Choices(fixed=radii, free=straight)
+    found = refine(legs, session.measurements, moved, session.start, choices=choices)
+    np.testing.assert_array_equal(found.outlines.used, ~bent)
+    (note,) = [n for n in found.notes if "left out as a whole" in n]
+    assert "arm2" in note
+    assert "arm1" not in note
+    for parameter, error in errors(session, found).items():
+        assert error < {"m": 1e-8, "rad": 1e-7}[found.units[parameter]], parameter
 
 
 @pytest.mark.parametrize("known_radii", [False, True])

@@ -130,6 +130,15 @@ def test_small_motions_are_not_refused_for_their_unit(
     assert [("in rad; check their unit" in note) for note in noted] == [True] * is_noted
 
 
+def test_what_a_hobby_servo_was_told_is_good_to_half_a_degree_in_any_unit(tmp_path: Path) -> None:
+    create_model(read_table(servo_table(tmp_path)), tmp_path)
+    model = str(tmp_path / "models/servos.yaml")
+    for entry, given in (({}, ANGLES), ({"readings": "deg"}, np.degrees(ANGLES))):
+        made = dataset_of_readings(tmp_path, given, entry, model)
+        found = load_dataset(made, check_images=False).measurements.sigma_by_joint
+        np.testing.assert_allclose(np.degrees([found[name] for name in SERVOS]), 0.5)
+
+
 def photographs(folder: Path, n: int) -> None:
     """Write photographs and the file of their camera."""
     (folder / "photos").mkdir()
@@ -203,6 +212,7 @@ def init(
         ("{}", ANGLES, ("--servo", "1500,0"), ("us_per_deg 0",)),
         ("{}", ANGLES, ("--encoder-sigma", "2um"), ("'2um'", "deg")),
         ("{} [rad]", np.degrees(ANGLES), (), ("look like readings in deg",)),
+        ("{} [deg]", BOTH_WAYS, (), ("% in rad", "--unit to rad")),
     ],
 )
 def test_what_init_cannot_make_of_angles(

@@ -23,6 +23,7 @@ from legcal.machine import (
     ActuatorColumns,
     Leg,
     LegKind,
+    Line,
     Machine,
     Parametrization,
     actuator_index,
@@ -229,30 +230,44 @@ _METRES, _RADIANS = ("m",) * 3, ("rad",) * 2
 
 
 def _of_actuator(actuator: Actuator) -> list[_Possible]:
-    """Return what may change of a motor that moves joints at A: its zero, and its axis."""
+    """Return what may change of a motor that moves joints at A: its zero, its axis, its arm."""
 
     def zero_moved(leg: Leg, _: int, step: float) -> Leg:
         there = np.array([step])
-        axis = leg.base_axis
+        axis, turn = leg.base_axis, actuator.rotations(there)[0]
+        moved = actuator
+        if actuator.arm is not None:
+            line = Line(
+                actuator.at(actuator.arm.line.point, there)[0], turn @ actuator.arm.line.axis
+            )
+            moved = replace(actuator, arm=replace(actuator.arm, line=line))
         return replace(
             leg,
             A=actuator.at(leg.A, there)[0],
-            base_axis=None if axis is None else actuator.rotations(there)[0] @ axis,
+            base_axis=None if axis is None else turn @ axis,
+            actuator=moved,
         )
 
-    def axis_moved(leg: Leg, k: int, step: float) -> Leg:
-        change = np.zeros(ActuatorColumns.COUNT)
-        change[k] = step
-        return replace(leg, actuator=actuator.moved(change))
+    def moved_from(first: int) -> _Moved:
+        def moved(leg: Leg, k: int, step: float) -> Leg:
+            change = np.zeros(ActuatorColumns.COUNT)
+            change[first + k] = step
+            return replace(leg, actuator=actuator.moved(change))
+
+        return moved
 
     joint = actuator.joint
     found: list[_Possible] = [
         (f"zero of {joint}", (f"{joint}.zero",), (actuator.unit,), "", zero_moved)
     ]
-    if actuator.turns:
-        numbers, units = ("1", "2", "place 1", "place 2"), (*_RADIANS, *_METRES[:2])
-        return [*found, (f"axis of {joint}", numbers, units, "", axis_moved)]
-    return [*found, (f"direction of {joint}", ("1", "2"), _RADIANS, "", axis_moved)]
+    numbers, units = ("1", "2", "place 1", "place 2"), (*_RADIANS, *_METRES[:2])
+    if not actuator.turns:
+        return [*found, (f"direction of {joint}", ("1", "2"), _RADIANS, "", moved_from(0))]
+    found.append((f"axis of {joint}", numbers, units, "", moved_from(0)))
+    if actuator.arm is not None:
+        line = ActuatorColumns.ARM.start - ActuatorColumns.AXIS.start
+        found.append((f"arm line of {joint}", numbers, units, "", moved_from(line)))
+    return found
 
 
 def _of_leg(machine: Machine, name: str, leg: Leg) -> list[_Possible]:

@@ -12,7 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +31,7 @@ from legcal.data import (
     Dataset,
     ImageReader,
     Outlines,
+    along_legs,
     is_edited,
     row_names,
     write_corners,
@@ -68,6 +69,7 @@ from legcal.perception import (
     OUTSIDE,
     Mark,
     PartMarks,
+    PlacedArm,
     draw,
     images_left_out,
     marks_of_corners,
@@ -127,6 +129,8 @@ class Detection:
         These, and what else a reader should know.
     corners : Corners or None
         The corners of calibration boards in all images; None without a board.
+    arms : mapping
+        Where arms that are cylinders are expected, by the legs that have them as parts.
     """
 
     dataset: Dataset
@@ -140,6 +144,7 @@ class Detection:
     image_notes: tuple[str, ...]
     notes: tuple[str, ...]
     corners: Corners | None = None
+    arms: Mapping[int, PlacedArm] = field(default_factory=dict)
 
     def view_of(self, row: int) -> str:
         """Return the name of the view of a row."""
@@ -147,22 +152,25 @@ class Detection:
         return measurements.views[int(measurements.view[row])].name
 
     def predicted(self, row: int) -> list[PredictedLeg]:
-        """Return where the legs of a row should be seen; none where the camera is not known."""
+        """Return where the legs of a row should be seen; none where the camera is not known.
+
+        Arms come after them, each as another one of the leg that has it as a part.
+        """
         measurements, legs = self.dataset.measurements, self.dataset.machine.legs
         view = int(measurements.view[row])
         T = self.T_base_camera[view]
         if T is None:
             return []
-        used = measurements.views[view].legs
-        found = predict_legs(
-            measurements.views[view].camera,
-            T,
-            self.A_base[row],
-            self.B_base[row],
-            self.cylinders,
-            row,
+        used, arms = measurements.views[view].legs, self.arms.values()
+        A, B = (
+            np.concatenate([ends[row], *(arm.ends[row, k : k + 1] for arm in arms)])
+            for k, ends in enumerate((self.A_base, self.B_base))
         )
-        return [leg for leg in found if used is None or legs[leg.leg].name in used]
+        cylinders = [*self.cylinders, *([arm.cylinder] for arm in arms)]
+        owner = [*range(len(legs)), *self.arms]
+        found = predict_legs(measurements.views[view].camera, T, A, B, cylinders, row)
+        every = [replace(leg, leg=owner[leg.leg]) for leg in found]
+        return [leg for leg in every if used is None or legs[leg.leg].name in used]
 
     @cached_property
     def left_out(self) -> dict[int, str]:
@@ -278,14 +286,15 @@ def _view_figures(detection: Detection) -> dict[str, ViewFigures]:
         here = measurements.view[detection.outlines.row] == v
         outlines = detection.outlines.choose(here)
         used, reasons = outlines.used, outlines.reason
-        hidden = [why == OUTSIDE or why.startswith(HIDDEN) for why in reasons]
+        rods = along_legs(outlines, detection.dataset.machine.legs)
+        hidden = [why == OUTSIDE or why.startswith(HIDDEN) for why in rods.reason]
         rejected = Counter(
             _counted_reason(why) for why, ok in zip(reasons, used, strict=True) if not ok
         )
         found[name] = ViewFigures(
             images=int(np.count_nonzero(measurements.view[detection.rows] == v)),
-            legs_visible=_count_legs(outlines, ~np.array(hidden, dtype=np.bool_) | used),
-            legs_found=_count_legs(outlines, used),
+            legs_visible=_count_legs(rods, ~np.array(hidden, dtype=np.bool_) | rods.used),
+            legs_found=_count_legs(rods, rods.used),
             outlines=len(outlines),
             used=int(np.count_nonzero(used)),
             edited=int(np.count_nonzero(is_edited(outlines))),

@@ -20,6 +20,7 @@ from legcal.errors import UsageError
 from legcal.files import RESULT, in_the_way, path_problem, read_json
 from legcal.geometry import components
 from legcal.machine import ends_in_base, measured_readings
+from legcal.perception import placed_arms
 from legcal.progress import Report
 from legcal.workers import Run
 
@@ -96,4 +97,11 @@ def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
         unplaced={},
         image_notes=(),
         notes=(),
+        arms=placed_arms(
+            solution.legs,
+            q,
+            measurements.pose,
+            T_base=machine.T_base_Rb,
+            radii=solution.radii,
+        ),
     )

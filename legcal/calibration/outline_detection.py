@@ -7,6 +7,7 @@ written beside the dataset.
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,20 +23,29 @@ from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.calibration.pipeline import rough_placement
 from legcal.data import (
     Dataset,
+    Outlines,
     few_views,
     inverse,
+    join_outlines,
     load_dataset,
+    merge_edited,
+    no_outlines,
     reject_unused_legs,
 )
 from legcal.errors import DatasetError
 from legcal.files import output_path
-from legcal.geometry import IntArray
+from legcal.geometry import IntArray, components
+from legcal.machine import measured_readings
 from legcal.perception import (
     BEFORE_FIT,
+    MeasuredImages,
+    PlacedArm,
     Placement,
     given_outlines,
     hint_notes,
+    measure_photographs,
     place_and_measure,
+    placed_arms,
 )
 from legcal.progress import Progress, shown_progress
 from legcal.workers import Workers, worker_pool
@@ -125,13 +135,16 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
         row = seen.outlines.row
         kept = placed[data.measurements.view[row]] | ~np.isin(row, photographs.detect)
         outlines, unplaced = seen.outlines.choose(kept), seen.placement.unplaced
+        arms = _nominal_arms(data)
+        if arms:
+            outlines = join_outlines([outlines, _of_arms(data, seen, arms)])
         image_notes, notes = _image_notes(data, seen.placement), _gamma_notes(data)
         # Legs of a view that could not be placed are drawn where its rough pose has them.
         drawn = tuple(
             T if T is not None else rough
             for T, rough in zip(cameras, scene.T_base_camera, strict=True)
         )
-        scene = replace(seen.placement, T_base_camera=drawn)
+        scene = replace(seen.placement, T_base_camera=drawn, arms=_nominal_arms(data))
     rows, legs, views = inverse(order.rows), inverse(order.legs), inverse(order.views)
     names = dataset.machine.leg_names
     return Detection(
@@ -140,6 +153,10 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
         A_base=scene.A_base[rows][:, legs],
         B_base=scene.B_base[rows][:, legs],
         cylinders=tuple(cylinders[leg] for leg in legs.tolist()),
+        arms={
+            int(np.flatnonzero(legs == j)[0]): replace(arm, ends=arm.ends[rows])
+            for j, arm in scene.arms.items()
+        },
         T_base_camera=tuple(scene.T_base_camera[v] for v in views.tolist()),
         rows=images,
         unplaced=unplaced,
@@ -147,6 +164,31 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
         notes=(*dataset.notes, *image_notes, *notes, *data.unreached_notes()),
         corners=None if board is None else order.restore(board.corners),
     )
+
+
+def _nominal_arms(data: OrderedDataset) -> dict[int, PlacedArm]:
+    """Return the arms that are cylinders, where the model has them at the readings of each row."""
+    legs, m = data.machine.legs, data.measurements
+    if not data.machine.is_determined or not any(leg.arm is not None for leg in legs):
+        return {}
+    q = measured_readings(legs, *components(data.T_base_platform), m.q_of_poses)
+    return placed_arms(legs, q, m.pose)
+
+
+def _of_arms(data: OrderedDataset, seen: MeasuredImages, arms: Mapping[int, PlacedArm]) -> Outlines:
+    """Return the outlines of arms in images that show the legs, before cameras that are placed."""
+    photographs, cameras = seen.photographs, seen.placement.T_base_camera
+    rows = [
+        row
+        for row in photographs.detect.tolist()
+        if row not in seen.left_out and cameras[data.measurements.view[row]] is not None
+    ]
+    some = replace(photographs, detect=np.array(rows, dtype=np.intp), keep=no_outlines())
+    placement = replace(seen.placement, arms=arms, window=None)
+    found = measure_photographs(some, placement, data.progress, stage="Measuring arms")
+    parts = zip(found.leg.tolist(), found.part, strict=True)
+    is_arm = np.array([data.machine.legs[j].is_arm(part) for j, part in parts], dtype=np.bool_)
+    return merge_edited(found.choose(is_arm), photographs.keep)
 
 
 def _image_notes(data: OrderedDataset, placement: Placement) -> list[str]:

@@ -78,11 +78,12 @@ def _expected(
     if not lost:
         return {}
     camera = measurements.views[int(measurements.view[row])].camera
-    legs = {leg.leg: leg for leg in predicted(row)}
+    legs = {(leg.leg, part.link): leg for leg in predicted(row) for part in leg.segments}
     expected = {}
     for i in lost:
         j, part, edge = int(outlines.leg[i]), outlines.part[i], int(outlines.edge[i])
-        ends = _ends(camera, legs[j], part, edge) if j in legs else None
+        leg = legs.get((j, part))
+        ends = None if leg is None else _ends(camera, leg, part, edge)
         if ends is not None:
             expected[f"{names[j]}\n{part}\n{edge}"] = np.round(ends, 2).tolist()
     return expected

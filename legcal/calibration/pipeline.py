@@ -31,7 +31,6 @@ from legcal.calibration.fit_overlays import check_overlays, with_overlays
 from legcal.calibration.four_steps import Steps, four_steps, starts
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit import (
-    DEFAULT_SETTINGS,
     Choices,
     GammaTrials,
     HeldOut,
@@ -72,11 +71,9 @@ from legcal.data import (
 )
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.files import check_destination, output_path
-from legcal.geometry import Array, IntArray, components
+from legcal.geometry import IntArray, components
 from legcal.machine import (
     Machine,
-    arms_at,
-    cylinder_of_arm,
     ends_in_base,
     measured_readings,
 )
@@ -84,7 +81,6 @@ from legcal.paper import Criteria, Transformation
 from legcal.perception import (
     MeasuredImages,
     Photographs,
-    PlacedArm,
     Placement,
     detection_settings,
     given_outlines,
@@ -93,6 +89,7 @@ from legcal.perception import (
     measure_photographs,
     nominal_placement,
     place_and_measure,
+    placed_arms,
     require_rough_cameras,
     require_standing_joints,
     used_as_before,
@@ -376,7 +373,15 @@ def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]
     NotIdentifiable
         If readings do not give the poses of images that are to be searched, and a view of these has
         no rough camera pose or joints at A move; nothing is searched then.
+    NotVisible
+        If they are to be searched for legs none of which is visible.
     """
+    if len(data.photographs.detect) and not any(leg.cylinders for leg in data.machine.legs):
+        raise NotVisible(
+            f"{data.machine.urdf_path}: the images could not be searched: found no <visual> "
+            "cylinder along any leg, so that nothing of the legs is visible, needed one along each "
+            "that images show; add them with their radii."
+        )
     hints = [view.T_base_camera for view in data.measurements.views]
     on_base = data.dataset.board_on("base")
     by_board = on_base is not None and (
@@ -513,27 +518,8 @@ def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredIm
         None if known is None else T_base_Rb * T.inv()
         for known, T in zip(seen.placement.T_base_camera, solution.T_camera_Rb, strict=True)
     )
-    arms = {
-        j: replace(arm, ends=T_base_Rb.apply(arm.ends.reshape(-1, 3)).reshape(-1, 2, 3)[pose])
-        for j, arm in _arms_of_fit(solution, q).items()
-    }
+    arms = placed_arms(solution.legs, q, pose, T_base=T_base_Rb, radii=solution.radii)
     return Placement.of_fit(A[pose], B[pose], cameras, seen.blur, arms)
-
-
-def _arms_of_fit(solution: Solution, q: Array) -> dict[int, PlacedArm]:
-    """Return the arms that are cylinders in R_b, at readings of actuators (n_poses, n_actuators).
-
-    One of which the fit has seen nothing is where the model has it.
-    """
-    found = {}
-    for j, ends in arms_at(solution.legs, q).items():
-        actuator = solution.legs[j].actuator
-        if actuator is not None and actuator.arm is not None:
-            seen = solution.radii.get((j, actuator.arm.link))
-            arm = actuator.arm if seen is None else replace(actuator.arm, radius=seen)
-            error = DEFAULT_SETTINGS.arm_point_sigma if seen is None else 0.0
-            found[j] = PlacedArm(actuator.joint, cylinder_of_arm(arm), ends, error)
-    return found
 
 
 def _not_found_again(first: Estimate, again: Estimate) -> list[str]:

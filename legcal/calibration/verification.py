@@ -39,9 +39,11 @@ from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.estimation import Frames
 from legcal.geometry import Array
 from legcal.machine import (
+    ARM_KINDS,
     Machine,
     Parametrization,
     geometries,
+    kind_of_parameter,
     parametrization_of,
     pose_sensitivity,
     vector_of,
@@ -275,8 +277,10 @@ def _choices(dataset: Dataset, earlier: EarlierResult, prior: _EarlierEstimate) 
     views = dataset.measurements.views
     owners = shared_cameras([view.name for view in views], [view.camera for view in views])
     found = {owner: earlier.intrinsics(v.camera) for owner, v in zip(owners, views, strict=True)}
+    # Lines of arms that the earlier images did not show were left at nominal, and not known.
+    fixed = [name for name in earlier.fixed if kind_of_parameter(name) not in ARM_KINDS]
     return Choices(
-        fixed=frozenset(earlier.fixed),
+        fixed=frozenset(fixed),
         priors=priors,
         cameras={owner: known for owner, known in found.items() if known is not None},
         least_shared_px=earlier.document.residuals.shared_px,

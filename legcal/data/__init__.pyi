@@ -66,7 +66,7 @@ from .photograph_notes import GOOD_QUALITY as GOOD_QUALITY
 from .photograph_notes import compressed as compressed
 from .photograph_notes import compression_note as compression_note
 from .photograph_notes import notes_on_photographs as notes_on_photographs
-from .reading_units import SIGMA_ANGLE as SIGMA_ANGLE
 from .reading_units import sigmas_of as sigmas_of
 from .reading_units import sigmas_of_legs as sigmas_of_legs
+from .reading_units import usual_sigma as usual_sigma
 from .readings_sheet import ReadingsSheet as ReadingsSheet

@@ -25,9 +25,9 @@ from legcal.data.outlines import Outlines, read_observations
 from legcal.data.overrides import Override
 from legcal.data.photograph_notes import notes_on_photographs
 from legcal.data.reading_units import (
-    PULSES,
     SERVO_SIGMA,
     ReadingUnit,
+    are_commands,
     legs_with_readings,
     reading_units,
     sigma_in,
@@ -145,7 +145,8 @@ def _encoder_sigmas(
 ) -> tuple[float, dict[str, float]]:
     """Return the standard deviation of readings in metres, and those by joint [m or rad].
 
-    Servos whose readings are their pulses need none: they are taken to be good to half a degree.
+    Hobby servos need none, whose readings are commands: these are taken to be good to half a
+    degree.
 
     Raises
     ------
@@ -154,7 +155,10 @@ def _encoder_sigmas(
         has none.
     """
     turning = [a.joint for a in machine.actuators if a.turns]
-    commanded = {name: SERVO_SIGMA for name, unit in units.items() if unit.name == PULSES}
+    of_motor = {str(leg.prismatic): leg for leg in legs_with_readings(machine.legs)}
+    commanded = {
+        name: SERVO_SIGMA for name, unit in units.items() if are_commands(of_motor[name], unit)
+    }
     if stated is None:
         stated = {}
     if not isinstance(stated, Mapping):
@@ -183,7 +187,6 @@ def _encoder_sigmas(
             f"standard deviation of a reading{'' if machine.actuators else ' [m]'}, for each motor "
             "in the unit of its readings where one turns; add it."
         )
-    of_motor = {str(leg.prismatic): leg for leg in legs_with_readings(machine.legs)}
     found, problems = dict[str, float](), list[str]()
     for name, sigma in stated.items():
         try:

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -244,22 +245,44 @@ def readings_in(
             f"{table.path}, {of_this}: readings are outside the travel: {found}; {remedy}."
         )
     if not beyond:
-        for problem, is_sure in _hardly_moving(given, readings, actuated, stated):
-            if is_sure:
-                table.refuse_file(f"{table.path}, {problem}")
+        for doubt in doubted_units(given, readings, actuated, stated):
+            if doubt.is_sure:
+                table.refuse_file(
+                    f"{doubt.in_words(table.path)}; write readings: {doubt.other} in the dataset "
+                    f"file, and convert them first if they are in {doubt.stated}."
+                )
             else:
-                notes.append(f"{table.path}, {problem}")
+                notes.append(
+                    f"{table.path}, {doubt.columns}: readings {doubt.uses}; check their unit."
+                )
     return readings, tuple(notes)
 
 
-def _hardly_moving(
+class DoubtedUnit(NamedTuple):
+    """A unit in which readings hardly move, and a larger one in which they use the travel."""
+
+    columns: str  # in words
+    uses: str  # which part of the travel they use in either unit, in words
+    stated: str  # the unit
+    other: str  # the larger one
+    is_sure: bool
+
+    def in_words(self, path: Path) -> str:
+        """Return the sentence that refuses it, up to the remedy."""
+        return (
+            f"{path}, {self.columns}: the unit of the readings could not be decided: found that "
+            f"they {self.uses}, needed the unit in which they are"
+        )
+
+
+def doubted_units(
     given: Array, readings: Array, legs: Sequence[Leg], units: Sequence[ReadingUnit]
-) -> list[tuple[str, bool]]:
+) -> list[DoubtedUnit]:
     """Return which columns hardly move in their unit and do in a larger one, and whether surely.
 
     The largest units are never doubted, so that small motions can always be written in them.
     """
-    found = list[tuple[str, bool]]()
+    found = list[DoubtedUnit]()
     n_poses = len(np.unique(given, axis=0))
     for name in dict.fromkeys(unit.name for unit in units):
         some = [j for j, unit in enumerate(units) if unit.name == name]
@@ -282,14 +305,7 @@ def _hardly_moving(
                 f"{100 * moved:.2g} % in {other}"
             )
             is_sure = n_poses >= MIN_POSES and moved > SURELY_MOVES
-            said = (
-                f"{columns}: the unit of the readings could not be decided: found that they "
-                f"{uses}, needed the unit in which they are; write readings: {other} in the "
-                f"dataset file, and convert them first if they are in {name}."
-                if is_sure
-                else f"{columns}: readings {uses}; check their unit."
-            )
-            found.append((said, is_sure))
+            found.append(DoubtedUnit(columns, uses, name, other, is_sure))
             break
     return found
 

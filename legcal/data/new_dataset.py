@@ -28,12 +28,7 @@ from legcal.data.photograph_matching import (
     likely_pattern,
     match,
 )
-from legcal.data.reading_units import (
-    PULSES,
-    SERVO_SIGMA,
-    SIGMA_ANGLE,
-    sigma_in,
-)
+from legcal.data.reading_units import are_commands, sigma_in, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
 from legcal.errors import DatasetError, UsageError
 from legcal.files import (
@@ -423,18 +418,16 @@ def _sigmas(
                 raise UsageError(
                     "The standard deviation of a reading could not be used: " + str(error)
                 ) from None
-        elif unit.name == PULSES:
-            found[name] = SERVO_SIGMA
         else:
-            found[name] = max(digit, SIGMA_ANGLE if leg.reads_angle else MIN_SIGMA)
+            found[name] = max(digit, usual_sigma(leg, MIN_SIGMA, unit))
     if given is None:
         said = [
             f"{name} {sigma:.2g} {leg.reading_unit}"
             for leg, (name, sigma) in zip(motors, found.items(), strict=True)
         ]
         why = "the last digit of the table, at least that of a good encoder"
-        if any(unit.name == PULSES for unit in readings.units):
-            why = "half a degree of what a hobby servo makes of its pulses"
+        if any(map(are_commands, motors, readings.units)):
+            why = "half a degree of what a hobby servo makes of its command"
         notes.append(
             f"encoder_sigma is {few(said)}, {why}: give --encoder-sigma if readings are known "
             "better or worse."

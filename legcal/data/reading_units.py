@@ -172,14 +172,24 @@ def sigmas_of_legs(legs: Sequence[Leg], sigma_q: float, stated: Mapping[str, flo
 
     It is what is stated of its motor, or the usual one: *sigma_q* [m] of motors that slide.
     """
-    return np.array([stated.get(str(leg.prismatic), _usual_sigma(leg, sigma_q)) for leg in legs])
+    return np.array([stated.get(str(leg.prismatic), usual_sigma(leg, sigma_q)) for leg in legs])
 
 
-def _usual_sigma(leg: Leg, sigma_q: float) -> float:
+def are_commands(leg: Leg, unit: ReadingUnit | None = None) -> bool:
+    """Say whether readings are what a hobby servo was told, and not where it is.
+
+    They are if their *unit* is that of pulses, or the model knows the pulses of the servo: it has
+    no other readings, whatever their unit.
+    """
+    is_servo = leg.actuator is not None and leg.actuator.pulses is not None
+    return is_servo or (unit is not None and unit.name == PULSES)
+
+
+def usual_sigma(leg: Leg, sigma_q: float, unit: ReadingUnit | None = None) -> float:
     """Return the standard deviation [m or rad] of readings of which none is stated."""
-    if leg.actuator is None or not leg.actuator.turns:
+    if not leg.reads_angle:
         return sigma_q
-    return SIGMA_ANGLE if leg.actuator.pulses is None else SERVO_SIGMA
+    return SERVO_SIGMA if are_commands(leg, unit) else SIGMA_ANGLE
 
 
 def sigmas_of(stated: float | str, legs: Sequence[Leg]) -> dict[str, float]:

@@ -18,7 +18,13 @@ from types import MappingProxyType
 
 import numpy as np
 
-from legcal.data.measurements import few, in_travel, reading_columns, readings_of_lengths
+from legcal.data.measurements import (
+    doubted_units,
+    few,
+    in_travel,
+    reading_columns,
+    readings_of_lengths,
+)
 from legcal.data.reading_units import PULSES, ReadingUnit, unit_named
 from legcal.errors import DatasetError, UsageError
 from legcal.files import (
@@ -129,7 +135,8 @@ class ReadingsSheet:
         Raises
         ------
         DatasetError, UsageError
-            If the unit cannot be decided, or with a sentence for each reading outside its travel.
+            If the unit cannot be decided or surely is another one, or with a sentence for each
+            reading outside its travel.
         """
         units, unit_from = self._units(unit, lengths, servos)
         texts = [self._table.text(joint) for joint in self._joints]
@@ -139,7 +146,8 @@ class ReadingsSheet:
         q = values
         if lengths:
             q = np.round(readings_of_lengths(values, self.motors), 12) + 0.0
-        for row, j in np.argwhere(~in_travel(q, self.motors)).tolist():
+        inside = in_travel(q, self.motors)
+        for row, j in np.argwhere(~inside).tolist():
             leg = self.motors[j]
             size, shown = SHOWN_IN[leg.reading_unit]
             low, high = (size * x for x in leg.travel)
@@ -152,6 +160,14 @@ class ReadingsSheet:
                 next(text for text, name in self.taken.items() if name == self._joints[j]),
                 what="reading",
             )
+        if inside.all() and not lengths:
+            numbers = self._table.numbers(self._joints)
+            for doubt in doubted_units(numbers, q, self.motors, units):
+                if doubt.is_sure:
+                    self._table.refuse_file(
+                        f"{doubt.in_words(self.path)}; correct the headings or --unit to "
+                        f"{doubt.other}, or convert them to it if they are in {doubt.stated}."
+                    )
         self._table.check()
         digits = [min(int(Decimal(x).as_tuple().exponent) for x in column) for column in texts]
         last = [

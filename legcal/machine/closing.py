@@ -27,10 +27,11 @@ def close_at(
 ) -> Array:
     """Return the configuration (nq,) that closes every loop to 1e-12 m with the platform at a pose.
 
-    Sliders are set from the distance of their joints, so that no leg is ever flipped; joint angles
-    are solved from ``start``, and from seeded random ones for legs that do not close from there.
-    The pose must meet the constraints. Where it is not *exact* it need meet them but for rounding:
-    in the end the platform is free too, and moves by what the axes of the model are off.
+    Sliders, and motors on which rods hang, are set from the pose, so that no leg is ever flipped;
+    other joint angles are solved from ``start``, and from seeded random ones for legs that do not
+    close from there. The pose must meet the constraints. Where it is not *exact* it need meet them
+    but for rounding: in the end the platform is free too, and moves by what the axes of the model
+    are off.
 
     Raises
     ------
@@ -42,6 +43,8 @@ def close_at(
     for joint in machine.urdf.joints.values():
         if joint.type in ("revolute", "continuous"):
             angles[chain.v_index(joint.name)] = True
+    set_first = slider_columns(machine, range(machine.n_legs))[1]
+    angles[set_first] = False
     # Gaps of legs shorter than a metre count in leg lengths: beside angles in radians they would
     # weigh too little to be closed, and AXIS_TOLERANCE would be a large part of a leg.
     metre = min(1.0, leg_scale(machine, T_base_platform))
@@ -61,7 +64,7 @@ def close_at(
     everything = closure_equations(machine, T_base_platform, 1.0, angles)
     left = everything[0](configuration[None])[0][0]
     if np.abs(left).max(initial=0.0) >= CLOSED:
-        angles[slider_columns(machine, range(machine.n_legs))[1]] = True  # and sliders
+        angles[set_first] = True
         pose = T_base_platform if exact else None
         every = angles if exact else np.ones(chain.nv, dtype=np.bool_)
         equations, retract = closure_equations(machine, pose, 1.0, every)

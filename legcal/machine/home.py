@@ -7,6 +7,7 @@ of this machine, and everything computed there would be judged where no motor go
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -24,6 +25,7 @@ from legcal.machine.topology import level_rotation
 
 TRIALS = 200
 MIN_TRIALS = 20  # trials, where one of them found a pose above the base
+MIN_APART = 0.05  # of the reach, by which a platform is above or below the base
 BATCH = 21  # trials solved at once
 MAX_STALLED = 5  # steps that change little
 MAX_OUTSIDE = 1.0  # of the travel: refused beyond, if it is also beyond
@@ -78,6 +80,8 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
     ------
     DidNotConverge
         If none is found.
+    ModelError
+        If rods on motors reach the platform on both sides of the base: nothing says on which it is.
     """
     middle = np.array([0.5 * sum(leg.travel) for leg in machine.legs])
     if readings is not None:
@@ -88,6 +92,7 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
     level = level_rotation(A, machine.B_platform)
     reach = float(np.abs(machine.lengths_at(middle)).mean())
     best: tuple[float, RigidTransform] | None = None
+    at_readings = partial(_at_readings, machine, readings=middle[list(machine.motors)], reach=reach)
     for first in range(0, TRIALS, BATCH):
         trials = np.arange(first, min(first + BATCH, TRIALS))
         starts = [
@@ -95,21 +100,47 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
             for trial in trials
         ]
         starts = [(t, (level * Rotation.from_rotvec(turn)).as_rotvec()) for t, turn in starts]
-        found = _at_readings(machine, starts, middle[list(machine.motors)], reach)
-        for trial, T in zip(trials, found, strict=True):
+        found = at_readings(starts)
+        for T in found:
             if T is None:
                 continue
             rank = _unlikely(machine, T) + float((level.inv() * T.rotation).magnitude())
             if best is None or rank < best[0] - 1e-6:
                 best = rank, T
-            if trial >= MIN_TRIALS and best[0] < 5.0:
-                return best[1]
+        if trials[-1] >= MIN_TRIALS and best is not None and best[0] < 5.0:
+            break
     if best is None:
         raise DidNotConverge(
             f"{machine.yaml_path}: no home pose was found: with all legs at mid-travel the "
             f"loops did not close from {TRIALS} starts, needed a closed pose; write legcal.home."
         )
-    return best[1]
+    home = best[1]
+    if machine.actuators:
+        mirror = np.diag([1.0, 1.0, -1.0])
+        R, t = mirror @ home.rotation.as_matrix() @ mirror, mirror @ (home.translation - centre)
+        (other,) = at_readings([(centre + t, Rotation.from_matrix(R).as_rotvec())])
+        sides = [_height(machine, T, centre) for T in (home, other) if T is not None]
+        if np.prod(sides) < 0.0 and min(map(abs, sides)) > MIN_APART * reach:
+            poses = " and ".join(_in_yaml(T) for T in (home, other) if T is not None)
+            raise ModelError(
+                f"{machine.yaml_path}: the assembly at home is ambiguous: found no legcal.home, "
+                f"and that at the same readings of the motors the rods reach the platform at "
+                f"{poses}, needed one; write legcal.home with the pose in which the machine is "
+                "assembled."
+            )
+    return home
+
+
+def _height(machine: Machine, T: RigidTransform, centre: Array) -> float:
+    """Return how far joints of the platform are above a point of the base, in the mean [m]."""
+    return float(np.mean(T.apply(machine.B_platform)[:, 2]) - centre[2])
+
+
+def _in_yaml(T: RigidTransform) -> str:
+    """Return a pose as models have it."""
+    xyz, quat = T.translation, T.rotation.as_quat()
+    numbers = [", ".join(f"{x + 0.0:.4g}" for x in part.round(6)) for part in (xyz, quat)]
+    return f"{{xyz: [{numbers[0]}], quat_xyzw: [{numbers[1]}]}}"
 
 
 def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> RigidTransform | None:

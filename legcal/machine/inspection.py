@@ -39,9 +39,16 @@ class ActuatorBlock(SparseDocument):
         return self
 
 
+class InspectedArm(ArmBlock):
+    """An arm that is a cylinder, as the model draws it."""
+
+    radius: Number  # [m]
+
+
 class InspectedActuator(ActuatorBlock):
     """A motor as the model has it."""
 
+    arm: InspectedArm | None = None
     gain: Number | None = None  # true motion over reading; left out where it is 1
     centre_us: Number | None = None  # of a hobby servo: the pulse at joint value 0 [us]
     us_per_deg: Number | None = None
@@ -99,10 +106,12 @@ def machine_document(machine: Machine) -> dict[str, Any]:
     kinds = [leg.kind for leg in machine.legs]
     readings = readings_at(machine, machine.home).tolist()
     stated = motor_entries(machine.actuators)
-    actuators = {
-        a.joint: InspectedActuator.model_validate(a.document() | stated.get(a.joint, {}))
-        for a in machine.actuators
-    }
+    actuators = dict[str, InspectedActuator]()
+    for a in machine.actuators:
+        found = a.document() | stated.get(a.joint, {})
+        if a.arm is not None:
+            found["arm"] = found["arm"] | {"radius": a.arm.radius}
+        actuators[a.joint] = InspectedActuator.model_validate(found)
     return Inspection(
         name=machine.name,
         spatial=machine.spatial,

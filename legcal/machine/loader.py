@@ -329,20 +329,28 @@ def _readings_at_home(machine: Machine, given: Mapping[str, float]) -> list[floa
         if leg.actuator is None:
             continue
         both = [float(reading_of_rod(replace(leg, mode=m), B[j : j + 1])[0]) for m in (1, -1)]
+        size, unit = SHOWN_IN[leg.reading_unit]
+        said = f"the readings {size * both[0]:.1f} and {size * both[1]:.1f} {unit}"
         if leg.actuator.joint in given:
             wanted = given[leg.actuator.joint]
             q[j] = min(both, key=lambda x: abs(x - wanted))
+            if not leg.in_travel(np.array([wanted]))[0]:
+                degrees = ", in radians" if leg.reads_angle else ""
+                raise ModelError(
+                    f"{path}: legcal.home_readings.{leg.actuator.joint} could not be used: found "
+                    f"{wanted:g} {leg.reading_unit}, outside the travel of {leg.travel[0]:.4g} to "
+                    f"{leg.travel[1]:.4g} {leg.reading_unit}, needed the one of {said} that is "
+                    f"that of home; correct it{degrees}."
+                )
             continue
         inside = [bool(leg.in_travel(np.array([x]))[0]) for x in both]
         scale = 1e-6 * max(1.0, float(np.ptp(leg.travel)))
         if all(inside) and abs(both[0] - both[1]) > scale:
-            size, unit = SHOWN_IN[leg.reading_unit]
             raise ModelError(
                 f"{path}: the assembly of leg '{leg.name}' at home is ambiguous: found that its "
-                f"rod reaches the platform at the readings {size * both[0]:.1f} and "
-                f"{size * both[1]:.1f} {unit} of '{leg.actuator.joint}', both inside its travel, "
-                "needed one; write legcal.home_readings with the reading of each actuator at "
-                "home, or narrow the limits of the joint."
+                f"rod reaches the platform at {said} of '{leg.actuator.joint}', both inside its "
+                "travel, needed one; write legcal.home_readings with the reading of each actuator "
+                "at home, or narrow the limits of the joint."
             )
         middle = 0.5 * sum(leg.travel)
         q[j] = both[inside.index(True)] if any(inside) else min(both, key=lambda x: abs(x - middle))
@@ -617,13 +625,16 @@ def _check_unit(machine: Machine) -> None:
                 "limits of its slider in metres (are they millimetres?)."
             )
     for leg, length in zip(machine.legs, np.where(fixed, lengths.max(), lengths), strict=True):
-        for cylinder in leg.cylinders:
-            if not MIN_RADIUS < cylinder.radius / length < MAX_RADIUS:
+        seen = [(c.link, c.radius, f"along leg '{leg.name}'") for c in leg.cylinders]
+        if leg.arm is not None:
+            seen.append((leg.arm.link, leg.arm.radius, f"on the arm of leg '{leg.name}'"))
+        for link, radius, where in seen:
+            if not MIN_RADIUS < radius / length < MAX_RADIUS:
                 raise ModelError(
-                    f"{machine.urdf_path}: the <visual> cylinder of link '{cylinder.link}' "
-                    f"could not be used: found a radius of {1e3 * cylinder.radius:.4g} mm along "
-                    f"leg '{leg.name}', which is {1e3 * length:.4g} mm long at home, needed "
-                    f"{MIN_RADIUS:g} to {MAX_RADIUS:g} of the length; correct radius and its unit."
+                    f"{machine.urdf_path}: the <visual> cylinder of link '{link}' could not be "
+                    f"used: found a radius of {1e3 * radius:.4g} mm {where}, which is "
+                    f"{1e3 * length:.4g} mm long at home, needed {MIN_RADIUS:g} to "
+                    f"{MAX_RADIUS:g} of the length; correct radius and its unit."
                 )
 
 

@@ -42,6 +42,7 @@ from .outline import HIDDEN as HIDDEN
 from .outline import MIN_LENGTH as MIN_LENGTH
 from .outline import MIN_LONE_KEPT as MIN_LONE_KEPT
 from .outline import OUTSIDE as OUTSIDE
+from .outline import WRONG_WIDTH as WRONG_WIDTH
 from .outline import ImageSearch as ImageSearch
 from .outline import Method as Method
 from .outline import OutlineLine as OutlineLine
@@ -72,4 +73,5 @@ from .placement import PlacedArm as PlacedArm
 from .placement import Placement as Placement
 from .placement import Search as Search
 from .placement import group_views as group_views
+from .placement import placed_arms as placed_arms
 from .placement import unplaced_notes as unplaced_notes

@@ -94,7 +94,7 @@ def marks_of_image(
 
     From its outlines and the predicted legs.
     """
-    of_leg = {leg.leg: leg for leg in predicted}
+    of_part = {(leg.leg, segment.link): leg for leg in predicted for segment in leg.segments}
     several = {leg.leg for leg in predicted if len(leg.segments) > 1}
     pairs: dict[tuple[int, str], list[int]] = {}
     for i, key in enumerate(zip(outlines.leg.tolist(), outlines.part, strict=True)):
@@ -103,7 +103,7 @@ def marks_of_image(
     found = []
     for (leg, part), rows in pairs.items():
         pair = outlines.choose(np.array(rows, dtype=np.intp))
-        marks = _part_marks(camera, pair, part, of_leg.get(leg))
+        marks = _part_marks(camera, pair, part, of_part.get((leg, part)))
         if not marks:
             continue
         name = leg_names[leg]
@@ -112,8 +112,8 @@ def marks_of_image(
         if "edited" in pair.source:
             name += " (edited)"
         found.append(PartMarks(name, _reason(pair), marks))
-    for absent in predicted:  # legs of which the table has nothing
-        if any(absent.leg == j for j, _ in pairs):
+    for absent in predicted:  # legs and arms of which the table has nothing
+        if any((absent.leg, segment.link) in pairs for segment in absent.segments):
             continue
         parts = range(len(absent.segments))
         marks = tuple(mark for i in parts for mark in _prediction(camera, absent, i))

@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.data import Measurements, by_cause, few_views
 from legcal.errors import NotVisible
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Cylinder
+from legcal.machine import Cylinder, Leg, arms_at, cylinder_of_arm
 from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
 from legcal.perception.radii import NO_RADIUS_FACTORS, RadiusFactors
@@ -90,12 +90,34 @@ def sensor_extent(camera: Camera) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class PlacedArm:
-    """An arm that is a cylinder, where a joint fit has it."""
+    """An arm that is a cylinder, where a joint fit or the model has it."""
 
     name: str  # its motor, for reasons
     cylinder: Cylinder  # along its line, from its near end
     ends: Array  # (n_rows, 2, 3) in the base link [m]
     error: float  # how far it may be from there: where only the model has it [m]
+
+
+def placed_arms(
+    legs: Sequence[Leg],
+    q: Array,  # (n_poses, n_actuators) readings of actuators
+    pose: IntArray,  # (n_rows,) the pose of each row
+    *,
+    T_base: RigidTransform | None = None,  # from the frame of the legs, if that is not the base
+    radii: Mapping[tuple[int, str], float] = MappingProxyType({}),  # of those that a fit has seen
+) -> dict[int, PlacedArm]:
+    """Return the arms that are cylinders, by the legs that have them as parts."""
+    found = {}
+    for j, ends in arms_at(legs, q).items():
+        actuator = legs[j].actuator
+        if actuator is not None and actuator.arm is not None:
+            if T_base is not None:
+                ends = T_base.apply(ends.reshape(-1, 3)).reshape(ends.shape)
+            seen = radii.get((j, actuator.arm.link))
+            arm = actuator.arm if seen is None else replace(actuator.arm, radius=seen)
+            error = PREDICTED_JOINT_ERROR if seen is None else 0.0
+            found[j] = PlacedArm(actuator.joint, cylinder_of_arm(arm), ends[pose], error)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +139,7 @@ class Placement:
     radii: RadiusFactors = NO_RADIUS_FACTORS  # that images contradict; cameras are placed by theirs
     unplaced: dict[str, str] = field(default_factory=dict)  # why views have no camera, by name
     notes: tuple[str, ...] = ()  # what else a reader should know
-    # by the legs that have them as parts; looked for near a joint fit alone
+    # by the legs that have them as parts; looked for once cameras are placed
     arms: Mapping[int, PlacedArm] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

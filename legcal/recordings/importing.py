@@ -13,9 +13,9 @@ import numpy as np
 
 from legcal.data import (
     MIN_SIGMA,
-    SIGMA_ANGLE,
     few,
     plan_new_dataset,
+    usual_sigma,
     write_new_dataset,
 )
 from legcal.errors import DatasetError, OutOfResources, UsageError
@@ -161,14 +161,12 @@ class Import:
         By joint [m or rad] where a motor turns.
         """
         scatter = np.max([view.scatter for view in self.views], axis=0)
-        turning = [self.machine.legs[j].reads_angle for j in self.machine.motors]
-        if not any(turning):
+        motors = [self.machine.legs[j] for j in self.machine.motors]
+        if not any(leg.reads_angle for leg in motors):
             return max(float(scatter.max()), MIN_SIGMA)
         return {
-            name: max(sigma, SIGMA_ANGLE if turns else MIN_SIGMA)
-            for name, sigma, turns in zip(
-                self.machine.motor_names, scatter.tolist(), turning, strict=True
-            )
+            str(leg.prismatic): max(sigma, usual_sigma(leg, MIN_SIGMA))
+            for leg, sigma in zip(motors, scatter.tolist(), strict=True)
         }
 
     def document(self, written: Sequence[Path]) -> dict[str, Any]:

@@ -111,6 +111,8 @@ def _motors(description: dict[str, Any]) -> RenderableType:
         )
         if turns:
             rows.append(("", "", f"at {_points([motor['point']])[0]} mm", "", ""))
+        if "arm" in motor:
+            rows.append(("", "", f"a round arm, R {1e3 * motor['arm']['radius']:g} mm", "", ""))
         if "us_per_deg" in motor:
             pulses = f"{motor['centre_us']:g} us at 0, {motor['us_per_deg']:g} us/deg"
             rows.append(("", "", pulses, "", ""))

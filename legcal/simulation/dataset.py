@@ -224,13 +224,16 @@ def _write_photographs(
 
 def _check_readings(nominal: Machine, settings: SimulationSettings) -> None:
     """Refuse errors of readings that are larger than what is read."""
-    travel = min((np.ptp(nominal.legs[j].travel) for j in nominal.motors), default=np.inf)
-    if settings.readings.size > travel:
-        raise UsageError(
-            f"The readings could not be simulated: found errors of {settings.readings.size:g} m, "
-            f"needed at most the shortest travel of a motor, {travel:g} m; give them with the "
-            "unit that is meant."
-        )
+    for leg in (nominal.legs[j] for j in nominal.motors):
+        size, travel = settings.reading_errors(leg).size, float(np.ptp(leg.travel))
+        if size > travel:
+            found, most = (x if leg.reading_unit == "m" else np.degrees(x) for x in (size, travel))
+            unit = "m" if leg.reading_unit == "m" else "deg"
+            raise UsageError(
+                f"The readings could not be simulated: found errors of {found:g} {unit}, needed at "
+                f"most the travel of motor '{leg.motor_label}', {most:g} {unit}; give them with "
+                "the unit that is meant."
+            )
 
 
 class ViewSummary(Document):

@@ -222,7 +222,11 @@ class Request:
     )
     encoder_noise: str = field(
         default="2um",
-        metadata=_option("Sigma of readings; 3um:uniform for +-3um.", _NOISE, metavar="SIGMA"),
+        metadata=_option(
+            "Sigma of readings, 2um or of motors that turn 0.5deg; 3um:uniform for +-3um.",
+            _NOISE,
+            metavar="SIGMA",
+        ),
     )
     appearance: Path | None = field(
         default=None,

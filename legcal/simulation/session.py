@@ -376,11 +376,14 @@ def _recorded(
         used = shown if 0 < len(shown) < len(legs) else None
         views.append(View(view.name, view.camera, *((T, used) if hints else (None, None))))
     q = poses.readings
-    size = np.array([leg.reading_of(settings.readings.size) for leg in truth.legs])
-    if settings.readings.distribution is Distribution.UNIFORM:
-        errors = rngs["readings"].uniform(-size, size, q.shape)
-    else:
-        errors = size * rngs["readings"].normal(size=q.shape)
+    spreads = [settings.reading_errors(leg) for leg in truth.legs]
+    errors = np.zeros(q.shape)
+    for kind in dict.fromkeys(spread.distribution for spread in spreads):
+        size = np.array([spread.size * (spread.distribution is kind) for spread in spreads])
+        if kind is Distribution.UNIFORM:
+            errors += rngs["readings"].uniform(-size, size, q.shape)
+        else:
+            errors += size * rngs["readings"].normal(size=q.shape)
     q = q + errors[:, list(truth.reads)]
     names = [""] * len(images)
     if photographs:
@@ -398,10 +401,7 @@ def _recorded(
         q=q[images.pose],
         sigma_q=max(settings.encoder_sigma, _MIN_SIGMA_Q),
         sigma_by_joint={
-            str(truth.legs[j].prismatic): max(
-                truth.legs[j].reading_of(settings.encoder_sigma), _MIN_SIGMA_Q
-            )
-            for j in truth.motors
+            str(truth.legs[j].prismatic): max(spreads[j].sigma, _MIN_SIGMA_Q) for j in truth.motors
         }
         if any(a.turns for a in truth.actuators)
         else {},

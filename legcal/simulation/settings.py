@@ -35,7 +35,7 @@ from legcal.files import (
     read_yaml,
     validate,
 )
-from legcal.machine import LegKind, Machine, kind_of_parameter, parametrization_of
+from legcal.machine import Leg, LegKind, Machine, kind_of_parameter, parametrization_of
 from legcal.simulation.board import KINDS as BOARD_KINDS
 from legcal.simulation.observe import TableNoise
 from legcal.simulation.rendering.appearance import Appearance, Light
@@ -84,6 +84,11 @@ class Spread:
             )
         object.__setattr__(self, "size", float(self.size))
         object.__setattr__(self, "distribution", Distribution(self.distribution))
+
+    @property
+    def sigma(self) -> float:
+        """Their standard deviation [m] or [rad]."""
+        return self.size if self.distribution is Distribution.NORMAL else self.size / math.sqrt(3.0)
 
 
 @dataclass(frozen=True)
@@ -192,7 +197,9 @@ class SimulationSettings:
     table : TableNoise
         Noise of axes.
     readings : Spread
-        Errors of encoder readings [m].
+        Errors of encoder readings [m]; of motors that turn as far as they move A.
+    angles : Spread or None
+        Errors of readings of motors that turn [rad], in place of these.
     appearance : Appearance
         How photographs look.
     board : Board, str, Path or None
@@ -231,6 +238,7 @@ class SimulationSettings:
     sigma_px: float = 0.1
     table: TableNoise = field(default_factory=TableNoise)
     readings: Spread = DEFAULT_READINGS
+    angles: Spread | None = None
     appearance: Appearance = field(default_factory=Appearance)
     board: Board | str | Path | None = None
     board_pose: bool = False
@@ -267,6 +275,8 @@ class SimulationSettings:
             "appearance": (self.appearance, Appearance),
             "sigma_px": (self.sigma_px, Real),
         }
+        if self.angles is not None:
+            kinds["angles"] = (self.angles, Spread)
         if isinstance(self.errors, ParameterErrors):
             kinds |= {f"errors.{name}": (getattr(self.errors, name), Spread) for name in KINDS}
         if isinstance(self.table, TableNoise):
@@ -286,6 +296,8 @@ class SimulationSettings:
             "noise of edge points": (self.sigma_px, 0.0, MAX_SIGMA_PX),
             "noise of readings": (self.readings.size, 0.0, MAX_SIZE),
         }
+        if self.angles is not None:
+            sizes["noise of angles"] = (self.angles.size, 0.0, MAX_SIZE)
         for name in KINDS:
             size = getattr(self.errors, name).size
             sizes[f"errors of {name.replace('_', ' ')}"] = (size, 0.0, MAX_SIZE)
@@ -342,8 +354,13 @@ class SimulationSettings:
     @property
     def encoder_sigma(self) -> float:
         """Standard deviation of a reading [m]."""
-        size = self.readings.size
-        return size if self.readings.distribution is Distribution.NORMAL else size / math.sqrt(3.0)
+        return self.readings.sigma
+
+    def reading_errors(self, leg: Leg) -> Spread:
+        """Return the errors of the readings of a leg's motor [m or rad]."""
+        if leg.reads_angle and self.angles is not None:
+            return self.angles
+        return replace(self.readings, size=leg.reading_of(self.readings.size))
 
 
 def _choice(choices: type[StrEnum], name: str, found: str) -> StrEnum:
@@ -375,7 +392,7 @@ def _unit(name: str) -> str:
     """Return the unit of a size, by its name."""
     if name.endswith("points"):
         return "px"
-    return "rad" if name.endswith(("axes", "twists", "psi", "theta")) else "m"
+    return "rad" if name.endswith(("axes", "twists", "psi", "theta", "angles")) else "m"
 
 
 def read_appearance(path: Path) -> Appearance:
@@ -449,12 +466,24 @@ def requested(request: Request, nominal: Machine) -> SimulationSettings:
         tell_gamma=request.tell_gamma is not False,
         sigma_px=parse_quantity(noise, PIXELS, "--pixel-noise"),
         table=TableNoise.in_radians() if request.table_noise is Angles.RADIANS else TableNoise(),
-        readings=_spread(request.encoder_noise, LENGTH, Distribution.NORMAL, "--encoder-noise"),
+        **_encoder_noise(request.encoder_noise, nominal),
         appearance=_appearance(request),
         seed=request.seed,
         plan=request.plan,
         lengths=_lengths(request.length or (), nominal),
     )
+
+
+def _encoder_noise(text: str, nominal: Machine) -> dict[str, Spread]:
+    """Return the errors of readings [m], or of motors that turn [rad] where it is an angle."""
+    if not any(text.partition(":")[0].endswith(unit) for unit in ANGLE):
+        return {"readings": _spread(text, LENGTH, Distribution.NORMAL, "--encoder-noise")}
+    if not any(leg.reads_angle for leg in nominal.legs):
+        raise UsageError(
+            f"--encoder-noise could not be used: found {describe(text)} and no motor that turns, "
+            "needed a length such as 2um; correct it."
+        )
+    return {"angles": _spread(text, ANGLE, Distribution.NORMAL, "--encoder-noise")}
 
 
 def _lengths(stated: Sequence[str], nominal: Machine) -> dict[str, float]:

@@ -439,6 +439,10 @@ def read_views(
 def _refusal(dataset: Dataset, report: Identifiability) -> str:
     """Return why a dataset cannot be calibrated, and the remedies."""
     remedies = [remedy.remedy for remedy in report.remedies if remedy.enough]
+    unseen = [leg.name for leg in dataset.machine.legs if not leg.cylinders]
+    if unseen and dataset.axes is None:
+        names = legs_in_words([dataset.machine.leg_names.index(n) for n in unseen], report.legs)
+        remedies.insert(0, f"add a <visual> cylinder along {names}, which no image shows without")
     remedy = remedies[0] if remedies else "add images of other poses, and of more legs at once"
     return (
         f"{dataset.folder}: the parameters cannot be identified: found that these views and poses "

@@ -361,7 +361,7 @@ def planned_observations(
 
 def recorded_observations(
     # A view is taken to show the legs that have axes in it; without a table of axes those that it
-    # names, or all
+    # names, or all, which have a visible cylinder
     dataset: Dataset,
     *,
     twists: bool = False,  # count twists of legs and gains of actuators among the parameters
@@ -391,7 +391,13 @@ def recorded_observations(
     used = np.unique(m.view)
     views = [m.views[v] for v in used]
     seen = np.array(
-        [[view.legs is None or name in view.legs for name in machine.leg_names] for view in views]
+        [
+            [
+                bool(leg.cylinders) and (view.legs is None or leg.name in view.legs)
+                for leg in machine.legs
+            ]
+            for view in views
+        ]
     )
     if dataset.axes is not None:
         shown_legs = np.zeros((len(m.views), len(machine.leg_names)), dtype=np.bool_)

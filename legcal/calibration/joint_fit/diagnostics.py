@@ -22,6 +22,7 @@ from legcal.calibration.joint_fit.parameter_choices import Prior, board_scale
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.variables import Start, State, intrinsic_of
+from legcal.data import Outlines
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation import (
     NormalEquations,
@@ -35,9 +36,11 @@ from legcal.machine import (
     Actuator,
     actuators_of,
     kind_of_parameter,
+    list_in_words,
     owner_of_parameter,
     radius_name,
 )
+from legcal.perception import WRONG_WIDTH
 from legcal.vision import LINKS, Link, intrinsic_names, intrinsic_unit
 
 _SIGNIFICANT = 5.0  # standard deviations between a prior and the measurements
@@ -51,6 +54,7 @@ _NOMINAL_SIGMA = 0.01  # of the mean leg length: how far a nominal model is off 
 _MIN_SHARE = 0.01  # of the variance that a camera file states, which measurements must remove
 _MANY_REJECTED = 0.1  # of all outlines
 _MOST_REJECTED = 0.5  # of those of a leg or a view
+_ARM_MISFIT = 3.0  # of an arm that is no cylinder: of its outlines to those of rods
 _MIN_COUNT = 3  # rejected outlines of a leg or a view, at least, before it is noted
 _RADIUS_SIGMAS = 3.0  # between radii and the model's, of whose prior nobody said a word
 _RADIUS_SPREAD = 0.25  # of their common difference
@@ -397,8 +401,7 @@ def doubted_cameras(
 def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
     """Return a note where many outlines, or most of a leg or of a view, disagree with the fit."""
     o = problem.outlines
-    names, leg = problem.legs.names, np.where(o.on_arm, len(problem.legs.names) + o.leg, o.leg)
-    legs = _mostly_rejected(leg, (*names, *_arm_names(problem)), o.index, accepted)
+    legs = _mostly_rejected(o.leg, problem.legs.names, o.index, accepted | o.on_arm)
     views = _mostly_rejected(o.view, o.views, o.index, accepted)
     n, n_rejected = len(accepted), int(np.sum(~accepted))
     of = [f"{rejected} of {total} of {name}" for name, (rejected, total) in (legs | views).items()]
@@ -438,10 +441,59 @@ def legs_left_out(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
     )
 
 
-def _arm_names(problem: FitProblem) -> tuple[str, ...]:
-    """Return what messages call the arm of each leg."""
-    arms = [leg.arm for leg in problem.legs.nominal]
-    return tuple("" if arm is None else f"{arm.leg}.{arm.link}" for arm in arms)
+def arms_of_other_widths(outlines: Outlines, is_arm: BoolArray) -> dict[int, str]:
+    """Return the legs whose arms are seen with other widths than the model's, and how often.
+
+    *is_arm* says which outlines of the table are of arms. Both edges of another shape, or of
+    another radius, are found in most images, and those that are used pass by chance.
+    """
+    is_wide = np.array([why.startswith(WRONG_WIDTH) for why in outlines.reason], dtype=np.bool_)
+    found = dict[int, str]()
+    for leg in np.unique(outlines.leg[is_arm & outlines.used]).tolist():
+        own = is_arm & (outlines.leg == leg)
+        n_wrong, total = int(is_wide[own].sum()), int((is_wide | outlines.used)[own].sum())
+        if n_wrong >= _MIN_COUNT and n_wrong > _MOST_REJECTED * total:
+            found[leg] = f"{n_wrong} of whose {total} outlines show another width than the model's"
+    return found
+
+
+def wrong_arms(problem: FitProblem, state: State, outlines: Outlines) -> dict[int, str]:
+    """Return the legs whose arms a fit contradicts, and how, after the name of the motor.
+
+    Such an arm has most of its outlines rejected, or the median one lies much further off than that
+    of the rods, in standard deviations that are claimed. *outlines* are those of the table, with
+    the verdicts of the fit.
+    """
+    o = problem.outlines
+    if not o.on_arm.any() or o.on_arm.all():
+        return {}
+    offsets, used = problem.offsets(state), outlines.used[o.index]
+    squares = np.einsum(
+        "na,na->n", offsets, np.linalg.solve(o.covariance, offsets[..., None])[..., 0]
+    )
+    usual, found = float(np.median(squares[~o.on_arm])), dict[int, str]()
+    for leg in np.unique(o.leg[o.on_arm]).tolist():
+        own = o.on_arm & (o.leg == leg)
+        total, rejected = int(own.sum()), int(np.sum(own & ~used))
+        times = float(np.sqrt(np.median(squares[own]) / usual)) if usual > 0.0 else 0.0
+        if rejected >= _MIN_COUNT and rejected > _MOST_REJECTED * total:
+            found[leg] = f"{rejected} of whose {total} outlines disagree with the fit"
+        elif total >= _MIN_COUNT and times > _ARM_MISFIT:
+            found[leg] = f"whose outlines lie {times:.1f} times as far off as those of rods"
+    return found
+
+
+def reversed_motors(problem: FitProblem, state: State) -> tuple[str, ...]:
+    """Return a note on motors whose axes or directions come out opposite to the model's."""
+    pairs = zip(actuators_of(state.legs), actuators_of(problem.legs.nominal), strict=True)
+    names = [found.joint for found, nominal in pairs if found.axis @ nominal.axis < 0.0]
+    if not names:
+        return ()
+    return (
+        f"The readings of {list_in_words(names)} count the other way than the model says: "
+        "found axes or directions that came out reversed; correct them in the model, or reverse "
+        "the readings (of a servo give us_per_deg the other sign).",
+    )
 
 
 def scale_notes(problem: FitProblem, state: State) -> tuple[str, ...]:

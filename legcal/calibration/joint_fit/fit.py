@@ -7,7 +7,7 @@ noise of outlines is estimated, outlines that disagree are rejected, and the res
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -17,12 +17,14 @@ from legcal.calibration.joint_fit.determinacy import (
     refuse_undetermined_inliers,
 )
 from legcal.calibration.joint_fit.diagnostics import (
+    arms_of_other_widths,
     naming_missing_lengths,
     naming_stated_values,
     refuse_contradicted_priors,
     refuse_contradicted_values,
     refuse_other_board,
     rejected_notes,
+    wrong_arms,
 )
 from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.free_poses import (
@@ -53,6 +55,7 @@ from legcal.estimation import (
     named_covariance,
 )
 from legcal.geometry import Array
+from legcal.machine import Leg, list_in_words
 
 _MAX_RADIUS_CHANGE = 0.5
 _COST_TOLERANCE = 1e-6  # relative: the same minimum
@@ -115,13 +118,54 @@ def refine(
     DatasetError
         If an outline or an axis cannot be used.
     """
-    problem = build_fit(
-        legs, measurements, outlines, settings, axes=axes, board=board, choices=choices
-    )
-    problem.require_determined()
     starts = [start] if isinstance(start, Start) else start
-    with naming_missing_lengths(problem):
-        return _best(problem, outlines, starts)
+
+    def fitted(seen: Outlines) -> Solution:
+        problem = build_fit(
+            legs, measurements, seen, settings, axes=axes, board=board, choices=choices
+        )
+        problem.require_determined()
+        with naming_missing_lengths(problem):
+            return _best(problem, seen, starts)
+
+    return _without_wrong_arms(fitted, outlines, legs.nominal)
+
+
+def _without_wrong_arms(
+    fitted: Callable[[Outlines], Solution], outlines: Outlines, legs: Sequence[Leg]
+) -> Solution:
+    """Return a fit without the arms that are no cylinders on their motors, each as a whole.
+
+    The rods do without arms, and outlines of another shape bend the fit or raise the noise of all.
+    So arms that a fit contradicts are left out, and all of them where it fails with them.
+    """
+    parts = list(zip(outlines.leg.tolist(), outlines.part, strict=True))
+    is_arm = np.array([legs[j].is_arm(part) for j, part in parts], dtype=np.bool_)
+    notes, wrong = list[str](), arms_of_other_widths(outlines, is_arm)
+    while True:
+        if wrong:
+            left_out = is_arm & np.isin(outlines.leg, list(wrong))
+            outlines = outlines.reject(left_out, "the arm is left out as a whole")
+            reasons: dict[str, list[str]] = {}
+            for j, why in wrong.items():
+                reasons.setdefault(why, []).append(str(legs[j].prismatic))
+            said = "; ".join(f"{list_in_words(names)}, {why}" for why, names in reasons.items())
+            notes.append(
+                f"Arms were left out as a whole: found those of {said}, needed straight cylinders "
+                "as the model draws them; correct their radii, or draw other shapes as boxes or "
+                "meshes."
+            )
+        try:
+            found = fitted(outlines)
+            wrong = wrong_arms(found.posterior.problem, found.posterior.state, found.outlines)
+        except (DidNotConverge, NotIdentifiable):
+            seen = {parts[i][0] for i in np.flatnonzero(is_arm & outlines.used).tolist()}
+            if not seen:
+                raise
+            wrong = dict.fromkeys(sorted(seen), "with whose outlines the joint fit fails")
+        else:
+            if not wrong:
+                return dataclasses.replace(found, notes=(*notes, *found.notes))
 
 
 def _called(start: Start) -> str:

@@ -17,6 +17,7 @@ from legcal.calibration.joint_fit.diagnostics import (
     doubted_cameras,
     legs_left_out,
     rejected_notes,
+    reversed_motors,
     scale_notes,
 )
 from legcal.calibration.joint_fit.free_poses import TOO_FEW_LEGS, of_determined_poses
@@ -238,6 +239,7 @@ def assemble_solution(
             *rejected_notes(problem, fit.accepted),
             *corner_notes(problem),
             *reading_notes(readings),
+            *reversed_motors(problem, state),
             *map(str, gammas),
             *notes_on_blur(fit.edge_biases, problem.outlines.covariance[fit.accepted]),
             *(scale or contradicted_radii(problem, state, normal)),
