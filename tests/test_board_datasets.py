@@ -21,6 +21,7 @@ from legcal.data import (
 )
 from legcal.data.corners import COLUMNS, read_corners
 from legcal.errors import DatasetError
+from legcal.vision import FixedBoard
 
 __all__ = ["folder"]
 BOARD = {"kind": "charuco", "squares_x": 4, "squares_y": 3, "square": 0.03, "marker": 0.02,
@@ -78,6 +79,7 @@ def test_hand_held_views_count_in_the_order_of_the_table(folder: Folder) -> None
         ("0 corners", ("row 2", "found no corners")),
         ("no image", ("row 2, column image", "neither an image")),
         ("corners alone", ("corners.csv", "no board")),
+        ("no legs", ("views c1, c2 could not be used", "empty list of legs")),
         ("a number", ("views.c1.hand_held", "found 3", "true or false")),
         ("a wrong board", ("dataset.yaml", "board.square", "30 m")),
         ("a word", ("dataset.yaml", "board", "'charuco'", "mapping")),
@@ -88,7 +90,7 @@ def test_what_no_board_can_place_is_refused(
 ) -> None:
     entry, views = folder.entry, folder.entry["views"]
     pose = views["c1"]["T_base_camera"]
-    if change != "corners alone":
+    if change not in ("corners alone", "no legs"):
         _hold(folder, "c1")
     if change == "no board":
         del entry["board"]
@@ -104,6 +106,9 @@ def test_what_no_board_can_place_is_refused(
         _write(folder.path / "corners.csv", lines)
     elif change == "no image":
         folder.rows[1]["image"] = ""
+    elif change == "no legs":
+        for view in views.values():
+            view["legs"] = []
     elif change == "corners alone":
         _write(folder.path / "corners.csv", _lines("c1,images/c1_1.png"))
     else:
@@ -127,6 +132,7 @@ MEASUREMENTS = Measurements(
     q=np.zeros((3, 1)),
     sigma_q=1e-6,
 )
+BOARDS = (FixedBoard(CHARUCO, "base"),)
 KEYS = st.lists(
     st.tuples(st.integers(0, 2), st.integers(0, CHARUCO.n_corners - 1)),
     min_size=1,
@@ -158,7 +164,7 @@ def test_corners_are_read_as_they_were_written_and_put_in_order(corners: Corners
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "corners.csv"
         write_corners(path, corners, MEASUREMENTS)
-        assert _same(read_corners(path, CHARUCO.n_corners, MEASUREMENTS), corners)
+        assert _same(read_corners(path, BOARDS, MEASUREMENTS), corners)
     order = canonical_order(MEASUREMENTS, ["leg1"])
     back = order.restore(order.reorder(corners))
     assert _same(back, corners.choose(np.lexsort([corners.corner, corners.row])))
@@ -166,7 +172,7 @@ def test_corners_are_read_as_they_were_written_and_put_in_order(corners: Corners
 
 def _read(tmp_path: Path, *lines: str) -> Corners:
     _write(tmp_path / "corners.csv", list(lines))
-    return read_corners(tmp_path / "corners.csv", CHARUCO.n_corners, MEASUREMENTS)
+    return read_corners(tmp_path / "corners.csv", BOARDS, MEASUREMENTS)
 
 
 def test_an_edited_corner_wins_and_a_rejected_one_needs_no_place(tmp_path: Path) -> None:
@@ -185,6 +191,13 @@ def test_an_edited_corner_wins_and_a_rejected_one_needs_no_place(tmp_path: Path)
 
 
 FIRST = "c1,c.png,0,5.0,5.0,0.1,used,,detected"
+
+
+def test_corners_of_a_board_that_is_gone_are_refused_once(tmp_path: Path) -> None:
+    lines = [f"c1,c.png,{k},{5 + k},5.0,0.1,used,,detected" for k in range(30)]
+    with pytest.raises(DatasetError, match=r"corners up to 29, .*15 on the base") as caught:
+        _read(tmp_path, *lines)
+    assert len(caught.value.problems) == 1
 
 
 @pytest.mark.parametrize(

@@ -369,6 +369,7 @@ PAIRS = {
 Refused = tuple[dict[str, Any], tuple[str, ...]]  # what is changed, what must be named
 TABLE_REFUSED: list[Refused] = [
     ({"legcal_table": None}, ("legcal_table", "needed 1", "legcal_table: 1")),
+    ({"legcal_table": None, "version": 1}, ("version: 1", "write 'legcal_table: 1'")),
     ({"legcal_table": True}, ("legcal_table", "true", "needed 1")),
     ({"type": 3}, ("type", "found 3", "6-UPS")),
     ({"type": "²-RPS"}, ("type", "'²-RPS'")),

@@ -16,10 +16,11 @@ from bound import ERRORS
 from fit_sessions import MachineSession, machine_session
 from layouts import Layout, LegLayout, MachineSpec, write_machine
 from machines import exechon, four_upu, two_upr_two_sps
-from outline_sessions import Noise, design_of, draw_session, one_fit
+from outline_sessions import Noise, design_of, draw_session, made, one_fit
 from scipy.spatial.transform import Rotation
 from thinned import thinned
 
+import legcal
 from legcal import identifiability
 from legcal.calibration.joint_fit import refine
 from legcal.calibration.joint_fit.diagnostics import refuse_contradicted_values
@@ -43,7 +44,14 @@ from legcal.machine import (
     platform_in_base,
     solve_poses,
 )
-from legcal.simulation import ParameterErrors, Spread, write_true_model
+from legcal.simulation import (
+    Level,
+    ParameterErrors,
+    SimulationSettings,
+    Spread,
+    simulate,
+    write_true_model,
+)
 
 KINDS: dict[str, tuple[Callable[[], MachineSpec], int, int]] = {  # mobility, parameters less ties
     "exechon": (exechon, 3, 19 - 7),
@@ -222,3 +230,11 @@ def test_ways_of_dependent_constraints_need_no_short_steps(tmp_path: Path) -> No
     _, slowly = follow_poses(machine, machine.home, home, q, 1.0 / 256.0)
     assert np.sum(slowly == 1.0) > 5
     np.testing.assert_array_equal(quickly == 1.0, slowly == 1.0)
+
+
+def test_twists_that_ties_hold_are_called_tied_and_not_fixed(tmp_path: Path) -> None:
+    machine, folder = made("2-upr-2-sps", tmp_path), tmp_path / "dataset"
+    simulate(machine.yaml_path, folder, SimulationSettings(level=Level.AXES, poses=5, seed=1))
+    platform = legcal.calibrate(folder).platform
+    assert platform is not None
+    assert [one.what for one in platform.effects] == ["twists that are tied, each 0.1 deg off,"]

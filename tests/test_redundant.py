@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import run
 from csv_rows import read_rows, write_rows
 from fit_sessions import machine_session
 from layouts import Layout, LegSpec, MachineSpec, write_machine
@@ -28,8 +29,10 @@ from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.exports import ExportOptions, Subject, export
 from legcal.geometry import Array
 from legcal.machine import (
+    Contradiction,
     Follower,
     Machine,
+    contradictions,
     forward_kinematics,
     forward_kinematics_many,
     geometries,
@@ -67,6 +70,9 @@ REDUNDANT: dict[str, Callable[[], MachineSpec]] = {
         ["RS", "RS", "SS", "SS", "SS"], ["actuated"] * 4 + ["constant"]
     ),
 }
+SEVERAL: dict[str, Callable[[], MachineSpec]] = {
+    "4-UPS + 2-SPS + RPS": lambda: of_types(["US"] * 4 + ["SS"] * 2 + ["RS"]),
+}
 OTHERS: dict[str, Callable[[], MachineSpec]] = {
     "3-RPS": lambda: of_types(["RS"] * 3),
     "5-UPS": lambda: of_types(["US"] * 5),
@@ -78,7 +84,7 @@ MOBILITY = {"7-UPS": 6, "4-RPR": 3, "3-RPS + SPS": 3, "5-UPS + RPS": 5, "2-RPS +
 @cache
 def machine_of(name: str) -> Machine:
     """Return a machine that is written and loaded once."""
-    spec = (REDUNDANT | OTHERS)[name]()
+    spec = (REDUNDANT | SEVERAL | OTHERS)[name]()
     return load_mechanism(write_machine(Path(mkdtemp()), spec, Layout()))
 
 
@@ -204,6 +210,36 @@ def test_readings_that_contradict_each_other_are_refused_with_the_motor(tmp_path
         given_poses(machine, path)
 
 
+def test_a_wrong_reading_is_told_from_errors_of_the_model_or_motors_that_explain_it_are() -> None:
+    rng = np.random.default_rng(8)
+    for name, most_alike in {"4-RPR": 4, "4-UPS + 2-SPS + RPS": 1}.items():
+        nominal = machine_of(name)
+        legs = [
+            dataclasses.replace(
+                leg,
+                A=leg.A + 2e-3 * rng.normal(size=3) * [1.0, 1.0, nominal.spatial],
+                q0=leg.q0 + 2e-3 * rng.normal(),
+            )
+            for leg in geometries(nominal)
+        ]
+        true = dataclasses.replace(nominal, legs=legs_in_links(nominal, legs))
+        q = random_configurations(true, 24, rng).readings
+        motors, row, i, off = list(nominal.motors), 7, 2, 0.012
+
+        def found(q: Array, nominal: Machine = nominal) -> dict[int, Contradiction]:
+            T = platforms_in_base(nominal, forward_kinematics_many(nominal, q))
+            return contradictions(nominal, T, q[:, list(nominal.motors)])
+
+        assert found(q) == {}
+        q[row, motors[i]] += off
+        ((pose, one),) = found(q).items()
+        assert pose == row
+        assert motors[i] in one.legs
+        assert len(one.legs) <= most_alike
+        if most_alike == 1:
+            assert one.off == pytest.approx(off, abs=1e-3)
+
+
 def test_carriages_may_be_redundant(tmp_path: Path) -> None:
     """Seven carriages: a fit with too many readings is exact, a contradictory one is named."""
     machine = made("7-pss", tmp_path)
@@ -324,6 +360,24 @@ def test_a_redundant_machine_calibrates_and_a_wrong_reading_is_refused(tmp_path:
     write_rows(table, of_pose)
     with pytest.raises(DatasetError, match=r"readings of view .* from where the other motors put"):
         legcal.calibrate(folder, output=tmp_path / "refused")
+
+
+def test_two_models_compared_say_how_redundant_readings_agree_with_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    machine, folder = made("4-rpr", tmp_path), tmp_path / "dataset"
+    simulate(machine.yaml_path, folder, SimulationSettings(level=Level.AXES, poses=6, seed=2))
+    truth = next((folder / "truth/models").glob("*.yaml"))
+    args = ["evaluate", str(machine.yaml_path), str(truth), "--dataset", str(folder)]
+    assert run(monkeypatch, *args, "--json") == 0
+    found = json.loads(capsys.readouterr().out)["redundant_readings"]
+    assert found["model"]["rms_expected"] == found["reference"]["rms_expected"] == 0.5
+    assert found["model"]["rms_m"] > 1e-4  # joints are off by up to 2 mm
+    assert found["reference"]["rms"] == pytest.approx(0.5, rel=0.5)
+    assert run(monkeypatch, *args) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for who, one in found.items():
+        assert f"in the {who}: off by {1e3 * one['rms_m']:.4f} mm, {one['rms']:.2f} of" in text
 
 
 def test_corrected_commands_of_redundant_motors_are_poses_of_least_squares(tmp_path: Path) -> None:

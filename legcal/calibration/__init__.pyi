@@ -86,6 +86,7 @@ from .result_folder import load_result as load_result
 from .summary import NUMBERS as NUMBERS
 from .summary import UNITS as UNITS
 from .summary import ParameterTable as ParameterTable
+from .summary import residuals_in_words as residuals_in_words
 from .summary import sentences as sentences
 from .summary import tables as tables
 from .verification import SIGNIFICANCE as SIGNIFICANCE

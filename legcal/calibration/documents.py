@@ -231,12 +231,17 @@ class WrongReadingBlock(Document):
     unit: Literal["m", "rad"]
 
 
-class RedundantReadings(Document):
-    """How readings of more motors than freedoms agree with each other and with the rest."""
+class ReadingResiduals(Document):
+    """How readings of more motors than freedoms agree with a model."""
 
     rms: NotNegative  # of residuals over their standard deviations
-    rms_expected: NotNegative  # of right readings: below 1, because the fit follows each in part
+    rms_expected: NotNegative  # of right readings: below 1, because poses follow each in part
     rms_m: NotNegative  # of residuals, as far as they move joints
+
+
+class RedundantReadings(ReadingResiduals):
+    """The same of a fit, which also leaves out wrong ones."""
+
     wrong: list[WrongReadingBlock]
 
 
@@ -540,5 +545,7 @@ class EvaluationDocument(Document):
     poses: int  # that are compared
     left_out: int  # poses that are not, since one of the models does not reach them
     unreached: list[UnreachedRow]  # the rows of these
+    # Of the readings of a dataset by model and reference, where motors are redundant
+    redundant_readings: dict[Literal["model", "reference"], ReadingResiduals] | None
     parameters: list[ComparedParameter]
     links: dict[Link, ComparedLink]

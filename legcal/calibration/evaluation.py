@@ -18,6 +18,7 @@ from legcal.calibration.documents import (
     ComparedLink,
     ComparedParameter,
     EvaluationDocument,
+    ReadingResiduals,
     UnreachedRow,
 )
 from legcal.calibration.link_joints import compared_joints
@@ -36,6 +37,7 @@ from legcal.machine import (
     platforms_in_base,
     pose_differences,
     random_poses,
+    reading_residuals,
     vector_of,
 )
 from legcal.vision import Link
@@ -68,6 +70,9 @@ class Evaluation:
         Poses of the dataset that are not compared, since one of the models does not reach them.
     unreached : tuple of UnreachedRow
         The rows of the dataset with these poses, and who does not reach them.
+    redundant_readings : dict or None
+        By ``model`` and ``reference`` how the readings of the dataset agree at the poses that are
+        compared; None without a dataset and where readings cannot disagree.
     joints_move : bool
         Whether motors move joints of the base, which are compared where these read 0.
     """
@@ -81,6 +86,7 @@ class Evaluation:
     links: dict[Link, ComparedLink]
     n_left_out: int = 0
     unreached: tuple[UnreachedRow, ...] = ()
+    redundant_readings: dict[Literal["model", "reference"], ReadingResiduals] | None = None
     joints_move: bool = False
 
     def document(self) -> dict[str, Any]:
@@ -94,6 +100,7 @@ class Evaluation:
             poses=len(dX),
             left_out=self.n_left_out,
             unreached=list(self.unreached),
+            redundant_readings=self.redundant_readings,
             parameters=[
                 ComparedParameter(name=name, value=v, reference=r, difference=v - r)
                 for name, v, r in numbers
@@ -141,6 +148,7 @@ def evaluate(
     reference_poses: list[RigidTransform] = []
     n_left_out = 0
     unreached: tuple[UnreachedRow, ...] = ()
+    redundant: dict[Literal["model", "reference"], ReadingResiduals] | None = None
     if not (machine.is_determined and truth.is_determined):
         pass  # no reading says where the platform is
     elif dataset is None:
@@ -158,6 +166,10 @@ def evaluate(
             [T for T, *off in zip(found, *missed, strict=True) if T is not None and not any(off)]
             for found in both
         )
+        if machine.is_redundant:
+            reached = np.flatnonzero(~np.any(missed, axis=0))
+            models = zip(WHO, (machine, truth), (poses, reference_poses), strict=True)
+            redundant = {who: _residuals(given, model, T, q[reached]) for who, model, T in models}
     displacement, rotation = pose_differences(
         platforms_in_base(machine, poses),
         platforms_in_base(truth, reference_poses),
@@ -174,6 +186,7 @@ def evaluate(
         compared_joints(machine, truth),
         n_left_out,
         unreached,
+        redundant,
         bool(machine.actuators),
     )
 
@@ -221,6 +234,21 @@ def _readings_of(dataset: Dataset, machine: Machine) -> Array:
         )
     legs = [names.index(name) for name in machine.leg_names]
     return dataset.measurements.q_of_poses[:, legs]
+
+
+def _residuals(
+    dataset: Dataset, machine: Machine, poses: Sequence[RigidTransform], q: Array
+) -> ReadingResiduals:
+    """Return how readings (n_poses, n_legs) of redundant motors agree at poses T_base_platform."""
+    motors = list(machine.motors)
+    legs = [machine.legs[j] for j in motors]
+    rows = zip(poses, q, strict=True)
+    off = np.array([reading_residuals(machine, T, row)[motors] for T, row in rows])
+    sigma = dataset.measurements.sigma_of(legs)
+    moved = off / [leg.reading_of(1.0) for leg in legs]
+    rms, rms_m = (float(np.sqrt(np.mean(x**2))) for x in (off / sigma, moved))
+    expected = float(np.sqrt(1.0 - machine.mobility / len(motors)))
+    return ReadingResiduals(rms=rms, rms_expected=expected, rms_m=rms_m)
 
 
 def _poses_at(machine: Machine, q: Array) -> list[RigidTransform | None]:

@@ -36,7 +36,7 @@ from legcal.geometry import Array, IntArray, components, product
 from legcal.machine import (
     Leg,
     Machine,
-    contradiction,
+    contradictions,
     followed_poses,
     geometries,
     platform_in_base,
@@ -215,7 +215,8 @@ def nominal_poses(
     Raises
     ------
     DatasetError
-        Naming the images whose residual is more than 3 % of the mean leg length.
+        Naming the images whose residual is more than 3 % of the mean leg length, and those at which
+        readings of redundant motors contradict each other as much and do not tell which is wrong.
     """
     q = measurements.q_of_poses
     if not machine.is_determined:
@@ -231,15 +232,26 @@ def nominal_poses(
             T[k] = pose
     at_home = vectors_A_to_B(machine, machine.home)
     most = MAX_NOMINAL_RESIDUAL * float(np.linalg.norm(at_home, axis=1).mean())
-    contradicting = _contradictions(machine, measurements, T)
     first = measurements.first_rows.tolist()
-    wrong = {first[k]: what for k, what in contradicting.items()}
+    motors, sigma = list(machine.motors), measurements.sigma_of(machine.legs)
+    found = contradictions(machine, T, q[:, motors], sigma[motors])
+    wrong = {
+        first[k]: f"found {one.in_words(machine)}; check this reading, its encoder and the offset "
+        "of the leg, or take"
+        for k, one in found.items()
+        if len(one.legs) > 1 and one.distance > most
+    }
+    for k, one in found.items():
+        if len(one.legs) == 1:  # the fit says so with images; they are searched at the other ones
+            others = q[[k]]
+            others[:, np.equal(machine.reads, one.legs[0])] = np.nan
+            T[k] = _least_squares(machine, others, [T[k]])[0][0]
     wrong |= {
         first[k]: "found that the legs of the nominal model miss them by "
         f"{1e3 * residual[k]:.1f} mm at the nearest pose, needed at most {1e3 * most:.1f} mm; "
         "check these readings and legcal.home, or take"
         for k in off
-        if not residual[k] <= most and k not in contradicting
+        if not residual[k] <= most and k not in found
     }
     if wrong:
         raise DatasetError(
@@ -250,25 +262,6 @@ def nominal_poses(
             ]
         )
     return tuple(T), residual
-
-
-def _contradictions(
-    machine: Machine, measurements: Measurements, T_Rb_Re: Sequence[RigidTransform]
-) -> dict[int, str]:
-    """Return what is found of poses at which readings of redundant motors contradict others."""
-    if not machine.is_redundant:
-        return {}
-    q = measurements.q_of_poses[:, list(machine.motors)]
-    from_Re = machine.T_platform_Re.inv()
-    found = [
-        contradiction(machine, product(machine.T_base_Rb, T, from_Re), row)
-        for T, row in zip(T_Rb_Re, q, strict=True)
-    ]
-    return {
-        k: f"found {words}; check this reading, its encoder and the offset of the leg, or take"
-        for k, words in enumerate(found)
-        if words is not None
-    }
 
 
 def _least_squares(

@@ -16,6 +16,7 @@ from legcal.calibration.documents import (
     NoSteps,
     Observations,
     PlatformBlock,
+    ReadingResiduals,
     Result,
     WorkspaceAccuracy,
 )
@@ -384,18 +385,21 @@ def _fit_line(result: Result) -> str:
     if found.rms_axes is not None:
         parts.append(f"axes off by {found.rms_axes:.3f} of their standard deviations, rms")
     if found.redundant_readings is not None:
-        redundant = found.redundant_readings
-        parts.append(
-            f"readings of redundant motors off by {1e3 * redundant.rms_m:.4f} mm, "
-            f"{redundant.rms:.2f} of their standard deviations, rms "
-            f"(expected {redundant.rms_expected:.2f})"
-        )
+        parts.append(f"readings of redundant motors {residuals_in_words(found.redundant_readings)}")
     line = (
         f"The joint fit started from the {result.start} model: chi2 {found.chi2:.1f} "
         f"for {', '.join(parts)}."
     )
     shared = [f"{what} {sigma:.3f} px" for what, sigma in found.shared_px.items() if sigma > _NONE]
     return line + (f" Common-mode edge biases: {', '.join(shared)}." if shared else "")
+
+
+def residuals_in_words(found: ReadingResiduals) -> str:
+    """Return how far readings of redundant motors are off."""
+    return (
+        f"off by {1e3 * found.rms_m:.4f} mm, {found.rms:.2f} of their standard deviations, rms "
+        f"(expected {found.rms_expected:.2f})"
+    )
 
 
 def _direction_lines(result: Result) -> list[str]:

@@ -17,8 +17,10 @@ from legcal.brief import brief
 from legcal.data.image_tables import ImageTable
 from legcal.data.measurements import Measurements, find_rows, places, refuse_unknown_rows
 from legcal.data.outlines import SOURCES, UNLESS_REJECTED, VERDICT_COLUMNS, VERDICTS
-from legcal.files import Column, format_table, read_table, write_atomically
+from legcal.errors import DatasetError
+from legcal.files import Column, describe, format_table, read_table, write_atomically
 from legcal.geometry import Array, BoolArray, IntArray
+from legcal.vision import FixedBoard
 
 NUMBERS = ("u", "v", "sigma")
 COLUMNS = ("view", "image", "corner", *NUMBERS, *(column.name for column in VERDICT_COLUMNS))
@@ -81,13 +83,16 @@ def format_corners(corners: Corners, measurements: Measurements) -> str:
     return format_table(COLUMNS, rows)
 
 
-def read_corners(path: Path, n_corners: int, measurements: Measurements) -> Corners:
-    """Return the table ``corners.csv`` in the order of the file; boards have *n_corners*.
+def read_corners(path: Path, boards: Sequence[FixedBoard], measurements: Measurements) -> Corners:
+    """Return the table ``corners.csv`` of boards in the order of the file.
 
     An edited row wins over the detected one of the same image and corner. Raises DatasetError with
     one sentence for each thing that is wrong.
     """
     least, most = SIGMA_RANGE
+    n_corners = sum(one.board.n_corners for one in boards)
+    needed = f"a corner of the board, 0 to {n_corners - 1}"
+    remedy = "correct it, or the board in the dataset file"
     table = read_table(
         path,
         "table of corners",
@@ -95,13 +100,7 @@ def read_corners(path: Path, n_corners: int, measurements: Measurements) -> Corn
         [
             Column("view", "text"),
             Column("image", "text"),
-            Column(
-                "corner",
-                "whole",
-                most=n_corners - 1,
-                needed=f"a corner of the board, 0 to {n_corners - 1}",
-                remedy="correct it, or the board in the dataset file",
-            ),
+            Column("corner", "whole", least=0, needed=needed, remedy=remedy),
             *(Column(name, blank=True, remedy=UNLESS_REJECTED) for name in NUMBERS[:2]),
             Column(
                 "sigma",
@@ -116,6 +115,19 @@ def read_corners(path: Path, n_corners: int, measurements: Measurements) -> Corn
         needed="the corners of the board in the images; add them, or delete the file to have "
         "images searched",
     )
+    numbers_of_corners = [int(text) for text in table.text("corner") if text.isdigit()]
+    beyond = {k for k in numbers_of_corners if k >= n_corners}
+    if len(beyond) > 1:  # no slip of a pen
+        described = " and ".join(f"{b.board.n_corners} on the {b.link}" for b in boards)
+        raise DatasetError(
+            f"{path}: the corners could not be used: found corners up to {max(beyond)}, and in the "
+            f"dataset file boards with {n_corners} ({described}), needed the boards on which these "
+            "were found, whose corners are counted one board after the other; describe the other "
+            "board in the dataset file again, or delete the table to have images searched."
+        )
+    for i, text in enumerate(table.text("corner")):
+        if text.isdigit() and int(text) >= n_corners:
+            table.refuse(i, describe(text), f"{needed}; {remedy}", "corner")
     row = find_rows(table, measurements)
     refuse_unknown_rows(table, row, measurements)
     used = np.array([verdict == "used" for verdict in table.text("verdict")], dtype=np.bool_)

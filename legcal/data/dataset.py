@@ -438,7 +438,7 @@ def read_given_corners(
             f"{path}: the corners could not be used: found no board in the dataset file, needed "
             "the one that they belong to; describe it in the block board, or remove the table."
         )
-    return read_corners(path, sum(b.board.n_corners for b in boards), measurements)
+    return read_corners(path, boards, measurements)
 
 
 def rows_without_board(

@@ -200,13 +200,15 @@ def view_problems(
 
     *boards* are the links that have a board.
     """
-    problems = [
-        f"{path}: views.{name}.legs could not be used: found an empty list and no board on the "
-        "platform, needed a leg or such a board in the images of every view; name legs, or "
-        "describe the board in the block board (on: platform)."
-        for name, view in views.items()
-        if view.legs == [] and "platform" not in boards
-    ]
+    blind = [name for name, view in views.items() if view.legs == []]
+    problems = []
+    if blind and "platform" not in boards:
+        problems.append(
+            f"{path}: view{'s' * (len(blind) > 1)} {', '.join(blind)} could not be used: found an "
+            "empty list of legs and no "
+            "board on the platform, needed a leg or such a board in the images of every view; name "
+            "legs, or describe the board in the block board (on: platform)."
+        )
     held = {name: view for name, view in views.items() if view.hand_held}
     problems += [
         f"{path}: views.{name}.hand_held could not be used: found no board, needed a calibration "

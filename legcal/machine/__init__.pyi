@@ -65,9 +65,6 @@ from .home import legs_outside as legs_outside
 from .inspection import ActuatorBlock as ActuatorBlock
 from .inspection import machine_document as machine_document
 from .kinematics import Follower as Follower
-from .kinematics import consistent_readings as consistent_readings
-from .kinematics import contradiction as contradiction
-from .kinematics import determining_readings as determining_readings
 from .kinematics import equations_of_readings as equations_of_readings
 from .kinematics import follow as follow
 from .kinematics import follow_each as follow_each
@@ -79,9 +76,6 @@ from .kinematics import inverse_kinematics as inverse_kinematics
 from .kinematics import platform_in_base as platform_in_base
 from .kinematics import platforms_in_base as platforms_in_base
 from .kinematics import pose_differences as pose_differences
-from .kinematics import reading_residuals as reading_residuals
-from .kinematics import solve_poses as solve_poses
-from .kinematics import solve_postures as solve_postures
 from .leg import TRAVEL_MARGIN as TRAVEL_MARGIN
 from .leg import Cylinder as Cylinder
 from .leg import EquationKind as EquationKind
@@ -139,6 +133,14 @@ from .parameters import turns_between as turns_between
 from .parameters import twist_after as twist_after
 from .parameters import vector_of as vector_of
 from .parameters import with_numbers as with_numbers
+from .redundancy import MIN_REDUNDANCY as MIN_REDUNDANCY
+from .redundancy import ROUGH_READING as ROUGH_READING
+from .redundancy import Contradiction as Contradiction
+from .redundancy import ReadingTests as ReadingTests
+from .redundancy import consistent_readings as consistent_readings
+from .redundancy import contradictions as contradictions
+from .redundancy import determining_readings as determining_readings
+from .redundancy import reading_residuals as reading_residuals
 from .rods import AT_ZERO as AT_ZERO
 from .rods import actuator_index as actuator_index
 from .rods import actuators_of as actuators_of
@@ -152,6 +154,8 @@ from .rods import reading_legs as reading_legs
 from .rods import reading_of_rod as reading_of_rod
 from .rods import readings_of_rods as readings_of_rods
 from .rods import rod_mode as rod_mode
+from .solved_poses import solve_poses as solve_poses
+from .solved_poses import solve_postures as solve_postures
 from .solver import poses_after as poses_after
 from .solver import solve as solve
 from .table_template import write_template as write_template

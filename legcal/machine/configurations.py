@@ -18,12 +18,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge
 from legcal.geometry import Array, BoolArray, motions_of
 from legcal.machine.equations import PoseEquations, equations_at_readings, freedoms, pose_equations
-from legcal.machine.kinematics import (
-    determining_readings,
-    follow,
-    follow_poses,
-    solve_poses,
-)
+from legcal.machine.kinematics import follow, follow_poses
 from legcal.machine.leg import Leg
 from legcal.machine.mobility import free_motions, project, singularities, singularity
 from legcal.machine.model import (
@@ -33,7 +28,9 @@ from legcal.machine.model import (
     readings_at_poses,
     slider_columns,
 )
+from legcal.machine.redundancy import determining_readings
 from legcal.machine.rods import actuator_index, readings_of_rods
+from legcal.machine.solved_poses import solve_poses
 from legcal.machine.solver import RANK, poses_after
 
 MAX_DRAWS = 40  # draws for each configuration

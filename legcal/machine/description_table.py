@@ -379,6 +379,12 @@ def read_description(
             if unit is not None:
                 found.setdefault("unit", unit)
         _refuse_twice(path, found, given)
+        if "version" in found and "legcal_table" not in found:
+            raise ModelError(
+                f"{path}: the table could not be read: found version: {found['version']}, needed "
+                "the key legcal_table for the version of a table; write 'legcal_table: 1' in its "
+                "place."
+            )
         file = validate(TableFile, {**found, **given}, path)
     except DatasetError as error:
         raise ModelError(error.problems) from error

@@ -161,9 +161,9 @@ def posture_constraints(
 
 
 def equations_at_readings(
-    legs: Sequence[Leg], R: Array, t: Array, lengthening: Array
+    legs: Sequence[Leg], R: Array, t: Array, lengthening: Array, *, by_local: bool = False
 ) -> PoseEquations:
-    """Return what legs miss at poses and readings, without derivatives by parameters.
+    """Return what legs miss at poses and readings, if asked with derivatives by parameters.
 
     *lengthening* (k, n_legs) is s q of actuated legs [m] and q of rods on actuators [m, rad]; rows
     of readings that are not known (NaN) are zero.
@@ -171,7 +171,7 @@ def equations_at_readings(
     on = actuator_index(legs)
     rods = [on.index(a) for a in range(max(on, default=-1) + 1)]
     q = np.nan_to_num(lengthening[:, rods]) if rods else None
-    found = pose_equations(legs, R, t, by_local=False, q=q)
+    found = pose_equations(legs, R, t, by_local=by_local, q=q)
     wanted = np.where(found.measured, lengthening[:, found.leg], 0.0)
     known = np.isfinite(wanted)
     hangs = np.array(on)[found.leg] >= 0

@@ -23,7 +23,7 @@ from legcal.machine.configurations import (
     beyond_travel,
     random_walk,
 )
-from legcal.machine.kinematics import determining_readings, follow
+from legcal.machine.kinematics import follow
 from legcal.machine.mobility import singularity
 from legcal.machine.model import (
     Machine,
@@ -32,6 +32,7 @@ from legcal.machine.model import (
     slider_columns,
     vectors_A_to_B,
 )
+from legcal.machine.redundancy import determining_readings
 from legcal.progress import Report, no_progress
 
 JITTER = 0.12  # of the travel, by which extreme readings stay away from its ends at most

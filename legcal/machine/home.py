@@ -15,10 +15,10 @@ from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry import Array, motion_of
 from legcal.machine.closing import close_at
 from legcal.machine.equations import is_constrained, machine_equations_at
-from legcal.machine.kinematics import project_pose
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine, platform_pose, readings_at
 from legcal.machine.parameters import legs_in_links
+from legcal.machine.solved_poses import project_pose
 from legcal.machine.solver import poses_after, solve
 from legcal.machine.topology import level_rotation
 

@@ -8,33 +8,20 @@ and the chain closed where it ends.
 """
 
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry import Array, BoolArray, IntArray, motion_of, motions_of, product
 from legcal.machine.closing import close_at, closure_equations
 from legcal.machine.equations import (
-    PoseEquations,
-    constraints_at,
-    describe_worst,
-    equations_at,
-    equations_at_readings,
-    freedoms,
     is_constrained,
-    is_overdetermined,
     least_squares_equations,
-    machine_equations,
     machine_equations_at,
-    pose_equations,
-    posture_constraints,
     violated_constraint,
 )
-from legcal.machine.leg import Leg, LegKind
+from legcal.machine.leg import LegKind
 from legcal.machine.mobility import (
     CLOSED,
     dimensionless,
@@ -49,19 +36,15 @@ from legcal.machine.model import (
     readings_at_poses,
     slider_columns,
 )
+from legcal.machine.redundancy import contradictions
+from legcal.machine.solved_poses import TOLERANCE, project_pose
 from legcal.machine.solver import Equations, newton, poses_after, solve, walk_in_steps
 
 CONTRACTION = 0.5  # of the step before; of 1 rad or a leg length for the first
-TOLERANCE = 1e-13  # of a leg length
 MIN_STEP = 1.0 / 4096.0  # of the way from known readings to the wanted ones
 LONG_STEP = 1.0 / 16.0  # where another way follows if that does not lead there
 RANDOM_ANGLES = 6  # other angles of all legs that are tried
 FEW_RESTARTS = 2  # of legs that do not close from there
-DEPENDENT = 1e-7  # of the largest singular value: equations that say the same
-MAX_POSE_ERROR = 0.01  # of a leg length: how far a given pose may be from a closed one
-MAX_CONTRADICTION = 0.03  # of a leg length: errors of a model, not of readings
-UNCHECKED = 1e-3  # redundancy of a reading that no other says anything about
-ALIKE = 0.9  # of the largest test: readings that explain a contradiction as well
 FEW_STEPS = 12  # of Newton's method at most, and
 REDUNDANT_STEPS = 40  # where readings contradict each other: convergence is linear there
 
@@ -93,7 +76,7 @@ def forward_kinematics(
         If the motors do not determine the pose.
     DidNotConverge
         If no closed pose is reached from ``start`` without crossing a singularity, or readings of
-        redundant motors contradict each other by more than 3 % of a leg length.
+        redundant motors contradict each other by more than errors of a nominal model explain.
     UsageError
         If the readings are too few or not finite.
     """
@@ -285,108 +268,16 @@ def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> A
     return q
 
 
-def reading_residuals(machine: Machine, T_base_platform: RigidTransform, q: Array) -> Array:
-    """Return what readings q (n_legs,) miss at a pose, (n_legs,) [m]; zero for legs without motor.
-
-    They are zero up to rounding at the pose of forward kinematics unless motors are redundant.
-    """
-    motors, found = list(machine.motors), np.zeros(machine.n_legs)
-    found[motors] = np.asarray(q)[motors] - readings_at(machine, T_base_platform)[motors]
-    return found
-
-
-def consistent_readings(
-    machine: Machine, readings: Array, at: RigidTransform | None = None
-) -> Array:
-    """Return the nearest readings (k, n_motors) that motors can have together.
-
-    They are so linearly, from home or another pose T_base_platform. Readings of motors that are not
-    redundant are returned as they are.
-    """
-    if not machine.is_redundant:
-        return readings
-    motors = list(machine.motors)
-    if at is None:
-        at, here = machine.home, machine.home_configuration[slider_columns(machine, motors)[0]]
-    else:
-        here = readings_at(machine, at)[motors]
-    span = machine.sign[motors][:, None] * reading_span(machine, at)
-    return np.asarray(here + (readings - here) @ span @ span.T)
-
-
-def determining_readings(machine: Machine, readings: Array) -> Array:
-    """Return readings (k, n_motors) near given ones, NaN of motors beyond the freedoms.
-
-    The others are those that tell most of the pose at home. What readings contradict each other by
-    far from home would have to be shared out among all, which takes many steps.
-    """
-    if not machine.is_redundant:
-        return readings
-    found = consistent_readings(machine, readings)
-    found[:, _surplus_motors(machine)] = np.nan
-    return found
-
-
-@lru_cache(maxsize=8)
-def _surplus_motors(machine: Machine) -> IntArray:
-    """Return which motors of a redundant machine tell least of the pose at home, by number."""
-    _, _, order = qr(reading_span(machine, machine.home).T, mode="economic", pivoting=True)
-    return np.asarray(order[machine.mobility :])
-
-
-def reading_span(machine: Machine, T: RigidTransform) -> Array:
-    """Return a basis (n_motors, mobility) of how lengths change together near a pose."""
-    equations = equations_at(machine, T)
-    J = equations.by_pose[0][equations.measured]
-    C = equations.by_pose[0][~equations.measured]
-    J = J - J @ np.linalg.pinv(C, rcond=DEPENDENT) @ C
-    return np.linalg.svd(J, full_matrices=False)[0][:, : machine.mobility]
-
-
-def contradiction(machine: Machine, T: RigidTransform, readings: Array) -> str | None:
-    """Return in words which readings (n_motors,) of redundant motors contradict the others grossly.
-
-    The pose T_base_platform is that of least squares. Each reading in turn is taken for the wrong
-    one: the largest residual over the root of its redundancy names it. Where there is only one
-    motor too many, all explain the contradiction alike.
-    """
-    if not machine.is_redundant:
-        return None
-    motors = list(machine.motors)
-    span = reading_span(machine, T)
-    redundancy = np.maximum(1.0 - np.sum(span**2, axis=1), UNCHECKED)
-    q = np.zeros(machine.n_legs)
-    q[motors] = readings
-    legs = [machine.legs[j] for j in motors]
-    residual = np.abs(reading_residuals(machine, T, q)[motors])
-    residual /= [leg.reading_of(1.0) for leg in legs]  # of angles: how far joints at A move
-    test = residual / np.sqrt(redundancy)
-    worst, most = int(np.argmax(test)), MAX_CONTRADICTION * leg_scale(machine, T)
-    if test[worst] <= most:
-        return None
-    names = [leg.motor_label for leg in legs]
-    alike = [names[i] for i in np.flatnonzero(test > ALIKE * test[worst]).tolist()]
-    alike.remove(names[worst])
-    others = f" (or as likely one of {', '.join(alike)})" if alike else ""
-    off = 1e3 * residual[worst] / redundancy[worst]
-    allowed = 1e3 * most / np.sqrt(redundancy[worst])
-    whose = "leg" if legs[worst].actuator is None else "motor"
-    return (
-        f"the reading of {whose} '{names[worst]}'{others} {off:.1f} mm from where the other motors "
-        f"put it, needed at most {allowed:.1f} mm"
-    )
-
-
 def _disagreement(
     machine: Machine, T: RigidTransform, readings: Array, which: str = ""
 ) -> DidNotConverge | None:
     """Return the error of readings (n_motors,) that contradict each other, None if they do not."""
-    found = contradiction(machine, T, readings)
-    if found is None:
+    found = contradictions(machine, [platform_in_base(machine, T)], readings[None])
+    if not found:
         return None
     return DidNotConverge(
         f"{machine.yaml_path}: the pose at the readings{which} could not be computed: found "
-        f"{found}; check this reading, its encoder and the offset of the leg."
+        f"{found[0].in_words(machine)}; check this reading, its encoder and the offset of the leg."
     )
 
 
@@ -455,130 +346,6 @@ def pose_differences(
         return displacement, np.zeros(0)
     between = np.swapaxes(T_reference[:, :3, :3], 1, 2) @ T[:, :3, :3]
     return displacement, np.asarray(Rotation.from_matrix(between).magnitude())
-
-
-class SolvedPoses(NamedTuple):
-    """Platform poses of R_e in R_b at which legs miss least."""
-
-    R: Array  # (k, 3, 3)
-    t: Array  # (k, 3) [m]
-    missed: Array  # (k,) the largest of what legs still miss [m]
-    size: Array  # (k,) the last step [m, rad]: not small where a pose has not come to rest
-
-
-def solve_poses(
-    legs: Sequence[Leg],
-    frame_legs: Sequence[int],
-    R: Array,
-    t: Array,
-    lengthening: Array | None = None,
-    steps: int = 60,
-) -> SolvedPoses:
-    """Return the poses near R, t of R_e in R_b where the equations of legs hold at readings.
-
-    *lengthening* (k, n_legs) is s q of actuated legs [m] and q of rods on actuators [m, rad], NaN
-    where unknown; without it poses move
-    to the nearest at which the constraints hold. Where no pose meets all (parameters far from the
-    truth) the one with least squares is found; of redundant motors that with least squares of the
-    lengths, the constraints exact. After few *steps* poses are only nearer.
-    """
-    fixed = np.ones(6, dtype=np.bool_)
-    fixed[list(freedoms(frame_legs))] = False
-
-    def equations(poses: Array) -> tuple[Array, Array]:
-        if lengthening is None:
-            found = pose_equations(legs, poses[:, :, :3], poses[:, :, 3], by_local=False)
-            found = found.of(~found.measured)
-        else:
-            found = equations_at_readings(legs, poses[:, :, :3], poses[:, :, 3], lengthening)
-        jacobian = found.by_pose.copy()
-        jacobian[:, :, fixed] = 0.0
-        return found.values, jacobian
-
-    poses = np.concatenate([R, t[..., None]], axis=2)
-    found = solve(equations, poses_after, poses, tolerance=1e-15, rank=DEPENDENT, steps=steps)
-    poses, missed, size = found.points, found.worst, found.size
-    if lengthening is None or len(poses) == 0:
-        return SolvedPoses(poses[:, :, :3], poses[:, :, 3], missed, size)
-
-    def with_known(poses: Array) -> PoseEquations:
-        found = equations_at_readings(legs, poses[:, :, :3], poses[:, :, 3], lengthening)
-        found.by_pose[:, :, fixed] = 0.0
-        return found.of(~found.measured | np.isfinite(lengthening[0, found.leg]))
-
-    if is_overdetermined(with_known(poses), freedoms(frame_legs)):
-        found = solve(
-            lambda poses: least_squares_equations(with_known(poses)),
-            poses_after,
-            poses,
-            tolerance=1e-15,
-            rank=DEPENDENT,
-            steps=steps,
-        )
-        poses, size = found.points, found.size
-        missed = np.abs(equations(poses)[0]).max(axis=1, initial=0.0)
-    return SolvedPoses(poses[:, :, :3], poses[:, :, 3], missed, size)
-
-
-def solve_postures(
-    legs: Sequence[Leg], frame_legs: Sequence[int], R: Array, t: Array, q: Array
-) -> tuple[SolvedPoses, Array]:
-    """Return the poses near R, t and readings near q (k, n) at which all constraints hold.
-
-    Both move together, as little as possible; q are those of actuators.
-    """
-    free = [*freedoms(frame_legs), *range(6, 6 + q.shape[1])]
-    fixed = np.setdiff1d(np.arange(6 + q.shape[1]), free)
-
-    def equations(points: Array) -> tuple[Array, Array]:
-        poses = points[:, :12].reshape(-1, 3, 4)
-        found = posture_constraints(legs, poses[:, :, :3], poses[:, :, 3], points[:, 12:])
-        jacobian = np.concatenate([found.by_pose, found.by_q], axis=2)
-        jacobian[:, :, fixed] = 0.0
-        return found.values, jacobian
-
-    def retract(points: Array, step: Array) -> Array:
-        poses = poses_after(points[:, :12].reshape(-1, 3, 4), step[:, :6])
-        return np.concatenate([poses.reshape(-1, 12), points[:, 12:] + step[:, 6:]], axis=1)
-
-    points = np.concatenate([R, t[..., None]], axis=2).reshape(-1, 12)
-    points = np.concatenate([points, q], axis=1)
-    found = solve(equations, retract, points, tolerance=1e-15, rank=DEPENDENT)
-    poses = found.points[:, :12].reshape(-1, 3, 4)
-    solved = SolvedPoses(poses[:, :, :3], poses[:, :, 3], found.worst, found.size)
-    return solved, found.points[:, 12:]
-
-
-def project_pose(
-    machine: Machine, T: RigidTransform, max_error: float = MAX_POSE_ERROR
-) -> tuple[RigidTransform, str | None]:
-    """Return the nearest pose that meets every constraint, and what is in the way if none is near.
-
-    Constraints may be missed by *max_error* leg lengths at the start, T_base_platform.
-    """
-    if not is_constrained(machine):
-        return T, None
-    scale = leg_scale(machine, T)
-    first = constraints_at(machine, T)
-    worst = np.abs(first.values).max()
-    if worst <= TOLERANCE * scale:
-        return T, None
-    if worst > max_error * scale:
-        return T, describe_worst(machine, first)
-
-    def equations(poses: Array) -> tuple[Array, Array]:
-        found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
-        constraints = ~found.measured
-        return found.values[:, constraints], found.by_pose[:, constraints]
-
-    unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
-    found = solve(
-        equations, poses_after, T.as_matrix()[None, :3], tolerance=TOLERANCE * scale, unit=unit
-    )
-    projected = motion_of(found.points[0, :, :3], found.points[0, :, 3])
-    if found.worst[0] <= 1e-9 * scale:
-        return projected, None
-    return projected, describe_worst(machine, constraints_at(machine, projected))
 
 
 def follow(

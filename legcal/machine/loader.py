@@ -30,7 +30,6 @@ from legcal.machine.diagnostics import mechanism_notes, proposal_notes
 from legcal.machine.equations import constraints_at, leg_equations, n_pose_constraints
 from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home, home_at_mid_travel
-from legcal.machine.kinematics import MAX_POSE_ERROR
 from legcal.machine.leg import (
     MAX_LEGS,
     MAX_LENGTH,
@@ -53,6 +52,7 @@ from legcal.machine.origins import with_own_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
 from legcal.machine.rods import reading_of_rod, rod_mode
 from legcal.machine.schema import LegcalBlock, MechanismFile
+from legcal.machine.solved_poses import MAX_POSE_ERROR
 from legcal.machine.spanning_tree import Source
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
 from legcal.machine.topology import (

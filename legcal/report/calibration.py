@@ -15,6 +15,7 @@ from legcal.calibration import (
     UNITS,
     joints_title,
     mark_in_words,
+    residuals_in_words,
     sentences,
     tables,
 )
@@ -106,6 +107,10 @@ def accuracy_table(evaluation: Evaluation) -> RenderableType:
     columns = ("parameter", ">model", ">reference", ">difference")
     return report(
         headline,
+        *(
+            f"Readings of redundant motors in the {who}: {residuals_in_words(found)}"
+            for who, found in (evaluation.redundant_readings or {}).items()
+        ),
         *_left_out(evaluation),
         *_joint_tables(evaluation),
         table(*columns, rows=rows, title=f"Parameters, joints in R_b and R_e [mm{angles}]"),

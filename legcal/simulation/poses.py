@@ -19,11 +19,12 @@ from legcal.machine import (
     Configurations,
     Feasibility,
     Machine,
-    contradiction,
+    contradictions,
     feasible_poses,
     follow,
     forward_kinematics,
     motor_travel,
+    platform_in_base,
     platform_pose,
     poses_at,
     singularity,
@@ -92,9 +93,12 @@ def given_poses(machine: Machine, path: Path) -> Configurations:
             except DidNotConverge:
                 problem = "legs that cannot have these lengths at the same time"
             else:
-                T = platform_pose(machine, configuration)
-                problem = contradiction(machine, T, row) or feasibility.problem(
-                    configuration, of_motors=False
+                T = platform_in_base(machine, platform_pose(machine, configuration))
+                off = contradictions(machine, [T], row[None])
+                problem = (
+                    off[0].in_words(machine)
+                    if off
+                    else feasibility.problem(configuration, of_motors=False)
                 )
                 known.append(row)
                 reached.append(configuration)

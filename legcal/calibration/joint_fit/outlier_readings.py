@@ -1,10 +1,9 @@
 """Outliers among the readings of redundant motors: found, named, left out.
 
-Every reading is tested by its residual over the standard deviation that this has if the reading is
-right, the root of its redundancy (Baarda's data snooping); the largest of a pose names the wrong
-one, unless another one explains as much. The first fits have rough readings, so that single wrong
-ones stand out; with the stated standard deviations they would bend the model, and outlines would
-seem to be wrong in their place.
+Every reading is tested as it is before images are searched (:class:`legcal.machine.ReadingTests`),
+here against all measurements. The first fits have rough readings, so that single wrong ones stand
+out; with the stated standard deviations they would bend the model, and outlines would seem to be
+wrong in their place.
 """
 
 from __future__ import annotations
@@ -27,12 +26,10 @@ from legcal.estimation import (
     linearize,
 )
 from legcal.files import SHOWN_IN
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import BoolArray, IntArray
+from legcal.machine import MIN_REDUNDANCY, ROUGH_READING, ReadingTests
 
 _FACTORS = "readings", "actuator_readings"
-_ROUGH = 6e-5  # standard deviation of rough readings, as far as they move a joint [m]
-_MIN_REDUNDANCY = 1e-3  # of a reading that something else says anything about
-_AS_LIKELY = 25.0  # difference of squared tests from which one reading is clearly the wrong one
 _MOST_OF_MOTOR = 0.1  # of the readings of a motor that may be wrong by accident
 _MIN_COUNT = 3  # that are no accident
 _SIGNIFICANT = 5.0  # standard deviations of the sum of squares of residuals
@@ -62,24 +59,6 @@ class JudgedReadings:
     doubts: tuple[str, ...]  # why the result cannot be trusted, a sentence each
 
 
-@dataclass(frozen=True, eq=False)
-class _Tests:
-    """Readings that are used, of both factors, and how well each agrees."""
-
-    factor: IntArray  # (n,) index in _FACTORS
-    number: IntArray  # (n,) in its factor
-    leg: IntArray  # (n,)
-    pose: IntArray  # (n,)
-    r: Array  # (n,) residuals over their standard deviations
-    redundancy: Array  # (n,) variance of r if the reading is right
-
-    @property
-    def squared(self) -> Array:
-        """Squared residuals over their variance, 0 where nothing else tells of a reading."""
-        told = self.redundancy > _MIN_REDUNDANCY
-        return np.where(told, self.r**2 / np.maximum(self.redundancy, _MIN_REDUNDANCY), 0.0)
-
-
 def with_rough_readings(problem: FitProblem) -> FitProblem:
     """Return the problem with rough readings under the loss, if they can contradict each other."""
     if not problem.legs.is_redundant:
@@ -87,7 +66,7 @@ def with_rough_readings(problem: FitProblem) -> FitProblem:
     rough = []
     for name, readings in zip(_FACTORS, _readings(problem), strict=True):
         factor = problem.factor(name)
-        least = np.array([problem.legs.nominal[j].reading_of(_ROUGH) for j in readings.leg])
+        least = np.array([problem.legs.nominal[j].reading_of(ROUGH_READING) for j in readings.leg])
         used = np.asarray(factor.whitening)[:, 0, 0] > 0.0
         weight = used / np.maximum(readings.sigma, least)
         rough.append(replace(factor, whitening=weight[:, None, None], robust=True))
@@ -111,12 +90,12 @@ def with_judged_readings(
     linear = linearize(problem, state)
     normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
     tests = _tests(problem, linear, normal)
+    of_factor, number = _numbers(problem)
     out: list[list[int]] = [[], []]
-    scale = max(1.0, _scale(tests))
     for pose in np.unique(tests.pose).tolist():
-        best, is_clear = _worst(tests, pose, scale * settings.rejection)
-        if best is not None and is_clear:
-            out[int(tests.factor[best])].append(int(tests.number[best]))
+        found = tests.of_pose(pose, settings.rejection, tests.scale)
+        if len(found) == 1:
+            out[int(of_factor[found[0]])].append(int(number[found[0]]))
     if not any(out):
         return problem, False
     changed = []
@@ -139,7 +118,7 @@ def with_agreeing_readings(
     restored = problem.with_factors(*map(every.factor, _FACTORS))
     linear = linearize(problem, state)
     normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
-    most = settings.rejection * max(1.0, _scale(_tests(problem, linear, normal)))
+    most = settings.rejection * _tests(problem, linear, normal).scale
     linear, back = linearize(restored, state), list[BoolArray]()
     for name in _FACTORS:
         predicted = explained_share(restored, linear, normal, name)[:, 0, 0]
@@ -211,7 +190,10 @@ def _first_image(problem: FitProblem, pose: int) -> tuple[str, str]:
 
 
 def _doubts(
-    problem: FitProblem, tests: _Tests, wrong: list[WrongReading], settings: RefinementSettings
+    problem: FitProblem,
+    tests: ReadingTests,
+    wrong: list[WrongReading],
+    settings: RefinementSettings,
 ) -> tuple[str, ...]:
     """Return why readings leave a result in doubt."""
     legs, doubts = problem.legs.nominal, list[str]()
@@ -227,18 +209,19 @@ def _doubts(
             )
     alike = list[str]()
     for pose in np.unique(tests.pose).tolist():
-        best, is_clear = _worst(tests, pose, max(1.0, _scale(tests)) * settings.rejection)
-        if best is not None and not is_clear:
+        found = tests.of_pose(pose, settings.rejection, tests.scale)
+        if len(found) > 1:
             view, image = _first_image(problem, pose)
-            alike.append(f"{view}, image {image} ({few(_as_likely(problem, tests, pose))})")
+            labels = [legs[j].motor_label for j in tests.leg[found].tolist()]
+            alike.append(f"{view}, image {image} ({few(labels)})")
     if alike:
         doubts.append(
             f"the readings of {few(alike)} contradict each other, and the measurements do not tell "
             "which of these motors is wrong; check them, or take the images out"
         )
-    expected, found = float(tests.redundancy.sum()), float(np.sum(tests.r**2))
-    if found > expected + _SIGNIFICANT * np.sqrt(2.0 * expected):
-        times = np.sqrt(found / max(expected, 1.0))
+    expected, missed = float(tests.redundancy.sum()), float(np.sum(tests.r**2))
+    if missed > expected + _SIGNIFICANT * np.sqrt(2.0 * expected):
+        times = np.sqrt(missed / max(expected, 1.0))
         squared = tests.squared
         motors = np.unique(tests.leg)
         leg = int(motors[np.argmax([squared[tests.leg == j].mean() for j in motors])])
@@ -251,46 +234,25 @@ def _doubts(
     return tuple(doubts)
 
 
-def _as_likely(problem: FitProblem, tests: _Tests, pose: int) -> list[str]:
-    """Return the motors of which one is as likely wrong as another at a pose."""
-    own = np.flatnonzero(tests.pose == pose)
-    squared = tests.squared[own]
-    return [
-        problem.legs.nominal[int(tests.leg[own[k]])].motor_label
-        for k in np.argsort(-squared).tolist()
-        if squared.max() - squared[k] < _AS_LIKELY
-    ]
-
-
-def _worst(tests: _Tests, pose: int, most: float) -> tuple[int | None, bool]:
-    """Return the reading of a pose that agrees least, if beyond *most*, and whether it is clear."""
-    own = np.flatnonzero(tests.pose == pose)
-    order = own[np.argsort(-tests.squared[own])]
-    squared = tests.squared[order]
-    if not squared[0] > most**2:
-        return None, False
-    return int(order[0]), len(squared) < 2 or bool(squared[0] - squared[1] > _AS_LIKELY)
-
-
-def _scale(tests: _Tests) -> float:
-    """Return how many times their standard deviations the residuals of most readings are."""
-    told = tests.redundancy > _MIN_REDUNDANCY
-    return float(np.sqrt(np.median(tests.squared[told])) / 0.6745) if told.any() else 0.0
-
-
-def _tests(problem: FitProblem, linear: Linearization, normal: NormalEquations) -> _Tests:
-    """Return the tests of the readings that are used."""
+def _tests(problem: FitProblem, linear: Linearization, normal: NormalEquations) -> ReadingTests:
+    """Return the tests of the readings that are used, of both factors."""
     parts = []
-    for i, (name, readings) in enumerate(zip(_FACTORS, _readings(problem), strict=True)):
+    for name, readings in zip(_FACTORS, _readings(problem), strict=True):
         used = np.flatnonzero(_used(problem, name))
         if not len(readings):
             continue
         share = explained_share(problem, linear, normal, name)[used, 0, 0]
+        redundancy = np.where(1.0 - share > MIN_REDUNDANCY, 1.0 - share, 0.0)
         r = linear[name].r[used, 0]
-        parts.append(
-            (np.full(len(used), i), used, readings.leg[used], readings.pose[used], r, 1.0 - share)
-        )
-    return _Tests(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        parts.append((readings.pose[used], readings.leg[used], r, redundancy))
+    return ReadingTests(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _numbers(problem: FitProblem) -> tuple[IntArray, IntArray]:
+    """Return factor and number of every reading that is used."""
+    used = [np.flatnonzero(_used(problem, name)) for name in _FACTORS]
+    of_factor = np.repeat(np.arange(len(used)), [len(one) for one in used])
+    return of_factor, np.concatenate(used)
 
 
 def _used(problem: FitProblem, name: str) -> BoolArray:

@@ -24,7 +24,7 @@ from legcal.estimation import (
     score_test,
 )
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import LegColumns
+from legcal.machine import LegColumns, is_held_by_default
 from legcal.vision import Camera, shared_cameras
 
 FOCAL_PART = 0.01  # of the focal length: the error whose effect is reported
@@ -108,12 +108,17 @@ def sensitivities(
         found = [
             Sensitivity(what, _of_kinematic(problem, steps[:, [i]])) for i, what in enumerate(names)
         ]
-    place = problem.legs.parametrization.place[:, LegColumns.TWIST]
-    twisted = [j for j, x in enumerate(place) if x >= 0 and not problem.free[x]]
-    if twisted:
-        columns = [_of_twist(problem, state, linear, normal, j) for j in twisted]
-        what = "twists that are fixed, each 0.1 deg off,"
-        found.append(Sensitivity(what, np.column_stack(columns)))
+    every, choices = problem.legs.parametrization, problem.choices
+    twists: dict[str, list[Array]] = {}
+    for j, x in enumerate(every.place[:, LegColumns.TWIST].tolist()):
+        if x >= 0 and not problem.free[x]:
+            name = every.names[x]
+            is_fixed = choices.holds(name, by_default=is_held_by_default(name))
+            step = _of_twist(problem, state, linear, normal, j)
+            twists.setdefault("fixed" if is_fixed else "tied", []).append(step)
+    for how, steps_of_twists in twists.items():
+        what = f"twists that are {how}, each 0.1 deg off,"
+        found.append(Sensitivity(what, np.column_stack(steps_of_twists)))
     return tuple(found)
 
 

@@ -1,0 +1,321 @@
+"""More motors than freedoms: readings that agree, and which of those that do not are wrong.
+
+What readings of redundant motors cannot have together is left of their equations by no motion of
+the platform. Every reading is tested as if it alone were wrong: its residual over the standard
+deviation that this has if the reading is right, the root of its redundancy (Baarda's data
+snooping). The largest test of a pose names the wrong reading, unless another one explains as much.
+
+By a nominal model readings contradict each other although all are right, since joints are not where
+the model has them. Errors of joints, lengths and axes are the same at all poses, so that these tell
+them from wrong readings: they are estimated from the readings, with a prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from scipy.linalg import qr
+from scipy.spatial.transform import RigidTransform
+
+from legcal.geometry import Array, BoolArray, IntArray, components
+from legcal.machine.equations import equations_at, equations_at_readings, freedoms
+from legcal.machine.model import Machine, readings_at, slider_columns, vectors_A_to_B
+from legcal.machine.parameters import geometries, parametrization_of
+from legcal.machine.rods import actuator_index
+from legcal.machine.solved_poses import solve_poses
+
+ROUGH_READING = 6e-5  # standard deviation of rough readings, as far as they move a joint [m]
+REJECTION = 4.5  # a test beyond is that of a wrong reading; of a right one in 150,000 it is
+AS_LIKELY = 25.0  # difference of squared tests from which one reading is clearly the wrong one
+MIN_REDUNDANCY = 1e-3  # of a reading that something else says anything about
+_MODEL = 0.005  # of the mean leg length, angles at it: errors of a nominal model
+_DEPENDENT = 1e-7  # of the largest singular value: equations that say the same
+_ROUNDS = 20  # in each of which a pose is set aside whose readings contradict each other
+_SAYS = 1e-6  # redundancy of a reading that may explain a contradiction, however wrong it is
+_OF_MEDIAN = 0.6745  # of the standard deviation: the median of absolute values
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingTests:
+    """How well readings agree with all else, each tested as if it alone were wrong."""
+
+    pose: IntArray  # (n,)
+    leg: IntArray  # (n,) whose motor it is
+    r: Array  # (n,) residuals over the standard deviations of the readings
+    redundancy: Array  # (n,) variance of r if the reading is right; 0 if nothing else tells of it
+
+    @cached_property
+    def squared(self) -> Array:
+        """Squared residuals over their variance, 0 where nothing else tells of a reading."""
+        told = self.redundancy > 0.0
+        return np.where(told, self.r**2 / np.where(told, self.redundancy, 1.0), 0.0)
+
+    @cached_property
+    def scale(self) -> float:
+        """How many times their standard deviations the residuals of most readings are, from 1."""
+        told = self.redundancy > 0.0
+        if not told.any():
+            return 1.0
+        return max(1.0, float(np.sqrt(np.median(self.squared[told]))) / _OF_MEDIAN)
+
+    def of_pose(self, pose: int, most: float, scale: float) -> list[int]:
+        """Return the readings of a pose one of which is wrong, the likeliest first.
+
+        There are none if no test is beyond *most*, times the *scale* of residuals. Of several one
+        is as likely wrong as another.
+        """
+        own = np.flatnonzero(self.pose == pose)
+        order = own[np.argsort(-self.squared[own], kind="stable")]
+        squared = self.squared[order]
+        if not squared[0] > (scale * most) ** 2:
+            return []
+        return [int(k) for k in order[squared[0] - squared <= AS_LIKELY * scale**2]]
+
+
+@dataclass(frozen=True, eq=False)
+class Contradiction:
+    """Readings of a pose that no pose of the platform has together."""
+
+    legs: tuple[int, ...]  # one of whose motors is wrong, the likeliest first
+    off: float  # how far the reading of the first is above what the others show [m or rad]
+    distance: float  # how far that moves a joint [m]
+    allowed: float  # how far readings that agree do [m]
+
+    def in_words(self, machine: Machine) -> str:
+        """Return what is found, and what was needed."""
+        legs = [machine.legs[j] for j in self.legs]
+        first, *others = [leg.motor_label for leg in legs]
+        alike = f" (or as likely one of {', '.join(others)})" if others else ""
+        whose = "leg" if legs[0].actuator is None else "motor"
+        return (
+            f"the reading of {whose} '{first}'{alike} {1e3 * self.distance:.1f} mm from where the "
+            f"other motors put it, needed at most {1e3 * self.allowed:.1f} mm"
+        )
+
+
+def contradictions(
+    machine: Machine, T_Rb_Re: Sequence[RigidTransform], readings: Array, sigma: Array | None = None
+) -> dict[int, Contradiction]:
+    """Return the poses at which readings of redundant motors contradict each other, and which do.
+
+    Parameters
+    ----------
+    machine : Machine
+        A nominal model.
+    T_Rb_Re : sequence of RigidTransform
+        The poses of least squares at the readings.
+    readings : (n_poses, n_motors) array
+        Readings [m, rad].
+    sigma : (n_motors,) array, optional
+        Their standard deviations [m, rad]; rough ones where these are smaller, and without.
+    """
+    if not machine.is_redundant or len(readings) == 0:
+        return {}
+    R, t = components(T_Rb_Re)
+    unit = np.array([machine.legs[j].reading_of(1.0) for j in machine.motors])  # of a metre
+    sigma_m = np.maximum(np.zeros(len(unit)) if sigma is None else sigma / unit, ROUGH_READING)
+    surplus = _Surplus.of(machine, R, t, readings)
+    used, scale = np.ones(len(readings), dtype=np.bool_), 1.0
+    model = _fitted_model(surplus, sigma_m, used)
+    # One after the other, since a wrong one bends the model, and others seem wrong in its place.
+    for _ in range(min(_ROUNDS, len(used))):
+        tests = _tests(machine, surplus, sigma_m, model, used)
+        worst = int(tests.pose[np.argmax(tests.squared)])
+        others = used & (np.arange(len(used)) != worst)
+        by_others = _fitted_model(surplus, sigma_m, others)
+        scale = _tests(machine, surplus, sigma_m, by_others, others).scale
+        if not tests.squared.max() > (REJECTION * scale) ** 2:
+            break
+        used, model = others, by_others
+    if used.all():
+        return {}
+    # A pose of all readings is off where one is wrong: each is tested where the others put it.
+    chi2, _, _ = _tested(surplus.at(~used), sigma_m, *model)
+    R, t, suspected = R[~used], t[~used], readings[~used]
+    explained, off, redundancy = (np.zeros(suspected.shape) for _ in range(3))
+    for i in range(len(unit)):
+        others = suspected.copy()
+        others[:, i] = np.nan
+        lengthening = machine.sign * machine.at_readings(others)
+        there = solve_poses(geometries(machine), machine.frame_legs, R, t, lengthening)
+        at = _Surplus.of(machine, there.R, there.t, suspected)
+        left, own_r, own = (x if x.ndim == 1 else x[:, i] for x in _tested(at, sigma_m, *model))
+        told = own > 0.0
+        redundancy[:, i] = own
+        off[:, i] = np.where(told, own_r / np.where(told, own, 1.0), 0.0)
+        explained[:, i] = np.where(told, np.maximum(chi2 - left + own * off[:, i] ** 2, 0.0), 0.0)
+    r = np.sqrt(explained * redundancy)
+    judged = ReadingTests(*_numbers(machine, ~used), r.ravel(), redundancy.ravel())
+    found = dict[int, Contradiction]()
+    for k, pose in enumerate(np.flatnonzero(~used).tolist()):
+        alike = judged.of_pose(pose, REJECTION, scale)
+        if not alike:
+            continue
+        i = alike[0] - k * len(unit)
+        found[pose] = Contradiction(
+            tuple(judged.leg[alike].tolist()),
+            float(off[k, i] * sigma_m[i] * unit[i]),
+            float(abs(off[k, i]) * sigma_m[i]),
+            float(REJECTION * scale * sigma_m[i] / np.sqrt(redundancy[k, i])),
+        )
+    return found
+
+
+def _numbers(machine: Machine, poses: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return pose and leg of every reading of some poses."""
+    chosen = np.flatnonzero(poses)
+    return np.repeat(chosen, len(machine.motors)), np.tile(machine.motors, len(chosen))
+
+
+def _tests(
+    machine: Machine,
+    surplus: _Surplus,
+    sigma_m: Array,
+    model: tuple[Array, Array],
+    used: BoolArray,
+) -> ReadingTests:
+    """Return the tests of the readings of poses by the model that they show."""
+    _, r, redundancy = _tested(surplus, sigma_m, *model, used)
+    return ReadingTests(*_numbers(machine, used), r[used].ravel(), redundancy[used].ravel())
+
+
+@dataclass(frozen=True, eq=False)
+class _Surplus:
+    """What the equations of legs say beyond the pose, s numbers at each of k poses [m]."""
+
+    values: Array  # (k, s)
+    by_reading: Array  # (k, s, n_motors) by what readings move joints [m]
+    by_model: Array  # (k, s, p) by parameters, over their standard deviations
+    is_told: BoolArray  # (k, n_motors) of which readings they say anything
+
+    @classmethod
+    def of(cls, machine: Machine, R: Array, t: Array, readings: Array) -> _Surplus:
+        """Return them of a nominal model at poses R, t of R_e in R_b and readings."""
+        legs, motors = geometries(machine), machine.motors
+        lengthening = machine.sign * machine.at_readings(readings)
+        found = equations_at_readings(legs, R, t, lengthening, by_local=True)
+        by_pose = found.by_pose[:, :, list(freedoms(machine.frame_legs))]
+        left = np.linalg.svd(by_pose)[0][:, :, by_pose.shape[2] :]  # what no motion changes
+        on, by_reading = actuator_index(legs), np.zeros((*found.values.shape, len(motors)))
+        for i, j in enumerate(motors):
+            if on[j] >= 0:
+                by_reading[:, :, i] = found.by_q[:, :, on[j]] * legs[j].reading_of(1.0)
+            else:
+                by_reading[:, found.measured & (found.leg == j), i] = -legs[j].sign
+        parametrization = parametrization_of(machine)
+        length = float(np.mean([np.linalg.norm(v) for v in vectors_A_to_B(machine, machine.home)]))
+        size = np.array([length if unit == "m" else 1.0 for unit in parametrization.units])
+        by_model = found.by_parameters(parametrization) * (_MODEL * size)
+        values, own, of_model = (
+            np.einsum("kms,km...->ks...", left, x) for x in (found.values, by_reading, by_model)
+        )
+        share = np.sum(own**2, axis=1) / np.maximum(np.sum(by_reading**2, axis=1), 1e-300)
+        return cls(values, own, of_model, share > _SAYS)
+
+    def at(self, poses: BoolArray) -> _Surplus:
+        """Return those of some poses."""
+        return _Surplus(
+            self.values[poses], self.by_reading[poses], self.by_model[poses], self.is_told[poses]
+        )
+
+    def information(self, sigma_m: Array) -> Array:
+        """Return the inverse covariance (k, s, s) if the model is right."""
+        moved = self.by_reading * sigma_m
+        rough = ROUGH_READING**2 * np.eye(self.values.shape[1])  # constraints are not exact either
+        return np.asarray(np.linalg.inv(moved @ np.swapaxes(moved, 1, 2) + rough))
+
+
+def _fitted_model(surplus: _Surplus, sigma_m: Array, used: BoolArray) -> tuple[Array, Array]:
+    """Return the errors of a model that some poses show, and their covariance."""
+    own = surplus.at(used)
+    weighted = np.swapaxes(own.by_model, 1, 2) @ own.information(sigma_m)
+    H = np.eye(own.by_model.shape[2]) + np.einsum("kps,ksq->pq", weighted, own.by_model)
+    covariance = np.linalg.inv(H)
+    return -covariance @ np.einsum("kps,ks->p", weighted, own.values), covariance
+
+
+def _tested(
+    surplus: _Surplus,
+    sigma_m: Array,
+    model: Array,
+    covariance: Array,
+    used: BoolArray | None = None,
+) -> tuple[Array, Array, Array]:
+    """Return chi2 (k,) of poses, and of their readings residuals and redundancies (k, n_motors).
+
+    *used* are the poses that showed the errors of the model; without it, none of these did.
+    """
+    e, P = surplus.values + surplus.by_model @ model, surplus.by_model
+    W = surplus.information(sigma_m)
+    spread = P @ covariance @ np.swapaxes(P, 1, 2)
+    apart = np.linalg.inv(np.linalg.inv(W) + spread)
+    if used is None:
+        Q, v = apart, (apart @ e[..., None])[..., 0]
+    else:  # residuals of a fit
+        Q = np.where(used[:, None, None], W - W @ spread @ W, apart)
+        v = np.where(used[:, None], (W @ e[..., None])[..., 0], (apart @ e[..., None])[..., 0])
+    by = surplus.by_reading
+    r = sigma_m * np.einsum("ksn,ks->kn", by, v)
+    redundancy = sigma_m**2 * np.einsum("ksn,kst,ktn->kn", by, Q, by)
+    return np.einsum("ks,ks->k", e, v), r, np.where(surplus.is_told, redundancy, 0.0)
+
+
+def reading_residuals(machine: Machine, T_base_platform: RigidTransform, q: Array) -> Array:
+    """Return what readings q (n_legs,) miss at a pose, (n_legs,) [m]; zero for legs without motor.
+
+    They are zero up to rounding at the pose of forward kinematics unless motors are redundant.
+    """
+    motors, found = list(machine.motors), np.zeros(machine.n_legs)
+    found[motors] = np.asarray(q)[motors] - readings_at(machine, T_base_platform)[motors]
+    return found
+
+
+def consistent_readings(
+    machine: Machine, readings: Array, at: RigidTransform | None = None
+) -> Array:
+    """Return the nearest readings (k, n_motors) that motors can have together.
+
+    They are so linearly, from home or another pose T_base_platform. Readings of motors that are not
+    redundant are returned as they are.
+    """
+    if not machine.is_redundant:
+        return readings
+    motors = list(machine.motors)
+    if at is None:
+        at, here = machine.home, machine.home_configuration[slider_columns(machine, motors)[0]]
+    else:
+        here = readings_at(machine, at)[motors]
+    span = machine.sign[motors][:, None] * reading_span(machine, at)
+    return np.asarray(here + (readings - here) @ span @ span.T)
+
+
+def determining_readings(machine: Machine, readings: Array) -> Array:
+    """Return readings (k, n_motors) near given ones, NaN of motors beyond the freedoms.
+
+    The others are those that tell most of the pose at home. What readings contradict each other by
+    far from home would have to be shared out among all, which takes many steps.
+    """
+    if not machine.is_redundant:
+        return readings
+    found = consistent_readings(machine, readings)
+    found[:, _surplus_motors(machine)] = np.nan
+    return found
+
+
+@lru_cache(maxsize=8)
+def _surplus_motors(machine: Machine) -> IntArray:
+    """Return which motors of a redundant machine tell least of the pose at home, by number."""
+    _, _, order = qr(reading_span(machine, machine.home).T, mode="economic", pivoting=True)
+    return np.asarray(order[machine.mobility :])
+
+
+def reading_span(machine: Machine, T: RigidTransform) -> Array:
+    """Return a basis (n_motors, mobility) of how lengths change together near a pose."""
+    equations = equations_at(machine, T)
+    J = equations.by_pose[0][equations.measured]
+    C = equations.by_pose[0][~equations.measured]
+    J = J - J @ np.linalg.pinv(C, rcond=_DEPENDENT) @ C
+    return np.linalg.svd(J, full_matrices=False)[0][:, : machine.mobility]

@@ -1,0 +1,154 @@
+"""Platform poses from the equations of the legs alone: nearest ones, and those at readings."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.geometry import Array, motion_of
+from legcal.machine.equations import (
+    PoseEquations,
+    constraints_at,
+    describe_worst,
+    equations_at_readings,
+    freedoms,
+    is_constrained,
+    is_overdetermined,
+    least_squares_equations,
+    machine_equations,
+    pose_equations,
+    posture_constraints,
+)
+from legcal.machine.leg import Leg
+from legcal.machine.mobility import leg_scale
+from legcal.machine.model import Machine
+from legcal.machine.solver import poses_after, solve
+
+TOLERANCE = 1e-13  # of a leg length
+MAX_POSE_ERROR = 0.01  # of a leg length: how far a given pose may be from a closed one
+DEPENDENT = 1e-7  # of the largest singular value: equations that say the same
+
+
+class SolvedPoses(NamedTuple):
+    """Platform poses of R_e in R_b at which legs miss least."""
+
+    R: Array  # (k, 3, 3)
+    t: Array  # (k, 3) [m]
+    missed: Array  # (k,) the largest of what legs still miss [m]
+    size: Array  # (k,) the last step [m, rad]: not small where a pose has not come to rest
+
+
+def solve_poses(
+    legs: Sequence[Leg],
+    frame_legs: Sequence[int],
+    R: Array,
+    t: Array,
+    lengthening: Array | None = None,
+    steps: int = 60,
+) -> SolvedPoses:
+    """Return the poses near R, t of R_e in R_b where the equations of legs hold at readings.
+
+    *lengthening* (k, n_legs) is s q of actuated legs [m] and q of rods on actuators [m, rad], NaN
+    where unknown; without it poses move
+    to the nearest at which the constraints hold. Where no pose meets all (parameters far from the
+    truth) the one with least squares is found; of redundant motors that with least squares of the
+    lengths, the constraints exact. After few *steps* poses are only nearer.
+    """
+    fixed = np.ones(6, dtype=np.bool_)
+    fixed[list(freedoms(frame_legs))] = False
+
+    def equations(poses: Array) -> tuple[Array, Array]:
+        if lengthening is None:
+            found = pose_equations(legs, poses[:, :, :3], poses[:, :, 3], by_local=False)
+            found = found.of(~found.measured)
+        else:
+            found = equations_at_readings(legs, poses[:, :, :3], poses[:, :, 3], lengthening)
+        jacobian = found.by_pose.copy()
+        jacobian[:, :, fixed] = 0.0
+        return found.values, jacobian
+
+    poses = np.concatenate([R, t[..., None]], axis=2)
+    found = solve(equations, poses_after, poses, tolerance=1e-15, rank=DEPENDENT, steps=steps)
+    poses, missed, size = found.points, found.worst, found.size
+    if lengthening is None or len(poses) == 0:
+        return SolvedPoses(poses[:, :, :3], poses[:, :, 3], missed, size)
+
+    def with_known(poses: Array) -> PoseEquations:
+        found = equations_at_readings(legs, poses[:, :, :3], poses[:, :, 3], lengthening)
+        found.by_pose[:, :, fixed] = 0.0
+        return found.of(~found.measured | np.isfinite(lengthening[0, found.leg]))
+
+    if is_overdetermined(with_known(poses), freedoms(frame_legs)):
+        found = solve(
+            lambda poses: least_squares_equations(with_known(poses)),
+            poses_after,
+            poses,
+            tolerance=1e-15,
+            rank=DEPENDENT,
+            steps=steps,
+        )
+        poses, size = found.points, found.size
+        missed = np.abs(equations(poses)[0]).max(axis=1, initial=0.0)
+    return SolvedPoses(poses[:, :, :3], poses[:, :, 3], missed, size)
+
+
+def solve_postures(
+    legs: Sequence[Leg], frame_legs: Sequence[int], R: Array, t: Array, q: Array
+) -> tuple[SolvedPoses, Array]:
+    """Return the poses near R, t and readings near q (k, n) at which all constraints hold.
+
+    Both move together, as little as possible; q are those of actuators.
+    """
+    free = [*freedoms(frame_legs), *range(6, 6 + q.shape[1])]
+    fixed = np.setdiff1d(np.arange(6 + q.shape[1]), free)
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        poses = points[:, :12].reshape(-1, 3, 4)
+        found = posture_constraints(legs, poses[:, :, :3], poses[:, :, 3], points[:, 12:])
+        jacobian = np.concatenate([found.by_pose, found.by_q], axis=2)
+        jacobian[:, :, fixed] = 0.0
+        return found.values, jacobian
+
+    def retract(points: Array, step: Array) -> Array:
+        poses = poses_after(points[:, :12].reshape(-1, 3, 4), step[:, :6])
+        return np.concatenate([poses.reshape(-1, 12), points[:, 12:] + step[:, 6:]], axis=1)
+
+    points = np.concatenate([R, t[..., None]], axis=2).reshape(-1, 12)
+    points = np.concatenate([points, q], axis=1)
+    found = solve(equations, retract, points, tolerance=1e-15, rank=DEPENDENT)
+    poses = found.points[:, :12].reshape(-1, 3, 4)
+    solved = SolvedPoses(poses[:, :, :3], poses[:, :, 3], found.worst, found.size)
+    return solved, found.points[:, 12:]
+
+
+def project_pose(
+    machine: Machine, T: RigidTransform, max_error: float = MAX_POSE_ERROR
+) -> tuple[RigidTransform, str | None]:
+    """Return the nearest pose that meets every constraint, and what is in the way if none is near.
+
+    Constraints may be missed by *max_error* leg lengths at the start, T_base_platform.
+    """
+    if not is_constrained(machine):
+        return T, None
+    scale = leg_scale(machine, T)
+    first = constraints_at(machine, T)
+    worst = np.abs(first.values).max()
+    if worst <= TOLERANCE * scale:
+        return T, None
+    if worst > max_error * scale:
+        return T, describe_worst(machine, first)
+
+    def equations(poses: Array) -> tuple[Array, Array]:
+        found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
+        constraints = ~found.measured
+        return found.values[:, constraints], found.by_pose[:, constraints]
+
+    unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
+    found = solve(
+        equations, poses_after, T.as_matrix()[None, :3], tolerance=TOLERANCE * scale, unit=unit
+    )
+    projected = motion_of(found.points[0, :, :3], found.points[0, :, 3])
+    if found.worst[0] <= 1e-9 * scale:
+        return projected, None
+    return projected, describe_worst(machine, constraints_at(machine, projected))
