@@ -253,7 +253,6 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
         legs=FittedLegs(
             machine.leg_names,
             legs,
-            machine.sign.astype(np.intp),
             machine.frame_legs,
             radii,
             platform_in_base(machine, machine.home),
@@ -455,7 +454,7 @@ def staged_legs(session: OutlineSession, criteria: Criteria) -> tuple[Leg, ...]:
     legs = session.legs
     radii = {part: radius for (_, part), radius in legs.radii.items()}
     axes = axes_from_outlines(session.outlines, session.measurements, radii)
-    machine = NominalMachine(legs.names, legs.nominal, legs.sign, legs.frame_legs)
+    machine = NominalMachine(legs.names, legs.nominal, legs.frame_legs)
     return run_steps(machine, axes, session.measurements, criteria=criteria).legs
 
 

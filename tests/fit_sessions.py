@@ -373,8 +373,7 @@ def irregular_hexapod(
     white = np.tile(sigma_px**2 * np.eye(2), (2 * legs_seen * n_rows, 1, 1))
     outlines = replace(outlines_of(scene), covariance=white)
     radii = {(i, "rod"): RADIUS for i in range(6)}
-    sign = np.ones(6, dtype=np.intp)
-    legs = FittedLegs(names, point_like_legs(TRUTH), sign, FRAME_LEGS, radii)
+    legs = FittedLegs(names, point_like_legs(TRUTH), FRAME_LEGS, radii)
     return HexapodSession(legs, measurements, outlines, TRUTH, T_cameras, tuple(poses))
 
 
@@ -578,7 +577,7 @@ def axes_session(
     near = simulation.hexapod_session(machine, cameras, rng, noise=TableNoise(), n_poses=1)
     legs_true = point_like_legs(machine.parameters)
     return AxesSession(
-        FittedLegs(machine.leg_names, legs_true, machine.sign, machine.frame_legs, {}),
+        FittedLegs(machine.leg_names, legs_true, machine.frame_legs, {}),
         replace(session.measurements, views=near.measurements.views),
         session.axes,
         session.scene,

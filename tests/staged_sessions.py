@@ -114,7 +114,7 @@ def _observed(session: MachineSession) -> Observed:
     legs = session.legs
     radii = {part: radius for (_, part), radius in legs.radii.items()}
     return Observed(
-        NominalMachine(legs.names, legs.nominal, legs.sign, legs.frame_legs),
+        NominalMachine(legs.names, legs.nominal, legs.frame_legs),
         axes_from_outlines(session.outlines, session.measurements, radii),
         session.measurements,
         session.truth.legs,
@@ -122,9 +122,7 @@ def _observed(session: MachineSession) -> Observed:
     )
 
 
-def planned(
-    session: PredictedObservations, sign: Array, *, noise: float = 0.0, seed: int = 0
-) -> Observed:
+def planned(session: PredictedObservations, *, noise: float = 0.0, seed: int = 0) -> Observed:
     """Return what a planned session will show, nominal legs being 3 mm and 1 deg off.
 
     The noise counts in the standard deviations of the session; without it all is exact.
@@ -142,6 +140,7 @@ def planned(
     covariance = np.asarray(np.linalg.inv(np.swapaxes(rows, 1, 2) @ rows), dtype=np.float64)
     M = session.A_at[pose, leg] - session.camera[session.view[row]]
     actuated = np.array([leg.kind is LegKind.ACTUATED for leg in session.legs])
+    sign = [leg.sign for leg in session.legs]
     q = np.where(actuated, sign * (session.length - [leg.q0 for leg in session.legs]), np.nan)
     carried = session.carried_by >= 0
     q[:, carried] = session.q[:, session.carried_by[carried]]
@@ -167,7 +166,7 @@ def planned(
     step *= np.random.default_rng(0).choice([-1.0, 1.0], len(step))
     away = moved_legs(session.legs, session.parametrization.place, step)
     return Observed(
-        NominalMachine(session.leg_names, away, sign, session.frame_legs),
+        NominalMachine(session.leg_names, away, session.frame_legs),
         LegAxes(row, leg, u, M, E, covariance),
         Measurements(
             tuple(View(f"c{v + 1}", PINHOLE) for v in range(session.n_views)),
@@ -192,7 +191,7 @@ def made_up_base(A_Rb: Array, v_Rb: Array) -> NominalMachine:
         for A, v in zip(A_Rb, v_Rb, strict=True)
     )
     names = tuple(f"leg{j + 1}" for j in range(len(legs)))
-    return NominalMachine(names, legs, np.ones(len(legs)), (0, 1, 2))
+    return NominalMachine(names, legs, (0, 1, 2))
 
 
 def seen_from(

@@ -348,7 +348,8 @@ def test_a_leg_that_no_image_shows_is_found_from_its_encoder_whatever_its_sign()
     session, sign = irregular_hexapod(12), np.array([1, -1, 1, 1, -1, 1])
     shown = replace(session.outlines, used=session.outlines.leg != 2)
     measurements = replace(session.measurements, q=sign * session.measurements.q)
-    legs = replace(session.legs, sign=sign)
+    nominal = zip(session.legs.nominal, sign.tolist(), strict=True)
+    legs = replace(session.legs, nominal=tuple(replace(leg, sign=s) for leg, s in nominal))
     found = refine(legs, measurements, shown, disturbed_start(session))
     assert np.abs(joint_errors(found.parameters)).max() < 1e-9
     assert (2, "rod") not in found.radii
@@ -497,7 +498,6 @@ def test_images_near_a_turning_point_of_a_reading_fit_as_well_as_others() -> Non
     fitted = FittedLegs(
         names,
         legs,
-        np.ones(len(legs), dtype=np.intp),
         frame_legs(len(legs)),
         {(j, "rod"): 0.008 for j in range(len(legs))},
         RigidTransform.from_components(t0, Rotation.from_matrix(R0)),
@@ -559,7 +559,6 @@ def test_relabelling_legs_relabels_the_result(name: str) -> None:
     relabelled = FittedLegs(
         tuple(legs.names[i] for i in order),
         tuple(legs.nominal[i] for i in order),
-        legs.sign[order],
         tuple(int(new[i]) for i in legs.frame_legs),
         {(int(new[i]), part): r for (i, part), r in legs.radii.items()},
     )

@@ -34,7 +34,7 @@ TURNING = ("6-rss", "delta")
 
 def seen(name: str, *, images: int = 6, noise: float = 0.0, seed: int = 0) -> Observed:
     found = session(name, images=images)
-    return planned(found, np.ones(found.n_legs), noise=noise, seed=seed)
+    return planned(found, noise=noise, seed=seed)
 
 
 # The four steps

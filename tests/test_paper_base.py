@@ -458,7 +458,7 @@ def plane_with_joints_on_a_line(A: Array, B: Array, nominal_A: Array) -> Observe
         for P in (nominal_A, A)
     )
     return Observed(
-        NominalMachine(("leg1", "leg2", "leg3"), nominal, np.ones(3), (0, 1)),
+        NominalMachine(("leg1", "leg2", "leg3"), nominal, (0, 1)),
         LegAxes(np.repeat(rows, 3), leg, u, M, normal_basis(u), covariance),
         Measurements(
             (View("c1", PINHOLE), View("c2", PINHOLE)), ("",) * 12, view, rows, length - 0.1, 2e-6

@@ -23,7 +23,13 @@ from legcal.calibration.identify.predicted_observations import planned_observati
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, IntArray, normal_basis
 from legcal.machine import EquationKind, LegKind, leg_equations, load_mechanism
-from legcal.paper import Transformation, platform, run_base_steps, run_platform_steps
+from legcal.paper import (
+    Transformation,
+    platform,
+    run_base_steps,
+    run_platform_steps,
+    run_steps,
+)
 from legcal.paper.gibbs import axis_frames, motion_after
 from legcal.paper.least_squares import IpoptSolution, LeastSquares, solve_least_squares
 from legcal.paper.leg_directions import LegDirections, directions_through_joints
@@ -61,7 +67,11 @@ def test_a_motor_that_counts_backwards_changes_nothing() -> None:
     backwards = replace(
         session, measurements=replace(session.measurements, q=session.measurements.q * sign)
     )
-    forth, back = staged(session, nominal), staged(backwards, replace(nominal, sign=sign))
+    machine = nominal_of(nominal)
+    legs = tuple(replace(leg, sign=s) for leg, s in zip(machine.legs, sign.tolist(), strict=True))
+    turned = replace(machine, legs=legs)
+    forth = run_steps(machine, session.axes, session.measurements)
+    back = run_steps(turned, backwards.axes, backwards.measurements)
     assert np.allclose(back.parameters.offsets, forth.parameters.offsets, rtol=0.0, atol=1e-12)
 
 
@@ -184,7 +194,7 @@ def test_platform_joints_that_images_do_not_tie_together_are_refused(
 def test_axes_that_no_three_legs_at_once_show_are_refused_in_geometric_words() -> None:
     machine = load_mechanism("3-spr")
     session = planned_observations(machine, ((0, 1), (1, 2), (0, 2)), 8)
-    observed = planned(session, machine.sign)
+    observed = planned(session)
     with pytest.raises(NotIdentifiable, match="no pose shows three legs of known length at once"):
         observed.run("literal")
     words = r"angle \d of platform axis of leg \d can change without any image noticing"

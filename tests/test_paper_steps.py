@@ -266,7 +266,7 @@ def test_steps_find_what_ranks_call_determined_and_refuse_the_rest(
 ) -> None:
     machine = load_mechanism(name)
     session = planned_observations(machine, views, 8)
-    analysis, observed = Analysis(session), planned(session, machine.sign)
+    analysis, observed = Analysis(session), planned(session)
     full = {r.name: r.rank == r.of for r in analysis.step_ranks if r.criteria == "default"}
     assert full["joints_in_cameras"]
     if full["base_joints"]:
@@ -293,7 +293,7 @@ def test_the_rigid_criterion_has_the_rank_that_is_predicted(name: str) -> None:
         for r in Analysis(session).step_ranks
         if (r.name, r.criteria) == ("platform_joints", "default")
     ]
-    observed = planned(session, machine.sign)
+    observed = planned(session)
     rigid = rigid_problem(observed)
     problem = build_rigid_platform(rigid)
     J, residuals = problem.jacobian(problem.start), problem.residuals(problem.start)
@@ -351,7 +351,6 @@ def test_turned_cameras_and_other_orders_change_nothing(
             nominal,
             leg_names=tuple(nominal.leg_names[j] for j in order),
             legs=tuple(nominal.legs[j] for j in order),
-            sign=nominal.sign[order],
             frame_legs=tuple(int(place[j]) for j in nominal.frame_legs),
         )
     elif change == "views":

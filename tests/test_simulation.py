@@ -26,7 +26,7 @@ from legcal.simulation.hexapod import follow_from_home, poses_with_lengths, simu
 def test_the_hexapod_in_memory_is_the_shipped_one() -> None:
     shipped, machine = load_mechanism("hexapod"), paper_hexapod()
     assert tuple(machine.frame_legs) == tuple(shipped.frame_legs)
-    assert np.array_equal(machine.sign, shipped.sign)
+    assert np.all(shipped.sign == 1)
     found = to_vector(machine.parameters, machine.frame_legs)
     assert np.allclose(found, to_vector(shipped.parameters, shipped.frame_legs), rtol=0, atol=1e-15)
     home = shipped.T_base_Rb.inv() * shipped.home * shipped.T_platform_Re

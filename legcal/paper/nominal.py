@@ -8,10 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
@@ -33,13 +31,17 @@ class NominalMachine:
 
     leg_names: tuple[str, ...]
     legs: tuple[Leg, ...]  # what belongs to the base in R_b, to the platform in R_e
-    sign: NDArray[Any]  # (n_legs,), of q in the leg length L = sign q + q0
     frame_legs: tuple[int, ...]  # their joints define R_b and R_e: three in space, two in a plane
 
     @property
     def n_legs(self) -> int:
         """Number of legs."""
         return len(self.legs)
+
+    @cached_property
+    def sign(self) -> Array:
+        """Whether each leg grows (+1) or shrinks (-1) with its reading, (n_legs,)."""
+        return np.array([float(leg.sign) for leg in self.legs])
 
     @property
     def spatial(self) -> bool:
@@ -116,14 +118,11 @@ class NominalMachine:
 
 def nominal_machine(machine: Machine) -> NominalMachine:
     """Return a machine as the steps take it."""
-    return NominalMachine(machine.leg_names, geometries(machine), machine.sign, machine.frame_legs)
+    return NominalMachine(machine.leg_names, geometries(machine), machine.frame_legs)
 
 
 def point_like_machine(
-    leg_names: Sequence[str],
-    parameters: KinematicParameters,
-    sign: NDArray[Any],
-    frame_legs: tuple[int, ...],
+    leg_names: Sequence[str], parameters: KinematicParameters, frame_legs: tuple[int, ...]
 ) -> NominalMachine:
     """Return a machine with point-like joints."""
-    return NominalMachine(tuple(leg_names), point_like_legs(parameters), sign, frame_legs)
+    return NominalMachine(tuple(leg_names), point_like_legs(parameters), frame_legs)

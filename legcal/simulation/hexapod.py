@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data import LegAxes, Measurements, Outlines, View, axes_from_outlines, axes_of_table
 from legcal.errors import DidNotConverge
-from legcal.geometry import Array, BoolArray, IntArray, frame_on_points, look_at
+from legcal.geometry import Array, BoolArray, frame_on_points, look_at
 from legcal.machine import (
     KinematicParameters,
     from_vector,
@@ -49,7 +49,6 @@ class PaperHexapod:
     """A 6-SPU hexapod, or any n-leg platform with point-like joints and motors on all legs."""
 
     parameters: KinematicParameters  # its parameters xi, in R_b and R_e
-    sign: IntArray  # (n_legs,) leg length = sign * q + q0
     frame_legs: tuple[int, ...]  # the legs whose joint centres define R_b and R_e
     radius: Array  # (n_legs,) radii of the legs [m]
     travel: Array  # (n_legs, 2) shortest and longest leg [m]
@@ -58,7 +57,7 @@ class PaperHexapod:
     @property
     def n_legs(self) -> int:
         """Number of legs."""
-        return len(self.sign)
+        return len(self.radius)
 
     @property
     def leg_names(self) -> tuple[str, ...]:
@@ -94,7 +93,6 @@ def paper_hexapod(scale: float = 1.0) -> PaperHexapod:
     )
     return PaperHexapod(
         parameters=_without_rounding(parameters, frame_legs),
-        sign=np.ones(6, dtype=np.intp),
         frame_legs=frame_legs,
         radius=np.full(6, 0.010 * scale),
         travel=scale * np.tile([0.345, 0.485], (6, 1)),
@@ -296,7 +294,7 @@ def hexapod_session(
     pose = np.repeat(np.arange(n_views * n_poses), n_images)
     pose = (pose % n_poses if share_poses else pose).astype(np.intp)
     legs = simulated_leg_vectors(machine.parameters, T_Rb_Re)
-    q = (np.linalg.norm(legs, axis=-1) - machine.parameters.offsets) * machine.sign
+    q = np.linalg.norm(legs, axis=-1) - machine.parameters.offsets
     if noisy and uniform_readings:
         half_width = np.sqrt(3.0) * sigma_q
         q = q + rng.uniform(-half_width, half_width, q.shape)

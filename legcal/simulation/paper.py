@@ -237,7 +237,7 @@ def one_fit(session: HexapodSession, nominal: PaperHexapod) -> KinematicParamete
     measurements = session.measurements
     axes = average_images(session.axes, measurements)
     legs = _legs(nominal)
-    lengths = nominal.sign * measurements.q_of_poses + nominal.parameters.offsets
+    lengths = measurements.q_of_poses + nominal.parameters.offsets
     start = start_from(
         legs.nominal,
         measurements,
@@ -270,15 +270,13 @@ def bound_covariance(session: HexapodSession, exact: LegAxes) -> Array:
 
 def nominal_of(machine: PaperHexapod) -> NominalMachine:
     """Return a simulated machine as the steps take it."""
-    return point_like_machine(
-        machine.leg_names, machine.parameters, machine.sign, machine.frame_legs
-    )
+    return point_like_machine(machine.leg_names, machine.parameters, machine.frame_legs)
 
 
 def _legs(machine: PaperHexapod) -> FittedLegs:
     """Return the legs of a machine as the fit sees them."""
     legs = point_like_legs(machine.parameters)
-    return FittedLegs(machine.leg_names, legs, machine.sign, machine.frame_legs, {})
+    return FittedLegs(machine.leg_names, legs, machine.frame_legs, {})
 
 
 def errors_record(errors: PlatformErrors, of_bound_squared: float, parameters: Array) -> Record:

@@ -214,7 +214,6 @@ class FittedLegs:
 
     names: tuple[str, ...]
     nominal: tuple[Leg, ...]  # in R_b and R_e: what axes count from, what fixed ones keep
-    sign: IntArray  # (n_legs,) L = sign q + q0
     frame_legs: tuple[int, ...]  # whose joint centres define R_b and R_e: three, two in a plane
     radii: dict[tuple[int, str], float]  # of the model [m], for each (leg index, part)
     home: RigidTransform | None = None  # T_Rb_Re; without it constraints tie no parameters
@@ -229,6 +228,11 @@ class FittedLegs:
     def spatial(self) -> bool:
         """Whether the platform moves in space and not in a plane."""
         return len(self.frame_legs) == 3
+
+    @cached_property
+    def sign(self) -> IntArray:
+        """Whether each leg grows (+1) or shrinks (-1) with its reading, (n_legs,)."""
+        return np.array([leg.sign for leg in self.nominal], dtype=np.intp)
 
     @cached_property
     def n_actuators(self) -> int:
@@ -257,7 +261,6 @@ def fitted_legs(machine: Machine) -> FittedLegs:
     return FittedLegs(
         tuple(leg.name for leg in machine.legs),
         geometries(machine),
-        np.array([leg.sign for leg in machine.legs], dtype=np.intp),
         tuple(machine.frame_legs),
         {
             (i, part): r
