@@ -293,7 +293,10 @@ def test_a_motor_of_another_scale_is_named_and_not_trusted(tmp_path: Path) -> No
     wrong = dataclasses.replace(session.measurements, q=q)
     found = refine(session.legs, wrong, session.outlines, session.start)
     assert found.redundant_readings is not None
-    assert any(session.legs.names[2] in why for why in found.redundant_readings.doubts)
+    assert any(
+        f"scale of {session.legs.names[2]} that is -1 % off explains most" in why
+        for why in found.redundant_readings.doubts
+    )
 
 
 @pytest.mark.system

@@ -24,14 +24,17 @@ from legcal.estimation import (
     explained_share,
     information,
     linearize,
+    normal_equations,
+    score_test,
 )
 from legcal.files import SHOWN_IN
-from legcal.geometry import BoolArray, IntArray
-from legcal.machine import MIN_REDUNDANCY, ROUGH_READING, ReadingTests
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.machine import AS_LIKELY, MIN_REDUNDANCY, ROUGH_READING, ReadingTests
 
 _FACTORS = "readings", "actuator_readings"
 _MOST_OF_MOTOR = 0.1  # of the readings of a motor that may be wrong by accident
 _MIN_COUNT = 3  # that are no accident
+_NOTHING = 1e-12  # information on a scale of which nothing tells
 _SIGNIFICANT = 5.0  # standard deviations of the sum of squares of residuals
 
 
@@ -132,7 +135,7 @@ def judged_readings(
     moved = tests.r * sigma[used] * distance
     rms, rms_m = (float(np.sqrt(np.mean(x**2))) for x in (tests.r, moved))
     expected = float(np.sqrt(np.mean(tests.redundancy)))
-    doubts = _doubts(problem, tests, wrong, settings)
+    doubts = _doubts(problem, state, linear, tests, wrong, settings)
     return JudgedReadings(tuple(wrong), rms, expected, rms_m, doubts)
 
 
@@ -163,6 +166,8 @@ def _first_image(problem: FitProblem, pose: int) -> tuple[str, str]:
 
 def _doubts(
     problem: FitProblem,
+    state: State,
+    linear: Linearization,
     tests: ReadingTests,
     wrong: list[WrongReading],
     settings: RefinementSettings,
@@ -194,16 +199,37 @@ def _doubts(
     expected, missed = float(tests.redundancy.sum()), float(np.sum(tests.r**2))
     if missed > expected + _SIGNIFICANT * np.sqrt(2.0 * expected):
         times = np.sqrt(missed / max(expected, 1.0))
-        squared = tests.squared
-        motors = np.unique(tests.leg)
-        leg = int(motors[np.argmax([squared[tests.leg == j].mean() for j in motors])])
+        plain = normal_equations(problem, state, linear)
         doubts.append(
             f"the readings of redundant motors contradict each other and the images {times:.1f} "
-            f"times as much as their standard deviations allow, those of {legs[leg].motor_label} "
-            "most; check the scale, the zero and the slip of the motors, or state the standard "
+            f"times as much as their standard deviations allow, {_most(problem, linear, plain)}; "
+            "check the scale, the zero and the slip of the motors, or state the standard "
             "deviations of their readings"
         )
     return tuple(doubts)
+
+
+def _most(problem: FitProblem, linear: Linearization, normal: NormalEquations) -> str:
+    """Return whose scale explains most of what readings miss, all else following (Rao's test)."""
+    legs, columns = problem.legs.nominal, dict[str, Array]()
+    motors = sorted({int(j) for readings in _readings(problem) for j in readings.leg})
+    for name, readings in zip(_FACTORS, _readings(problem), strict=True):
+        if len(readings):
+            of_motor = readings.leg[:, None] == np.array(motors)
+            by_scale = of_motor * readings.by_scale[:, None]
+            columns[name] = np.asarray(problem.factor(name).whitening) @ by_scale[:, None]
+    score, left = score_test(problem, linear, normal, columns)
+    K = np.maximum(np.diagonal(left), _NOTHING)
+    squared = score**2 / K
+    order = np.argsort(-squared)
+    alike = order[squared[order[0]] - squared[order] <= AS_LIKELY]
+    first = int(order[0])
+    labels = few([legs[motors[i]].motor_label for i in alike.tolist()])
+    if len(alike) > 1:
+        return f"and the scales of {labels} explain most of that alike"
+    return (
+        f"and a scale of {labels} that is {100 * score[first] / K[first]:+.2g} % off explains most"
+    )
 
 
 def _tests(problem: FitProblem, linear: Linearization, normal: NormalEquations) -> ReadingTests:
