@@ -285,6 +285,25 @@ def test_a_wrong_reading_is_named_with_its_amount_and_does_no_harm(
     np.testing.assert_allclose(values, session.legs.vector(session.truth.legs), atol=1e-6)
 
 
+def test_a_contradiction_that_no_image_shows_is_left_out_and_accuses_no_motor_alone(
+    tmp_path: Path,
+) -> None:
+    session = machine_session(str(made("7-ups", tmp_path).yaml_path), n_poses=12)
+    m, leg, row = session.measurements, 3, 7
+    q = m.q.copy()
+    q[row, leg] -= 0.02
+    wrong = dataclasses.replace(m, q=q)
+    outlines = session.outlines.choose(session.outlines.row != row)
+    found = refine(session.legs, wrong, outlines, session.start)
+    assert found.redundant_readings is not None
+    (one,) = found.redundant_readings.wrong
+    assert one.pose == row
+    assert {one.motor, *one.alike} == set(session.legs.names)
+    assert found.redundant_readings.doubts == ()
+    values = np.array([found.values[name] for name in found.parametrization.names])
+    np.testing.assert_allclose(values, session.legs.vector(session.truth.legs), atol=1e-6)
+
+
 @pytest.mark.system
 def test_a_motor_of_another_scale_is_named_and_not_trusted(tmp_path: Path) -> None:
     session = machine_session(str(made("7-ups", tmp_path).yaml_path), n_poses=12)

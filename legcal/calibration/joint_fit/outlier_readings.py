@@ -34,6 +34,7 @@ from legcal.machine import AS_LIKELY, MIN_REDUNDANCY, ROUGH_READING, ReadingTest
 _FACTORS = "readings", "actuator_readings"
 _MOST_OF_MOTOR = 0.1  # of the readings of a motor that may be wrong by accident
 _MIN_COUNT = 3  # that are no accident
+_SAME = 1e-4  # part of a test that an error of another reading leaves: not told apart
 _NOTHING = 1e-12  # information on a scale of which nothing tells
 _SIGNIFICANT = 5.0  # standard deviations of the sum of squares of residuals
 
@@ -49,6 +50,7 @@ class WrongReading:
     image: str
     off: float  # how far it is above what all else shows [m or rad]
     unit: Literal["m", "rad"]
+    alike: tuple[str, ...] = ()  # other motors one of which may be meant as well
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,15 +91,19 @@ def like_readings(problem: FitProblem, other: FitProblem) -> FitProblem:
 def with_judged_readings(
     problem: FitProblem, state: State, settings: RefinementSettings
 ) -> tuple[FitProblem, bool]:
-    """Return the problem without the clearly wrong reading of every pose; say if there was one."""
+    """Return the problem without the wrong reading of every pose; say if there was one.
+
+    Of a pose that nothing but readings shows any of those that may be wrong will do: the others
+    agree then, and say nothing of the machine.
+    """
     linear = linearize(problem, state)
     normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
     tests = _tests(problem, linear, normal)
     of_factor, number = _numbers(problem)
     out: list[list[int]] = [[], []]
     for pose in np.unique(tests.pose).tolist():
-        found = tests.of_pose(pose, settings.rejection, tests.scale)
-        if len(found) == 1:
+        found = _of_pose(problem, state, linear, tests, pose, settings)
+        if len(found) == 1 or (found and not _is_shown(problem, pose)):
             out[int(of_factor[found[0]])].append(int(number[found[0]]))
     if not any(out):
         return problem, False
@@ -121,13 +127,23 @@ def judged_readings(
     if not problem.legs.is_redundant:
         return None
     legs, wrong = problem.legs.nominal, list[WrongReading]()
+    loss = PseudoHuber(settings.loss_width)
     for name, readings in zip(_FACTORS, _readings(problem), strict=True):
         off = readings.wrong_by(problem.factor(name).rows(state))
         for k in np.flatnonzero(~_used(problem, name)).tolist():
             leg, pose = int(readings.leg[k]), int(readings.pose[k])
             where, unit = _first_image(problem, pose), legs[leg].reading_unit
-            motor = legs[leg].motor_label
-            wrong.append(WrongReading(leg, pose, motor, *where, float(off[k]), unit))
+            motor, alike = legs[leg].motor_label, list[str]()
+            if not _is_shown(problem, pose):
+                whole = _with_used(problem, name, k)
+                again = linearize(whole, state)
+                every = _tests(whole, again, information(whole, state, again, loss))
+                alike = [
+                    legs[int(every.leg[i])].motor_label
+                    for i in _of_pose(whole, state, again, every, pose, settings)
+                    if every.leg[i] != leg
+                ]
+            wrong.append(WrongReading(leg, pose, motor, *where, float(off[k]), unit, tuple(alike)))
     tests = _tests(problem, linear, normal)
     sigma = np.concatenate([readings.sigma for readings in _readings(problem)])
     used = np.concatenate([_used(problem, name) for name in _FACTORS])
@@ -155,7 +171,9 @@ def reading_notes(judged: JudgedReadings | None) -> tuple[str, ...]:
 def _in_words(wrong: WrongReading) -> str:
     """Return whose reading it is, of which image, and by how much it is wrong."""
     size, unit = SHOWN_IN[wrong.unit]
-    return f"{wrong.motor} in {wrong.view}, image {wrong.image} by {size * wrong.off:+.3g} {unit}"
+    alike = f" (or as likely one of {', '.join(wrong.alike)})" if wrong.alike else ""
+    where = f"{wrong.view}, image {wrong.image}"
+    return f"{wrong.motor}{alike} in {where} by {size * wrong.off:+.3g} {unit}"
 
 
 def _first_image(problem: FitProblem, pose: int) -> tuple[str, str]:
@@ -186,7 +204,7 @@ def _doubts(
             )
     alike = list[str]()
     for pose in np.unique(tests.pose).tolist():
-        found = tests.of_pose(pose, settings.rejection, tests.scale)
+        found = _of_pose(problem, state, linear, tests, pose, settings)
         if len(found) > 1:
             view, image = _first_image(problem, pose)
             labels = [legs[j].motor_label for j in tests.leg[found].tolist()]
@@ -207,6 +225,58 @@ def _doubts(
             "deviations of their readings"
         )
     return tuple(doubts)
+
+
+def _of_pose(
+    problem: FitProblem,
+    state: State,
+    linear: Linearization,
+    tests: ReadingTests,
+    pose: int,
+    settings: RefinementSettings,
+) -> list[int]:
+    """Return the readings of a pose one of which is wrong, the likeliest first.
+
+    A robust loss leaves a contradiction to one of the readings that explain it alike. So those
+    count as alike, too, whose errors the measurements do not tell from that of the likeliest: the
+    part of its test that theirs does not explain is 1 - rho^2, rho the correlation of both tests.
+    """
+    found = tests.of_pose(pose, settings.rejection, tests.scale)
+    if not found:
+        return []
+    factor, number = _numbers(problem)
+    own = [found[0], *(i for i in np.flatnonzero(tests.pose == pose).tolist() if i != found[0])]
+    columns = {
+        name: np.zeros((len(readings), 1, len(own)))
+        for name, readings in zip(_FACTORS, _readings(problem), strict=True)
+        if len(readings)
+    }
+    for c, i in enumerate(own):
+        columns[_FACTORS[int(factor[i])]][number[i], 0, c] = 1.0
+    _, K = score_test(problem, linear, normal_equations(problem, state, linear), columns)
+    variance = np.maximum(np.diagonal(K), _NOTHING)
+    apart = 1.0 - K[0] ** 2 / (variance[0] * variance)
+    enough = AS_LIKELY * tests.scale**2 / tests.squared[found[0]]
+    alike = [i for i, a in zip(own[1:], apart[1:], strict=True) if a <= max(enough, _SAME)]
+    return [*found, *(i for i in alike if i not in found)]
+
+
+def _is_shown(problem: FitProblem, pose: int) -> bool:
+    """Say whether anything but readings is measured at a pose."""
+    return any(
+        bool(np.any(np.asarray(f.whitening)[f.element == pose] != 0.0))
+        for f in problem.factors
+        if f.robust and f.name not in _FACTORS and f.element is not None and f.n
+    )
+
+
+def _with_used(problem: FitProblem, name: str, number: int) -> FitProblem:
+    """Return the problem with a reading that it leaves out."""
+    factor = problem.factor(name)
+    readings = dict(zip(_FACTORS, _readings(problem), strict=True))[name]
+    whitening = np.array(factor.whitening)
+    whitening[number] = 1.0 / readings.sigma[number]
+    return problem.with_factors(replace(factor, whitening=whitening))
 
 
 def _most(problem: FitProblem, linear: Linearization, normal: NormalEquations) -> str:
