@@ -14,9 +14,9 @@ version, name and unit (mm). Two things are asked:
 - datasets (``--datasets``) of ``legcal simulate`` without hints at ``--level``, whose true machine
   is off by up to 2 mm, calibrated by ``legcal calibrate``: how many converge, and how many of these
   the verdict trusts; of all that converge the platform error of eq (20) at their readings before
-  and after, and how the latter compares with the predicted sigma (mean over seeds). Where motors do
-  not determine the pose, cameras have hints, and errors are those of the parameters in metres (root
-  mean square), with their normalised squared error.
+  and after, how the latter compares with the predicted sigma, and the normalised squared error of
+  the parameters (means over seeds). Where motors do not determine the pose, cameras have hints, and
+  errors are those of the parameters in metres (root mean square).
 """
 
 import argparse
@@ -46,6 +46,7 @@ from outline_study import failures_of
 
 from legcal import LegcalError, calibrate, evaluate, load_mechanism
 from legcal.calibration import Evaluation, Solution
+from legcal.machine import Machine, geometries, vector_of
 from legcal.simulation import Level, SimulationSettings, failure_of, simulate
 
 N_VIEWS, N_POSES = 3, 15
@@ -128,15 +129,15 @@ def datasets(kind: str, level: Level, seeds: Sequence[int], scratch: Path) -> st
                 if name.split(".")[1] in ("base", "platform", "offset", "length")
             ]
             predicted = math.sqrt(float(np.mean(lengths)))
-            squared.append(normalised_error(both[1], solution))
         else:
             before, after = (one.displacement.mean() for one in both)
             predicted = platform.sigma.mean_displacement
+        squared.append(normalised_error(machine, result / "calibrated.yaml", truth, solution))
         found.append((before, after, predicted))
         trusted = calibration.verdict.trustworthy
         n_trusted += trusted
         seconds = time.perf_counter() - begin
-        nse = "" if platform is not None else f", nse {squared[-1]:5.2f}"
+        nse = f", nse {squared[-1]:5.2f}"
         print(f"{kind:20}{seed:4}{numbers(found[-1])}{nse}{seconds:6.0f} s", end="")
         print("" if trusted else f", not trusted: {calibration.verdict.sentence}", flush=True)
     line = f"{kind:20}{len(found):4} of {len(seeds)} converge from {level}, {n_trusted} trusted"
@@ -144,15 +145,25 @@ def datasets(kind: str, level: Level, seeds: Sequence[int], scratch: Path) -> st
     return line + (f", nse {np.mean(squared):5.2f}" if squared else "")
 
 
-def normalised_error(found: Evaluation, solution: Solution) -> float:
-    """Return the normalised squared error of all parameters that the fit estimates."""
-    names = solution.parametrization.names
-    at = [found.names.index(name) for name in names]
-    error, covariance = (found.values - found.references)[at], solution.value_covariance
-    value, vector = np.linalg.eigh(covariance / np.sqrt(np.outer(*[np.diagonal(covariance)] * 2)))
+def normalised_error(nominal: Machine, calibrated: Path, truth: Path, solution: Solution) -> float:
+    """Return the normalised squared error of all parameters that the fit estimates.
+
+    Axes count from the nominal ones, as in the covariance: turns about another axis are about other
+    directions.
+    """
+    there, true = (
+        vector_of(
+            solution.parametrization,
+            geometries(load_mechanism(path).with_leg_order(nominal.leg_names)),
+            geometries(nominal),
+        )
+        for path in (calibrated, truth)
+    )
+    covariance = solution.value_covariance
     unit = np.sqrt(np.diagonal(covariance))
+    value, vector = np.linalg.eigh(covariance / np.outer(unit, unit))
     kept = value > 1e-9
-    along = vector[:, kept].T @ (error / unit)
+    along = vector[:, kept].T @ ((there - true) / unit)
     return float(np.mean(along**2 / value[kept]))
 
 

@@ -316,6 +316,25 @@ def test_right_readings_that_a_bent_model_contradicts_come_back(
     assert found.redundant_readings.doubts == ()
 
 
+def test_a_contradiction_that_no_image_shows_is_left_out_and_accuses_no_motor_alone(
+    tmp_path: Path,
+) -> None:
+    session = machine_session(str(made("7-ups", tmp_path).yaml_path), n_poses=12)
+    m, leg, row = session.measurements, 3, 7
+    q = m.q.copy()
+    q[row, leg] -= 0.02
+    wrong = dataclasses.replace(m, q=q)
+    outlines = session.outlines.choose(session.outlines.row != row)
+    found = refine(session.legs, wrong, outlines, session.start)
+    assert found.redundant_readings is not None
+    (one,) = found.redundant_readings.wrong
+    assert one.pose == row
+    assert {one.motor, *one.alike} == set(session.legs.names)
+    assert found.redundant_readings.doubts == ()
+    values = np.array([found.values[name] for name in found.parametrization.names])
+    np.testing.assert_allclose(values, session.legs.vector(session.truth.legs), atol=1e-6)
+
+
 @pytest.mark.system
 def test_a_motor_of_another_scale_is_named_and_not_trusted(tmp_path: Path) -> None:
     session = machine_session(str(made("7-ups", tmp_path).yaml_path), n_poses=12)
@@ -324,7 +343,10 @@ def test_a_motor_of_another_scale_is_named_and_not_trusted(tmp_path: Path) -> No
     wrong = dataclasses.replace(session.measurements, q=q)
     found = refine(session.legs, wrong, session.outlines, session.start)
     assert found.redundant_readings is not None
-    assert any(session.legs.names[2] in why for why in found.redundant_readings.doubts)
+    assert any(
+        f"scale of {session.legs.names[2]} that is -1 % off explains most" in why
+        for why in found.redundant_readings.doubts
+    )
 
 
 @pytest.mark.system

@@ -229,6 +229,7 @@ class WrongReadingBlock(Document):
     image: str
     off: Number  # how far it is above what all else shows
     unit: Literal["m", "rad"]
+    alike: list[str]  # other motors one of which may be meant as well
 
 
 class ReadingResiduals(Document):

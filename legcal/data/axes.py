@@ -50,7 +50,7 @@ COLUMNS = (
             least=-most - ANGLE_ROUNDING,
             most=most + ANGLE_ROUNDING,
             needed=f"an angle from {-most:.4f} to {most:.4f} rad",
-            remedy="write radians, not degrees, or remove the row",
+            remedy="write radians, not degrees, less whole turns, or remove the row",
         )
         for name, most in MAX_ANGLE.items()
     ),

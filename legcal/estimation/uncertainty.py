@@ -187,7 +187,8 @@ def _add_products(
     c = columns.shape[-1]
     for member, places in where.members:
         J = rows.J[member]
-        np.add.at(kept, places, J.reshape(-1, J.shape[-1]).T @ columns[member].reshape(-1, c))
+        flat = J.reshape(J.shape[0] * J.shape[1], J.shape[2])  # of no columns, too
+        np.add.at(kept, places, flat.T @ columns[member].reshape(-1, c))
     if where.element is not None:
         np.add.at(elements, where.element, np.swapaxes(rows.J_element, 1, 2) @ columns)
 

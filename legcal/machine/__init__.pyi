@@ -133,6 +133,7 @@ from .parameters import turns_between as turns_between
 from .parameters import twist_after as twist_after
 from .parameters import vector_of as vector_of
 from .parameters import with_numbers as with_numbers
+from .redundancy import AS_LIKELY as AS_LIKELY
 from .redundancy import MIN_REDUNDANCY as MIN_REDUNDANCY
 from .redundancy import ROUGH_READING as ROUGH_READING
 from .redundancy import Contradiction as Contradiction

@@ -459,6 +459,11 @@ class Readings:
     def __len__(self) -> int:
         return len(self.leg)
 
+    @property
+    def by_scale(self) -> Array:
+        """How residuals (n,) change with the scale of the readings [m]."""
+        return -self.length
+
     def wrong_by(self, rows: Residuals) -> Array:
         """Return how far readings are above those of a state, (n,) [m]."""
         return -self.sign * rows.r[:, 0]
@@ -526,6 +531,11 @@ class ActuatorReadings:
 
     def __len__(self) -> int:
         return len(self.pose)
+
+    @property
+    def by_scale(self) -> Array:
+        """How residuals (n,) change with the scale of the readings [m or rad]."""
+        return -self.reading
 
     def wrong_by(self, rows: Residuals) -> Array:
         """Return how far readings are above those of a state, (n,) [m or rad]."""

@@ -24,14 +24,18 @@ from legcal.estimation import (
     explained_share,
     information,
     linearize,
+    normal_equations,
+    score_test,
 )
 from legcal.files import SHOWN_IN
-from legcal.geometry import BoolArray, IntArray
-from legcal.machine import MIN_REDUNDANCY, ROUGH_READING, ReadingTests
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.machine import AS_LIKELY, MIN_REDUNDANCY, ROUGH_READING, ReadingTests
 
 _FACTORS = "readings", "actuator_readings"
 _MOST_OF_MOTOR = 0.1  # of the readings of a motor that may be wrong by accident
 _MIN_COUNT = 3  # that are no accident
+_SAME = 1e-4  # part of a test that an error of another reading leaves: not told apart
+_NOTHING = 1e-12  # information on a scale of which nothing tells
 _SIGNIFICANT = 5.0  # standard deviations of the sum of squares of residuals
 
 
@@ -46,6 +50,7 @@ class WrongReading:
     image: str
     off: float  # how far it is above what all else shows [m or rad]
     unit: Literal["m", "rad"]
+    alike: tuple[str, ...] = ()  # other motors one of which may be meant as well
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,15 +91,19 @@ def like_readings(problem: FitProblem, other: FitProblem) -> FitProblem:
 def with_judged_readings(
     problem: FitProblem, state: State, settings: RefinementSettings
 ) -> tuple[FitProblem, bool]:
-    """Return the problem without the clearly wrong reading of every pose; say if there was one."""
+    """Return the problem without the wrong reading of every pose; say if there was one.
+
+    Of a pose that nothing but readings shows any of those that may be wrong will do: the others
+    agree then, and say nothing of the machine.
+    """
     linear = linearize(problem, state)
     normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
     tests = _tests(problem, linear, normal)
     of_factor, number = _numbers(problem)
     out: list[list[int]] = [[], []]
     for pose in np.unique(tests.pose).tolist():
-        found = tests.of_pose(pose, settings.rejection, tests.scale)
-        if len(found) == 1:
+        found = _of_pose(problem, state, linear, tests, pose, settings)
+        if len(found) == 1 or (found and not _is_shown(problem, pose)):
             out[int(of_factor[found[0]])].append(int(number[found[0]]))
     if not any(out):
         return problem, False
@@ -146,13 +155,23 @@ def judged_readings(
     if not problem.legs.is_redundant:
         return None
     legs, wrong = problem.legs.nominal, list[WrongReading]()
+    loss = PseudoHuber(settings.loss_width)
     for name, readings in zip(_FACTORS, _readings(problem), strict=True):
         off = readings.wrong_by(problem.factor(name).rows(state))
         for k in np.flatnonzero(~_used(problem, name)).tolist():
             leg, pose = int(readings.leg[k]), int(readings.pose[k])
             where, unit = _first_image(problem, pose), legs[leg].reading_unit
-            motor = legs[leg].motor_label
-            wrong.append(WrongReading(leg, pose, motor, *where, float(off[k]), unit))
+            motor, alike = legs[leg].motor_label, list[str]()
+            if not _is_shown(problem, pose):
+                whole = _with_used(problem, name, k)
+                again = linearize(whole, state)
+                every = _tests(whole, again, information(whole, state, again, loss))
+                alike = [
+                    legs[int(every.leg[i])].motor_label
+                    for i in _of_pose(whole, state, again, every, pose, settings)
+                    if every.leg[i] != leg
+                ]
+            wrong.append(WrongReading(leg, pose, motor, *where, float(off[k]), unit, tuple(alike)))
     tests = _tests(problem, linear, normal)
     sigma = np.concatenate([readings.sigma for readings in _readings(problem)])
     used = np.concatenate([_used(problem, name) for name in _FACTORS])
@@ -160,7 +179,7 @@ def judged_readings(
     moved = tests.r * sigma[used] * distance
     rms, rms_m = (float(np.sqrt(np.mean(x**2))) for x in (tests.r, moved))
     expected = float(np.sqrt(np.mean(tests.redundancy)))
-    doubts = _doubts(problem, tests, wrong, settings)
+    doubts = _doubts(problem, state, linear, tests, wrong, settings)
     return JudgedReadings(tuple(wrong), rms, expected, rms_m, doubts)
 
 
@@ -180,7 +199,9 @@ def reading_notes(judged: JudgedReadings | None) -> tuple[str, ...]:
 def _in_words(wrong: WrongReading) -> str:
     """Return whose reading it is, of which image, and by how much it is wrong."""
     size, unit = SHOWN_IN[wrong.unit]
-    return f"{wrong.motor} in {wrong.view}, image {wrong.image} by {size * wrong.off:+.3g} {unit}"
+    alike = f" (or as likely one of {', '.join(wrong.alike)})" if wrong.alike else ""
+    where = f"{wrong.view}, image {wrong.image}"
+    return f"{wrong.motor}{alike} in {where} by {size * wrong.off:+.3g} {unit}"
 
 
 def _first_image(problem: FitProblem, pose: int) -> tuple[str, str]:
@@ -191,6 +212,8 @@ def _first_image(problem: FitProblem, pose: int) -> tuple[str, str]:
 
 def _doubts(
     problem: FitProblem,
+    state: State,
+    linear: Linearization,
     tests: ReadingTests,
     wrong: list[WrongReading],
     settings: RefinementSettings,
@@ -209,7 +232,7 @@ def _doubts(
             )
     alike = list[str]()
     for pose in np.unique(tests.pose).tolist():
-        found = tests.of_pose(pose, settings.rejection, tests.scale)
+        found = _of_pose(problem, state, linear, tests, pose, settings)
         if len(found) > 1:
             view, image = _first_image(problem, pose)
             labels = [legs[j].motor_label for j in tests.leg[found].tolist()]
@@ -222,16 +245,89 @@ def _doubts(
     expected, missed = float(tests.redundancy.sum()), float(np.sum(tests.r**2))
     if missed > expected + _SIGNIFICANT * np.sqrt(2.0 * expected):
         times = np.sqrt(missed / max(expected, 1.0))
-        squared = tests.squared
-        motors = np.unique(tests.leg)
-        leg = int(motors[np.argmax([squared[tests.leg == j].mean() for j in motors])])
+        plain = normal_equations(problem, state, linear)
         doubts.append(
             f"the readings of redundant motors contradict each other and the images {times:.1f} "
-            f"times as much as their standard deviations allow, those of {legs[leg].motor_label} "
-            "most; check the scale, the zero and the slip of the motors, or state the standard "
+            f"times as much as their standard deviations allow, {_most(problem, linear, plain)}; "
+            "check the scale, the zero and the slip of the motors, or state the standard "
             "deviations of their readings"
         )
     return tuple(doubts)
+
+
+def _of_pose(
+    problem: FitProblem,
+    state: State,
+    linear: Linearization,
+    tests: ReadingTests,
+    pose: int,
+    settings: RefinementSettings,
+) -> list[int]:
+    """Return the readings of a pose one of which is wrong, the likeliest first.
+
+    A robust loss leaves a contradiction to one of the readings that explain it alike. So those
+    count as alike, too, whose errors the measurements do not tell from that of the likeliest: the
+    part of its test that theirs does not explain is 1 - rho^2, rho the correlation of both tests.
+    """
+    found = tests.of_pose(pose, settings.rejection, tests.scale)
+    if not found:
+        return []
+    factor, number = _numbers(problem)
+    own = [found[0], *(i for i in np.flatnonzero(tests.pose == pose).tolist() if i != found[0])]
+    columns = {
+        name: np.zeros((len(readings), 1, len(own)))
+        for name, readings in zip(_FACTORS, _readings(problem), strict=True)
+        if len(readings)
+    }
+    for c, i in enumerate(own):
+        columns[_FACTORS[int(factor[i])]][number[i], 0, c] = 1.0
+    _, K = score_test(problem, linear, normal_equations(problem, state, linear), columns)
+    variance = np.maximum(np.diagonal(K), _NOTHING)
+    apart = 1.0 - K[0] ** 2 / (variance[0] * variance)
+    enough = AS_LIKELY * tests.scale**2 / tests.squared[found[0]]
+    alike = [i for i, a in zip(own[1:], apart[1:], strict=True) if a <= max(enough, _SAME)]
+    return [*found, *(i for i in alike if i not in found)]
+
+
+def _is_shown(problem: FitProblem, pose: int) -> bool:
+    """Say whether anything but readings is measured at a pose."""
+    return any(
+        bool(np.any(np.asarray(f.whitening)[f.element == pose] != 0.0))
+        for f in problem.factors
+        if f.robust and f.name not in _FACTORS and f.element is not None and f.n
+    )
+
+
+def _with_used(problem: FitProblem, name: str, number: int) -> FitProblem:
+    """Return the problem with a reading that it leaves out."""
+    factor = problem.factor(name)
+    readings = dict(zip(_FACTORS, _readings(problem), strict=True))[name]
+    whitening = np.array(factor.whitening)
+    whitening[number] = 1.0 / readings.sigma[number]
+    return problem.with_factors(replace(factor, whitening=whitening))
+
+
+def _most(problem: FitProblem, linear: Linearization, normal: NormalEquations) -> str:
+    """Return whose scale explains most of what readings miss, all else following (Rao's test)."""
+    legs, columns = problem.legs.nominal, dict[str, Array]()
+    motors = sorted({int(j) for readings in _readings(problem) for j in readings.leg})
+    for name, readings in zip(_FACTORS, _readings(problem), strict=True):
+        if len(readings):
+            of_motor = readings.leg[:, None] == np.array(motors)
+            by_scale = of_motor * readings.by_scale[:, None]
+            columns[name] = np.asarray(problem.factor(name).whitening) @ by_scale[:, None]
+    score, left = score_test(problem, linear, normal, columns)
+    K = np.maximum(np.diagonal(left), _NOTHING)
+    squared = score**2 / K
+    order = np.argsort(-squared)
+    alike = order[squared[order[0]] - squared[order] <= AS_LIKELY]
+    first = int(order[0])
+    labels = few([legs[motors[i]].motor_label for i in alike.tolist()])
+    if len(alike) > 1:
+        return f"and the scales of {labels} explain most of that alike"
+    return (
+        f"and a scale of {labels} that is {100 * score[first] / K[first]:+.2g} % off explains most"
+    )
 
 
 def _tests(problem: FitProblem, linear: Linearization, normal: NormalEquations) -> ReadingTests:
