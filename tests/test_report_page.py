@@ -182,6 +182,18 @@ def test_the_map_of_the_workspace_agrees_with_the_models(example_run: Run) -> No
     assert found.position[at] == pytest.approx(places[found.index >= 0], abs=1e-12)
 
 
+def test_the_map_leaves_out_places_that_the_calibrated_legs_do_not_reach(example_run: Run) -> None:
+    calibration = example_run.calibration
+    solution, whole = calibration.solution, platform_map(calibration)
+    long = replace(solution.legs[0], q0=solution.legs[0].q0 + 0.15)
+    apart = replace(solution, legs=(long, *solution.legs[1:]))
+    found = platform_map(replace(calibration, solution=apart))
+    assert whole is not None
+    assert found is not None
+    assert 0 < len(found.position) < len(whole.position)
+    assert np.isfinite(found.sigma.displacement).all()
+
+
 def test_residuals_belong_to_their_outlines(example_run: Run) -> None:
     # By what the fit predicts of each outline, made from the result in the order of the files.
     calibration = example_run.calibration

@@ -63,11 +63,13 @@ from legcal.data import (
     fingerprint,
     image_notes,
     load_dataset,
+    no_outlines,
     overrides_of_call,
     plan_dataset,
     reject_unused_legs,
     split_images,
     store_outlines,
+    through_cameras,
 )
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.files import check_destination, output_path
@@ -455,10 +457,11 @@ def _measure_again(
 
     def at_fit(near: Estimate, gammas: Mapping[str, float]) -> tuple[Photographs, Placement]:
         machine = _with_fitted_radii(again.machine, near.solution)
-        photographs = replace(again, machine=machine).with_gammas(gammas)
+        photographs = replace(again, machine=machine).with_intrinsics(near.solution.cameras)
         here = near.fitted.with_fitted_poses(near.solution.T_Rb_Re)
         every = replace(data, seen_poses=here.seen_poses)
-        return photographs, _fitted_placement(every, near.solution, seen)
+        placement = _fitted_placement(every, near.solution, seen)
+        return photographs.with_gammas(gammas), placement
 
     def fitted(near: Estimate, gammas: Mapping[str, float], like: Outlines | None) -> Estimate:
         photographs, placement = at_fit(near, gammas)
@@ -466,7 +469,11 @@ def _measure_again(
         stage = "Measuring outlines near the fit"
         if gammas:
             stage += f", gamma {few(sorted({f'{gamma:.2f}' for gamma in gammas.values()}))}"
-        outlines = measure_photographs(photographs, placement, data.progress, stage=stage)
+        search = replace(photographs, keep=no_outlines())
+        outlines = measure_photographs(search, placement, data.progress, stage=stage)
+        # The table and the next fit have the cameras of the files.
+        lenses = [[view.camera for view in p.measurements.views] for p in (photographs, again)]
+        outlines = again.with_found(through_cameras(outlines, view[outlines.row], *lenses))
         if like is not None:
             outlines = used_as_before(outlines, like)
         return _fit(here, outlines, placement, board, options)

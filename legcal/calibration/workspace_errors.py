@@ -18,6 +18,7 @@ from legcal.calibration.joint_fit import (
     expected_error,
     platform_by_parameters,
     poses_at_readings,
+    reach_readings,
 )
 from legcal.calibration.result import Calibration
 from legcal.errors import DidNotConverge, NotIdentifiable
@@ -129,6 +130,7 @@ def _errors(
     calibrated = poses_at_readings(machine, solution.legs, q, nominal)
     apart, turned = pose_differences(nominal, wanted)
     reached = (apart < _CLOSED) & (turned < _CLOSED)
+    reached &= reach_readings(machine, solution.legs, q, calibrated)
     kept = np.flatnonzero(reached)
     if not len(kept):
         return None

@@ -55,6 +55,7 @@ from .outlines import join_outlines as join_outlines
 from .outlines import merge_edited as merge_edited
 from .outlines import no_outlines as no_outlines
 from .outlines import reject_unused_legs as reject_unused_legs
+from .outlines import through_cameras as through_cameras
 from .outlines import write_observations as write_observations
 from .overrides import Action as Action
 from .overrides import Override as Override

@@ -118,6 +118,36 @@ class Outlines(ImageTable):
         return {key for key, is_used in pairs if is_used}
 
 
+def through_cameras(
+    outlines: Outlines, view: IntArray, measured: Sequence[Camera], wanted: Sequence[Camera]
+) -> Outlines:
+    """Return outlines that were measured with some cameras as other cameras have them.
+
+    The ends stay where they are in the image, and the planes go through them. *view* is that of
+    each outline, and has a camera in either sequence.
+    """
+    h = outlines.h.copy()
+    for v in np.unique(view).tolist():
+        at = np.flatnonzero((view == v) & np.isfinite(outlines.h).all(axis=1))
+        one, two = ((camera[v].K, camera[v].distortion) for camera in (measured, wanted))
+        if len(at) == 0 or all(map(np.array_equal, one, two)):
+            continue
+        before, after = (
+            _plane_through(camera[v].undistort(outlines.ends[at])) for camera in (measured, wanted)
+        )
+        size = np.linalg.norm(after, axis=1)
+        size *= np.sign(np.sum(before * outlines.h[at], axis=1))
+        there = size != 0.0
+        h[at[there]] = after[there] / size[there, None]
+    return replace(outlines, h=h)
+
+
+def _plane_through(ends: Array) -> Array:
+    """Return normals (n, 3) of the planes through the camera and two points (n, 2, 2) each."""
+    rays = np.concatenate([ends, np.ones((*ends.shape[:2], 1))], axis=2)
+    return cross(rays[:, 0], rays[:, 1])
+
+
 def no_outlines() -> Outlines:
     """Return an empty table."""
     none = np.zeros(0, dtype=np.intp)

@@ -51,7 +51,7 @@ from legcal.perception.radii import LegRadius, RadiusFactors, radius_notes
 from legcal.perception.recognition import recognise
 from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
-from legcal.vision import look_alike, shared_cameras
+from legcal.vision import Camera, look_alike, shared_cameras
 from legcal.workers import Run
 
 DETECTOR_VERSION = 9  # raise it whenever outlines or notes that are kept come out differently
@@ -128,6 +128,14 @@ class Photographs:
         """Return the search of some rows again; edited and other rows' outlines are kept."""
         kept = ~np.isin(outlines.row, rows) | is_edited(outlines)
         return replace(self, detect=rows, keep=outlines.choose(kept))
+
+    def with_intrinsics(self, cameras: Sequence[Camera]) -> Photographs:
+        """Return the same images, seen through the lenses of other cameras, one a view."""
+        views = tuple(
+            replace(view, camera=replace(view.camera, K=lens.K, distortion=lens.distortion))
+            for view, lens in zip(self.measurements.views, cameras, strict=True)
+        )
+        return replace(self, measurements=replace(self.measurements, views=views))
 
     def with_gammas(self, gammas: Mapping[str, float]) -> Photographs:
         """Return the same images, read with other gammas of some views, by their names."""

@@ -27,6 +27,7 @@ from .platform import expected_error as expected_error
 from .platform import platform_accuracy as platform_accuracy
 from .platform import platform_by_parameters as platform_by_parameters
 from .platform import poses_at_readings as poses_at_readings
+from .platform import reach_readings as reach_readings
 from .problem import FitProblem as FitProblem
 from .problem import build_fit as build_fit
 from .rounds import DISAGREES as DISAGREES

@@ -17,7 +17,7 @@ from legcal.calibration.joint_fit.sensitivity import Sensitivity
 from legcal.calibration.joint_fit.variables import platform_poses
 from legcal.errors import DidNotConverge
 from legcal.estimation import Frames
-from legcal.geometry import Array
+from legcal.geometry import Array, BoolArray
 from legcal.machine import (
     Leg,
     LegKind,
@@ -171,19 +171,30 @@ def _workspace_poses(machine: Machine, legs: Sequence[Leg]) -> Sequence[RigidTra
     except DidNotConverge:  # travel or home of the model forbid it, which harms no calibration
         return None
     poses = poses_at_readings(machine, legs, readings, platforms_in_base(machine, drawn))
-    R, t = Frames.of(poses)
-    reached = np.ones(len(poses), dtype=np.bool_)  # some legs have some lengths nowhere
-    for leg, q in zip(legs, readings.T, strict=True):
+    reached = np.flatnonzero(reach_readings(machine, legs, readings, poses))
+    return [poses[k] for k in reached] or None
+
+
+def reach_readings(
+    machine: Machine, legs: Sequence[Leg], q: Array, T_Rb_Re: Sequence[RigidTransform]
+) -> BoolArray:
+    """Return at which poses (n_poses,) the legs have the lengths of their readings.
+
+    Some lengths are possible nowhere, and :func:`poses_at_readings` then gives the nearest pose.
+    """
+    R, t = Frames.of(T_Rb_Re)
+    reached = np.ones(len(t), dtype=np.bool_)
+    for leg, reading in zip(legs, q.T, strict=True):
         if leg.kind is LegKind.ACTUATED:
-            A, wanted = leg.A, leg.sign * q + leg.q0
+            A, wanted = leg.A, leg.sign * reading + leg.q0
         elif leg.actuator is not None:
-            A, wanted = leg.actuator.at(leg.A, q), leg.q0
+            A, wanted = leg.actuator.at(leg.A, reading), leg.q0
         else:
             continue
         length = np.linalg.norm(R @ leg.B + t - A, axis=1)
         most = _REACHED_BY_ALL * length if machine.is_redundant else _REACHED
         reached &= np.abs(length - wanted) < most
-    return [poses[k] for k in np.flatnonzero(reached)] or None
+    return reached
 
 
 def poses_at_readings(

@@ -46,8 +46,9 @@ def platform_blocks(calibration: Calibration) -> list[Any]:
                      found.sigma.rotation),
         ]  # fmt: skip
     columns = ("", ">mean [mm]", ">largest [mm]", ">mean [deg]", ">largest [deg]")
+    what = "The first two rows" if found is not None else "Both rows"
     note = (
-        f"The first two rows are at the {platform.poses} poses of the images. Both models get the "
+        f"{what} are at the {platform.poses} poses of the images. Both models get the "
         "same readings; errors of the readings themselves are not in sigma."
     )
     histograms = [
