@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import one_thread  # noqa: F401
+import process_settings  # noqa: F401
 import pytest
 import typer.main
 from hexapod_example import Run, copy_of_the_example
