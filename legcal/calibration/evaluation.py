@@ -227,7 +227,8 @@ def _poses_at(machine: Machine, q: Array) -> list[RigidTransform | None]:
     lengths = machine.lengths_at(q[:, list(machine.motors)], machine.motors)
     possible = np.flatnonzero(np.all(lengths > 0.0, axis=1)).tolist()
     poses: list[RigidTransform | None] = [None] * len(q)
-    for k, (T, failure) in zip(possible, followed_poses(machine, q[possible]), strict=True):
+    followed = followed_poses(machine, q[possible], on_the_chain=False)
+    for k, (T, failure) in zip(possible, followed, strict=True):
         poses[k] = T if failure is None else None
     return poses
 
