@@ -109,9 +109,9 @@ def drawings(folder: Path, camera: Camera, n_images: int) -> list[Path]:
         normal = T.rotation.as_matrix()[2]
         direction = rays @ T.rotation.as_matrix().T.astype(np.float32)
         hit = T.translation - direction * (T.translation[2] / (rays @ normal))[..., None]
-        cell = np.floor(hit[..., :2] / BOARD.side).astype(np.intp)
-        on_board = np.all((cell >= -1) & (cell < [BOARD.columns - 1, BOARD.rows - 1]), axis=-1)
-        black = on_board & (cell.sum(axis=-1) % 2 == 0)
+        i, j = (np.floor(hit[..., a] / BOARD.side).astype(np.intp) for a in (0, 1))
+        on_board = (i >= -1) & (i < BOARD.columns - 1) & (j >= -1) & (j < BOARD.rows - 1)
+        black = on_board & ((i + j) % 2 == 0)
         levels = np.where(black, 30.0, 190.0).astype(np.float32)
         fine = np.asarray(cv2.GaussianBlur(levels, (0, 0), 0.6 * n))
         image = fine.reshape(camera.height, n, camera.width, n).mean(axis=(1, 3))

@@ -1,14 +1,15 @@
 """What several test files share."""
 
+import gc
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import one_thread  # noqa: F401
+import process_settings  # noqa: F401
 import pytest
 import typer.main
 from hexapod_example import Run, copy_of_the_example
@@ -24,6 +25,17 @@ os.environ.setdefault("HYPOTHESIS_NO_PLUGINS", "1")
 
 LEFT = ("observations.csv", ".legcal-cache.json")  # beside a dataset, for the next run
 STAGES = "stages.txt"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Load modules without searches for dead cycles: none of what they make is dead."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)

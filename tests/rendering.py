@@ -135,7 +135,8 @@ def _box(shape: tuple[int, ...], rays: Array, bar: Bar) -> tuple[slice, slice]:
     xy = ends[:, :2] / ends[:, 2:]
     margin = 2.0 * bar.radius / ends[:, 2].min()
     low, high = xy.min(axis=0) - margin, xy.max(axis=0) + margin
-    inside = np.all((rays[..., :2] >= low) & (rays[..., :2] <= high), axis=-1)
+    x, y = rays[..., 0], rays[..., 1]
+    inside = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
     rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
     if not len(rows):
         return slice(0, 0), slice(0, 0)

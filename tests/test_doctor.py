@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from characterisation.running import fits_schema
 from command_line import run
+from csv_rows import read_rows, write_rows
 from hexapod_example import Spoiled, spoiled
 from photograph_files import exif, jpeg
+from simulated import simulated
 
 from legcal import SimulationSettings, doctor, simulate
 from legcal.calibration import Examination
@@ -81,12 +83,14 @@ def test_photographs_of_another_size_are_one_finding(tmp_path: Path) -> None:
 
 
 def test_readings_are_compared_with_travel_digits_and_stated_noise(tmp_path: Path) -> None:
-    session = made(tmp_path)
-    for row in session.rows:
+    folder = simulated(tmp_path / "set", "hexapod", poses=2, views=3).folder
+    rows = read_rows(folder / "measurements.csv")
+    for row in rows:
         row |= {name: f"{float(row[name]):.4f}" for name in COLUMNS}
         row["leg5_prismatic"] = "0.0500"
         row["leg3_prismatic"] = f"{float(row['leg3_prismatic']) / 50.0 + 0.02:.4f}"
-    found = doctor(session.write())
+    write_rows(folder / "measurements.csv", rows)
+    found = doctor(folder)
     constant, still, coarse = found_of(found, "readings", "warning")
     assert "found the same reading in all rows of leg5_prismatic" in constant.what
     assert "found leg3_prismatic in" in still.what

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from command_line import run
-from hexapod_example import TRUTH, Run
+from hexapod_example import TRUTH, Run, spoiled
 from lxml import html
 from rich.console import Group
 from rich.table import Table as TextTable
@@ -414,14 +414,15 @@ def test_other_commands_write_what_they_print_as_a_page(
     assert path.read_bytes() == before
 
 
+@pytest.mark.usefixtures("page")  # which writes the report of the result
 def test_a_check_writes_a_page_and_never_over_that_of_a_result(
     example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ("calibrate", example_run.folder, "--check", example_run.output, "-o")
-    page = example_run.output / "report.html"
-    before = page.read_bytes() if page.exists() else b""
+    few = spoiled(tmp_path / "few", 2).write()  # photographs, at half their size
+    words = ("calibrate", few, "--check", example_run.output, "-o")
+    before = (example_run.output / "report.html").read_bytes()
     assert run(monkeypatch, *words, example_run.output) == 2
-    assert (page.read_bytes() if page.exists() else b"") == before
+    assert (example_run.output / "report.html").read_bytes() == before
     assert run(monkeypatch, *words, tmp_path / "check") == 0
     found: Any = html.fromstring((tmp_path / "check" / "report.html").read_text("utf-8"))
     assert "No change was detected" in found.xpath("string(//section[@id='verdict'])")

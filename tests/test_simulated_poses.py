@@ -314,7 +314,7 @@ def test_poses_that_the_nominal_model_does_not_reach_are_drawn_again(
 ) -> None:
     nominal, truth = pair
     readings = draw_poses(truth, 3, np.random.default_rng(0)).readings
-    monkeypatch.setattr(module, "_reaches", lambda _, q: not np.array_equal(q, readings[1]))
+    monkeypatch.setattr(module, "_reached", lambda _, q: np.any(q != readings[1], axis=1))
     poses = commanded_poses(truth, nominal, 3, np.random.default_rng(0), Sampling.EXTREME)
     assert np.array_equal(poses.readings[:2], readings[[0, 2]])
     assert len(poses.poses) == 3
@@ -324,7 +324,7 @@ def test_a_machine_far_from_its_model_is_refused(
     pair: tuple[Machine, Machine], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nominal, truth = pair
-    monkeypatch.setattr(module, "_reaches", lambda *_: False)
+    monkeypatch.setattr(module, "_reached", lambda _, q: np.zeros(len(q), dtype=np.bool_))
     monkeypatch.setattr(module, "_MAX_ROUNDS", 2)
     with pytest.raises(DidNotConverge, match="found 0 that the true machine and the nominal"):
         commanded_poses(truth, nominal, 1, np.random.default_rng(0), Sampling.EXTREME)

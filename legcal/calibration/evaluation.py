@@ -30,7 +30,6 @@ from legcal.machine import (
     WORKSPACE_SEED,
     Machine,
     followed_poses,
-    forward_kinematics,
     geometries,
     load_mechanism,
     parametrization_of,
@@ -256,7 +255,8 @@ def _poses_at(machine: Machine, q: Array) -> list[RigidTransform | None]:
     lengths = machine.lengths_at(q[:, list(machine.motors)], machine.motors)
     possible = np.flatnonzero(np.all(lengths > 0.0, axis=1)).tolist()
     poses: list[RigidTransform | None] = [None] * len(q)
-    for k, (T, failure) in zip(possible, followed_poses(machine, q[possible]), strict=True):
+    followed = followed_poses(machine, q[possible], on_the_chain=False)
+    for k, (T, failure) in zip(possible, followed, strict=True):
         poses[k] = T if failure is None else None
     return poses
 
@@ -298,12 +298,12 @@ def _random_poses(
         if turn > 0 and not poses:
             break
         count = WORKSPACE_POSES - len(poses) if turn > 0 else FIRST_POSES
-        for q, T in zip(*random_poses(machine, count, rng), strict=True):
-            try:
-                reference_poses.append(forward_kinematics(reference, q))
-            except DidNotConverge:  # the reference cannot have these lengths at the same time
-                continue
-            poses.append(T)
+        q, drawn = random_poses(machine, count, rng)
+        there = followed_poses(reference, q, on_the_chain=False)
+        for T, (reference_T, failure) in zip(drawn, there, strict=True):
+            if failure is None:  # else the reference cannot have these lengths at the same time
+                poses.append(T)
+                reference_poses.append(reference_T)
         if len(poses) == WORKSPACE_POSES:
             return poses, reference_poses
     raise DidNotConverge(

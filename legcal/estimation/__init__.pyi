@@ -15,6 +15,7 @@ from .problem import Variables as Variables
 from .problem import all_free as all_free
 from .problem import fixed_at_start as fixed_at_start
 from .problem import linearize as linearize
+from .solver import COST_TOLERANCE as COST_TOLERANCE
 from .solver import Minimum as Minimum
 from .solver import NormalEquations as NormalEquations
 from .solver import information as information

@@ -33,7 +33,7 @@ from legcal.geometry import Array, BoolArray
 _FIRST_DAMPING = 1e-6
 _MIN_DAMPING = 1e-10
 _MAX_DAMPING = 1e8
-_COST_TOLERANCE = 1e-12  # predicted fall of the cost at a minimum, in squared sigmas
+COST_TOLERANCE = 1e-12  # predicted fall of the cost at a minimum, in squared sigmas
 _ROUNDING = 1e-13  # of the cost
 _WIDTH_IN_MEDIANS = 5.0  # width of the loss while most measurements are beyond its final one
 _SLOW_FALL = 0.5  # of the cost: below, the loss is narrowed as far as the median allows
@@ -69,7 +69,7 @@ def minimise(
     *,
     max_iterations: int = 200,
     is_near: bool = False,
-    tolerance: float = _COST_TOLERANCE,
+    tolerance: float = COST_TOLERANCE,
     relative_tolerance: float = 0.0,
     must_converge: bool = True,
     known: Mapping[str, Residuals] | None = None,
@@ -113,7 +113,7 @@ def minimise(
     for iteration in range(1, max_iterations + 1):
         normal = normal or normal_equations(problem, state, linear, wide)
         step, predicted = normal.step(damping)
-        converged = predicted < _COST_TOLERANCE + _ROUNDING * cost
+        converged = predicted < COST_TOLERANCE + _ROUNDING * cost
         trial = _tried(problem, state, step)
         there = np.inf if trial is None else robust_cost(problem, trial[1], wide)
         if trial is not None and not converged and not there < cost:

@@ -92,6 +92,7 @@ from .leg import radius_name as radius_name
 from .leg import with_platform_points as with_platform_points
 from .loader import load_mechanism as load_mechanism
 from .mobility import leg_scale as leg_scale
+from .mobility import singularities as singularities
 from .mobility import singularity as singularity
 from .model import Machine as Machine
 from .model import joint_values as joint_values

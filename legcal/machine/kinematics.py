@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.geometry import Array, BoolArray, IntArray, motion_of, motions_of, product
+from legcal.geometry import Array, BoolArray, IntArray, matrix_of, motion_of, motions_of, product
 from legcal.machine.closing import close_at, closure_equations
 from legcal.machine.equations import (
     is_constrained,
@@ -385,7 +385,10 @@ def follow(
         if reached is None or _is_flipped(machine, reached):
             return False
         if not excludes_singularity(known, jacobian):
-            ends = [platform_pose(machine, c).as_matrix() for c in (configuration, reached)]
+            ends = [
+                matrix_of(*machine.chain.placement(c, machine.base, machine.platform))
+                for c in (configuration, reached)
+            ]
             if not is_on_same_side(*dimensionless(machine, np.array(ends), motors)):
                 return False
         configuration, known = reached, jacobian

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.estimation import (
+    COST_TOLERANCE,
     NO_PRIOR,
     Clusters,
     Factor,
@@ -129,6 +130,7 @@ def adjust_board(
     *,
     held: bool = False,  # whether camera and sheet stay, and only poses follow
     max_iterations: int = _MAX_ITERATIONS,
+    tolerance: float = COST_TOLERANCE,  # fall of the cost at which to stop, in squared sigmas
 ) -> AdjustedBoard | None:
     """Return the board's poses of least cost near a start, and free intrinsics of the camera.
 
@@ -143,7 +145,14 @@ def adjust_board(
     moving = problem
     if held:
         moving = replace(problem, variables=tuple(map(_held, problem.variables)))
-    found = minimise(moving, state, LOSS, max_iterations=max_iterations, must_converge=False)
+    found = minimise(
+        moving,
+        state,
+        LOSS,
+        max_iterations=max_iterations,
+        tolerance=tolerance,
+        must_converge=False,
+    )
     linear = linearize(problem, found.state) if held else found.linear
     normal = normal_equations(problem, found.state, linear, LOSS)
     return AdjustedBoard(

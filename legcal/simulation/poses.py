@@ -22,11 +22,12 @@ from legcal.machine import (
     contradictions,
     feasible_poses,
     follow,
-    forward_kinematics,
+    followed_poses,
     motor_travel,
     platform_in_base,
     platform_pose,
     poses_at,
+    singularities,
     singularity,
     slider_columns,
 )
@@ -133,11 +134,7 @@ def commanded_poses(
 
     for _ in range(_MAX_ROUNDS):
         drawn = draw_poses(truth, n_poses - len(kept), rng, sampling, report)
-        kept += [
-            configuration
-            for configuration, q in zip(drawn.configurations, drawn.readings, strict=True)
-            if _reaches(nominal, q)
-        ]
+        kept += list(drawn.configurations[_reached(nominal, drawn.readings)])
         if len(kept) == n_poses:
             return poses_at(truth, kept)
     raise DidNotConverge(
@@ -158,12 +155,12 @@ def _outside_travel(machine: Machine, row: Array) -> str | None:
     return None
 
 
-def _reaches(nominal: Machine, q: Array) -> bool:
-    """Say whether the nominal model reaches readings, away from its singularities."""
+def _reached(nominal: Machine, readings: Array) -> BoolArray:
+    """Say which readings (k, n_legs) the nominal model reaches, away from its singularities."""
     if not nominal.is_determined:
-        return True
-    try:
-        T = forward_kinematics(nominal, q)
-    except DidNotConverge:
-        return False
-    return singularity(nominal, T) >= _REGULAR_NOMINAL * singularity(nominal, nominal.home)
+        return np.ones(len(readings), dtype=np.bool_)
+    poses, failures = zip(*followed_poses(nominal, readings, on_the_chain=False), strict=True)
+    is_reached = np.array([failure is None for failure in failures])
+    regular = singularities(nominal, np.array([T.as_matrix() for T in poses]))
+    least = _REGULAR_NOMINAL * singularity(nominal, nominal.home)
+    return np.asarray(is_reached & (regular >= least))

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import one_thread  # noqa: F401
+import process_settings  # noqa: F401
 import typer.main
 
 from legcal import cli

@@ -19,7 +19,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtri
 
 from legcal.calibration.camera_calibration.starts import again, from_scratch, part_of
-from legcal.estimation import Clusters
+from legcal.estimation import COST_TOLERANCE, Clusters
 from legcal.geometry import Array, BoolArray
 from legcal.perception import LOSS, SHEET, AdjustedBoard, BoardImages, Sheet, adjust_board
 from legcal.vision import DistortionModel, ImageSize, intrinsic_names, intrinsic_values
@@ -32,6 +32,7 @@ _FIRST_RATIO = 3.0  # by which errors of the cheapest half are smaller than thos
 _CLEAR = 0.6  # part of the images, from which a group is not searched further
 _MORE_STARTS = 4  # fits of random images, then
 _EXPLAINED = 0.6  # part of what is wrong with an image, from which it is the reason
+_NEGLIGIBLE = 1e-3  # part of what is wrong with an image that is not searched for
 _ALMOST = 0.9  # part of the best explanation, from which a simpler one is the reason
 _ALIKE = 0.2  # part by which changes of both focal lengths, or in images, may differ from a mean
 _PAIR = 2  # images that have a change in common by chance
@@ -341,6 +342,7 @@ def _faults(adjusted: AdjustedBoard, seen: BoardImages, i: int, usual: float) ->
     if plain is None:
         return {"motion": _Fault(0, 0.0, np.zeros(2))}
     wrong = max(plain.cost - 0.5 * usual * max(2 * len(points) - 6, 1), 1e-300)
+    fine = max(_NEGLIGIBLE * wrong, COST_TOLERANCE)
 
     def fault(n_unknowns: int, found: AdjustedBoard | None, change: Array | None = None) -> _Fault:
         gain = 0.0 if found is None else (plain.cost - found.cost) / wrong
@@ -358,9 +360,9 @@ def _faults(adjusted: AdjustedBoard, seen: BoardImages, i: int, usual: float) ->
         pose = RigidTransform.from_components(t, Rotation.from_matrix(side[:, None] * R * flip))
         px = np.where(side[:2] < 0.0, far - image.px, image.px)
         back = replace(image, points=sheet.placed(points * flip + to_there)[0], px=px)
-        faults[name] = fault(0, adjust_board(camera, [pose], back))
+        faults[name] = fault(0, adjust_board(camera, [pose], back, tolerance=fine))
     for name, free in _FREE.items():
-        found = adjust_board(camera, [T], image, free)
+        found = adjust_board(camera, [T], image, free, tolerance=fine)
         change = np.zeros(2)
         if found is not None and name == "shift":
             change = found.camera.K[:2, 2] - camera.K[:2, 2]
@@ -370,7 +372,8 @@ def _faults(adjusted: AdjustedBoard, seen: BoardImages, i: int, usual: float) ->
         if name == "crop" and not both:
             continue
         faults["stretch" if name == "zoom" and not both else name] = fault(len(free), found, change)
-    faults["sheet"] = fault(4, adjust_board(camera, [T], image, (), Sheet.flat(seen.points)))
+    bent = adjust_board(camera, [T], image, (), Sheet.flat(seen.points), tolerance=fine)
+    faults["sheet"] = fault(4, bent)
     faults["motion"] = _Fault(6, _gain_of_motion(plain, image) / wrong, np.zeros(2))
     return faults
 
