@@ -109,9 +109,29 @@ def as_given(data: OrderedDataset) -> Assumed:
     return Assumed(data.machine, data.measurements.q, np.ones((data.measurements.n_rows, 2)))
 
 
-def mistakes(data: OrderedDataset) -> list[Mistake]:
-    """Return what may be wrong with a session, the commoner before the rarer."""
-    given = as_given(data)
+def both(one: Mistake, other: Mistake, beside: Sequence[Mistake] = ()) -> Mistake:
+    """Return two mistakes at once: the other one was found beside what is true after the first.
+
+    ``beside`` are what images cannot tell from the first, one of each kind.
+    """
+    alike = [same.what for same in beside if same.kind != one.kind]
+    return Mistake(
+        f"{one.kind} and {other.kind}",
+        f"{one.what}, and {other.what}",
+        f"{one.mended} and {other.mended}",
+        f"{one.remedy}, and {other.remedy}",
+        other.true,
+        (*one.same_as, *alike, *other.same_as),
+        one.test or other.test,
+    )
+
+
+def mistakes(data: OrderedDataset, given: Assumed | None = None) -> list[Mistake]:
+    """Return what may be wrong with a session, the commoner before the rarer.
+
+    That is beside what is ``given``, by default the session as its files have it.
+    """
+    given = given or as_given(data)
     found = [
         *_of_columns(data, given),
         *_of_rows(data, given),
@@ -175,12 +195,12 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         )
 
 
-def shifted_from(data: OrderedDataset, v: int, first: int, k: int) -> Mistake:
+def shifted_from(data: OrderedDataset, given: Assumed, v: int, first: int, k: int) -> Mistake:
     """Return readings of a view that stand k rows late from its first-th one on in the file.
 
     The last ones, whose own are not known, are left as they are.
     """
-    given, rows = as_given(data), rows_of_views(data)[v][first:]
+    rows = rows_of_views(data)[v][first:]
     q = given.q.copy()
     q[rows[:-k] if k > 0 else rows[-k:]] = given.q[rows[k:] if k > 0 else rows[:k]]
     name, row = data.measurements.views[v].name, data.order.rows[rows[0]]
@@ -189,7 +209,7 @@ def shifted_from(data: OrderedDataset, v: int, first: int, k: int) -> Mistake:
         "readings shifted",
         f"the readings of view {name} look as if they stood {_rows_late(k)} from {where} on, as if "
         + ("an image were missing there" if k > 0 else "a row of readings were missing there"),
-        f"with them moved by {abs(k)}",
+        f"with them moved by {_rows(k)}",
         "check which image belongs to which row",
         replace(given, q=q),
         amount_of=f"rows of view {name}",
@@ -205,8 +225,12 @@ def rows_of_views(data: OrderedDataset) -> list[IntArray]:
     ]
 
 
+def _rows(k: int) -> str:
+    return f"{abs(k)} row{'s' * (abs(k) > 1)}"
+
+
 def _rows_late(k: int) -> str:
-    return f"{abs(k)} row{'s' * (abs(k) > 1)} too {'early' if k < 0 else 'late'}"
+    return f"{_rows(k)} too {'early' if k < 0 else 'late'}"
 
 
 def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
@@ -226,7 +250,7 @@ def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
             "readings shifted",
             f"the readings{where} look as if they stood {_rows_late(k)}: each image has those of "
             "another",
-            f"with them moved by {abs(k)}",
+            f"with them moved by {_rows(k)}",
             "check which image belongs to which row",
             replace(given, q=q),
             amount_of=f"rows{where}",
@@ -377,13 +401,15 @@ def _of_images(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         yield _turned_over(data, given, rows, LEFT_RIGHT, f" of view {view.name}")
 
 
-def turned_images(data: OrderedDataset, rows: Sequence[int], turn: Array) -> Mistake:
+def turned_images(
+    data: OrderedDataset, given: Assumed, rows: Sequence[int], turn: Array
+) -> Mistake:
     """Return images of some rows of a view that are turned over, and others are not."""
     m = data.measurements
     names = row_names(data.dataset.measurements)
     first = names[data.order.rows[rows[0]]]
     which = f" {first} and {len(rows) - 1} more of view {m.views[m.view[rows[0]]].name}"
-    one = _turned_over(data, as_given(data), rows, turn, which)
+    one = _turned_over(data, given, rows, turn, which)
     return replace(one, of_few=tuple(rows), test="")
 
 
@@ -392,7 +418,7 @@ def _turned_over(
 ) -> Mistake:
     kind, what = _TURNS_IN_WORDS[turn is UPSIDE_DOWN]
     flip = given.flip.copy()
-    flip[list(rows)] = turn
+    flip[list(rows)] *= turn
     things, remedy = "images", "replace them by the originals"
     if len(data.photographs.detect) == 0:
         things, remedy = "outlines", "correct the direction of an axis of their table"
@@ -523,8 +549,8 @@ def _focal_length(given: Assumed, factor: float) -> Mistake:
         "scaled or cropped after the camera was calibrated, or another zoom",
         "with that",
         "calibrate the camera with images as these are (legcal camera)",
-        replace(given, focal=factor),
+        replace(given, focal=factor * given.focal),
         amount_of="focal length",
         finer=lambda more: _focal_length(given, factor * _FOCAL_STEP**more),
-        opposite=replace(given, focal=1.0 / factor),
+        opposite=replace(given, focal=given.focal / factor),
     )
