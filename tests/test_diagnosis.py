@@ -183,7 +183,7 @@ def test_two_mistakes_at_once_are_named_together(
     assert set(found.kind.split(" and ")) == {"columns exchanged", "diameter for radius"}
     assert "columns leg3_prismatic and leg4_prismatic look exchanged" in found.sentence.lower()
     assert "correct the <visual> cylinders" in found.remedy
-    assert "exchange their headers" in found.remedy
+    assert "exchange the headers" in found.remedy
     assert found.after >= 11 > found.before
 
 
@@ -313,7 +313,7 @@ def test_a_diagnosis_names_each_kind_of_mistake_that_images_do_not_tell_from_it(
     found = _diagnosed(d, kinds, monkeypatch)
     assert found.kind == "columns exchanged"
     assert len([one for one in found.same_as if one.startswith("columns")]) == 2
-    told = found.sentence.partition(": with them exchanged")[0]
+    told = found.sentence.partition(": with the columns exchanged,")[0]
     assert "or the outlines look mirrored, or the joints of the model look mirrored" in told
     assert "or 2 more that are alike" in told
 

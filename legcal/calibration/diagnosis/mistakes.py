@@ -89,7 +89,7 @@ class Mistake:
 
     kind: str  # a word or two, for scripts
     what: str  # clause: "columns leg1_prismatic and leg2_prismatic look exchanged"
-    mended: str  # "with them exchanged"
+    mended: str  # "with the columns exchanged"
     remedy: str  # what to do
     true: Assumed
     same_as: tuple[str, ...] = ()  # clauses of what no image can tell from it
@@ -166,8 +166,8 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         yield Mistake(
             "columns exchanged",
             f"columns {names[i]} and {names[k]} look exchanged",
-            "with them exchanged",
-            "exchange their headers",
+            "with the columns exchanged",
+            "exchange the headers of these columns",
             with_columns(source),
             (f"{what} {legs} look exchanged in the model",),
             _MOVE_ONE,
@@ -176,8 +176,8 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         yield Mistake(
             "columns reversed",
             "the columns of readings look as if they were in reverse order",
-            "with them reversed",
-            "reverse their headers",
+            "with the columns reversed",
+            "reverse the headers of the columns",
             with_columns(every[::-1]),
             ("the legs look as if they were numbered backwards in the model",),
             _MOVE_ONE,
@@ -187,8 +187,8 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
             "columns rotated",
             f"the columns of readings look as if they began with another leg: what "
             f"{names[0]} holds is of {names[(n - k) % n]}",
-            f"with them moved on by {k}",
-            "correct their headers",
+            f"with the columns moved on by {k}",
+            "correct the headers of the columns",
             with_columns([(j + k) % n for j in every]),
             ("the legs look as if they were numbered from another one on in the model",),
             _MOVE_ONE,
@@ -209,7 +209,7 @@ def shifted_from(data: OrderedDataset, given: Assumed, v: int, first: int, k: in
         "readings shifted",
         f"the readings of view {name} look as if they stood {_rows_late(k)} from {where} on, as if "
         + ("an image were missing there" if k > 0 else "a row of readings were missing there"),
-        f"with them moved by {_rows(k)}",
+        f"with the readings moved by {_rows(k)}",
         "check which image belongs to which row",
         replace(given, q=q),
         amount_of=f"rows of view {name}",
@@ -250,7 +250,7 @@ def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
             "readings shifted",
             f"the readings{where} look as if they stood {_rows_late(k)}: each image has those of "
             "another",
-            f"with them moved by {_rows(k)}",
+            f"with the readings moved by {_rows(k)}",
             "check which image belongs to which row",
             replace(given, q=q),
             amount_of=f"rows{where}",
@@ -270,7 +270,7 @@ def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         yield Mistake(
             "views exchanged",
             f"the readings of views {names[a]} and {names[b]} look exchanged",
-            "with them exchanged",
+            "with the views exchanged",
             "check which images belong to which view",
             replace(given, q=q),
         )
@@ -311,7 +311,7 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
                 "unit",
                 f"the readings{of} look like {unit}",
                 "taken so",
-                f"multiply them by {scale:g}",
+                f"multiply these readings by {scale:g}",
                 with_readings(scale * own[:, which], which),
             )
     if not any(leg.actuator for leg in legs):
@@ -326,16 +326,16 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
         yield Mistake(
             "direction of encoders",
             f"the readings of all {things} look as if they had {what}",
-            "with it reversed",
-            "reverse it in the table of readings",
+            "with the readings reversed",
+            "reverse them in the table of readings",
             with_readings(change, every),
         )
         for k in moving:
             yield Mistake(
                 "direction of an encoder",
                 f"column {legs[k].prismatic} looks as if it had {what}",
-                "with it reversed",
-                "reverse it in the table of readings",
+                "with the column reversed",
+                "reverse the column in the table of readings",
                 with_readings(change[:, k : k + 1], [k]),
             )
 
@@ -363,7 +363,7 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
             "zero of an encoder",
             f"column {legs[which[0]].prismatic} looks as if it had another zero: about {size}",
             added,
-            "correct it in the table of readings, or "
+            "correct the column in the table of readings, or "
             + (
                 f"the zero of {names[which[0]]} in the model"
                 if legs[which[0]].actuator
@@ -419,13 +419,13 @@ def _turned_over(
     kind, what = _TURNS_IN_WORDS[turn is UPSIDE_DOWN]
     flip = given.flip.copy()
     flip[list(rows)] *= turn
-    things, remedy = "images", "replace them by the originals"
+    things, remedy = "images", "replace these images by the originals"
     if len(data.photographs.detect) == 0:
         things, remedy = "outlines", "correct the direction of an axis of their table"
     return Mistake(
         kind,
         f"the {things}{which} look {what}",
-        "turned back",
+        f"with the {things} turned back",
         remedy,
         replace(given, flip=flip),
         test=_LETTERING,
@@ -461,7 +461,7 @@ def _of_model(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
             "platform joints from another leg",
             f"the platform joints of the model look as if they were listed from another leg on: "
             f"that of {machine.legs[order[0]].name} is where that of {name} stands",
-            f"with them moved on by {k}",
+            f"with the platform joints moved on by {k}",
             "correct the order of the platform joints in the model",
             replace(given, machine=replace(machine, legs=tuple(legs))),
         )
@@ -496,7 +496,7 @@ def _of_radii(given: Assumed) -> Iterator[Mistake]:
                 "diameter for radius",
                 f"{name} of the legs in the model look{'s' * (only is not None)} {end}: a "
                 f"{'diameter in place of a radius' if factor < 1.0 else 'radius halved twice'}",
-                f"with {'half' if factor < 1.0 else 'twice'} of it",
+                f"with {name} {_scaled_by(factor)}",
                 "correct the <visual> cylinders of the model",
                 replace(given, machine=_with_radii(given.machine, partial(scaled, factor, only))),
             )
@@ -508,7 +508,7 @@ def _of_radii(given: Assumed) -> Iterator[Mistake]:
                 yield Mistake(
                     "diameter for radius",
                     f"the radii of leg {leg.name} in the model look {what}",
-                    f"with {'half' if factor < 1.0 else 'twice'} of them",
+                    f"with the radii {_scaled_by(factor)}",
                     "correct its <visual> cylinders in the model",
                     replace(given, machine=given.machine.with_cylinders(cylinders)),
                     is_small=True,
@@ -524,10 +524,14 @@ def _of_radii(given: Assumed) -> Iterator[Mistake]:
         yield Mistake(
             "tube and rod exchanged",
             f"the radii of tube and rod look exchanged ({', '.join(pairs)})",
-            "with them exchanged",
-            "exchange them in the <visual> cylinders of the model",
+            "with the radii exchanged",
+            "exchange the radii in the <visual> cylinders of the model",
             replace(given, machine=given.machine.with_cylinders(cylinders)),
         )
+
+
+def _scaled_by(factor: float) -> str:
+    return "halved" if factor < 1.0 else "doubled"
 
 
 def _with_radii(machine: Machine, radius: Callable[[float], float]) -> Machine:
@@ -547,7 +551,7 @@ def _focal_length(given: Assumed, factor: float) -> Mistake:
         "focal length",
         f"the focal length looks as if it were {factor:.2g} times the stated one: images that were "
         "scaled or cropped after the camera was calibrated, or another zoom",
-        "with that",
+        "with that focal length",
         "calibrate the camera with images as these are (legcal camera)",
         replace(given, focal=factor * given.focal),
         amount_of="focal length",
