@@ -407,14 +407,18 @@ class _Judge:
     ) -> list[_Judged]:
         """Return two mistakes at once, where images still show less than half of the legs with one.
 
-        The other one is looked for beside the likeliest, or beside those that suit best where none
-        is likely. With both of them undone images show half of the legs.
+        The other one is looked for beside the likeliest, or where none is likely beside those that
+        suit best, if that is no chance. With both of them undone images show half of the legs.
         """
         now = likeliest[0][1] if likeliest else self.own
         if now.mean >= _SUITS:
             return []
-        of_all = [(what, one) for what, one in judged if not what.of_few]
-        by_total = sorted(of_all, key=lambda one: -_total(one[1]))
+        better = [
+            (what, one)
+            for what, one in judged
+            if not what.of_few and _signed_ranks(one.share - self.own.share) >= _MIN_SIGMAS
+        ]
+        by_total = sorted(better, key=lambda one: -_total(one[1]))
         for first, of_first in likeliest[:1] or by_total[:_FIRSTS]:
             judge = self.beside(first, of_first)
             tried = [
