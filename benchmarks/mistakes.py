@@ -10,15 +10,16 @@ are kept in DIR as well. Every other one has no rough camera poses. In each sess
 kinds come about equally often; and nothing is done to it once, and once its model gets joints that
 are 10 mm off. What is named is written to FILE (JSON lines), and what FILE has is not done again,
 so that a run can be continued (--minutes ends it early). Printed is what FILE has in the end: how
-often the right kind was the first of the diagnosis, with its 95 % interval (Wilson), and how often
-anything was named of sessions without a mistake.
+often the right kind was the first of the diagnosis, with its 95 % interval (Wilson), how often both
+of two mistakes were, and how often anything was named of sessions without a mistake; and how long
+it took, also in processor time (of this process: all of it with one worker).
 
 Right is the kind of mistake that was made, or one whose undoing gives the same machine: legs at the
 same places in all images, whatever their names and wherever the camera stands. That is computed
 for each diagnosis from the nominal model and the readings (a mirror-symmetric hexapod with reversed
 columns is one whose images are mirrored). Where what was done leaves the machine the same, as with
 columns of a threefold symmetric one that are moved on, nothing should be named. Of two mistakes
-at once either one is right: mended, the other is found.
+at once either one alone is right as well: mended, the other is found.
 """
 
 import argparse
@@ -425,9 +426,12 @@ def ordered(session: Session, pool: Run) -> OrderedDataset:
 def judged(kind: str, spoiled: Session, true: Session, pool: Run) -> dict[str, object]:
     """Return what is named of a session, and whether that is right."""
     data = ordered(spoiled, pool)
-    start = time.monotonic()
+    start, processor = time.monotonic(), time.process_time()
     found = diagnose(data)
-    entry: dict[str, object] = {"seconds": round(time.monotonic() - start, 1)}
+    entry: dict[str, object] = {
+        "seconds": round(time.monotonic() - start, 1),
+        "processor": round(time.process_time() - processor, 1),
+    }
     reference = ordered(true, pool)
     place = {image: row for row, image in enumerate(data.measurements.image)}
     rows = [place[image] for image in reference.measurements.image]  # canonical orders may differ
@@ -443,10 +447,11 @@ def judged(kind: str, spoiled: Session, true: Session, pool: Run) -> dict[str, o
     entry |= {"named": first.kind, "sentence": first.sentence}
     if not is_mistake:
         return entry | {"right": False}
-    is_kind = first.kind in MISTAKES[kind][1].split(", ")
+    made, named = set(MISTAKES[kind][1].split(", ")), set(first.kind.split(" and "))
     mended = [one.true for one in mistakes(data) if one.what == first.what]
-    right = is_kind or any(is_true(one) for one in mended)
-    return entry | {"right": bool(right), "kind": is_kind}
+    right = named <= made or any(is_true(one) for one in mended)
+    entry |= {"right": bool(right), "kind": named <= made}
+    return entry | ({"both": named == made} if len(made) > 1 else {})
 
 
 def deal(machine: Machine, each: int, counts: Counter[str], rng: np.random.Generator) -> list[str]:
@@ -460,23 +465,32 @@ def deal(machine: Machine, each: int, counts: Counter[str], rng: np.random.Gener
 
 def report(entries: list[dict[str, object]]) -> None:
     """Print what was named, by kinds of mistakes."""
+
+    def share(right: int, n: int) -> str:
+        low, high = wilson(right, n)
+        return f"{right:3} of {n:3} ({low:.2f} to {high:.2f})"
+
     for kind in (*MISTAKES, CLEAN, OFF):
         own = [one for one in entries if one["mistake"] == kind]
         if own:
             right = sum(bool(one["right"]) for one in own)
             wrong = Counter(str(one["named"]) for one in own if not one["right"])
             others = ", ".join(f"{name} {n}" for name, n in wrong.most_common())
-            print(f"{kind:17} {right:3} of {len(own):3}  {others}")
+            print(f"{kind:17} {share(right, len(own))}  {others}")
+    two = [bool(one["both"]) for one in entries if "both" in one]
+    if two:
+        print(f"both of two mistakes: {share(sum(two), len(two))}")
     made = [one for one in entries if one["mistake"] in MISTAKES]
     clean = [one for one in entries if one["mistake"] not in MISTAKES]
-    for what, own in (("right", made), ("nothing named without a mistake", clean)):
+    single = [one for one in made if "both" not in one]
+    of_all = ("right", made), ("of single mistakes", single), ("nothing without a mistake", clean)
+    for what, own in of_all:
         if own:
-            k = sum(bool(one["right"]) for one in own)
-            low, high = wilson(k, len(own))
-            print(f"{what}: {k} of {len(own)} ({low:.3f} to {high:.3f})")
-    seconds = [float(str(one["seconds"])) for one in made]
-    if seconds:
-        print(f"seconds: median {np.median(seconds):.1f}, most {max(seconds):.1f}")
+            print(f"{what}: {share(sum(bool(one['right']) for one in own), len(own))}")
+    for what in ("seconds", "processor"):
+        own_seconds = [float(str(one[what])) for one in entries if what in one]
+        if own_seconds:
+            print(f"{what} [s]: median {np.median(own_seconds):.1f}, most {max(own_seconds):.1f}")
 
 
 def main() -> None:
@@ -501,10 +515,11 @@ def main() -> None:
             for model in args.models.split(","):
                 true = None
                 for kind in (None, CLEAN, OFF):
-                    rng = np.random.default_rng([2002, seed, MODELS.index(model)])
+                    of_session = [2002, seed, MODELS.index(model)]
                     if kind is None:
                         if true is None:
                             true = session(model, seed, args.keep, pool)
+                        rng = np.random.default_rng(of_session)
                         kinds = deal(true.dataset.machine, args.each, counts, rng)
                         kinds = [args.only] if args.only else kinds
                     else:
@@ -516,6 +531,9 @@ def main() -> None:
                             report(entries)
                             return
                         spoiled = true
+                        # Its own, so that a run that is continued makes the same mistakes.
+                        place = [*MISTAKES, CLEAN, OFF].index(one)
+                        rng = np.random.default_rng([*of_session, place])
                         if one in MISTAKES:
                             spoiled = MISTAKES[one][0](true, rng)
                         elif one == OFF:

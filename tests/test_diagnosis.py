@@ -15,8 +15,8 @@ from simulated import settings, simulated
 from legcal import calibrate, load_dataset
 from legcal.calibration.diagnosis import diagnosis
 from legcal.calibration.diagnosis.diagnosis import diagnose
-from legcal.calibration.diagnosis.mistakes import as_given, mistakes
-from legcal.calibration.ordered_dataset import order_dataset
+from legcal.calibration.diagnosis.mistakes import Assumed, Mistake, as_given, mistakes
+from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.data import Dataset, dataset_at, row_names
 from legcal.errors import DatasetError, NotVisible
 from legcal.geometry import Array
@@ -169,6 +169,24 @@ def test_given_outlines_name_a_mistake_as_photographs_do(
     assert ("To tell these apart" in found.sentence) == bool(found.same_as)
 
 
+def test_two_mistakes_at_once_are_named_together(
+    outlines: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Either one alone leaves images that contradict each other."""
+
+    def few(data: OrderedDataset, given: Assumed | None = None) -> list[Mistake]:
+        of_kinds = ("columns leg3", "the radii of the legs")
+        return [one for one in mistakes(data, given) if one.what.startswith(of_kinds)]
+
+    monkeypatch.setattr(diagnosis, "mistakes", few)
+    (found,) = diagnose(order_dataset(_exchanged(_thick(outlines)), in_turn, no_progress))
+    assert set(found.kind.split(" and ")) == {"columns exchanged", "diameter for radius"}
+    assert "columns leg3_prismatic and leg4_prismatic look exchanged" in found.sentence.lower()
+    assert "correct the <visual> cylinders" in found.remedy
+    assert "exchange the headers" in found.remedy
+    assert found.after >= 11 > found.before
+
+
 @pytest.fixture(scope="module")
 def delta(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("delta") / "set"
@@ -295,7 +313,7 @@ def test_a_diagnosis_names_each_kind_of_mistake_that_images_do_not_tell_from_it(
     found = _diagnosed(d, kinds, monkeypatch)
     assert found.kind == "columns exchanged"
     assert len([one for one in found.same_as if one.startswith("columns")]) == 2
-    told = found.sentence.partition(": with them exchanged")[0]
+    told = found.sentence.partition(": with the columns exchanged,")[0]
     assert "or the outlines look mirrored, or the joints of the model look mirrored" in told
     assert "or 2 more that are alike" in told
 

@@ -381,7 +381,8 @@ def _problem(name: str, placed: PoseCandidates, hinted: bool, *, is_mirrored: bo
         return (
             f"view {name}: its camera could not be placed: found that its images show the legs if "
             "left and right are exchanged, needed photographs as the camera took them; replace "
-            "the mirrored images by the originals."
+            "mirrored images by the originals, or check what may look the same: the order of the "
+            "columns of readings, and the signs of y in the model."
         )
     where = "near its T_base_camera or anywhere else" if hinted else "anywhere"
     if len(placed.poses) == 0:

@@ -3,12 +3,14 @@
 Every mistake is undone in turn, and the images say how well they agree then (how many of the legs
 that they should show are there, with cameras placed anywhere). A few images of the views that
 disagree most say which mistakes are worth a closer look, all images judge these. One is named where
-far more images agree; those that images cannot tell from it are named with it.
+far more images agree; those that images cannot tell from it are named with it. Where images show
+little without it, or nothing is explained, another one is undone beside it in the same way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 
@@ -21,6 +23,7 @@ from legcal.calibration.diagnosis.mistakes import (
     Assumed,
     Mistake,
     as_given,
+    both,
     mistakes,
     rows_of_views,
     shifted_from,
@@ -43,6 +46,9 @@ from legcal.perception import (
     pairs_of_images,
     pairs_of_outlines,
 )
+from legcal.progress import no_progress
+
+_Judged = tuple[Mistake, Agreement]  # with what all images say of it
 
 STAGE = "Trying common mistakes"
 
@@ -54,6 +60,7 @@ _STARTS = 1, 1, 2  # images that suggest cameras, of all
 _FEW_STARTS = (1,), (1, 1)  # of the first few, and of the next few if these suit no mistake
 _POOL = 3  # cameras of other mistakes that are tried
 _FINALISTS = 6  # mistakes that all images judge
+_FIRSTS = 2  # mistakes beside which another one is looked for, where none explains the images
 _NEAR_BEST = 0.5  # of the gain of the best, which few images gave, that all images judge as well
 _ONE_ROW = (1, -1)  # by which readings stand late from a row on
 _FINER = (0.5, 0.25)  # steps of an amount between those that are tried
@@ -76,7 +83,8 @@ class Diagnosis:
     Attributes
     ----------
     kind : str
-        What it is in a few words: ``columns exchanged``, ``handedness``, ...
+        What it is in a few words: ``columns exchanged``, ``handedness``, ...; of two at once
+        ``columns exchanged and diameter for radius``.
     what : str
         The same as a clause that names columns, views and legs.
     same_as : tuple of str
@@ -118,7 +126,7 @@ class Diagnosis:
         tell = f". To tell these apart, {', or '.join(self.tests)}" if self.tests else ""
         rest = " (what the others show may have another cause as well)"
         return (
-            f"{what}{others}: {self.mended} {self.after} of {self.images} images agree"
+            f"{what}{others}: {self.mended}, {self.after} of {self.images} images agree"
             f"{rest * (self.after < _MIN_SHARE * self.images)}, as it is {self.before}; "
             f"{self.remedy}{tell}."
         )
@@ -153,18 +161,16 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     if judge.own.images > _AGREE_ALREADY * len(judge.own.row):
         return ()
     tried = [*mistakes(data), *judge.shifted_from_a_row_on(), *judge.turned_images()]
-    judged = judge.judged({k: tried[k] for k in judge.finalists(tried)})
-    found = {k: (what, one) for k, (what, one) in judged.items() if judge.is_explained(what, one)}
+    judged = judge.judged(judge.finalists(tried))
+    likeliest = judge.likeliest(judged)
+    likeliest = judge.likeliest_two(judged, likeliest) or likeliest
     data.progress(STAGE, 1, 1)
-    if not found:
+    if not likeliest:
         return ()
-    best = max((one for _, one in found.values()), key=lambda one: float(one.support.sum()))
-    alike = [k for k, (_, one) in found.items() if _is_as_good(one, best)]
-    suited = {k: judge.hints_suited(found[k][1]) for k in alike}
-    alike.sort(key=lambda k: (-suited[k], k))  # the commoner first
-    first = [found[k][0] for k in alike]
-    by_hints = len(alike) > 1 and suited[alike[0]] > max(suited[k] for k in alike[1:])
-    return (_diagnosis(first, found[alike[0]][1], judge.own, by_hints=by_hints),)
+    suited = [judge.hints_suited(one) for _, one in likeliest]
+    by_hints = len(suited) > 1 and suited[0] > max(suited[1:])
+    first = [what for what, _ in likeliest]
+    return (_diagnosis(first, likeliest[0][1], judge.own, by_hints=by_hints),)
 
 
 def notes_beside(diagnosis: Sequence[Diagnosis], notes: Sequence[str], job: str) -> list[str]:
@@ -222,10 +228,7 @@ class _Judge:
         missing = [row for row in rows if row not in data.edge_pairs]
         data.edge_pairs.update(pairs_of_images(search, missing, data.pool))
         self.search = replace(search, edge_pairs={row: data.edge_pairs[row] for row in rows})
-        self.pool: list[list[RigidTransform]] = [
-            [] if group.hint is None else [group.hint, _mirrored_camera(group.hint)]
-            for group in groups
-        ]
+        self.pool: list[list[RigidTransform]] = [self._known(g) for g in range(len(groups))]
         self.of_groups = [
             self._compare([self.given], g, group.rows, _STARTS)[0] for g, group in enumerate(groups)
         ]
@@ -245,14 +248,14 @@ class _Judge:
                 order = [row for row in of_views[v].tolist() if row in group.rows]
                 if len(order) < 2 * MIN_IMAGES:
                     continue
-                late = shifted_from(self.data, v, 0, k).true
+                late = shifted_from(self.data, self.given, v, 0, k).true
                 now, then = self.of_groups[g], self._compare([late], g, group.rows, ())[0]
                 gain = dict(zip(now.row.tolist(), then.support - now.support, strict=True))
                 from_on = np.cumsum([gain[row] for row in order][::-1])[::-1]
                 first = int(np.argmax(from_on[MIN_IMAGES : 1 - MIN_IMAGES])) + MIN_IMAGES
                 if from_on[first] > 0.0:
                     place = of_views[v].tolist().index(order[first])
-                    found.append(shifted_from(self.data, v, place, k))
+                    found.append(shifted_from(self.data, self.given, v, place, k))
         return found
 
     def turned_images(self) -> list[Mistake]:
@@ -261,30 +264,46 @@ class _Judge:
         for g, group in enumerate(self.groups):
             own = self.of_groups[g]
             T_own, left = own.cameras[0], own.row[~own.agrees].tolist()
-            if T_own is None:
+            if T_own is None or len(left) == len(own.row):  # no image speaks for that camera
                 continue
             for v, turn in product(group.views, TURNS):
                 rows = [row for row in left if group.view_of_row[row] == v]
                 for _ in range(2):  # all that do not agree, then those of them that do
-                    if MIN_IMAGES <= len(rows) < len(own.row):
-                        true = turned_images(self.data, rows, turn).true
+                    if len(rows) >= MIN_IMAGES:
+                        true = turned_images(self.data, self.given, rows, turn).true
                         then = self._compare([true], g, rows, (), [T_own])[0]
                         rows = then.row[then.agrees].tolist()
                 if len(rows) >= MIN_IMAGES:
-                    found.append(turned_images(self.data, rows, turn))
+                    found.append(turned_images(self.data, self.given, rows, turn))
         return found
 
-    def finalists(self, tried: Sequence[Mistake]) -> list[int]:
+    def beside(self, what: Mistake, one: Agreement) -> _Judge:
+        """Return what judges other mistakes beside one, which are undone together."""
+        other = copy(self)
+        other.data = replace(self.data, progress=no_progress)
+        other.given, other.own = what.true, one
+        other.of_groups = [replace(one.at(group.rows), cameras=(T,))
+                           for group, T in zip(self.groups, one.cameras, strict=True)]  # fmt: skip
+        other.pool = [[*self._known(g), *([] if T is None else [T])]
+                      for g, T in enumerate(one.cameras)]  # fmt: skip
+        return other
+
+    def _known(self, g: int) -> list[RigidTransform]:
+        """Return the cameras of a group that are known before anything is compared."""
+        hint = self.groups[g].hint
+        return [] if hint is None else [hint, _mirrored_camera(hint)]
+
+    def finalists(self, tried: Sequence[Mistake], rounds: int = len(_FEW_STARTS)) -> list[Mistake]:
         """Return the mistakes that some images of the views that disagree most speak for.
 
         These are all images of views that nearly agree, whose cameras are known about, and a few of
-        others.
+        others; more of them in each of some rounds.
         """
         missing = [float((one.expected - one.support).sum()) for one in self.of_groups]
         left = np.argsort(-np.array(missing), kind="stable").tolist()
         gain, seen = np.zeros(len(tried)), list[Agreement]()
-        done, total = 0, len(_FEW_STARTS) * len(tried)
-        for starts in _FEW_STARTS:
+        done, total = 0, rounds * len(tried)
+        for starts in _FEW_STARTS[:rounds]:
             n_images = 0
             while left and n_images < _FEW:
                 g = left.pop(0)
@@ -310,7 +329,7 @@ class _Judge:
                 found.append(k)
                 left_for[of_all] -= 1
                 amounts |= {tried[k].amount_of} - {""}
-        return found
+        return [tried[k] for k in sorted(found)]  # the commoner first
 
     def _nearly_agrees(self, g: int) -> bool:
         """Say whether the images of a group show half of the legs as things are, or more."""
@@ -363,18 +382,59 @@ class _Judge:
             look([k for k in worse if not tried[k].is_small], (), self._alike(T_best))
         return found + support
 
-    def judged(self, finalists: Mapping[int, Mistake]) -> dict[int, tuple[Mistake, Agreement]]:
+    def judged(self, finalists: Sequence[Mistake]) -> list[_Judged]:
         """Return what all images say of some mistakes, with the amounts that suit them best."""
-        found = {k: (one, self.all(one.true)) for k, one in finalists.items()}
+        found = [(what, self.all(what.true)) for what in finalists]
         if not found:
-            return {}
-        first = max(found.values(), key=lambda one: float(one[1].support.sum()))[1]
+            return []
+        first = max((one for _, one in found), key=_total)
         alike = [[] if T is None else self._alike(T) for T in first.cameras]
-        for k, (what, one) in found.items():
+        for k, (what, one) in enumerate(found):
             if not _is_as_good(one, first):
                 one = _better(one, self.all(what.true, (), alike))
             found[k] = self._best_amount(what, one)
         return found
+
+    def likeliest(self, judged: Sequence[_Judged]) -> list[_Judged]:
+        """Return the mistakes that explain the images best, which do not tell these apart."""
+        found = [(what, one) for what, one in judged if self.is_explained(what, one)]
+        best = max((one for _, one in found), key=_total, default=self.own)
+        alike = [(what, one) for what, one in found if _is_as_good(one, best)]
+        return sorted(alike, key=lambda one: -self.hints_suited(one[1]))  # then the commoner
+
+    def likeliest_two(
+        self, judged: Sequence[_Judged], likeliest: Sequence[_Judged]
+    ) -> list[_Judged]:
+        """Return two mistakes at once, where images still show less than half of the legs with one.
+
+        The other one is looked for beside the likeliest, or where none is likely beside those that
+        suit best, if that is no chance. With both of them undone images show half of the legs.
+        """
+        now = likeliest[0][1] if likeliest else self.own
+        if now.mean >= _SUITS:
+            return []
+        better = [
+            (what, one)
+            for what, one in judged
+            if not what.of_few and _signed_ranks(one.share - self.own.share) >= _MIN_SIGMAS
+        ]
+        by_total = sorted(better, key=lambda one: -_total(one[1]))
+        for first, of_first in likeliest[:1] or by_total[:_FIRSTS]:
+            judge = self.beside(first, of_first)
+            tried = [
+                what
+                for what in mistakes(self.data, first.true)
+                if not (what.amount_of and what.amount_of == first.amount_of)
+            ]
+            alike = [what for what, _ in likeliest[1:]]
+            found = [
+                (both(first, what, alike), one)
+                for what, one in judge.likeliest(judge.judged(judge.finalists(tried, 1)))
+                if _suits(_total(one), self.own)
+            ]
+            if found:
+                return found
+        return []
 
     def _best_amount(self, what: Mistake, one: Agreement) -> tuple[Mistake, Agreement]:
         """Return the amount of a mistake that suits all images best, by halving steps."""
@@ -510,8 +570,12 @@ def symmetries(machine: Machine) -> list[Array]:
     return found
 
 
+def _total(one: Agreement) -> float:
+    return float(one.support.sum())
+
+
 def _better(one: Agreement, other: Agreement) -> Agreement:
-    return one if one.support.sum() >= other.support.sum() else other
+    return one if _total(one) >= _total(other) else other
 
 
 def _suits(support: float, own: Agreement) -> bool:

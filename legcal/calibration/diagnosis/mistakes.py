@@ -89,7 +89,7 @@ class Mistake:
 
     kind: str  # a word or two, for scripts
     what: str  # clause: "columns leg1_prismatic and leg2_prismatic look exchanged"
-    mended: str  # "with them exchanged"
+    mended: str  # "with the columns exchanged"
     remedy: str  # what to do
     true: Assumed
     same_as: tuple[str, ...] = ()  # clauses of what no image can tell from it
@@ -109,9 +109,29 @@ def as_given(data: OrderedDataset) -> Assumed:
     return Assumed(data.machine, data.measurements.q, np.ones((data.measurements.n_rows, 2)))
 
 
-def mistakes(data: OrderedDataset) -> list[Mistake]:
-    """Return what may be wrong with a session, the commoner before the rarer."""
-    given = as_given(data)
+def both(one: Mistake, other: Mistake, beside: Sequence[Mistake] = ()) -> Mistake:
+    """Return two mistakes at once: the other one was found beside what is true after the first.
+
+    ``beside`` are what images cannot tell from the first, one of each kind.
+    """
+    alike = [same.what for same in beside if same.kind != one.kind]
+    return Mistake(
+        f"{one.kind} and {other.kind}",
+        f"{one.what}, and {other.what}",
+        f"{one.mended} and {other.mended}",
+        f"{one.remedy}, and {other.remedy}",
+        other.true,
+        (*one.same_as, *alike, *other.same_as),
+        one.test or other.test,
+    )
+
+
+def mistakes(data: OrderedDataset, given: Assumed | None = None) -> list[Mistake]:
+    """Return what may be wrong with a session, the commoner before the rarer.
+
+    That is beside what is ``given``, by default the session as its files have it.
+    """
+    given = given or as_given(data)
     found = [
         *_of_columns(data, given),
         *_of_rows(data, given),
@@ -146,8 +166,8 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         yield Mistake(
             "columns exchanged",
             f"columns {names[i]} and {names[k]} look exchanged",
-            "with them exchanged",
-            "exchange their headers",
+            "with the columns exchanged",
+            "exchange the headers of these columns",
             with_columns(source),
             (f"{what} {legs} look exchanged in the model",),
             _MOVE_ONE,
@@ -156,8 +176,8 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         yield Mistake(
             "columns reversed",
             "the columns of readings look as if they were in reverse order",
-            "with them reversed",
-            "reverse their headers",
+            "with the columns reversed",
+            "reverse the headers of the columns",
             with_columns(every[::-1]),
             ("the legs look as if they were numbered backwards in the model",),
             _MOVE_ONE,
@@ -167,20 +187,20 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
             "columns rotated",
             f"the columns of readings look as if they began with another leg: what "
             f"{names[0]} holds is of {names[(n - k) % n]}",
-            f"with them moved on by {k}",
-            "correct their headers",
+            f"with the columns moved on by {k}",
+            "correct the headers of the columns",
             with_columns([(j + k) % n for j in every]),
             ("the legs look as if they were numbered from another one on in the model",),
             _MOVE_ONE,
         )
 
 
-def shifted_from(data: OrderedDataset, v: int, first: int, k: int) -> Mistake:
+def shifted_from(data: OrderedDataset, given: Assumed, v: int, first: int, k: int) -> Mistake:
     """Return readings of a view that stand k rows late from its first-th one on in the file.
 
     The last ones, whose own are not known, are left as they are.
     """
-    given, rows = as_given(data), rows_of_views(data)[v][first:]
+    rows = rows_of_views(data)[v][first:]
     q = given.q.copy()
     q[rows[:-k] if k > 0 else rows[-k:]] = given.q[rows[k:] if k > 0 else rows[:k]]
     name, row = data.measurements.views[v].name, data.order.rows[rows[0]]
@@ -189,7 +209,7 @@ def shifted_from(data: OrderedDataset, v: int, first: int, k: int) -> Mistake:
         "readings shifted",
         f"the readings of view {name} look as if they stood {_rows_late(k)} from {where} on, as if "
         + ("an image were missing there" if k > 0 else "a row of readings were missing there"),
-        f"with them moved by {abs(k)}",
+        f"with the readings moved by {_rows(k)}",
         "check which image belongs to which row",
         replace(given, q=q),
         amount_of=f"rows of view {name}",
@@ -205,8 +225,12 @@ def rows_of_views(data: OrderedDataset) -> list[IntArray]:
     ]
 
 
+def _rows(k: int) -> str:
+    return f"{abs(k)} row{'s' * (abs(k) > 1)}"
+
+
 def _rows_late(k: int) -> str:
-    return f"{abs(k)} row{'s' * (abs(k) > 1)} too {'early' if k < 0 else 'late'}"
+    return f"{_rows(k)} too {'early' if k < 0 else 'late'}"
 
 
 def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
@@ -226,7 +250,7 @@ def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
             "readings shifted",
             f"the readings{where} look as if they stood {_rows_late(k)}: each image has those of "
             "another",
-            f"with them moved by {abs(k)}",
+            f"with the readings moved by {_rows(k)}",
             "check which image belongs to which row",
             replace(given, q=q),
             amount_of=f"rows{where}",
@@ -246,7 +270,7 @@ def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         yield Mistake(
             "views exchanged",
             f"the readings of views {names[a]} and {names[b]} look exchanged",
-            "with them exchanged",
+            "with the views exchanged",
             "check which images belong to which view",
             replace(given, q=q),
         )
@@ -287,7 +311,7 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
                 "unit",
                 f"the readings{of} look like {unit}",
                 "taken so",
-                f"multiply them by {scale:g}",
+                f"multiply these readings by {scale:g}",
                 with_readings(scale * own[:, which], which),
             )
     if not any(leg.actuator for leg in legs):
@@ -302,16 +326,16 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
         yield Mistake(
             "direction of encoders",
             f"the readings of all {things} look as if they had {what}",
-            "with it reversed",
-            "reverse it in the table of readings",
+            "with the readings reversed",
+            "reverse them in the table of readings",
             with_readings(change, every),
         )
         for k in moving:
             yield Mistake(
                 "direction of an encoder",
                 f"column {legs[k].prismatic} looks as if it had {what}",
-                "with it reversed",
-                "reverse it in the table of readings",
+                "with the column reversed",
+                "reverse the column in the table of readings",
                 with_readings(change[:, k : k + 1], [k]),
             )
 
@@ -339,7 +363,7 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
             "zero of an encoder",
             f"column {legs[which[0]].prismatic} looks as if it had another zero: about {size}",
             added,
-            "correct it in the table of readings, or "
+            "correct the column in the table of readings, or "
             + (
                 f"the zero of {names[which[0]]} in the model"
                 if legs[which[0]].actuator
@@ -377,13 +401,15 @@ def _of_images(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         yield _turned_over(data, given, rows, LEFT_RIGHT, f" of view {view.name}")
 
 
-def turned_images(data: OrderedDataset, rows: Sequence[int], turn: Array) -> Mistake:
+def turned_images(
+    data: OrderedDataset, given: Assumed, rows: Sequence[int], turn: Array
+) -> Mistake:
     """Return images of some rows of a view that are turned over, and others are not."""
     m = data.measurements
     names = row_names(data.dataset.measurements)
     first = names[data.order.rows[rows[0]]]
     which = f" {first} and {len(rows) - 1} more of view {m.views[m.view[rows[0]]].name}"
-    one = _turned_over(data, as_given(data), rows, turn, which)
+    one = _turned_over(data, given, rows, turn, which)
     return replace(one, of_few=tuple(rows), test="")
 
 
@@ -392,14 +418,14 @@ def _turned_over(
 ) -> Mistake:
     kind, what = _TURNS_IN_WORDS[turn is UPSIDE_DOWN]
     flip = given.flip.copy()
-    flip[list(rows)] = turn
-    things, remedy = "images", "replace them by the originals"
+    flip[list(rows)] *= turn
+    things, remedy = "images", "replace these images by the originals"
     if len(data.photographs.detect) == 0:
         things, remedy = "outlines", "correct the direction of an axis of their table"
     return Mistake(
         kind,
         f"the {things}{which} look {what}",
-        "turned back",
+        f"with the {things} turned back",
         remedy,
         replace(given, flip=flip),
         test=_LETTERING,
@@ -435,7 +461,7 @@ def _of_model(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
             "platform joints from another leg",
             f"the platform joints of the model look as if they were listed from another leg on: "
             f"that of {machine.legs[order[0]].name} is where that of {name} stands",
-            f"with them moved on by {k}",
+            f"with the platform joints moved on by {k}",
             "correct the order of the platform joints in the model",
             replace(given, machine=replace(machine, legs=tuple(legs))),
         )
@@ -470,7 +496,7 @@ def _of_radii(given: Assumed) -> Iterator[Mistake]:
                 "diameter for radius",
                 f"{name} of the legs in the model look{'s' * (only is not None)} {end}: a "
                 f"{'diameter in place of a radius' if factor < 1.0 else 'radius halved twice'}",
-                f"with {'half' if factor < 1.0 else 'twice'} of it",
+                f"with {name} {_scaled_by(factor)}",
                 "correct the <visual> cylinders of the model",
                 replace(given, machine=_with_radii(given.machine, partial(scaled, factor, only))),
             )
@@ -482,7 +508,7 @@ def _of_radii(given: Assumed) -> Iterator[Mistake]:
                 yield Mistake(
                     "diameter for radius",
                     f"the radii of leg {leg.name} in the model look {what}",
-                    f"with {'half' if factor < 1.0 else 'twice'} of them",
+                    f"with the radii {_scaled_by(factor)}",
                     "correct its <visual> cylinders in the model",
                     replace(given, machine=given.machine.with_cylinders(cylinders)),
                     is_small=True,
@@ -498,10 +524,14 @@ def _of_radii(given: Assumed) -> Iterator[Mistake]:
         yield Mistake(
             "tube and rod exchanged",
             f"the radii of tube and rod look exchanged ({', '.join(pairs)})",
-            "with them exchanged",
-            "exchange them in the <visual> cylinders of the model",
+            "with the radii exchanged",
+            "exchange the radii in the <visual> cylinders of the model",
             replace(given, machine=given.machine.with_cylinders(cylinders)),
         )
+
+
+def _scaled_by(factor: float) -> str:
+    return "halved" if factor < 1.0 else "doubled"
 
 
 def _with_radii(machine: Machine, radius: Callable[[float], float]) -> Machine:
@@ -521,10 +551,10 @@ def _focal_length(given: Assumed, factor: float) -> Mistake:
         "focal length",
         f"the focal length looks as if it were {factor:.2g} times the stated one: images that were "
         "scaled or cropped after the camera was calibrated, or another zoom",
-        "with that",
+        "with that focal length",
         "calibrate the camera with images as these are (legcal camera)",
-        replace(given, focal=factor),
+        replace(given, focal=factor * given.focal),
         amount_of="focal length",
         finer=lambda more: _focal_length(given, factor * _FOCAL_STEP**more),
-        opposite=replace(given, focal=1.0 / factor),
+        opposite=replace(given, focal=given.focal / factor),
     )
