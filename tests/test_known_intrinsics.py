@@ -238,6 +238,7 @@ def test_photographs_correct_a_camera_of_which_little_is_known(tmp_path: Path) -
             assert one.sigma is not None
             assert one.sigma < 3.0
             assert abs(one.value - wanted[key]) < 4.0 * one.sigma
+    assert found.observations is not None
     assert found.observations.used > 0.7 * found.observations.total
 
 
