@@ -7,17 +7,20 @@ import numpy as np
 import pytest
 from rendering import Bar, Light, render
 from scipy.spatial.transform import RigidTransform
+from six_photographs import six_photographs
 
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
 from legcal.machine import Cylinder
+from legcal.perception import measure_photographs, with_measured_radii
 from legcal.perception.blocks import BlockLine
 from legcal.perception.detection import measure_outlines
 from legcal.perception.outline import NARROW_BIAS, WRONG_WIDTH, PartVerdict, verdict
 from legcal.perception.part_edges import MIN_LONE_SCORE, EdgePair, _alone, _lines
 from legcal.perception.placement import Placement, Search
 from legcal.perception.subpixel_edges import MeasuredEdge
+from legcal.progress import no_progress
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 from legcal.vision.visibility import END_COVER, visible_segments
@@ -505,3 +508,25 @@ def test_an_edge_where_other_legs_predict_it_needs_no_partner(beside: float, use
     assert found.reasons[1].startswith(WRONG_WIDTH)
     lone = _judged(6.0, _edge(np.full(2, beside)), None, alone=True, window=5.0)
     assert (lone.reasons[0] == "") is used
+
+
+def test_a_width_that_most_outlines_of_a_cylinder_share_speaks_against_none_of_them() -> None:
+    photographs, _, fitted = six_photographs()
+    true = [leg.cylinders for leg in photographs.machine.legs]
+    wrong = [[replace(one, radius=0.87 * one.radius) for one in cylinders] for cylinders in true]
+    biased = replace(photographs, machine=photographs.machine.with_cylinders(wrong))
+    before = measure_photographs(biased, fitted, no_progress)
+    other = with_measured_radii(biased, fitted, before)
+    assert other is not None
+    ratios = np.array(
+        [
+            one.radius / of_truth.radius
+            for leg, cylinders in zip(other.machine.legs, true, strict=True)
+            for one, of_truth in zip(leg.cylinders, cylinders, strict=True)
+        ]
+    )
+    changed = ratios > 0.88
+    assert changed.sum() >= len(ratios) // 2
+    np.testing.assert_allclose(ratios[changed], 1.0, atol=0.05)
+    after = measure_photographs(other, fitted, no_progress)
+    assert after.used.sum() > before.used.sum()

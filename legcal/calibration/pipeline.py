@@ -95,6 +95,7 @@ from legcal.perception import (
     require_rough_cameras,
     require_standing_joints,
     used_as_before,
+    with_measured_radii,
 )
 from legcal.progress import Progress, shown_progress
 from legcal.vision import shared_cameras, stated_covariances
@@ -471,6 +472,11 @@ def _measure_again(
             stage += f", gamma {few(sorted({f'{gamma:.2f}' for gamma in gammas.values()}))}"
         search = replace(photographs, keep=no_outlines())
         outlines = measure_photographs(search, placement, data.progress, stage=stage)
+        other = None if like is not None else with_measured_radii(search, placement, outlines)
+        if other is not None:
+            stage += " with other radii"
+            with_other = measure_photographs(other, placement, data.progress, stage=stage)
+            outlines = max(outlines, with_other, key=lambda found: int(found.used.sum()))
         # The table and the next fit have the cameras of the files.
         lenses = [[view.camera for view in p.measurements.views] for p in (photographs, again)]
         outlines = again.with_found(through_cameras(outlines, view[outlines.row], *lenses))

@@ -68,6 +68,7 @@ from .photographs import measure_photographs as measure_photographs
 from .photographs import nominal_placement as nominal_placement
 from .photographs import place_and_measure as place_and_measure
 from .photographs import recognise_and_place as recognise_and_place
+from .photographs import with_measured_radii as with_measured_radii
 from .placement import Group as Group
 from .placement import PlacedArm as PlacedArm
 from .placement import Placement as Placement

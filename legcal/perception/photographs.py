@@ -51,7 +51,7 @@ from legcal.perception.radii import LegRadius, RadiusFactors, radius_notes
 from legcal.perception.recognition import recognise
 from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
-from legcal.vision import Camera, look_alike, shared_cameras
+from legcal.vision import EPSILON, Camera, look_alike, shared_cameras
 from legcal.workers import Run
 
 DETECTOR_VERSION = 9  # raise it whenever outlines or notes that are kept come out differently
@@ -392,6 +392,40 @@ def measure_photographs(
     return _measured(
         photographs, search, placement, report, together=together, method=method, stage=stage
     )[0]
+
+
+def with_measured_radii(
+    photographs: Photographs, placement: Placement, outlines: Outlines
+) -> Photographs | None:
+    """Return a search near a fit with the radii that its outlines have; None where it had them.
+
+    The radius of a fit has the bias of the edges that it was fitted to. Edges that were measured
+    otherwise have another one: with more care, or with another gamma. Where that is why most
+    outlines of a cylinder are at a wrong distance, it speaks against none of them.
+    """
+    m, machine = photographs.measurements, photographs.machine
+    wrong = np.array([why.startswith(WRONG_WIDTH) for why in outlines.reason], dtype=np.bool_)
+    judged = (outlines.used | wrong) & np.isfinite(outlines.h).all(axis=1)
+    places = {
+        v: T.inv() for v, T in enumerate(placement.T_base_camera) if T is not None
+    }  # of the base before the cameras
+    part, changed = np.array(outlines.part), False
+    cylinders = []
+    for j, leg in enumerate(machine.legs):
+        radii = {}
+        for cylinder in leg.cylinders:
+            own = np.flatnonzero(judged & (outlines.leg == j) & (part == cylinder.link))
+            if 2 * np.count_nonzero(wrong[own]) <= len(own):
+                continue
+            row, edge = outlines.row[own], outlines.edge[own]
+            A = np.array([places[int(m.view[r])].apply(placement.A_base[r, j]) for r in row])
+            distance = np.sum(outlines.h[own] * A, axis=1) * np.array(EPSILON)[edge - 1]
+            of_edges = [np.median(distance[edge == e]) for e in np.unique(edge)]
+            if len(of_edges) == len(EPSILON):
+                radii[cylinder.radius] = float(np.mean(of_edges))
+        changed = changed or bool(radii)
+        cylinders.append([replace(c, radius=radii.get(c.radius, c.radius)) for c in leg.cylinders])
+    return replace(photographs, machine=machine.with_cylinders(cylinders)) if changed else None
 
 
 def _recognised(
