@@ -422,3 +422,18 @@ def test_corrected_commands_of_redundant_motors_are_poses_of_least_squares(tmp_p
         moved = forward_kinematics(nominal, inverse_kinematics(machine, pose))
         angle = moved.rotation.as_euler("xyz", degrees=True)[2]
         np.testing.assert_allclose([*(1e3 * moved.translation[:2]), angle], corrected, atol=1e-5)
+
+
+def test_doctor_names_readings_that_contradict_each_other(tmp_path: Path) -> None:
+    machine, folder = made("4-rpr", tmp_path), tmp_path / "dataset"
+    simulate(machine.yaml_path, folder, SimulationSettings(level=Level.AXES, poses=10, seed=3))
+    contradict = "contradict each other"
+    assert not [one for one in legcal.doctor(folder).findings if contradict in one.what]
+    table = folder / "measurements.csv"
+    rows, column = read_rows(table), str(machine.legs[1].prismatic)
+    there = float(rows[13][column])
+    rows[13][column] = str(there + (0.008 if there < 0.06 else -0.008))
+    write_rows(table, rows)
+    (found,) = [one for one in legcal.doctor(folder).findings if contradict in one.what]
+    assert (found.check, found.severity) == ("readings", "warning")
+    assert machine.legs[1].name in found.what

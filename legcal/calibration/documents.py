@@ -537,7 +537,7 @@ class UnreachedRow(Document):
     by: list[Literal["model", "reference"]]  # who does not reach it
 
 
-class EvaluationDocument(Document):
+class EvaluationDocument(SparseDocument):
     """What ``legcal evaluate --json`` prints; null where no pose is compared."""
 
     dX_m: float | None
@@ -546,7 +546,7 @@ class EvaluationDocument(Document):
     poses: int  # that are compared
     left_out: int  # poses that are not, since one of the models does not reach them
     unreached: list[UnreachedRow]  # the rows of these
-    # Of the readings of a dataset by model and reference, where motors are redundant
-    redundant_readings: dict[Literal["model", "reference"], ReadingResiduals] | None
+    # Of the readings of a dataset by model and reference; left out where these cannot disagree
+    redundant_readings: dict[Literal["model", "reference"], ReadingResiduals] | None = None
     parameters: list[ComparedParameter]
     links: dict[Link, ComparedLink]

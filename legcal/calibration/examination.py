@@ -22,7 +22,11 @@ from legcal.calibration.diagnosis.diagnosis import MIN_IMAGES, Diagnosis, diagno
 from legcal.calibration.documents import DiagnosisBlock
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit import Choices
-from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
+from legcal.calibration.ordered_dataset import (
+    OrderedDataset,
+    contradicting_readings,
+    order_dataset,
+)
 from legcal.calibration.outline_detection import detected
 from legcal.calibration.pipeline import chosen_parameters, exact_cameras, unseen_legs
 from legcal.data import (
@@ -301,6 +305,15 @@ def _look_at_readings(found: _Found, notes: Sequence[str]) -> None:
     legs = dataset.machine.legs
     for note in notes:
         found.add("readings", "warning", note)
+    contradicting = contradicting_readings(dataset.machine, dataset.measurements)
+    for what, rows in by_cause(contradicting):
+        found.add(
+            "readings",
+            "warning",
+            f"The readings of {images_in_words(dataset.measurements, rows)} contradict each other: "
+            f"found {what}; check them, or leave it to the images to show which is wrong.",
+            rows,
+        )
     motors = dataset.machine.motors
     sigma, unit = dataset.measurements.sigma_of(legs), dict[int, Literal["m", "rad"]]()
     for j, column in zip(motors, reading_columns(legs), strict=True):

@@ -34,6 +34,7 @@ from legcal.data import (
 from legcal.errors import DatasetError
 from legcal.geometry import Array, IntArray, components, product
 from legcal.machine import (
+    Contradiction,
     Leg,
     Machine,
     contradictions,
@@ -230,16 +231,13 @@ def nominal_poses(
         nearest, residual[off] = _least_squares(machine, q[off], [T[k] for k in off])
         for k, pose in zip(off, nearest, strict=True):
             T[k] = pose
-    at_home = vectors_A_to_B(machine, machine.home)
-    most = MAX_NOMINAL_RESIDUAL * float(np.linalg.norm(at_home, axis=1).mean())
-    first = measurements.first_rows.tolist()
-    motors, sigma = list(machine.motors), measurements.sigma_of(machine.legs)
-    found = contradictions(machine, T, q[:, motors], sigma[motors])
+    most, first = _largest_residual(machine), measurements.first_rows.tolist()
+    found = _contradictions(machine, measurements, T)
     wrong = {
         first[k]: f"found {one.in_words(machine)}; check this reading, its encoder and the offset "
         "of the leg, or take"
         for k, one in found.items()
-        if len(one.legs) > 1 and one.distance > most
+        if _is_refused(one, machine)
     }
     for k, one in found.items():
         if len(one.legs) == 1:  # the fit says so with images; they are searched at the other ones
@@ -262,6 +260,42 @@ def nominal_poses(
             ]
         )
     return tuple(T), residual
+
+
+def contradicting_readings(machine: Machine, measurements: Measurements) -> dict[int, str]:
+    """Return what is found of readings of redundant motors that contradict each other, by row.
+
+    They are those that :func:`nominal_poses` does not refuse.
+    """
+    if not machine.is_redundant:
+        return {}
+    followed = followed_poses(machine, measurements.q_of_poses, on_the_chain=False)
+    T = platforms_in_base(machine, [pose for pose, _ in followed])
+    first = measurements.first_rows.tolist()
+    return {
+        first[k]: one.in_words(machine)
+        for k, one in _contradictions(machine, measurements, T).items()
+        if not _is_refused(one, machine)
+    }
+
+
+def _contradictions(
+    machine: Machine, measurements: Measurements, T_Rb_Re: Sequence[RigidTransform]
+) -> dict[int, Contradiction]:
+    """Return the poses at which readings of redundant motors contradict each other."""
+    motors, sigma = list(machine.motors), measurements.sigma_of(machine.legs)
+    return contradictions(machine, T_Rb_Re, measurements.q_of_poses[:, motors], sigma[motors])
+
+
+def _is_refused(found: Contradiction, machine: Machine) -> bool:
+    """Say whether images cannot be searched at readings that contradict each other."""
+    return len(found.legs) > 1 and found.distance > _largest_residual(machine)
+
+
+def _largest_residual(machine: Machine) -> float:
+    """Return how far errors of a nominal model may put a leg from its reading [m]."""
+    at_home = vectors_A_to_B(machine, machine.home)
+    return MAX_NOMINAL_RESIDUAL * float(np.linalg.norm(at_home, axis=1).mean())
 
 
 def _least_squares(

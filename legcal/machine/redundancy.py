@@ -33,6 +33,7 @@ AS_LIKELY = 25.0  # difference of squared tests from which one reading is clearl
 MIN_REDUNDANCY = 1e-3  # of a reading that something else says anything about
 _MODEL = 0.005  # of the mean leg length, angles at it: errors of a nominal model
 _DEPENDENT = 1e-7  # of the largest singular value: equations that say the same
+_AT_REST = 1e-6  # [m, rad] last step of a pose that was found
 _ROUNDS = 20  # in each of which a pose is set aside whose readings contradict each other
 _SAYS = 1e-6  # redundancy of a reading that may explain a contradiction, however wrong it is
 _OF_MEDIAN = 0.6745  # of the standard deviation: the median of absolute values
@@ -133,9 +134,12 @@ def contradictions(
     if used.all():
         return {}
     # A pose of all readings is off where one is wrong: each is tested where the others put it.
-    chi2, _, _ = _tested(surplus.at(~used), sigma_m, *model)
+    # One without which the pose is not determined explains all.
+    chi2, r, redundancy = _tested(surplus.at(~used), sigma_m, *model)
     R, t, suspected = R[~used], t[~used], readings[~used]
-    explained, off, redundancy = (np.zeros(suspected.shape) for _ in range(3))
+    is_told = redundancy > 0.0
+    off = np.where(is_told, r / np.where(is_told, redundancy, 1.0), 0.0)
+    explained = np.where(is_told, chi2[:, None], 0.0)
     for i in range(len(unit)):
         others = suspected.copy()
         others[:, i] = np.nan
@@ -143,10 +147,9 @@ def contradictions(
         there = solve_poses(geometries(machine), machine.frame_legs, R, t, lengthening)
         at = _Surplus.of(machine, there.R, there.t, suspected)
         left, own_r, own = (x if x.ndim == 1 else x[:, i] for x in _tested(at, sigma_m, *model))
-        told = own > 0.0
-        redundancy[:, i] = own
-        off[:, i] = np.where(told, own_r / np.where(told, own, 1.0), 0.0)
-        explained[:, i] = np.where(told, np.maximum(chi2 - left + own * off[:, i] ** 2, 0.0), 0.0)
+        good = (own > 0.0) & (there.size < _AT_REST)
+        redundancy[good, i], off[good, i] = own[good], own_r[good] / own[good]
+        explained[good, i] = np.maximum(chi2 - left + own * off[:, i] ** 2, 0.0)[good]
     r = np.sqrt(explained * redundancy)
     judged = ReadingTests(*_numbers(machine, ~used), r.ravel(), redundancy.ravel())
     found = dict[int, Contradiction]()
