@@ -343,7 +343,7 @@ class _Judge:
     def _gains(self, tried: Sequence[Mistake], g: int, starts: Sequence[int]) -> Array:
         """Return how many more legs some images of a group show without each mistake.
 
-        Cameras are tried where they are known roughly, or about where those of images that nearly
+        Cameras are tried where they are known roughly, and about where those of images that nearly
         agree are. They are searched for where that suits none, or suits as well as things as they
         are: a symmetric machine nearly agrees with its mirror image.
         """
@@ -367,7 +367,7 @@ class _Judge:
         cameras: dict[int, RigidTransform | None] = {}
         T_own = self.of_groups[g].cameras[0]
         if self._nearly_agrees(g) and T_own is not None:
-            look(some, (), self._alike(T_own))
+            look(some, (), [*self._alike(T_own), *self._known(g)])
             nearly = [k for k in some if support[k] >= _NEARLY * float(before.support.sum())]
             look([k for k in nearly if not tried[k].is_small], starts)
         else:
