@@ -157,11 +157,12 @@ class Follower:
         """
         readings = _readings(self._machine, np.asarray(q, dtype=np.float64)[None])[0]
         reached = follow(self._machine, self.configuration, readings)
-        failure = _disagreement(self._machine, platform_pose(self._machine, reached), readings)
+        pose = platform_pose(self._machine, reached)
+        failure = _disagreement(self._machine, pose, readings)
         if failure is not None:
             raise failure
         self.configuration = reached
-        return self.pose
+        return pose
 
 
 def forward_kinematics_many(machine: Machine, q: Array) -> list[RigidTransform]:

@@ -558,7 +558,8 @@ def _linear_carrier(
         raise ValueError("a leg that hangs on no actuator")
     n, least = len(np.unique(q)), MIN_IMAGES[nominal.turns]
     if n < least:
-        return f"it was found at {n} readings of {nominal.joint}, and {least} are needed"
+        readings = "reading" if n == 1 else "readings"
+        return f"it was found at {n} {readings} of {nominal.joint}, and {least} are needed"
     u, M, E = axes.u[rows], axes.M[rows], axes.basis[rows]
     one, nowhere = Bundles(rows, np.array([len(rows)])), np.zeros((len(rows), 3))
     normal = np.eye(3) - u[:, :, None] * u[:, None, :]

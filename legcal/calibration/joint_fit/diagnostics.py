@@ -18,6 +18,7 @@ from legcal.calibration.joint_fit.determinacy import (
     held_at_nominal,
     open_directions,
 )
+from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.parameter_choices import Prior, board_scale
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
@@ -54,7 +55,8 @@ _NOMINAL_SIGMA = 0.01  # of the mean leg length: how far a nominal model is off 
 _MIN_SHARE = 0.01  # of the variance that a camera file states, which measurements must remove
 _MANY_REJECTED = 0.1  # of all outlines
 _MOST_REJECTED = 0.5  # of those of a leg or a view
-_ARM_MISFIT = 3.0  # of an arm that is no cylinder: of its outlines to those of rods
+# Of an arm that is no cylinder: how far off its median outline is, over that of rods, and [px]
+_ARM_MISFIT, _ARM_MISFIT_PX = 5.0, 0.1
 _MIN_COUNT = 3  # rejected outlines of a leg or a view, at least, before it is noted
 _RADIUS_SIGMAS = 3.0  # between radii and the model's, of whose prior nobody said a word
 _RADIUS_SPREAD = 0.25  # of their common difference
@@ -457,20 +459,22 @@ def arms_of_other_widths(outlines: Outlines, is_arm: BoolArray) -> dict[int, str
     return found
 
 
-def wrong_arms(problem: FitProblem, state: State, outlines: Outlines) -> dict[int, str]:
+def wrong_arms(
+    problem: FitProblem, state: State, noise: NoiseModel, outlines: Outlines
+) -> dict[int, str]:
     """Return the legs whose arms a fit contradicts, and how, after the name of the motor.
 
     Such an arm has most of its outlines rejected, or the median one lies much further off than that
-    of the rods, in standard deviations that are claimed. *outlines* are those of the table, with
-    the verdicts of the fit.
+    of the rods, in standard deviations of the noise that was found. *outlines* are those of the
+    table, with the verdicts of the fit.
     """
     o = problem.outlines
     if not o.on_arm.any() or o.on_arm.all():
         return {}
     offsets, used = problem.offsets(state), outlines.used[o.index]
-    squares = np.einsum(
-        "na,na->n", offsets, np.linalg.solve(o.covariance, offsets[..., None])[..., 0]
-    )
+    covariance, away = noise.covariance(o.covariance), np.abs(offsets).max(axis=1)
+    whitened = np.linalg.solve(covariance, offsets[..., None])[..., 0]
+    squares = np.sum(offsets * whitened, axis=1)
     usual, found = float(np.median(squares[~o.on_arm])), dict[int, str]()
     for leg in np.unique(o.leg[o.on_arm]).tolist():
         own = o.on_arm & (o.leg == leg)
@@ -478,7 +482,7 @@ def wrong_arms(problem: FitProblem, state: State, outlines: Outlines) -> dict[in
         times = float(np.sqrt(np.median(squares[own]) / usual)) if usual > 0.0 else 0.0
         if rejected >= _MIN_COUNT and rejected > _MOST_REJECTED * total:
             found[leg] = f"{rejected} of whose {total} outlines disagree with the fit"
-        elif total >= _MIN_COUNT and times > _ARM_MISFIT:
+        elif times > _ARM_MISFIT and float(np.median(away[own])) > _ARM_MISFIT_PX:
             found[leg] = f"whose outlines lie {times:.1f} times as far off as those of rods"
     return found
 

@@ -157,7 +157,8 @@ def _without_wrong_arms(
             )
         try:
             found = fitted(outlines)
-            wrong = wrong_arms(found.posterior.problem, found.posterior.state, found.outlines)
+            fit = found.posterior
+            wrong = wrong_arms(fit.problem, fit.state, fit.noise, found.outlines)
         except (DidNotConverge, NotIdentifiable):
             seen = {parts[i][0] for i in np.flatnonzero(is_arm & outlines.used).tolist()}
             if not seen:
