@@ -79,7 +79,7 @@ def test_hand_held_views_count_in_the_order_of_the_table(folder: Folder) -> None
         ("0 corners", ("row 2", "found no corners")),
         ("no image", ("row 2, column image", "neither an image")),
         ("corners alone", ("corners.csv", "no board")),
-        ("no legs", ("views c1, c2 could not be used", "empty list of legs")),
+        ("no legs", ("views.c1.legs and views.c2.legs could not be used", "no leg and no board")),
         ("a number", ("views.c1.hand_held", "found 3", "true or false")),
         ("a wrong board", ("dataset.yaml", "board.square", "30 m")),
         ("a word", ("dataset.yaml", "board", "'charuco'", "mapping")),

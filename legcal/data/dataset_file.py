@@ -34,7 +34,7 @@ from legcal.files import (
     read_yaml,
     validate,
 )
-from legcal.machine import DATASET_YAML
+from legcal.machine import DATASET_YAML, list_in_words
 from legcal.vision import Link
 
 ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
@@ -204,10 +204,9 @@ def view_problems(
     problems = []
     if blind and "platform" not in boards:
         problems.append(
-            f"{path}: view{'s' * (len(blind) > 1)} {', '.join(blind)} could not be used: found an "
-            "empty list of legs and no "
-            "board on the platform, needed a leg or such a board in the images of every view; name "
-            "legs, or describe the board in the block board (on: platform)."
+            f"{path}: {list_in_words([f'views.{name}.legs' for name in blind])} could not be used: "
+            "found no leg and no board on the platform, needed a leg or such a board in the images "
+            "of every view; name legs, or describe the board in the block board (on: platform)."
         )
     held = {name: view for name, view in views.items() if view.hand_held}
     problems += [

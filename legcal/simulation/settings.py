@@ -198,8 +198,6 @@ class SimulationSettings:
         Noise of axes.
     readings : Spread
         Errors of encoder readings [m]; of motors that turn as far as they move A.
-    angles : Spread or None
-        Errors of readings of motors that turn [rad], in place of these.
     appearance : Appearance
         How photographs look.
     board : Board, str, Path or None
@@ -218,6 +216,8 @@ class SimulationSettings:
     lengths : dict
         Distances of two joints that are measured by hand, by ``LEG.SIDE:LEG.SIDE``, with their
         standard deviations [m].
+    angles : Spread or None
+        Errors of readings of motors that turn [rad], in place of ``readings``.
 
     Raises
     ------
@@ -238,7 +238,6 @@ class SimulationSettings:
     sigma_px: float = 0.1
     table: TableNoise = field(default_factory=TableNoise)
     readings: Spread = DEFAULT_READINGS
-    angles: Spread | None = None
     appearance: Appearance = field(default_factory=Appearance)
     board: Board | str | Path | None = None
     board_pose: bool = False
@@ -247,6 +246,7 @@ class SimulationSettings:
     platform_board: Board | str | Path | None = None
     plan: Path | None = None
     lengths: Mapping[str, float] = field(default_factory=dict)
+    angles: Spread | None = None
 
     def __post_init__(self) -> None:
         for name, choices in (("level", Level), ("sampling", Sampling)):

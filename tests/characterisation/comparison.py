@@ -57,7 +57,7 @@ ADDED = re.compile(  # to documents and folders since they were recorded
     r"\.(document|(result|detection)\.json)(\.observations|\.details|\.links|\.explanations\.keys\.links|\.stages\.staged\.from_fit"
     r"|\.board\.(corners|used|images|off)|\.left_out|\.unreached|\.motor_rank"
     r"|\.weakest\[\d+\]\.links|\.platform_board|\.base_frame|\.home|\.legs\[\d+\]\.(travel|q_home))$"
-    r"|/truth\.json\.settings\.(platform_board|plan|lengths)$|\.files\.(staged\.(urdf|yaml)|report\.html|photographs/.*)$"
+    r"|/truth\.json\.settings\.(platform_board|plan|lengths|angles)$|\.files\.(staged\.(urdf|yaml)|report\.html|photographs/.*)$"
 )
 OF_UNKNOWNS = {"parameters", "covariance", "kinematic", "held", "base_axes", "platform_axes"}
 
