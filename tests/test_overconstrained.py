@@ -233,8 +233,8 @@ def test_ways_of_dependent_constraints_need_no_short_steps(tmp_path: Path) -> No
 
 
 def test_twists_that_ties_hold_are_called_tied_and_not_fixed(tmp_path: Path) -> None:
-    machine, folder = made("2-upr-2-sps", tmp_path), tmp_path / "dataset"
-    simulate(machine.yaml_path, folder, SimulationSettings(level=Level.AXES, poses=5, seed=1))
+    machine, folder = made("exechon", tmp_path), tmp_path / "dataset"
+    simulate(machine.yaml_path, folder, SimulationSettings(level=Level.AXES, poses=4, seed=1))
     platform = legcal.calibrate(folder).platform
     assert platform is not None
     assert [one.what for one in platform.effects] == ["twists that are tied, each 0.1 deg off,"]
