@@ -159,11 +159,13 @@ def normalised_error(nominal: Machine, calibrated: Path, truth: Path, solution: 
         )
         for path in (calibrated, truth)
     )
-    covariance = solution.value_covariance
-    unit = np.sqrt(np.diagonal(covariance))
+    sigma = np.sqrt(np.diagonal(solution.value_covariance))
+    free = np.flatnonzero(sigma > 0.0)  # gains are fixed
+    unit = sigma[free]
+    covariance = solution.value_covariance[np.ix_(free, free)]
     value, vector = np.linalg.eigh(covariance / np.outer(unit, unit))
     kept = value > 1e-9
-    along = vector[:, kept].T @ ((there - true) / unit)
+    along = vector[:, kept].T @ ((there - true)[free] / unit)
     return float(np.mean(along**2 / value[kept]))
 
 
