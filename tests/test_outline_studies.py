@@ -275,6 +275,15 @@ def test_the_bound_is_as_large_as_the_noise() -> None:
     assert np.all(bound_of(design, 2e-5, 0.02).sigma > once.sigma * (1.0 - 1e-9))
 
 
+def test_motors_that_turn_know_their_size_as_well_as_the_mean_of_the_radii() -> None:
+    design, relative = design_of("delta", 3, 6, Noise().sigma_px), 0.02
+    bound = bound_of(design, Noise().sigma_q, relative)
+    sigma = dict(zip(bound.names, np.sqrt(np.diagonal(bound.covariance)), strict=True))
+    wanted = relative / np.sqrt(len(design.parts))
+    for leg, name in zip(design.legs.nominal, design.legs.names, strict=True):
+        assert sigma[f"{name}.length"] / leg.q0 == pytest.approx(wanted, rel=1e-3)
+
+
 def test_a_bound_of_too_little_data_and_legs_that_meet_nowhere_are_refused() -> None:
     with pytest.raises(NotIdentifiable, match="do not determine"):
         bound_of(design_of("3-rpr", 1, 1, NOISE.sigma_px), 2e-6, 0.02)
