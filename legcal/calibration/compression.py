@@ -49,8 +49,8 @@ class CompressionEffect:
         """In words, that go after "with standard deviations"."""
         times = f"about {self.increase:.2f}" if math.isfinite(self.increase) else "more than 3"
         return (
-            f"{times} times those without compression (compressing photographs once more moves "
-            f"outlines by {self.moved_px:.3f} px)"
+            f"{times} times those without compression (compressing photographs once more moves a "
+            f"typical outline by {self.moved_px:.3f} px)"
         )
 
 
