@@ -8,6 +8,7 @@ wrong in their place.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -15,12 +16,11 @@ import numpy as np
 
 from legcal.calibration.joint_fit.factors import ActuatorReadings, Readings
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.variables import RefinementSettings, State
+from legcal.calibration.joint_fit.variables import State
 from legcal.data import few
 from legcal.estimation import (
     Linearization,
     NormalEquations,
-    PseudoHuber,
     explained_share,
     information,
     linearize,
@@ -80,44 +80,32 @@ def with_rough_readings(problem: FitProblem) -> FitProblem:
 
 def like_readings(problem: FitProblem, other: FitProblem) -> FitProblem:
     """Return a problem that leaves out the readings that another one leaves out."""
-    found = []
-    for name in _FACTORS:
-        factor = problem.factor(name)
-        used = np.asarray(other.factor(name).whitening) > 0.0
-        found.append(replace(factor, whitening=used * np.asarray(factor.whitening)))
-    return problem.with_factors(*found)
+    used = [_used(problem, name) & _used(other, name) for name in _FACTORS]
+    return _using(problem, problem, used)
 
 
-def with_judged_readings(
-    problem: FitProblem, state: State, settings: RefinementSettings
-) -> tuple[FitProblem, bool]:
+def with_judged_readings(problem: FitProblem, state: State) -> tuple[FitProblem, bool]:
     """Return the problem without the wrong reading of every pose; say if there was one.
 
     Of a pose that nothing but readings shows any of those that may be wrong will do: the others
     agree then, and say nothing of the machine.
     """
     linear = linearize(problem, state)
-    normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
+    normal = information(problem, state, linear, problem.loss)
     tests = _tests(problem, linear, normal)
     of_factor, number = _numbers(problem)
-    out: list[list[int]] = [[], []]
+    used = [_used(problem, name) for name in _FACTORS]
+    is_changed = False
     for pose in np.unique(tests.pose).tolist():
-        found = _of_pose(problem, state, linear, tests, pose, settings)
+        found = _of_pose(problem, state, linear, tests, pose)
         if len(found) == 1 or (found and not _is_shown(problem, pose)):
-            out[int(of_factor[found[0]])].append(int(number[found[0]]))
-    if not any(out):
-        return problem, False
-    changed = []
-    for name, numbers in zip(_FACTORS, out, strict=True):
-        factor = problem.factor(name)
-        whitening = np.array(factor.whitening)
-        whitening[numbers] = 0.0
-        changed.append(replace(factor, whitening=whitening))
-    return problem.with_factors(*changed), True
+            used[int(of_factor[found[0]])][number[found[0]]] = False
+            is_changed = True
+    return (_using(problem, problem, used) if is_changed else problem), is_changed
 
 
 def with_agreeing_readings(
-    problem: FitProblem, every: FitProblem, state: State, settings: RefinementSettings
+    problem: FitProblem, every: FitProblem, state: State
 ) -> tuple[FitProblem, bool]:
     """Return the problem with the readings that agree after all; say if there was one.
 
@@ -126,22 +114,16 @@ def with_agreeing_readings(
     """
     restored = problem.with_factors(*map(every.factor, _FACTORS))
     linear = linearize(problem, state)
-    normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
-    most = settings.rejection * _tests(problem, linear, normal).scale
-    linear, back = linearize(restored, state), list[BoolArray]()
+    normal = information(problem, state, linear, problem.loss)
+    most = problem.settings.rejection * _tests(problem, linear, normal).scale
+    linear, used, is_changed = linearize(restored, state), list[BoolArray](), False
     for name in _FACTORS:
         predicted = explained_share(restored, linear, normal, name)[:, 0, 0]
         agrees = linear[name].r[:, 0] ** 2 <= most**2 * (1.0 + predicted)
-        back.append(agrees & _used(every, name) & ~_used(problem, name))
-    if not any(one.any() for one in back):
-        return problem, False
-    changed = []
-    for name, agrees in zip(_FACTORS, back, strict=True):
-        factor = every.factor(name)
-        used = _used(problem, name) | agrees
-        whitening = np.where(used[:, None, None], factor.whitening, 0.0)
-        changed.append(replace(factor, whitening=whitening))
-    return problem.with_factors(*changed), True
+        back = agrees & _used(every, name) & ~_used(problem, name)
+        used.append(_used(problem, name) | back)
+        is_changed |= bool(back.any())
+    return (_using(problem, every, used) if is_changed else problem), is_changed
 
 
 def judged_readings(
@@ -149,13 +131,11 @@ def judged_readings(
     state: State,
     linear: Linearization,
     normal: NormalEquations,
-    settings: RefinementSettings,
 ) -> JudgedReadings | None:
     """Return which readings a fit left out, and how the others agree; None if they always do."""
     if not problem.legs.is_redundant:
         return None
     legs, wrong = problem.legs.nominal, list[WrongReading]()
-    loss = PseudoHuber(settings.loss_width)
     for name, readings in zip(_FACTORS, _readings(problem), strict=True):
         off = readings.wrong_by(problem.factor(name).rows(state))
         for k in np.flatnonzero(~_used(problem, name)).tolist():
@@ -165,10 +145,10 @@ def judged_readings(
             if not _is_shown(problem, pose):
                 whole = _with_used(problem, name, k)
                 again = linearize(whole, state)
-                every = _tests(whole, again, information(whole, state, again, loss))
+                every = _tests(whole, again, information(whole, state, again, whole.loss))
                 alike = [
                     legs[int(every.leg[i])].motor_label
-                    for i in _of_pose(whole, state, again, every, pose, settings)
+                    for i in _of_pose(whole, state, again, every, pose)
                     if every.leg[i] != leg
                 ]
             wrong.append(WrongReading(leg, pose, motor, *where, float(off[k]), unit, tuple(alike)))
@@ -179,7 +159,7 @@ def judged_readings(
     moved = tests.r * sigma[used] * distance
     rms, rms_m = (float(np.sqrt(np.mean(x**2))) for x in (tests.r, moved))
     expected = float(np.sqrt(np.mean(tests.redundancy)))
-    doubts = _doubts(problem, state, linear, tests, wrong, settings)
+    doubts = _doubts(problem, state, linear, tests, wrong)
     return JudgedReadings(tuple(wrong), rms, expected, rms_m, doubts)
 
 
@@ -216,7 +196,6 @@ def _doubts(
     linear: Linearization,
     tests: ReadingTests,
     wrong: list[WrongReading],
-    settings: RefinementSettings,
 ) -> tuple[str, ...]:
     """Return why readings leave a result in doubt."""
     legs, doubts = problem.legs.nominal, list[str]()
@@ -232,7 +211,7 @@ def _doubts(
             )
     alike = list[str]()
     for pose in np.unique(tests.pose).tolist():
-        found = _of_pose(problem, state, linear, tests, pose, settings)
+        found = _of_pose(problem, state, linear, tests, pose)
         if len(found) > 1:
             view, image = _first_image(problem, pose)
             labels = [legs[j].motor_label for j in tests.leg[found].tolist()]
@@ -261,7 +240,6 @@ def _of_pose(
     linear: Linearization,
     tests: ReadingTests,
     pose: int,
-    settings: RefinementSettings,
 ) -> list[int]:
     """Return the readings of a pose one of which is wrong, the likeliest first.
 
@@ -269,7 +247,7 @@ def _of_pose(
     count as alike, too, whose errors the measurements do not tell from that of the likeliest: the
     part of its test that theirs does not explain is 1 - rho^2, rho the correlation of both tests.
     """
-    found = tests.of_pose(pose, settings.rejection, tests.scale)
+    found = tests.of_pose(pose, problem.settings.rejection, tests.scale)
     if not found:
         return []
     factor, number = _numbers(problem)
@@ -349,6 +327,17 @@ def _numbers(problem: FitProblem) -> tuple[IntArray, IntArray]:
     used = [np.flatnonzero(_used(problem, name)) for name in _FACTORS]
     of_factor = np.repeat(np.arange(len(used)), [len(one) for one in used])
     return of_factor, np.concatenate(used)
+
+
+def _using(problem: FitProblem, every: FitProblem, used: Sequence[BoolArray]) -> FitProblem:
+    """Return the problem with those readings of another one that are *used*, by factor."""
+    factors = [every.factor(name) for name in _FACTORS]
+    return problem.with_factors(
+        *(
+            replace(factor, whitening=np.where(own[:, None, None], factor.whitening, 0.0))
+            for factor, own in zip(factors, used, strict=True)
+        )
+    )
 
 
 def _used(problem: FitProblem, name: str) -> BoolArray:

@@ -257,11 +257,9 @@ def _without_wrong_readings(
     """
     may_come_back = True
     for _ in range(_READING_ROUNDS):
-        problem, is_changed = with_judged_readings(problem, minimum.state, problem.settings)
+        problem, is_changed = with_judged_readings(problem, minimum.state)
         if not is_changed and may_come_back:
-            problem, is_changed = with_agreeing_readings(
-                problem, every, minimum.state, problem.settings
-            )
+            problem, is_changed = with_agreeing_readings(problem, every, minimum.state)
             may_come_back = False
         if not is_changed:
             break

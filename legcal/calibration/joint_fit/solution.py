@@ -158,7 +158,7 @@ def assemble_solution(
     estimated = covariance[np.ix_(where, where)]
     offsets, cost = problem.offsets(state), comparable_cost(problem, state)
     used = offsets[fit.accepted]
-    readings = judged_readings(problem, state, linear, normal, problem.settings)
+    readings = judged_readings(problem, state, linear, normal)
     n_rejected = offsets.size - used.size + (0 if readings is None else len(readings.wrong))
     n_residuals = problem.n_equations + len(problem.priors.mean) - n_rejected
     chi2 = float(np.sum(linear.prior_r**2)) + sum(
