@@ -25,6 +25,7 @@ from legcal import calibrate, evaluate, load_dataset, load_mechanism, load_resul
 from legcal.calibration import Calibration, poses_at_readings
 from legcal.calibration.board import BoardViews, base_of_board, board_notes
 from legcal.calibration.four_steps import Steps
+from legcal.calibration.joint_fit import FOUND_CAMERA, Sensitivity
 from legcal.calibration.result_folder import write_result
 from legcal.calibration.verdict import judge
 from legcal.data import found_corners
@@ -184,11 +185,14 @@ def test_a_model_is_trusted_if_its_change_exceeds_two_sigma(
         assert _judged(calibration, **scaled).verdict.trustworthy is trusted
 
 
-def test_a_contradicted_focal_length_counts_in_the_verdict(
+def test_a_contradicted_camera_counts_in_the_verdict(
     planar: tuple[Path, Calibration],
 ) -> None:
     assert _judged(planar[1]).verdict.trustworthy
-    assert not _judged(planar[1], focal_error=10.0).verdict.trustworthy
+    every = planar[1].solution.sensitivities
+    focal = next(s for s in every if "focal" in s.what)
+    wrong = Sensitivity(FOUND_CAMERA, 1e3 * focal.steps)
+    assert not _judged(planar[1], sensitivities=(*every, wrong)).verdict.trustworthy
 
 
 def test_a_leg_of_a_view_that_was_left_out_speaks_against_a_model(

@@ -154,7 +154,7 @@ def test_what_the_owner_chooses_leaves_the_covariance_of_the_file() -> None:
     ("name", "error", "said"),
     [
         ("f", 0.01, ("focal length of c1", "given 1302.9 px", "same focus and zoom")),
-        ("cx", 25.0, ("camera of c1", "same focus and zoom")),
+        ("cx", 25.0, ("principal point of c1", "given (543.0, 380.0) px", "same focus and zoom")),
     ],
 )
 def test_a_camera_that_contradicts_its_covariance_is_named(
@@ -169,7 +169,6 @@ def test_a_camera_that_contradicts_its_covariance_is_named(
     (note,) = said_of_cameras(found)
     assert [word for word in said if word not in note] == []
     assert found.contradicted_cameras == ("c1",)
-    assert (found.focal_error > 0.005) == (name == "f")
 
 
 def test_axes_do_not_depend_on_cameras() -> None:

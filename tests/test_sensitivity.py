@@ -18,7 +18,7 @@ from fit_sessions import (
 )
 
 from legcal.calibration.joint_fit import (
-    FOUND_DISTORTION,
+    FOUND_CAMERA,
     NO_CHOICES,
     Choices,
     Prior,
@@ -178,11 +178,18 @@ def notes_on_focal_lengths(solution: Solution) -> list[str]:
 def test_a_focal_length_wrong_by_one_percent_is_noticed(camera: Camera, factor: float) -> None:
     solution = fitted(irregular_hexapod(12, camera=camera), 0, factor)
     (note,) = notes_on_focal_lengths(solution)
-    assert solution.focal_error == pytest.approx(0.01, abs=0.004)
     found = float(note.partition("found fx = ")[2].partition(" +-")[0])
     assert found == pytest.approx(1290.0, abs=5.0)
     assert note.startswith("The focal length of c1 does not agree with the measurements")
     assert f"given {1290.0 * factor:.1f} px" in note
+
+
+def test_a_second_mistake_in_a_camera_is_named_beside_the_first() -> None:
+    wrong = {"cy": 395.0, "fx": 1320.0, "fy": 1310.0}
+    solution = fitted(irregular_hexapod(12), 0, 1.0, **wrong)
+    said = [note.partition(" of c1 ")[0] for note in solution.notes if "does not agree" in note]
+    assert sorted(said) == ["The focal length", "The principal point"]
+    assert solution.contradicted_cameras == ("c1",)
 
 
 def test_a_view_at_another_zoom_than_the_others_of_its_camera_is_named() -> None:
@@ -198,7 +205,8 @@ def test_a_view_at_another_zoom_than_the_others_of_its_camera_is_named() -> None
     solution = refine(session.legs, *data, disturbed_start(session))
     (note,) = notes_on_focal_lengths(solution)
     assert note.startswith("The focal length of view c2 does not agree with the other views")
-    assert solution.focal_error == pytest.approx(0.03, abs=0.012)
+    found = float(note.partition("found it ")[2].partition(" +-")[0])
+    assert found == pytest.approx(3.0, abs=1.2)
     assert solution.contradicted_cameras == ("c2",)
 
 
@@ -207,7 +215,7 @@ def test_a_right_focal_length_is_left_alone() -> None:
     for seed in range(4):
         solution = fitted(session, seed, 1.0)
         assert notes_on_focal_lengths(solution) == []
-        assert solution.focal_error == 0.0
+        assert not [s for s in solution.sensitivities if s.what == FOUND_CAMERA]
 
 
 def test_nothing_is_said_where_the_noise_hides_it() -> None:
@@ -223,21 +231,27 @@ def test_a_focal_length_that_is_estimated_is_not_tested() -> None:
 
 
 @pytest.mark.parametrize(
-    ("camera", "given", "words"),
-    [(LENS, 0.0, "had not been corrected"), (PINHOLE, -0.1, "had been corrected")],
+    ("camera", "wrong", "start", "words"),
+    [
+        (LENS, {"k1": 0.0}, "The distortion of c1", "had not been corrected"),
+        (PINHOLE, {"k1": -0.1}, "The distortion of c1", "had been corrected"),
+        (PINHOLE, {"cx": 539.0}, "The principal point of c1", "given (539.0, 380.0) px"),
+        (LENS, {"cx": 524.0, "cy": 394.0}, "The principal point of c1", "given (524.0, 394.0) px"),
+    ],
 )
-def test_photographs_of_another_distortion_are_noticed(
-    camera: Camera, given: float, words: str
+def test_a_wrong_camera_file_is_noticed_and_what_it_does_is_told(
+    camera: Camera, wrong: dict[str, float], start: str, words: str
 ) -> None:
-    """As where board and machine are corrected for the lens differently."""
+    """As where board and machine are corrected for the lens, or cropped, differently."""
     session = irregular_hexapod(12, camera=camera)
-    solution = fitted(session, 0, 1.0, k1=given)
-    (note,) = (note for note in solution.notes if note.startswith("The distortion of c1"))
+    solution = fitted(session, 0, 1.0, **wrong)
+    (note,) = (note for note in solution.notes if "does not agree" in note)
+    assert note.startswith(start)
     assert words in note
     assert solution.contradicted_cameras == ("c1",)
-    (effect,) = (s for s in solution.sensitivities if s.what == FOUND_DISTORTION)
+    (effect,) = (s for s in solution.sensitivities if s.what == FOUND_CAMERA)
     right = fitted(session, 0, 1.0)
-    assert not [note for note in right.notes if "distortion" in note]
+    assert not [note for note in right.notes if "does not agree" in note]
     assert right.contradicted_cameras == ()
     off = np.array([solution.values[n] - right.values[n] for n in right.parametrization.names])
     moved = effect.steps[:, 0]

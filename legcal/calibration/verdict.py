@@ -10,8 +10,7 @@ from legcal.calibration.closeness import closeness
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit import (
-    FOCAL_PART,
-    FOUND_DISTORTION,
+    FOUND_CAMERA,
     HeldOut,
     PlatformAccuracy,
     Solution,
@@ -60,7 +59,7 @@ def judge(
     if platform is None:
         change, sigma, found = _change_of_parameters(dataset, solution)
     else:
-        change, sigma, found = _change_of_platform(platform, solution.focal_error)
+        change, sigma, found = _change_of_platform(platform)
     if diagnosis:
         why = f"{diagnosis[0].sentence} As it is, {found}."
         verdict = Verdict(False, f"Do not load this into the controller: {why}")
@@ -92,11 +91,10 @@ def judge(
     )
 
 
-def _change_of_platform(platform: PlatformAccuracy, focal_error: float) -> tuple[float, float, str]:
+def _change_of_platform(platform: PlatformAccuracy) -> tuple[float, float, str]:
     """Return the change of the platform, its uncertainty, both displacements [m], and a clause.
 
-    Focal lengths and distortions that the measurements contradict count with what they do to the
-    platform.
+    Cameras that the measurements contradict count with what they do to the platform.
     """
     change, sigma = platform.change, platform.sigma
     found = (
@@ -105,19 +103,11 @@ def _change_of_platform(platform: PlatformAccuracy, focal_error: float) -> tuple
         f"{1e3 * sigma.mean_displacement:.3f} mm / {np.degrees(sigma.mean_rotation):.4f} deg "
         "(1 sigma)"
     )
-    of_focal = [e.error.mean_displacement for e in platform.effects if "focal" in e.what]
-    focal_effect = focal_error / FOCAL_PART * max(of_focal, default=0.0)
-    if focal_effect > 0.0:
-        found += (
-            f"; a focal length that the measurements contradict may add {1e3 * focal_effect:.3f} mm"
-        )
-    of_lens = [e.error.mean_displacement for e in platform.effects if e.what == FOUND_DISTORTION]
-    lens_effect = max(of_lens, default=0.0)
-    if lens_effect > 0.0:
-        found += (
-            f"; a distortion that the measurements contradict may add {1e3 * lens_effect:.3f} mm"
-        )
-    known_to = float(np.linalg.norm([sigma.mean_displacement, focal_effect, lens_effect]))
+    of_cameras = [e.error.mean_displacement for e in platform.effects if e.what == FOUND_CAMERA]
+    effect = max(of_cameras, default=0.0)
+    if effect > 0.0:
+        found += f"; a camera file that the measurements contradict may add {1e3 * effect:.3f} mm"
+    known_to = float(np.hypot(sigma.mean_displacement, effect))
     return change.mean_displacement, known_to, found
 
 

@@ -31,8 +31,8 @@ from .platform import reach_readings as reach_readings
 from .problem import FitProblem as FitProblem
 from .problem import build_fit as build_fit
 from .rounds import DISAGREES as DISAGREES
-from .sensitivity import FOCAL_PART as FOCAL_PART
-from .sensitivity import FOUND_DISTORTION as FOUND_DISTORTION
+from .sensitivity import FOUND_CAMERA as FOUND_CAMERA
+from .sensitivity import Sensitivity as Sensitivity
 from .solution import Solution as Solution
 from .solution import in_file_order as in_file_order
 from .variables import DEFAULT_SETTINGS as DEFAULT_SETTINGS

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,14 +26,14 @@ from legcal.estimation import (
 )
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import LegColumns, is_held_by_default
-from legcal.vision import Camera, shared_cameras
+from legcal.vision import shared_cameras
 
-FOCAL_PART = 0.01  # of the focal length: the error whose effect is reported
-FOUND_DISTORTION = "the distortion that the measurements show"
+FOUND_CAMERA = "cameras as the measurements have them"  # where these contradict their files
+_FOCAL_PART = 0.01  # of the focal length: the error whose effect is reported
 _RADIUS_PART = 0.01
 _TWIST_ERROR = np.radians(0.1)
 _CAMERA_ERRORS: Mapping[str, tuple[Mapping[str, float], Mapping[str, float]]] = {  # relative, px
-    "a focal length 1 % longer": ({"fx": FOCAL_PART, "fy": FOCAL_PART}, {}),
+    "a focal length 1 % longer": ({"fx": _FOCAL_PART, "fy": _FOCAL_PART}, {}),
     "a principal point 0.1 px further right": ({}, {"cx": 0.1}),
     "a principal point 0.1 px further down": ({}, {"cy": 0.1}),
 }
@@ -51,7 +52,7 @@ class Sensitivity:
 
 
 def sensitivities(
-    cameras: CameraResiduals, normal: NormalEquations, distorted: Sequence[LensDistortion] = ()
+    cameras: CameraResiduals, normal: NormalEquations, contradicted: Sequence[WrongIntrinsic] = ()
 ) -> tuple[Sensitivity, ...]:
     """Return how errors of cameras, radii and fixed twists would change the parameters.
 
@@ -64,8 +65,8 @@ def sensitivities(
         Where the fit ended.
     normal : NormalEquations
         The information there.
-    distorted : sequence of LensDistortion
-        Those that the measurements contradict: what they have instead is one more error.
+    contradicted : sequence of WrongIntrinsic
+        What the measurements contradict of cameras: what they have instead is one more error.
     """
     problem, state, linear = cameras.problem, cameras.state, cameras.linear
     radii = np.array([problem.legs.radii[part] for part in problem.outlines.parts])
@@ -74,12 +75,8 @@ def sensitivities(
         what: (of_cameras, _camera_error(state, relative, added))
         for what, (relative, added) in _CAMERA_ERRORS.items()
     }
-    if distorted:
-        owners = shared_cameras(problem.outlines.views, problem.first_cameras)
-        by_owner = {lens.view: lens.change for lens in distorted}
-        error = np.zeros((len(owners), len(_KEYS)))
-        error[:, _KEYS.index("k1")] = [by_owner.get(owner, 0.0) for owner in owners]
-        errors[FOUND_DISTORTION] = of_cameras, error
+    if contradicted:
+        errors[FOUND_CAMERA] = of_cameras, np.sum([one.error for one in contradicted], axis=0)
     errors["radii 1 % larger"] = problem.place["radii"], _RADIUS_PART * radii[:, None]
     names, changes, pulls = list[str](), list[dict[str, Array]](), list[Array]()
     for what, (place, error) in errors.items():
@@ -178,24 +175,19 @@ def _of_twist(
     return steps
 
 
-@dataclass(frozen=True)
-class _TestedIntrinsic:
-    """What the measurements say of an intrinsic of a camera whose file says what it is."""
+@dataclass(frozen=True, eq=False)
+class WrongIntrinsic:
+    """Intrinsics of a camera that the measurements contradict, which its file says."""
+
+    units: ClassVar[tuple[tuple[Mapping[str, float], Mapping[str, float]], ...]]  # relative, added
+    keys: ClassVar[tuple[str, ...]]  # what is told of each of these
 
     view: str  # the first one by name if several have the camera
-    given: float  # in the camera file
-    change: float  # what would have to be added to it
-    sigma: float  # standard deviation of that
-
-    @property
-    def apart(self) -> float:
-        """How many standard deviations lie between what was given and what was found."""
-        return abs(self.change) / self.sigma
-
-    @property
-    def is_contradicted(self) -> bool:
-        """Whether the measurements disagree with what was given."""
-        return self.apart > _SIGNIFICANT
+    given: Array  # (u,) in the camera file
+    change: Array  # (u,) what would have to be added, in these units
+    sigma: Array  # (u,) standard deviations of that
+    apart: float  # standard deviations between what was given and what was found
+    error: Array  # (n_views, 5) the same change in all views
 
     @property
     def camera(self) -> str:
@@ -203,22 +195,25 @@ class _TestedIntrinsic:
         return self.view
 
 
-class FocalLength(_TestedIntrinsic):
+class FocalLength(WrongIntrinsic):
     """A focal length: ``given`` is fx [px], ``change`` that of fx and fy, as a part of them."""
 
+    units = ((_FOCAL, {}),)
+    keys = ("fx",)
+
     def __str__(self) -> str:
-        found, sigma = self.given * (1.0 + self.change), self.given * self.sigma
+        (given,), (change,) = self.given, self.change
         return (
             f"The focal length of {self.view} does not agree with the measurements: found fx = "
-            f"{found:.1f} +- {sigma:.1f} px, given {self.given:.1f} px, {self.apart:.0f} standard "
-            f"deviations and {1e2 * self.change:+.2f} % apart; the stated uncertainty knows "
-            "nothing of it; calibrate the camera again at the same focus and zoom, look for "
-            "pictures that were scaled or focused anew, or let the fit find it "
-            f"(--free {self.view}.fx --free {self.view}.fy)."
+            f"{given * (1.0 + change):.1f} +- {given * self.sigma[0]:.1f} px, given "
+            f"{given:.1f} px, {self.apart:.0f} standard deviations and {1e2 * change:+.2f} % "
+            "apart; the stated uncertainty knows nothing of it; calibrate the camera again at the "
+            "same focus and zoom, look for pictures that were scaled or focused anew, or let the "
+            f"fit find it (--free {self.view}.fx --free {self.view}.fy)."
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ZoomedView(FocalLength):
     """The focal length of a view against that of the other views with its camera file."""
 
@@ -232,26 +227,47 @@ class ZoomedView(FocalLength):
     def __str__(self) -> str:
         return (
             f"The focal length of view {self.view} does not agree with the other views of its "
-            f"camera: found it {1e2 * self.change:+.2f} +- {1e2 * self.sigma:.2f} % apart from "
-            f"theirs, {self.apart:.0f} standard deviations; the stated uncertainty knows nothing "
-            "of it; look for photographs of that view that were zoomed, scaled, cropped or focused "
-            "anew, and calibrate its camera as it was there."
+            f"camera: found it {1e2 * self.change[0]:+.2f} +- {1e2 * self.sigma[0]:.2f} % apart "
+            f"from theirs, {self.apart:.0f} standard deviations; the stated uncertainty knows "
+            "nothing of it; look for photographs of that view that were zoomed, scaled, cropped or "
+            "focused anew, and calibrate its camera as it was there."
         )
 
 
-class LensDistortion(_TestedIntrinsic):
-    """A distortion, by its first coefficient k1."""
+class PrincipalPoint(WrongIntrinsic):
+    """A principal point, cx and cy [px]."""
+
+    units = (({}, {"cx": 1.0}), ({}, {"cy": 1.0}))
+    keys = ("cx", "cy")
 
     def __str__(self) -> str:
-        found = self.given + self.change
+        (cx, cy), (dx, dy) = self.given + self.change, self.sigma
+        return (
+            f"The principal point of {self.view} does not agree with the measurements: found it at "
+            f"({cx:.1f} +- {dx:.1f}, {cy:.1f} +- {dy:.1f}) px, given ({self.given[0]:.1f}, "
+            f"{self.given[1]:.1f}) px, {self.apart:.0f} standard deviations apart; the stated "
+            "uncertainty knows nothing of it; look for photographs that were cropped or "
+            "stabilised, calibrate the camera again at the same focus and zoom, or let the fit "
+            f"find it (--free {self.view}.cx --free {self.view}.cy)."
+        )
+
+
+class LensDistortion(WrongIntrinsic):
+    """A distortion, by its first coefficient k1, which is the largest in most lenses."""
+
+    units = (({}, {"k1": 1.0}),)
+    keys = ("k1",)
+
+    def __str__(self) -> str:
+        (given,), (found,) = self.given, self.given + self.change
         looks = ""
-        if abs(found) < 0.5 * abs(self.given):
+        if abs(found) < 0.5 * abs(given):
             looks = "; the photographs look as if they had been corrected for their lens"
-        elif self.given == 0.0:
+        elif given == 0.0:
             looks = "; the photographs look as if they had not been corrected for their lens"
         return (
             f"The distortion of {self.view} does not agree with the measurements: found k1 = "
-            f"{found:.3f} +- {self.sigma:.3f}, given {self.given:.3f}, {self.apart:.0f} standard "
+            f"{found:.3f} +- {self.sigma[0]:.3f}, given {given:.3f}, {self.apart:.0f} standard "
             f"deviations apart{looks}; the stated uncertainty knows nothing of it; take and "
             "process the photographs of board and machine alike, with lens correction in all or in "
             "none, and calibrate the camera again."
@@ -292,38 +308,72 @@ class CameraResiduals:
             for name, by in self.derivatives.items()
         }
 
-    def contradicted(self) -> list[FocalLength | LensDistortion]:
-        """Return what the measurements contradict of camera files, the clearest of each camera.
+    def contradicted(self) -> list[WrongIntrinsic]:
+        """Return what the measurements contradict of camera files.
 
-        One mistake in a camera looks like others: of each camera the test that sees most counts.
+        One mistake in a camera looks like others: what they show most clearly counts, and beside
+        it only what they still show once that is corrected.
         """
-        tests: list[FocalLength | LensDistortion] = [
-            *self._focal_lengths(),
-            *self._zoomed_views(),
-            *self._lens_distortions(),
-        ]
-        clearest = {test.camera: test for test in sorted(tests, key=lambda test: test.apart)}
-        return [test for test in clearest.values() if test.is_contradicted]
+        owners = shared_cameras(self.problem.outlines.views, self.problem.first_cameras)
+        zoomed = {test.camera: test for test in self._zoomed_views()}
+        found = list[WrongIntrinsic]()
+        for owner in dict.fromkeys(owners):
+            wrong = self._wrong_intrinsics(owner)
+            zoom = zoomed.get(owner)
+            clearest = max((one.apart for one in wrong), default=_SIGNIFICANT)
+            found += wrong if zoom is None or zoom.apart <= clearest else [zoom]
+        return found
 
-    def _focal_lengths(self) -> list[FocalLength]:
-        """Return what the measurements say of the focal lengths that camera files say.
+    def _wrong_intrinsics(self, owner: str) -> list[WrongIntrinsic]:
+        """Return what the measurements contradict of a camera, by the view that stands for it.
 
-        One for each camera of which they say anything and nothing was chosen. The common-mode
-        biases of outlines are in the problem, and so are errors of intrinsics with the covariance
-        that camera files state, so that these do not pass for a focal length.
+        Of what nothing was chosen. The common-mode biases of outlines are in the problem, and so
+        are errors of intrinsics with the covariance that camera files state, so that these do not
+        pass for a wrong file.
         """
-        return [
-            FocalLength(view, intrinsic_of(camera, "fx"), change, sigma)
-            for view, camera, change, sigma in self._tested(_camera_error(self.state, _FOCAL, {}))
-        ]
+        kinds, errors, place = list[type[WrongIntrinsic]](), list[Array](), list[IntArray]()
+        for kind in (FocalLength, PrincipalPoint, LensDistortion):
+            units = [_camera_error(self.state, *unit) for unit in kind.units]
+            known, owners = self._known_views(np.sum(units, axis=0))
+            own = np.array([v in known and owners[v] == owner for v in range(len(owners))])
+            if own.any():
+                kinds.append(kind)
+                place.append(len(errors) + np.arange(len(units), dtype=np.intp))
+                errors += [own[:, None] * unit for unit in units]
+        if not kinds:
+            return []
+        score, information = self._score(errors)
+        left = [k for k in range(len(kinds)) if np.all(np.diagonal(information)[place[k]] > 0.0)]
 
-    def _lens_distortions(self) -> list[LensDistortion]:
-        """Return the same of distortions, by the coefficient that is largest in most lenses."""
-        error = _camera_error(self.state, {}, {"k1": 1.0})
-        return [
-            LensDistortion(view, intrinsic_of(camera, "k1"), change, sigma)
-            for view, camera, change, sigma in self._tested(error)
-        ]
+        def explained(which: Sequence[int]) -> float:
+            at = np.concatenate([place[k] for k in which])
+            inverse = np.linalg.pinv(information[np.ix_(at, at)], rcond=_ROUNDING, hermitian=True)
+            return float(score[at] @ inverse @ score[at])
+
+        wrong, apart, so_far = list[int](), list[float](), 0.0
+        while left:
+            value = {k: explained([*wrong, k]) for k in left}
+            best = max(left, key=value.__getitem__)
+            gain = float(np.sqrt(max(value[best] - so_far, 0.0)))
+            if gain <= _SIGNIFICANT:
+                break
+            left.remove(best)
+            wrong.append(best)
+            apart.append(gain)
+            so_far = value[best]
+        if not wrong:
+            return []
+        at = np.concatenate([place[k] for k in wrong])
+        covariance = np.linalg.pinv(information[np.ix_(at, at)], rcond=_ROUNDING, hermitian=True)
+        change, sigma = -covariance @ score[at], np.sqrt(np.diagonal(covariance))
+        camera = self.problem.first_cameras[self.problem.outlines.views.index(owner)]
+        found = []
+        for k, gain in zip(wrong, apart, strict=True):
+            own = np.isin(at, place[k])
+            given = np.array([intrinsic_of(camera, key) for key in kinds[k].keys])
+            error = np.tensordot(change[own], [errors[i] for i in at[own].tolist()], axes=1)
+            found.append(kinds[k](owner, given, change[own], sigma[own], gain, error))
+        return found
 
     def _zoomed_views(self) -> list[ZoomedView]:
         """Return of each camera the view whose focal length differs most from the others'.
@@ -350,30 +400,11 @@ class CameraResiduals:
                 view = views[int(seen[k])]
                 given = intrinsic_of(problem.first_cameras[view], "fx")
                 name, sigma = problem.outlines.views[view], float(np.sqrt(spread[1, 1]))
-                tests.append(ZoomedView(name, given, apart, sigma, owner))
+                zoom = apart * error * (np.arange(len(error)) == view)[:, None]
+                there = np.array([given]), np.array([apart]), np.array([sigma])
+                tests.append(ZoomedView(name, *there, abs(apart) / sigma, zoom, owner))
             found += sorted(tests, key=lambda test: test.apart)[-1:]
         return found
-
-    def _tested(self, error: Array) -> list[tuple[str, Camera, float, float]]:
-        """Return how much of an error (n_views, 5) the residuals show, and its standard deviation.
-
-        They come with the view that stands for each camera of which nothing was chosen, and with
-        the camera of its file.
-        """
-        known, owners = self._known_views(error)
-        tested = sorted({owners[v] for v in known})
-        if not tested:
-            return []
-        which = [
-            np.array([v in known and owners[v] == owner for v in range(len(owners))])
-            for owner in tested
-        ]
-        cameras = self.problem.first_cameras
-        seen, change, covariance = self._scores(error, which)
-        return [
-            (tested[i], cameras[owners.index(tested[i])], float(d), float(s))
-            for i, d, s in zip(seen.tolist(), change, np.sqrt(np.diagonal(covariance)), strict=True)
-        ]
 
     def _known_views(self, error: Array) -> tuple[list[int], tuple[str, ...]]:
         """Return views whose intrinsics with an error are as files say, and each view's camera."""
@@ -389,7 +420,18 @@ class CameraResiduals:
         Which of these the residuals say anything of, (k,), how much of the error, (k,), and its
         covariance.
         """
-        changes = [self.changes(error * own[:, None]) for own in which]
+        score, information = self._score([error * own[:, None] for own in which])
+        seen = np.flatnonzero(np.diagonal(information) > 0.0)
+        own = information[np.ix_(seen, seen)]
+        covariance = np.linalg.pinv(own, rcond=_ROUNDING, hermitian=True)
+        return seen, -covariance @ score[seen], np.asarray(covariance, dtype=np.float64)
+
+    def _score(self, errors: Sequence[Array]) -> tuple[Array, Array]:
+        """Return the slope (c,) by parts of errors (n_views, 5) of cameras, and its information.
+
+        Of errors of which the residuals say nothing the information is zero.
+        """
+        changes = [self.changes(error) for error in errors]
         columns = {
             name: np.stack([change[name] for change in changes], axis=-1)
             for name in self.derivatives
@@ -397,7 +439,6 @@ class CameraResiduals:
         normal = normal_equations(self.problem, self.state, self.linear)
         score, information = score_test(self.problem, self.linear, normal, columns)
         whole = sum(np.sum(of_kind**2, axis=(0, 1)) for of_kind in columns.values())
-        seen = np.flatnonzero(np.diagonal(information) > _ROUNDING * whole)
-        own = information[np.ix_(seen, seen)]
-        covariance = np.linalg.pinv(own, rcond=_ROUNDING, hermitian=True)
-        return seen, -covariance @ score[seen], np.asarray(covariance, dtype=np.float64)
+        unseen = np.diagonal(information) <= _ROUNDING * whole
+        information[unseen] = information[:, unseen] = score[unseen] = 0.0
+        return score, information

@@ -38,9 +38,8 @@ from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_reasons
 from legcal.calibration.joint_fit.sensitivity import (
     CameraResiduals,
-    FocalLength,
-    LensDistortion,
     Sensitivity,
+    WrongIntrinsic,
     sensitivities,
 )
 from legcal.calibration.joint_fit.variables import State
@@ -121,7 +120,6 @@ class Solution:
     posterior: Posterior  # what it predicts of other images; in the order that was fitted
     notes: tuple[str, ...] = ()  # one sentence each
     details: tuple[str, ...] = ()  # how it was found, the same
-    focal_error: float = 0.0  # relative error of a focal length that the measurements contradict
     contradicted_cameras: tuple[str, ...] = ()  # views that stand for such cameras
     left_out: tuple[str, ...] = ()  # legs of views most of whose outlines disagree, unconfirmed
     camera_notes: tuple[str, ...] = ()  # those of the notes that are about these
@@ -224,12 +222,11 @@ def assemble_solution(
         gammas=gammas,
         biases={n: v for n, v in biases if not n.endswith(GAMMA_SUFFIX)},
         shared_px=fit.shared_px,
-        sensitivities=sensitivities(cameras, normal, doubts.distortions),
+        sensitivities=sensitivities(cameras, normal, doubts.tested),
         outlines=_with_rejections(outlines, fit, offsets),
         start=label,
         iterations=fit.iterations,
         posterior=Posterior(problem, state, fit.edge_biases, fit.noise, kept),
-        focal_error=doubts.focal_error,
         contradicted_cameras=doubts.views,
         left_out=legs_left_out(problem, fit.accepted),
         camera_notes=doubts.notes,
@@ -253,7 +250,7 @@ def assemble_solution(
 class _CameraDoubts:
     """What the measurements contradict of the cameras."""
 
-    tested: list[FocalLength | LensDistortion]  # one error of a camera, the clearest
+    tested: list[WrongIntrinsic]
     others: list[DoubtedCamera]  # that are moved too far for what their files state
 
     @classmethod
@@ -267,23 +264,13 @@ class _CameraDoubts:
     @property
     def views(self) -> tuple[str, ...]:
         """The views that stand for these cameras."""
-        return tuple(one.view for one in (*self.tested, *self.others))
+        views = [one.view for one in self.tested] + [one.view for one in self.others]
+        return tuple(dict.fromkeys(views))
 
     @property
     def notes(self) -> tuple[str, ...]:
         """A sentence on each."""
         return tuple(str(one) for one in (*self.tested, *self.others))
-
-    @property
-    def focal_error(self) -> float:
-        """The largest relative error of a focal length."""
-        errors = (abs(test.change) for test in self.tested if isinstance(test, FocalLength))
-        return max(errors, default=0.0)
-
-    @property
-    def distortions(self) -> list[LensDistortion]:
-        """Those that are of distortions."""
-        return [test for test in self.tested if isinstance(test, LensDistortion)]
 
 
 def _prior_sigma(problem: FitProblem) -> dict[str, float]:
