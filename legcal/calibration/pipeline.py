@@ -87,7 +87,7 @@ from legcal.perception import (
     detection_settings,
     given_outlines,
     hint_notes,
-    is_visible,
+    is_measurable,
     measure_photographs,
     nominal_placement,
     place_and_measure,
@@ -363,8 +363,8 @@ def _is_doubtful(
 
 
 def _unused_share(estimate: Estimate) -> float:
-    """Return which part of the outlines that should be seen was not used."""
-    shown = estimate.solution.outlines.choose(is_visible(estimate.solution.outlines))
+    """Return which part of the outlines that should be measured was not used."""
+    shown = estimate.solution.outlines.choose(is_measurable(estimate.solution.outlines))
     return 1.0 - float(shown.used.mean()) if len(shown) else 1.0
 
 

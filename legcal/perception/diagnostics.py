@@ -20,7 +20,7 @@ from legcal.geometry import BoolArray, IntArray, pose_distance
 from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped, shrunk
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.detection import NOT_PLACED
-from legcal.perception.outline import HIDDEN, OUTSIDE
+from legcal.perception.outline import HIDDEN, OUTSIDE, TOO_SHORT
 from legcal.perception.pair_matching import (
     CameraPoses,
     Picture,
@@ -147,6 +147,12 @@ def is_visible(outlines: Outlines) -> BoolArray:
     """Return which outlines an image should show."""
     hidden = (*NOT_IN_SIGHT, NOT_PLACED)
     return np.array([not why.startswith(hidden) for why in outlines.reason], dtype=np.bool_)
+
+
+def is_measurable(outlines: Outlines) -> BoolArray:
+    """Return which outlines an image should show at a length that can be measured."""
+    too_short = [why.startswith(TOO_SHORT) for why in outlines.reason]
+    return is_visible(outlines) & ~np.array(too_short, dtype=np.bool_)
 
 
 def _without_views(

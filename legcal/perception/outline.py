@@ -22,6 +22,7 @@ from legcal.vision import EPSILON, Band, Camera, Grey, PredictedLeg, Segment, hi
 
 OUTSIDE = "outside the image"  # a reason
 HIDDEN = "hidden by"  # the beginning of one
+TOO_SHORT = "too short"  # to be measured: beginning of the reason
 WRONG_WIDTH = "width inconsistent with the radius"  # the beginning of another one
 MARGIN = 4.0  # beside a leg in front, within which it hides others [px]
 MIN_WIDTH = 5.0  # of a part [px]
@@ -167,7 +168,7 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
             if width < MIN_WIDTH:
                 reject(leg, segment.link, f"too narrow, {width:.1f} px wide")
             elif band.length < _min_length(width):
-                reject(leg, segment.link, f"too short, {band.length:.0f} px in the image")
+                reject(leg, segment.link, f"{TOO_SHORT}, {band.length:.0f} px in the image")
             else:
                 searched.append(_Predicted(leg, segment, band, h, v, width))
     free_parts: list[LegPart] = []
@@ -414,7 +415,7 @@ def _reason(edge: MeasuredEdge | None, length: float, width: float) -> str:
     least = max(MIN_LENGTH[0], MIN_LENGTH[1] * width)
     visible = (line.last - line.first) * length
     if visible < least:
-        return f"too short, {visible:.0f} px visible"
+        return f"{TOO_SHORT}, {visible:.0f} px visible"
     if line.inlier_share < MIN_INLIER_SHARE:
         return f"edge not straight, {100 * line.inlier_share:.0f} % of it on one line"
     kept = float(np.mean(line.kept))

@@ -33,7 +33,7 @@ from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.detection import measure_outlines
 from legcal.perception.diagnostics import (
     find_wrong_images,
-    is_visible,
+    is_measurable,
     reject_images,
 )
 from legcal.perception.free_poses import ROUNDS, find_free_poses
@@ -58,7 +58,6 @@ DETECTOR_VERSION = 9  # raise it whenever outlines or notes that are kept come o
 MEASURING = "Measuring outlines"  # a stage of progress
 CHOICE_ROUNDS = 2  # in which outlines decide between poses that readings leave open
 FreePosesOf = Mapping[int, tuple[RigidTransform, ...]]  # T_base_platform of poses, likeliest first
-TOO_SHORT = "px in the image"  # end of the reason for parts that are not looked for
 MIN_VIEWS = 2  # in which a part must show another radius than the model's
 MAX_USED_SHARE = 0.3  # of the outlines of a part that should be seen
 
@@ -510,11 +509,9 @@ def _inspect(
 def _parts_not_found(legs: Sequence[Leg], outlines: Outlines) -> list[LegRadius]:
     """Return the parts of legs, by leg and radius, of which hardly an outline can be used.
 
-    One that is used although the width of its part is wrong supports no radius; one that is too
-    short to be measured where it is predicted contradicts none.
+    One that is used although the width of its part is wrong supports no radius.
     """
-    too_short = np.array([why.endswith(TOO_SHORT) for why in outlines.reason], dtype=np.bool_)
-    visible = is_visible(outlines) & ~too_short
+    visible = is_measurable(outlines)
     which = list(zip(outlines.row.tolist(), outlines.leg.tolist(), outlines.part, strict=True))
     of_wrong_width = {
         one for one, why in zip(which, outlines.reason, strict=True) if why.startswith(WRONG_WIDTH)
