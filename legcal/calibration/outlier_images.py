@@ -36,6 +36,10 @@ from legcal.machine import Machine, actuator_index, joints_at, reading_of_rod
 MIN_REJECTED = 0.34  # share of an image's outlines that the fit rejected
 MIN_REJECTED_LEGS = 2  # of which it rejected all outlines
 MIN_REJECTED_UNEXPLAINED = 0.67  # the share, if the readings agree with the image
+POSE_IN_DOUBT = (
+    "its readings do not give the pose of the platform, and what it shows suits several; take it "
+    "again with more legs in sight"
+)
 CAMERA_MOVED = "its readings suit it, so check that nobody moved the camera"
 MIN_OUTLINES, MIN_LEGS = 6, 3  # that determine a pose
 MIN_NOISE = 5e-5  # of an outline at its leg [m]
@@ -78,8 +82,11 @@ def outlier_images(
         ]
         if len(wrong) < MIN_REJECTED * len(judged) or len(legs) < MIN_REJECTED_LEGS:
             continue
-        image = _Image(measurements, machine, solution, row)
-        explanation = image.wrong_reading(judged) or image.explanation(judged)
+        if machine.is_determined:
+            image = _Image(measurements, machine, solution, row)
+            explanation = image.wrong_reading(judged) or image.explanation(judged)
+        else:
+            explanation = POSE_IN_DOUBT
         if not explanation and len(wrong) < MIN_REJECTED_UNEXPLAINED * len(judged):
             continue  # the outlines are wrong, not the image
         notes[row] = (

@@ -18,7 +18,8 @@ from legcal.calibration.joint_fit import (
     platform_accuracy,
 )
 from legcal.calibration.result import Calibration, Verdict
-from legcal.data import Corners, Dataset
+from legcal.data import Corners, Dataset, few_views
+from legcal.perception import far_off
 
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
 
@@ -76,6 +77,13 @@ def judge(
             "something else or the fit is wrong; look at them in the table of observations, and "
             "correct them or leave the leg out of the legs of that view.",
         )
+    elif strayed := _strayed_cameras(dataset, solution):
+        verdict = Verdict(
+            False,
+            f"Do not load this into the controller: {found}, but the fit has {strayed} far from "
+            "the rough T_base_camera near which platform poses were looked for, so that these are "
+            "wrong or it is; measure it again, or take images that show more legs.",
+        )
     else:
         verdict = _verdict(change, sigma, found)
     return Calibration(
@@ -89,6 +97,20 @@ def judge(
         corners,
         tuple(diagnosis),
     )
+
+
+def _strayed_cameras(dataset: Dataset, solution: Solution) -> str:
+    """Return the views whose cameras left the rough poses by which platforms were found, or ""."""
+    if dataset.machine.is_determined:
+        return ""
+    cameras = [dataset.machine.T_base_Rb * T.inv() for T in solution.T_camera_Rb]
+    views = zip(dataset.measurements.views, cameras, strict=True)
+    strayed = [
+        view.name
+        for view, T in views
+        if view.T_base_camera is not None and far_off(view.T_base_camera, T)
+    ]
+    return few_views(strayed) if strayed else ""
 
 
 def _change_of_platform(platform: PlatformAccuracy) -> tuple[float, float, str]:

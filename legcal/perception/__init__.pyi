@@ -60,6 +60,7 @@ from .overlays import marks_of_image as marks_of_image
 from .overlays import marks_of_pairs as marks_of_pairs
 from .overlays import short_reason as short_reason
 from .part_edges import LegPart as LegPart
+from .photographs import TOO_FEW_LEGS as TOO_FEW_LEGS
 from .photographs import MeasuredImages as MeasuredImages
 from .photographs import Photographs as Photographs
 from .photographs import defects_of as defects_of

@@ -3,8 +3,9 @@
 A platform that is moved by hand, or has fewer motors than freedoms, is at a pose of its own in
 every image. Base joints stay where they are, so that a rough camera pose says where each leg
 begins: poses drawn from the workspace are judged by the edge pairs of their images, the better ones
-improved by Gauss-Newton steps, and cameras and poses of all images fitted to their pairs in turn.
-Readings and the constraints of legs hold as far as the nominal model has them.
+improved by Gauss-Newton steps in which their cameras follow as far as they are rough, and cameras
+and poses of all images fitted to their pairs in turn. Readings and the constraints of legs hold as
+far as the nominal model has them.
 
 From far a platform that tilts towards the camera looks like one that tilts away from it, and pairs
 do not tell them apart. So the best poses that differ are kept of every image: the outlines that
@@ -24,7 +25,6 @@ from legcal.data import Measurements, few_views
 from legcal.errors import NotIdentifiable
 from legcal.estimation import (
     Factor,
-    Frames,
     GaussianPrior,
     Problem,
     Residuals,
@@ -33,7 +33,7 @@ from legcal.estimation import (
     information,
     linearize,
 )
-from legcal.geometry import Array, BoolArray, IntArray, cross, motion_of
+from legcal.geometry import Array, BoolArray, IntArray, cross, motions_of, rotation_matrices
 from legcal.machine import (
     LegKind,
     Machine,
@@ -65,7 +65,7 @@ EQUATION_SIGMA = 3e-3  # of lengths and constraints by the nominal model [m]
 TRAVEL_SIGMA = 5e-3  # beyond the travel of a slider without a motor [m]
 # Of the score, for squares of what the model says against a pose; larger ones count no more.
 MODEL_COST, MODEL_WIDTH = 0.01, 5.0
-CAMERA_SIGMA = 0.03, 0.03  # of a rough pose: angle, part of the distance
+CAMERA_SIGMA = 0.03, 0.03  # of a rough pose: angle [rad], place as a part of the distance
 TURN_SIGMA, PLACE_SIGMA = 0.1, 0.1  # of a pose that its images do not determine [rad], leg lengths
 MAX_STEP = 3.0  # of these, in one step
 ROUNDS = 2  # of a search in each image and a fit of all
@@ -111,27 +111,47 @@ class _Scene:
         return cls(machine, wanted, q, drawn, tuple(_targets(machine, drawn)), images)
 
     def pictures(
-        self,
-        targets: Sequence[LegSegments],
-        of_pose: Sequence[int],
-        cameras: Sequence[RigidTransform | None],
+        self, targets: Sequence[LegSegments], of_pose: Sequence[int], cameras: Array
     ) -> tuple[Pictures, IntArray]:
         """Return what images show and should show with the legs at poses, and the index of each.
 
-        *of_pose* are the poses of the measurements whose images they are.
+        *of_pose* are the poses of the measurements whose images they are, *cameras* (n, n_views, 3,
+        4) T_camera_base with each of them.
         """
         found, index = list[Picture](), list[int]()
-        placed = [None if T is None else (T.rotation.as_matrix(), T.translation)
-                  for T in (None if T is None else T.inv() for T in cameras)]  # fmt: skip
         for n, (own, k) in enumerate(zip(targets, of_pose, strict=True)):
             for image in self.images[k]:
-                camera = placed[image.view]
-                if camera is None:
-                    continue
+                camera = cameras[n, image.view]
                 shown = replace(own, share=own.share * self.wanted[image.view, own.leg])
-                found.append(Picture(image.pairs, shown, image.corners, *camera))
+                at = camera[:, :3], camera[:, 3]
+                found.append(Picture(image.pairs, shown, image.corners, *at))
                 index.append(n)
         return Pictures.of(found), np.array(index, dtype=np.intp)
+
+    def views(self, k: int) -> list[int]:
+        """Return the views that show a pose of the measurements."""
+        return sorted({image.view for image in self.images[k]})
+
+
+@dataclass(frozen=True, eq=False)
+class _Guesses:
+    """Where the platform may be at a pose of the measurements, each with cameras that suit it."""
+
+    poses: Array  # (n, 3, 4) T_base_platform
+    cameras: Array  # (n, n_views, 3, 4) T_camera_base
+
+    def __len__(self) -> int:
+        """Return their number."""
+        return len(self.poses)
+
+    def take(self, chosen: IntArray | slice) -> _Guesses:
+        """Return some of them."""
+        return _Guesses(self.poses[chosen], self.cameras[chosen])
+
+    @classmethod
+    def before(cls, cameras: Array, poses: Array) -> _Guesses:
+        """Return all poses before the same cameras (n_views, 3, 4)."""
+        return cls(poses, np.repeat(cameras[None], len(poses), axis=0))
 
 
 def _targets(machine: Machine, poses: Array) -> list[LegSegments]:
@@ -200,18 +220,22 @@ def find_free_poses(
         image = _Image(view, pairs, sensor_extent(m.views[view].camera))
         images.setdefault(int(m.pose[row]), []).append(image)
     scene = _Scene.of(machine, search.wanted, m.q_of_poses, images)
-    every, cameras = dict[int, Array](), tuple(hints)
+    rough = _cameras_of(hints)
+    cameras, every = rough, dict[int, _Guesses]()
     for _ in range(ROUNDS):
         for k, found in zip(images, run(partial(_searched, scene, cameras), images), strict=True):
             every[k] = found
             for _ in images[k]:
                 progress(k)
-        best, cameras = _fitted(scene, {k: found[0] for k, found in every.items()}, cameras)
+        first = {k: one.poses[0] for k, one in every.items()}
+        best, cameras = _fitted(scene, first, _agreed(scene, cameras, every), rough)
+    T = dict[int, tuple[RigidTransform, ...]]()
     for k, found in every.items():
-        others = _stepped_often(scene, cameras, k, found[1:], FITTED[1:])
-        every[k] = _apart(scene.machine, np.concatenate([best[k][None], others]), CHOICES)
-    T = {k: tuple(motion_of(at[:, :3], at[:, 3]) for at in found) for k, found in every.items()}
-    return FreePoses(T, cameras)
+        others = _Guesses.before(cameras, found.poses[1:])
+        others = _stepped_often(scene, None, k, others, FITTED[1:])
+        poses = np.concatenate([best[k][None], others.poses])
+        T[k] = _motions(poses[_apart(machine, poses, CHOICES)])
+    return FreePoses(T, _placed(hints, cameras))
 
 
 def require_standing_joints(machine: Machine) -> None:
@@ -238,21 +262,33 @@ def require_rough_cameras(
         )
 
 
-def _searched(scene: _Scene, cameras: Sequence[RigidTransform | None], k: int) -> Array:
-    """Return the poses (n, 3, 4) at which the images of pose *k* show most legs, best first."""
-    poses, targets = scene.drawn, list(scene.targets)
+def _searched(scene: _Scene, cameras: Array, k: int) -> _Guesses:
+    """Return the poses at which the images of pose *k* show most legs, best first."""
+    found, targets = _Guesses.before(cameras, scene.drawn), list(scene.targets)
     for kept, tolerance in zip(KEPT, TOLERANCES, strict=True):
-        score = _scores(scene, cameras, k, poses, targets, tolerance)
-        poses = poses[np.argsort(-score, kind="stable")]
-        poses = _apart(scene.machine, poses, kept) if kept <= ALL_ALIKE else poses[:kept]
-        poses = _stepped_often(scene, cameras, k, poses, [tolerance] * (1 + (kept <= ALL_ALIKE)))
-        targets = _targets(scene.machine, poses)
-    score = _scores(scene, cameras, k, poses, targets, TOLERANCES[-1])
-    return _apart(scene.machine, poses[np.argsort(-score, kind="stable")], CHOICES)
+        score = _scores(scene, cameras, k, found, targets, tolerance)
+        found = found.take(np.argsort(-score, kind="stable"))
+        few = kept <= ALL_ALIKE
+        found = found.take(_apart(scene.machine, found.poses, kept) if few else slice(kept))
+        found = _stepped_often(scene, cameras, k, found, [tolerance] * (1 + few))
+        targets = _targets(scene.machine, found.poses)
+    score = _scores(scene, cameras, k, found, targets, TOLERANCES[-1])
+    found = found.take(np.argsort(-score, kind="stable"))
+    return found.take(_apart(scene.machine, found.poses, CHOICES))
 
 
-def _apart(machine: Machine, poses: Array, n: int) -> Array:
-    """Return the first n poses (m, 3, 4) that are not near an earlier one."""
+def _agreed(scene: _Scene, rough: Array, every: Mapping[int, _Guesses]) -> Array:
+    """Return the cameras on which the likeliest poses of all images agree: medians."""
+    found = rough.copy()
+    for v in range(len(rough)):
+        own = np.array([one.cameras[0, v] for k, one in every.items() if v in scene.views(k)])
+        if len(own):
+            found[v] = _camera_after(rough[v], np.median(_camera_change(rough[v], own), axis=0))
+    return found
+
+
+def _apart(machine: Machine, poses: Array, n: int) -> IntArray:
+    """Return which are the first n poses (m, 3, 4) that are not near an earlier one."""
     ends = machine.B_platform @ poses[:, :, :3].swapaxes(1, 2) + poses[:, None, :, 3]
     off = np.linalg.norm(ends[:, None] - ends, axis=3)
     near = np.sqrt(np.mean(off**2, axis=2)) < APART * leg_scale(machine, machine.home)
@@ -260,61 +296,121 @@ def _apart(machine: Machine, poses: Array, n: int) -> Array:
     for i in range(len(poses)):
         if len(kept) < n and not near[i, kept].any():
             kept.append(i)
-    return poses[kept]
+    return np.array(kept, dtype=np.intp)
 
 
 def _stepped_often(
-    scene: _Scene,
-    cameras: Sequence[RigidTransform | None],
-    k: int,
-    poses: Array,
-    tolerances: Sequence[float],
-) -> Array:
-    """Return poses (n, 3, 4) after a Gauss-Newton step with each tolerance."""
-    for tolerance in tolerances if len(poses) else ():
-        targets = _targets(scene.machine, poses)
-        poses = _stepped(scene, cameras, k, poses, targets, tolerance)
-    return poses
+    scene: _Scene, rough: Array | None, k: int, found: _Guesses, tolerances: Sequence[float]
+) -> _Guesses:
+    """Return guesses after a Gauss-Newton step with each tolerance."""
+    for tolerance in tolerances if len(found) else ():
+        found = _stepped(scene, rough, k, found, tolerance)
+    return found
 
 
 def _scores(
     scene: _Scene,
-    cameras: Sequence[RigidTransform | None],
+    rough: Array,
     k: int,
-    poses: Array,
+    guesses: _Guesses,
     targets: Sequence[LegSegments],
     tolerance: float,
 ) -> Array:
-    """Return how many legs agree with each pose (n, 3, 4), less what the model says against it."""
-    every, index = scene.pictures(targets, [k] * len(poses), cameras)
+    """Return how many legs agree with each guess, less what the model and rough poses say."""
+    poses = guesses.poses
+    every, index = scene.pictures(targets, [k] * len(poses), guesses.cameras)
     found = match_pairs(every, _as_they_are(scene), tolerance)
     value = (found.exclusive_score[:, 0] * every.share).sum(axis=1)
     score = np.bincount(index, value, minlength=len(poses))
     residual, _ = _model_rows(scene, poses, np.full(len(poses), k))
+    views = scene.views(k)
+    turns = _camera_change(rough[views], guesses.cameras[:, views]) / _camera_unit(rough[views])
+    residual = np.concatenate([residual, turns.reshape(len(poses), -1)], axis=1)
     off = np.sum(residual**2 / (1.0 + residual**2 / MODEL_WIDTH**2), axis=1)
     return np.asarray(score - MODEL_COST * off)
 
 
 def _stepped(
-    scene: _Scene,
-    cameras: Sequence[RigidTransform | None],
-    k: int,
-    poses: Array,
-    targets: Sequence[LegSegments],
-    tolerance: float,
-) -> Array:
-    """Return poses (n, 3, 4) after a Gauss-Newton step towards the pairs that they match."""
-    every, index = scene.pictures(targets, [k] * len(poses), cameras)
-    rows, _ = _line_rows(scene, every, index, poses, tolerance)
+    scene: _Scene, rough: Array | None, k: int, guesses: _Guesses, tolerance: float
+) -> _Guesses:
+    """Return guesses after a Gauss-Newton step towards the pairs that they match.
+
+    Cameras move as far as rough poses (n_views, 3, 4) let them; without these they are held.
+    """
+    poses, views = guesses.poses, [] if rough is None else scene.views(k)
+    targets = _targets(scene.machine, poses)
+    every, index = scene.pictures(targets, [k] * len(poses), guesses.cameras)
+    of_lines, by_camera = _line_rows(scene, every, index, poses, tolerance)
     residual, jacobian = _model_rows(scene, poses, np.full(len(poses), k))
-    H = jacobian.swapaxes(1, 2) @ jacobian
-    b = -(jacobian.swapaxes(1, 2) @ residual[..., None])[..., 0]
-    np.add.at(H, index, np.einsum("krx,kry->kxy", rows[..., 1:], rows[..., 1:]))
-    np.add.at(b, index, -np.einsum("krx,kr->kx", rows[..., 1:], rows[..., 0]))
-    unit = _pose_unit(scene)
-    step = np.linalg.solve(H + np.diag(unit**-2), b[..., None])[..., 0]
-    longest = np.abs(step / unit).max(axis=1, keepdims=True)
-    return poses_after(poses, step * (MAX_STEP / np.maximum(longest, MAX_STEP)))
+    n, unit = 6 + 6 * len(views), _pose_unit(scene)
+    J = np.zeros((*of_lines.shape[:2], n))
+    J[..., :6] = of_lines[..., 1:]
+    weight, value = np.zeros(n), np.zeros((len(poses), n))  # of what is known without images
+    weight[:6] = unit**-2
+    if rough is not None:
+        seen = np.array([views.index(image.view) for image in scene.images[k]] * len(poses))
+        for i, v in enumerate(views):
+            part = slice(6 + 6 * i, 12 + 6 * i)
+            J[:, :, part] = by_camera * (seen == i)[:, None, None]
+            weight[part] = _camera_unit(rough[v]) ** -2
+            value[:, part] = _camera_change(rough[v], guesses.cameras[:, v])
+    H = np.zeros((len(poses), n, n))
+    b = -value * weight
+    H[:, :6, :6] = jacobian.swapaxes(1, 2) @ jacobian
+    b[:, :6] -= (jacobian.swapaxes(1, 2) @ residual[..., None])[..., 0]
+    np.add.at(H, index, np.einsum("krx,kry->kxy", J, J))
+    np.add.at(b, index, -np.einsum("krx,kr->kx", J, of_lines[..., 0]))
+    step = np.asarray(np.linalg.solve(H + np.diag(weight), b[..., None])[..., 0], dtype=np.float64)
+    longest = np.abs(step[:, :6] / unit).max(axis=1, keepdims=True)
+    step *= MAX_STEP / np.maximum(longest, MAX_STEP)
+    cameras = guesses.cameras.copy()
+    for i, v in enumerate(views):
+        cameras[:, v] = _camera_after(cameras[:, v], step[:, 6 + 6 * i : 12 + 6 * i])
+    return _Guesses(poses_after(poses, step[:, :6]), cameras)
+
+
+def _cameras_of(T_base_camera: Sequence[RigidTransform | None]) -> Array:
+    """Return T_camera_base (n_views, 3, 4); NaN where nothing is known."""
+    found = np.full((len(T_base_camera), 3, 4), np.nan)
+    for v, T in enumerate(T_base_camera):
+        if T is not None:
+            found[v] = T.inv().as_matrix()[:3]
+    return found
+
+
+def _placed(
+    hints: Sequence[RigidTransform | None], cameras: Array
+) -> tuple[RigidTransform | None, ...]:
+    """Return T_base_camera of the cameras that are known."""
+    found = _motions(np.where(np.isnan(cameras), np.eye(4)[:3], cameras))
+    return tuple(None if hint is None else T.inv() for hint, T in zip(hints, found, strict=True))
+
+
+def _motions(of: Array) -> tuple[RigidTransform, ...]:
+    """Return rigid motions of matrices (n, 3, 4)."""
+    return motions_of(of[..., :3], of[..., 3])
+
+
+def _camera_after(cameras: Array, step: Array) -> Array:
+    """Return T_camera_base (..., 3, 4) after turns about the camera and moves, (..., 6)."""
+    R = rotation_matrices(step[..., :3])
+    moved = R @ cameras
+    moved[..., 3] += step[..., 3:]
+    return moved
+
+
+def _camera_change(start: Array, cameras: Array) -> Array:
+    """Return the step (..., 6) from T_camera_base (..., 3, 4) to others."""
+    R = cameras[..., :3] @ start[..., :3].swapaxes(-1, -2)
+    turn = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:-2], 3)
+    moved = cameras[..., 3] - (R @ start[..., 3:])[..., 0]
+    return np.concatenate([turn, moved], axis=-1)
+
+
+def _camera_unit(rough: Array) -> Array:
+    """Return how far cameras may be from rough ones (..., 3, 4), (..., 6) [rad, m]."""
+    far = CAMERA_SIGMA[1] * np.linalg.norm(rough[..., 3], axis=-1)
+    return np.stack([np.full_like(far, CAMERA_SIGMA[0])] * 3 + [far] * 3, axis=-1)
 
 
 def _pose_unit(scene: _Scene) -> Array:
@@ -333,7 +429,7 @@ def _line_rows(
 ) -> tuple[Array, Array]:
     """Return whitened rows of lines (n_pictures, 2 n_segments, 7): residual, derivatives by pose.
 
-    With derivatives (n_pictures, 2 n_segments, 6) by a motion of everything in the base link.
+    With derivatives (n_pictures, 2 n_segments, 6) by a step of the camera.
     """
     base = _as_they_are(scene)
     found = match_pairs(every, base, tolerance)
@@ -344,8 +440,11 @@ def _line_rows(
     by_pose = np.concatenate([cross(arm[:, :, None], by_B), by_B], axis=-1)
     flat = len(every), -1
     rows = np.concatenate([residual[:, 0, :, :2, None], by_pose], axis=-1) * root[..., None]
-    by_base = J[:, 0, :, :2] * root[..., None]
-    return rows.reshape(*flat, 7), by_base.reshape(*flat, 6)
+    by_base = (J[:, 0, :, :2] * root[..., None]).reshape(*flat, 6)
+    R = every.R.swapaxes(1, 2)
+    by_move = by_base[..., 3:] @ R
+    by_turn = by_base[..., :3] @ R + cross(every.t[:, None], by_move)
+    return rows.reshape(*flat, 7), np.concatenate([by_turn, by_move], axis=-1)
 
 
 def _model_rows(scene: _Scene, poses: Array, k: IntArray) -> tuple[Array, Array]:
@@ -384,42 +483,33 @@ def _beyond_travel(machine: Machine, poses: Array) -> tuple[Array, Array]:
 class _State:
     """What the fit of all images moves."""
 
-    camera: Frames  # T_camera_base, one a view that is used
-    platform: Frames  # T_base_platform, one a pose that has images
-
-    @property
-    def poses(self) -> Array:
-        """The platform poses, (n_poses, 3, 4)."""
-        return np.concatenate([self.platform.R, self.platform.t[..., None]], axis=2)
+    cameras: Array  # (n_used, 3, 4) T_camera_base of the views that have images
+    poses: Array  # (n_poses, 3, 4) T_base_platform of the poses that have images
 
 
 def _fitted(
-    scene: _Scene, poses: dict[int, Array], cameras: Sequence[RigidTransform | None]
-) -> tuple[dict[int, Array], tuple[RigidTransform | None, ...]]:
+    scene: _Scene, poses: Mapping[int, Array], cameras: Array, rough: Array
+) -> tuple[dict[int, Array], Array]:
     """Return poses and cameras after steps of all of them together towards the pairs."""
     keys = np.array(sorted(poses), dtype=np.intp)
     images = [(i, image) for i, k in enumerate(keys.tolist()) for image in scene.images[k]]
     views = sorted({image.view for _, image in images})
     element = np.array([i for i, _ in images], dtype=np.intp)
     view = np.array([views.index(image.view) for _, image in images], dtype=np.intp)
-    camera = Frames.of([T.inv() for v in views if (T := cameras[v]) is not None])
-    at = np.array([poses[k] for k in keys.tolist()])
-    state = _State(camera, Frames(at[..., :3], at[..., 3]))
+    state = _State(cameras[views], np.array([poses[k] for k in keys.tolist()]))
     n_rows = 4 * sum(len(leg.cylinders) for leg in scene.machine.legs)  # at most, of an image
     unit = _pose_unit(scene)
 
-    def placed(state: _State) -> tuple[RigidTransform | None, ...]:
-        found = list(cameras)
-        for v, T in zip(views, state.camera.motions, strict=True):
-            found[v] = T.inv()
-        return tuple(found)
+    def placed(state: _State) -> Array:
+        found = cameras.copy()
+        found[views] = state.cameras
+        return found
 
     def lines(state: _State, tolerance: float) -> Residuals:
         targets = _targets(scene.machine, state.poses)
-        every, index = scene.pictures(targets, keys.tolist(), placed(state))
-        rows, by_base = _line_rows(scene, every, index, state.poses, tolerance)
-        R = state.camera.R[view].swapaxes(1, 2)
-        by_camera = np.concatenate([by_base[..., :3] @ R, by_base[..., 3:] @ R], axis=-1)
+        every_camera = np.repeat(placed(state)[None], len(keys), axis=0)
+        every, index = scene.pictures(targets, keys.tolist(), every_camera)
+        rows, by_camera = _line_rows(scene, every, index, state.poses, tolerance)
         fill = ((0, 0), (0, n_rows - rows.shape[1]), (0, 0))
         rows, by_camera = np.pad(rows, fill), np.pad(by_camera, fill)
         return Residuals.of(rows[..., 0], by_camera, rows[..., 1:])
@@ -433,29 +523,24 @@ def _fitted(
         J = np.broadcast_to(np.diag(1.0 / unit), (len(r), 6, 6))
         return Residuals.of(r, np.zeros((len(r), 6, 0)), J)
 
-    def from_start(now: Frames) -> Array:
-        turn = Rotation.from_matrix(now.R @ camera.R.swapaxes(1, 2)).as_rotvec()
-        return np.concatenate([turn, now.t - camera.t], axis=1).ravel()
-
-    far = np.linalg.norm(camera.t, axis=1)[:, None] * np.full(3, CAMERA_SIGMA[1])
-    sigma = np.concatenate([np.full_like(far, CAMERA_SIGMA[0]), far], axis=1).ravel()
+    sigma = _camera_unit(rough[views]).ravel()
     of_cameras = Variables(
-        "camera",
+        "cameras",
         all_free(len(views), 6),
-        Frames.moved,
-        coordinates=from_start,
+        _camera_after,
+        coordinates=lambda now: _camera_change(rough[views], now).ravel(),
         prior=GaussianPrior(np.arange(len(sigma)), np.zeros(len(sigma)), sigma),
     )
     each, n_model = np.arange(len(keys)), model(state).r.shape[1]
     for tolerance in FITTED:
         problem = Problem[_State](
             (of_cameras,),
-            Variables("platform", all_free(len(keys), 6), Frames.moved),
+            Variables("poses", all_free(len(keys), 6), poses_after),
             (
                 Factor(
                     "lines",
                     partial(lines, tolerance=tolerance),
-                    (("camera", view, slice(None)),),
+                    (("cameras", view, slice(None)),),
                     len(images),
                     n_rows,
                     element,

@@ -58,6 +58,11 @@ DETECTOR_VERSION = 9  # raise it whenever outlines or notes that are kept come o
 MEASURING = "Measuring outlines"  # a stage of progress
 CHOICE_ROUNDS = 2  # in which outlines decide between poses that readings leave open
 FreePosesOf = Mapping[int, tuple[RigidTransform, ...]]  # T_base_platform of poses, likeliest first
+TOO_FEW_LEGS = "shows too few legs to place the platform"  # a reason
+# Outlines that check a pose which readings do not give: with fewer of them one image in two shows
+# as many at a wrong pose.
+MIN_OUTLINES = 5
+MIN_POSES = 3  # of a view, so that they check its camera
 MIN_VIEWS = 2  # in which a part must show another radius than the model's
 MAX_USED_SHARE = 0.3  # of the outlines of a part that should be seen
 
@@ -198,16 +203,21 @@ def place_and_measure(
     usable = np.array([row for row in photographs.detect if row not in defects], dtype=np.intp)
     nominal, free_poses = _with_free_poses(photographs, nominal, pairs, usable, report)
     hints = nominal.T_base_camera
-    if any(len(choices) > 1 for choices in free_poses.values()):
-        nominal, free_poses = _decided_by_outlines(
+    if free_poses:
+        nominal, free_poses, shown = _decided_by_outlines(
             photographs, nominal, free_poses, usable, report, joined
         )
+        doubtful = _in_doubt(photographs.measurements, usable, shown)
+        defects |= doubtful
+        usable = np.setdiff1d(usable, list(doubtful))
     search = photographs.search(nominal, pairs, rough)
     recognised = partial(_recognised, photographs, search, usable, hints, report, joined)
     placement = recognised()
     outlines, blur = _measured(photographs, search, placement, report, together=together)
     at_nominal = _Measured(photographs, search, placement, outlines, blur)
-    measured = _with_other_radii(at_nominal, recognised, report, together=together)
+    measured = at_nominal
+    if not free_poses:  # which would follow wrong radii, and these wrong poses
+        measured = _with_other_radii(at_nominal, recognised, report, together=together)
     photographs, search, outlines = measured.photographs, measured.search, measured.outlines
     groups = group_views(photographs.measurements, usable, hints, joined)
     is_own = np.isin(outlines.row, usable)
@@ -334,6 +344,20 @@ def _at_poses(
     return replace(nominal, B_base=B_base)
 
 
+def _in_doubt(
+    measurements: Measurements, rows: IntArray, n_outlines: Mapping[int, int]
+) -> dict[int, str]:
+    """Return why images do not tell where the platform is, by row, by the outlines of poses."""
+    checked = np.array([n_outlines[k] >= MIN_OUTLINES for k in measurements.pose[rows].tolist()])
+    reasons = dict.fromkeys(rows[~checked].tolist(), TOO_FEW_LEGS)
+    left, view = rows[checked], measurements.view
+    for v in np.unique(view[left]).tolist():
+        own = left[view[left] == v]
+        if len(np.unique(measurements.pose[own])) < MIN_POSES:
+            reasons |= dict.fromkeys(own.tolist(), f"{TOO_FEW_LEGS}, as most of its view do")
+    return reasons
+
+
 def _decided_by_outlines(
     photographs: Photographs,
     nominal: Placement,
@@ -341,9 +365,10 @@ def _decided_by_outlines(
     rows: IntArray,
     report: Report,
     joined: Joined,
-) -> tuple[Placement, FreePosesOf]:
+) -> tuple[Placement, FreePosesOf, dict[int, int]]:
     """Return the legs at those of several poses at which most outlines can be measured.
 
+    With the number of outlines there, by pose.
     They are measured at the likeliest poses of all images first, then at others before cameras
     that these have placed; twice, since cameras stand better with better poses.
     """
@@ -371,7 +396,7 @@ def _decided_by_outlines(
         }
         first = {pose: every[0] for pose, every in choices.items()}
         nominal = _at_poses(photographs, nominal, first)
-    return nominal, choices
+    return nominal, choices, most
 
 
 def measure_photographs(

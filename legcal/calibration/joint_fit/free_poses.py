@@ -25,7 +25,6 @@ from legcal.estimation import (
 from legcal.geometry import Array, BoolArray
 from legcal.machine import first_rods, freedoms, pose_equations
 
-TOO_FEW_LEGS = "shows too few legs to place the platform"  # a reason
 _SEED, _DRAWN = 1965, 16  # places from which every pose is looked for, beside where it is
 _TURN, _SHIFT = 0.4, 0.3  # of these from there [rad, mean leg lengths], one standard deviation
 _STEPS = 25  # of a pose

@@ -20,7 +20,7 @@ from legcal.calibration.joint_fit.diagnostics import (
     reversed_motors,
     scale_notes,
 )
-from legcal.calibration.joint_fit.free_poses import TOO_FEW_LEGS, of_determined_poses
+from legcal.calibration.joint_fit.free_poses import of_determined_poses
 from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.outlier_readings import (
     JudgedReadings,
@@ -62,6 +62,7 @@ from legcal.machine import (
     radius_name,
     with_platform_points,
 )
+from legcal.perception import TOO_FEW_LEGS
 from legcal.vision import Camera, Link
 
 _SIGNIFICANT = 5.0  # standard deviations of chi2
