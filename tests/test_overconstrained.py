@@ -5,6 +5,7 @@ the base lie along the line of the bases (four angles), the axes at the platform
 across the line of the platform joints (three) and across the outer ones (two twists).
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
@@ -203,6 +204,14 @@ def test_a_machine_off_its_mobility_is_refused(
 ) -> None:
     path = write_machine(tmp_path, tilted(end, angle), LAYOUTS[0])
     with pytest.raises(OutOfClass, match=rf"'machine' .*{found}"):
+        load_mechanism(path)
+
+
+def test_a_file_of_nine_decimals_is_refused_for_its_digits(tmp_path: Path) -> None:
+    path = write_machine(tmp_path, exechon(), LAYOUTS[0])
+    urdf = path.with_suffix(".urdf")
+    urdf.write_text(re.sub(r"-?\d\.\d{9,}", lambda x: f"{float(x[0]):.9f}", urdf.read_text()))
+    with pytest.raises(OutOfClass, match=r"2 of the 5 constraints .* with all digits"):
         load_mechanism(path)
 
 

@@ -64,7 +64,7 @@ _MAX_STEP = 0.3  # step [rad, m]
 
 _NO_BLOCK = (
     ("legcal.home could not be used", "the pose that the file draws could not be used"),
-    ("legcal.home is not given", "no closed pose was found near the one that the file draws"),
+    ("legcal.home is not given", "the file draws no closed pose"),
     ("write legcal.home", "add a block legcal with home"),
     ("correct legcal.home", "add a block legcal with another home"),
     ("check legcal.home or the limits", "check the limits, or add a block legcal with home"),
@@ -424,13 +424,16 @@ def completed(source: Source) -> Source:
     configuration = start if found is None else found
     urdf = source.urdf
     sliders = sliders_without_travel(urdf)
-    if sliders and found is not None and _off(chain, start) > CLOSED:
+    is_drawn_open = _off(chain, start) > CLOSED
+    if sliders and found is not None and is_drawn_open:
         configuration = found = _levelled(chain, found, source, closures)
     poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
     if sliders:
         readings = {name: float(configuration[chain.q_index(name)]) for name in sliders}
         source = _with_travel(source, readings, poses)
-    return source if found is None else replace(source, poses=poses)
+    if found is None:
+        return source
+    return replace(source, poses=poses, is_drawn_open=is_drawn_open and not sliders)
 
 
 def _levelled(
