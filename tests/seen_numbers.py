@@ -59,5 +59,3 @@ def n_seen(machine: Machine) -> int:
     singular = np.linalg.svd(np.column_stack(columns), compute_uv=False)
     n_twists = sum(leg.twist is not None for leg in legs)
     return int(np.sum(singular > 1e-6 * singular[0])) - (6 if machine.spatial else 3) - n_twists
-
-
