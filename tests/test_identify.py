@@ -367,6 +367,8 @@ def test_any_views_of_any_model_are_judged(data: st.DataObject) -> None:
         ("leg3.radius.rod c1.fx", "radius of leg 3 and fx of camera c1 together"),
         ("c1.fy c2.fx c1.fx", "fx and fy of camera c1 and fx of camera c2 together"),
         ("leg1.left.k1", "k1 of camera leg1.left"),
+        ("platform_board.scale leg1.offset",
+         "size of the board on the platform and offset of leg 1 together"),
         ("leg1.offset leg1.base.x leg2.base.y leg3.base.z leg4.platform.x",
          "offset of leg 1, x of base joint 1, y of base joint 2 and 2 more such changes together"),
     ],
