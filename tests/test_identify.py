@@ -308,6 +308,16 @@ def test_choices_determine_what_they_say_and_no_more() -> None:
     assert rank(vague) == alone
 
 
+@pytest.mark.parametrize(("name", "noted"), [("3-rps", True), ("hexapod", False)])
+def test_directions_that_a_fit_would_refuse_are_noted(name: str, noted: bool) -> None:
+    machine = legcal.load_mechanism(name)
+    report = identifiability(machine, [machine.leg_names])
+    assert report.identifiable
+    assert report.platform_sigma is not None
+    assert (report.platform_sigma.dX_m > 0.02) == noted
+    assert any("a tenth of a leg" in note for note in report.notes) == noted
+
+
 def test_what_is_odd_about_a_machine_is_noted(tmp_path: Path) -> None:
     entry = yaml.safe_load(SHIPPED_YAML.read_text())
     entry["name_mot"] = entry["name_mot"][:-1]
