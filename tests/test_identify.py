@@ -311,7 +311,7 @@ def test_choices_determine_what_they_say_and_no_more() -> None:
 @pytest.mark.parametrize(("name", "noted"), [("3-rps", True), ("hexapod", False)])
 def test_directions_that_a_fit_would_refuse_are_noted(name: str, noted: bool) -> None:
     machine = legcal.load_mechanism(name)
-    report = identifiability(machine, [machine.leg_names])
+    report = legcal.identifiability(machine, [machine.leg_names])
     assert report.identifiable
     assert report.platform_sigma is not None
     assert (report.platform_sigma.dX_m > 0.02) == noted
