@@ -1,24 +1,21 @@
 """Types, mobility, constraints and motors of every layout, against the screws of the joints."""
 
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
-import numpy as np
 import pytest
-from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
+from layouts import Layout, LegLayout, MachineSpec, write_machine
 from leg_screws import freedoms_of
-from machines import exechon, four_upu, of_types, planar, two_upr_two_sps
+from machines import exechon, exechon_and_sps, four_upu, of_types, planar, two_upr_two_sps
 from seen_numbers import n_seen
 
 from legcal import identifiability
 from legcal.machine import geometries, load_mechanism
 
 A, P, C = "actuated", "passive", "constant"
-EXTRA = LegSpec("SS", np.array([-0.05, -0.25, 0.0]), np.array([-0.02, -0.1, 0.41]))
 KINDS: dict[str, MachineSpec] = {
     "Exechon": exechon(),
-    "Exechon + SPS": replace(exechon(), legs=(*exechon().legs, EXTRA)),
+    "Exechon + SPS": exechon_and_sps(),
     "2-UPR + 2-SPS": two_upr_two_sps(),
     "4-UPU": four_upu(),
     "TriVariant": of_types(["SS", "SS", "U"]),

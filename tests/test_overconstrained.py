@@ -16,7 +16,7 @@ import pytest
 from bound import ERRORS
 from fit_sessions import MachineSession, machine_session
 from layouts import Layout, LegLayout, MachineSpec, write_machine
-from machines import exechon, four_upu, two_upr_two_sps
+from machines import exechon, exechon_and_sps, four_upu, two_upr_two_sps
 from outline_sessions import Noise, design_of, draw_session, made, one_fit
 from scipy.spatial.transform import Rotation
 from thinned import thinned
@@ -230,8 +230,11 @@ def test_free_poses_that_the_legs_cannot_follow_stay(tmp_path: Path) -> None:
     assert np.isfinite(moved).all()
 
 
-def test_ways_of_dependent_constraints_need_no_short_steps(tmp_path: Path) -> None:
-    machine = written("2-UPR + 2-SPS", LAYOUTS[0], tmp_path)
+@pytest.mark.parametrize("drawn", [two_upr_two_sps, exechon_and_sps])
+def test_ways_of_dependent_constraints_need_no_short_steps(
+    drawn: Callable[[], MachineSpec], tmp_path: Path
+) -> None:
+    machine = load_mechanism(write_machine(tmp_path, drawn(), LAYOUTS[0]))
     home = inverse_kinematics(machine, machine.home)
     lower, upper = np.array([leg.travel for leg in machine.legs]).T
     q = home + 0.4 * (np.random.default_rng(1).uniform(lower, upper, (30, len(home))) - home)
