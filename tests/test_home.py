@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 import yaml
 from layouts import Layout, LegLayout, MachineSpec, write_machine
-from machines import HOME, MACHINES, SHIPPED, displaced, exechon, of_types, write_home
+from machines import (
+    HOME,
+    MACHINES,
+    SHIPPED,
+    displaced,
+    exechon,
+    exechon_and_ups,
+    of_types,
+    write_home,
+)
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
@@ -140,11 +149,13 @@ def test_a_home_is_found_for_general_machines(description: str, tmp_path: Path) 
     np.testing.assert_allclose(q[motors], middle[motors], atol=1e-9)
 
 
-@pytest.mark.parametrize("types", [["US"] * 6 + ["SS"], ["RS"] * 3 + ["SS"]])
+@pytest.mark.parametrize(
+    "drawn", [of_types(["US"] * 6 + ["SS"]), of_types(["RS"] * 3 + ["SS"]), exechon_and_ups()]
+)
 def test_more_motors_than_freedoms_are_nearest_to_mid_travel(
-    types: list[str], tmp_path: Path
+    drawn: MachineSpec, tmp_path: Path
 ) -> None:
-    machine = load_mechanism(write_machine(tmp_path, of_types(types), Layout(home=False)))
+    machine = load_mechanism(write_machine(tmp_path, drawn, Layout(home=False)))
     check_closed(machine)
     assert any("as near mid-travel as they are together" in note for note in machine.diagnostics)
     lower, upper = np.array([leg.travel for leg in machine.legs]).T

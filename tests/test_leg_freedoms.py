@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from layouts import Layout, LegLayout, MachineSpec, write_machine
 from leg_screws import freedoms_of
-from machines import exechon, exechon_and_sps, four_upu, of_types, planar, two_upr_two_sps
+from machines import exechon, exechon_and_ups, four_upu, of_types, planar, two_upr_two_sps
 from seen_numbers import n_seen
 
 from legcal import identifiability
@@ -15,7 +15,7 @@ from legcal.machine import geometries, load_mechanism
 A, P, C = "actuated", "passive", "constant"
 KINDS: dict[str, MachineSpec] = {
     "Exechon": exechon(),
-    "Exechon + SPS": exechon_and_sps(),
+    "Exechon + UPS": exechon_and_ups(),
     "2-UPR + 2-SPS": two_upr_two_sps(),
     "4-UPU": four_upu(),
     "TriVariant": of_types(["SS", "SS", "U"]),

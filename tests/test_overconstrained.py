@@ -16,7 +16,7 @@ import pytest
 from bound import ERRORS
 from fit_sessions import MachineSession, machine_session
 from layouts import Layout, LegLayout, MachineSpec, write_machine
-from machines import exechon, exechon_and_sps, four_upu, two_upr_two_sps
+from machines import exechon, exechon_and_ups, four_upu, two_upr_two_sps
 from outline_sessions import Noise, design_of, draw_session, made, one_fit
 from scipy.spatial.transform import Rotation
 from thinned import thinned
@@ -230,7 +230,7 @@ def test_free_poses_that_the_legs_cannot_follow_stay(tmp_path: Path) -> None:
     assert np.isfinite(moved).all()
 
 
-@pytest.mark.parametrize("drawn", [two_upr_two_sps, exechon_and_sps])
+@pytest.mark.parametrize("drawn", [two_upr_two_sps, exechon_and_ups])
 def test_ways_of_dependent_constraints_need_no_short_steps(
     drawn: Callable[[], MachineSpec], tmp_path: Path
 ) -> None:

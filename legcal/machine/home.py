@@ -19,6 +19,7 @@ from legcal.machine.equations import (
     PoseEquations,
     is_constrained,
     least_squares_equations,
+    machine_equations,
     machine_equations_at,
 )
 from legcal.machine.leg import Leg, LegKind
@@ -33,6 +34,7 @@ MIN_TRIALS = 20  # trials, where one of them found a pose above the base
 MIN_APART = 0.05  # of the reach, by which a platform is above or below the base
 BATCH = 21  # trials solved at once
 MAX_STALLED = 5  # steps that change little
+_FAR, _DEPENDENT = 0.1, 1e-7  # of a leg length, and of the largest singular value
 _REGULAR = 1e-4  # singularity measure, beyond which motors hold the platform
 MAX_OUTSIDE = 1.0  # of the travel: refused beyond, if it is also beyond
 _MAX_OUTSIDE_OF_LEG = 0.01  # of the leg length at home, for sliders that hardly move
@@ -206,7 +208,8 @@ def _at_readings(
     found = solved(exact, poses)
     holds = found.worst < 1e-9
     if found.jacobian.shape[1] > 6 and not holds.any() and not machine.actuators:
-        found = solved(lambda poses: least_squares_equations(missed(poses)), found.points)
+        poses, n_dependent = _on_constraints(machine, found.points)
+        found = solved(lambda x: least_squares_equations(missed(x), n_dependent), poses)
         singular = np.linalg.svd(found.jacobian * unit, compute_uv=False)[:, -1]
         holds = (found.worst < 1e-9) & (singular > _REGULAR)
         holds &= [_in_travel(machine, pose) for pose in found.points]
@@ -214,6 +217,19 @@ def _at_readings(
         motion_of(pose[:, :3], pose[:, 3]) if held else None
         for pose, held in zip(found.points, holds, strict=True)
     ]
+
+
+def _on_constraints(machine: Machine, poses: Array) -> tuple[Array, int]:
+    """Return poses (k, 3, 4) where the constraints hold, if these are near, and how many depend."""
+    near = [project_pose(machine, motion_of(T[:, :3], T[:, 3]), _FAR) for T in poses]
+    held = np.array([problem is None for _, problem in near])
+    poses = np.array([T.as_matrix()[:3] for T, _ in near])
+    found = machine_equations(machine, poses[held, :, :3], poses[held, :, 3])
+    constraints = found.by_pose[:, ~found.measured]
+    n = constraints.shape[1]
+    if n == 0 or not held.any():
+        return poses, 0
+    return poses, n - int(np.linalg.matrix_rank(constraints, rtol=_DEPENDENT).max())
 
 
 def _in_travel(machine: Machine, pose: Array) -> bool:
