@@ -330,9 +330,10 @@ def _rough_notes(analysis: Analysis) -> list[str]:
     words = min((weak.direction for weak in found), key=len)
     more = f" and {len(found) - 1} more" if len(found) > 1 else ""
     return [
-        f"Determined, but to no better than {1e3 * _ROUGH * predicted.mean_length:.0f} mm (a tenth "
-        f"of a leg, 1 sigma): {words}{more}; calibrate refuses directions that are no better "
-        "known; add images from other directions, or at poses that differ more."
+        "From outlines good to 0.1 px known to no better than "
+        f"{1e3 * _ROUGH * predicted.mean_length:.0f} mm (a tenth of a leg, 1 sigma): {words}{more}; "
+        "calibrate refuses what its own measurements leave so rough. Add images from other "
+        "directions, or at poses that differ more."
     ]
 
 
