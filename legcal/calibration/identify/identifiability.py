@@ -329,11 +329,11 @@ def _rough_notes(analysis: Analysis) -> list[str]:
         return []
     words = min((weak.direction for weak in found), key=len)
     more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+    known = f"{1e3 * _ROUGH * predicted.mean_length:.0f} mm (a tenth of a leg, 1 sigma)"
     return [
-        "From outlines good to 0.1 px known to no better than "
-        f"{1e3 * _ROUGH * predicted.mean_length:.0f} mm (a tenth of a leg, 1 sigma): {words}{more}; "
-        "calibrate refuses what its own measurements leave so rough. Add images from other "
-        "directions, or at poses that differ more."
+        f"From outlines good to 0.1 px known to no better than {known}: {words}{more}; calibrate "
+        "refuses what its own measurements leave so rough. Add images from other directions, or at "
+        "poses that differ more."
     ]
 
 
