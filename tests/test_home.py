@@ -183,6 +183,22 @@ def test_where_a_file_without_a_block_draws_open_loops_travel_decides(
     np.testing.assert_allclose(readings_at(machine, machine.home), middle, atol=1e-9)
 
 
+def test_loops_that_few_digits_open_are_drawn_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("layouts.PASSED", 0.0)  # drawn at home, and not at mid-travel
+    path = write_machine(tmp_path, of_types(["US"] * 6), CARRIED)
+    urdf = path.with_suffix(".urdf")
+    urdf.write_text(re.sub(r"-?\d\.\d{6,}", lambda x: f"{float(x[0]):.5f}", urdf.read_text()))
+    document = yaml.safe_load(path.read_text())
+    document.pop("legcal")
+    path.write_text(yaml.safe_dump(document))
+    machine = load_mechanism(path)
+    check_closed(machine)
+    assert np.abs(readings_at(machine, machine.home)).max() < 1e-3
+    assert not any("draws no closed pose" in note for note in machine.diagnostics)
+
+
 def test_that_there_is_no_home_at_all_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

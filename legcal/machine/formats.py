@@ -58,6 +58,7 @@ _AXES = dict(zip("XYZ", np.eye(3), strict=True))
 TRIALS = 24
 STEPS = 200
 CLOSED = 1e-10  # [m] and [rad]
+_OPEN = 0.01  # of the size of the machine: loops that are open so far draw no home
 _RIGID = 1e-3  # determinants of rotations but for rounding
 _SPREAD = 0.1  # [rad] and [m], of the start of a trial, times its number
 _MAX_STEP = 0.3  # step [rad, m]
@@ -424,8 +425,8 @@ def completed(source: Source) -> Source:
     configuration = start if found is None else found
     urdf = source.urdf
     sliders = sliders_without_travel(urdf)
-    is_drawn_open = _off(chain, start) > CLOSED
-    if sliders and found is not None and is_drawn_open:
+    off = _off(chain, start)
+    if sliders and found is not None and off > CLOSED:
         configuration = found = _levelled(chain, found, source, closures)
     poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
     if sliders:
@@ -433,7 +434,8 @@ def completed(source: Source) -> Source:
         source = _with_travel(source, readings, poses)
     if found is None:
         return source
-    return replace(source, poses=poses, is_drawn_open=is_drawn_open and not sliders)
+    size = float(np.ptp([pose.translation for pose in poses.values()], axis=0).max())
+    return replace(source, poses=poses, is_drawn_open=not sliders and off > _OPEN * size)
 
 
 def _levelled(
