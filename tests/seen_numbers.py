@@ -50,7 +50,7 @@ def n_seen(machine: Machine) -> int:
         moves[:, LegColumns.LENGTH] = [leg.kind is not LegKind.PASSIVE for leg in legs]
     place = np.where(moves, np.cumsum(moves.ravel()).reshape(moves.shape) - 1, -1)
     columns = []
-    for step in 1e-6 * np.eye(np.count_nonzero(moves)):
+    for step in 1e-6 * np.eye(int(np.count_nonzero(moves))):
         lines = [
             lines_of(moved_legs(legs, place, s), machine, reached.R, reached.t, q)
             for s in (step, -step)
