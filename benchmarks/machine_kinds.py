@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python benchmarks/machine_kinds.py [KIND ...] [--runs 200] [--seed 0]
                          [--datasets 0] [--level axes|outlines|photographs] [--keep FOLDER]
-                         [--record FILE]
+                         [--record FILE] [--wrong-reading MM] [--wrong-scale PERCENT]
 
 KIND: a table of ``machine_kinds.yaml`` (all of them without), which is a table of joints without
 version, name and unit (mm). Two things are asked:
@@ -17,11 +17,17 @@ version, name and unit (mm). Two things are asked:
   and after, how the latter compares with the predicted sigma, and the normalised squared error of
   the parameters (means over seeds). Where motors do not determine the pose, cameras have hints, and
   errors are those of the parameters in metres (root mean square).
+
+A mistake is made in the readings of each dataset by ``--wrong-reading`` (so much is added to one of
+them) and ``--wrong-scale`` (those of one motor are so much larger); row and motor are drawn by the
+seed. What the fit names is printed; errors are those at the right readings.
 """
 
 import argparse
+import csv
 import json
 import math
+import shutil
 import sys
 import time
 from collections.abc import Sequence
@@ -97,7 +103,54 @@ def sessions(kind: str, runs: int, seed: int, record: Path | None) -> str:
     return f"{line}  {failures_of(records) or ''}"
 
 
-def datasets(kind: str, level: Level, seeds: Sequence[int], scratch: Path) -> str:
+def with_mistake(folder: Path, machine: Machine, seed: int, added: float, scale: float) -> Path:
+    """Return a copy of a dataset in whose readings a mistake was made, and print which.
+
+    *added* [m] is what one reading is larger by, and *scale* what those of a motor are multiplied
+    by.
+    """
+    wrong = shutil.copytree(folder, folder.with_name(f"{folder.name}-wrong"), dirs_exist_ok=True)
+    with (folder / "measurements.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    rng = np.random.default_rng(seed)
+    row, leg = int(rng.integers(len(rows))), machine.legs[int(rng.choice(machine.motors))]
+    motor, image = str(leg.prismatic), rows[row]["image"] or f"row {row + 1}"
+    for k, entry in enumerate(rows):
+        entry[motor] = repr(scale * float(entry[motor]) + (added if k == row else 0.0))
+    with (wrong / "measurements.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    if added:
+        print(f"{folder.name}: {1e3 * added:+g} mm in {leg.motor_label} of {image}")
+    if scale != 1.0:
+        print(f"{folder.name}: {100.0 * (scale - 1.0):+g} % in {leg.motor_label}")
+    return wrong
+
+
+def named_readings(solution: Solution) -> list[str]:
+    """Return what a fit says is wrong with readings, in words."""
+    judged = solution.redundant_readings
+    if judged is None:
+        return []
+    return [
+        *(
+            f"{' or '.join((one.motor, *one.alike))} of {one.image or f'pose {one.pose + 1}'} is "
+            f"{1e3 * one.off:+.3f} mm off"
+            for one in judged.wrong
+        ),
+        *judged.doubts,
+    ]
+
+
+def datasets(
+    kind: str,
+    level: Level,
+    seeds: Sequence[int],
+    scratch: Path,
+    added: float = 0.0,
+    scale: float = 1.0,
+) -> str:
     """Print a line a dataset, and return one on all that were calibrated."""
     machine = load_mechanism(kind) if kind in CARRIED else made(kind, scratch / "nominal")
     model, found, hints = machine.yaml_path, [], not machine.is_determined
@@ -112,7 +165,10 @@ def datasets(kind: str, level: Level, seeds: Sequence[int], scratch: Path) -> st
             begin = time.perf_counter()
             truth = next((folder / "truth/models").glob("*.yaml"))
             priors = measured_length(truth) if any(a.turns for a in machine.actuators) else []
-            calibration = calibrate(folder, output=result, use_cache=False, priors=priors)
+            read = folder
+            if added or scale != 1.0:
+                read = with_mistake(folder, machine, seed, added, scale)
+            calibration = calibrate(read, output=result, use_cache=False, priors=priors)
             both = [
                 evaluate(path, truth, dataset=folder)
                 for path in (model, result / "calibrated.yaml")
@@ -140,6 +196,8 @@ def datasets(kind: str, level: Level, seeds: Sequence[int], scratch: Path) -> st
         nse = f", nse {squared[-1]:5.2f}"
         print(f"{kind:20}{seed:4}{numbers(found[-1])}{nse}{seconds:6.0f} s", end="")
         print("" if trusted else f", not trusted: {calibration.verdict.sentence}", flush=True)
+        for words in named_readings(solution):
+            print(f"  named: {words}", flush=True)
     line = f"{kind:20}{len(found):4} of {len(seeds)} converge from {level}, {n_trusted} trusted"
     line += numbers(np.mean(found, axis=0)) if found else ""
     return line + (f", nse {np.mean(squared):5.2f}" if squared else "")
@@ -204,6 +262,8 @@ def main() -> None:
     parser.add_argument("--level", type=Level, default=Level.OUTLINES, choices=list(Level))
     parser.add_argument("--keep", type=Path, help="folder that keeps datasets for the next run")
     parser.add_argument("--record", type=Path, help="JSON lines of sessions, to go on from later")
+    parser.add_argument("--wrong-reading", type=float, default=0.0, help="[mm] in one; none")
+    parser.add_argument("--wrong-scale", type=float, default=0.0, help="[%%] of a motor; none")
     options = parser.parse_args()
     known = (*kinds(), *ROUND_ARMS, *CARRIED)
     if unknown := set(options.kinds) - set(known):
@@ -218,7 +278,8 @@ def main() -> None:
         with TemporaryDirectory() as temporary:
             scratch = options.keep or Path(temporary)
             scratch.mkdir(parents=True, exist_ok=True)
-            summary = [datasets(kind, options.level, seeds, scratch) for kind in chosen]
+            mistake = 1e-3 * options.wrong_reading, 1.0 + 0.01 * options.wrong_scale
+            summary = [datasets(kind, options.level, seeds, scratch, *mistake) for kind in chosen]
         print(*summary, sep="\n")
 
 

@@ -212,6 +212,14 @@ def exechon() -> MachineSpec:
     return MachineSpec(legs, RigidTransform.from_components([0.0, 0.03, 0.4], tilt))
 
 
+def exechon_and_ups() -> MachineSpec:
+    """Return an :func:`exechon` with a fourth motor, one more than its freedoms."""
+    machine = exechon()
+    A, B, axis = np.array([[-0.05, -0.25, 0.0], [-0.02, -0.1, 0.41], [1.0, 0.0, 0.0]])
+    more = LegSpec("US", A, B, base_axis=axis)
+    return MachineSpec((*machine.legs, more), machine.home)
+
+
 def two_upr_two_sps() -> MachineSpec:
     """Return the legs 1 and 2 of an :func:`exechon` with two SPS legs: four freedoms."""
     machine = exechon()

@@ -9,22 +9,12 @@ import pytest
 from fit_sessions import machine_session
 from layouts import Layout, LegLayout, write_machine
 from machines import of_types
+from seen_numbers import n_seen
 from thinned import thinned
 
 from legcal import identifiability
 from legcal.calibration.joint_fit import refine
-from legcal.geometry import Array, cross
-from legcal.machine import (
-    Leg,
-    LegColumns,
-    LegKind,
-    Machine,
-    geometries,
-    load_mechanism,
-    moved_legs,
-    platform_in_base,
-    solve_poses,
-)
+from legcal.machine import load_mechanism
 
 A, P = "actuated", "passive"
 KINDS: dict[str, tuple[list[str], list[str], tuple[int, ...]]] = {
@@ -47,43 +37,6 @@ def written(kind: str, layout: Layout, folder: Path) -> Path:
     """Write a machine with a leg that is fixed to its platform."""
     types, kinds, frame = KINDS[kind]
     return write_machine(folder, replace(of_types(types, kinds), frame_legs=frame), layout)
-
-
-def lines_of(legs: tuple[Leg, ...], machine: Machine, R: Array, t: Array, q: Array) -> Array:
-    """Return the lines of all legs at readings q, seen from the base."""
-    poses = solve_poses(legs, machine.frame_legs, R, t, q)
-    ends = np.stack([poses.R @ leg.B + poses.t for leg in legs], axis=1)
-    bases = np.array([leg.A for leg in legs])
-    along = (ends - bases) / np.linalg.norm(ends - bases, axis=2)[..., None]
-    return np.concatenate([along, cross(bases, along)], axis=2)
-
-
-def n_seen(machine: Machine) -> int:
-    """Return how many numbers of a machine show in its lines, beside where its base stands.
-
-    Every number of every leg is moved, twists apart, which count as known.
-    """
-    legs, home = geometries(machine), platform_in_base(machine, machine.home)
-    rng, n = np.random.default_rng(1), 14
-    shape = n, len(legs)
-    q = np.full(shape, np.nan)
-    lengths = np.linalg.norm([home.apply(leg.B) - leg.A for leg in legs], axis=1)
-    for j, leg in enumerate(legs):
-        if leg.kind is LegKind.ACTUATED:
-            q[:, j] = lengths[j] - leg.q0 + rng.uniform(-0.03, 0.03, n)
-    R, t = np.repeat(home.as_matrix()[None, :3], n, 0)[:, :, :3], np.tile(home.translation, (n, 1))
-    reached = solve_poses(legs, machine.frame_legs, R, t, q)
-    place = np.arange(len(legs) * LegColumns.COUNT).reshape(len(legs), -1)
-    columns = []
-    for step in 1e-5 * np.eye(place.size):
-        ends = [
-            lines_of(moved_legs(legs, place, s), machine, reached.R, reached.t, q)
-            for s in (step, -step)
-        ]
-        columns.append((ends[0] - ends[1]).ravel() / 2e-5)
-    singular = np.linalg.svd(np.column_stack(columns), compute_uv=False)
-    n_twists = sum(leg.twist is not None for leg in legs)
-    return int(np.sum(singular > 1e-6 * singular[0])) - 6 - n_twists
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,24 @@
 """Home: projected onto what rods and axes allow, found where none is given, refused if wrong."""
 
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from layouts import Layout, LegLayout, MachineSpec, write_machine
-from machines import HOME, MACHINES, SHIPPED, displaced, of_types, write_home
+from machines import (
+    HOME,
+    MACHINES,
+    SHIPPED,
+    displaced,
+    exechon,
+    exechon_and_ups,
+    of_types,
+    write_home,
+)
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
@@ -25,7 +36,9 @@ from legcal.machine import (
     platform_pose,
     pose_equations,
     readings_at,
+    slider_columns,
 )
+from legcal.machine.mobility import free_motions
 
 machine_of = cache(load_mechanism)
 CARRIED = Layout((LegLayout(cut="carry"), *[LegLayout(sphere=k % 2 == 0) for k in range(6)]))
@@ -136,12 +149,65 @@ def test_a_home_is_found_for_general_machines(description: str, tmp_path: Path) 
     np.testing.assert_allclose(q[motors], middle[motors], atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "drawn", [of_types(["US"] * 6 + ["SS"]), of_types(["RS"] * 3 + ["SS"]), exechon_and_ups()]
+)
+def test_more_motors_than_freedoms_are_nearest_to_mid_travel(
+    drawn: MachineSpec, tmp_path: Path
+) -> None:
+    machine = load_mechanism(write_machine(tmp_path, drawn, Layout(home=False)))
+    check_closed(machine)
+    assert any("as near mid-travel as they are together" in note for note in machine.diagnostics)
+    lower, upper = np.array([leg.travel for leg in machine.legs]).T
+    off = readings_at(machine, machine.home) - 0.5 * (lower + upper)
+    assert np.abs(off).max() > 1e-3
+    assert np.all(np.abs(off) < 0.5 * (upper - lower))
+    # no motion that the closures allow makes the sum of squares less
+    _, sliders = slider_columns(machine, machine.motors)
+    slope = off @ free_motions(machine, machine.home_configuration)[sliders]
+    np.testing.assert_allclose(slope, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("layout", [Layout(), CARRIED])
+def test_where_a_file_without_a_block_draws_open_loops_travel_decides(
+    layout: Layout, tmp_path: Path
+) -> None:
+    path = write_machine(tmp_path, exechon(), layout)
+    document = yaml.safe_load(path.read_text())
+    document.pop("legcal")
+    path.write_text(yaml.safe_dump(document))
+    machine = load_mechanism(path)
+    check_closed(machine)
+    assert any("the file draws no closed pose" in note for note in machine.diagnostics)
+    middle = [np.mean(leg.travel) for leg in machine.legs]
+    np.testing.assert_allclose(readings_at(machine, machine.home), middle, atol=1e-9)
+
+
+def test_loops_that_few_digits_open_are_drawn_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("layouts.PASSED", 0.0)  # drawn at home, and not at mid-travel
+    path = write_machine(tmp_path, of_types(["US"] * 6), CARRIED)
+    urdf = path.with_suffix(".urdf")
+    urdf.write_text(re.sub(r"-?\d\.\d{6,}", lambda x: f"{float(x[0]):.5f}", urdf.read_text()))
+    document = yaml.safe_load(path.read_text())
+    document.pop("legcal")
+    path.write_text(yaml.safe_dump(document))
+    machine = load_mechanism(path)
+    check_closed(machine)
+    assert np.abs(readings_at(machine, machine.home)).max() < 1e-3
+    assert not any("draws no closed pose" in note for note in machine.diagnostics)
+
+
 def test_that_there_is_no_home_at_all_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("legcal.machine.home.TRIALS", 8)
-    drawn = of_types(["US"] * 6 + ["SS"])  # seven motors: their middles contradict each other
-    path = write_machine(tmp_path, drawn, Layout(home=False))
+    path = write_machine(tmp_path, of_types(["US"] * 6 + ["SS"]), Layout(home=False))
+    urdf = path.with_suffix(".urdf")
+    limits = r'(<joint name="leg4_slider".*?)<limit lower="\S+" upper="\S+"'
+    longer = re.sub(limits, r'\1<limit lower="3.0" upper="3.1"', urdf.read_text())
+    urdf.write_text(longer)
     with pytest.raises(DidNotConverge, match=r"no home pose was found.*write legcal\.home"):
         load_mechanism(path)
 

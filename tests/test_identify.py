@@ -308,6 +308,16 @@ def test_choices_determine_what_they_say_and_no_more() -> None:
     assert rank(vague) == alone
 
 
+@pytest.mark.parametrize(("name", "noted"), [("3-rps", True), ("hexapod", False)])
+def test_directions_that_a_fit_would_refuse_are_noted(name: str, noted: bool) -> None:
+    machine = legcal.load_mechanism(name)
+    report = legcal.identifiability(machine, [machine.leg_names])
+    assert report.identifiable
+    assert report.platform_sigma is not None
+    assert (report.platform_sigma.dX_m > 0.02) == noted
+    assert any("a tenth of a leg" in note for note in report.notes) == noted
+
+
 def test_what_is_odd_about_a_machine_is_noted(tmp_path: Path) -> None:
     entry = yaml.safe_load(SHIPPED_YAML.read_text())
     entry["name_mot"] = entry["name_mot"][:-1]
@@ -367,6 +377,8 @@ def test_any_views_of_any_model_are_judged(data: st.DataObject) -> None:
         ("leg3.radius.rod c1.fx", "radius of leg 3 and fx of camera c1 together"),
         ("c1.fy c2.fx c1.fx", "fx and fy of camera c1 and fx of camera c2 together"),
         ("leg1.left.k1", "k1 of camera leg1.left"),
+        ("platform_board.scale leg1.offset",
+         "size of the board on the platform and offset of leg 1 together"),
         ("leg1.offset leg1.base.x leg2.base.y leg3.base.z leg4.platform.x",
          "offset of leg 1, x of base joint 1, y of base joint 2 and 2 more such changes together"),
     ],

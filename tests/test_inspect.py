@@ -95,6 +95,12 @@ def test_the_table_shows_millimetres_axes_and_twists_in_80_columns() -> None:
     assert "axis at base" in text
     assert f"{np.degrees(tilted['legs'][1]['twist']):.3f}" in text
     assert "axis at base" not in _printed(inspect_table(_described("3-rpr")))
+    for leg in tilted["legs"]:
+        leg["name"] = f"actuator_{leg['name']}"
+    text = _printed(inspect_table(tilted))
+    for heading in ("A in base [mm]", "R [mm]"):
+        below = text[text.index(heading) :].splitlines()[1:4]
+        assert [line.split()[0] for line in below] == [leg["name"] for leg in tilted["legs"]]
 
 
 def test_the_table_shows_signs_kinds_and_notes(tmp_path: Path) -> None:

@@ -5,7 +5,8 @@ import io
 import json
 import sys
 from pathlib import Path
-from typing import TypeVar
+from types import SimpleNamespace
+from typing import TypeVar, cast
 
 import bound as bound_study
 import classes_study
@@ -19,6 +20,7 @@ from convergence import ConvergenceStudy
 from fit_sessions import machine_session, shown_outlines
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from machine_kinds import normalised_error
 from outline_bound import Bound, Determined, at_best, band_of_ratio, bound_of
 from outline_sessions import (
     MACHINES,
@@ -37,6 +39,7 @@ from outline_study import (
     Found,
     OutlineStudy,
 )
+from parameter_steps import written_with
 from rich.console import Console
 from thinned import thinned
 
@@ -47,6 +50,7 @@ from legcal.machine import (
     Leg,
     LegKind,
     load_mechanism,
+    parametrization_of,
     platform_in_base,
     pose_equations,
     shipped_names,
@@ -621,3 +625,20 @@ def test_wrong_use_of_a_benchmark_is_one_sentence(
     monkeypatch.setattr(sys, "argv", ["study", *words])
     assert outline_study.run(study, "A study.") == 2
     assert message in capsys.readouterr().err
+
+
+def test_normalised_errors_of_axes_count_from_the_nominal_ones(tmp_path: Path) -> None:
+    nominal = load_mechanism("3-rps")
+    found, rng = parametrization_of(nominal), np.random.default_rng(2)
+    step = np.where([unit == "rad" for unit in found.units], 0.01, 2e-3)
+    away = step * rng.uniform(-1.0, 1.0, len(found))
+    sigma = 1e-3 * step
+    sigma[0] = 0.0  # a parameter that is held
+    error = sigma * rng.normal(size=len(found))
+    written = [
+        written_with(nominal, found, by, tmp_path / name).yaml_path
+        for name, by in {"truth": away, "calibrated": away + error}.items()
+    ]
+    solution = SimpleNamespace(parametrization=found, value_covariance=np.diag(sigma**2))
+    stated = normalised_error(nominal, written[1], written[0], cast(Solution, solution))
+    assert stated == pytest.approx(np.mean((error[1:] / sigma[1:]) ** 2), rel=1e-6)

@@ -5,6 +5,7 @@ the base lie along the line of the bases (four angles), the axes at the platform
 across the line of the platform joints (three) and across the outer ones (two twists).
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
@@ -15,7 +16,7 @@ import pytest
 from bound import ERRORS
 from fit_sessions import MachineSession, machine_session
 from layouts import Layout, LegLayout, MachineSpec, write_machine
-from machines import exechon, four_upu, two_upr_two_sps
+from machines import exechon, exechon_and_ups, four_upu, two_upr_two_sps
 from outline_sessions import Noise, design_of, draw_session, made, one_fit
 from scipy.spatial.transform import Rotation
 from thinned import thinned
@@ -206,6 +207,14 @@ def test_a_machine_off_its_mobility_is_refused(
         load_mechanism(path)
 
 
+def test_a_file_of_nine_decimals_is_refused_for_its_digits(tmp_path: Path) -> None:
+    path = write_machine(tmp_path, exechon(), LAYOUTS[0])
+    urdf = path.with_suffix(".urdf")
+    urdf.write_text(re.sub(r"-?\d\.\d{9,}", lambda x: f"{float(x[0]):.9f}", urdf.read_text()))
+    with pytest.raises(OutOfClass, match=r"2 of the 5 constraints .* with all digits"):
+        load_mechanism(path)
+
+
 def test_free_poses_that_the_legs_cannot_follow_stay(tmp_path: Path) -> None:
     machine = load_mechanism(write_machine(tmp_path, two_upr_two_sps(), LAYOUTS[0]))
     session = wrong_but_tied(machine_session(str(machine.yaml_path)), machine)
@@ -221,8 +230,11 @@ def test_free_poses_that_the_legs_cannot_follow_stay(tmp_path: Path) -> None:
     assert np.isfinite(moved).all()
 
 
-def test_ways_of_dependent_constraints_need_no_short_steps(tmp_path: Path) -> None:
-    machine = written("2-UPR + 2-SPS", LAYOUTS[0], tmp_path)
+@pytest.mark.parametrize("drawn", [two_upr_two_sps, exechon_and_ups])
+def test_ways_of_dependent_constraints_need_no_short_steps(
+    drawn: Callable[[], MachineSpec], tmp_path: Path
+) -> None:
+    machine = load_mechanism(write_machine(tmp_path, drawn(), LAYOUTS[0]))
     home = inverse_kinematics(machine, machine.home)
     lower, upper = np.array([leg.travel for leg in machine.legs]).T
     q = home + 0.4 * (np.random.default_rng(1).uniform(lower, upper, (30, len(home))) - home)

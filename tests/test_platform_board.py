@@ -141,7 +141,8 @@ def of_boards(tmp_path_factory: pytest.TempPathFactory) -> SimulatedDataset:
 def test_corners_of_two_boards_calibrate_a_machine_without_a_leg_or_a_rough_pose(
     of_boards: SimulatedDataset, tmp_path: Path
 ) -> None:
-    calibrate(of_boards.folder, output=tmp_path / "r")
+    calibration = calibrate(of_boards.folder, output=tmp_path / "r")
+    assert "steps need legs in sight: there is no staged.yaml" in calibration.summary()
     result = json.loads((tmp_path / "r/result.json").read_text())
     truth = json.loads((of_boards.folder / "truth/truth.json").read_text())
     error, nominal = (

@@ -533,7 +533,7 @@ class UnreachedRow(Document):
 
     row: int  # counted from 1, without the header
     view: str
-    image: str
+    image: str  # what other tables call it where it has none
     by: list[Literal["model", "reference"]]  # who does not reach it
 
 

@@ -22,7 +22,7 @@ from legcal.calibration.documents import (
     UnreachedRow,
 )
 from legcal.calibration.link_joints import compared_joints
-from legcal.data import Dataset, few, load_dataset
+from legcal.data import Dataset, few, load_dataset, row_names
 from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry import Array
 from legcal.machine import (
@@ -264,8 +264,9 @@ def _poses_at(machine: Machine, q: Array) -> list[RigidTransform | None]:
 def _unreached(dataset: Dataset, missed: Sequence[Sequence[bool]]) -> tuple[UnreachedRow, ...]:
     """Return the rows whose poses the model or the reference misses, in the order of the file."""
     m = dataset.measurements
+    names = row_names(m)
     return tuple(
-        UnreachedRow(row=row + 1, view=m.views[m.view[row]].name, image=m.image[row], by=by)
+        UnreachedRow(row=row + 1, view=m.views[m.view[row]].name, image=names[row], by=by)
         for row, pose in enumerate(m.pose.tolist())
         if (by := [who for who, off in zip(WHO, missed, strict=True) if off[pose]])
     )

@@ -289,7 +289,7 @@ def _contradictions(
 
 def _is_refused(found: Contradiction, machine: Machine) -> bool:
     """Say whether images cannot be searched at readings that contradict each other."""
-    return len(found.legs) > 1 and found.distance > _largest_residual(machine)
+    return len(found.legs) > 1 and found.distances[0] > _largest_residual(machine)
 
 
 def _largest_residual(machine: Machine) -> float:

@@ -320,6 +320,8 @@ def _observation_lines(result: Result) -> list[str]:
     most = sorted(seen.rejected.items(), key=lambda one: -one[1])[:_MAX_REASONS]
     rejected = ", ".join(f"{count} {reason}" for reason, count in most)
     lines = [f"Outlines: {seen.used} of {seen.total} used{f'; rejected: {rejected}' * bool(most)}."]
+    if seen.total == 0:  # boards are the whole measurement
+        lines = ["Outlines: none, no leg was measured."]
     return [*lines, *_left_out_lines(seen)]
 
 
@@ -364,6 +366,8 @@ def _of_board(link: Link, board: BoardBlock | None) -> list[str]:
 def _steps_lines(result: Result) -> list[str]:
     steps = result.stages.staged
     if isinstance(steps, NoSteps):
+        if result.observations is not None and result.observations.total == 0:
+            return ["The four steps need legs in sight: there is no staged.yaml."]
         return [f"The four steps alone gave no result, and no staged.yaml: {steps.failure}"]
     left_out = (
         f" They left out or at nominal {len(steps.diagnostics)} axes, joints or directions."

@@ -489,15 +489,17 @@ def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[in
     facts: dict[str, ImageFacts] = {}
     outlines = dataset.observations
     given = set() if outlines is None else set(outlines.row.tolist())
+    tables = f"outlines of it in {OBSERVATIONS_NAME}"
     if dataset.board_on("platform") is not None and dataset.corners is not None:
         given |= set(dataset.corners.row[dataset.corners.used].tolist())
+        tables += f" or corners in {CORNERS_NAME}"
     for row in range(measurements.n_rows):
         path = dataset.image_path(row)
         if path is None and row not in given:
             what = (
                 f"{table_path}, row {row + 1}, column image: the row could not be used: "
-                f"found neither an image nor outlines of it in {OBSERVATIONS_NAME}, needed one of "
-                "them; name an image or remove the row."
+                f"found neither an image nor {tables}, needed one of them; name an image or remove "
+                "the row."
             )
             problems.append((row, what))
         elif path is not None and (os.path.exists(path) or row not in given):

@@ -1,25 +1,32 @@
 """What deserves attention in a machine that was loaded, one sentence each."""
 
+import numpy as np
+
 from legcal.machine.home import legs_outside
 from legcal.machine.mobility import singularity
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.schema import LegcalBlock
 from legcal.machine.ties import ties_in_words
 
+_AT_MIDDLE = 1e-6  # [m, rad]
 _MIN_SINGULARITY = 1e-4  # singularity measure: less than that is the rounding of a file
 
 
 def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]:
     """Return what deserves attention in a mechanism, one sentence each."""
     notes = []
+    q = readings_at(machine, machine.home)
     if not home_is_given:
+        away = [q[j] - 0.5 * sum(machine.legs[j].travel) for j in machine.motors]
+        middle = "with all legs at mid-travel"
+        if np.abs(away).max(initial=0.0) > _AT_MIDDLE:
+            middle = "with all motors as near mid-travel as they are together"
         xyz = ", ".join(f"{x:.6g}" for x in machine.home.translation)
         quat = ", ".join(f"{x:.6g}" for x in machine.home.rotation.as_quat(canonical=True))
         notes.append(
-            "legcal.home is not given: a pose with all legs at mid-travel was taken, xyz "
+            f"legcal.home is not given: a pose {middle} was taken, xyz "
             f"[{xyz}], quat_xyzw [{quat}]; write it down if the machine is assembled this way."
         )
-    q = readings_at(machine, machine.home)
     outside = legs_outside(machine)
     for j, leg in enumerate(machine.legs):
         lower, upper = leg.travel

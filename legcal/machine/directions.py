@@ -55,8 +55,10 @@ _NOUN = {
     "platform_axis": ("platform axis of leg", "platform axes of legs"),
     "twist": ("twist of leg", "twists of legs"),
     "radius": ("radius of leg", "radii of legs"),
+    "board": ("size of the board on", "sizes of the boards on"),
     "": ("camera", "cameras"),
 }
+_BOARDS = {"board.scale": "the base", "platform_board.scale": "the platform"}
 _NOUN_OF_ACTUATOR = {
     "direction": ("direction of", "directions of"),
     "axis": ("axis of", "axes of"),
@@ -124,6 +126,7 @@ def _labelled(owners: Sequence[str], leg_names: Sequence[str]) -> list[str]:
 def _split(name: str, leg_names: Sequence[str]) -> tuple[str, str, str]:
     """Return leg, kind and coordinate of a parameter, or view, nothing and coordinate.
 
+    Of the size of a board it is the link.
     Names of legs may contain dots. Of a motor that moves joints at A it is its joint.
     """
     leg = owner_of_parameter(name, leg_names)
@@ -132,5 +135,7 @@ def _split(name: str, leg_names: Sequence[str]) -> tuple[str, str, str]:
         return leg, kind, which
     if of_actuator := _OF_ACTUATOR.fullmatch(name):
         return of_actuator[1], of_actuator[2] or of_actuator[3], ""
+    if name in _BOARDS:
+        return _BOARDS[name], "board", ""
     view, _, which = name.rpartition(".")
     return view, "", which

@@ -292,7 +292,10 @@ def _by_actuator(leg: Leg, moved: JointMotion, row: _EquationRow, local: Array) 
     return by_q + actuator.gain * by_angle
 
 
-def least_squares_equations(found: PoseEquations) -> tuple[Array, Array]:
+def least_squares_equations(
+    found: PoseEquations,
+    n_dependent: int = 0,  # constraints that follow from the others where all hold
+) -> tuple[Array, Array]:
     """Return equations (k, m) and derivatives (k, m, 6) that hold where readings miss least.
 
     They are the constraints as they are, and of the residuals of readings what no small motion that
@@ -300,7 +303,11 @@ def least_squares_equations(found: PoseEquations) -> tuple[Array, Array]:
     constraints exact.
     """
     constraints, J = found.by_pose[:, ~found.measured], found.by_pose[:, found.measured]
-    left = J - J @ (np.linalg.pinv(constraints, rcond=_DEPENDENT) @ constraints)
+    _, size, along = np.linalg.svd(constraints, full_matrices=False)
+    counts = size > _DEPENDENT * size[:, :1]
+    counts[:, max(constraints.shape[1] - n_dependent, 0) :] = False
+    along = along * counts[:, :, None]
+    left = J - J @ np.swapaxes(along, 1, 2) @ along
     U, singular, _ = np.linalg.svd(left, full_matrices=False)
     U = np.swapaxes(U * (singular > _SINGULAR * singular[:, :1])[:, None], 1, 2)
     residual = (U @ found.values[:, found.measured, None])[..., 0]

@@ -58,13 +58,14 @@ _AXES = dict(zip("XYZ", np.eye(3), strict=True))
 TRIALS = 24
 STEPS = 200
 CLOSED = 1e-10  # [m] and [rad]
+_OPEN = 0.01  # of the size of the machine: loops that are open so far draw no home
 _RIGID = 1e-3  # determinants of rotations but for rounding
 _SPREAD = 0.1  # [rad] and [m], of the start of a trial, times its number
 _MAX_STEP = 0.3  # step [rad, m]
 
 _NO_BLOCK = (
     ("legcal.home could not be used", "the pose that the file draws could not be used"),
-    ("legcal.home is not given", "no closed pose was found near the one that the file draws"),
+    ("legcal.home is not given", "the file draws no closed pose"),
     ("write legcal.home", "add a block legcal with home"),
     ("correct legcal.home", "add a block legcal with another home"),
     ("check legcal.home or the limits", "check the limits, or add a block legcal with home"),
@@ -424,13 +425,17 @@ def completed(source: Source) -> Source:
     configuration = start if found is None else found
     urdf = source.urdf
     sliders = sliders_without_travel(urdf)
-    if sliders and found is not None and _off(chain, start) > CLOSED:
+    off = _off(chain, start)
+    if sliders and found is not None and off > CLOSED:
         configuration = found = _levelled(chain, found, source, closures)
     poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
     if sliders:
         readings = {name: float(configuration[chain.q_index(name)]) for name in sliders}
         source = _with_travel(source, readings, poses)
-    return source if found is None else replace(source, poses=poses)
+    if found is None:
+        return source
+    size = float(np.ptp([pose.translation for pose in poses.values()], axis=0).max())
+    return replace(source, poses=poses, is_drawn_open=not sliders and off > _OPEN * size)
 
 
 def _levelled(

@@ -15,12 +15,18 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry import Array, motion_of
 from legcal.machine.closing import close_at
-from legcal.machine.equations import is_constrained, machine_equations_at
+from legcal.machine.equations import (
+    PoseEquations,
+    is_constrained,
+    least_squares_equations,
+    machine_equations,
+    machine_equations_at,
+)
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine, platform_pose, readings_at
 from legcal.machine.parameters import legs_in_links
 from legcal.machine.solved_poses import project_pose
-from legcal.machine.solver import poses_after, solve
+from legcal.machine.solver import Equations, Solved, poses_after, solve
 from legcal.machine.topology import level_rotation
 
 TRIALS = 200
@@ -28,6 +34,8 @@ MIN_TRIALS = 20  # trials, where one of them found a pose above the base
 MIN_APART = 0.05  # of the reach, by which a platform is above or below the base
 BATCH = 21  # trials solved at once
 MAX_STALLED = 5  # steps that change little
+_FAR, _DEPENDENT = 0.1, 1e-7  # of a leg length, and of the largest singular value
+_REGULAR = 1e-4  # singularity measure, beyond which motors hold the platform
 MAX_OUTSIDE = 1.0  # of the travel: refused beyond, if it is also beyond
 _MAX_OUTSIDE_OF_LEG = 0.01  # of the leg length at home, for sliders that hardly move
 
@@ -71,6 +79,7 @@ def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
 def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None) -> RigidTransform:
     """Return a pose where every leg is at the middle of its travel, or at readings (n_legs,).
 
+    More motors than freedoms are as near to it, in least squares, as they can be together.
     Among the poses that seeded starts lead to, the one with the smallest rotation of the platform
     is taken, counted from where its joints lie over those of the base, and among mirror images in
     the plane of the base joints the one on the positive side of
@@ -170,28 +179,63 @@ def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> Rig
 def _at_readings(
     machine: Machine, starts: Sequence[tuple[Array, Array]], readings: Array, reach: float
 ) -> list[RigidTransform | None]:
-    """Return the poses, found from places and turns, at readings (n_motors,) of the motors."""
+    """Return the poses, found from places and turns, at readings (n_motors,) of the motors.
+
+    Where sliders contradict each other there it is that of least squares, if all stay in travel.
+    """
     t, turns = (np.array(part) for part in zip(*starts, strict=True))
     poses = np.concatenate([Rotation.from_rotvec(turns).as_matrix(), t[..., None]], axis=2)
+    unit = np.array([1.0 / reach] * 3 + [1.0] * 3)
 
-    def equations(poses: Array) -> tuple[Array, Array]:
-        found = machine_equations_at(machine, poses[:, :, :3], poses[:, :, 3], readings[None])
+    def missed(poses: Array) -> PoseEquations:
+        return machine_equations_at(machine, poses[:, :, :3], poses[:, :, 3], readings[None])
+
+    def exact(poses: Array) -> tuple[Array, Array]:
+        found = missed(poses)
         return found.values, found.by_pose
 
-    unit = np.array([1.0 / reach] * 3 + [1.0] * 3)
-    found = solve(
-        equations,
-        poses_after,
-        poses,
-        tolerance=1e-14 * reach,
-        unit=unit,
-        damped=True,
-        max_stalled=MAX_STALLED,
-    )
+    def solved(equations: Equations, poses: Array) -> Solved:
+        return solve(
+            equations,
+            poses_after,
+            poses,
+            tolerance=1e-14 * reach,
+            unit=unit,
+            damped=True,
+            max_stalled=MAX_STALLED,
+        )
+
+    found = solved(exact, poses)
+    holds = found.worst < 1e-9
+    if found.jacobian.shape[1] > 6 and not holds.any() and not machine.actuators:
+        poses, n_dependent = _on_constraints(machine, found.points)
+        found = solved(lambda x: least_squares_equations(missed(x), n_dependent), poses)
+        singular = np.linalg.svd(found.jacobian * unit, compute_uv=False)[:, -1]
+        holds = (found.worst < 1e-9) & (singular > _REGULAR)
+        holds &= [_in_travel(machine, pose) for pose in found.points]
     return [
-        motion_of(pose[:, :3], pose[:, 3]) if worst < 1e-9 else None
-        for pose, worst in zip(found.points, found.worst, strict=True)
+        motion_of(pose[:, :3], pose[:, 3]) if held else None
+        for pose, held in zip(found.points, holds, strict=True)
     ]
+
+
+def _on_constraints(machine: Machine, poses: Array) -> tuple[Array, int]:
+    """Return poses (k, 3, 4) where the constraints hold, if these are near, and how many depend."""
+    near = [project_pose(machine, motion_of(T[:, :3], T[:, 3]), _FAR) for T in poses]
+    held = np.array([problem is None for _, problem in near])
+    poses = np.array([T.as_matrix()[:3] for T, _ in near])
+    found = machine_equations(machine, poses[held, :, :3], poses[held, :, 3])
+    constraints = found.by_pose[:, ~found.measured]
+    n = constraints.shape[1]
+    if n == 0 or not held.any():
+        return poses, 0
+    return poses, n - int(np.linalg.matrix_rank(constraints, rtol=_DEPENDENT).max())
+
+
+def _in_travel(machine: Machine, pose: Array) -> bool:
+    """Say whether all motors are inside their travel at a pose (3, 4)."""
+    q = readings_at(machine, motion_of(pose[:, :3], pose[:, 3]))
+    return all(machine.legs[j].in_travel(q[j : j + 1])[0] for j in machine.motors)
 
 
 def _unlikely(machine: Machine, T: RigidTransform) -> float:

@@ -39,6 +39,7 @@ from legcal.machine.model import (
 from legcal.machine.redundancy import contradictions
 from legcal.machine.solved_poses import TOLERANCE, project_pose
 from legcal.machine.solver import Equations, newton, poses_after, solve, walk_in_steps
+from legcal.machine.ties import machine_ties
 
 CONTRACTION = 0.5  # of the step before; of 1 rad or a leg length for the first
 MIN_STEP = 1.0 / 4096.0  # of the way from known readings to the wanted ones
@@ -437,11 +438,12 @@ def _nearest(machine: Machine, T: RigidTransform, readings: Array) -> RigidTrans
 
 def equations_of_readings(machine: Machine, readings: Array) -> Equations:
     """Return what poses must satisfy at readings of the motors (k, n_motors) [m, rad]."""
+    n_dependent = machine_ties(machine).n_dependent if machine.is_redundant else 0
 
     def equations(poses: Array) -> tuple[Array, Array]:
         found = machine_equations_at(machine, poses[:, :, :3], poses[:, :, 3], readings)
         if machine.is_redundant:
-            return least_squares_equations(found)
+            return least_squares_equations(found, n_dependent)
         return found.values, found.by_pose
 
     return equations

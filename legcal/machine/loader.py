@@ -7,13 +7,14 @@ with the file.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import LegcalError, ModelError, OutOfClass
+from legcal.errors import DidNotConverge, LegcalError, ModelError, OutOfClass
 from legcal.files import SHOWN_IN, MotionEntry, closest, motion_to_xyz_quat
 from legcal.geometry import Array
 from legcal.machine.actuator import Actuator, Pulses
@@ -125,6 +126,12 @@ def _load(source: Source) -> Machine:
         machine = _assemble(replace(source, urdf=urdf), block, own)
     # Home: a pose that closes.
     given = machine.home if block.home is not None else None
+    if given is not None and source.is_drawn_open and not machine.actuators:
+        _check_spread(machine)
+        with suppress(DidNotConverge):  # travels say more than where open loops happen to close
+            given = home_at_mid_travel(machine)
+            machine = replace(machine, home=given)
+            block = block.model_copy(update={"home": None})
     if given is None:
         _check_spread(machine)  # before a home of kilometres is looked for
         if machine.actuators:
@@ -140,7 +147,7 @@ def _load(source: Source) -> Machine:
         check_home_travel(machine)
     try:
         pose, configuration = closed_home(machine, given)
-    except ModelError:
+    except (ModelError, DidNotConverge):
         missed = np.abs(constraints_at(machine, machine.home).values).max(initial=0.0)
         if missed <= MAX_POSE_ERROR * leg_scale(machine, machine.home):
             _check_dependence(machine, closes=False)
@@ -654,7 +661,7 @@ def _check_dependence(machine: Machine, *, closes: bool = True) -> None:
             f"{machine.yaml_path}: the mechanism '{machine.name}' could not be used: found that "
             f"{nearly} of the {n} constraints of its joints follow from the others to 1 mrad but "
             "not exactly, needed an overconstrained machine to have its mobility exactly; write "
-            "axes that are parallel, perpendicular or meet with all digits."
+            "axes that are parallel, perpendicular or meet with all digits (12 decimals or more)."
         )
 
 

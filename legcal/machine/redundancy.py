@@ -80,20 +80,22 @@ class ReadingTests:
 class Contradiction:
     """Readings of a pose that no pose of the platform has together."""
 
-    legs: tuple[int, ...]  # one of whose motors is wrong, the likeliest first
+    legs: tuple[int, ...]  # one of whose motors is wrong, that with the least error first
     off: float  # how far the reading of the first is above what the others show [m or rad]
-    distance: float  # how far that moves a joint [m]
-    allowed: float  # how far readings that agree do [m]
+    distances: tuple[float, ...]  # how far each, alone wrong, is from there [m at a joint]
+    allowed: float  # how far that of the first may be if readings agree [m]
 
     def in_words(self, machine: Machine) -> str:
         """Return what is found, and what was needed."""
         legs = [machine.legs[j] for j in self.legs]
         first, *others = [leg.motor_label for leg in legs]
-        alike = f" (or as likely one of {', '.join(others)})" if others else ""
+        also = zip(others, self.distances[1:], strict=True)
+        words = ", ".join(f"{name} by {1e3 * distance:.1f} mm" for name, distance in also)
+        alike = f" (or as likely one of {words})" if others else ""
         whose = "leg" if legs[0].actuator is None else "motor"
         return (
-            f"the reading of {whose} '{first}'{alike} {1e3 * self.distance:.1f} mm from where the "
-            f"other motors put it, needed at most {1e3 * self.allowed:.1f} mm"
+            f"the reading of {whose} '{first}'{alike} {1e3 * self.distances[0]:.1f} mm from where "
+            f"the other motors put it, needed at most {1e3 * self.allowed:.1f} mm"
         )
 
 
@@ -154,14 +156,16 @@ def contradictions(
     judged = ReadingTests(*_numbers(machine, ~used), r.ravel(), redundancy.ravel())
     found = dict[int, Contradiction]()
     for k, pose in enumerate(np.flatnonzero(~used).tolist()):
-        alike = judged.of_pose(pose, REJECTION, scale)
+        alike = [one - k * len(unit) for one in judged.of_pose(pose, REJECTION, scale)]
         if not alike:
             continue
-        i = alike[0] - k * len(unit)
+        distance = np.abs(off[k]) * sigma_m
+        alike.sort(key=distance.__getitem__)
+        i = alike[0]
         found[pose] = Contradiction(
-            tuple(judged.leg[alike].tolist()),
+            tuple(machine.motors[own] for own in alike),
             float(off[k, i] * sigma_m[i] * unit[i]),
-            float(abs(off[k, i]) * sigma_m[i]),
+            tuple(distance[alike].tolist()),
             float(REJECTION * scale * sigma_m[i] / np.sqrt(redundancy[k, i])),
         )
     return found

@@ -24,7 +24,7 @@ from legcal.machine.schema import MechanismFile
 from legcal.machine.urdf import Urdf
 
 DRAWING = (
-    ("legcal.home is not given", "no closed pose was found near the one that the file draws"),
+    ("legcal.home is not given", "the file draws no closed pose"),
     ("write legcal.home", "draw the machine nearer to closed"),
     ("legcal.home", "the pose that the file draws"),
     (", legcal.base and legcal.platform", " and that the root is the base"),
@@ -43,6 +43,7 @@ class Source:
     notes: tuple[str, ...] = ()  # what the reader should know of the conversion, one sentence each
     values: Mapping[str, float] = field(default_factory=dict)  # joint values [rad
     poses: Mapping[str, RigidTransform] | None = None
+    is_drawn_open: bool = False  # poses close what a file with all travels draws open
     words: Sequence[tuple[str, str]] = ()
 
     def in_format_terms(self, problem: str) -> str:

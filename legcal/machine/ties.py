@@ -220,17 +220,22 @@ def ties_in_words(machine: Machine) -> str | None:
     tied = sparse_basis(independent(rows, by_step(rows, found.place) * scale)[1])
     is_alone = np.sum(np.abs(tied) > SHOWN, axis=1) == 1
     alone = [found.names[i] for i in np.argmax(np.abs(tied[is_alone]), axis=1)]
-    words = [describe_direction(alone, machine.leg_names)] if alone else []
+    words = [f"{_named(alone, machine)} stay as they are"] if alone else []
     together = np.flatnonzero(np.any(np.abs(tied[~is_alone]) > SHOWN, axis=0))
     names = [found.names[i] for i in together]
     if names:
-        words.append(f"{describe_direction(names, machine.leg_names)}, to each other")
+        words.append(f"{_named(names, machine)} change only together")
     n = sum(leg.n_constraints for leg in machine.legs)
     return (
         f"The machine is overconstrained: {ties.n_dependent} of the {n} constraints of its joints "
-        f"follow from the others only while {len(tied)} combinations of its parameters stay as "
-        f"they are, which are tied: {'; '.join(words)}."
+        f"follow{'s' * (ties.n_dependent == 1)} from the others. So that this stays so, "
+        f"{len(tied)} combinations of its parameters are tied: {'; '.join(words)}."
     )
+
+
+def _named(parameters: Sequence[str], machine: Machine) -> str:
+    """Return parameters in words."""
+    return describe_direction(parameters, machine.leg_names).removesuffix(" together")
 
 
 def _constraints(legs: Sequence[Leg], R: Array, t: Array) -> PoseEquations:

@@ -17,6 +17,7 @@ from legcal.geometry import roll_pitch_yaw
 from legcal.report.render import heading, report, table
 
 _TURNS = ("roll, x", "pitch, y", "yaw, z")
+_WIDTH = 80  # characters of a terminal
 _MAX_ROWS = 60  # of residuals; the file has them all
 
 
@@ -49,6 +50,14 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
     ]
     kinds = max(4, *(0 if leg["actuated"] else len(leg["kind"]) for leg in legs))
     columns = ("leg", "type", ">A in base [mm]", ">B in platform [mm]", ">length [mm]", ">R [mm]")
+    names = [column.removeprefix(">") for column in columns]
+    widths = [max(map(len, cells)) for cells in zip(names, *rows, strict=True)]
+    widths[1] = kinds
+    joints: list[tuple[str, ...]] = [*rows]
+    more = None
+    if sum(widths) + 2 * len(columns[1:]) > _WIDTH:  # long names would be broken
+        joints = [row[:4] for row in rows]
+        more = table(*columns[:1], *columns[4:], rows=[(row[0], *row[4:]) for row in rows])
     laws = [
         (
             leg["name"],
@@ -78,7 +87,8 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
         legend = f"R_b and R_e stand on the joints of {frame}, A where their motors read 0."
     return report(
         title,
-        table(*columns, rows=rows, least={1: kinds}),
+        table(*columns[: len(joints[0])], rows=joints, least={1: kinds}),
+        more,
         table(*of_laws, rows=laws) if laws else None,
         _motors(description) if "actuators" in description else None,
         table(*of_axes, rows=axes) if axes else None,

@@ -11,6 +11,7 @@ import numpy as np
 import yaml
 
 TEXT = "<text>"
+SAID_SINCE = "known to no better than", "the file draws no closed pose"  # were not said then
 DIGITS = 12  # of numbers that are not parameters
 
 # Lists of many alike entries, of which their number and the keys of the first say enough.
@@ -52,9 +53,11 @@ def _of_list(document: list[Any], key: str, path: tuple[str, ...]) -> Any:
         return {"shape": list(np.shape(document))}
     if key in MATRICES and np.ndim(document) == 2:
         return _of_covariance(np.array(document, dtype=np.float64))
-    if document and all(isinstance(entry, str) and _is_sentence(entry) for entry in document):
-        return {"sentences": len(document)}
     if key in {"notes", "diagnostics", "warnings"}:
+        return {
+            "sentences": sum(not any(x in str(entry) for x in SAID_SINCE) for entry in document)
+        }
+    if document and all(isinstance(entry, str) and _is_sentence(entry) for entry in document):
         return {"sentences": len(document)}
     if key in ALIKE and document and isinstance(document[0], dict):
         return {"count": len(document), "keys": keys(document[0])}

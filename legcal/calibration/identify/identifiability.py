@@ -18,7 +18,7 @@ from legcal.calibration.identify.predicted_observations import (
     planned_observations,
     recorded_observations,
 )
-from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.ranks import Analysis, undetermined, weak_directions
 from legcal.calibration.identify.remedies import (
     ENOUGH_IMAGES,
     Replanning,
@@ -55,6 +55,7 @@ from legcal.paper import (
 MOST_VIEWS = 50
 MOST_IMAGES = 2000  # of a session; more says nothing new and takes minutes
 _IMAGES = 15
+_ROUGH = 0.1  # mean leg lengths: calibrations do not accept directions known to no better
 
 
 def answer(
@@ -293,6 +294,8 @@ def _judge(
             why = machine.undetermined
         notes.append(f"Platform errors are not predicted: {why}.")
     notes += _machine_notes(machine)
+    if full.complete:
+        notes += _rough_notes(analysis)
     return Identifiability(
         spatial=machine.spatial,
         legs=machine.leg_names,
@@ -315,6 +318,23 @@ def _judge(
         notes=tuple(notes),
         scale=scale_sources(analysis),
     )
+
+
+def _rough_notes(analysis: Analysis) -> list[str]:
+    """Return which directions are determined so roughly that a fit may be refused."""
+    predicted, motion = analysis.predicted, analysis.motion
+    rough = undetermined(predicted, analysis.information, _ROUGH)
+    found = [w for w in weak_directions(predicted, motion, rough) if not w.harmless]
+    if not found:
+        return []
+    words = min((weak.direction for weak in found), key=len)
+    more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+    known = f"{1e3 * _ROUGH * predicted.mean_length:.0f} mm (a tenth of a leg, 1 sigma)"
+    return [
+        f"From outlines good to 0.1 px known to no better than {known}: {words}{more}; calibrate "
+        "refuses what its own measurements leave so rough. Add images from other directions, or at "
+        "poses that differ more."
+    ]
 
 
 def _machine_notes(machine: Machine) -> list[str]:

@@ -226,10 +226,14 @@ def determined(predicted: PredictedObservations, information: Array) -> int:
     return int(np.sum(singular > _limit(predicted)))
 
 
-def undetermined(predicted: PredictedObservations, information: Array) -> Array:
+def undetermined(
+    predicted: PredictedObservations,
+    information: Array,
+    sigma: float = MAX_SIGMA,  # mean leg lengths
+) -> Array:
     """Return an orthonormal basis (w, c) of the directions that rows (m, c) do not determine."""
     _, singular, basis = np.linalg.svd(compress(information))
-    return np.asarray(basis[singular <= _limit(predicted)])
+    return np.asarray(basis[singular <= _limit(predicted, sigma)])
 
 
 def missing(predicted: PredictedObservations, rows: Array, motion: PlatformMotion) -> int:
@@ -275,6 +279,6 @@ def _direction(
     )
 
 
-def _limit(predicted: PredictedObservations) -> float:
+def _limit(predicted: PredictedObservations, sigma: float = MAX_SIGMA) -> float:
     """Return the least singular value that counts [1/m]."""
-    return 1.0 / (MAX_SIGMA * predicted.mean_length)
+    return 1.0 / (sigma * predicted.mean_length)

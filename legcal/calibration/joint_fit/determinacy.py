@@ -17,7 +17,7 @@ from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import State, with_values
 from legcal.errors import NotIdentifiable
 from legcal.estimation import NormalEquations, inverse_on_range, marginal, named_information
-from legcal.geometry import Array
+from legcal.geometry import Array, BoolArray
 from legcal.machine import (
     SHOWN,
     describe_direction,
@@ -100,9 +100,13 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
 
 
 def refuse_undetermined_inliers(
-    problem: FitProblem, state: State, normal: NormalEquations, held: HeldDirections
+    problem: FitProblem,
+    state: State,
+    normal: NormalEquations,
+    held: HeldDirections,
+    accepted: BoolArray,  # which outlines agree with the fit
 ) -> None:
-    """Refuse a fit whose accepted outlines leave more open than was held before rejections.
+    """Refuse a fit that leaves more open than was held before outlines were rejected.
 
     Raises
     ------
@@ -117,10 +121,16 @@ def refuse_undetermined_inliers(
     value, vector = np.linalg.eigh(N.T @ scaled @ N)
     if value[0] * (_MAX_SIGMA * state.mean_length) ** 2 < 1.0:
         names = [problem.named[i] for i in kept]
+        words = _in_words(names, N @ vector[:, 0], problem.legs.names)
+        if accepted.all():
+            raise NotIdentifiable(
+                f"The fit is not determined: found that its measurements leave {words} open where "
+                f"it ends, needed all to a tenth of a leg; {_REMEDY}, or state what is known with "
+                "a prior."
+            )
         raise NotIdentifiable(
-            "The fit is not determined: found that the outlines which agree with it leave "
-            f"{_in_words(names, N @ vector[:, 0], problem.legs.names)} open, needed what the "
-            "rejected ones showed; correct these, or add images."
+            f"The fit is not determined: found that the outlines which agree with it leave {words} "
+            "open, needed what the rejected ones showed; correct these, or add images."
         )
 
 

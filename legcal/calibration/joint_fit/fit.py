@@ -339,7 +339,7 @@ def _refined(
             first = dataclasses.replace(there, iterations=first.iterations + there.iterations)
         fit = fit_in_rounds(problem, first)
         normal = information(fit.problem, fit.state, fit.minimum.linear, problem.loss)
-        refuse_undetermined_inliers(fit.problem, fit.state, normal, held)
+        refuse_undetermined_inliers(fit.problem, fit.state, normal, held, fit.accepted)
         _refuse_other_radii(problem, fit.state)
     except (DidNotConverge, NotIdentifiable) as failure:
         refuse_contradicted_values(free, start, state, with_priors=True)
