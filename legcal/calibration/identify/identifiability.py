@@ -357,6 +357,7 @@ def conditions_of(machine: Machine, predicted: PredictedObservations) -> tuple[C
         passive=[j for j, has in enumerate(predicted.with_length) if not has],
         board=bool(predicted.board.all()),
         actuators=predicted.on_actuators,
+        bodies=predicted.bodies,
     )
     frame, pose = predicted.frame[predicted.view[image]], predicted.pose[image]
     moves = predicted.carried_by[leg] >= 0
