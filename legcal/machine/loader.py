@@ -168,6 +168,12 @@ def _load(source: Source) -> Machine:
     configurations = generic_configurations(machine, CONFIGURATIONS)
     machine = replace(machine, mobility=mobility(machine, configurations))
     machine = replace(machine, motor_rank=motor_rank(machine, configurations))
+    if machine.internal_joints and machine.is_redundant:
+        raise OutOfClass(
+            f"{machine.yaml_path}: this machine is outside the method: found {len(machine.motors)} "
+            f"motors for the {machine.mobility} freedoms of a platform of several bodies, needed "
+            "no more motors than freedoms there; remove one from name_mot."
+        )
     _check_equations(machine, configurations)
     _check_dependence(machine)
     _check_ties(machine)

@@ -133,11 +133,12 @@ def coordinates_at(
 ) -> Array:
     """Return readings of actuators and then coordinates of internal joints, (k, n), at poses R, t.
 
-    Readings are *q* (k, n_actuators) if they are given, else those at which the first rod on each
-    actuator reaches the platform. Internal joints stand where rods miss their lengths least, near
-    *s* (k, n), or near zero: there if the pose leaves them free, as on an I4.
+    Readings are *q* (k, n_actuators), or one row for all, if they are given, else those at which
+    the first rod on each actuator reaches the platform. Internal joints stand where rods miss their
+    lengths least, near *s* (k, n), or near zero: there if the pose leaves them free, as on an I4.
     """
     s = np.zeros((len(t), len(internal_joints_of(legs)))) if s is None else s
+    q = None if q is None else np.broadcast_to(q, (len(t), q.shape[1]))
     if s.shape[1]:
         found = solve(
             lambda points: _missed_lengths(legs, R, t, points, q),
