@@ -336,6 +336,11 @@ def _machine_notes(machine: Machine) -> list[str]:
             "poses between home and travel were judged too, which the machine may not reach; "
             "correct legcal.home or the limits."
         )
+    if machine.internal_joints:
+        notes.append(
+            "The platform has several bodies: legcal identifies such a machine, and does not "
+            "calibrate it yet."
+        )
     tied = ties_in_words(machine)
     notes += [] if tied is None else [tied]
     singular = singularity_note(machine)
