@@ -19,6 +19,7 @@ from legcal.calibration.identify.identifiability import conditions_of, identifia
 from legcal.calibration.identify.predicted_observations import planned_observations
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.scale import is_scale_open
+from legcal.data import load_dataset
 from legcal.errors import OutOfClass, UsageError
 from legcal.geometry import Array, normal_basis
 from legcal.machine import (
@@ -374,6 +375,18 @@ def test_other_commands_refuse_them_and_say_what_works(
     assert "does not calibrate them yet" in err
     assert "'hinge1' and 'hinge2'" in err
     assert "inspect and identify work" in err
+
+
+def test_datasets_of_them_are_refused(tmp_path: Path) -> None:
+    example = Path(__file__).resolve().parents[1] / "examples" / "hexapod"
+    for name in ("measurements.csv", "camera_info.yaml"):
+        (tmp_path / name).write_bytes((example / name).read_bytes())
+    text = (example / "dataset.yaml").read_text()
+    assert "mechanism: models/hexapod.yaml" in text
+    (tmp_path / "dataset.yaml").write_text(text.replace("models/hexapod.yaml", "models/r.yaml"))
+    machine("i4", turning=True).write(tmp_path / "models")
+    with pytest.raises(OutOfClass, match=r"does not calibrate them yet: found the joint 'slide'"):
+        load_dataset(tmp_path)
 
 
 def test_machines_of_one_body_are_not_refused(loaded: Loaded) -> None:

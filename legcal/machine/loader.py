@@ -594,7 +594,7 @@ def _check_frames(machine: Machine) -> None:
 
 
 def _with_followers(machine: Machine, home: RigidTransform | None) -> Machine:
-    """Return the machine with what it is told which joints inside its platform follow from a pose.
+    """Return the machine with its joints inside the platform marked: which follow from a pose.
 
     Raises
     ------
