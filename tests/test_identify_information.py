@@ -401,7 +401,7 @@ def test_poses_out_of_reach_are_refused_and_rare_ones_found(
         random_poses_of_legs(geometries(machine), machine.frame_legs, home, away, 3, rng)
     monkeypatch.setattr(
         "legcal.machine.configurations._Drive.is_regular",
-        lambda _self, _R, t: rng.random(len(t)) < 0.75,  # in each of five steps
+        lambda _self, _R, t, _wanted: rng.random(len(t)) < 0.75,  # in each of five steps
     )
     assert len(planned_observations(machine, [range(6)], 60).t) == 60
 

@@ -564,28 +564,6 @@ def _delta(*, parallelograms: bool, elbows: int = 1) -> Drawing:
     return drawing
 
 
-def _articulated(joint: str) -> Drawing:
-    """Return an H4 (revolute) or I4 (prismatic): two bars on the platform, two arms on each."""
-    drawing, x = Drawing(), np.array([0.05, 0.0, 0.0])
-    axis = Z if joint == "revolute" else np.array([0.0, 1.0, 0.0])
-    for bar, side in (("bar0", -1.0), ("bar1", 1.0)):
-        drawing.add(bar, joint, "platform", side * x, axis)
-    for j, side in enumerate((-1.0, -1.0, 1.0, 1.0)):
-        across = np.array([0.0, (-1.0) ** j, 0.0])
-        tangent = np.cross(Z, across)
-        pivot, elbow, end = 0.2 * across, 0.35 * across + 0.1 * Z, side * x + 0.05 * across
-        end = end + HEIGHT * Z
-        drawing.add(f"arm{j}", "revolute", "base", pivot, tangent)
-        for k, out in enumerate((-0.03 * tangent, 0.03 * tangent)):
-            rod = _rod(elbow + out, end + out, tangent)
-            on = ("bar0" if side < 0.0 else "bar1", side * x + HEIGHT * Z)
-            name = f"rod{j}{k}"
-            drawing.chain(name, f"arm{j}", pivot, rod, end=end + out, kind="3d", on=on)
-            drawing.legs[name] = f"j_{name}_0"
-        drawing.motors.append(f"j_arm{j}")
-    return drawing
-
-
 def _couplers() -> Drawing:
     """Return a Delta whose parallelograms end on bars that turn on the platform."""
     drawing = Drawing()
@@ -647,12 +625,8 @@ DRAWN: dict[str, tuple[Callable[[], Drawing], bool, tuple[str, ...]]] = {
 }
 
 
-INNER = ("platform of several bodies", "2 legs that meet on link", "'bar", "H4 or I4")
 LOOP = ("a loop inside the leg", "'j_arm0'", "as a leg of its own")
 DRIVEN: dict[str, tuple[Callable[[], Drawing], bool, tuple[str, ...]]] = {
-    "H4": (lambda: _articulated("revolute"), True, (*INNER, "joint 'j_bar")),
-    "H4 without a block": (lambda: _articulated("revolute"), False, INNER),
-    "I4": (lambda: _articulated("prismatic"), True, (*INNER, "joint 'j_bar")),
     "a Delta with couplers": (_couplers, True, LOOP),
     "arm on arm": (lambda: _delta(parallelograms=False, elbows=2), True, (
         "the leg of motor 'j_arm0_0'", "no slider and 3 joints in different places", "a rod of")),

@@ -177,7 +177,8 @@ def test_axes_that_must_stay_parallel_turn_together(tmp_path: Path) -> None:
     # The platform keeps one direction: a rotation takes all its axes to those of the base.
     base, platform = (np.array([getattr(leg, f"{end}_axis") for leg in tied]) for end in ENDS)
     sign = np.sign(np.einsum("ji,ji->j", base, platform))[:, None]
-    assert Rotation.align_vectors(base, sign * platform)[1] < 1e-9
+    turn = Rotation.align_vectors(base, sign * platform)[0]
+    assert np.abs(turn.apply(sign * platform) - base).max() < 1e-9
     assert max(abs(leg.twist or 0.0) for leg in tied) < 1e-11
 
 

@@ -46,7 +46,7 @@ def simulate(
     from legcal.simulation import requested, summary_document
     from legcal.simulation import simulate as run
 
-    nominal = load_mechanism(model)
+    nominal = load_mechanism(model).require_rigid_platform()
     settings = requested(Request(**options), nominal)
     workers = image_workers(cluster)
     made = run(nominal, output, settings, force=force, workers=workers, progress=not quiet)

@@ -14,6 +14,7 @@ from .configurations import beyond_travel as beyond_travel
 from .configurations import random_configurations as random_configurations
 from .configurations import random_poses as random_poses
 from .configurations import random_poses_of_legs as random_poses_of_legs
+from .configurations import random_postures_of_legs as random_postures_of_legs
 from .configurations import random_walk as random_walk
 from .configurations import workspace as workspace
 from .coordinates import COORDINATES as COORDINATES
@@ -147,11 +148,15 @@ from .rods import AT_ZERO as AT_ZERO
 from .rods import actuator_index as actuator_index
 from .rods import actuators_of as actuators_of
 from .rods import arms_at as arms_at
+from .rods import coordinates_at as coordinates_at
 from .rods import ends_at_poses as ends_at_poses
 from .rods import ends_in_base as ends_in_base
 from .rods import first_rods as first_rods
+from .rods import internal_index as internal_index
+from .rods import internal_joints_of as internal_joints_of
 from .rods import joints_at as joints_at
 from .rods import measured_readings as measured_readings
+from .rods import platform_joints_at as platform_joints_at
 from .rods import reading_legs as reading_legs
 from .rods import reading_of_rod as reading_of_rod
 from .rods import readings_of_rods as readings_of_rods

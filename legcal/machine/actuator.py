@@ -8,6 +8,9 @@ A rod of constant length hangs at A, which moves with the reading q of the motor
 a is A at reading 0, and the gain g is 1 unless it is estimated. Several rods may hang on one motor
 (the arm of a Delta carries two): each has the same :class:`Actuator`, known by its joint. An arm
 that is a cylinder (:class:`Arm`) is seen itself: its line turns with A and need not meet it.
+
+A joint inside a platform of several bodies moves B of the rods on one of them in the same way, in
+the frame of the platform. It has no motor, and its coordinate no reading.
 """
 
 from __future__ import annotations
@@ -193,6 +196,9 @@ class Actuator:
     gain: float = 1.0  # true motion over reading
     pulses: Pulses | None = None  # of a hobby servo
     arm: Arm | None = None  # where cameras see it as a cylinder
+    # Of a joint inside a platform, whether the pose of the platform says where it stands. That of
+    # the guide of an I4 does not: it moves together with motors
+    follows: bool = True
 
     @property
     def line(self) -> Line:
@@ -271,21 +277,22 @@ class Actuator:
 
     def moved(self, step: Array) -> Actuator:
         """Return it after a step (9,): turns of its axis, its point, its gain, and its arm."""
-        line = self.line.moved(step[:4])
         arm = self.arm
         return replace(
-            self,
-            axis=line.axis,
-            point=line.point,
+            self.with_line(self.line.moved(step[:4])),
             gain=self.gain + float(step[4]),
             arm=None if arm is None else replace(arm, line=arm.line.moved(step[5:])),
         )
+
+    def with_line(self, line: Line) -> Actuator:
+        """Return it with another axis."""
+        return replace(self, axis=line.axis, point=line.point)
 
     def in_frame(self, T_to_from: Array) -> Actuator:
         """Return the same in another frame, T_to_from (4, 4)."""
         line, arm = self.line.in_frame(T_to_from), self.arm
         moved = None if arm is None else replace(arm, line=arm.line.in_frame(T_to_from))
-        return replace(self, axis=line.axis, point=line.point, arm=moved)
+        return replace(self.with_line(line), arm=moved)
 
     def numbers(self, nominal: Actuator) -> Array:
         """Return its nine numbers: those of its axis, its gain, and those of the line of its arm.

@@ -26,6 +26,7 @@ from legcal.machine.configurations import (
 from legcal.machine.kinematics import follow
 from legcal.machine.mobility import singularity
 from legcal.machine.model import (
+    B_at,
     Machine,
     joint_values,
     platform_pose,
@@ -224,7 +225,7 @@ class Feasibility:
         lengths = np.linalg.norm(vectors, axis=1)
         u = (vectors / lengths[:, None])[self._leg]
         along = self._ends + np.where(self._on_platform, lengths[self._leg], 0.0)[:, None]
-        B = T_base_platform.apply(self._machine.B_platform)
+        B = B_at(self._machine, T_base_platform.as_matrix()[None])[0]
         start = (B - vectors)[self._leg] + along[:, :1] * u
         one, two = self._pairs
         span = np.diff(along, axis=1) * u

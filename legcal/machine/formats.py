@@ -458,7 +458,7 @@ def _levelled(
         np.array(points) @ bodies.T_body_link[link][:3, :3]
         for link, points in (
             (block.base, [leg.A for leg in chains]),
-            (block.platform, [leg.line_in(-1, leg.B)[0] for leg in chains]),
+            (block.platform, [leg.B_platform for leg in chains]),
         )
     )
     level = RigidTransform.from_rotation(level_rotation(A, B))

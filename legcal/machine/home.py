@@ -23,7 +23,7 @@ from legcal.machine.equations import (
     machine_equations_at,
 )
 from legcal.machine.leg import Leg, LegKind
-from legcal.machine.model import Machine, platform_pose, readings_at
+from legcal.machine.model import B_at, Machine, platform_pose, readings_at
 from legcal.machine.parameters import legs_in_links
 from legcal.machine.solved_poses import project_pose
 from legcal.machine.solver import Equations, Solved, poses_after, solve
@@ -142,7 +142,7 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
 
 def _height(machine: Machine, T: RigidTransform, centre: Array) -> float:
     """Return how far joints of the platform are above a point of the base, in the mean [m]."""
-    return float(np.mean(T.apply(machine.B_platform)[:, 2]) - centre[2])
+    return float(np.mean(B_at(machine, T.as_matrix()[None])[0, :, 2]) - centre[2])
 
 
 def _in_yaml(T: RigidTransform) -> str:
@@ -169,6 +169,7 @@ def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> Rig
             platform_axis=wanted.platform_axis,
             twist=wanted.twist,
             actuator=wanted.actuator,
+            internal=wanted.internal,
         )
         for leg, wanted in zip(machine.legs, legs_in_links(machine, legs), strict=True)
     )
@@ -241,7 +242,7 @@ def _in_travel(machine: Machine, pose: Array) -> bool:
 def _unlikely(machine: Machine, T: RigidTransform) -> float:
     """Return a penalty: below the base, a fixed leg backwards, a passive one outside its travel."""
     centre = machine.A_base.mean(axis=0)
-    B = np.asarray(T.apply(machine.B_platform))
+    B = B_at(machine, T.as_matrix()[None])[0]
     size = float(np.abs(B - machine.A_base).max())
     below = machine.spatial and B.mean(axis=0)[2] < centre[2] - 1e-6 * size
     penalty = 10.0 * float(below)

@@ -11,8 +11,15 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array, cross
-from legcal.machine.equations import is_constrained, machine_equations
-from legcal.machine.model import Machine, slider_columns, vectors_A_to_B, vectors_at
+from legcal.machine.equations import is_constrained, machine_equations, machine_equations_at
+from legcal.machine.model import (
+    B_at,
+    Machine,
+    readings_at_poses,
+    slider_columns,
+    vectors_A_to_B,
+    vectors_at,
+)
 from legcal.machine.solver import solve
 
 CLOSED = 1e-12  # [m], and [rad] for frames
@@ -28,7 +35,7 @@ def leg_scale(machine: Machine, T_base_platform: RigidTransform) -> float:
 
 
 def mobility(machine: Machine, configurations: Sequence[Array]) -> int:
-    """Return the freedoms of the platform.
+    """Return the freedoms of the platform, the bodies that it carries counted.
 
     The rank is taken where the closures have their largest among closed configurations, of which
     some should be near home only, because a symmetric pose may be singular.
@@ -59,8 +66,12 @@ def motor_rank(machine: Machine, configurations: Sequence[Array]) -> int:
 
 def _moved(machine: Machine, motions: Array) -> int:
     """Return the rank of the platform's twists by motions (nv, k) of the joints, as linearised."""
+    scale = leg_scale(machine, machine.home)
     twist = machine.chain.twist(machine.base, machine.platform) @ motions
-    twist[:3] /= leg_scale(machine, machine.home)
+    twist[:3] /= scale
+    for joint in machine.internal_joints:
+        rate = motions[machine.chain.v_index(joint.joint)] / (1.0 if joint.turns else scale)
+        twist = np.concatenate([twist, rate[None]])
     return int(np.sum(np.linalg.svd(twist, compute_uv=False) > RANK_TOLERANCE))
 
 
@@ -158,22 +169,34 @@ def singularities(machine: Machine, poses: Array) -> Array:
     return np.asarray(np.linalg.svd(jacobian, compute_uv=False)[:, 5])
 
 
-def dimensionless(machine: Machine, poses: Array, motors: Sequence[int] | None = None) -> Array:
+def dimensionless(
+    machine: Machine,
+    poses: Array,
+    motors: Sequence[int] | None = None,
+    readings: Array | None = None,
+) -> Array:
     """Return the Jacobians of :func:`singularity`, (k, n_rows, 6): rotation, displacement.
 
-    Poses are matrices T_base_platform (k, 3 or 4, 4). All motors count, or some.
+    Poses are matrices T_base_platform (k, 3 or 4, 4). All motors count, or some. *readings*
+    (k, n_motors) matter where poses leave joints inside the platform free.
     """
     motors = list(machine.motors if motors is None else motors)
     R, t = poses[:, :3, :3], poses[:, :3, 3]
-    turned = machine.B_platform @ np.swapaxes(R, 1, 2)
+    turned = B_at(machine, poses) - t[:, None]
     vectors = vectors_at(machine, poses)
     lengths = np.linalg.norm(vectors, axis=2)
     scale = lengths.mean(axis=1)[:, None, None]
     centre = turned.mean(axis=1, keepdims=True)
-    if is_constrained(machine):
+    jacobian = None
+    if machine.internal_joints:
+        if readings is None:
+            readings = readings_at_poses(machine, poses)[:, motors]
+        jacobian = machine_equations_at(machine, R, t, readings).by_pose
+    elif is_constrained(machine):
         equations = machine_equations(machine, R, t)
         counts = ~equations.measured | np.isin(equations.leg, motors)
         jacobian = equations.by_pose[:, counts]
+    if jacobian is not None:
         gradient, moment = jacobian[:, :, 3:], jacobian[:, :, :3]
         return np.concatenate([(moment - cross(centre, gradient)) / scale, gradient], axis=2)
     u = (vectors / lengths[..., None])[:, motors]  # lines alone; of rods one hangs on each

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.errors import UsageError
+from legcal.errors import OutOfClass, UsageError
 from legcal.geometry import Array, frame_on_points
 from legcal.machine.actuator import Actuator
 from legcal.machine.chain import ClosedChain
@@ -25,8 +25,11 @@ from legcal.machine.leg import (
 from legcal.machine.rods import (
     AT_ZERO,
     actuators_of,
+    coordinates_at,
     first_rods,
+    internal_joints_of,
     joints_at,
+    platform_joints_at,
     reading_legs,
     reading_of_rod,
 )
@@ -65,7 +68,7 @@ class Machine:
         """The direction (3,) from base to platform at home, or the normal of a plane of motion."""
         if self.base_normal is not None:
             return self.base_normal
-        across = (self.home.apply(self.B_platform) - self.A_base).mean(axis=0)
+        across = (B_at(self, self.home.as_matrix()[None])[0] - self.A_base).mean(axis=0)
         size = float(np.linalg.norm(across))
         reach = float(np.ptp(self.A_base, axis=0).max())
         return np.asarray(across / size) if size > 1e-3 * reach else np.array([0.0, 0.0, 1.0])
@@ -99,6 +102,30 @@ class Machine:
     def actuators(self) -> tuple[Actuator, ...]:
         """What moves joints at A, each once, in the base link."""
         return actuators_of(self.legs)
+
+    @cached_property
+    def internal_joints(self) -> tuple[Actuator, ...]:
+        """The joints inside a platform of several bodies, each once, in the platform link."""
+        return internal_joints_of(self.legs)
+
+    def require_rigid_platform(self) -> "Machine":
+        """Return the machine itself, for what can be done with a platform of one body only.
+
+        Raises
+        ------
+        OutOfClass
+            If its platform has several bodies.
+        """
+        if not self.internal_joints:
+            return self
+        joints = " and ".join(f"'{joint.joint}'" for joint in self.internal_joints)
+        plural = "s" * (len(self.internal_joints) > 1)
+        raise OutOfClass(
+            f"{self.yaml_path}: legcal identifies machines whose platform has several bodies, and "
+            f"does not calibrate them yet: found the joint{plural} {joints} inside the platform, "
+            "needed one rigid platform; inspect and identify work, and forward and inverse "
+            "kinematics in Python."
+        )
 
     @property
     def at_zero(self) -> str:
@@ -155,7 +182,7 @@ class Machine:
 
     @property
     def B_platform(self) -> Array:
-        """Platform joint centres in the platform link, (n_legs, 3) [m]."""
+        """Platform joint centres in the platform link, (n_legs, 3) [m]; internal joints at 0."""
         return self._arrays[1].copy()
 
     @property
@@ -223,7 +250,7 @@ class Machine:
     @cached_property
     def sketch(self) -> Sketch:
         """What pictures of the machine at home show."""
-        B = np.asarray(self.home.apply(self.B_platform))
+        B = B_at(self, self.home.as_matrix()[None])[0]
         A = B - vectors_A_to_B(self, self.home)
         return Sketch.of(
             self.name,
@@ -271,12 +298,34 @@ def vectors_A_to_B(machine: Machine, T_base_platform: RigidTransform) -> Array:
     return np.asarray(vectors_at(machine, matrix[None])[0])
 
 
+def B_at(machine: Machine, poses: Array) -> Array:
+    """Return the platform joint centres in the base link, (k, n_legs, 3) [m].
+
+    At poses T_base_platform (k, 3 or 4, 4); a body of a platform of several is where its rods hold
+    it.
+    """
+    R, t = poses[:, :3, :3], poses[:, :3, 3]
+    B = machine.B_platform
+    if machine.internal_joints:
+        B = platform_joints_at(machine.legs, internal_coordinates(machine, poses))
+    return np.asarray(B @ np.swapaxes(R, 1, 2) + t[:, None])
+
+
+def internal_coordinates(machine: Machine, poses: Array) -> Array:
+    """Return the coordinates of the joints inside the platform at the same poses, (k, n).
+
+    Those that the pose leaves free are at zero.
+    """
+    found = coordinates_at(machine.legs, poses[:, :3, :3], poses[:, :3, 3])
+    return found[:, len(machine.actuators) :]
+
+
 def vectors_at(machine: Machine, poses: Array) -> Array:
     """Return the same at poses T_base_platform (k, 3 or 4, 4), (k, n_legs, 3) [m].
 
     Joints at A that move are where the first rod on their actuator reaches the platform.
     """
-    B = machine.B_platform @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    B = B_at(machine, poses)
     A = machine.A_at(_of_actuators(machine, B)) if machine.actuators else machine.A_base
     return np.asarray(B - A)
 
@@ -296,7 +345,7 @@ def readings_at_poses(machine: Machine, poses: Array) -> Array:
     q = sign (|AB| - q0); of a rod the reading of its actuator at which the first of its rods
     reaches the platform.
     """
-    B = machine.B_platform @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    B = B_at(machine, poses)
     lengths = np.linalg.norm(B - machine.A_base, axis=2)
     hangs = np.array([leg.actuator is not None for leg in machine.legs])
     own = machine.sign * (lengths - machine.q0)

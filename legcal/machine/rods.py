@@ -1,6 +1,7 @@
-"""Rods on actuators: which hang on which, where their joints at A are, and which reading they need.
+"""What carries the ends of rods: which hang on which, where A and B are, and at which readings.
 
-See :mod:`legcal.machine.actuator` for how A moves.
+See :mod:`legcal.machine.actuator` for how A and B move. The coordinates of a machine at a pose are
+the readings of its actuators, and after them those of the joints inside its platform.
 """
 
 from __future__ import annotations
@@ -13,7 +14,10 @@ from scipy.spatial.transform import RigidTransform
 from legcal.geometry import Array, cross
 from legcal.machine.actuator import Actuator
 from legcal.machine.leg import Leg
+from legcal.machine.solver import solve
 
+_CLOSED = 1e-15  # [m], of the lengths of rods
+_MAX_STEP = 0.3  # [rad or m] of an internal joint towards where rods hold it
 AT_ZERO = ", where their motors read 0"  # what is said of joints A that move, after their name
 
 
@@ -30,6 +34,29 @@ def actuator_index(legs: Sequence[Leg]) -> list[int]:
     """Return which of :func:`actuators_of` each leg hangs on, -1 for none."""
     number = {actuator.joint: i for i, actuator in enumerate(actuators_of(legs))}
     return [-1 if leg.actuator is None else number[leg.actuator.joint] for leg in legs]
+
+
+def internal_joints_of(legs: Sequence[Leg]) -> tuple[Actuator, ...]:
+    """Return the joints inside a platform of several bodies, each once, by their first legs."""
+    found: dict[str, Actuator] = {}
+    for leg in legs:
+        if leg.internal is not None:
+            found.setdefault(leg.internal.joint, leg.internal)
+    return tuple(found.values())
+
+
+def internal_index(legs: Sequence[Leg]) -> list[int]:
+    """Return which of :func:`internal_joints_of` carries B of each leg, -1 for none."""
+    number = {joint.joint: i for i, joint in enumerate(internal_joints_of(legs))}
+    return [-1 if leg.internal is None else number[leg.internal.joint] for leg in legs]
+
+
+def platform_joints_at(legs: Sequence[Leg], s: Array) -> Array:
+    """Return B of legs (k, n_legs, 3) [m] in a platform whose internal joints are at s (k, n)."""
+    B = np.empty((len(s), len(legs), 3))
+    for j, (leg, i) in enumerate(zip(legs, internal_index(legs), strict=True)):
+        B[:, j] = leg.B if leg.internal is None else leg.internal.at(leg.B, s[:, i])
+    return B
 
 
 def joints_at(legs: Sequence[Leg], q: Array) -> Array:
@@ -61,8 +88,14 @@ def ends_at_poses(
     Joints at A that move are where readings q (k, n_actuators) have them, or without these where
     the first rod on their actuator reaches the platform.
     """
-    B = np.stack([R @ leg.B + t for leg in legs], axis=1)
-    return joints_at(legs, readings_of_rods(legs, R, t) if q is None else q), B
+    c = coordinates_at(legs, R, t, q)
+    n = len(actuators_of(legs))
+    return joints_at(legs, c[:, :n]), _in_base(R, t, platform_joints_at(legs, c[:, n:]))
+
+
+def _in_base(R: Array, t: Array, B: Array) -> Array:
+    """Return points B (k, n, 3) of the platform in the frame of the base, at poses R, t."""
+    return np.asarray(B @ np.swapaxes(R, 1, 2) + t[:, None])
 
 
 def ends_in_base(
@@ -92,11 +125,72 @@ def first_rods(legs: Sequence[Leg]) -> list[int]:
 
 def readings_of_rods(legs: Sequence[Leg], R: Array, t: Array) -> Array:
     """Return the readings of actuators (k, n) at poses R, t: those of the first rod on each."""
+    return coordinates_at(legs, R, t)[:, : len(actuators_of(legs))]
+
+
+def coordinates_at(
+    legs: Sequence[Leg], R: Array, t: Array, q: Array | None = None, s: Array | None = None
+) -> Array:
+    """Return readings of actuators and then coordinates of internal joints, (k, n), at poses R, t.
+
+    Readings are *q* (k, n_actuators), or one row for all, if they are given, else those at which
+    the first rod on each actuator reaches the platform. Internal joints stand where rods miss their
+    lengths least, near *s* (k, n), or near zero: there if the pose leaves them free, as on an I4.
+    """
+    s = np.zeros((len(t), len(internal_joints_of(legs)))) if s is None else s
+    q = None if q is None else np.broadcast_to(q, (len(t), q.shape[1]))
+    if s.shape[1]:
+        found = solve(
+            lambda points: _missed_lengths(legs, R, t, points, q),
+            lambda points, step: points + np.clip(step, -_MAX_STEP, _MAX_STEP),
+            s,
+            tolerance=_CLOSED,
+            damped=True,
+        )
+        s = found.points
+    if q is None:
+        q = _readings_at(legs, _in_base(R, t, platform_joints_at(legs, s)))
+    return np.concatenate([q, s], axis=1)
+
+
+def _readings_at(legs: Sequence[Leg], B: Array) -> Array:
+    """Return the readings (k, n) at which the first rods on actuators reach B (k, n_legs, 3)."""
     first = first_rods(legs)
-    q = np.zeros((len(t), len(first)))
+    q = np.zeros((len(B), len(first)))
     for a, j in enumerate(first):
-        q[:, a] = reading_of_rod(legs[j], R @ legs[j].B + t)
+        q[:, a] = reading_of_rod(legs[j], B[:, j])
     return q
+
+
+def _missed_lengths(
+    legs: Sequence[Leg], R: Array, t: Array, s: Array, q: Array | None
+) -> tuple[Array, Array]:
+    """Return what rods on actuators miss at internal coordinates s (k, n) [m], and the slopes by s.
+
+    Without readings q what these can make good is left out of both.
+    """
+    rods = [j for j, leg in enumerate(legs) if leg.actuator is not None]
+    on, inside = actuator_index(legs), internal_index(legs)
+    B = _in_base(R, t, platform_joints_at(legs, s))
+    read = _readings_at(legs, B) if q is None else q
+    vectors = (B - joints_at(legs, read))[:, rods]
+    length = np.linalg.norm(vectors, axis=2)
+    u = vectors / length[..., None]
+    values, slopes = length - [legs[j].q0 for j in rods], np.zeros((*length.shape, s.shape[1]))
+    by_q = np.zeros((*length.shape, read.shape[1]))
+    for row, j in enumerate(rods):
+        leg = legs[j]
+        if leg.internal is not None:
+            by_s = leg.internal.by_reading(leg.internal.at(leg.B, s[:, inside[j]]))
+            slopes[:, row, inside[j]] = np.einsum("ki,kij,kj->k", u[:, row], R, by_s)
+        if q is None and leg.actuator is not None:
+            by_reading = leg.actuator.by_reading(leg.actuator.at(leg.A, read[:, on[j]]))
+            by_q[:, row, on[j]] = np.sum(u[:, row] * by_reading, axis=1)
+    if q is None:
+        by_q /= np.maximum(np.linalg.norm(by_q, axis=1, keepdims=True), 1e-300)
+        left = np.eye(len(rods)) - by_q @ np.swapaxes(by_q, 1, 2)
+        values, slopes = (left @ values[..., None])[..., 0], left @ slopes
+    return values, slopes
 
 
 def measured_readings(legs: Sequence[Leg], R: Array, t: Array, q: Array) -> Array:

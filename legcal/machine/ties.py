@@ -4,18 +4,22 @@ A leg that is fixed to the platform and defines R_e has B at its
 :func:`~legcal.machine.leg.frame_point`: sliding B along the leg together with its offset shows
 nowhere.
 
+A joint inside a platform of several bodies has no reading: where it stands at zero shows nowhere.
+B of the rods that it carries moves with it, and R_e with that of frame legs; what this changes of
+the parameters together is tied.
+
 An overconstrained machine has more constraints of joints than they take freedoms away (an Exechon,
 whose axes are parallel in pairs). Errors of its parameters keep the mobility if the constraints
 stay dependent: at every pose where they hold the machine has self-stresses, forces w of its joints
 in equilibrium, w . F_pose = 0, and a step of the parameters must do no work on any of them,
-w . F_xi step = 0. Over several poses these are the ties; parameters move on the manifold where all
-of them hold.
+w . F_xi step = 0. Over several postures (poses, with what motors and joints inside the platform
+read) these are the ties; parameters move on the manifold where all of them hold.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -23,16 +27,22 @@ import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
 from legcal.machine.directions import SHOWN, describe_direction, sparse_basis
-from legcal.machine.equations import PoseEquations, n_pose_constraints, pose_equations
+from legcal.machine.equations import (
+    PoseEquations,
+    n_pose_constraints,
+    posture_constraints,
+)
 from legcal.machine.leg import Leg, LegColumns, frame_point
 from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
+    free_coordinates,
     geometries,
     moved_legs,
     parametrization_of,
 )
+from legcal.machine.rods import actuators_of, coordinates_at, internal_index, internal_joints_of
 from legcal.machine.solver import poses_after
 
 _POSES, _TEST_POSES = (8, 16, 32, 64), 4  # where ties are taken, and where it is seen that
@@ -49,7 +59,18 @@ class TieRows(NamedTuple):
     """Ties at some legs."""
 
     values: Array  # (m,) what is left of each [m]
-    by_local: Array  # (m, n_legs, 12) derivative by the numbers of legs (LegColumns)
+    by_local: Array  # (m, n_legs, 25) derivative by the numbers of legs (LegColumns)
+
+
+class _Postures(NamedTuple):
+    """Poses of R_e in R_b, and what actuators and internal joints read there."""
+
+    R: Array  # (k, 3, 3)
+    t: Array  # (k, 3) [m]
+    q: Array  # (k, n) [m or rad]
+
+
+_NOWHERE = _Postures(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +80,11 @@ class Ties:
     frame_legs: tuple[int, ...]
     points: tuple[int, ...] = ()  # the frame legs that are fixed to the platform
     n_dependent: int = 0  # constraints at a pose that follow from the others
-    # Poses where constraints are looked at, (k, 3, 3) and (k, 3) [m]
-    R: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
-    t: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    n_zeros: int = 0  # joints inside the platform, whose zeros are tied
+    postures: _Postures = _NOWHERE  # where constraints are looked at
 
     def __bool__(self) -> bool:
-        return bool(self.points) or self.n_dependent > 0
+        return bool(self.points) or self.n_dependent > 0 or self.n_zeros > 0
 
     def at(self, legs: Sequence[Leg]) -> TieRows:
         """Return the ties at legs; those of constraints are not independent of each other."""
@@ -73,8 +93,10 @@ class Ties:
         for j in self.points:
             value, row = self._point(legs, j)
             parts.append((np.array([value]), row[None]))
+        if self.n_zeros:
+            parts.append((np.zeros(self.n_zeros), self._zeros(legs)))
         if self.n_dependent:
-            found, _, _, stress = _closed(legs, self.n_dependent, self.R, self.t)
+            _, found, stress = _closed(legs, self.n_dependent, self.postures)
             wide = np.zeros((*found.values.shape, *shape))
             wide[:, np.arange(len(found.leg)), found.leg] = found.by_local
             rows = np.einsum("kms,kmjc->ksjc", stress, wide)
@@ -100,6 +122,31 @@ class Ties:
             row[others[1], LegColumns.B] += 0.5 * between
         return float((B - frame_point(legs, self.frame_legs, leg)) @ u), row
 
+    def _zeros(self, legs: Sequence[Leg]) -> Array:
+        """Return what other zeros of internal joints change, (n, n_legs, 25)."""
+        B = np.array([leg.B for leg in legs])
+        zero = ~free_coordinates(len(legs), self.frame_legs)
+        # Of the frame, turned about its origin and moved, by its zero coordinates
+        moves = np.broadcast_to(np.eye(3), (len(B), 3, 3))
+        of_frame = np.concatenate([-cross(B[:, None], np.eye(3)), moves], axis=1)
+        columns, inside = LegColumns, np.array(internal_index(legs))
+        first = [int(np.argmax(inside == i)) for i in range(self.n_zeros)]  # of legs that share one
+        rows = np.zeros((self.n_zeros, len(legs), columns.COUNT))
+        for i, (row, joint) in enumerate(zip(rows, internal_joints_of(legs), strict=True)):
+            moved = np.where((inside == i)[:, None], joint.by_reading(B), 0.0)
+            step = np.linalg.solve(of_frame.transpose(0, 2, 1)[zero], moved[zero])
+            turn, shift = step[:3], step[3:]
+            row[:, columns.B] = moved - cross(turn, B) - shift
+            for j, (leg, own) in enumerate(zip(legs, row, strict=True)):
+                if leg.platform_axis is not None:
+                    own[columns.PLATFORM_AXIS] = -normal_basis(leg.platform_axis) @ turn
+                if leg.internal is not None and j in first:
+                    basis = normal_basis(leg.internal.axis)
+                    own[columns.INTERNAL_AXIS] = -basis @ turn
+                    across = basis @ (cross(turn, leg.internal.point) + shift)
+                    own[columns.INTERNAL_POINT] = -across * leg.internal.turns
+        return rows
+
 
 def ties_of(
     legs: Sequence[Leg],
@@ -110,14 +157,16 @@ def ties_of(
     """Return the ties of a machine from its nominal legs in R_b and R_e."""
     fixed = [j for j in frame_legs if legs[j].is_fixed_to_platform]
     defined = any(not legs[j].is_fixed_to_platform for j in frame_legs)
-    ties = Ties(tuple(frame_legs), tuple(fixed) if defined else ())
+    n_zeros = len(internal_joints_of(legs))
+    ties = Ties(tuple(frame_legs), tuple(fixed) if defined else (), n_zeros=n_zeros)
     n_dependent = 0 if home is None or len(frame_legs) < 3 else _n_dependent(legs, home)
     if home is None or n_dependent == 0:
         return ties
     for n in _POSES:
-        R, t = _poses_near(legs, n_dependent, home, n, 0)
-        ties = replace(ties, n_dependent=n_dependent, R=R, t=t)
-        rows = replace(ties, points=()).at(legs).by_local.reshape(-1, len(legs) * LegColumns.COUNT)
+        at = _postures_near(legs, n_dependent, home, n, 0)
+        ties = replace(ties, n_dependent=n_dependent, postures=at)
+        alone = replace(ties, points=(), n_zeros=0)
+        rows = alone.at(legs).by_local.reshape(-1, len(legs) * LegColumns.COUNT)
         if np.linalg.matrix_rank(rows, _RANK) < len(rows):  # more poses say no more
             break
     return ties
@@ -147,10 +196,13 @@ def independent(rows: TieRows, by_unknowns: Array, n: int | None = None) -> tupl
 
 
 def by_step(rows: TieRows, place: IntArray) -> Array:
-    """Return derivatives (m, p) by steps of parameters that stand at *place* (n_legs, 12)."""
-    found = np.zeros((len(rows.values), int(place.max(initial=-1)) + 1))
-    found[:, place[place >= 0]] = rows.by_local[:, place >= 0]
-    return found
+    """Return derivatives (m, p) by steps of parameters that stand at *place* (n_legs, 25).
+
+    Legs may share some, those of what carries their ends.
+    """
+    found = np.zeros((int(place.max(initial=-1)) + 1, len(rows.values)))
+    np.add.at(found, place[place >= 0], rows.by_local[:, place >= 0].T)
+    return found.T
 
 
 def on_ties(
@@ -159,7 +211,7 @@ def on_ties(
     """Return legs moved to where all ties hold, where the nominal ones are.
 
     Numbers move as little as possible over their *scale* (p,), not at all where that is zero; they
-    stand at *place* (n_legs, 12).
+    stand at *place* (n_legs, 25).
     """
     if not ties:
         return tuple(legs)
@@ -195,18 +247,18 @@ def n_nearly_dependent(machine: Machine) -> int:
 def is_tied(legs: Sequence[Leg], ties: Ties, parametrization: Parametrization) -> bool:
     """Say whether a machine with small errors can be moved to where it has its mobility again.
 
-    Then its constraints hold with as many of them dependent at poses where no tie was taken.
+    Then its constraints hold with as many of them dependent at postures where no tie was taken.
     """
     if ties.n_dependent == 0:
         return True
-    length = _length(legs, ties.R[0], ties.t[0])
+    home = np.concatenate([ties.postures.R[0], ties.postures.t[0][:, None]], axis=1)
+    length = _length(legs, home)
     unit = np.where([name == "m" for name in parametrization.units], length, 1.0)
     step = _TRIAL * unit * np.random.default_rng(1).uniform(-1.0, 1.0, len(unit))
     place = parametrization.place
     moved = on_ties(moved_legs(legs, place, step), legs, ties, place, unit)
-    home = np.concatenate([ties.R[0], ties.t[0][:, None]], axis=1)
-    R, t = _poses_near(moved, ties.n_dependent, home, _TEST_POSES, 1)
-    missed = np.abs(_constraints(moved, R, t).values).max()
+    there = _postures_near(moved, ties.n_dependent, home, _TEST_POSES, 1)
+    missed = np.abs(_constraints(moved, there).values).max()
     return bool(missed < _CLOSED * length)
 
 
@@ -215,7 +267,7 @@ def ties_in_words(machine: Machine) -> str | None:
     ties, found = machine_ties(machine), parametrization_of(machine, twists=True)
     if ties.n_dependent == 0:
         return None
-    rows = ties.at(geometries(machine))
+    rows = replace(ties, n_zeros=0).at(geometries(machine))
     scale = np.where([name == "m" for name in found.units], leg_scale(machine, machine.home), 1.0)
     tied = sparse_basis(independent(rows, by_step(rows, found.place) * scale)[1])
     is_alone = np.sum(np.abs(tied) > SHOWN, axis=1) == 1
@@ -225,7 +277,7 @@ def ties_in_words(machine: Machine) -> str | None:
     names = [found.names[i] for i in together]
     if names:
         words.append(f"{_named(names, machine)} change only together")
-    n = sum(leg.n_constraints for leg in machine.legs)
+    n = n_pose_constraints(machine.legs)
     return (
         f"The machine is overconstrained: {ties.n_dependent} of the {n} constraints of its joints "
         f"follow{'s' * (ties.n_dependent == 1)} from the others. So that this stays so, "
@@ -238,14 +290,22 @@ def _named(parameters: Sequence[str], machine: Machine) -> str:
     return describe_direction(parameters, machine.leg_names).removesuffix(" together")
 
 
-def _constraints(legs: Sequence[Leg], R: Array, t: Array) -> PoseEquations:
-    """Return what holds without a reading."""
-    found = pose_equations(legs, R, t)
-    return found.of(~found.measured)
+def _constraints(legs: Sequence[Leg], at: _Postures, *, by_local: bool = False) -> PoseEquations:
+    """Return what holds at postures, whatever was measured."""
+    return posture_constraints(legs, at.R, at.t, at.q, by_local=by_local)
 
 
-def _length(legs: Sequence[Leg], R: Array, t: Array) -> float:
-    """Return the mean length of legs at a pose [m]."""
+def _slopes(legs: Sequence[Leg], found: PoseEquations, home: Array) -> tuple[Array, Array]:
+    """Return derivatives (k, m, 6 + n) by postures, and what makes these comparable, (6 + n,)."""
+    joints = (*actuators_of(legs), *internal_joints_of(legs))
+    length = _length(legs, home)
+    unit = np.array([length] * 3 + [1.0] * 3 + [length if j.turns else 1.0 for j in joints])
+    return np.concatenate([found.by_pose, found.by_q], axis=2) / unit, unit
+
+
+def _length(legs: Sequence[Leg], home: Array) -> float:
+    """Return the mean length of legs at a pose (3, 4) [m]."""
+    R, t = home[:, :3], home[:, 3]
     return float(
         np.mean(
             [
@@ -257,64 +317,66 @@ def _length(legs: Sequence[Leg], R: Array, t: Array) -> float:
 
 
 def _n_dependent(legs: Sequence[Leg], home: Array, least: float = _RANK) -> int:
-    """Return how many constraints follow from the others at home and at poses around it."""
-    n = n_pose_constraints(legs)
+    """Return how many constraints follow from the others at home and at postures around it."""
     dependent = _n_dependent_at(legs, home, least)
     if dependent == 0:
         return 0
     # Where home alone is special, the constraints are independent a little way off.
-    R, t = _poses_near(legs, dependent, home, _TEST_POSES, 2)
-    around = _constraints(legs, R, t)
-    singular = np.linalg.svd(around.by_pose / _unit(legs, home), compute_uv=False)
+    around = _constraints(legs, _postures_near(legs, dependent, home, _TEST_POSES, 2))
+    singular = np.linalg.svd(_slopes(legs, around, home)[0], compute_uv=False)
     rank = np.sum(singular > least * singular[:, :1], axis=1)
-    return n - int(rank.max())
+    return len(around.leg) - int(rank.max())
 
 
 def _n_dependent_at(legs: Sequence[Leg], home: Array, least: float) -> int:
     """Return how many constraints follow from the others at one pose (3, 4)."""
-    n = n_pose_constraints(legs)
-    if n < 2:
+    R, t = home[None, :, :3], home[None, :, 3]
+    here = _constraints(legs, _Postures(R, t, coordinates_at(legs, R, t)))
+    if len(here.leg) < 2:
         return 0
-    here = _constraints(legs, home[None, :, :3], home[None, :, 3]).by_pose[0]
-    found = np.linalg.svd(here / _unit(legs, home), compute_uv=False)
-    return n - int(np.sum(found > least * found[0]))
+    found = np.linalg.svd(_slopes(legs, here, home)[0][0], compute_uv=False)
+    return len(here.leg) - int(np.sum(found > least * found[0]))
 
 
-def _unit(legs: Sequence[Leg], home: Array) -> Array:
-    """Return what makes rotations and displacements of a pose comparable, (6,)."""
-    return np.repeat([_length(legs, home[:, :3], home[:, 3]), 1.0], 3)
-
-
-def _poses_near(
+def _postures_near(
     legs: Sequence[Leg], n_dependent: int, home: Array, n: int, seed: int
-) -> tuple[Array, Array]:
-    """Return n poses around home, home first, where the independent constraints hold."""
-    unit = _unit(legs, home)
-    step = np.random.default_rng(seed).uniform(-_REACH, _REACH, (n, 6))
-    step[:, 3:] *= unit[0]
+) -> _Postures:
+    """Return n postures around home, home first, where the independent constraints hold."""
+    R, t = home[None, :, :3], home[None, :, 3]
+    at = _Postures(R, t, coordinates_at(legs, R, t))
+    slopes, unit = _slopes(legs, _constraints(legs, at), home)
+    step = _REACH * np.random.default_rng(seed).uniform(-1.0, 1.0, (n, len(unit)))
+    if at.q.shape[1]:  # motors follow the platform, as far as constraints leave it free
+        left = np.linalg.svd(slopes[0])[2][slopes.shape[1] - n_dependent :]
+        step = step @ left.T @ left
     step[0] = 0.0
-    poses = poses_after(np.repeat(home[None, :3], n, axis=0), step)
-    _, R, t, _ = _closed(legs, n_dependent, poses[:, :, :3], poses[:, :, 3])
-    return R, t
+    at = _Postures(*(np.repeat(part, n, axis=0) for part in at))
+    return _closed(legs, n_dependent, _moved(at, _length(legs, home) * step / unit))[0]
 
 
 def _closed(
-    legs: Sequence[Leg], n_dependent: int, R: Array, t: Array
-) -> tuple[PoseEquations, Array, Array, Array]:
-    """Return constraints, poses nearby and self-stresses (k, m, n_dependent) there.
+    legs: Sequence[Leg], n_dependent: int, at: _Postures
+) -> tuple[_Postures, PoseEquations, Array]:
+    """Return postures nearby, their constraints and self-stresses (k, m, n_dependent) there.
 
-    What the self-stresses see is left, whatever the pose: with errors that are not tied the
-    constraints contradict each other there.
+    What the self-stresses see is left, whatever the posture: with errors that are not tied the
+    constraints contradict each other there. The stresses do no work on motors and internal joints.
     """
-    poses = np.concatenate([R, t[..., None]], axis=2)
-    unit = _unit(legs, poses[0])
+    home = np.concatenate([at.R[0], at.t[0][:, None]], axis=1)
     for _ in range(_STEPS):
-        found = _constraints(legs, poses[:, :, :3], poses[:, :, 3])
-        left, singular, right = np.linalg.svd(found.by_pose / unit)
+        found = _constraints(legs, at, by_local=True)
+        slopes, unit = _slopes(legs, found, home)
+        left, singular, right = np.linalg.svd(slopes)
         rank = left.shape[1] - n_dependent
         along = np.einsum("kmr,km->kr", left[:, :, :rank], found.values) / singular[:, :rank]
         step = -np.einsum("kr,krc->kc", along, right[:, :rank]) / unit
         if np.abs(step).max(initial=0.0) < _AT_REST:
             break
-        poses = poses_after(poses, step)
-    return found, poses[:, :, :3], poses[:, :, 3], left[:, :, rank:]
+        at = _moved(at, step)
+    return at, found, left[:, :, rank:]
+
+
+def _moved(at: _Postures, step: Array) -> _Postures:
+    """Return postures after steps (k, 6 + n)."""
+    poses = poses_after(np.concatenate([at.R, at.t[..., None]], axis=2), step[:, :6])
+    return _Postures(poses[:, :, :3], poses[:, :, 3], at.q + step[:, 6:])

@@ -7,7 +7,7 @@ in front of the first underscore, where that tells them apart. The frames stand 
 joints span the largest triangle, or lie farthest apart in a plane.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -22,6 +22,7 @@ from legcal.machine.bodies import Bodies, Connection, frame_link, rigid_bodies
 from legcal.machine.chain import Closure
 from legcal.machine.classification import (
     CONCURRENT,
+    check_carried,
     classify_leg,
     is_actuator,
     nearest,
@@ -48,7 +49,8 @@ def find_chains(
 ) -> list[LegChain]:
     """Return the legs between two links, each classified as joint, slider or rod, joint.
 
-    Several rods may hang on what one of the *motors* on the base moves.
+    Several rods may hang on what one of the *motors* on the base moves, and end on a body that the
+    platform carries by a joint.
 
     Raises
     ------
@@ -63,16 +65,49 @@ def find_chains(
             "legcal.platform."
         )
     origin = bodies.T_body_link[platform][:3, 3]
-    return [
-        classify_leg(steps, origin, urdf.path, motors)
-        for steps in _paths(bodies, urdf, *ends, motors)
-    ]
+    inside = _internal_joints(bodies, urdf, *ends)
+    chains = []
+    for steps in _paths(bodies, urdf, *ends, motors, inside):
+        chain = classify_leg(steps, origin, urdf.path, motors)
+        last = steps[-1]
+        carrier = inside.get(last.connection.bodies[last.far])
+        if carrier is not None:
+            check_carried(chain, carrier, urdf.path)
+            chain = replace(chain, internal=carrier)
+        chains.append(chain)
+    return chains
+
+
+def _internal_joints(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> dict[str, Step]:
+    """Return the joint by which the platform carries each body on which legs end, by that body.
+
+    Seen from such a body, the legs without base and platform reach the base by several joints, and
+    the platform by this one.
+    """
+    found = {}
+    for connection in bodies.connections:
+        if platform not in connection.bodies or connection.joint is None:
+            continue
+        near = connection.bodies.index(platform)
+        body = connection.bodies[1 - near]
+        n_joints = sum(body in c.bodies for c in bodies.connections)
+        if body in (base, platform) or n_joints < 3:
+            continue
+        on_base, on_platform = _reached(bodies, body, (base, platform))
+        if len(on_base) > 1 and on_platform == [connection]:
+            found[body] = _step(connection, near, urdf)
+    return found
 
 
 def _paths(
-    bodies: Bodies, urdf: Urdf, base: str, platform: str, motors: Sequence[str]
+    bodies: Bodies,
+    urdf: Urdf,
+    base: str,
+    platform: str,
+    motors: Sequence[str],
+    inside: Mapping[str, Step],
 ) -> list[list[Step]]:
-    """Return the joints of every leg from base to platform."""
+    """Return the joints of every leg from base to platform, or to a body that this carries."""
     _refuse_second_mechanism(bodies, urdf, base, platform)
     at: dict[str, list[Connection]] = {}
     for connection in bodies.connections:
@@ -80,7 +115,7 @@ def _paths(
         for body in connection.bodies:
             at.setdefault(body, []).append(connection)
     begun: list[tuple[str, list[Step], Connection]] = []
-    used = set[int]()
+    used = {id(step.connection) for step in inside.values()}
     for first in at.get(base, []):
         step = _step(first, first.bodies.index(base), urdf)
         body = first.bodies[step.far]
@@ -96,7 +131,7 @@ def _paths(
             near = connection.bodies.index(body)
             steps.append(_step(connection, near, urdf))
             body = connection.bodies[1 - near]
-            if body == platform:
+            if body == platform or body in inside:
                 break
             if len(steps) > MAX_JOINTS_OF_LEG:
                 raise OutOfClass(
@@ -163,7 +198,7 @@ def propose_frame(names: Sequence[str], chains: Sequence[LegChain]) -> list[str]
         return list(names)
     ends = (
         np.array([chain.A for chain in chains]),
-        np.array([chain.line_in(-1, chain.B)[0] for chain in chains]),
+        np.array([chain.B_platform for chain in chains]),
     )
     if normals is not None:
         ends = _flat(ends[0], normals[0]), _flat(ends[1], normals[1])
@@ -405,6 +440,33 @@ def _several_bodies(
     Seen from the body without base and platform, the joints of a loop inside a leg reach the base
     by one joint, and those of a part of the platform by those of several legs.
     """
+    on_base, on_platform = _reached(bodies, body, ends)
+    if len(on_platform) != 1:
+        return ""
+    if len(on_base) == 1:
+        return (
+            f"{urdf.path}: this machine is outside the method: found a loop inside the leg that "
+            f"starts with {_name(steps[0].connection)}, closed at link '{body}', needed chains "
+            "without loops that end on the platform itself; if these are the rods of a "
+            "parallelogram on an arm or a carriage, close each on the platform as a leg of its "
+            "own, otherwise this machine cannot be calibrated this way."
+        )
+    if len(on_base) > 1:
+        return (
+            f"{urdf.path}: this machine is outside the method: found a platform of several bodies, "
+            f"with {len(on_base)} legs that meet on link '{body}' and more than the internal "
+            f"{_name(on_platform[0])} between it and the platform, needed one revolute or "
+            "prismatic joint between the platform and each other body on which legs end; name the "
+            "body between these in legcal.platform (on an H4 the bar in the middle), otherwise "
+            "this machine cannot be calibrated this way."
+        )
+    return ""
+
+
+def _reached(
+    bodies: Bodies, body: str, ends: tuple[str, str]
+) -> tuple[list[Connection], list[Connection]]:
+    """Return by which joints what hangs together with a body is on base and on platform."""
     base, platform = ends
     reached, new = {body}, [body]
     on_base, on_platform = list[Connection](), list[Connection]()
@@ -421,25 +483,7 @@ def _several_bodies(
             elif there not in reached:
                 reached.add(there)
                 new.append(there)
-    if len(on_platform) != 1:
-        return ""
-    if len(on_base) == 1:
-        return (
-            f"{urdf.path}: this machine is outside the method: found a loop inside the leg that "
-            f"starts with {_name(steps[0].connection)}, closed at link '{body}', needed chains "
-            "without loops that end on the platform itself; if these are the rods of a "
-            "parallelogram on an arm or a carriage, close each on the platform as a leg of its "
-            "own, otherwise this machine cannot be calibrated this way."
-        )
-    if len(on_base) > 1:
-        return (
-            f"{urdf.path}: this machine is outside the method: found a platform of several bodies, "
-            f"with {len(on_base)} legs that meet on link '{body}' and the internal "
-            f"{_name(on_platform[0])} between them and the platform (as on an H4 or I4), needed "
-            "one rigid platform; fix that joint if it does not move, otherwise this machine cannot "
-            "be calibrated this way."
-        )
-    return ""
+    return on_base, on_platform
 
 
 def _not_a_chain(urdf: Urdf, steps: list[Step], body: str, base: str, n_onward: int) -> str:
@@ -518,6 +562,8 @@ def _platform_body(
             "legcal.legs if another link is the base."
         )
     meeting = [body for body in at if body != base and len(at[body]) > 2]
+    # What lies between bodies where chains meet, as the bar in the middle of an H4
+    meeting += [b for b in at if b not in (base, *meeting) and set(at[b]) <= set(meeting)]
     candidates = meeting or [body for body in at if body != base]
     candidates = [body for body in candidates if body in carried] or candidates
     candidates.sort(key=lambda body: (base in at[body], -len(at[body])))  # arms come last

@@ -223,7 +223,8 @@ def plan_import(
     DatasetError, ModelError, UsageError
         If a file cannot be read, nothing moves or nothing rests, or the clocks cannot be compared.
     """
-    machine, destination = load_mechanism(model), Path(destination)
+    machine = load_mechanism(model).require_rigid_platform()
+    destination = Path(destination)
     recordings = [open_recording(Path(path), machine, image_topic, joint_topic) for path in sources]
     if (image_topic or joint_topic) and not any(isinstance(one, Bag) for one in recordings):
         raise UsageError(

@@ -91,6 +91,7 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
         more,
         table(*of_laws, rows=laws) if laws else None,
         _motors(description) if "actuators" in description else None,
+        _internal_joints(description) if "internal_joints" in description else None,
         table(*of_axes, rows=axes) if axes else None,
         [
             _home(description["home"]),
@@ -100,6 +101,36 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
     )
 
 
+def _internal_joints(description: dict[str, Any]) -> RenderableType:
+    """Return the joints inside a platform of several bodies: what moves, and how far."""
+    rows = []
+    for name, joint in description["internal_joints"].items():
+        legs = [leg["name"] for leg in description["legs"] if leg.get("internal") == name]
+        turns = joint["kind"] == "revolute"
+        scale, unit = SHOWN_IN["rad" if turns else "m"]
+        travel = "" if joint["travel"] is None else _travel(joint["travel"], turns)
+        moves = f"axis {_direction(joint['axis'])}" if turns else None
+        home = f"{scale * joint['at_home']:z.2f} {unit}"
+        rows.append(
+            (
+                name,
+                ", ".join(legs),
+                moves or f"along {_direction(joint['direction'])}",
+                travel,
+                home,
+            )
+        )
+        if turns:
+            rows.append(("", "", f"at {_points([joint['point']])[0]} mm", "", ""))
+    return table("inside", "legs", "moves", ">travel", ">at home", rows=rows)
+
+
+def _travel(limits: Sequence[float], turns: bool) -> str:
+    """Return the limits of a joint in millimetres or degrees."""
+    scale, unit = SHOWN_IN["rad" if turns else "m"]
+    return f"{scale * limits[0]:z.2f} to {scale * limits[1]:z.2f} {unit}"
+
+
 def _motors(description: dict[str, Any]) -> RenderableType:
     """Return the motors that rods hang on: what moves them, and how far."""
     rows = []
@@ -107,7 +138,6 @@ def _motors(description: dict[str, Any]) -> RenderableType:
         rods = [leg for leg in description["legs"] if leg.get("actuator") == joint]
         turns = motor["kind"] == "revolute"
         scale, unit = SHOWN_IN["rad" if turns else "m"]
-        low, high = rods[0]["travel"]
         rows.append(
             (
                 joint,
@@ -115,7 +145,7 @@ def _motors(description: dict[str, Any]) -> RenderableType:
                 f"axis {_direction(motor['axis'])}"
                 if turns
                 else f"along {_direction(motor['direction'])}",
-                f"{scale * low:z.2f} to {scale * high:z.2f} {unit}",
+                _travel(rods[0]["travel"], turns),
                 f"{scale * rods[0]['q_home']:z.2f} {unit}",
             )
         )

@@ -20,6 +20,7 @@ from legcal.geometry import Array, BoolArray, IntArray, components, cross
 from legcal.machine import (
     Actuator,
     ActuatorColumns,
+    JointMotion,
     Leg,
     LegColumns,
     LegKind,
@@ -29,11 +30,14 @@ from legcal.machine import (
     actuator_index,
     actuators_of,
     by_step,
+    coordinates_at,
     ends_at_poses,
     first_rods,
     freedoms,
     geometries,
     independent,
+    internal_index,
+    internal_joints_of,
     joints_at,
     leg_labels,
     list_in_words,
@@ -42,8 +46,9 @@ from legcal.machine import (
     moved_legs,
     on_ties,
     parametrization_of,
+    platform_joints_at,
     random_poses_of_legs,
-    readings_of_rods,
+    random_postures_of_legs,
     ties_of,
 )
 from legcal.vision import Link, shared_cameras
@@ -89,6 +94,9 @@ class PredictedObservations:
     platform_board: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     tied_by: Ties | None = None  # what ties these parameters; frames alone without it
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
+    # Readings of actuators and internal coordinates, (k, n) and (w, n), where poses do not say them
+    given_moving: Array | None = None
+    moving_reached: Array | None = None
 
     @property
     def n_legs(self) -> int:
@@ -144,9 +152,26 @@ class PredictedObservations:
         return np.array(actuator_index(self.legs), dtype=np.intp)
 
     @cached_property
+    def internal_joints(self) -> tuple[Actuator, ...]:
+        """What moves joints at B inside the platform, each once."""
+        return internal_joints_of(self.legs)
+
+    @cached_property
+    def on_body(self) -> IntArray:
+        """The body of the platform that B of each leg is on, (n_legs,): its joint, -1 for none."""
+        return np.array(internal_index(self.legs), dtype=np.intp)
+
+    @cached_property
+    def moving(self) -> Array:
+        """Readings of the actuators and then internal coordinates at every pose, (k, n)."""
+        if self.given_moving is not None:
+            return self.given_moving
+        return coordinates_at(self.legs, self.R, self.t)
+
+    @property
     def q(self) -> Array:
         """Readings of the actuators at every pose, (k, n_actuators) [m or rad]."""
-        return readings_of_rods(self.legs, self.R, self.t)
+        return self.moving[:, : len(self.actuators)]
 
     @cached_property
     def A_at(self) -> Array:
@@ -155,7 +180,7 @@ class PredictedObservations:
 
     @cached_property
     def A_by_local(self) -> Array:
-        """Their derivatives by the numbers of the legs (LegColumns), (k, n_legs, 3, 21)."""
+        """Their derivatives by the numbers of the legs (LegColumns), (k, n_legs, 3, 25)."""
         found = np.zeros((len(self.t), self.n_legs, 3, LegColumns.COUNT))
         found[..., LegColumns.A] = np.eye(3)
         for j, actuator, a in self._carried():
@@ -167,19 +192,36 @@ class PredictedObservations:
         return found
 
     @cached_property
-    def A_by_q(self) -> Array:
-        """Their derivatives by the readings of actuators in metres, (k, n_legs, 3, n_actuators)."""
-        found = np.zeros((len(self.t), self.n_legs, 3, len(self.actuators)))
+    def ends_by_moving(self) -> tuple[Array, Array]:
+        """Derivatives of A and B in R_b by :attr:`moving` in metres, (k, n_legs, 3, n) each."""
+        shape = len(self.t), self.n_legs, 3, self.moving.shape[1]
+        of_A, of_B = np.zeros(shape), np.zeros(shape)
         for j, actuator, a in self._carried():
             by_q = actuator.motion(self.legs[j].A, self.q[:, a]).by_q
-            found[:, j, :, a] = by_q * self.unit_of_q[a]
-        return found
+            of_A[:, j, :, a] = by_q * self.unit_of_moving[a]
+        for j, motion, column in self._inside():
+            of_B[:, j, :, column] = self.unit_of_moving[column] * (
+                self.R @ motion.by_q[:, :, None]
+            ).squeeze(2)
+        return of_A, of_B
 
     @cached_property
-    def unit_of_q(self) -> Array:
-        """A metre of every actuator's reading in its own unit, (n_actuators,)."""
-        turns = np.array([actuator.turns for actuator in self.actuators], dtype=np.bool_)
+    def unit_of_moving(self) -> Array:
+        """A metre of every one of :attr:`moving` in its own unit, (n,)."""
+        joints = (*self.actuators, *self.internal_joints)
+        turns = np.array([joint.turns for joint in joints], dtype=np.bool_)
         return np.where(turns, 1.0 / self.mean_length, 1.0)
+
+    @cached_property
+    def B_by_local(self) -> Array:
+        """Derivatives of B in R_e by the numbers of the legs (LegColumns), (k, n_legs, 3, 25)."""
+        found = np.zeros((len(self.t), self.n_legs, 3, LegColumns.COUNT))
+        found[..., LegColumns.B] = np.eye(3)
+        for j, motion, _ in self._inside():
+            found[:, j, :, LegColumns.B] = motion.by_A
+            found[:, j, :, LegColumns.INTERNAL_AXIS] = motion.by_axis
+            found[:, j, :, LegColumns.INTERNAL_POINT] = motion.by_point
+        return found
 
     @cached_property
     def sigma_of_legs(self) -> Array:
@@ -200,9 +242,19 @@ class PredictedObservations:
         )
 
     @property
+    def bodies(self) -> tuple[tuple[int, ...], ...]:
+        """The legs on each body of a platform of several; none where it is one."""
+        if not self.internal_joints:
+            return ()
+        return tuple(
+            tuple(np.flatnonzero(self.on_body == body).tolist())
+            for body in np.unique(self.on_body).tolist()
+        )
+
+    @property
     def n_motions(self) -> int:
-        """The unknowns of a pose: freedoms of the platform, and readings of actuators."""
-        return len(freedoms(self.frame_legs)) + len(self.actuators)
+        """The unknowns of a pose: freedoms of the platform, and what moves joints at A and B."""
+        return len(freedoms(self.frame_legs)) + int(self.moving.shape[1])
 
     def _carried(self) -> list[tuple[int, Actuator, int]]:
         """Return the legs whose joint at A moves, by what, and which actuator that is."""
@@ -212,11 +264,20 @@ class PredictedObservations:
             if leg.actuator is not None
         ]
 
+    def _inside(self) -> list[tuple[int, JointMotion, int]]:
+        """Return the legs whose joint at B moves in the platform, how, and its column there."""
+        n, s = len(self.actuators), self.moving[:, len(self.actuators) :]
+        return [
+            (j, leg.internal.motion(leg.B, s[:, self.on_body[j]]), n + int(self.on_body[j]))
+            for j, leg in enumerate(self.legs)
+            if leg.internal is not None
+        ]
+
     @cached_property
     def arm(self) -> Array:
         """From the origin of R_e to B in the directions of R_b, (k, n_legs, 3) [m]."""
-        B = np.array([leg.B for leg in self.legs])
-        return np.asarray(np.einsum("kij,nj->kni", self.R, B))
+        B = platform_joints_at(self.legs, self.moving[:, len(self.actuators) :])
+        return np.asarray(np.einsum("kij,knj->kni", self.R, B))
 
     @cached_property
     def length(self) -> Array:
@@ -241,7 +302,7 @@ class PredictedObservations:
 
     @cached_property
     def local_to_parameters(self) -> Array:
-        """Derivative of each leg's numbers by the parameters in metres, (n_legs, 17, p)."""
+        """Derivative of each leg's numbers by the parameters in metres, (n_legs, 25, p)."""
         n = LegColumns.COUNT
         scattered = [self.parametrization.scatter(np.eye(n), j) for j in range(self.n_legs)]
         return np.array(scattered).reshape(self.n_legs, n, len(self.unit)) * self.unit
@@ -331,7 +392,7 @@ def planned_observations(
     legs, length, rng = machine_near(machine, home)
     A, B = ends_at_pose(legs, home)
     n_poses = images * len(views)
-    R, t = random_poses_of_legs(
+    R, t, moving = random_postures_of_legs(
         legs, machine.frame_legs, home, travel_of(machine), max(n_poses, REACHED), rng
     )
     seen = np.zeros((len(views), len(legs)), dtype=np.bool_)
@@ -348,6 +409,8 @@ def planned_observations(
         t=t[:n_poses],
         R_reached=R,
         t_reached=t,
+        given_moving=moving[:n_poses] if machine.internal_joints else None,
+        moving_reached=moving if machine.internal_joints else None,
         view=np.repeat(np.arange(len(views)), images),
         pose=np.arange(n_poses),
         seen=seen,

@@ -189,6 +189,7 @@ class PlatformMotion:
                 predicted.frame_legs,
                 predicted.R_reached,
                 predicted.t_reached,
+                predicted.moving_reached,
             )
         except NotIdentifiable as error:
             self.why_not = str(error)

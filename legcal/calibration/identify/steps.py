@@ -176,7 +176,8 @@ def distance_rows(
 ) -> tuple[Array, Array, IntArray]:
     """Return what distances between leg ends say of the offsets.
 
-    Two legs on one platform joint have none: their distance is zero whatever the offsets are.
+    Two legs on one platform joint have none: their distance is zero whatever the offsets are. Two
+    on different bodies of the platform have none that is constant.
 
     Returns (m, n_lengths): Derivative of each distance by the offsets and lengths, whitened; (m, ):
     One over the standard deviation of each distance [1/m]; (m, 4): Frame, pose, and both legs of
@@ -197,6 +198,7 @@ def distance_rows(
         for i in np.flatnonzero(frame == f)
         for j, g in combinations(np.flatnonzero(shown[i]).tolist(), 2)
         if gaps[j, g] > _MIN_DISTANCE * predicted.mean_length
+        and predicted.on_body[j] == predicted.on_body[g]
     ]
     if not keys:
         return np.zeros((0, len(columns))), np.zeros(0), np.zeros((0, 4), dtype=np.intp)
@@ -239,6 +241,7 @@ def identify_platform(
         np.concatenate(
             [
                 predicted.columns(LegColumns.B, LegColumns.PLATFORM_AXIS, LegColumns.TWIST),
+                predicted.columns(LegColumns.INTERNAL),
                 predicted.columns(LegColumns.BASE_AXIS, legs=universal),
             ]
         )

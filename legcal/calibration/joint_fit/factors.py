@@ -39,7 +39,7 @@ from legcal.vision import (
 
 _SAME_GAMMA = 1e-6  # relative difference of gammas that count as one
 _SIX, _ALL, _ONE = slice(0, 6), slice(None), slice(0, 1)
-_OF_ACTUATOR = slice(LegColumns.OWN, LegColumns.COUNT)
+_OF_ACTUATOR = LegColumns.ACTUATOR
 
 
 class Observed(NamedTuple):

@@ -410,8 +410,9 @@ class LegParameters:
                     if x >= 0:
                         J[:, x] = column[self.free]
             if leg.actuator is not None and nominal.actuator is not None:
-                slope, own = leg.actuator.numbers_slope(nominal.actuator), number[LegColumns.OWN :]
-                for x, column in zip(unknown[LegColumns.OWN :], slope.T, strict=True):
+                slope = leg.actuator.numbers_slope(nominal.actuator)
+                own = number[LegColumns.ACTUATOR]
+                for x, column in zip(unknown[LegColumns.ACTUATOR], slope.T, strict=True):
                     if x >= 0:
                         turned = np.zeros(len(self.free))
                         turned[own[own >= 0]] = column[own >= 0]
