@@ -98,6 +98,40 @@ class ViewPattern:
         return None
 
 
+def with_likely_views(photographs: Sequence[Photograph]) -> tuple[list[Photograph], str | None]:
+    """Return photographs with the views that their names have, and the pattern of these.
+
+    They are as given and the pattern is None where names do not look so, or where folders name the
+    views. Numbers may be anything and name no views here.
+    """
+    pattern = likely_pattern(photographs)
+    if pattern is None or any(one.folder != "." for one in photographs):
+        return list(photographs), None
+    form = ViewPattern(pattern)
+    found = [one for photograph in photographs if (one := form.of(photograph)) is not None]
+    if all(one.view.isdecimal() for one in found):
+        return list(photographs), None
+    return found, pattern
+
+
+def columns_by_content(
+    photographs: Sequence[Photograph],
+) -> dict[str, Callable[[Sequence[str]], bool]]:
+    """Return what tells by the cells of a column that it names photographs, or their views."""
+    stems = {_stem(text) for one in photographs for text in (one.name, one.label) if text}
+    views = {one.folder.casefold() for one in photographs} - {"."}
+
+    def are_photographs(cells: Sequence[str]) -> bool:
+        named = [_stem(cell) for cell in cells if cell]
+        return bool(named) and not all(map(str.isdecimal, named)) and stems.issuperset(named)
+
+    def are_views(cells: Sequence[str]) -> bool:
+        named = [cell.casefold() for cell in cells]
+        return len(views) > 1 and len(named) > len(views) and set(named) == views
+
+    return {"image": are_photographs, "view": are_views}
+
+
 def likely_pattern(photographs: Sequence[Photograph]) -> str | None:
     """Return a pattern by which names in one folder are those of several views, as many of each.
 
@@ -393,7 +427,7 @@ def _in_order(rows: Sequence[Row], photographs: Sequence[Photograph], table: str
             (f"folder {folder}", list(range(len(rows))), inside)
             for folder, inside in folders.items()
         ]
-        how = "in the order of rows and of names: every folder shows the poses of all rows"
+        how = "in the order of rows and of names: every view shows the poses of all rows"
     problems = [
         f"{table}: the photographs of {name} could not be matched in order: found {len(inside)} "
         f"photographs for {len(members)} rows, needed as many; remove what has no partner, or add "
