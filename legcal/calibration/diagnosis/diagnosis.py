@@ -626,7 +626,7 @@ def _diagnosis(
     of_kinds = [*first.same_as, *(one.what for one in alike if kinds.get(one.kind) is one)]
     same = dict.fromkeys([*of_kinds, *(one.what for one in alike[1:])])
     tests = dict.fromkeys(one.test for one in alike if one.test) if same else {}
-    rough = ["the rough T_base_camera of the views speak for the first"] * by_hints
+    rough = "; the rough T_base_camera of the views speak for the first" * by_hints
     return Diagnosis(
         kind=first.kind,
         what=first.what,
@@ -636,7 +636,7 @@ def _diagnosis(
         before=before.images,
         after=after.images,
         score=after.mean,
-        remedy=", ".join([first.remedy, *rough]) if rough else first.remedy,
+        remedy=first.remedy + rough,
         tests=tuple(tests)[:2],
         n_kinds=len(of_kinds),
     )
