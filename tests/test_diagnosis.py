@@ -302,6 +302,22 @@ def test_single_images_that_are_mirrored_are_named(
     assert found.after > found.before
 
 
+def test_a_view_whose_camera_was_moved_is_named(
+    outlines: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    view = outlines.measurements.view.copy()
+    moved = np.flatnonzero(view == 1)[:5]
+    view[moved] = 0
+    d = replace(outlines, measurements=replace(outlines.measurements, view=view))
+    found = _diagnosed(d, {"readings shifted", "images upside down"}, monkeypatch)
+    first = [row_names(d.measurements)[k] for k in (0, int(moved[0]))]
+    assert found.what == (
+        f"the outlines of view c1 look as if they were taken from 2 places: {first[0]} and 5 more "
+        f"from one, {first[1]} and 4 more from another"
+    )
+    assert (found.images, found.before, found.after, found.same_as) == (11, 6, 11, ())
+
+
 def test_a_diagnosis_names_each_kind_of_mistake_that_images_do_not_tell_from_it(
     of_symmetric_machine: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

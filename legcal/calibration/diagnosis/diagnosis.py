@@ -25,6 +25,7 @@ from legcal.calibration.diagnosis.mistakes import (
     as_given,
     both,
     mistakes,
+    moved_camera,
     rows_of_views,
     shifted_from,
     turned_images,
@@ -54,6 +55,7 @@ STAGE = "Trying common mistakes"
 
 _AGREE_ALREADY = 0.9  # of the images: then nothing common is wrong
 MIN_IMAGES = 3  # of a group of views
+_MIN_PLACE = 5  # images that say where a camera stood: of fewer some pose fits nearly anything
 _FEW = 6  # images, at least, that say which mistakes are worth a closer look
 _SUITS = 0.5  # of the legs that they should show
 _STARTS = 1, 1, 2  # images that suggest cameras, of all
@@ -160,7 +162,11 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     judge = _Judge(data, groups)
     if judge.own.images > _AGREE_ALREADY * len(judge.own.row):
         return ()
-    tried = [*mistakes(data), *judge.shifted_from_a_row_on(), *judge.turned_images()]
+    tried = [
+        *mistakes(data),
+        *judge.shifted_from_a_row_on(),
+        *(judge.turned_images() or judge.moved_cameras()),  # upside down is as a camera that rolled
+    ]
     judged = judge.judged(judge.finalists(tried))
     likeliest = judge.likeliest(judged)
     likeliest = judge.likeliest_two(judged, likeliest) or likeliest
@@ -275,6 +281,24 @@ class _Judge:
                         rows = then.row[then.agrees].tolist()
                 if len(rows) >= MIN_IMAGES:
                     found.append(turned_images(self.data, self.given, rows, turn))
+        return found
+
+    def moved_cameras(self) -> list[Mistake]:
+        """Return views whose camera may have stood in several places.
+
+        Images that do not agree with the camera of the others agree with another one then.
+        """
+        found = list[Mistake]()
+        for g, group in enumerate(self.groups):
+            own = self.of_groups[g]
+            places, left = [own.row[own.agrees].tolist()], own.row[~own.agrees].tolist()
+            while len(places[-1]) >= _MIN_PLACE and len(left) >= _MIN_PLACE:
+                then = self._compare([self.given], g, left, _STARTS)[0]
+                places.append(then.row[then.agrees].tolist())
+                left = then.row[~then.agrees].tolist()
+            places = [rows for rows in places if len(rows) >= _MIN_PLACE]
+            if len(places) > 1 and len(group.views) == 1:  # of a board's views all would move
+                found.append(moved_camera(self.data, self.given, places))
         return found
 
     def beside(self, what: Mistake, one: Agreement) -> _Judge:
@@ -529,19 +553,29 @@ class _Judge:
 
         These are the pool's where none are given.
         """
+        parts = [
+            (one, [row for row in rows if one.place[row] == place])
+            for one in assumed
+            for place in np.unique(one.place[rows]).tolist()
+        ]
         assumptions = [
             Assumption(
-                _search(self.search, one, rows),
+                _search(self.search, one, some),
                 one.flip,
                 one.focal,
                 self.groups[g],
-                rows,
+                some,
                 starts,
                 self._as_far(known or self.pool[g], one.focal),
             )
+            for one, some in parts
+        ]
+        found = compare_assumptions(assumptions, self.data.pool)
+        of_each = [
+            [own for (part, _), own in zip(parts, found, strict=True) if part is one]
             for one in assumed
         ]
-        return compare_assumptions(assumptions, self.data.pool)
+        return [Agreement.of_places(own, rows) for own in of_each]
 
 
 def symmetries(machine: Machine) -> list[Array]:
