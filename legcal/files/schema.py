@@ -24,6 +24,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
+from legcal.brief import brief
 from legcal.errors import DatasetError
 from legcal.files.reading import MAX_TEXT, MAX_YAML, NotRegular, TooLarge, read_bytes
 
@@ -121,6 +122,7 @@ class FileSchema(BaseModel):
     )
 
 
+@brief
 class Document(BaseModel):
     """A JSON document that is written: its fields are the keys, in their order."""
 

@@ -25,7 +25,7 @@ from legcal.calibration.diagnosis.mistakes import (
     as_given,
     both,
     mistakes,
-    moved_camera,
+    moved_cameras,
     rows_of_views,
     shifted_from,
     turned_images,
@@ -56,6 +56,7 @@ STAGE = "Trying common mistakes"
 _AGREE_ALREADY = 0.9  # of the images: then nothing common is wrong
 MIN_IMAGES = 3  # of a group of views
 _MIN_PLACE = 5  # images that say where a camera stood: of fewer some pose fits nearly anything
+_MOST = 0.8  # of the images
 _FEW = 6  # images, at least, that say which mistakes are worth a closer look
 _SUITS = 0.5  # of the legs that they should show
 _STARTS = 1, 1, 2  # images that suggest cameras, of all
@@ -284,11 +285,12 @@ class _Judge:
         return found
 
     def moved_cameras(self) -> list[Mistake]:
-        """Return views whose camera may have stood in several places.
+        """Return that cameras of single views may have stood in several places.
 
-        Images that do not agree with the camera of the others agree with another one then.
+        Images that do not agree with the camera of the others agree with another one then, and
+        hardly any are left: where readings are wrong, some camera suits a few images as well.
         """
-        found = list[Mistake]()
+        moved, n_agree = list[list[list[int]]](), 0
         for g, group in enumerate(self.groups):
             own = self.of_groups[g]
             places, left = [own.row[own.agrees].tolist()], own.row[~own.agrees].tolist()
@@ -298,8 +300,13 @@ class _Judge:
                 left = then.row[~then.agrees].tolist()
             places = [rows for rows in places if len(rows) >= _MIN_PLACE]
             if len(places) > 1 and len(group.views) == 1:  # of a board's views all would move
-                found.append(moved_camera(self.data, self.given, places))
-        return found
+                moved.append(places)
+                n_agree += sum(map(len, places))
+            else:
+                n_agree += own.images
+        if not moved or n_agree < _MOST * len(self.own.row):
+            return []
+        return [moved_cameras(self.data, self.given, moved)]
 
     def beside(self, what: Mistake, one: Agreement) -> _Judge:
         """Return what judges other mistakes beside one, which are undone together."""

@@ -414,20 +414,27 @@ def turned_images(
     return replace(one, of_few=tuple(rows), test="")
 
 
-def moved_camera(data: OrderedDataset, given: Assumed, places: Sequence[Sequence[int]]) -> Mistake:
-    """Return images of a view that were taken from several places, by rows."""
-    m, place = data.measurements, given.place.copy()
-    others = [row for rows in places[1:] for row in rows]
-    for k, rows in enumerate(places):
-        place[list(rows)] = k
-    in_file = sorted(places, key=lambda rows: int(data.order.rows[list(rows)].min()))
-    of_each = [f"{_images(data, rows)} from {'another' if k else 'one'}"
-               for k, rows in enumerate(in_file)]  # fmt: skip
-    things = _things(data)
+def moved_cameras(
+    data: OrderedDataset, given: Assumed, views: Sequence[Sequence[Sequence[int]]]
+) -> Mistake:
+    """Return images of some views that were taken from several places, by rows of each place."""
+    m, place, things = data.measurements, given.place.copy(), _things(data)
+    others, said = list[int](), list[str]()
+    for places in views:
+        others += [row for rows in places[1:] for row in rows]
+        for k, rows in enumerate(places):
+            place[list(rows)] = k
+        in_file = sorted(places, key=lambda rows: int(data.order.rows[list(rows)].min()))
+        of_each = [f"{_images(data, rows)} from {'another' if k else 'one'}"
+                   for k, rows in enumerate(in_file)]  # fmt: skip
+        what = "those" if said else f"the {things}"
+        said.append(
+            f"{what} of view {m.views[m.view[places[0][0]]].name} look as if they were taken from "
+            f"{len(places)} places: {', '.join(of_each)}"
+        )
     return Mistake(
         "camera moved",
-        f"the {things} of view {m.views[m.view[places[0][0]]].name} look as if they were taken "
-        f"from {len(places)} places: {', '.join(of_each)}",
+        ", and ".join(said),
         "with a view for each place",
         f"give the {things} of each place a view of their own (for legcal init a folder, or a "
         "column view)",
