@@ -491,7 +491,7 @@ class _Judge:
             are_enough = some.images >= before.images + MIN_IMAGES
             return is_plain and are_enough and one.images > self.own.images
         if _explains(one, self.own):
-            return True
+            return _explains(one, self._as_it_is_near(one.cameras))
         gain = _signed_ranks(one.share - self.own.share)
         if what.opposite is None or one.images <= self.own.images or gain < _MIN_SIGMAS:
             return False
@@ -499,6 +499,18 @@ class _Judge:
         contrast = one.share - self.all(what.opposite, (), known).share
         is_sure = _signed_ranks(contrast) >= _SURE_SIGMAS
         return is_sure and float(contrast.mean()) >= _SURE_GAIN
+
+    def _as_it_is_near(self, cameras: Sequence[RigidTransform | None]) -> Agreement:
+        """Return what images say of things as they are, also near other cameras.
+
+        The search for cameras may have missed these, and then a mistake is none.
+        """
+        found = list(self.of_groups)
+        for g, (group, T) in enumerate(zip(self.groups, cameras, strict=True)):
+            if T is not None:
+                near = self._compare([self.given], g, group.rows, (), self._alike(T))[0]
+                found[g] = _better(found[g], near)
+        return Agreement.joined(found)
 
     def all(
         self,
@@ -634,7 +646,9 @@ def _explains(one: Agreement, own: Agreement) -> bool:
     changed = gain != 0.0
     size, sigmas = float(gain[changed].mean()), _signed_ranks(gain)
     if np.mean(one.agrees[changed]) < _MIN_SHARE:  # images show little, whatever is true
-        return size >= _MIN_GAIN and sigmas >= _SURE_SIGMAS
+        # The images of one view are too few for what is sure: they gain plainly, nearly all.
+        least = _MIN_SIGMAS if size >= _PLAIN_GAIN else _SURE_SIGMAS
+        return size >= _MIN_GAIN and sigmas >= least
     is_sure = size >= _SURE_GAIN and sigmas >= _SURE_SIGMAS
     is_plain = size >= _PLAIN_GAIN and sigmas >= _FEW_SIGMAS
     return is_plain or is_sure or (size >= _MIN_GAIN and sigmas >= _MIN_SIGMAS)
