@@ -9,6 +9,7 @@ little without it, or nothing is explained, another one is undone beside it in t
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -63,6 +64,7 @@ _STARTS = 1, 1, 2  # images that suggest cameras, of all
 _FEW_STARTS = (1,), (1, 1)  # of the first few, and of the next few if these suit no mistake
 _POOL = 3  # cameras of other mistakes that are tried
 _FINALISTS = 6  # mistakes that all images judge
+_SAME_AMOUNT = 2  # of these that differ by how much
 _FIRSTS = 2  # mistakes beside which another one is looked for, where none explains the images
 _NEAR_BEST = 0.5  # of the gain of the best, which few images gave, that all images judge as well
 _ONE_ROW = (1, -1)  # by which readings stand late from a row on
@@ -350,16 +352,18 @@ class _Judge:
         # Less than this is gained by chance, also by what is wrong with the images of one group.
         least = _SURE_GAIN * min(float(one.expected.sum()) for one in seen)
         found = [k for k, one in enumerate(tried) if one.of_few]  # their own images found them
-        amounts = set[str]()
+        amounts = Counter[str]()
         left_for = {True: _FINALISTS, False: _FINALISTS // 2}  # whether of all views, or of some
         for k in np.argsort(-gain, kind="stable").tolist():
             if gain[k] <= max(_NEAR_BEST * gain.max(), least):
                 break
             of_all = not any(tried[k].true.is_as(self.given, g.rows) for g in self.groups)
-            if tried[k].amount_of not in amounts and left_for[of_all] and k not in found:
+            amount = tried[k].amount_of
+            most = 1 if tried[k].finer else _SAME_AMOUNT  # all images find the amount then
+            if (not amount or amounts[amount] < most) and left_for[of_all] and k not in found:
                 found.append(k)
                 left_for[of_all] -= 1
-                amounts |= {tried[k].amount_of} - {""}
+                amounts[amount] += 1
         return [tried[k] for k in sorted(found)]  # the commoner first
 
     def _nearly_agrees(self, g: int) -> bool:
@@ -431,6 +435,11 @@ class _Judge:
         found = [(what, one) for what, one in judged if self.is_explained(what, one)]
         best = max((one for _, one in found), key=_total, default=self.own)
         alike = [(what, one) for what, one in found if _is_as_good(one, best)]
+        most = dict[str, float]()  # of those that differ by how much
+        for what, one in alike:
+            most[what.amount_of] = max(_total(one), most.get(what.amount_of, 0.0))
+        alike = [(what, one) for what, one in alike
+                 if not what.amount_of or _total(one) == most[what.amount_of]]  # fmt: skip
         return sorted(alike, key=lambda one: -self.hints_suited(one[1]))  # then the commoner
 
     def likeliest_two(
@@ -491,7 +500,7 @@ class _Judge:
             are_enough = some.images >= before.images + MIN_IMAGES
             return is_plain and are_enough and one.images > self.own.images
         if _explains(one, self.own):
-            return _explains(one, self._as_it_is_near(one.cameras))
+            return _explains(one, self._as_it_is_near(what, one))
         gain = _signed_ranks(one.share - self.own.share)
         if what.opposite is None or one.images <= self.own.images or gain < _MIN_SIGMAS:
             return False
@@ -500,14 +509,14 @@ class _Judge:
         is_sure = _signed_ranks(contrast) >= _SURE_SIGMAS
         return is_sure and float(contrast.mean()) >= _SURE_GAIN
 
-    def _as_it_is_near(self, cameras: Sequence[RigidTransform | None]) -> Agreement:
-        """Return what images say of things as they are, also near other cameras.
+    def _as_it_is_near(self, what: Mistake, one: Agreement) -> Agreement:
+        """Return what images say of things as they are, also near the cameras of a mistake.
 
         The search for cameras may have missed these, and then a mistake is none.
         """
         found = list(self.of_groups)
-        for g, (group, T) in enumerate(zip(self.groups, cameras, strict=True)):
-            if T is not None:
+        for g, (group, T) in enumerate(zip(self.groups, one.cameras, strict=True)):
+            if T is not None and not what.true.is_as(self.given, group.rows):
                 near = self._compare([self.given], g, group.rows, (), self._alike(T))[0]
                 found[g] = _better(found[g], near)
         return Agreement.joined(found)

@@ -215,7 +215,7 @@ def shifted_from(data: OrderedDataset, given: Assumed, v: int, first: int, k: in
         f"with the readings moved by {_rows(k)}",
         "check which image belongs to which row",
         replace(given, q=q),
-        amount_of=f"rows of view {name} from one on",
+        amount_of=f"rows of view {name}",
     )
 
 
