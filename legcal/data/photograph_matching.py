@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 
 from legcal.data.measurements import few
 from legcal.errors import DatasetError, UsageError
-from legcal.files import MAX_IMAGE, closest, describe, is_name, read_bytes
+from legcal.files import MAX_IMAGE, NAME_NEEDED, closest, describe, is_name, read_bytes
 from legcal.vision import (
     CONVERT,
     CONVERT_HEIC,
@@ -259,11 +259,11 @@ def match(
         )
     found = {"name": _by_name, "time": _by_time, "order": _in_order}[how](rows, photographs, table)
     used = {photograph.name for _, photograph in found.pairs}
-    bad = [name for name in used if not is_name(name)]
+    bad = sorted(name for name in used if not is_name(name))
     if bad:
         raise DatasetError(
             f"{table}: the photograph {describe(bad[0])} could not be used: found a name that "
-            "tables cannot show, needed printable characters; rename the file."
+            f"tables cannot show, needed {NAME_NEEDED}; rename the file."
         )
     spare = [photograph.name for photograph in photographs if photograph.name not in used]
     notes = found.notes
