@@ -235,6 +235,18 @@ def test_views_that_are_words_in_the_names_are_taken_and_numbers_proposed(
     assert {view for view, *_ in pairs(numbered)} == {"c1"}
 
 
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-8-sig", "utf-16"])
+def test_tables_are_read_as_spreadsheets_write_them(
+    encoding: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [f"Länge {j} (mm)" for j in range(1, 7)]
+    table(own_folder(tmp_path, FLAT), names=names, add=345.0, separator=";")
+    path = tmp_path / "own.csv"
+    path.write_bytes(("sep=;\r\n" + path.read_text()).encode(encoding))
+    assert init(monkeypatch, tmp_path, "--lengths") == 0
+    assert [k for *_, k in pairs(tmp_path)] == [0, 1, 2]
+
+
 def test_columns_of_photographs_and_views_are_known_by_their_cells(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -40,6 +40,8 @@ _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 MAX_ROWS = 50_000
 MAX_COLUMNS = 300
 _MAX_NAMED = 10  # columns that a sentence names
+_TEXT = re.compile(rb"[\t\n\r\x20-\x7e\xa0-\xff]*")  # of Windows-1252, without what is rare
+_SEPARATOR = re.compile(r"\Asep=.\r?\n")
 _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
 _COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?", re.ASCII)
 _WORKBOOKS = {b"PK\x03\x04": "an XLSX or ODS workbook", b"\xd0\xcf\x11\xe0": "an XLS workbook"}
@@ -410,9 +412,21 @@ def _read_lines(path: Path, what: str, *, loose: bool = False) -> Lines:
 
 
 def _decoded(content: bytes, *, loose: bool) -> str:
-    """Return the text of a file in UTF-8; if ``loose``, also in UTF-16 with its mark."""
-    is_wide = loose and content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    return content.decode("utf-16" if is_wide else "utf-8-sig")
+    """Return the text of a file in UTF-8.
+
+    If ``loose`` also in UTF-16 with its mark, and as Excel writes it in western Europe, without the
+    line that names its delimiter.
+    """
+    if not loose:
+        return content.decode("utf-8-sig")
+    is_wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        text = content.decode("utf-16" if is_wide else "utf-8-sig")
+    except UnicodeDecodeError:
+        if is_wide or not _TEXT.fullmatch(content):
+            raise
+        text = content.decode("cp1252")
+    return _SEPARATOR.sub("\n", text, count=1)  # lines keep their numbers
 
 
 def _delimiter(text: str) -> str:
