@@ -160,6 +160,7 @@ REFUSED: list[tuple[str, Sequence[str], Sequence[str]]] = [
     (twelve_points("B", "P").replace("P3", "P2"), OPTIONS, ("'P2' twice",)),
     (twelve_points("B", "P").replace("P3", "sun"), OPTIONS, ("'sun'", "B1 and P1")),
     (twelve_points("B", "P").replace("P3,-144.9,38.8,0\n", ""), OPTIONS, ("platform_x",)),
+    ("Point,X [mm],Y [mm],Z [mm]\n", OPTIONS, ("no row",)),
     (twelve_points("", ""), OPTIONS, ("'1'", "B1 and P1")),
     (wide("bx,by,bz,px,py,pz").partition("\n")[2], OPTIONS, ("numbers in the first line",)),
     (wide("u,v,w,r,s,t"), OPTIONS, ("columns 'u', 'v', 'w', 'r', 's', 't'", "columns 'base_x'")),

@@ -227,7 +227,7 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: object) -> Lines:
             f"{path}, header: the unit could not be decided: found {' and '.join(units)}, needed m "
             "or mm for all lengths; correct the headings."
         )
-    if {"x", "y"} <= set(keys):
+    if {"x", "y"} <= set(keys) and len(lines) > 1:
         lines = _from_points(lines, keys, path)
         keys = [split_heading(text)[0] for text in lines[0][1]]
     found = [_coordinate(key) for key in keys]
