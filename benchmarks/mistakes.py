@@ -12,7 +12,9 @@ are 10 mm off. What is named is written to FILE (JSON lines), and what FILE has 
 so that a run can be continued (--minutes ends it early). Printed is what FILE has in the end: how
 often the right kind was the first of the diagnosis, with its 95 % interval (Wilson), how often both
 of two mistakes were, and how often anything was named of sessions without a mistake; and how long
-it took, also in processor time (of this process: all of it with one worker).
+it took, also in processor time (of this process: all of it with one worker). The example that comes
+with legcal is one more model (--models example), with its rough camera poses (seed 0) and without
+(seed 1).
 
 Right is the kind of mistake that was made, or one whose undoing gives the same machine: legs at the
 same places in all images, whatever their names and wherever the camera stands. That is computed
@@ -55,6 +57,7 @@ from legcal.simulation import Level
 from legcal.workers import Run, worker_pool
 
 MODELS = ("hexapod", "3-rps", "3-upu", "tricept")
+EXAMPLE, EXAMPLE_FOLDER = "example", Path(__file__).parents[1] / "examples/hexapod"
 JOINTS, WRONG_JOINTS = 2e-3, 10e-3  # standard deviation of joint centres of the model [m]
 SAME = 0.01  # of the size of the machine: legs at the same places
 WRONG_RADIUS = 0.05  # relative
@@ -391,8 +394,11 @@ def wilson(k: int, n: int) -> tuple[float, float]:
 
 
 def session(model: str, seed: int, keep: Path, pool: Run) -> Session:
-    """Return a rendered session with its edge pairs, made once."""
+    """Return a session with its edge pairs, rendered and searched once."""
     folder = keep / f"{model}-{seed}-{1e3 * JOINTS:g}"
+    kept = folder / "pairs.pickle"
+    if model == EXAMPLE:
+        folder, kept = EXAMPLE_FOLDER, keep / f"{EXAMPLE}.pickle"
     if not (folder / "dataset.yaml").exists():
         spread = Spread(JOINTS)
         settings = SimulationSettings(
@@ -401,7 +407,7 @@ def session(model: str, seed: int, keep: Path, pool: Run) -> Session:
             errors=ParameterErrors(base_joints=spread, platform_joints=spread, offsets=spread),
         )
         simulate(model, folder, settings)
-    dataset, kept = load_dataset(folder), folder / "pairs.pickle"
+    dataset = load_dataset(folder)
     if not kept.exists():
         data = order_dataset(dataset, pool, no_progress)
         n, m = data.measurements.n_rows, data.measurements
@@ -515,7 +521,7 @@ def main() -> None:
             for model in args.models.split(","):
                 true = None
                 for kind in (None, CLEAN, OFF):
-                    of_session = [2002, seed, MODELS.index(model)]
+                    of_session = [2002, seed, [*MODELS, EXAMPLE].index(model)]
                     if kind is None:
                         if true is None:
                             true = session(model, seed, args.keep, pool)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+from pydantic import BaseModel
 from scipy.spatial.transform import RigidTransform, Rotation
 
 T = TypeVar("T")
@@ -22,22 +23,20 @@ _WIDTH = 100  # characters of a line
 
 
 def brief(cls: type[T]) -> type[T]:
-    """Give a dataclass a ``repr`` of at most ten lines, however much it holds, and a table of HTML.
+    """Give a class a ``repr`` of at most ten lines, however much it holds, and a table of HTML.
+
+    The class is a dataclass or a pydantic model.
 
     Large arrays are shown by their shape, sequences by what is in them, dataclasses by their name.
     """
-    cls.__repr__ = _repr  # type: ignore[method-assign]
+    cls.__repr__ = cls.__str__ = _repr  # type: ignore[method-assign]
     if not hasattr(cls, "_repr_html_"):
         cls._repr_html_ = _repr_html  # type: ignore[attr-defined]
     return cls
 
 
 def _repr(self: object) -> str:
-    shown = [
-        f"{field.name}={_value(getattr(self, field.name))}"
-        for field in fields(self)  # type: ignore[arg-type]
-        if field.repr
-    ]
+    shown = [f"{name}={_value(getattr(self, name))}" for name in _shown(self)]
     name = type(self).__name__
     line = f"{name}({', '.join(shown)})"
     if len(line) <= _WIDTH:
@@ -52,13 +51,19 @@ def _repr_html(self: object) -> str:
     answer = getattr(self, "sentence", None)
     told = f"<p><b>{escape(answer)}</b></p>" if isinstance(answer, str) else ""
     rows = "".join(
-        f'<tr><td style="text-align:left">{escape(field.name)}</td>'
-        f'<td style="text-align:left">{escape(_value(getattr(self, field.name)))}</td></tr>'
-        for field in fields(self)  # type: ignore[arg-type]
-        if field.repr
+        f'<tr><td style="text-align:left">{escape(name)}</td>'
+        f'<td style="text-align:left">{escape(_value(getattr(self, name)))}</td></tr>'
+        for name in _shown(self)
     )
     name = escape(type(self).__name__)
     return f"{told}<details open><summary>{name}</summary><table>{rows}</table></details>"
+
+
+def _shown(self: object) -> list[str]:
+    """Return the names of the fields that are shown."""
+    if isinstance(self, BaseModel):
+        return [name for name, field in type(self).model_fields.items() if field.repr]
+    return [field.name for field in fields(self) if field.repr]  # type: ignore[arg-type]
 
 
 def _value(value: object) -> str:
@@ -75,7 +80,7 @@ def _value(value: object) -> str:
         return _several(list(value), "{}") if value else "{}"
     if isinstance(value, tuple | list | Set):
         return _several(list(value), "()" if isinstance(value, tuple) else "[]")
-    if is_dataclass(value):
+    if is_dataclass(value) or isinstance(value, BaseModel):
         return f"{type(value).__name__}(...)"
     return _short(repr(value))
 

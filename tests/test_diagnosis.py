@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import run
 from csv_rows import read_rows, write_rows
 from hexapod_example import Spoiled, spoiled
 from simulated import settings, simulated
@@ -300,6 +301,45 @@ def test_single_images_that_are_mirrored_are_named(
     name = row_names(d.measurements)[int(np.flatnonzero(d.measurements.view == 1)[1])]
     assert found.what == f"the outlines {name} and 2 more of view c2 look mirrored"
     assert found.after > found.before
+
+
+NEARLY_SYMMETRIC = """leg,type,bx,by,bz,px,py,pz
+1,RPS,200.0,0.0,0,120.0,0.0,0
+2,RPS,-80.0,183.2,0,-70.0,123.9,0
+3,RPS,-110.0,-157.2,0,-76.0,-113.9,0
+"""
+
+
+def test_rough_camera_poses_find_what_a_nearly_symmetric_machine_hides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its images nearly agree with cameras elsewhere, near which the right one is not found."""
+    (tmp_path / "tripod.csv").write_text(NEARLY_SYMMETRIC)
+    lengths = ("--min-length", "380", "--max-length", "520", "--leg-radius", "9", "--height", "430")
+    assert (
+        run(monkeypatch, "new", tmp_path / "tripod.csv", "--unit", "mm", *lengths, "-o", tmp_path)
+        == 0
+    )
+    simulate(str(tmp_path / "models/tripod.yaml"), tmp_path / "set", settings(poses=5))
+    d = _with_readings(load_dataset(tmp_path / "set"), lambda q: q[:, [1, 0, 2]])
+    found = _diagnosed(d, {"columns exchanged", "images mirrored"}, monkeypatch)
+    assert found.what == "columns leg1_prismatic and leg2_prismatic look exchanged"
+
+
+def test_a_view_whose_camera_was_moved_is_named(
+    outlines: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    view = outlines.measurements.view.copy()
+    moved = np.flatnonzero(view == 1)[:5]
+    view[moved] = 0
+    d = replace(outlines, measurements=replace(outlines.measurements, view=view))
+    found = _diagnosed(d, {"readings shifted", "images upside down"}, monkeypatch)
+    first = [row_names(d.measurements)[k] for k in (0, int(moved[0]))]
+    assert found.what == (
+        f"the outlines of view c1 look as if they were taken from 2 places: {first[0]} and 5 more "
+        f"from one, {first[1]} and 4 more from another"
+    )
+    assert (found.images, found.before, found.after, found.same_as) == (11, 6, 11, ())
 
 
 def test_a_diagnosis_names_each_kind_of_mistake_that_images_do_not_tell_from_it(

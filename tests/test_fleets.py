@@ -148,4 +148,4 @@ def test_a_terminal_shows_every_failure_whole(
     monkeypatch.setenv("COLUMNS", "50")
     run_command(monkeypatch, "calibrate", *places, "-o", tmp_path / "out")
     told = " ".join(capsys.readouterr().out.split())
-    assert told.count("give the folder of a dataset.") == len(places)
+    assert told.count("a table of readings (legcal init).") == len(places)

@@ -212,16 +212,54 @@ def test_views_are_found_in_names_of_photographs_in_one_folder(
     load_dataset(tmp_path / "dataset")
 
 
-def test_a_pattern_of_views_is_proposed_and_not_taken(
+def test_views_that_are_words_in_the_names_are_taken_and_numbers_proposed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table(own_folder(tmp_path, AT_THE_END), n=4)
-    assert init(monkeypatch, tmp_path, "--dry-run") == 0
-    assert "give --view-pattern '*-{view}'" in " ".join(capsys.readouterr().out.split())
-    table(tmp_path, {"view": ("left", "right", "left", "right")}, n=4)  # or a column says it
     assert init(monkeypatch, tmp_path) == 0
-    views = {Path(image).name: view for view, image, _ in pairs(tmp_path)}
-    assert views == {name: name[4:].removesuffix(".png") for name in AT_THE_END}
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Views left, right are taken from the names of the photographs, '*-{view}'" in said
+    table(tmp_path, {"view": ("a", "a", "b", "b")}, n=4)  # or a column says it
+    assert init(monkeypatch, tmp_path, "--match", "order", output="other") == 0
+    by_names, by_column = (
+        {Path(row["image"]).name: row["view"] for row in read_rows(tmp_path / name)}
+        for name in ("dataset/measurements.csv", "other/measurements.csv")
+    )
+    assert by_names == {name: name[4:].removesuffix(".png") for name in AT_THE_END}
+    assert by_column == dict(zip(AT_THE_END, "aabb", strict=True))
+    numbered = tmp_path / "numbered"
+    numbered.mkdir()
+    table(own_folder(numbered, ("1_01.png", "1_02.png", "2_01.png", "2_02.png")), n=4)
+    assert init(monkeypatch, numbered) == 0
+    assert "give --view-pattern '{view}_*'" in " ".join(capsys.readouterr().out.split())
+    assert {view for view, *_ in pairs(numbered)} == {"c1"}
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-8-sig", "utf-16"])
+def test_tables_are_read_as_spreadsheets_write_them(
+    encoding: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [f"Länge {j} (mm)" for j in range(1, 7)]
+    table(own_folder(tmp_path, FLAT), names=names, add=345.0, separator=";")
+    path = tmp_path / "own.csv"
+    path.write_bytes(("sep=;\r\n" + path.read_text()).encode(encoding))
+    assert init(monkeypatch, tmp_path, "--lengths") == 0
+    assert [k for *_, k in pairs(tmp_path)] == [0, 1, 2]
+
+
+def test_columns_of_photographs_and_views_are_known_by_their_cells(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    columns = {"Ort": ("b", "b", "a", "a"), "Bild": ("2.jpg", "x1.jpg", "x1.jpg", "2.jpg"),
+               "Lage": ("b", "a", "c", "a")}  # fmt: skip
+    own_folder(tmp_path, ("a/x1.png", "a/2.png", "b/x1.png", "b/2.png"))
+    table(tmp_path, columns, n=4)
+    assert init(monkeypatch, tmp_path) == 0
+    assert "Column 'Lage'" in " ".join(capsys.readouterr().out.split())
+    places = {image.removeprefix("images/"): (view, k) for view, image, k in pairs(tmp_path)}
+    assert places == {
+        "b/2.png": ("b", 0), "b/x1.png": ("b", 1), "a/x1.png": ("a", 2), "a/2.png": ("a", 3),
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -259,6 +297,7 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (("1.jpg", "1.png", "2.png"), {"columns": {"image": "112"}}, (), ("row 1", "1.jpg, 1.png")),
     (SAME, {"n": 6, "columns": {"image": "123123"}}, (), ("a/1.png", "column view")),
     (FLAT, {"names": LEGS[:5]}, (), ("leg6", "'leg5'")),
+    (FLAT, {"names": ["1.5"] * 6}, (), ("numbers in the first line", "leg1")),
     (FLAT, {"names": ["a", "b", "c", "d", "e", "f"]}, (), ("'a'", "L1, q1, 1")),
     (FLAT, {"names": [*LEGS[:5], "leg5 mm"]}, (), ("'leg5'", "'leg5 mm'")),
     (FLAT, {"add": 345.0}, (), ("lengths of legs in mm", "add --lengths")),

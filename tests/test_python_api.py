@@ -32,13 +32,14 @@ def test_everything_that_is_returned_is_short_to_look_at(example_run: Run) -> No
         calibration.platform,
         calibration.steps,
         legcal.load_result(example_run.output),
+        legcal.load_result(example_run.output).result,
         legcal.evaluate("hexapod", "hexapod"),
         legcal.identifiability(calibration.dataset.machine),
     ]
     for one in shown:
-        lines = repr(one).splitlines()
-        assert 1 <= len(lines) <= 10, type(one)
-        assert len(repr(one)) < 1000, type(one)
+        for text in (repr(one), str(one)):
+            assert 1 <= len(text.splitlines()) <= 10, type(one)
+            assert len(text) < 1000, type(one)
 
 
 def test_a_result_that_is_loaded_says_what_the_calibration_said(example_run: Run) -> None:
@@ -51,6 +52,7 @@ def test_a_result_that_is_loaded_says_what_the_calibration_said(example_run: Run
     found = calibration.solution.values["leg2.offset"]
     assert rows["leg2.offset"]["calibrated"] == pytest.approx(1e3 * found, rel=1e-12)
     assert rows["leg2.offset"]["unit"] == "mm"
+    assert table[-1] == list(table)[-1]
     assert len(table) == len(loaded.result.parameters)
     assert repr(table).count("\n") == len(table)
 

@@ -70,6 +70,10 @@ def made(folder: Path) -> Machine:
         (twelve_points("B", "P"), ()),
         (twelve_points("A", "B"), ()),
         (twelve_points("Base joint ", "Platform joint "), ()),
+        (twelve_points("B", "P").replace("Point", "Punkt").replace(",", ";"), ()),
+        (twelve_points("B", "P").partition("\n")[2], ("--unit", "mm")),  # without headings
+        (twelve_points("B", "P").partition("\n")[2].replace(",", "  "), ("--unit", "mm")),
+        (twelve_points("base,", "platform,").replace("Point", "Side,Leg"), ()),
     ],
 )  # fmt: skip
 def test_headings_as_people_write_them_give_one_machine(
@@ -156,6 +160,10 @@ REFUSED: list[tuple[str, Sequence[str], Sequence[str]]] = [
     (twelve_points("B", "P").replace("P3", "P2"), OPTIONS, ("'P2' twice",)),
     (twelve_points("B", "P").replace("P3", "sun"), OPTIONS, ("'sun'", "B1 and P1")),
     (twelve_points("B", "P").replace("P3,-144.9,38.8,0\n", ""), OPTIONS, ("platform_x",)),
+    ("Point,X [mm],Y [mm],Z [mm]\n", OPTIONS, ("no row",)),
+    (twelve_points("", ""), OPTIONS, ("'1'", "B1 and P1")),
+    (wide("bx,by,bz,px,py,pz").partition("\n")[2], OPTIONS, ("numbers in the first line",)),
+    (wide("u,v,w,r,s,t"), OPTIONS, ("columns 'u', 'v', 'w', 'r', 's', 't'", "columns 'base_x'")),
     (one_row("B", "P") * 2, ("--unit", "mm", *OPTIONS), ("3 rows", "one complete row")),
     (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", "--max-length", "500", "--type", "UPS"),
      ("max_length alone",)),

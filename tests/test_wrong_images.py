@@ -325,6 +325,9 @@ def test_a_rough_pose_in_another_convention_is_called_so(
     T = _pose(np.array([0.3, -0.9, 0.5]), Rotation.from_quat([0.68, 0.17, -0.2, 0.68]))
     (note,) = hint_notes(["c1"], [written(T * near)], [T])
     assert words in note
+    notes = hint_notes(["c1", "c2"], [written(T * near)] * 2, [T] * 2)
+    assert len(notes) == 1 + words.startswith("needed")  # one cause, one note
+    assert ("views c1, c2:" in notes[0]) == (len(notes) == 1)
 
 
 def _pose(xyz: NDArray[np.float64], rotation: Rotation) -> RigidTransform:

@@ -212,6 +212,12 @@ def load_result(given: str | Path) -> EarlierResult:
     """
     path = Path(given)
     path = path if path.name == RESULT_NAME and not os.path.isdir(path) else path / RESULT_NAME
+    if os.path.isdir(path.parent) and not os.path.exists(path):
+        raise DatasetError(
+            f"{given}: the result of an earlier calibration could not be read: found no "
+            f"{RESULT_NAME} in the folder, needed one that legcal calibrate wrote (-o); check the "
+            "path."
+        )
     document = Result.read(path)
     try:
         machine = load_mechanism(path.parent / RESULT_YAML)

@@ -126,7 +126,10 @@ class ParameterTable:
         return len(self.rows)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        return (dict(zip(self.columns, row, strict=True)) for row in self.rows)
+        return (self[k] for k in range(len(self)))
+
+    def __getitem__(self, row: int) -> dict[str, Any]:
+        return dict(zip(self.columns, self.rows[row], strict=True))
 
     def cells(self) -> list[tuple[str, ...]]:
         """Return the rows as texts, the status of estimated parameters left out."""

@@ -176,7 +176,8 @@ def find_dataset_file(given: Path) -> Path:
     if not os.path.exists(path):
         raise DatasetError(
             f"{given}: the dataset could not be read: found no {path.name} in the folder, needed "
-            "one; give the folder of a dataset."
+            "one; give the folder of a dataset, or make one of photographs and a table of readings "
+            "(legcal init)."
         )
     return path
 

@@ -24,9 +24,11 @@ from legcal.data.photograph_matching import (
     Matching,
     Photograph,
     Row,
+    columns_by_content,
     find_photographs,
     likely_pattern,
     match,
+    with_likely_views,
 )
 from legcal.data.reading_units import are_commands, sigma_in, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
@@ -239,7 +241,16 @@ def plan_new_dataset(
     machine = load_mechanism(model).require_rigid_platform()
     _check_place(folder, destination)
     photographs = find_photographs(folder, [view.strip("/") for view in views], view_pattern)
-    sheet = ReadingsSheet(path, machine, "photograph")
+    by_names, pattern = photographs, None
+    if view_pattern is None:
+        by_names, pattern = with_likely_views(photographs)
+    sheet = ReadingsSheet(path, machine, "photograph", columns_by_content(by_names))
+    if {view.casefold() for view in sheet.text("view") if view} <= {
+        one.folder.casefold() for one in by_names
+    }:
+        photographs = by_names
+    else:
+        pattern = None  # the table names other views
     found = sheet.readings(unit, lengths=lengths, servos=read_servos(servos, sheet.motors))
     rows = tuple(
         Row(where, *texts)
@@ -262,6 +273,12 @@ def plan_new_dataset(
     _check_photographs(matching, [read[of_views[view]] for view in view_of])
     sigma, note = _sigmas(encoder_sigma, sheet.motors, found)
     notes = [*sheet.notes, *matching.notes, *note]
+    if pattern is not None and "view" not in sheet:
+        notes.append(
+            f"Views {few(list(dict.fromkeys(view_of)))} are taken from the names of the "
+            f"photographs, '{pattern}': if that is not where the camera stood, add a column view, "
+            "or give --view-pattern."
+        )
     if set(view_of) == {ONE_VIEW} and not any(row.view for row in rows):
         likely = likely_pattern([photograph for _, photograph in matching.pairs])
         remedy = "put those of each place in a folder, add a column view, or give --view-pattern"

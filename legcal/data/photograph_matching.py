@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 
 from legcal.data.measurements import few
 from legcal.errors import DatasetError, UsageError
-from legcal.files import MAX_IMAGE, closest, describe, is_name, read_bytes
+from legcal.files import MAX_IMAGE, NAME_NEEDED, closest, describe, is_name, read_bytes
 from legcal.vision import (
     CONVERT,
     CONVERT_HEIC,
@@ -96,6 +96,40 @@ class ViewPattern:
                 label = (found["before"] + found["after"]).removesuffix(path.suffix)
                 return replace(photograph, view=found["view"], label=label.strip(_SEPARATORS))
         return None
+
+
+def with_likely_views(photographs: Sequence[Photograph]) -> tuple[list[Photograph], str | None]:
+    """Return photographs with the views that their names have, and the pattern of these.
+
+    They are as given and the pattern is None where names do not look so, or where folders name the
+    views. Numbers may be anything and name no views here.
+    """
+    pattern = likely_pattern(photographs)
+    if pattern is None or any(one.folder != "." for one in photographs):
+        return list(photographs), None
+    form = ViewPattern(pattern)
+    found = [one for photograph in photographs if (one := form.of(photograph)) is not None]
+    if all(one.view.isdecimal() for one in found):
+        return list(photographs), None
+    return found, pattern
+
+
+def columns_by_content(
+    photographs: Sequence[Photograph],
+) -> dict[str, Callable[[Sequence[str]], bool]]:
+    """Return what tells by the cells of a column that it names photographs, or their views."""
+    stems = {_stem(text) for one in photographs for text in (one.name, one.label) if text}
+    views = {one.folder.casefold() for one in photographs} - {"."}
+
+    def are_photographs(cells: Sequence[str]) -> bool:
+        named = [_stem(cell) for cell in cells if cell]
+        return bool(named) and not all(map(str.isdecimal, named)) and stems.issuperset(named)
+
+    def are_views(cells: Sequence[str]) -> bool:
+        named = [cell.casefold() for cell in cells]
+        return len(views) > 1 and len(named) > len(views) and set(named) == views
+
+    return {"image": are_photographs, "view": are_views}
 
 
 def likely_pattern(photographs: Sequence[Photograph]) -> str | None:
@@ -225,11 +259,11 @@ def match(
         )
     found = {"name": _by_name, "time": _by_time, "order": _in_order}[how](rows, photographs, table)
     used = {photograph.name for _, photograph in found.pairs}
-    bad = [name for name in used if not is_name(name)]
+    bad = sorted(name for name in used if not is_name(name))
     if bad:
         raise DatasetError(
             f"{table}: the photograph {describe(bad[0])} could not be used: found a name that "
-            "tables cannot show, needed printable characters; rename the file."
+            f"tables cannot show, needed {NAME_NEEDED}; rename the file."
         )
     spare = [photograph.name for photograph in photographs if photograph.name not in used]
     notes = found.notes
@@ -393,7 +427,7 @@ def _in_order(rows: Sequence[Row], photographs: Sequence[Photograph], table: str
             (f"folder {folder}", list(range(len(rows))), inside)
             for folder, inside in folders.items()
         ]
-        how = "in the order of rows and of names: every folder shows the poses of all rows"
+        how = "in the order of rows and of names: every view shows the poses of all rows"
     problems = [
         f"{table}: the photographs of {name} could not be matched in order: found {len(inside)} "
         f"photographs for {len(members)} rows, needed as many; remove what has no partner, or add "

@@ -1,14 +1,15 @@
 """A table of readings as its owner keeps it: headings, units, readings or whole lengths.
 
-Columns are found by their headings: an encoder by the name of its leg or joint, or by a number. The
-unit is that of the headings, else the one in which the readings lie in the travel of the legs.
+Columns are found by their headings: an encoder by the name of its leg or joint, or by a number; a
+column of photographs or views by its cells as well. The unit is that of the headings, else the one
+in which the readings lie in the travel of the legs.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -34,6 +35,7 @@ from legcal.files import (
     Column,
     Lines,
     describe,
+    is_number,
     read_table,
     split_heading,
 )
@@ -53,6 +55,7 @@ _HEADINGS = {
 }  # fmt: skip
 _SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 _TIME = re.compile(rf"(?:{'|'.join(_HEADINGS['time'])}|t)({'|'.join(_SECONDS)})")
+ByContent = Mapping[str, Callable[[Sequence[str]], bool]]
 _NUMBERED = re.compile(r"([^\W\d]*?)0*(\d{1,3})([^\W\d]*)")
 
 
@@ -74,6 +77,9 @@ class SheetReadings:
 class ReadingsSheet:
     """A table of readings, one row for each of what *each* names (a photograph, a time).
 
+    *by_content* says for image and view whether the cells of a column are that, whatever its
+    heading.
+
     Attributes
     ----------
     motors : list of Leg
@@ -89,10 +95,12 @@ class ReadingsSheet:
         If the file, a heading or a cell cannot be read.
     """
 
-    def __init__(self, path: Path, machine: Machine, each: str) -> None:
+    def __init__(
+        self, path: Path, machine: Machine, each: str, by_content: ByContent = MappingProxyType({})
+    ) -> None:
         self.path = path
         self.motors = [machine.legs[j] for j in machine.motors]
-        headings = _Headings(path, self.motors)
+        headings = _Headings(path, self.motors, by_content)
         self._table = read_table(
             path, "table of readings", "row", headings.columns(), needed=f"one row for each {each}",
             reshape=headings.reshape,
@@ -230,9 +238,10 @@ class ReadingsSheet:
 class _Headings:
     """What the headings of a table of readings mean."""
 
-    def __init__(self, path: Path, motors: Sequence[Leg]) -> None:
+    def __init__(self, path: Path, motors: Sequence[Leg], by_content: ByContent) -> None:
         self.path = path
         self.motors = motors
+        self.by_content = by_content
         self.joints = [column.name for column in reading_columns(motors)]
         self.taken: dict[str, str] = {}  # meaning of each heading that is used
         self.units: dict[str, str] = {}  # of each joint, as its heading says
@@ -246,6 +255,12 @@ class _Headings:
     def reshape(self, lines: Lines) -> Lines:
         """Return lines under the names that their columns have here; others are left out."""
         number, header = lines[0]
+        if sum(is_number(text) and not text.isdecimal() for text in header) > 1:
+            raise DatasetError(
+                f"{self.path}: the readings could not be found: found numbers in the first line, "
+                f"needed headings that name the legs ({self.motors[0].name}) or number them (L1, "
+                "q1, 1); add a first line of headings."
+            )
         split = [split_heading(text) for text in header]
         readings = [split_heading(text, (*LENGTH, *READING_ANGLES)) for text in header]
         meaning: dict[int, str] = {}
@@ -259,6 +274,11 @@ class _Headings:
                     clock = {i: _SECONDS[timed[1]]}
         free = [i for i in range(len(header)) if i not in meaning]
         meaning |= self._joints(free, readings, header)
+        for i in [i for i in free if i not in meaning]:
+            cells = [cells[i] for _, cells in lines[1:] if len(cells) == len(header)]
+            for name, holds in self.by_content.items():
+                if name not in meaning.values() and holds(cells):
+                    meaning[i] = name
         for i, name in meaning.items():
             self.taken[header[i]] = name
             if name in self.joints:

@@ -64,6 +64,7 @@ from .table import Column as Column
 from .table import Lines as Lines
 from .table import Table as Table
 from .table import format_table as format_table
+from .table import is_number as is_number
 from .table import place_in as place_in
 from .table import read_table as read_table
 from .table import split_heading as split_heading

@@ -24,6 +24,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
+from legcal.brief import brief
 from legcal.errors import DatasetError
 from legcal.files.reading import MAX_TEXT, MAX_YAML, NotRegular, TooLarge, read_bytes
 
@@ -121,6 +122,7 @@ class FileSchema(BaseModel):
     )
 
 
+@brief
 class Document(BaseModel):
     """A JSON document that is written: its fields are the keys, in their order."""
 
@@ -394,13 +396,19 @@ def describe(value: object) -> str:
 def closest(word: str, known: Iterable[str]) -> str:
     """Return a hint at the known word most like a given one, or the known words, ten at most."""
     names = list(known)
-    near = difflib.get_close_matches(word, names, n=1) if len(word) <= _LONGEST_WORD else []
+    near = nearest(word, names)
     if near:
-        return f"did you mean '{near[0]}'?"
+        return f"did you mean '{near}'?"
     more = len(names) - _MOST_NAMES
     shown = names[:_MOST_NAMES]
     rest = f" and {more} more" if more > 0 else ""
     return f"known are: {', '.join(shown) or 'none'}{rest}"
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return the known word most like a given one, "" if none is like it."""
+    near = difflib.get_close_matches(word, known, n=1) if len(word) <= _LONGEST_WORD else []
+    return near[0] if near else ""
 
 
 def _sentence(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: str) -> str:

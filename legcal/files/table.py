@@ -25,12 +25,23 @@ import numpy as np
 from legcal.errors import DatasetError
 from legcal.files.quantity import LENGTH
 from legcal.files.reading import MAX_TABLE
-from legcal.files.schema import MAX_PROBLEMS, NAME_NEEDED, closest, content_of, describe, is_name
+from legcal.files.schema import (
+    MAX_PROBLEMS,
+    NAME_NEEDED,
+    closest,
+    content_of,
+    describe,
+    is_name,
+    nearest,
+)
 from legcal.geometry import Array, BoolArray
 
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 MAX_ROWS = 50_000
 MAX_COLUMNS = 300
+_MAX_NAMED = 10  # columns that a sentence names
+_TEXT = re.compile(rb"[\t\n\r\x20-\x7e\xa0-\xff]*")  # of Windows-1252, without what is rare
+_SEPARATOR = re.compile(r"\Asep=.\r?\n")
 _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
 _COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?", re.ASCII)
 _WORKBOOKS = {b"PK\x03\x04": "an XLSX or ODS workbook", b"\xd0\xcf\x11\xe0": "an XLS workbook"}
@@ -241,34 +252,56 @@ def read_table(
             f"{path}, header: the columns could not be used: found {other[0]!r} between columns, "
             "needed ',' there and '.' in numbers; save it again with commas (CSV)."
         )
-    start = f"{path}, header: the columns could not be used: found"
     known = {column.name: column for column in columns}
-    problems = []
-    for name in dict.fromkeys(header):
-        if name not in known:
-            said = unknown(name) or (
-                f"the unknown column {describe(name)}, needed those of a {what}; "
-                f"{closest(name, known)}"
-            )
-            problems.append(f"{start} {said}")
-        elif header.count(name) > 1:
-            problems.append(
-                f"{start} the column '{name}' {header.count(name)} times, needed it once; remove "
-                "one."
-            )
-    groups = {column.group for column in columns if column.group and column.name in header}
-    for name, column in known.items():
-        if name not in header and (column.required or column.group in groups):
-            says = ", ".join(filter(None, (column.what, column.unit and f"in {column.unit}")))
-            problems.append(
-                f"{start} no column '{name}', needed it{f' ({says})' if says else ''}; add the "
-                f"column{f', or {remedy}' if remedy else ''}."
-            )
+    problems = _of_header(header, known, what, remedy, unknown)
     if problems:
-        raise DatasetError(problems)
+        start = f"{path}, header: the columns could not be used: found"
+        raise DatasetError([f"{start} {problem}" for problem in problems])
     table = Table(path, thing, [known[name] for name in header])
     table._add(lines[1:], header)
     return table
+
+
+def _of_header(
+    header: Sequence[str],
+    known: dict[str, Column],
+    what: str,
+    remedy: str,
+    unknown: Callable[[str], str],
+) -> list[str]:
+    """Return what is wrong with the names of columns, each cause once."""
+    strange = [name for name in dict.fromkeys(header) if name not in known]
+    problems = [said for name in strange if (said := unknown(name))]
+    if others := [name for name in strange if not unknown(name)]:
+        near = dict.fromkeys(one for name in others if (one := nearest(name, known)))
+        hint = f"did you mean {_names(near)}?" if near else closest(others[0], known)
+        words = f"the unknown column{'s' * (len(others) > 1)} {_names(others)}"
+        problems.append(f"{words}, needed those of a {what}; {hint}")
+    problems += [
+        f"the column '{name}' {header.count(name)} times, needed it once; remove one."
+        for name in known
+        if header.count(name) > 1
+    ]
+    groups = {known[name].group for name in header if name in known} - {""}
+    missing: dict[str, list[str]] = {}  # by what they are
+    for name, column in known.items():
+        if name not in header and (column.required or column.group in groups):
+            says = ", ".join(filter(None, (column.what, column.unit and f"in {column.unit}")))
+            missing.setdefault(f" ({says})" if says else "", []).append(name)
+    for says, names in missing.items():
+        s, it = ("s", "them") if len(names) > 1 else ("", "it")
+        problems.append(
+            f"no column{s} {_names(names)}, needed {it}{says}; add the column{s}"
+            f"{f', or {remedy}' if remedy else ''}."
+        )
+    return problems
+
+
+def _names(names: Iterable[str]) -> str:
+    """Return names of columns in a sentence, a few of them."""
+    quoted = [describe(name) for name in names]
+    more = len(quoted) - _MAX_NAMED
+    return ", ".join(quoted[:_MAX_NAMED]) + f" and {more} more" * (more > 0)
 
 
 def format_table(header: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
@@ -289,6 +322,11 @@ def _sentence(problem: str | tuple[str, ...]) -> str:
         return problem
     where, what, found, needed = problem
     return f"{where}: the {what} could not be used: found {found}, needed {needed}."
+
+
+def is_number(text: str) -> bool:
+    """Say whether a cell holds a number."""
+    return math.isfinite(_number_in(text))
 
 
 def _number_in(text: str) -> float:
@@ -344,7 +382,14 @@ def _read_lines(path: Path, what: str, *, loose: bool = False) -> Lines:
     try:
         text = _decoded(content, loose=loose)
         delimiter = _delimiter(text) if loose else ","
-        reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+        if delimiter == " ":  # several stand between columns, or at the end
+            text = "\n".join(map(str.strip, text.splitlines()))
+        reader = csv.reader(
+            io.StringIO(text, newline=""),
+            delimiter=delimiter,
+            skipinitialspace=delimiter == " ",
+            strict=True,
+        )
         lines: Lines = []
         for cells in reader:
             if len(lines) > MAX_ROWS or len(cells) > MAX_COLUMNS:
@@ -367,15 +412,27 @@ def _read_lines(path: Path, what: str, *, loose: bool = False) -> Lines:
 
 
 def _decoded(content: bytes, *, loose: bool) -> str:
-    """Return the text of a file in UTF-8; if ``loose``, also in UTF-16 with its mark."""
-    is_wide = loose and content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    return content.decode("utf-16" if is_wide else "utf-8-sig")
+    """Return the text of a file in UTF-8.
+
+    If ``loose`` also in UTF-16 with its mark, and as Excel writes it in western Europe, without the
+    line that names its delimiter.
+    """
+    if not loose:
+        return content.decode("utf-8-sig")
+    is_wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        text = content.decode("utf-16" if is_wide else "utf-8-sig")
+    except UnicodeDecodeError:
+        if is_wide or not _TEXT.fullmatch(content):
+            raise
+        text = content.decode("cp1252")
+    return _SEPARATOR.sub("\n", text, count=1)  # lines keep their numbers
 
 
 def _delimiter(text: str) -> str:
     """Return what separates the cells of the first line that is not blank."""
-    first = next(filter(str.strip, text.splitlines()), "")
-    return next((mark for mark in ";\t" if mark in first), ",")
+    first = next(filter(None, map(str.strip, text.splitlines())), "")
+    return next((mark for mark in ";\t, " if mark in first), ",")
 
 
 def _with_point(cell: str) -> str:

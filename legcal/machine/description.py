@@ -172,13 +172,13 @@ def look_like_base(described: Description) -> list[str]:
     lengths = np.linalg.norm(B - A, axis=1)
     if 2.0 * apart < lengths.mean() or not _closes(described, origin):
         return []
-    middle = 1e3 * B.mean(axis=0)
+    middle = np.round(1e3 * B.mean(axis=0), 2) + 0.0
     return [
         f"{described.source}: platform_joints could not be used: found joints around "
-        f"({', '.join(f'{x:.4g}' for x in middle)}) mm that fit the lengths of all legs where they "
-        "are, which look like coordinates of the base at home, needed coordinates of the platform; "
-        "say which they are with --platform-in base (or platform_in: base), or with --platform-in "
-        "platform if they are right."
+        f"({', '.join(f'{x:g}' for x in middle)}) mm, as far from the base joints as legs are "
+        "long, which look like coordinates of the base at home, needed coordinates of the "
+        "platform; say which they are with --platform-in base (or platform_in: base), or with "
+        "--platform-in platform if they are right."
     ]
 
 

@@ -2,8 +2,9 @@
 
 Headings are those that people write, and three layouts are understood: a row for each leg (``bx by
 bz px py pz``, ``base_x``, ``x_base``), a row with all joints (``B1x``), and a row for each joint
-(``B1, x, y, z``). A and B are base and platform where both are there, as in the paper; otherwise B
-is the base and P, or T, the platform.
+(``B1, x, y, z``, or side and number in two columns; headings may be missing there). A and B are
+base and platform where both are there, as in the paper; otherwise B is the base and P, or T, the
+platform.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from legcal.errors import DatasetError
-from legcal.files import Column, Lines, Table, describe, read_table, split_heading
+from legcal.files import Column, Lines, Table, describe, is_number, read_table, split_heading
 
 WHAT = "table"
 MAX_NUMBER = 1e9  # of any number, whatever its unit
@@ -43,7 +44,7 @@ _POINT = ("point", "joint", "name", "id", "label")
 _WORDS = "|".join(sorted([*SIDES["base"], *SIDES["platform"], "b"], key=len, reverse=True))
 _COORDINATE = re.compile(rf"({_WORDS})(?:joints?|points?)?(\d*)([xyz])(\d*)")
 _COORDINATE_FIRST = re.compile(rf"([xyz])({_WORDS})(\d*)")
-_NAMED = re.compile(rf"({_WORDS})(?:joints?|points?)?0*(\d{{1,3}})")
+_NAMED = re.compile(rf"({_WORDS})(?:joints?|points?|legs?)?0*(\d{{1,3}})")
 _XYZ = ("x", "y", "z")
 MOTIONS = ("direction", "point", "axis")  # of what rods hang on
 _RADII = ("radius", "tube", "rod")
@@ -216,6 +217,7 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: object) -> Lines:
     ``names`` are those of the columns. Headings that mean nothing stay as they are, in small
     letters, and a column ``unit`` is added where headings of joints have one.
     """
+    lines = _with_headings(lines, path)
     number, header = lines[0]
     split = [split_heading(text) for text in header]
     keys = [key for key, _ in split]
@@ -225,7 +227,7 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: object) -> Lines:
             f"{path}, header: the unit could not be decided: found {' and '.join(units)}, needed m "
             "or mm for all lengths; correct the headings."
         )
-    if {"x", "y"} <= set(keys) and any(key in _POINT for key in keys):
+    if {"x", "y"} <= set(keys) and len(lines) > 1:
         lines = _from_points(lines, keys, path)
         keys = [split_heading(text)[0] for text in lines[0][1]]
     found = [_coordinate(key) for key in keys]
@@ -253,6 +255,20 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: object) -> Lines:
         n, header = len(header), [*header, "unit"]
         below = [(line, [*cells, units[0]] if len(cells) == n else cells) for line, cells in below]
     return [(number, header), *below]
+
+
+def _with_headings(lines: Lines, path: object) -> Lines:
+    """Return lines with headings: a list of named points needs none."""
+    first = lines[0][1]
+    if sum(is_number(text) for text in first) < 2:
+        return lines
+    if len(first) in (3, 4) and _NAMED.fullmatch(split_heading(first[0])[0]):
+        return [(lines[0][0], ["point", *_XYZ[: len(first) - 1]]), *lines]
+    raise DatasetError(
+        f"{path}: the joints could not be read: found numbers in the first line, needed headings "
+        "such as leg,base_x,base_y,base_z,platform_x,platform_y,platform_z, or names of the joints "
+        "before their coordinates (B1,289.8,77.6,0 and P1,106.1,106.1,0); add them."
+    )
 
 
 def _coordinate(key: str) -> tuple[str, str, str] | None:
@@ -296,32 +312,46 @@ def _from_one_row(
 
 
 def _from_points(lines: Lines, keys: Sequence[str], path: object) -> Lines:
-    """Return a row for each leg of a table with a row for each joint."""
+    """Return a row for each leg of a table with a row for each joint.
+
+    A joint is named by one column, or by two: its side, and the number of the leg.
+    """
     number, header = lines[0]
-    at = next(i for i, key in enumerate(keys) if key in _POINT)
-    axes = {key: i for i, key in enumerate(keys) if key in ("x", "y", "z")}
-    named = [
-        (line, cells, _NAMED.fullmatch(split_heading(cells[at])[0]))
-        for line, cells in lines[1:]
-        if len(cells) == len(header)
+    axes = {key: i for i, key in enumerate(keys) if key in _XYZ}
+    of_name = [i for i, key in enumerate(keys) if key in _POINT] or [
+        i for i, key in enumerate(keys) if key not in (*_XYZ, *_OTHER["unit"])
     ]
-    if len(named) < len(lines) - 1 or not all(match for *_, match in named):
-        wrong = next((cells[at] for _, cells, match in named if not match), "an incomplete row")
+    named = []
+    for _, cells in lines[1:]:
+        if len(cells) != len(header):
+            raise DatasetError(
+                f"{path}: the joints could not be read: found a row of {len(cells)} cells, needed "
+                f"{len(header)} as in the header; complete it."
+            )
+        words = [cells[i] for i in of_name[:2]]
+        spelt = [
+            "".join(split_heading(word)[0] for word in order) for order in (words, words[::-1])
+        ]
+        matches = [match for text in spelt if (match := _NAMED.fullmatch(text))]
+        named.append((" ".join(words), cells, matches[0] if matches else None))
+    wrong = [name for name, _, match in named if match is None]
+    if wrong:
+        found = describe(wrong[0]) if wrong[0].strip() else "no name"
         raise DatasetError(
-            f"{path}: the joints could not be read: found {describe(wrong)} in a table with a row "
-            "for each joint, needed names of side and number such as B1 and P1, or base1 and "
-            "platform1; correct it."
+            f"{path}: the joints could not be read: found {found} in a "
+            "table with a row for each joint, needed names of side and number such as B1 and P1, "
+            "or base1 and platform1; correct it."
         )
     sides = _sides(match[1] for *_, match in named if match)
     joints: dict[int, dict[str, str]] = {}
-    for _, cells, match in named:
+    for name, cells, match in named:
         if match is None:
             continue
         leg = joints.setdefault(int(match[2]), {})
         for axis, i in axes.items():
             if leg.setdefault(f"{sides[match[1]]}_{axis}", cells[i]) is not cells[i]:
                 raise DatasetError(
-                    f"{path}: the joints could not be read: found {describe(cells[at])} twice, "
+                    f"{path}: the joints could not be read: found {describe(name)} twice, "
                     "needed each joint once; correct it."
                 )
     return _rows(joints, {}, (number, lines[1][0]))

@@ -42,6 +42,21 @@ class Agreement:
             tuple(T for part in parts for T in part.cameras),
         )
 
+    @classmethod
+    def of_places(cls, parts: Sequence["Agreement"], rows: Sequence[int]) -> "Agreement":
+        """Return the agreement of the images of one group, whose cameras stood in several places.
+
+        The images are in the order of *rows*; the camera is that of the first place.
+        """
+        if len(parts) == 1:
+            return parts[0]
+        joined = cls.joined(parts)
+        place = {row: i for i, row in enumerate(joined.row.tolist())}
+        order = [place[row] for row in rows]
+        return cls(
+            joined.row[order], joined.support[order], joined.expected[order], parts[0].cameras
+        )
+
     def at(self, rows: Sequence[int]) -> "Agreement":
         """Return that of some images."""
         chosen = np.isin(self.row, rows)

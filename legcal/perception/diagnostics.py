@@ -15,7 +15,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data import Measurements, Outlines, by_cause, image_notes, images_in_words, is_edited
+from legcal.data import (
+    Measurements,
+    Outlines,
+    by_cause,
+    few_views,
+    image_notes,
+    images_in_words,
+    is_edited,
+)
 from legcal.geometry import BoolArray, IntArray, pose_distance
 from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped, shrunk
 from legcal.perception.candidate_pairs import CandidatePairs
@@ -515,9 +523,10 @@ def hint_notes(
     """Return notes on rough T_base_camera of views that the images contradict.
 
     ``cameras`` are as the images have them, None where a view could not be placed; ``reach`` is how
-    many times farther than rough poses are they may be.
+    many times farther than rough poses are they may be. Views that mean the same other thing have
+    one note.
     """
-    notes = []
+    notes, alike = [], dict[str, list[tuple[str, float, float]]]()  # by what they mean
     for name, hint, T in zip(names, hints, cameras, strict=True):
         if hint is None or T is None or not far_off(hint, T, reach):
             continue
@@ -537,10 +546,26 @@ def hint_notes(
         if other is not None:
             remedy = f"it suits view {other}: check whether views or their images were exchanged"
         elif meant is not None:
-            remedy = f"it suits the images if {meant}: {remedy}"
+            alike.setdefault(meant, []).append((name, 1e3 * apart, float(np.degrees(angle))))
+            continue
         notes.append(
             f"view {name}: its T_base_camera is wrong: found it {1e3 * apart:.0f} mm and "
             f"{np.degrees(angle):.0f} deg from where the images put the camera (xyz: [{x:.3f}, "
             f"{y:.3f}, {z:.3f}]), needed a rough pose; {remedy}."
         )
+    for meant, views in alike.items():
+        of_views, mm, deg = zip(*views, strict=True)
+        one = len(views) == 1
+        notes.append(
+            f"{few_views(of_views)}: {'its' if one else 'each'} T_base_camera is wrong: found it "
+            f"{_span(mm)} mm and {_span(deg)} deg from where the images put the camera, needed a "
+            f"rough pose; it suits the images if {meant}: correct {'it' if one else 'them'} in "
+            "dataset.yaml."
+        )
     return notes
+
+
+def _span(values: Sequence[float]) -> str:
+    """Return the range of some values, in whole numbers."""
+    ends = f"{min(values):.0f}", f"{max(values):.0f}"
+    return " to ".join(dict.fromkeys(ends))

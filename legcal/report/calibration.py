@@ -99,7 +99,7 @@ def accuracy_table(evaluation: Evaluation) -> RenderableType:
     scale = np.array([UNITS[unit][0] for unit in evaluation.units])
     values, references = scale * evaluation.values, scale * evaluation.references
     rows = [
-        (name, f"{value:.4f}", f"{reference:.4f}", f"{value - reference:+.4f}")
+        (name, f"{value:z.4f}", f"{reference:z.4f}", f"{value - reference:+z.4f}")
         for name, value, reference in zip(evaluation.names, values, references, strict=True)
         if not (name.endswith(".gain") and value == reference == 1.0)
     ]
@@ -125,8 +125,8 @@ def _joint_tables(evaluation: Evaluation) -> list[RenderableType]:
             (
                 joint.leg if k == 0 else "",
                 axis,
-                *(f"{1e3 * x:.4f}" for x in (joint.xyz[k], joint.reference[k])),
-                f"{1e3 * joint.difference[k]:+.4f}",
+                *(f"{1e3 * x:z.4f}" for x in (joint.xyz[k], joint.reference[k])),
+                f"{1e3 * joint.difference[k]:+z.4f}",
                 mark_in_words(side, "frame" if joint.defined[k] else "estimated", joint.defines),
             )
             for joint in block.joints

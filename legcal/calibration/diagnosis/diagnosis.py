@@ -9,6 +9,7 @@ little without it, or nothing is explained, another one is undone beside it in t
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ from legcal.calibration.diagnosis.mistakes import (
     as_given,
     both,
     mistakes,
+    moved_cameras,
     rows_of_views,
     shifted_from,
     turned_images,
@@ -54,12 +56,15 @@ STAGE = "Trying common mistakes"
 
 _AGREE_ALREADY = 0.9  # of the images: then nothing common is wrong
 MIN_IMAGES = 3  # of a group of views
+_MIN_PLACE = 5  # images that say where a camera stood: of fewer some pose fits nearly anything
+_MOST = 0.8  # of the images
 _FEW = 6  # images, at least, that say which mistakes are worth a closer look
 _SUITS = 0.5  # of the legs that they should show
 _STARTS = 1, 1, 2  # images that suggest cameras, of all
 _FEW_STARTS = (1,), (1, 1)  # of the first few, and of the next few if these suit no mistake
 _POOL = 3  # cameras of other mistakes that are tried
 _FINALISTS = 6  # mistakes that all images judge
+_SAME_AMOUNT = 2  # of these that differ by how much
 _FIRSTS = 2  # mistakes beside which another one is looked for, where none explains the images
 _NEAR_BEST = 0.5  # of the gain of the best, which few images gave, that all images judge as well
 _ONE_ROW = (1, -1)  # by which readings stand late from a row on
@@ -160,7 +165,11 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     judge = _Judge(data, groups)
     if judge.own.images > _AGREE_ALREADY * len(judge.own.row):
         return ()
-    tried = [*mistakes(data), *judge.shifted_from_a_row_on(), *judge.turned_images()]
+    tried = [
+        *mistakes(data),
+        *judge.shifted_from_a_row_on(),
+        *(judge.turned_images() or judge.moved_cameras()),  # upside down is as a camera that rolled
+    ]
     judged = judge.judged(judge.finalists(tried))
     likeliest = judge.likeliest(judged)
     likeliest = judge.likeliest_two(judged, likeliest) or likeliest
@@ -277,6 +286,30 @@ class _Judge:
                     found.append(turned_images(self.data, self.given, rows, turn))
         return found
 
+    def moved_cameras(self) -> list[Mistake]:
+        """Return that cameras of single views may have stood in several places.
+
+        Images that do not agree with the camera of the others agree with another one then, and
+        hardly any are left: where readings are wrong, some camera suits a few images as well.
+        """
+        moved, n_agree = list[list[list[int]]](), 0
+        for g, group in enumerate(self.groups):
+            own = self.of_groups[g]
+            places, left = [own.row[own.agrees].tolist()], own.row[~own.agrees].tolist()
+            while len(places[-1]) >= _MIN_PLACE and len(left) >= _MIN_PLACE:
+                then = self._compare([self.given], g, left, _STARTS)[0]
+                places.append(then.row[then.agrees].tolist())
+                left = then.row[~then.agrees].tolist()
+            places = [rows for rows in places if len(rows) >= _MIN_PLACE]
+            if len(places) > 1 and len(group.views) == 1:  # of a board's views all would move
+                moved.append(places)
+                n_agree += sum(map(len, places))
+            else:
+                n_agree += own.images
+        if not moved or n_agree < _MOST * len(self.own.row):
+            return []
+        return [moved_cameras(self.data, self.given, moved)]
+
     def beside(self, what: Mistake, one: Agreement) -> _Judge:
         """Return what judges other mistakes beside one, which are undone together."""
         other = copy(self)
@@ -319,16 +352,18 @@ class _Judge:
         # Less than this is gained by chance, also by what is wrong with the images of one group.
         least = _SURE_GAIN * min(float(one.expected.sum()) for one in seen)
         found = [k for k, one in enumerate(tried) if one.of_few]  # their own images found them
-        amounts = set[str]()
+        amounts = Counter[str]()
         left_for = {True: _FINALISTS, False: _FINALISTS // 2}  # whether of all views, or of some
         for k in np.argsort(-gain, kind="stable").tolist():
             if gain[k] <= max(_NEAR_BEST * gain.max(), least):
                 break
             of_all = not any(tried[k].true.is_as(self.given, g.rows) for g in self.groups)
-            if tried[k].amount_of not in amounts and left_for[of_all] and k not in found:
+            amount = tried[k].amount_of
+            most = 1 if tried[k].finer else _SAME_AMOUNT  # all images find the amount then
+            if (not amount or amounts[amount] < most) and left_for[of_all] and k not in found:
                 found.append(k)
                 left_for[of_all] -= 1
-                amounts |= {tried[k].amount_of} - {""}
+                amounts[amount] += 1
         return [tried[k] for k in sorted(found)]  # the commoner first
 
     def _nearly_agrees(self, g: int) -> bool:
@@ -400,6 +435,11 @@ class _Judge:
         found = [(what, one) for what, one in judged if self.is_explained(what, one)]
         best = max((one for _, one in found), key=_total, default=self.own)
         alike = [(what, one) for what, one in found if _is_as_good(one, best)]
+        most = dict[str, float]()  # of those that differ by how much
+        for what, one in alike:
+            most[what.amount_of] = max(_total(one), most.get(what.amount_of, 0.0))
+        alike = [(what, one) for what, one in alike
+                 if not what.amount_of or _total(one) == most[what.amount_of]]  # fmt: skip
         return sorted(alike, key=lambda one: -self.hints_suited(one[1]))  # then the commoner
 
     def likeliest_two(
@@ -460,7 +500,7 @@ class _Judge:
             are_enough = some.images >= before.images + MIN_IMAGES
             return is_plain and are_enough and one.images > self.own.images
         if _explains(one, self.own):
-            return True
+            return _explains(one, self._as_it_is_near(what, one))
         gain = _signed_ranks(one.share - self.own.share)
         if what.opposite is None or one.images <= self.own.images or gain < _MIN_SIGMAS:
             return False
@@ -468,6 +508,18 @@ class _Judge:
         contrast = one.share - self.all(what.opposite, (), known).share
         is_sure = _signed_ranks(contrast) >= _SURE_SIGMAS
         return is_sure and float(contrast.mean()) >= _SURE_GAIN
+
+    def _as_it_is_near(self, what: Mistake, one: Agreement) -> Agreement:
+        """Return what images say of things as they are, also near the cameras of a mistake.
+
+        The search for cameras may have missed these, and then a mistake is none.
+        """
+        found = list(self.of_groups)
+        for g, (group, T) in enumerate(zip(self.groups, one.cameras, strict=True)):
+            if T is not None and not what.true.is_as(self.given, group.rows):
+                near = self._compare([self.given], g, group.rows, (), self._alike(T))[0]
+                found[g] = _better(found[g], near)
+        return Agreement.joined(found)
 
     def all(
         self,
@@ -529,19 +581,29 @@ class _Judge:
 
         These are the pool's where none are given.
         """
+        parts = [
+            (one, [row for row in rows if one.place[row] == place])
+            for one in assumed
+            for place in np.unique(one.place[rows]).tolist()
+        ]
         assumptions = [
             Assumption(
-                _search(self.search, one, rows),
+                _search(self.search, one, some),
                 one.flip,
                 one.focal,
                 self.groups[g],
-                rows,
+                some,
                 starts,
                 self._as_far(known or self.pool[g], one.focal),
             )
+            for one, some in parts
+        ]
+        found = compare_assumptions(assumptions, self.data.pool)
+        of_each = [
+            [own for (part, _), own in zip(parts, found, strict=True) if part is one]
             for one in assumed
         ]
-        return compare_assumptions(assumptions, self.data.pool)
+        return [Agreement.of_places(own, rows) for own in of_each]
 
 
 def symmetries(machine: Machine) -> list[Array]:
@@ -593,7 +655,9 @@ def _explains(one: Agreement, own: Agreement) -> bool:
     changed = gain != 0.0
     size, sigmas = float(gain[changed].mean()), _signed_ranks(gain)
     if np.mean(one.agrees[changed]) < _MIN_SHARE:  # images show little, whatever is true
-        return size >= _MIN_GAIN and sigmas >= _SURE_SIGMAS
+        # The images of one view are too few for what is sure: they gain plainly, nearly all.
+        least = _MIN_SIGMAS if size >= _PLAIN_GAIN else _SURE_SIGMAS
+        return size >= _MIN_GAIN and sigmas >= least
     is_sure = size >= _SURE_GAIN and sigmas >= _SURE_SIGMAS
     is_plain = size >= _PLAIN_GAIN and sigmas >= _FEW_SIGMAS
     return is_plain or is_sure or (size >= _MIN_GAIN and sigmas >= _MIN_SIGMAS)
@@ -626,7 +690,7 @@ def _diagnosis(
     of_kinds = [*first.same_as, *(one.what for one in alike if kinds.get(one.kind) is one)]
     same = dict.fromkeys([*of_kinds, *(one.what for one in alike[1:])])
     tests = dict.fromkeys(one.test for one in alike if one.test) if same else {}
-    rough = ["the rough T_base_camera of the views speak for the first"] * by_hints
+    rough = "; the rough T_base_camera of the views speak for the first" * by_hints
     return Diagnosis(
         kind=first.kind,
         what=first.what,
@@ -636,7 +700,7 @@ def _diagnosis(
         before=before.images,
         after=after.images,
         score=after.mean,
-        remedy=", ".join([first.remedy, *rough]) if rough else first.remedy,
+        remedy=first.remedy + rough,
         tests=tuple(tests)[:2],
         n_kinds=len(of_kinds),
     )

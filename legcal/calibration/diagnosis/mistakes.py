@@ -44,6 +44,7 @@ class Assumed:
     machine: Machine
     q: Array  # (n_rows, n_legs) readings [m or rad]
     flip: Array  # (n_rows, 2) -1 along axes that images are turned over
+    place: IntArray  # (n_rows,) where the camera of a view stood, numbers from 0
     focal: float = 1.0  # focal length as a part of the stated one
 
     def joints(self, rows: Sequence[int]) -> tuple[Array, Array]:
@@ -71,6 +72,7 @@ class Assumed:
             and self.focal == other.focal
             and np.array_equal(self.q[rows], other.q[rows], equal_nan=True)
             and np.array_equal(self.flip[rows], other.flip[rows])
+            and np.array_equal(self.place[rows], other.place[rows])
         )
 
     @property
@@ -106,7 +108,8 @@ class Mistake:
 
 def as_given(data: OrderedDataset) -> Assumed:
     """Return a session as its files have it."""
-    return Assumed(data.machine, data.measurements.q, np.ones((data.measurements.n_rows, 2)))
+    n = data.measurements.n_rows
+    return Assumed(data.machine, data.measurements.q, np.ones((n, 2)), np.zeros(n, dtype=np.intp))
 
 
 def both(one: Mistake, other: Mistake, beside: Sequence[Mistake] = ()) -> Mistake:
@@ -406,11 +409,49 @@ def turned_images(
 ) -> Mistake:
     """Return images of some rows of a view that are turned over, and others are not."""
     m = data.measurements
-    names = row_names(data.dataset.measurements)
-    first = names[data.order.rows[rows[0]]]
-    which = f" {first} and {len(rows) - 1} more of view {m.views[m.view[rows[0]]].name}"
+    which = f" {_images(data, rows)} of view {m.views[m.view[rows[0]]].name}"
     one = _turned_over(data, given, rows, turn, which)
     return replace(one, of_few=tuple(rows), test="")
+
+
+def moved_cameras(
+    data: OrderedDataset, given: Assumed, views: Sequence[Sequence[Sequence[int]]]
+) -> Mistake:
+    """Return images of some views that were taken from several places, by rows of each place."""
+    m, place, things = data.measurements, given.place.copy(), _things(data)
+    others, said = list[int](), list[str]()
+    for places in views:
+        others += [row for rows in places[1:] for row in rows]
+        for k, rows in enumerate(places):
+            place[list(rows)] = k
+        in_file = sorted(places, key=lambda rows: int(data.order.rows[list(rows)].min()))
+        of_each = [f"{_images(data, rows)} from {'another' if k else 'one'}"
+                   for k, rows in enumerate(in_file)]  # fmt: skip
+        what = "those" if said else f"the {things}"
+        said.append(
+            f"{what} of view {m.views[m.view[places[0][0]]].name} look as if they were taken from "
+            f"{len(places)} places: {', '.join(of_each)}"
+        )
+    return Mistake(
+        "camera moved",
+        ", and ".join(said),
+        "with a view for each place",
+        f"give the {things} of each place a view of their own (for legcal init a folder, or a "
+        "column view)",
+        replace(given, place=place),
+        of_few=tuple(others),
+    )
+
+
+def _things(data: OrderedDataset) -> str:
+    """Return what is seen of the machine, in words."""
+    return "images" if len(data.photographs.detect) else "outlines"
+
+
+def _images(data: OrderedDataset, rows: Sequence[int]) -> str:
+    """Return images as a sentence names them: the first of them in the file, and how many more."""
+    in_file = sorted(data.order.rows[list(rows)].tolist())
+    return f"{row_names(data.dataset.measurements)[in_file[0]]} and {len(rows) - 1} more"
 
 
 def _turned_over(
@@ -419,9 +460,9 @@ def _turned_over(
     kind, what = _TURNS_IN_WORDS[turn is UPSIDE_DOWN]
     flip = given.flip.copy()
     flip[list(rows)] *= turn
-    things, remedy = "images", "replace these images by the originals"
-    if len(data.photographs.detect) == 0:
-        things, remedy = "outlines", "correct the direction of an axis of their table"
+    things, remedy = _things(data), "replace these images by the originals"
+    if things == "outlines":
+        remedy = "correct the direction of an axis of their table"
     return Mistake(
         kind,
         f"the {things}{which} look {what}",
