@@ -331,8 +331,8 @@ def test_counts_and_ranks_are_those_of_closure_and_outlines(
 @pytest.mark.parametrize(
     ("kind", "turning"),
     [
-        ("i4", False),
         ("i4", True),
+        pytest.param("i4", False, marks=pytest.mark.slow),
         pytest.param("h4", False, marks=pytest.mark.slow),
         pytest.param("h4", True, marks=pytest.mark.slow),
     ],

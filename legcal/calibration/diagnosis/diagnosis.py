@@ -78,6 +78,7 @@ _MIN_GAIN, _SURE_GAIN = 0.1, 0.05  # in the share of legs that images show, on a
 _MIRROR_X, _MIRROR_Y = np.diag([-1.0, 1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0, 1.0])
 _MIN_SIGMAS = 2.5  # of its signed ranks: chance gains in some images and loses in others
 _PLAIN_GAIN, _FEW_SIGMAS = 0.3, 2.2  # of all of six images
+_LEAST_GAIN = 0.03  # where an opposite is worse: errors of the model make up for less
 _SURE_SIGMAS = 4.5  # of a gain that may be small: in nearly all of many images
 
 
@@ -501,8 +502,9 @@ class _Judge:
             return is_plain and are_enough and one.images > self.own.images
         if _explains(one, self.own):
             return _explains(one, self._as_it_is_near(what, one))
-        gain = _signed_ranks(one.share - self.own.share)
-        if what.opposite is None or one.images <= self.own.images or gain < _MIN_SIGMAS:
+        gain = one.share - self.own.share
+        is_more = one.images > self.own.images and float(gain.mean()) >= _LEAST_GAIN
+        if what.opposite is None or not is_more or _signed_ranks(gain) < _MIN_SIGMAS:
             return False
         known = [[] if T is None else [T] for T in self.own.cameras]
         contrast = one.share - self.all(what.opposite, (), known).share
