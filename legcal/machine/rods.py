@@ -18,6 +18,7 @@ from legcal.machine.solver import solve
 
 _CLOSED = 1e-15  # [m], of the lengths of rods
 _MAX_STEP = 0.3  # [rad or m] of an internal joint towards where rods hold it
+_STALLED = 3  # steps that hardly improve: the squares are least there
 AT_ZERO = ", where their motors read 0"  # what is said of joints A that move, after their name
 
 
@@ -146,6 +147,7 @@ def coordinates_at(
             s,
             tolerance=_CLOSED,
             damped=True,
+            max_stalled=_STALLED,
         )
         s = found.points
     if q is None:
