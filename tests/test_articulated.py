@@ -310,8 +310,8 @@ def test_rods_on_a_body_of_the_platform_outside_the_class_are_refused(
 @pytest.mark.parametrize(
     ("kind", "turning"),
     [
-        ("h4", True),
         ("i4", False),
+        pytest.param("h4", True, marks=pytest.mark.slow),
         pytest.param("h4", False, marks=pytest.mark.slow),
         pytest.param("i4", True, marks=pytest.mark.slow),
     ],

@@ -170,6 +170,7 @@ def test_given_outlines_name_a_mistake_as_photographs_do(
     assert ("To tell these apart" in found.sentence) == bool(found.same_as)
 
 
+@pytest.mark.system
 def test_two_mistakes_at_once_are_named_together(
     outlines: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

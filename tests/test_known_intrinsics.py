@@ -211,6 +211,7 @@ def test_a_camera_file_with_a_covariance_is_used_from_calibration_to_check(tmp_p
     np.testing.assert_allclose(np.linalg.inv(whitened.T @ whitened), earlier, rtol=1e-6)
 
 
+@pytest.mark.system
 def test_photographs_correct_a_camera_of_which_little_is_known(tmp_path: Path) -> None:
     # They are searched again where the fit with the corrected camera has the legs.
     session = spoiled(tmp_path / "set", 5)

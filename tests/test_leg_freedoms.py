@@ -8,6 +8,7 @@ from layouts import Layout, LegLayout, MachineSpec, write_machine
 from leg_screws import freedoms_of
 from machines import exechon, exechon_and_ups, four_upu, of_types, planar, two_upr_two_sps
 from seen_numbers import n_seen
+from thinned import thinned
 
 from legcal import identifiability
 from legcal.machine import geometries, load_mechanism
@@ -68,10 +69,10 @@ def test_freedoms_are_those_of_the_screws_of_the_joints(
 
 @pytest.mark.parametrize(
     ("kind", "layout"),
-    [  # each kind in one layout by default, and each layout
-        pytest.param(kind, layout, marks=() if (i + j) % 3 == 0 else pytest.mark.slow)
-        for (i, kind), (j, layout) in product(enumerate(REDUNDANT), enumerate(LAYOUTS))
-    ],
+    thinned(
+        product(REDUNDANT, LAYOUTS),
+        [("7-UPS", "hung from the base"), ("3-RPS + SPS", "hung from the platform")],
+    ),
 )
 def test_identify_counts_the_numbers_of_redundant_machines_that_show(
     kind: str, layout: str, tmp_path: Path

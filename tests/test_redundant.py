@@ -385,6 +385,7 @@ def test_a_redundant_machine_calibrates_and_a_wrong_reading_is_refused(tmp_path:
         legcal.calibrate(folder, output=tmp_path / "refused")
 
 
+@pytest.mark.slow
 def test_two_models_compared_say_how_redundant_readings_agree_with_each(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -425,6 +426,7 @@ def test_corrected_commands_of_redundant_motors_are_poses_of_least_squares(tmp_p
         np.testing.assert_allclose([*(1e3 * moved.translation[:2]), angle], corrected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_doctor_names_readings_that_contradict_each_other(tmp_path: Path) -> None:
     machine, folder = made("4-rpr", tmp_path), tmp_path / "dataset"
     simulate(machine.yaml_path, folder, SimulationSettings(level=Level.AXES, poses=10, seed=3))
