@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from legcal.geometry import Array
+from legcal.geometry import Array, IntArray
 
 HOME = np.array([0.012, -0.017, -0.45])  # of the platform, which is not turned, below the base
 UP, ACROSS = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
@@ -36,10 +36,10 @@ class Articulated:
     turning: bool  # motors turn arms; else they move carriages
     motor_point: Array  # (4, 3)
     motor_axis: Array  # (4, 3)
-    motor: Array  # (8,) of each rod
+    motor: IntArray  # (8,) of each rod
     A: Array  # (8, 3)
     B: Array  # (8, 3)
-    body: Array  # (8,) 0 the platform, 1 and 2 what ``inside`` carries
+    body: IntArray  # (8,) 0 the platform, 1 and 2 what ``inside`` carries
     inside: tuple[Inside, ...]
 
     def write(self, folder: Path, *, block: bool = True, platform: str = "platform") -> Path:

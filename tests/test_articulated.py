@@ -92,12 +92,12 @@ class Written:
         motors, of_A, of_B, lengths, *inside = np.split(numbers, self.parts[1:-1], axis=1)
         A = drawn.A + of_A.reshape(n, 8, 3)
         B = drawn.B - HOME + of_B.reshape(n, 8, 3)
-        for j, k in enumerate(drawn.motor):
+        for j, k in enumerate(drawn.motor.tolist()):
             line = motors.reshape(n, 4, -1)[:, k]
             point, axis = drawn.motor_point[k], drawn.motor_axis[k]
             A[:, j] = _carried(A[:, j], point, axis, line, image[:, 6 + k])
         for i, (joint, line) in enumerate(zip(drawn.inside, inside, strict=True)):
-            for j in np.flatnonzero(drawn.body == i + 1):
+            for j in np.flatnonzero(drawn.body == i + 1).tolist():
                 B[:, j] = _carried(B[:, j], joint.point, joint.axis, line, image[:, 10 + i])
         turn = Rotation.from_rotvec(image[:, :3]).as_matrix()
         B = np.einsum("nij,nkj->nki", turn, B) + (HOME + image[:, 3:6])[:, None]
@@ -347,6 +347,7 @@ def test_free_radii_leave_open_the_scale_of_machines_whose_motors_turn(
     )
 
 
+@pytest.mark.slow
 def test_counts_are_those_of_the_joints_on_each_body(loaded: Loaded) -> None:
     found = loaded("h4", False)
     on = [None if leg.internal is None else leg.internal.joint for leg in found.legs]

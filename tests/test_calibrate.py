@@ -387,6 +387,7 @@ def in_the_hand(
     return made, calibrate(made.folder, output=folder / "result")
 
 
+@pytest.mark.system
 def test_hand_held_cameras_need_no_poses(in_the_hand: tuple[SimulatedDataset, Calibration]) -> None:
     made, calibration = in_the_hand
     assert len(calibration.solution.T_camera_Rb) == 12
@@ -399,6 +400,7 @@ def test_hand_held_cameras_need_no_poses(in_the_hand: tuple[SimulatedDataset, Ca
     assert (made.folder.parent / "result/corners.csv").is_file()
 
 
+@pytest.mark.system
 def test_a_board_joins_views_that_share_no_leg(
     in_the_hand: tuple[SimulatedDataset, Calibration], tmp_path: Path
 ) -> None:

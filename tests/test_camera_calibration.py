@@ -242,6 +242,7 @@ def test_a_third_of_the_images_wrong_alike_is_named_and_moves_nothing(
     refuse_divided(found, [str(k) for k in range(15)])
 
 
+@pytest.mark.slow
 def test_a_richer_lens_model_does_not_take_in_images_that_are_wrong() -> None:
     """Its residuals, with them, are so large that nothing contradicts it."""
     good = seen_corners(TRUTH, 8, 2, sheet=SHEET)

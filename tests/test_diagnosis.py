@@ -215,6 +215,7 @@ def test_motors_that_move_joints_at_A_are_mistaken_as_encoders_of_legs_are(delta
         assert np.allclose(ends[rows] * [1.0, -1.0, 1.0], of_mirror[rows], atol=1e-9)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("change", "kinds", "what"),
     [
@@ -293,6 +294,7 @@ def test_mirrored_outlines_of_one_view_lose_to_no_mistake_of_all_views(
     assert (found.after, found.same_as) == (14, ())
 
 
+@pytest.mark.system
 def test_single_images_that_are_mirrored_are_named(
     of_symmetric_machine: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -138,6 +138,7 @@ def of_boards(tmp_path_factory: pytest.TempPathFactory) -> SimulatedDataset:
     return made
 
 
+@pytest.mark.system
 def test_corners_of_two_boards_calibrate_a_machine_without_a_leg_or_a_rough_pose(
     of_boards: SimulatedDataset, tmp_path: Path
 ) -> None:

@@ -186,7 +186,7 @@ def test_a_focal_length_wrong_by_one_percent_is_noticed(camera: Camera, factor: 
 
 def test_a_second_mistake_in_a_camera_is_named_beside_the_first() -> None:
     wrong = {"cy": 395.0, "fx": 1320.0, "fy": 1310.0}
-    solution = fitted(irregular_hexapod(12), 0, 1.0, **wrong)
+    solution = fitted(irregular_hexapod(12), 0, 1.0, frozenset(), **wrong)
     said = [note.partition(" of c1 ")[0] for note in solution.notes if "does not agree" in note]
     assert sorted(said) == ["The focal length", "The principal point"]
     assert solution.contradicted_cameras == ("c1",)
@@ -244,7 +244,7 @@ def test_a_wrong_camera_file_is_noticed_and_what_it_does_is_told(
 ) -> None:
     """As where board and machine are corrected for the lens, or cropped, differently."""
     session = irregular_hexapod(12, camera=camera)
-    solution = fitted(session, 0, 1.0, **wrong)
+    solution = fitted(session, 0, 1.0, frozenset(), **wrong)
     (note,) = (note for note in solution.notes if "does not agree" in note)
     assert note.startswith(start)
     assert words in note
