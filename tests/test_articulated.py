@@ -14,6 +14,7 @@ import pytest
 from articulated import HOME, Articulated, machine
 from command_line import run
 from scipy.spatial.transform import RigidTransform, Rotation
+from thinned import thinned
 
 from legcal.calibration.identify.identifiability import conditions_of, identifiability
 from legcal.calibration.identify.predicted_observations import planned_observations
@@ -307,15 +308,7 @@ def test_rods_on_a_body_of_the_platform_outside_the_class_are_refused(
 # --- what can be identified ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("kind", "turning"),
-    [
-        ("i4", False),
-        pytest.param("h4", True, marks=pytest.mark.slow),
-        pytest.param("h4", False, marks=pytest.mark.slow),
-        pytest.param("i4", True, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("kind", "turning"), thinned(KINDS, [("i4", False)]))
 def test_counts_and_ranks_are_those_of_closure_and_outlines(
     kind: str, turning: bool, loaded: Loaded
 ) -> None:
@@ -328,15 +321,7 @@ def test_counts_and_ranks_are_those_of_closure_and_outlines(
     assert rank_found == COUNTS[kind, turning][1]
 
 
-@pytest.mark.parametrize(
-    ("kind", "turning"),
-    [
-        ("i4", True),
-        pytest.param("i4", False, marks=pytest.mark.slow),
-        pytest.param("h4", False, marks=pytest.mark.slow),
-        pytest.param("h4", True, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("kind", "turning"), thinned(KINDS, [("i4", True)]))
 def test_free_radii_leave_open_the_scale_of_machines_whose_motors_turn(
     kind: str, turning: bool, loaded: Loaded
 ) -> None:

@@ -24,32 +24,37 @@ AT_ZERO = ", where their motors read 0"  # what is said of joints A that move, a
 
 def actuators_of(legs: Sequence[Leg]) -> tuple[Actuator, ...]:
     """Return the actuators of legs, each once, in the order of their first legs."""
-    found: dict[str, Actuator] = {}
-    for leg in legs:
-        if leg.actuator is not None:
-            found.setdefault(leg.actuator.joint, leg.actuator)
-    return tuple(found.values())
+    return _each_once([leg.actuator for leg in legs])
 
 
 def actuator_index(legs: Sequence[Leg]) -> list[int]:
     """Return which of :func:`actuators_of` each leg hangs on, -1 for none."""
-    number = {actuator.joint: i for i, actuator in enumerate(actuators_of(legs))}
-    return [-1 if leg.actuator is None else number[leg.actuator.joint] for leg in legs]
+    return _places([leg.actuator for leg in legs])
 
 
 def internal_joints_of(legs: Sequence[Leg]) -> tuple[Actuator, ...]:
     """Return the joints inside a platform of several bodies, each once, by their first legs."""
-    found: dict[str, Actuator] = {}
-    for leg in legs:
-        if leg.internal is not None:
-            found.setdefault(leg.internal.joint, leg.internal)
-    return tuple(found.values())
+    return _each_once([leg.internal for leg in legs])
 
 
 def internal_index(legs: Sequence[Leg]) -> list[int]:
     """Return which of :func:`internal_joints_of` carries B of each leg, -1 for none."""
-    number = {joint.joint: i for i, joint in enumerate(internal_joints_of(legs))}
-    return [-1 if leg.internal is None else number[leg.internal.joint] for leg in legs]
+    return _places([leg.internal for leg in legs])
+
+
+def _each_once(joints: Sequence[Actuator | None]) -> tuple[Actuator, ...]:
+    """Return the joints that carry ends of legs, each once, in the order of their first legs."""
+    found: dict[str, Actuator] = {}
+    for joint in joints:
+        if joint is not None:
+            found.setdefault(joint.joint, joint)
+    return tuple(found.values())
+
+
+def _places(joints: Sequence[Actuator | None]) -> list[int]:
+    """Return which of :func:`_each_once` each leg has, -1 for none."""
+    number = {joint.joint: i for i, joint in enumerate(_each_once(joints))}
+    return [-1 if joint is None else number[joint.joint] for joint in joints]
 
 
 def platform_joints_at(legs: Sequence[Leg], s: Array) -> Array:

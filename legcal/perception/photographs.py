@@ -368,9 +368,9 @@ def _decided_by_outlines(
 ) -> tuple[Placement, FreePosesOf, dict[int, int]]:
     """Return the legs at those of several poses at which most outlines can be measured.
 
-    With the number of outlines there, by pose.
-    They are measured at the likeliest poses of all images first, then at others before cameras
-    that these have placed; twice, since cameras stand better with better poses.
+    With the number of outlines there, by pose. They are measured at the likeliest poses of all
+    images first, then at others before cameras that these have placed; twice, since cameras stand
+    better with better poses.
     """
     hints = nominal.T_base_camera
     for _ in range(CHOICE_ROUNDS):

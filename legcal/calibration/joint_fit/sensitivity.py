@@ -299,6 +299,11 @@ class CameraResiduals:
             for corners in problem.boards
         }
 
+    @cached_property
+    def _plain(self) -> NormalEquations:
+        """The normal equations of plain squares."""
+        return normal_equations(self.problem, self.state, self.linear)
+
     def changes(self, error: Array) -> dict[str, Array]:
         """Return how whitened residuals (n, q) change with errors (n_views, 5) of cameras."""
         views = {corners.name: corners.view for corners in self.problem.boards}
@@ -347,8 +352,7 @@ class CameraResiduals:
 
         def explained(which: Sequence[int]) -> float:
             at = np.concatenate([place[k] for k in which])
-            inverse = np.linalg.pinv(information[np.ix_(at, at)], rcond=_ROUNDING, hermitian=True)
-            return float(score[at] @ inverse @ score[at])
+            return float(score[at] @ _inverse(information, at) @ score[at])
 
         wrong, apart, so_far = list[int](), list[float](), 0.0
         while left:
@@ -364,7 +368,7 @@ class CameraResiduals:
         if not wrong:
             return []
         at = np.concatenate([place[k] for k in wrong])
-        covariance = np.linalg.pinv(information[np.ix_(at, at)], rcond=_ROUNDING, hermitian=True)
+        covariance = _inverse(information, at)
         change, sigma = -covariance @ score[at], np.sqrt(np.diagonal(covariance))
         camera = self.problem.first_cameras[self.problem.outlines.views.index(owner)]
         found = []
@@ -391,7 +395,7 @@ class CameraResiduals:
         found = []
         for owner in sorted({owners[v] for v in views}):
             own = [i for i, k in enumerate(seen.tolist()) if owners[views[k]] == owner]
-            weight = np.linalg.pinv(covariance[np.ix_(own, own)], rcond=_ROUNDING, hermitian=True)
+            weight = _inverse(covariance, np.array(own, dtype=np.intp))
             tests = []
             for i, k in enumerate(own if len(own) > 1 else []):
                 X = np.column_stack([np.ones(len(own)), np.arange(len(own)) == i])
@@ -422,9 +426,8 @@ class CameraResiduals:
         """
         score, information = self._score([error * own[:, None] for own in which])
         seen = np.flatnonzero(np.diagonal(information) > 0.0)
-        own = information[np.ix_(seen, seen)]
-        covariance = np.linalg.pinv(own, rcond=_ROUNDING, hermitian=True)
-        return seen, -covariance @ score[seen], np.asarray(covariance, dtype=np.float64)
+        covariance = _inverse(information, seen)
+        return seen, -covariance @ score[seen], covariance
 
     def _score(self, errors: Sequence[Array]) -> tuple[Array, Array]:
         """Return the slope (c,) by parts of errors (n_views, 5) of cameras, and its information.
@@ -436,9 +439,14 @@ class CameraResiduals:
             name: np.stack([change[name] for change in changes], axis=-1)
             for name in self.derivatives
         }
-        normal = normal_equations(self.problem, self.state, self.linear)
-        score, information = score_test(self.problem, self.linear, normal, columns)
+        score, information = score_test(self.problem, self.linear, self._plain, columns)
         whole = sum(np.sum(of_kind**2, axis=(0, 1)) for of_kind in columns.values())
         unseen = np.diagonal(information) <= _ROUNDING * whole
         information[unseen] = information[:, unseen] = score[unseen] = 0.0
         return score, information
+
+
+def _inverse(matrix: Array, at: IntArray) -> Array:
+    """Return the inverse of some rows and columns (c,) of a symmetric matrix, on its range."""
+    own = matrix[np.ix_(at, at)]
+    return np.asarray(np.linalg.pinv(own, rcond=_ROUNDING, hermitian=True), dtype=np.float64)
