@@ -55,7 +55,7 @@ from rich.console import RenderableType
 
 from legcal.calibration import Choices, Solution, Start, refine
 from legcal.errors import DidNotConverge, LegcalError
-from legcal.geometry import components
+from legcal.geometry import Array, components
 from legcal.machine import Leg, radius_name, vector_of
 from legcal.paper import Criteria
 from legcal.report import report
@@ -73,6 +73,7 @@ HEADINGS = {
 NSE = (0.9, 1.1)
 LARGEST_RATIO = 1.05
 _EXACT = 1e-6  # squared standard deviations
+_JUDGED = 0.1  # least part of a direction that is one of the parameters that are judged
 _PLATFORM = {"dX", "dE"}
 _NUMBERS = {"rank", "nse", "of_bound"}
 WORTH = ("determined", "runs", "error/bound", "nse", "covered", "verdict")
@@ -177,7 +178,7 @@ def errors_of_fit(
     design: Design, session: OutlineSession, solution: Solution, noise: Noise
 ) -> Record:
     """Return rank, normalised squared errors (stated, and by the bound), and errors over sigmas."""
-    parametrization, n_held = design.parametrization, len(solution.held_basis)
+    parametrization, n_held = design.parametrization, len(held_of(design, solution))
     there = standing_where_held(design, session, solution)
     best = (_same_bound if n_held == 0 else at_best)(
         there, noise.sigma_q, noise.radius_sigma, n_held
@@ -198,6 +199,17 @@ def errors_of_fit(
     }
 
 
+def held_of(design: Design, solution: Solution) -> Array:
+    """Return what a fit holds of the parameters that are judged, (w, p) in ``unit_of``.
+
+    Lines of arms are none of these: where one alone is held, all of them are judged.
+    """
+    known = solution.parametrization.names  # twists and arms too
+    place = [known.index(name) for name in design.parametrization.names]
+    held = solution.held_basis[:, place] / unit_of(design)
+    return np.asarray(held[np.linalg.norm(held, axis=1) > _JUDGED])
+
+
 _same_bound = lru_cache(maxsize=32)(at_best)  # of the true machines, the same in all runs
 
 
@@ -207,7 +219,7 @@ def standing_where_held(design: Design, session: OutlineSession, solution: Solut
     It is fitted to the exact outlines and readings, from the solution: without noise nothing is
     left of what is determined, and what is open stays.
     """
-    if not solution.held:
+    if not len(held_of(design, solution)):
         return design
     true = design.legs
     radii = (radius_name(true.names[leg], part) for leg, part in solution.radii)
@@ -240,7 +252,7 @@ def as_stated(design: Design, solution: Solution) -> Determined:
     known = solution.parametrization.names  # twists too, which are fixed
     place, unit = [known.index(name) for name in design.parametrization.names], unit_of(design)
     tied = tied_directions(design)
-    parts = across(np.concatenate([solution.held_basis[:, place] / unit, tied])) / unit
+    parts = across(np.concatenate([held_of(design, solution), tied])) / unit
     covariance = solution.value_covariance[np.ix_(place, place)]
     return Determined(parts, np.asarray(parts @ covariance @ parts.T))
 

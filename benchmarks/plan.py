@@ -10,6 +10,9 @@ sessions: the rank correlation (Spearman) of each with the predicted error of th
 error that is predicted for the session that it takes for the best, over that of the best.
 
     python benchmarks/plan.py --machines hexapod 3-rpr --random 50 --runs 20
+
+Machines are shipped ones, or ``delta-round-arms`` and its like (``outline_sessions``); where motors
+turn, the rod that the plan counts on is measured.
 """
 
 from __future__ import annotations
@@ -21,14 +24,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from outline_sessions import ROUND_ARMS, made
 from scipy.stats import spearmanr
 
 import legcal
+from legcal.calibration import NO_CHOICES, Choices, Prior
 from legcal.errors import LegcalError, NotIdentifiable
 from legcal.geometry import Array, direction_above
 from legcal.machine import Machine, feasible_poses, load_mechanism, poses_at
 from legcal.planning import (
     DEFAULT_NOISE,
+    LENGTH_SIGMA,
     WHITE,
     Candidates,
     Place,
@@ -39,6 +45,7 @@ from legcal.planning import (
     all_points,
     drawn_covariance,
     places_along,
+    rod_to_measure,
     surely_reached,
     workspace_of,
     write_session,
@@ -126,8 +133,18 @@ def main() -> None:
 
 def compare(name: str, args: argparse.Namespace) -> dict[str, object]:
     """Return the figures of one machine."""
-    machine = load_mechanism(name)
-    predictor = Predictor(machine, sample_camera(), DEFAULT_NOISE, 2e-6)
+    with TemporaryDirectory() as folder:
+        machine = made(name, Path(folder)) if name in ROUND_ARMS else load_mechanism(name)
+        return compared(name, machine, args)
+
+
+def compared(name: str, machine: Machine, args: argparse.Namespace) -> dict[str, object]:
+    """Return the figures of one machine, whose files are there."""
+    choices, rod = NO_CHOICES, rod_to_measure(machine, board=False)
+    if rod is not None:
+        known = Prior(rod[0].q0, LENGTH_SIGMA)
+        choices = Choices(priors={f"{rod[0].name}.length": known})
+    predictor = Predictor(machine, sample_camera(), DEFAULT_NOISE, 2e-6, choices)
     scene = Scene.nominal(Task(predictor, args.images, args.cameras))
     work = workspace_of(machine, predictor.legs)
     if work is None:
@@ -188,17 +205,18 @@ def shot(
     The standard error of their ratio is that of the mean square of the runs.
     """
     dX, dE, stated, failed = [], [], [], []
+    rod = rod_to_measure(machine, board=False)
+    lengths = {} if rod is None else {rod[1]: LENGTH_SIGMA}
     for seed in range(first, first + runs):
         folder, out = session.parent / f"shot{seed}", session.parent / f"out{seed}"
         try:
-            made = simulate(
-                machine, folder, SimulationSettings(plan=session, level=level, seed=seed)
-            )
+            settings = SimulationSettings(plan=session, level=level, seed=seed, lengths=lengths)
+            taken = simulate(machine, folder, settings)
             result = legcal.calibrate(folder, output=out)
         except LegcalError as error:
             failed.append(str(error))
             continue
-        of = legcal.evaluate(out / "calibrated.yaml", made.truth_path)
+        of = legcal.evaluate(out / "calibrated.yaml", taken.truth_path)
         dX.append(of.displacement)
         dE.append(of.rotation)
         if result.platform is not None and result.platform.workspace is not None:

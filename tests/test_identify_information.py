@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from hexapod_example import HEXAPOD
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from layouts import Layout, write_machine
-from machines import MACHINES, of_types
+from machines import MACHINES, of_types, read_family
 from random_legs import changed, closed_leg
 from scipy.spatial.transform import Rotation
 from thinned import thinned
@@ -35,6 +36,8 @@ from legcal.calibration.identify.predicted_observations import (
     recorded_observations,
 )
 from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.scale import is_scale_open
+from legcal.calibration.joint_fit import Choices, Prior
 from legcal.data import load_dataset
 from legcal.errors import DidNotConverge
 from legcal.estimation import (
@@ -50,8 +53,12 @@ from legcal.geometry import Array
 from legcal.machine import (
     EquationKind,
     LegKind,
+    Machine,
+    arms_at,
+    create_model,
     forward_kinematics_many,
     geometries,
+    moved_legs,
     parametrize,
     random_poses_of_legs,
 )
@@ -156,6 +163,64 @@ def test_rows_equal_finite_differences_of_axes_cut_in_the_camera_and_of_legs(see
     difference = np.delete(np.stack(demanded, axis=-1), np.s_[6:12], axis=1)
     rows = np.abs(difference).max(axis=1, keepdims=True)
     np.testing.assert_allclose(exact / rows, difference / rows, atol=1e-5)
+
+
+def round_arms(folder: Path) -> Machine:
+    """Return a Delta whose arms are cylinders."""
+    return create_model(read_family("delta", arm_radius=8.0), folder).machine
+
+
+def test_rows_of_arms_equal_finite_differences_of_their_axes(tmp_path: Path) -> None:
+    """By readings, cameras, all parameters of their motors, and their own lines."""
+    machine = round_arms(tmp_path)
+    session = planned_observations(machine, [range(6), range(2, 6)], 2)
+    named = parametrize(machine.leg_names, session.legs, machine.frame_legs, twists=True)
+    session = replace(session, parametrization=named)
+    base, platform = at_base_joints(session), at_platform_joints(session)
+    n, n_q, L = session.n_legs, session.moving.shape[1], session.mean_length
+    assert list(session.arms) == [0, 2, 4]
+    assert not base.gradient[session.view == 1, n].any()  # it shows no rod on this arm
+
+    def offsets(q: Array, camera: Array, step: Array, image: int) -> Array:
+        """Return how far axes have moved at their old ends, in standard deviations, (3, 4)."""
+        pose, found = session.pose[image], []
+        legs = moved_legs(session.legs, named.place, step)
+        ends = arms_at(legs, (session.q + q)[[pose]])
+        turn = Rotation.from_rotvec(camera[:3])
+        for a, there in enumerate(ends.values()):
+            A, B = turn.inv().apply(there[0] - camera[3:])
+            old = base.point[image, n + a], platform.point[image, n + a]
+            u0 = (old[1] - old[0]) / np.linalg.norm(old[1] - old[0])
+            cut = [A + (B - A) * ((P - A) @ u0) / ((B - A) @ u0) - P for P in old]
+            sides = zip((base, platform), cut, strict=True)
+            found.append(np.concatenate([s.gradient[image, n + a] @ c for s, c in sides]))
+        return np.array(found)
+
+    rows, h = image_rows(session)[:, n:], 1e-6
+    unit = np.concatenate([np.ones(6), np.full(n_q, 1.0 / L), np.repeat([1.0 / L, 1.0], 3)])
+    unit = np.concatenate([unit, session.unit])
+    for image in range(len(session.view)):
+        found = []
+        for column in np.diag(unit):
+            _, q, camera, step = np.split(column * h, [6, 6 + n_q, 12 + n_q])
+            one, other = (offsets(s * q, s * camera, s * step, image) for s in (1.0, -1.0))
+            found.append((one - other) / (2.0 * h))
+        difference = np.stack(found, axis=-1)
+        np.testing.assert_allclose(rows[image], difference, atol=1e-5 * np.abs(difference).max())
+
+
+def test_arms_tell_of_motors_but_not_of_the_scale(tmp_path: Path) -> None:
+    machine, bare = round_arms(tmp_path), legcal.load_mechanism("delta")
+    with_arms, without = (
+        Analysis(planned_observations(m, [range(6)] * 2, 15)) for m in (machine, bare)
+    )
+    sigma, other = (a.motion.sigma(a.information) for a in (with_arms, without))
+    assert sigma is not None
+    assert other is not None
+    assert 0.5 * other.dX_m < sigma.dX_m < 0.9 * other.dX_m
+    assert is_scale_open(with_arms)
+    radii = {f"leg{j}.radius.arm{a}_link": Prior(0.008, 1e-5) for j, a in ((1, 1), (3, 2), (5, 3))}
+    assert not is_scale_open(replace(with_arms, choices=Choices(priors=radii)))
 
 
 def test_a_tenth_of_a_pixel_across_is_one_standard_deviation() -> None:

@@ -19,6 +19,7 @@ import yaml
 from command_line import run
 from csv_rows import read_rows
 from fit_sessions import machine_session
+from machines import read_family
 from rich.console import Console
 
 import legcal
@@ -26,11 +27,14 @@ from legcal import planning
 from legcal.data import load_dataset
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.machine import (
+    ARM_KINDS,
     Cylinder,
     Feasibility,
     Pulses,
+    create_model,
     follow,
     inverse_kinematics,
+    kind_of_parameter,
     load_mechanism,
     random_configurations,
     slider_columns,
@@ -255,6 +259,40 @@ def test_what_is_seen_is_what_the_simulation_shows(planned: planning.Plan, tmp_p
             assert np.linalg.norm(lines[key][1][1] - lines[key][1][0]) > 0.6 * shown
         row += len(view.poses.poses)
     assert missing <= 0.1 * agreeing
+
+
+def test_arms_that_are_cylinders_count_as_a_calibration_has_them(tmp_path: Path) -> None:
+    """They are seen where the simulation shows them, and their lines become as well known."""
+    machine = create_model(read_family("delta", arm_radius=8.0), tmp_path).machine
+    setting = replace(FEW, shift=0.0, turn=0.0)
+    plan = legcal.plan(machine, images=15, seed=1, noise=planning.WHITE, setting=setting)
+    planning.write_session(plan, tmp_path / "session")
+    lengths = {"leg1.base:leg1.platform": 5e-5}
+    settings = SimulationSettings(
+        plan=tmp_path / "session", level=Level.OUTLINES, seed=2, lengths=lengths
+    )
+    simulate(machine, tmp_path / "shot", settings)
+    shown = load_dataset(tmp_path / "shot").observations
+    assert shown is not None
+    keys = {key for key in shown.row_keys() if key[2].startswith("arm")}
+    row, told = 0, set()
+    for view in plan.views:
+        of_view = view.seen.outlines(0.1, row + np.arange(len(view.poses.poses)))
+        told |= {key for key in of_view.row_keys() if key[2].startswith("arm")}
+        row += len(view.poses.poses)
+    assert len(keys & told) >= 0.75 * max(len(keys), len(told))
+    found = legcal.calibrate(tmp_path / "shot", output=tmp_path / "out")
+    stated = dict(zip(found.solution.names, found.solution.sigma.tolist(), strict=True))
+    names = [name for name in plan.names if kind_of_parameter(name) in ARM_KINDS]
+    sigma = dict(zip(plan.names, plan.sigma.tolist(), strict=True))
+    ratios = [stated[name] / sigma[name] for name in names]
+    assert len(ratios) == 12
+    assert 0.75 < np.exp(np.mean(np.log(ratios))) < 1.3
+    assert found.platform is not None
+    assert found.platform.workspace is not None
+    assert plan.error is not None
+    stated_error = found.platform.workspace.mean_displacement
+    assert plan.error.mean_displacement == pytest.approx(stated_error, rel=0.15)
 
 
 def test_the_way_between_planned_poses_is_free(planned: planning.Plan) -> None:

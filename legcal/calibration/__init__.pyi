@@ -44,6 +44,7 @@ from .joint_fit.platform import expected_error as expected_error
 from .joint_fit.platform import platform_by_parameters as platform_by_parameters
 from .joint_fit.platform import poses_at_readings as poses_at_readings
 from .joint_fit.problem import FitProblem as FitProblem
+from .joint_fit.problem import arm_sigmas as arm_sigmas
 from .joint_fit.problem import build_fit as build_fit
 from .joint_fit.solution import Solution as Solution
 from .joint_fit.variables import DEFAULT_SETTINGS as DEFAULT_SETTINGS

@@ -25,6 +25,7 @@ from .planner import Task as Task
 from .planner import drawn_covariance as drawn_covariance
 from .planner import plan_session as plan_session
 from .poses import surely_reached as surely_reached
+from .request import LENGTH_SIGMA as LENGTH_SIGMA
 from .request import difference as difference
 from .request import plan as plan
 from .session import check_session as check_session

@@ -1,11 +1,11 @@
 """What predicted images say: the rows that each adds to the information of the joint fit.
 
 The joint fit itself is built at predicted outlines, with its common-mode edge biases, radii,
-intrinsics of which the camera file states a covariance, and gamma where it is not given. The
-platform pose of an image is eliminated; machine, cameras and what images share are kept, so that an
-image is a low-rank update: rows U with U^T U added to the information. Unknowns have names, those
-of a view begin with its name; unknown kinematic parameters are coordinates inside what the
-mechanism ties.
+intrinsics of which the camera file states a covariance, lines of arms with their prior, and gamma
+where it is not given. The platform pose of an image is eliminated; machine, cameras and what images
+share are kept, so that an image is a low-rank update: rows U with U^T U added to the information.
+Unknowns have names, those of a view begin with its name; unknown kinematic parameters are
+coordinates inside what the mechanism ties.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ from legcal.calibration import (
     FitProblem,
     FittedLegs,
     NoiseModel,
+    Prior,
     Start,
     State,
+    arm_sigmas,
     build_fit,
     fitted_legs,
     possible_biases,
@@ -109,6 +111,14 @@ class Predictor:
         """The legs as the joint fit sees them."""
         return fitted_legs(self.machine)
 
+    @cached_property
+    def _known(self) -> Choices:
+        """The choices, with lines of arms unknown in all images, also in those that show none."""
+        seen = [j for j, leg in enumerate(self.legs.nominal) if leg.arm is not None]
+        sigmas = arm_sigmas(self.legs.parametrization, seen)
+        arms = {name: Prior(0.0, sigma) for name, sigma in sigmas.items()}
+        return replace(self.choices, priors=arms | dict(self.choices.priors))
+
     def contributions(
         self,
         views: Mapping[str, RigidTransform],  # T_base_camera of views by their names
@@ -134,7 +144,7 @@ class Predictor:
             sigma_q=self.sigma_q,
             sigma_by_joint=self.sigma_by_joint,
         )
-        problem = build_fit(self.legs, measurements, self.noise.of(outlines), choices=self.choices)
+        problem = build_fit(self.legs, measurements, self.noise.of(outlines), choices=self._known)
         biases = possible_biases(problem.outlines, self.legs.names)
         problem = problem.with_biases(
             biases.of_sizes(with_gamma(np.append(self.noise.common_px, 0.0)))

@@ -2,20 +2,19 @@
 
 It lies flat at the level of the base joints, in their middle or beside them, its print up: there
 most places see it. An image shows it if all of its corners are in the picture, seen from above by
-enough and large enough to be read, and behind neither a leg nor the plate of the platform.
+enough and large enough to be read, and behind no leg, no arm and not the plate of the platform.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array, BoolArray, normal_basis
-from legcal.machine import Cylinder, Machine
-from legcal.planning.sight import behind_plate
+from legcal.machine import Machine
+from legcal.planning.sight import Bodies, behind_plate
 from legcal.vision import Board, Camera, dictionary, facing_board, in_picture, rays_past_axes
 
 _SIDES = 4  # directions beside the machine
@@ -48,15 +47,13 @@ class LaidBoard:
         self,
         camera: Camera,
         T_base_camera: RigidTransform,
-        A: Array,  # (n_images, n_legs, 3) in the base link [m]
-        B: Array,  # (n_images, n_legs, 3) the same
-        cylinders: Sequence[Sequence[Cylinder]],  # of each leg
+        bodies: Bodies,
         margin_px: float = 0.0,
         *,
         is_read: bool = True,  # whether it must look large enough
     ) -> BoolArray:
         """Return which images of one camera show it, (n_images,)."""
-        n = len(B)
+        n = len(bodies.B)
         outer, eye = self.corners, T_base_camera.translation
         P = T_base_camera.inv().apply(outer)
         normal = self.T_base_board.rotation.as_matrix()[:, 2] * self.board.towards_viewer
@@ -69,13 +66,11 @@ class LaidBoard:
         points = np.concatenate([outer, self.T_base_board.apply(self.board.points)])
         T = T_base_camera.inv()
         P = np.broadcast_to(T.apply(points), (n, len(points), 3))
-        A, B = (T.apply(X.reshape(-1, 3)).reshape(X.shape) for X in (A, B))
-        length = np.linalg.norm(B - A, axis=-1)
-        u = (B - A) / length[..., None]
-        radius = np.array([max((c.radius for c in some), default=0.0) for some in cylinders])
-        distance, depth, square = rays_past_axes(P, A, u, length)
-        aside = radius + self.board.side * depth / distance[..., None]
+        bodies = bodies.before(T_base_camera)
+        distance, depth, square = rays_past_axes(P, bodies.A, *bodies.axes)
+        aside = bodies.radius + self.board.side * depth / distance[..., None]
         hidden = (square < aside**2) & (depth > 0.0) & (depth < distance[..., None])
+        B = bodies.B[:, : bodies.n_legs]
         hidden = hidden.any(axis=-1) | behind_plate(P[:, None], B, 0.0, surely=False)[:, 0]
         return ~np.asarray(hidden.any(axis=1))
 

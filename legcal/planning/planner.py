@@ -18,9 +18,8 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration import poses_at_readings
 from legcal.errors import NotIdentifiable, NotVisible
-from legcal.estimation import Frames
 from legcal.geometry import Array, BoolArray, look_at
-from legcal.machine import Configurations, Leg, Machine, ends_in_base, platforms_in_base
+from legcal.machine import Configurations, Leg, Machine, platforms_in_base
 from legcal.planning.exchange import Chosen, Criterion, Session, choose, exchange
 from legcal.planning.goals import Goal, Workspace, criterion_of, workspace_of
 from legcal.planning.information import Contributions, Predictor
@@ -36,7 +35,7 @@ from legcal.planning.places import (
 )
 from legcal.planning.planned_session import Plan, PlannedView
 from legcal.planning.poses import candidate_poses, drawn_legs, poses_near, some_of
-from legcal.planning.sight import Seen, what_is_seen
+from legcal.planning.sight import Bodies, Seen, what_is_seen
 from legcal.progress import Report, no_progress
 from legcal.vision import Board
 from legcal.workers import Run, in_turn
@@ -108,10 +107,10 @@ class Scene:
 
     def seen(self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool) -> Seen:
         """Return what a camera sees at poses T_Rb_Re; *surely*: wherever the tripod is set."""
-        A, B = self._joints(poses)
-        margin = self._margin(T, np.concatenate([A, B]).reshape(-1, 3)) if surely else 0.0
-        cylinders = [leg.cylinders for leg in self.task.machine.legs]
-        return what_is_seen(self.task.predictor.camera, T, A, B, cylinders, margin)
+        bodies = Bodies.at(self.task.machine, self.legs, poses)
+        points = np.concatenate([bodies.A, bodies.B]).reshape(-1, 3)
+        margin = self._margin(T, points) if surely else 0.0
+        return what_is_seen(self.task.predictor.camera, T, bodies, margin)
 
     def board_is_shown(
         self,
@@ -125,10 +124,9 @@ class Scene:
         laid, camera = self.task.laid, self.task.predictor.camera
         if laid is None:
             return np.ones(len(poses), dtype=np.bool_)
-        A, B = self._joints(poses)
+        bodies = Bodies.at(self.task.machine, self.legs, poses)
         margin = self._margin(T, laid.corners) if surely else 0.0
-        cylinders = [leg.cylinders for leg in self.task.machine.legs]
-        return laid.is_shown(camera, T, A, B, cylinders, margin, is_read=is_read)
+        return laid.is_shown(camera, T, bodies, margin, is_read=is_read)
 
     def showing(self, own: Candidates) -> Candidates:
         """Return the candidates whose images show the board, the same if all do."""
@@ -137,10 +135,6 @@ class Scene:
         if shown.all():
             return own
         return replace(own, poses=some_of(own.poses, np.flatnonzero(shown).tolist()))
-
-    def _joints(self, poses: Sequence[RigidTransform]) -> tuple[Array, Array]:
-        """Return A and B (n, n_legs, 3) in the base link."""
-        return ends_in_base(self.legs, self.task.machine.T_base_Rb, *Frames.of(poses))
 
     def _margin(self, T: RigidTransform, points: Array) -> float:
         """Return how far in the picture points (n, 3) in the base link move at most [px]."""

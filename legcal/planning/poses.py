@@ -12,6 +12,7 @@ from legcal.errors import DidNotConverge
 from legcal.estimation import Frames
 from legcal.geometry import Array, BoolArray
 from legcal.machine import (
+    ARM_KINDS,
     Configurations,
     Feasibility,
     Leg,
@@ -20,6 +21,7 @@ from legcal.machine import (
     feasible_poses,
     follow,
     is_held_by_default,
+    kind_of_parameter,
     motor_travel,
     moved_legs,
     platforms_in_base,
@@ -102,10 +104,11 @@ def _at_readings(legs: Sequence[Leg], q: Array) -> tuple[Array, Array]:
 
 
 def drawn_legs(legs: FittedLegs, setting: Setting, rng: np.random.Generator) -> tuple[Leg, ...]:
-    """Return legs as they may be, within the prior errors of the machine."""
+    """Return legs, and arms that are seen, as they may be: within the prior errors of a machine."""
     found = legs.parametrization
     size = np.where([unit == "m" for unit in found.units], setting.length, setting.angle)
-    size = size * np.array([not is_held_by_default(name) for name in found.names])
+    arms = np.array([kind_of_parameter(name) in ARM_KINDS for name in found.names])
+    size = size * (arms | [not is_held_by_default(name) for name in found.names])
     return moved_legs(legs.nominal, found.place, size * rng.uniform(-1.0, 1.0, len(size)))
 
 

@@ -1,22 +1,25 @@
-"""What a camera will see of a machine: the visible stretch of every part of every leg.
+"""What a camera will see of a machine: the visible stretch of every part of legs, and of arms.
 
 A stretch counts where it is in the picture by a margin, in front of the camera, and behind neither
-another leg nor the plates that the joints of base and platform span. It is found along rays to
-points of the axis, of many poses at once; its outlines follow from eqs (3) and (5).
+another leg or arm nor the plates that the joints of base and platform span; joints on carriages and
+arms span none. It is found along rays to points of the axis, of many poses at once; its outlines
+follow from eqs (3) and (5).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data import Outlines
+from legcal.estimation import Frames
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Cylinder
+from legcal.machine import Cylinder, Leg, Machine, ends_in_base, readings_of_rods
+from legcal.perception import placed_arms
 from legcal.vision import (
     EPSILON,
     Camera,
@@ -38,11 +41,62 @@ _THIN = 1e-3  # of the largest extent of joints that span no plate
 
 
 @dataclass(frozen=True, eq=False)
+class Bodies:
+    """What stands before a camera: the legs of a machine, then its arms that are cylinders."""
+
+    A: Array  # (n_images, n, 3) one end of each in the base link [m]
+    B: Array  # (n_images, n, 3) the other
+    cylinders: tuple[Sequence[Cylinder], ...]  # of each
+    leg: IntArray  # (n,) of an arm the leg that has it as a part
+    is_moved: BoolArray  # (n_legs,) whether a motor moves A
+
+    @property
+    def n_legs(self) -> int:
+        """Number of legs."""
+        return len(self.is_moved)
+
+    @classmethod
+    def at(cls, machine: Machine, legs: Sequence[Leg], poses: Sequence[RigidTransform]) -> Bodies:
+        """Return those of legs in R_b and R_e at poses T_Rb_Re, as thick as the model says."""
+        (R, t), T = Frames.of(poses), machine.T_base_Rb
+        A, B = ends_in_base(legs, T, R, t)
+        pose = np.arange(len(poses), dtype=np.intp)
+        arms = placed_arms(legs, readings_of_rods(legs, R, t), pose, T_base=T)
+        near, far = ([arm.ends[:, k : k + 1] for arm in arms.values()] for k in (0, 1))
+        return cls(
+            np.concatenate([A, *near], axis=1),
+            np.concatenate([B, *far], axis=1),
+            (*(leg.cylinders for leg in machine.legs), *([arm.cylinder] for arm in arms.values())),
+            np.array([*range(len(legs)), *arms], dtype=np.intp),
+            np.array([leg.actuator is not None for leg in legs], dtype=np.bool_),
+        )
+
+    def before(self, T_base_camera: RigidTransform) -> Bodies:
+        """Return the same in the frame of a camera."""
+        T = T_base_camera.as_matrix()
+        A, B = ((X - T[:3, 3]) @ T[:3, :3] for X in (self.A, self.B))
+        return replace(self, A=A, B=B)
+
+    @property
+    def radius(self) -> Array:
+        """The largest radius of each, (n,) [m]."""
+        return np.array([max((c.radius for c in some), default=0.0) for some in self.cylinders])
+
+    @property
+    def axes(self) -> tuple[Array, Array]:
+        """Direction (n_images, n, 3) and length (n_images, n) [m] of each."""
+        along = self.B - self.A
+        length = np.linalg.norm(along, axis=-1)
+        return along / length[..., None], length
+
+
+@dataclass(frozen=True, eq=False)
 class Seen:
-    """Visible stretches of legs in images of one camera, n of them."""
+    """Visible stretches of legs and arms in images of one camera, n of them."""
 
     image: IntArray  # (n,)
     leg: IntArray  # (n,)
+    is_arm: BoolArray  # (n,) whether it is the arm of the leg, and not along it
     part: tuple[str, ...]  # the URDF link of the cylinder
     h: Array  # (n, 2, 3) both outlines, eq (3)
     ends: Array  # (n, 2, 2, 2) of both outlines, both ends [px], the first nearer to the base joint
@@ -72,6 +126,7 @@ class Seen:
         return Seen(
             np.zeros(len(own), dtype=np.intp),
             self.leg[own],
+            self.is_arm[own],
             tuple(self.part[i] for i in own),
             self.h[own],
             self.ends[own],
@@ -80,43 +135,38 @@ class Seen:
 
     def legs_in(self, n_images: int, n_legs: int) -> BoolArray:
         """Return which legs each image shows, (n_images, n_legs)."""
-        shown = np.zeros((n_images, n_legs), dtype=np.bool_)
-        shown[self.image, self.leg] = True
+        shown, along = np.zeros((n_images, n_legs), dtype=np.bool_), ~self.is_arm
+        shown[self.image[along], self.leg[along]] = True
         return shown
 
 
 def what_is_seen(
     camera: Camera,
     T_base_camera: RigidTransform,
-    A: Array,  # (n_images, n_legs, 3) in the base link [m]
-    B: Array,  # (n_images, n_legs, 3) the same
-    cylinders: Sequence[Sequence[Cylinder]],  # of each leg
+    bodies: Bodies,
     margin_px: float = 0.0,  # that stays free at the border of the picture
 ) -> Seen:
-    """Return the visible stretches of the legs in images of one camera."""
-    T = T_base_camera.as_matrix()
-    A, B = ((X - T[:3, 3]) @ T[:3, :3] for X in (A, B))  # in the camera frame
-    along = B - A
-    length = np.linalg.norm(along, axis=-1)
-    u = along / length[..., None]
-    leg, link, radius, start, end = _parts(cylinders, length)
+    """Return the visible stretches of legs and arms in images of one camera."""
+    bodies = bodies.before(T_base_camera)
+    A, (u, length) = bodies.A, bodies.axes
+    body, link, radius, start, end = _parts(bodies.cylinders, length)
     share = np.linspace(0.0, 1.0, N_SAMPLES)
     s = start[..., None] + (end - start)[..., None] * share
-    u_part = u[:, leg]
-    P = A[:, leg, None] + s[..., None] * u_part[:, :, None]  # (n_images, n_parts, N_SAMPLES, 3)
+    u_part = u[:, body]
+    P = A[:, body, None] + s[..., None] * u_part[:, :, None]  # (n_images, n_parts, N_SAMPLES, 3)
     seen = (end > start)[..., None] & in_picture(camera, P, _NEAREST, margin_px)
-    foot = A[:, leg] - u_part * np.sum(u_part * A[:, leg], axis=-1, keepdims=True)
+    foot = A[:, body] - u_part * np.sum(u_part * A[:, body], axis=-1, keepdims=True)
     seen &= (np.linalg.norm(foot, axis=-1) > _OUTSIDE * radius)[..., None]
-    of_leg = np.zeros(len(cylinders))
-    np.maximum.at(of_leg, leg, radius)
-    seen &= ~_behind_legs(P, leg, radius, A, u, length, of_leg)
-    thick = _IN_PLATE * float(of_leg.max(initial=0.0))
-    seen &= ~behind_plate(P, A, thick)
-    seen &= ~behind_plate(P, B, thick)
+    of_body = np.zeros(len(bodies.leg))
+    np.maximum.at(of_body, body, radius)
+    seen &= ~_behind_others(P, body, radius, A, u, length, of_body)
+    thick, n = _IN_PLATE * float(of_body[: bodies.n_legs].max(initial=0.0)), bodies.n_legs
+    seen &= ~behind_plate(P, A[:, :n][:, ~bodies.is_moved], thick)
+    seen &= ~behind_plate(P, bodies.B[:, :n], thick)
     first, last = longest_runs(seen)
     image, part = np.nonzero(last > first)
     begin, finish = (s[image, part, k[image, part]] for k in (first, last))
-    u_seen, M = u_part[image, part], A[image, leg[part]]
+    u_seen, M = u_part[image, part], A[image, body[part]]
     h = outlines_of_axis(u_seen, M, radius[part])
     axis = M[:, None] + np.stack([begin, finish], axis=1)[..., None] * u_seen[:, None]
     # h . M = epsilon R on the axis: the cylinder touches the plane of its outline at M - eps R h.
@@ -127,7 +177,8 @@ def what_is_seen(
     parts = part[kept]
     return Seen(
         image[kept],
-        leg[parts],
+        bodies.leg[body[parts]],
+        body[parts] >= bodies.n_legs,
         tuple(link[k] for k in parts),
         h[kept],
         ends[kept],
@@ -138,7 +189,7 @@ def what_is_seen(
 def _parts(
     cylinders: Sequence[Sequence[Cylinder]], length: Array
 ) -> tuple[IntArray, list[str], Array, Array, Array]:
-    """Return leg, link and radius of all parts, and their stretches (n_images, n_parts) each [m].
+    """Return body, link and radius of all parts, and their stretches (n_images, n_parts) each [m].
 
     Stretches of parts that a length leaves no room for are empty.
     """
@@ -163,21 +214,21 @@ def _parts(
     return leg, [link for _, link in number], np.array(radius), start, end
 
 
-def _behind_legs(
+def _behind_others(
     P: Array,  # (k, n_parts, m, 3)
     own: IntArray,  # (n_parts,)
     radius: Array,  # (n_parts,)
-    A: Array,  # (n_images, n_legs, 3)
-    u: Array,  # (k, n_legs, 3)
-    length: Array,  # (k, n_legs)
-    of_leg: Array,  # (n_legs,) the largest radius
+    A: Array,  # (n_images, n, 3)
+    u: Array,  # (k, n, 3)
+    length: Array,  # (k, n)
+    of_body: Array,  # (n,) the largest radius that is seen
 ) -> BoolArray:
-    """Return which points have another leg in front of them, wholly or in part."""
+    """Return which points have another leg or arm in front of them, wholly or in part."""
     rays = rays_past_axes(P.reshape(len(P), -1, 3), A, u, length)
     distance, depth, square = (x.reshape(*P.shape[:-1], *x.shape[2:]) for x in rays)
-    # A ray to the edge of the leg itself passes at its radius, as far as the other leg is nearer.
+    # A ray to the edge of a body itself passes at its radius, as far as the other is nearer.
     beside = radius[:, None, None] * depth / distance[..., None]
-    hides = (square < (of_leg + beside) ** 2) & (depth > 0.0) & (depth < distance[..., None])
+    hides = (square < (of_body + beside) ** 2) & (depth > 0.0) & (depth < distance[..., None])
     hides &= own[:, None, None] != np.arange(A.shape[1])
     return np.asarray(hides.any(axis=-1))
 
@@ -188,9 +239,11 @@ def behind_plate(P: Array, joints: Array, thick: float, *, surely: bool = True) 
     Points in the plate are not behind it, by its thickness [m]: so are legs of a planar machine.
     Without *surely* those count too that a plate of another shape may hide.
     """
+    if joints.shape[1] < 3:
+        return np.zeros(P.shape[:-1], dtype=np.bool_)
     middle = joints.mean(axis=1, keepdims=True)
     _, extent, axes = np.linalg.svd(joints - middle)
-    if joints.shape[1] < 3 or extent[:, 1].min() < _THIN * extent[:, 0].max():
+    if extent[:, 1].min() < _THIN * extent[:, 0].max():
         return np.zeros(P.shape[:-1], dtype=np.bool_)
     x, y, normal = (axes[:, i] for i in range(3))
     across = np.einsum("kpmx,kx->kpm", P, normal)

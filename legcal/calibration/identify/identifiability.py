@@ -187,6 +187,7 @@ def identifiability_of_dataset(
             analysis.prior,
             orientations_of(dataset, predicted),
             cameras_of(dataset),
+            analysis.arms,
         )
         report = replace(report, intrinsics=found)
     if dataset.machine.is_determined:

@@ -1,9 +1,9 @@
 """The problem of the joint fit at predicted observations, and what these determine.
 
-Platform poses, cameras and parameters are variables; images, the equations of readings and legs
-are factors, linearised at the nominal machine. Unknowns are in metres (angles count at the mean leg
-length) and rows in standard deviations, so that a singular value is one over a standard deviation
-[1/m]. Radii of legs and intrinsics of cameras come as further variables where these are judged.
+Platform poses, cameras, parameters and lines of arms are variables; images, the equations of
+readings and legs are factors, linearised at the nominal machine. Unknowns are in metres (angles
+count at the mean leg length) and rows in standard deviations, so that a singular value is one over
+a standard deviation [1/m]. Radii and intrinsics come as further variables where these are judged.
 """
 
 from __future__ import annotations
@@ -23,8 +23,10 @@ from legcal.calibration.identify.predicted_observations import (
 from legcal.calibration.identify.report import CameraIntrinsics
 from legcal.calibration.joint_fit import Choices
 from legcal.calibration.joint_fit.parameter_choices import joints_of_length
+from legcal.calibration.joint_fit.problem import arm_sigmas
 from legcal.calibration.joint_fit.variables import RefinementSettings
 from legcal.estimation import (
+    NO_PRIOR,
     Factor,
     GaussianPrior,
     Problem,
@@ -36,10 +38,14 @@ from legcal.estimation import (
 )
 from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
 from legcal.machine import (
+    ARM_KINDS,
+    ActuatorColumns,
     EquationKind,
     LegColumns,
     freedoms,
     is_held_by_default,
+    kind_of_parameter,
+    parametrize,
     pose_equations,
 )
 
@@ -58,6 +64,7 @@ class _Nominal:
     camera: Array
     pose: Array
     platform_board: Array
+    arm: Array = field(default_factory=lambda: np.zeros(0))
     radius: Array = field(default_factory=lambda: np.zeros(0))
     intrinsics: Array = field(default_factory=lambda: np.zeros(0))
 
@@ -107,7 +114,7 @@ def whitened_leg_equations(predicted: PredictedObservations) -> WhitenedEquation
 
 
 def image_rows(predicted: PredictedObservations) -> Array:
-    """Return the whitened derivatives (n_images, n_legs, 4, f + 6 + p) of what images show.
+    """Return the whitened derivatives (n_images, n_bodies, 4, f + 6 + p) of what images show.
 
     They are derivatives by the motion of the platform and of what moves joints at A and B, that of
     the camera, and the parameters.
@@ -115,23 +122,41 @@ def image_rows(predicted: PredictedObservations) -> Array:
     base, platform = at_base_joints(predicted), at_platform_joints(predicted)
     turns = pose_unit(predicted)
     by_camera = np.concatenate([base.by_camera(), platform.by_camera()], axis=2) * turns
-    turn = cross(predicted.arm[predicted.pose][:, :, None], platform.gradient)
+    n = predicted.n_legs
+    at_A, at_B = base.gradient[:, :n], platform.gradient[:, :n]
+    turn = cross(predicted.arm[predicted.pose][:, :, None], at_B)
     by_pose = np.zeros_like(by_camera)
-    by_pose[:, :, 2:] = np.concatenate([turn, platform.gradient], axis=3) * turns
+    by_pose[:, :n, 2:] = np.concatenate([turn, at_B], axis=3) * turns
     scatter = predicted.local_to_parameters
-    inside = platform.gradient @ predicted.R[predicted.pose][:, None]
-    of_A, of_B = base.gradient @ scatter[:, :3], inside @ scatter[:, 3:6]
+    inside = at_B @ predicted.R[predicted.pose][:, None]
+    of_A, of_B = at_A @ scatter[:, :3], inside @ scatter[:, 3:6]
     columns = list(freedoms(predicted.frame_legs))
     by_pose = by_pose[..., columns]
     if predicted.actuators:
-        of_A = base.gradient @ (predicted.A_by_local @ scatter)[predicted.pose]
+        of_A = at_A @ (predicted.A_by_local @ scatter)[predicted.pose]
         ends = zip((base, platform), predicted.ends_by_moving, strict=True)
         by_moving = [end.gradient @ by[predicted.pose] for end, by in ends]
         by_pose = np.concatenate([by_pose, np.concatenate(by_moving, axis=2)], axis=3)
     if predicted.internal_joints:
         of_B = inside @ (predicted.B_by_local @ scatter)[predicted.pose]
     by_parameters = np.concatenate([of_A, of_B], axis=2)
+    if predicted.arms:
+        by = predicted.arms_by_local @ scatter[list(predicted.arms)][:, None]
+        of_arms = _of_arms(predicted, by)
+        by_parameters = np.concatenate([by_parameters, of_arms], axis=1)
     return np.concatenate([by_pose, by_camera, by_parameters], axis=3)
+
+
+def _of_arms(predicted: PredictedObservations, by: Array) -> Array:
+    """Return whitened derivatives (n_images, n_arms, 4, d) by those of both ends (k, ..., 3, d)."""
+    n, by = predicted.n_legs, by[predicted.pose]
+    ends = at_base_joints(predicted), at_platform_joints(predicted)
+    return np.concatenate([e.gradient[:, n:] @ by[:, :, k] for k, e in enumerate(ends)], axis=2)
+
+
+def _line_unit(predicted: PredictedObservations) -> Array:
+    """Return a metre of each number of the line of an arm in its own unit, (4,)."""
+    return np.repeat([1.0 / predicted.mean_length, 1.0], 2)
 
 
 def pose_unit(predicted: PredictedObservations) -> Array:
@@ -143,12 +168,31 @@ def prior_of(predicted: PredictedObservations, choices: Choices) -> GaussianPrio
     """Return what is known of the parameters of a session: fixed ones, and those with priors."""
     sigma: dict[int, float] = {}
     for i, name in enumerate(predicted.parametrization.names):
-        if name in choices.priors:
+        is_arm = kind_of_parameter(name) in ARM_KINDS  # :func:`prior_of_arms` knows of it
+        if name in choices.priors and not is_arm:
             sigma[i] = choices.priors[name].sigma
-        elif choices.holds(name, by_default=is_held_by_default(name)):
+        elif is_arm or choices.holds(name, by_default=is_held_by_default(name)):
             sigma[i] = SIGMA_EXACT * predicted.unit[i]
     known, values = np.array(list(sigma), dtype=np.intp), np.array(list(sigma.values()))
     return GaussianPrior(known, np.zeros(len(sigma)), values)
+
+
+def prior_of_arms(
+    predicted: PredictedObservations, choices: Choices, *, stated: bool = False
+) -> GaussianPrior:
+    """Return what is known of the lines of arms, four numbers each; *stated*: by somebody."""
+    named = parametrize(predicted.leg_names, predicted.legs, predicted.frame_legs, twists=True)
+    sigmas, unit = arm_sigmas(named, predicted.arms), _line_unit(predicted)
+    known = {}
+    for i, (name, sigma) in enumerate(sigmas.items()):
+        if name in choices.priors:
+            known[i] = choices.priors[name].sigma / unit[i % 4]
+        elif name in choices.fixed:
+            known[i] = SIGMA_EXACT
+        elif name not in choices.free and not stated:
+            known[i] = sigma / unit[i % 4]
+    of = np.array(list(known), dtype=np.intp)
+    return GaussianPrior(of, np.zeros(len(of)), np.array(list(known.values())))
 
 
 def length_rows(predicted: PredictedObservations, choices: Choices) -> Array:
@@ -176,17 +220,20 @@ def problem_of(
     prior: GaussianPrior,
     more: Sequence[tuple[Variables, IntArray, Array]] = (),  # see below
     lengths: Array | None = None,  # of length_rows
+    arms: GaussianPrior = NO_PRIOR,  # of prior_of_arms
 ) -> tuple[Problem[_Nominal], _Nominal]:
     """Return the problem of a session and the state that it is linearised at.
 
     Views that show a board on the base share one camera: that of the board. One on the platform is
-    a factor of its own. *more* has variables that images depend on too: the element that each leg
-    in each image depends on (n_images, n_legs), and the derivatives (n_images, n_legs, 4, d) of
+    a factor of its own. *more* has variables that images depend on too: the element that each body
+    in each image depends on (n_images, n_bodies), and the derivatives (n_images, n_bodies, 4, d) of
     what it shows.
     """
     n_f, n_p, n_poses = predicted.n_motions, len(predicted.unit), len(predicted.t)
-    n_images, n_legs = images.shape[:2]
-    n, m, whole = n_images * n_legs, len(equations.leg), slice(None)
+    n_images, n_bodies = images.shape[:2]
+    n, m, whole = n_images * n_bodies, len(equations.leg), slice(None)
+    if predicted.arms:
+        more = (*more, _lines(predicted, arms))
     J = np.concatenate([images[..., n_f:], *(by for _, _, by in more)], axis=3).reshape(n, 4, -1)
     ties = predicted.ties[None] / SIGMA_EXACT
     if lengths is not None:
@@ -217,13 +264,13 @@ def problem_of(
                 "images",
                 lambda _: shown,
                 (
-                    ("camera", np.repeat(predicted.frame[predicted.view], n_legs), whole),
+                    ("camera", np.repeat(predicted.frame[predicted.view], n_bodies), whole),
                     ("parameters", np.zeros(n, dtype=np.intp), whole),
                     *((variables.name, element.ravel(), whole) for variables, element, _ in more),
                 ),
                 n,
                 4,
-                np.repeat(predicted.pose, n_legs),
+                np.repeat(predicted.pose, n_bodies),
             ),
             Factor(
                 "legs",
@@ -245,6 +292,19 @@ def problem_of(
     )
     zeros = {b.name: np.zeros(b.n_unknowns) for b in problem.variables}
     return problem, _Nominal(pose=np.zeros((n_poses, n_f)), **zeros)
+
+
+def _lines(
+    predicted: PredictedObservations, prior: GaussianPrior
+) -> tuple[Variables, IntArray, Array]:
+    """Return the lines of arms as further variables of :func:`problem_of`."""
+    n_images, n, n_arms = len(predicted.view), predicted.n_legs, len(predicted.arms)
+    by_line = np.zeros((n_images, predicted.n_bodies, 4, 4))
+    slopes = predicted.arms_by_local[..., ActuatorColumns.ARM] * _line_unit(predicted)
+    by_line[:, n:] = _of_arms(predicted, slopes)
+    arm = np.maximum(np.arange(predicted.n_bodies) - n, 0)  # legs depend on none
+    element = np.broadcast_to(arm, (n_images, predicted.n_bodies))
+    return Variables("arm", all_free(n_arms, 4), prior=prior), element, by_line
 
 
 def _platform_board(predicted: PredictedObservations) -> tuple[Factor[_Nominal], ...]:
@@ -297,16 +357,16 @@ def expected_intrinsics(
     orientation: Array,  # (n_views, 3, 3): R of every camera in R_b, its optical axis last
     # (n_views): the camera of every view: views with the same one share their intrinsics
     owners: Sequence[str],
+    arms: GaussianPrior = NO_PRIOR,  # of prior_of_arms
 ) -> tuple[CameraIntrinsics, ...]:
     """Return what the legs determine of the intrinsics of cameras, estimated with all else."""
     cameras = tuple(dict.fromkeys(owners))
     of_view = np.array([cameras.index(owner) for owner in owners], dtype=np.intp)
-    n_legs, n_cameras = predicted.n_legs, len(cameras)
+    n, n_cameras = predicted.n_bodies, len(cameras)
     by_radius, by_intrinsics = _radii_and_intrinsics(predicted, orientation)
-    known = GaussianPrior(
-        np.arange(n_legs), np.zeros(n_legs), RefinementSettings.radius_sigma * predicted.radius
-    )
-    leg = np.broadcast_to(np.arange(n_legs), images.shape[:2])
+    sigma_radius = RefinementSettings.radius_sigma * predicted.body_radius
+    known = GaussianPrior(np.arange(n), np.zeros(n), sigma_radius)
+    body = np.broadcast_to(np.arange(n), images.shape[:2])
     camera = np.broadcast_to(of_view[predicted.view][:, None], images.shape[:2])
     numbers = Variables("intrinsics", all_free(n_cameras, len(INTRINSICS)))
     problem, state = problem_of(
@@ -315,9 +375,10 @@ def expected_intrinsics(
         equations,
         prior,
         (
-            (Variables("radius", all_free(n_legs, 1), prior=known), leg, by_radius),
+            (Variables("radius", all_free(n, 1), prior=known), body, by_radius),
             (numbers, camera, by_intrinsics),
         ),
+        arms=arms,
     )
     left = marginal_rows(information_rows(problem, state), problem.where("intrinsics"))
     _, singular, basis = np.linalg.svd(left)
@@ -343,8 +404,8 @@ def expected_intrinsics(
 def _radii_and_intrinsics(
     predicted: PredictedObservations, orientation: Array
 ) -> tuple[Array, Array]:
-    """Return derivatives of what images show by radii and intrinsics, (n_images, n_legs, 4, d)."""
-    shape = len(predicted.view), predicted.n_legs, 4
+    """Return derivatives (n_images, n_bodies, 4, d) of what images show by radii and intrinsics."""
+    shape = len(predicted.view), predicted.n_bodies, 4
     by_radius, by_intrinsics = np.zeros((*shape, 1)), np.zeros((*shape, len(INTRINSICS)))
     unit = (predicted.focal / predicted.mean_length)[predicted.view][:, None, None, None]
     for k, across in enumerate((at_base_joints(predicted), at_platform_joints(predicted))):
@@ -352,32 +413,31 @@ def _radii_and_intrinsics(
         sigma_lateral, towards = _scales(predicted, across)
         rows = [lateral / sigma_lateral[..., None], widening * towards[..., None]]
         by_intrinsics[:, :, 2 * k : 2 * k + 2] = np.stack(rows, 2) * unit
-        by_radius[:, :, 2 * k + 1, 0] = towards / predicted.radius
-    hidden = ~predicted.seen[predicted.view]
-    by_radius[hidden] = by_intrinsics[hidden] = 0.0
+        by_radius[:, :, 2 * k + 1, 0] = towards / predicted.body_radius
+    by_radius[~predicted.shown] = by_intrinsics[~predicted.shown] = 0.0
     return by_radius, by_intrinsics
 
 
 def radius_rows(predicted: PredictedObservations) -> Array:
-    """Return the derivatives of what images show by the radius of each leg, (..., 4, 1) [1/m].
+    """Return the derivatives of what images show by the radius of each body, (..., 4, 1) [1/m].
 
-    A thicker leg looks nearer, by as much as makes a scene that is larger in all, cameras and radii
+    A thicker one looks nearer, by as much as makes a scene that is larger in all, cameras and radii
     included, look the same.
     """
-    by_radius = np.zeros((len(predicted.view), predicted.n_legs, 4, 1))
+    by_radius = np.zeros((len(predicted.view), predicted.n_bodies, 4, 1))
     for k, across in enumerate((at_base_joints(predicted), at_platform_joints(predicted))):
         ray = across.point - predicted.camera[predicted.view][:, None]
         towards = -np.sum(across.gradient[:, :, 1] * ray, axis=2)
-        by_radius[:, :, 2 * k + 1, 0] = towards / predicted.radius
+        by_radius[:, :, 2 * k + 1, 0] = towards / predicted.body_radius
     return by_radius
 
 
 def intrinsics_changes(
     predicted: PredictedObservations, across: Across, orientation: Array
 ) -> tuple[Array, Array]:
-    """Return what a pixel more of each intrinsic does, both (n_images, n_legs, 4).
+    """Return what a pixel more of each intrinsic does, both (n_images, n_bodies, 4).
 
-    How far it moves the axis across the leg [m/px], and how much wider it makes the leg [1/px].
+    How far it moves the axis across the body [m/px], and how much wider it makes this [1/px].
     """
     R = orientation[predicted.view]
     at = (across.point - predicted.camera[predicted.view][:, None]) @ R  # in the camera frame
@@ -386,7 +446,7 @@ def intrinsics_changes(
     focal = predicted.focal[predicted.view][:, None, None]
     depth = np.maximum(at[..., 2:], 1e-6)
     xy = at[..., :2] / depth
-    u = predicted.u[predicted.pose] @ R
+    u = predicted.body_u[predicted.pose] @ R
     along, imaged = (focal / depth * (d[..., :2] - d[..., 2:] * xy) for d in (u, lateral))  # px/m
     normal = np.stack([-along[..., 1], along[..., 0]], axis=2)
     normal /= np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-300)
@@ -396,9 +456,9 @@ def intrinsics_changes(
 
 
 def _scales(predicted: PredictedObservations, across: Across) -> tuple[Array, Array]:
-    """Return, both (n_images, n_legs), what weighs such changes.
+    """Return, both (n_images, n_bodies), what weighs such changes.
 
-    The standard deviation of the axis across the leg [m], and by how many standard deviations a leg
+    The standard deviation of the axis across the body [m], and by how many standard deviations one
     as wide again looks nearer, as what is seen towards the camera counts it.
     """
     lateral, depth = across.gradient[:, :, 0], across.gradient[:, :, 1]

@@ -1,7 +1,8 @@
 """Predicted observations: which legs each camera position shows, at which poses.
 
 They are planned (cameras in default places, random poses) or those of a dataset; what they show
-across each leg is given with the standard deviation of an outline.
+across each body is given with the standard deviation of an outline. Bodies are the legs, and after
+them the arms that are cylinders; a view that shows a leg shows the arm that is a part of it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from legcal.geometry import Array, BoolArray, IntArray, components, cross
 from legcal.machine import (
     Actuator,
     ActuatorColumns,
+    Arm,
     JointMotion,
     Leg,
     LegColumns,
@@ -29,6 +31,7 @@ from legcal.machine import (
     Ties,
     actuator_index,
     actuators_of,
+    arms_at,
     by_step,
     coordinates_at,
     ends_at_poses,
@@ -97,6 +100,7 @@ class PredictedObservations:
     # Readings of actuators and internal coordinates, (k, n) and (w, n), where poses do not say them
     given_moving: Array | None = None
     moving_reached: Array | None = None
+    shows_arms: bool = True  # which a table of axes does not
 
     @property
     def n_legs(self) -> int:
@@ -107,6 +111,76 @@ class PredictedObservations:
     def n_views(self) -> int:
         """Number of camera positions."""
         return len(self.seen)
+
+    @cached_property
+    def arms(self) -> dict[int, Arm]:
+        """The arms that are cylinders, by the legs that have them as parts."""
+        legs = self.legs if self.shows_arms else ()
+        return {j: leg.arm for j, leg in enumerate(legs) if leg.arm is not None}
+
+    @property
+    def n_bodies(self) -> int:
+        """Number of legs and arms."""
+        return self.n_legs + len(self.arms)
+
+    @property
+    def parts(self) -> tuple[tuple[int, str], ...]:
+        """Leg of each body, and the part of an arm, "" of a leg, (n_bodies,)."""
+        legs = ((j, "") for j in range(self.n_legs))
+        return (*legs, *((j, arm.link) for j, arm in self.arms.items()))
+
+    @cached_property
+    def shown(self) -> BoolArray:
+        """The bodies that each image shows, (n_images, n_bodies)."""
+        return np.asarray(self.seen[:, [j for j, _ in self.parts]][self.view])
+
+    @cached_property
+    def body_radius(self) -> Array:
+        """Radius of each body, (n_bodies,) [m]."""
+        return np.append(self.radius, [arm.radius for arm in self.arms.values()])
+
+    @cached_property
+    def ends(self) -> tuple[Array, Array]:
+        """Both ends of bodies in R_b at every pose, (k, n_bodies, 3) each [m]."""
+        legs = self.A_at, self.arm + self.t[:, None]
+        arms = [] if not self.arms else list(arms_at(self.legs, self.q).values())
+        near, far = (
+            np.concatenate([of_legs, *(ends[:, k : k + 1] for ends in arms)], axis=1)
+            for k, of_legs in enumerate(legs)
+        )
+        return near, far
+
+    @cached_property
+    def body_u(self) -> Array:
+        """Directions of bodies in R_b at every pose, (k, n_bodies, 3)."""
+        along = self.ends[1] - self.ends[0]
+        return np.asarray(along / np.linalg.norm(along, axis=2, keepdims=True))
+
+    @cached_property
+    def arms_by_local(self) -> Array:
+        """Derivatives of both ends of arms by numbers of their legs, (k, n_arms, 2, 3, 25).
+
+        Those by the line of an arm (``ActuatorColumns.ARM``) are by its motions (``Line.moved``).
+        """
+        found = np.zeros((len(self.t), len(self.arms), 2, 3, LegColumns.COUNT))
+        for a, motions in enumerate(self._motions_of_arms()):
+            for end, (motion, slope) in enumerate(motions):
+                found[:, a, end, :, ActuatorColumns.AXIS] = motion.by_axis
+                found[:, a, end, :, ActuatorColumns.POINT] = motion.by_point
+                found[:, a, end, :, ActuatorColumns.GAIN] = motion.by_gain
+                found[:, a, end, :, ActuatorColumns.ARM] = motion.by_A @ slope
+        return found
+
+    def _motions_of_arms(self) -> list[list[tuple[JointMotion, Array]]]:
+        """Return how both ends of arms move, and their slope (3, 4) by the line of the arm."""
+        return [
+            [
+                (actuator.motion(end, self.q[:, a]), slope)
+                for end, slope in zip(self.arms[j].ends, self.arms[j].ends_slope(), strict=True)
+            ]
+            for j, actuator, a in self._carried()
+            if j in self.arms
+        ]
 
     @cached_property
     def frame(self) -> IntArray:
@@ -193,8 +267,8 @@ class PredictedObservations:
 
     @cached_property
     def ends_by_moving(self) -> tuple[Array, Array]:
-        """Derivatives of A and B in R_b by :attr:`moving` in metres, (k, n_legs, 3, n) each."""
-        shape = len(self.t), self.n_legs, 3, self.moving.shape[1]
+        """Derivatives of both ends in R_b by :attr:`moving` in metres, (k, n_bodies, 3, n) each."""
+        shape = len(self.t), self.n_bodies, 3, self.moving.shape[1]
         of_A, of_B = np.zeros(shape), np.zeros(shape)
         for j, actuator, a in self._carried():
             by_q = actuator.motion(self.legs[j].A, self.q[:, a]).by_q
@@ -203,6 +277,12 @@ class PredictedObservations:
             of_B[:, j, :, column] = self.unit_of_moving[column] * (
                 self.R @ motion.by_q[:, :, None]
             ).squeeze(2)
+        for body, (j, motions) in enumerate(
+            zip(self.arms, self._motions_of_arms(), strict=True), start=self.n_legs
+        ):
+            a = int(self.carried_by[j])
+            for by_moving, (motion, _) in zip((of_A, of_B), motions, strict=True):
+                by_moving[:, body, :, a] = motion.by_q * self.unit_of_moving[a]
         return of_A, of_B
 
     @cached_property
@@ -335,43 +415,43 @@ class PredictedObservations:
 
 @dataclass(frozen=True, eq=False)
 class Across:
-    """Two directions across each leg at a point of its axis, over their standard deviations."""
+    """Two directions across each body at a point of its axis, over their standard deviations."""
 
-    # (n_images, n_legs, 2, 3): n_lat and n_dep in R_b by their sigma [1/m]; zero where the leg is
-    # not seen
+    # (n_images, n_bodies, 2, 3): n_lat and n_dep in R_b by their sigma [1/m]; zero where the body
+    # is not seen
     gradient: Array
-    point: Array  # (n_images, n_legs, 3): the points in R_b [m]
+    point: Array  # (n_images, n_bodies, 3): the points in R_b [m]
 
     def by_camera(self) -> Array:
-        """Return the derivative (n_images, n_legs, 2, 6) by the camera's turn and displacement."""
+        """Return derivatives (n_images, n_bodies, 2, 6) by the camera's turn and displacement."""
         turn = -cross(self.point[:, :, None], self.gradient)
         return np.concatenate([turn, -self.gradient], axis=3)
 
 
 def at_base_joints(predicted: PredictedObservations) -> Across:
-    """Return what is seen at the base joint centres."""
-    return _across(predicted, predicted.A_at[predicted.pose])
+    """Return what is seen at the base joint centres, and at the near ends of arms."""
+    return _across(predicted, predicted.ends[0][predicted.pose])
 
 
 def at_platform_joints(predicted: PredictedObservations) -> Across:
-    """Return what is seen at the platform joint centres."""
-    return _across(predicted, (predicted.arm + predicted.t[:, None])[predicted.pose])
+    """Return what is seen at the platform joint centres, and at the far ends of arms."""
+    return _across(predicted, predicted.ends[1][predicted.pose])
 
 
 def _across(predicted: PredictedObservations, point: Array) -> Across:
-    """Return the directions across legs at points (n_images, n_legs, 3)."""
-    u = predicted.u[predicted.pose]
+    """Return the directions across bodies at points (n_images, n_bodies, 3)."""
+    u = predicted.body_u[predicted.pose]
     ray = point - predicted.camera[predicted.view][:, None]
     distance = np.linalg.norm(ray, axis=2)
     lateral = cross(u, ray / distance[..., None])
     lateral /= np.maximum(np.linalg.norm(lateral, axis=2), _ALONG)[..., None]
     depth = cross(u, lateral)
     sigma_lateral = SIGMA_PX * distance / predicted.focal[predicted.view][:, None]
-    sigma_depth = sigma_lateral * distance / predicted.radius
+    sigma_depth = sigma_lateral * distance / predicted.body_radius
     gradient = np.stack(
         [lateral / sigma_lateral[..., None], depth / sigma_depth[..., None]], axis=2
     )
-    gradient[~predicted.seen[predicted.view]] = 0.0
+    gradient[~predicted.shown] = 0.0
     return Across(gradient, point)
 
 
@@ -492,6 +572,7 @@ def recorded_observations(
         sigma_by_joint=m.sigma_by_joint,
         board=np.isin(used, m.view[_showing(dataset, "base")]),
         platform_board=_showing(dataset, "platform"),
+        shows_arms=dataset.axes is None,
     )
 
 

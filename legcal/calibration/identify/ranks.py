@@ -12,6 +12,7 @@ from legcal.calibration.identify.information import (
     image_rows,
     length_rows,
     prior_of,
+    prior_of_arms,
     problem_of,
     whitened_leg_equations,
 )
@@ -85,6 +86,11 @@ class Analysis:
         return prior_of(self.predicted, self.choices)
 
     @cached_property
+    def arms(self) -> GaussianPrior:
+        """What is known of the lines of arms without images."""
+        return prior_of_arms(self.predicted, self.choices)
+
+    @cached_property
     def located(self) -> Located:
         """Step 1."""
         return locate_joints(self.predicted)
@@ -100,7 +106,12 @@ class Analysis:
         return (
             identify_base(self.predicted, self.located),
             offsets_from_distances(self.predicted, *self.distances),
-            identify_platform(self.predicted, self.located, self.images, self.equations),
+            identify_platform(
+                self.predicted,
+                self.located,
+                self.images[:, : self.predicted.n_legs],  # no step uses arms
+                self.equations,
+            ),
         )
 
     @cached_property
@@ -123,6 +134,7 @@ class Analysis:
                 self.equations,
                 self.prior,
                 lengths=length_rows(self.predicted, self.choices),
+                arms=self.arms,
             )
         )
 

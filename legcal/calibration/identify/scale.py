@@ -2,7 +2,7 @@
 
 Encoders of arms know angles: such a machine, twice as large with rods twice as thick and cameras
 twice as far, gives the same images and readings. A measured length, a board, or radii fix its
-scale; a prior on radii that nobody has stated must not do so silently.
+scale; a prior on radii, or on lines of arms, that nobody has stated must not do so silently.
 """
 
 from __future__ import annotations
@@ -11,17 +11,23 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from legcal.calibration.identify.information import length_rows, problem_of, radius_rows
+from legcal.calibration.identify.information import (
+    length_rows,
+    prior_of_arms,
+    problem_of,
+    radius_rows,
+)
 from legcal.calibration.identify.ranks import Analysis, undetermined
 from legcal.calibration.identify.report import ScaleSource
 from legcal.calibration.joint_fit.variables import RefinementSettings
 from legcal.estimation import GaussianPrior, Variables, all_free, information_rows, marginal_rows
 from legcal.geometry import Array, IntArray
-from legcal.machine import LegColumns
+from legcal.machine import LegColumns, radius_name
 from legcal.vision import Link
 
 LENGTH_SIGMA = 5e-5  # [m] of a length that somebody measures
 _OPEN = 1e-6  # of their mean, in directions that are not determined: lengths are open
+_KNOWN = 1e-9  # [m] of a radius that is known
 _LINKS: tuple[Link, ...] = ("base", "platform")
 
 
@@ -59,10 +65,12 @@ def is_scale_open(analysis: Analysis) -> bool:
 
     Of radii those count as known that are fixed or have a stated prior.
     """
-    found = _information(analysis, stated=True)
-    return len(undetermined(analysis.predicted, found)) > len(
-        undetermined(analysis.predicted, analysis.information)
-    )
+    return _n_open(analysis, _stated_radii(analysis)) > _n_open(analysis, 0.0)
+
+
+def _n_open(analysis: Analysis, sigma_radius: Array | float) -> int:
+    """Return how many directions are open where radii are known so well [m]."""
+    return len(undetermined(analysis.predicted, _information(analysis, sigma_radius)))
 
 
 def _source(analysis: Analysis, name: str, words: str, information: Array) -> ScaleSource:
@@ -73,7 +81,7 @@ def _source(analysis: Analysis, name: str, words: str, information: Array) -> Sc
     mean = np.zeros(len(predicted.unit))  # of the relative errors of lengths
     mean[columns] = 1.0 / (len(columns) * lengths)
     hidden = undetermined(predicted, information)
-    leaves_more = len(hidden) > len(undetermined(predicted, analysis.information))
+    leaves_more = len(hidden) > _n_open(analysis, 0.0)
     if leaves_more or np.linalg.norm(hidden @ mean) > _OPEN * np.linalg.norm(mean):
         return ScaleSource(name, words, None, None)
     _, singular, basis = np.linalg.svd(information, full_matrices=False)
@@ -82,26 +90,31 @@ def _source(analysis: Analysis, name: str, words: str, information: Array) -> Sc
     return ScaleSource(name, words, sigma, analysis.motion.sigma(information))
 
 
-def _information(analysis: Analysis, *, common: float | None = None, stated: bool = False) -> Array:
-    """Return rows by the parameters with radii free, or wrong alike by *common* of their size."""
+def _information(
+    analysis: Analysis, sigma_radius: Array | float = np.inf, *, common: float | None = None
+) -> Array:
+    """Return rows by the parameters with radii known so well [m], or wrong alike by a part of them.
+
+    Of lines of arms that counts which somebody has stated.
+    """
     predicted = analysis.predicted
-    n_legs, by_radius = predicted.n_legs, radius_rows(predicted)
+    n, by_radius = predicted.n_bodies, radius_rows(predicted)
     shape = by_radius.shape[:2]
     own: tuple[Variables, IntArray, Array]
     if common is not None:
         known = GaussianPrior(np.zeros(1, dtype=np.intp), np.zeros(1), np.array([common]))
-        relative = by_radius * predicted.radius[:, None, None]
+        relative = by_radius * predicted.body_radius[:, None, None]
         own = (
             Variables("radius", all_free(1, 1), prior=known),
             np.zeros(shape, dtype=np.intp),
             relative,
         )
     else:
-        sigma = _stated_radii(analysis) if stated else np.full(n_legs, np.inf)
+        sigma = np.maximum(np.broadcast_to(sigma_radius, n), _KNOWN)
         which = np.flatnonzero(np.isfinite(sigma))
         prior = GaussianPrior(which, np.zeros(len(which)), sigma[which])
-        leg = np.broadcast_to(np.arange(n_legs), shape)
-        own = (Variables("radius", all_free(n_legs, 1), prior=prior), leg, by_radius)
+        body = np.broadcast_to(np.arange(n), shape)
+        own = (Variables("radius", all_free(n, 1), prior=prior), body, by_radius)
     problem, state = problem_of(
         predicted,
         analysis.images,
@@ -109,22 +122,25 @@ def _information(analysis: Analysis, *, common: float | None = None, stated: boo
         analysis.prior,
         (own,),
         length_rows(predicted, analysis.choices),
+        prior_of_arms(predicted, analysis.choices, stated=True),
     )
     return marginal_rows(information_rows(problem, state), problem.where("parameters"))
 
 
 def _stated_radii(analysis: Analysis) -> Array:
     """Return the standard deviations of radii that were stated, infinite for the others [m]."""
-    choices, names = analysis.choices, analysis.predicted.leg_names
+    choices, predicted = analysis.choices, analysis.predicted
 
-    def sigma(leg: str) -> float:
-        first = f"{leg}.radius."
-        stated = [p.sigma for name, p in choices.priors.items() if name.startswith(first)]
-        if any(name.startswith(first) for name in choices.fixed):
-            stated.append(1e-9)
+    def sigma(j: int, arm: str) -> float:
+        leg = predicted.legs[j]
+        links = [arm] if arm else leg.radius_along
+        names = [radius_name(predicted.leg_names[j], link) for link in links]
+        stated = [choices.priors[name].sigma for name in names if name in choices.priors]
+        if choices.fixed.intersection(names):
+            stated.append(_KNOWN)
         return min(stated, default=np.inf)
 
-    return np.array([sigma(name) for name in names])
+    return np.array([sigma(*part) for part in predicted.parts])
 
 
 def scale_in_words(sources: Sequence[ScaleSource]) -> str:

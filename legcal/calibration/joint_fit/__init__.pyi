@@ -29,6 +29,7 @@ from .platform import platform_by_parameters as platform_by_parameters
 from .platform import poses_at_readings as poses_at_readings
 from .platform import reach_readings as reach_readings
 from .problem import FitProblem as FitProblem
+from .problem import arm_sigmas as arm_sigmas
 from .problem import build_fit as build_fit
 from .rounds import DISAGREES as DISAGREES
 from .sensitivity import FOUND_CAMERA as FOUND_CAMERA

@@ -10,7 +10,7 @@ measurement is a class with a factor, registered in
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -68,6 +68,7 @@ from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
     ActuatorColumns,
     Leg,
+    Parametrization,
     freedoms,
     is_held_by_default,
     radius_name,
@@ -414,15 +415,24 @@ def _arm_priors(
 
     Those are left out of which something was chosen.
     """
-    sigmas = (settings.arm_axis_sigma,) * 2 + (settings.arm_point_sigma,) * 2
-    names, place = legs.parametrization.names, legs.parametrization.place[:, ActuatorColumns.ARM]
+    seen = [leg for leg, part in outlines.parts if (leg, part) in outlines.arms]
     chosen = {*choices.fixed, *choices.free, *choices.priors}
+    known = arm_sigmas(legs.parametrization, seen, settings)
+    return {name: sigma for name, sigma in known.items() if name not in chosen}
+
+
+def arm_sigmas(
+    parametrization: Parametrization,
+    legs: Iterable[int],  # that have arms as parts
+    settings: RefinementSettings = DEFAULT_SETTINGS,
+) -> dict[str, float]:
+    """Return how well the lines of arms are known before a fit [rad, m], by parameter."""
+    sigmas = (settings.arm_axis_sigma,) * 2 + (settings.arm_point_sigma,) * 2
+    names, place = parametrization.names, parametrization.place[:, ActuatorColumns.ARM]
     return {
         names[i]: sigma
-        for leg, part in outlines.parts
-        if (leg, part) in outlines.arms
+        for leg in legs
         for i, sigma in zip(place[leg].tolist(), sigmas, strict=True)
-        if names[i] not in chosen
     }
 
 
