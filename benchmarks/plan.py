@@ -29,6 +29,7 @@ from scipy.stats import spearmanr
 
 import legcal
 from legcal.calibration import NO_CHOICES, Choices, Prior
+from legcal.data import sigmas_of
 from legcal.errors import LegcalError, NotIdentifiable
 from legcal.geometry import Array, direction_above
 from legcal.machine import Machine, feasible_poses, load_mechanism, poses_at
@@ -50,7 +51,7 @@ from legcal.planning import (
     workspace_of,
     write_session,
 )
-from legcal.simulation import Level, SimulationSettings, simulate
+from legcal.simulation import Distribution, Level, SimulationSettings, Spread, simulate
 from legcal.vision import sample_camera
 
 MACHINES = ("hexapod", "3-upu-tilted", "3-rpr", "3-rps", "tricept")
@@ -121,6 +122,7 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=3, help="of each random session")
     parser.add_argument("--runs", type=int, default=0, help="calibrations from outlines")
     parser.add_argument("--rendered", type=int, default=0, help="calibrations from photographs")
+    parser.add_argument("--encoder-sigma", help="of motors that turn: 0.5deg")
     parser.add_argument("--record", type=Path)
     args = parser.parse_args()
     for name in args.machines:
@@ -144,13 +146,16 @@ def compared(name: str, machine: Machine, args: argparse.Namespace) -> dict[str,
     if rod is not None:
         known = Prior(rod[0].q0, LENGTH_SIGMA)
         choices = Choices(priors={f"{rod[0].name}.length": known})
-    predictor = Predictor(machine, sample_camera(), DEFAULT_NOISE, 2e-6, choices)
+    sigma = {} if args.encoder_sigma is None else sigmas_of(args.encoder_sigma, machine.legs)
+    predictor = Predictor(machine, sample_camera(), DEFAULT_NOISE, 2e-6, choices, sigma)
     scene = Scene.nominal(Task(predictor, args.images, args.cameras))
     work = workspace_of(machine, predictor.legs)
     if work is None:
         raise NotIdentifiable(f"{name}: readings do not give the pose, needed another machine.")
     start = time.perf_counter()
-    plan = legcal.plan(machine, images=args.images, cameras=args.cameras)
+    plan = legcal.plan(
+        machine, images=args.images, cameras=args.cameras, encoder_sigma=args.encoder_sigma
+    )
     seconds = time.perf_counter() - start
     session = [Candidates(Place(v.T_base_camera), v.poses) for v in plan.views]
     planned = work.error(judged(scene, session, args.draws)).mean_displacement
@@ -184,7 +189,13 @@ def compared(name: str, machine: Machine, args: argparse.Namespace) -> dict[str,
         }
     with TemporaryDirectory() as folder:
         if args.runs:
-            white = legcal.plan(machine, images=args.images, cameras=args.cameras, noise=WHITE)
+            white = legcal.plan(
+                machine,
+                images=args.images,
+                cameras=args.cameras,
+                noise=WHITE,
+                encoder_sigma=args.encoder_sigma,
+            )
             write_session(white, Path(folder) / "white")
             found["outlines"] = shot(
                 machine, white, Path(folder) / "white", Level.OUTLINES, args.first, args.runs
@@ -204,13 +215,18 @@ def shot(
 
     The standard error of their ratio is that of the mean square of the runs.
     """
-    dX, dE, stated, failed = [], [], [], []
+    dX, dE, stated, turned, failed = [], [], [], [], []
     rod = rod_to_measure(machine, board=False)
     lengths = {} if rod is None else {rod[1]: LENGTH_SIGMA}
+    angles = None
+    if plan.sigma_by_joint:
+        angles = Spread(min(plan.sigma_by_joint.values()), Distribution.NORMAL)
     for seed in range(first, first + runs):
         folder, out = session.parent / f"shot{seed}", session.parent / f"out{seed}"
         try:
-            settings = SimulationSettings(plan=session, level=level, seed=seed, lengths=lengths)
+            settings = SimulationSettings(
+                plan=session, level=level, seed=seed, lengths=lengths, angles=angles
+            )
             taken = simulate(machine, folder, settings)
             result = legcal.calibrate(folder, output=out)
         except LegcalError as error:
@@ -221,12 +237,19 @@ def shot(
         dE.append(of.rotation)
         if result.platform is not None and result.platform.workspace is not None:
             stated.append(result.platform.workspace.displacement)
+            turned.append(result.platform.workspace.rotation)
     expected = plan.error
     if expected is None:
         raise NotIdentifiable("Readings do not give the pose, needed another machine.")
     rms = {
         key: float(np.sqrt(np.mean(np.square(np.concatenate(x)))))
-        for key, x in (("found", dX), ("stated", stated), ("expected", [expected.displacement]))
+        for key, x in (
+            ("found", dX),
+            ("stated", stated),
+            ("expected", [expected.displacement]),
+            ("turned", turned),
+            ("expected_turn", [expected.rotation]),
+        )
     }
     square = np.array([float(np.mean(np.square(x))) for x in dX])
     spread = float(square.std(ddof=1)) if len(square) > 1 else 0.0
@@ -241,6 +264,7 @@ def shot(
         "found_over_predicted": rms["found"] / rms["expected"],
         "found_error": 0.5 * spread / len(square) ** 0.5 / rms["found"] / rms["expected"],
         "stated_over_predicted": rms["stated"] / rms["expected"],
+        "stated_turn_over_predicted": rms["turned"] / rms["expected_turn"],
         "found_mm": (1e3 * np.sqrt(square)).tolist(),
     }
 

@@ -19,11 +19,13 @@ from legcal.calibration.detection import (
     check_detection_destination,
     write_detection,
 )
+from legcal.calibration.joint_fit.diagnostics import arms_of_other_widths, wrong_arms_in_words
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.calibration.pipeline import rough_placement
 from legcal.data import (
     Dataset,
     Outlines,
+    are_of_arms,
     few_views,
     inverse,
     join_outlines,
@@ -139,6 +141,9 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
         if arms:
             outlines = join_outlines([outlines, _of_arms(data, seen, arms)])
         image_notes, notes = _image_notes(data, seen.placement), _gamma_notes(data)
+        if wrong := arms_of_other_widths(outlines, are_of_arms(outlines, data.machine.legs)):
+            said = wrong_arms_in_words(wrong, data.machine.legs)
+            notes.append(f"Arms do not look as the model draws them: {said}")
         # Legs of a view that could not be placed are drawn where its rough pose has them.
         drawn = tuple(
             T if T is not None else rough
@@ -186,9 +191,8 @@ def _of_arms(data: OrderedDataset, seen: MeasuredImages, arms: Mapping[int, Plac
     some = replace(photographs, detect=np.array(rows, dtype=np.intp), keep=no_outlines())
     placement = replace(seen.placement, arms=arms, window=None)
     found = measure_photographs(some, placement, data.progress, stage="Measuring arms")
-    parts = zip(found.leg.tolist(), found.part, strict=True)
-    is_arm = np.array([data.machine.legs[j].is_arm(part) for j, part in parts], dtype=np.bool_)
-    return merge_edited(found.choose(is_arm), photographs.keep)
+    of_arms = found.choose(are_of_arms(found, data.machine.legs))
+    return merge_edited(of_arms, photographs.keep)
 
 
 def _image_notes(data: OrderedDataset, placement: Placement) -> list[str]:

@@ -49,6 +49,7 @@ from .new_dataset import write_new_dataset as write_new_dataset
 from .outlines import OUTLINE_COLUMNS as OUTLINE_COLUMNS
 from .outlines import Outlines as Outlines
 from .outlines import along_legs as along_legs
+from .outlines import are_of_arms as are_of_arms
 from .outlines import format_observations as format_observations
 from .outlines import is_edited as is_edited
 from .outlines import join_outlines as join_outlines

@@ -189,9 +189,14 @@ def merge_edited(detected: Outlines, table: Outlines) -> Outlines:
 
 def along_legs(outlines: Outlines, legs: Sequence[Leg]) -> Outlines:
     """Return the outlines of what lies along legs: without those of arms."""
-    parts = zip(outlines.leg.tolist(), outlines.part, strict=True)
-    arms = np.array([legs[j].is_arm(part) for j, part in parts], dtype=np.bool_)
+    arms = are_of_arms(outlines, legs)
     return outlines.choose(~arms) if arms.any() else outlines
+
+
+def are_of_arms(outlines: Outlines, legs: Sequence[Leg]) -> BoolArray:
+    """Return which outlines are of arms, (n,)."""
+    parts = zip(outlines.leg.tolist(), outlines.part, strict=True)
+    return np.array([legs[j].is_arm(part) for j, part in parts], dtype=np.bool_)
 
 
 def reject_unused_legs(

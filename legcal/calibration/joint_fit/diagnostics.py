@@ -35,6 +35,7 @@ from legcal.estimation import (
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
     Actuator,
+    Leg,
     actuators_of,
     kind_of_parameter,
     list_in_words,
@@ -457,6 +458,18 @@ def arms_of_other_widths(outlines: Outlines, is_arm: BoolArray) -> dict[int, str
         if n_wrong >= _MIN_COUNT and n_wrong > _MOST_REJECTED * total:
             found[leg] = f"{n_wrong} of whose {total} outlines show another width than the model's"
     return found
+
+
+def wrong_arms_in_words(wrong: Mapping[int, str], legs: Sequence[Leg]) -> str:
+    """Return which arms are wrong and how, as :func:`wrong_arms` does, in words."""
+    reasons: dict[str, list[str]] = {}
+    for j, why in wrong.items():
+        reasons.setdefault(why, []).append(str(legs[j].prismatic))
+    said = "; ".join(f"{list_in_words(names)}, {why}" for why, names in reasons.items())
+    return (
+        f"found those of {said}, needed straight cylinders as the model draws them; correct their "
+        "radii, or draw other shapes as boxes or meshes."
+    )
 
 
 def wrong_arms(

@@ -25,6 +25,7 @@ from legcal.calibration.joint_fit.diagnostics import (
     refuse_other_board,
     rejected_notes,
     wrong_arms,
+    wrong_arms_in_words,
 )
 from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.free_poses import (
@@ -45,7 +46,7 @@ from legcal.calibration.joint_fit.variables import (
     Start,
     State,
 )
-from legcal.data import LegAxes, Measurements, Outlines
+from legcal.data import LegAxes, Measurements, Outlines, are_of_arms
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation import (
     Minimum,
@@ -55,7 +56,7 @@ from legcal.estimation import (
     named_covariance,
 )
 from legcal.geometry import Array
-from legcal.machine import Leg, list_in_words
+from legcal.machine import Leg
 
 _MAX_RADIUS_CHANGE = 0.5
 _COST_TOLERANCE = 1e-6  # relative: the same minimum
@@ -139,31 +140,22 @@ def _without_wrong_arms(
     The rods do without arms, and outlines of another shape bend the fit or raise the noise of all.
     So arms that a fit contradicts are left out, and all of them where it fails with them.
     """
-    parts = list(zip(outlines.leg.tolist(), outlines.part, strict=True))
-    is_arm = np.array([legs[j].is_arm(part) for j, part in parts], dtype=np.bool_)
+    is_arm = are_of_arms(outlines, legs)
     notes, wrong = list[str](), arms_of_other_widths(outlines, is_arm)
     while True:
         if wrong:
             left_out = is_arm & np.isin(outlines.leg, list(wrong))
             outlines = outlines.reject(left_out, "the arm is left out as a whole")
-            reasons: dict[str, list[str]] = {}
-            for j, why in wrong.items():
-                reasons.setdefault(why, []).append(str(legs[j].prismatic))
-            said = "; ".join(f"{list_in_words(names)}, {why}" for why, names in reasons.items())
-            notes.append(
-                f"Arms were left out as a whole: found those of {said}, needed straight cylinders "
-                "as the model draws them; correct their radii, or draw other shapes as boxes or "
-                "meshes."
-            )
+            notes.append(f"Arms were left out as a whole: {wrong_arms_in_words(wrong, legs)}")
         try:
             found = fitted(outlines)
             fit = found.posterior
             wrong = wrong_arms(fit.problem, fit.state, fit.noise, found.outlines)
         except (DidNotConverge, NotIdentifiable):
-            seen = {parts[i][0] for i in np.flatnonzero(is_arm & outlines.used).tolist()}
+            seen = np.unique(outlines.leg[is_arm & outlines.used]).tolist()
             if not seen:
                 raise
-            wrong = dict.fromkeys(sorted(seen), "with whose outlines the joint fit fails")
+            wrong = dict.fromkeys(seen, "with whose outlines the joint fit fails")
         else:
             if not wrong:
                 return dataclasses.replace(found, notes=(*notes, *found.notes))
