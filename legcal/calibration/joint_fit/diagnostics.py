@@ -57,7 +57,7 @@ _MIN_SHARE = 0.01  # of the variance that a camera file states, which measuremen
 _MANY_REJECTED = 0.1  # of all outlines
 _MOST_REJECTED = 0.5  # of those of a leg or a view
 # Of an arm that is no cylinder: how far off its median outline is, over that of rods, and [px]
-_ARM_MISFIT, _ARM_MISFIT_PX = 5.0, 0.1
+ARM_MISFIT, _ARM_MISFIT_PX = 5.0, 0.1
 _MIN_COUNT = 3  # rejected outlines of a leg or a view, at least, before it is noted
 _RADIUS_SIGMAS = 3.0  # between radii and the model's, of whose prior nobody said a word
 _RADIUS_SPREAD = 0.25  # of their common difference
@@ -482,21 +482,36 @@ def wrong_arms(
     table, with the verdicts of the fit.
     """
     o = problem.outlines
-    if not o.on_arm.any() or o.on_arm.all():
-        return {}
-    offsets, used = problem.offsets(state), outlines.used[o.index]
-    covariance, away = noise.covariance(o.covariance), np.abs(offsets).max(axis=1)
-    whitened = np.linalg.solve(covariance, offsets[..., None])[..., 0]
-    squares = np.sum(offsets * whitened, axis=1)
-    usual, found = float(np.median(squares[~o.on_arm])), dict[int, str]()
-    for leg in np.unique(o.leg[o.on_arm]).tolist():
+    used, found = outlines.used[o.index], dict[int, str]()
+    for leg, (times, away_px) in arm_misfits(problem, state, noise).items():
         own = o.on_arm & (o.leg == leg)
         total, rejected = int(own.sum()), int(np.sum(own & ~used))
-        times = float(np.sqrt(np.median(squares[own]) / usual)) if usual > 0.0 else 0.0
         if rejected >= _MIN_COUNT and rejected > _MOST_REJECTED * total:
             found[leg] = f"{rejected} of whose {total} outlines disagree with the fit"
-        elif times > _ARM_MISFIT and float(np.median(away[own])) > _ARM_MISFIT_PX:
+        elif times > ARM_MISFIT and away_px > _ARM_MISFIT_PX:
             found[leg] = f"whose outlines lie {times:.1f} times as far off as those of rods"
+    return found
+
+
+def arm_misfits(
+    problem: FitProblem, state: State, noise: NoiseModel
+) -> dict[int, tuple[float, float]]:
+    """Return how far off the median outline of arms is, by their legs: over that of rods, and [px].
+
+    The former counts in standard deviations of the noise that was found. Without rods there is
+    nothing to compare with.
+    """
+    o = problem.outlines
+    if not o.on_arm.any() or o.on_arm.all():
+        return {}
+    offsets, found = problem.offsets(state), dict[int, tuple[float, float]]()
+    whitened = np.linalg.solve(noise.covariance(o.covariance), offsets[..., None])[..., 0]
+    squares, away = np.sum(offsets * whitened, axis=1), np.abs(offsets).max(axis=1)
+    usual = float(np.median(squares[~o.on_arm]))
+    for leg in np.unique(o.leg[o.on_arm]).tolist():
+        own = o.on_arm & (o.leg == leg)
+        times = float(np.sqrt(np.median(squares[own]) / usual)) if usual > 0.0 else 0.0
+        found[leg] = times, float(np.median(away[own]))
     return found
 
 
