@@ -56,8 +56,8 @@ _NOMINAL_SIGMA = 0.01  # of the mean leg length: how far a nominal model is off 
 _MIN_SHARE = 0.01  # of the variance that a camera file states, which measurements must remove
 _MANY_REJECTED = 0.1  # of all outlines
 _MOST_REJECTED = 0.5  # of those of a leg or a view
-# Of an arm that is no cylinder: how far off its median outline is, over that of rods (1.8 is the most
-# of 204 arms that are cylinders in benchmarks/arm_misfits.py), and [px]
+# Of an arm that is no cylinder: how far off its median outline is, over that of rods (1.8 is the
+# most of 204 arms that are cylinders in benchmarks/arm_misfits.py), and [px]
 ARM_MISFIT, _ARM_MISFIT_PX = 2.0, 0.03
 _MIN_COUNT = 3  # rejected outlines of a leg or a view, at least, before it is noted
 _RADIUS_SIGMAS = 3.0  # between radii and the model's, of whose prior nobody said a word
