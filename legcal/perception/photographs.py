@@ -48,7 +48,7 @@ from legcal.perception.placement import (
     group_views,
 )
 from legcal.perception.radii import LegRadius, RadiusFactors, radius_notes
-from legcal.perception.recognition import recognise
+from legcal.perception.recognition import PlacedViews, place_views
 from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
 from legcal.vision import EPSILON, Camera, look_alike, shared_cameras
@@ -211,13 +211,13 @@ def place_and_measure(
         defects |= doubtful
         usable = np.setdiff1d(usable, list(doubtful))
     search = photographs.search(nominal, pairs, rough)
-    recognised = partial(_recognised, photographs, search, usable, hints, report, joined)
-    placement = recognised()
+    views = _placed(photographs, search, usable, hints, report, joined)
+    placement = views.recognised(photographs.run)
     outlines, blur = _measured(photographs, search, placement, report, together=together)
     at_nominal = _Measured(photographs, search, placement, outlines, blur)
     measured = at_nominal
     if not free_poses:  # which would follow wrong radii, and these wrong poses
-        measured = _with_other_radii(at_nominal, recognised, report, together=together)
+        measured = _with_other_radii(at_nominal, views, report, together=together)
     photographs, search, outlines = measured.photographs, measured.search, measured.outlines
     groups = group_views(photographs.measurements, usable, hints, joined)
     is_own = np.isin(outlines.row, usable)
@@ -262,22 +262,22 @@ class _Measured:
 
 def _with_other_radii(
     found: _Measured,
-    recognised: Callable[[Collection[LegRadius]], Placement],
+    views: PlacedViews,
     report: Report,
     *,
     together: bool,
 ) -> _Measured:
     """Return what is measured with other radii of parts that were not found, if it is more.
 
-    *recognised* places the cameras anew, with other radii of some parts.
+    *views* are where its images were recognised.
     """
     machine, m = found.photographs.machine, found.photographs.measurements
     suspects = _parts_not_found(machine.legs, found.outlines)
     while suspects:
-        placement = recognised(suspects)
-        radii = placement.radii
-        if not radii.factor:
+        placement = views.with_other_radii(suspects, found.photographs.run)
+        if placement is None:
             break
+        radii = placement.radii
         cylinders = radii.corrected(found.search.cylinders)
         photographs = replace(found.photographs, machine=machine.with_cylinders(cylinders))
         search = replace(found.search, cylinders=photographs.cylinders)
@@ -307,7 +307,8 @@ def recognise_and_place(
     """Recognise the legs in the images, and place the cameras by them."""
     nominal, _ = _with_free_poses(photographs, nominal, {}, photographs.detect, report)
     search, hints = photographs.search(nominal), nominal.T_base_camera
-    return _recognised(photographs, search, photographs.detect, hints, report, joined)
+    views = _placed(photographs, search, photographs.detect, hints, report, joined)
+    return views.recognised(photographs.run)
 
 
 def _with_free_poses(
@@ -375,7 +376,8 @@ def _decided_by_outlines(
     hints = nominal.T_base_camera
     for _ in range(CHOICE_ROUNDS):
         search = photographs.search(nominal)
-        placement = _recognised(photographs, search, rows, hints, report, joined)
+        views = _placed(photographs, search, rows, hints, report, joined)
+        placement = views.recognised(photographs.run)
         most = dict.fromkeys(choices, -1)
         chosen = dict[int, int]()
         for n in range(max(map(len, choices.values()))):
@@ -452,20 +454,17 @@ def with_measured_radii(
     return replace(photographs, machine=machine.with_cylinders(cylinders)) if changed else None
 
 
-def _recognised(
+def _placed(
     photographs: Photographs,
     search: Search,
     rows: IntArray,
     hints: Sequence[RigidTransform | None],
     report: Report,
     joined: Joined,
-    suspects: Collection[LegRadius] = (),
-) -> Placement:
-    """Return what is recognised in some images."""
+) -> PlacedViews:
+    """Return where views have the legs that some images show."""
     progress = _counted(report, "Recognising legs", len(rows))
-    return recognise(
-        search, rows, hints, joined, suspects=suspects, run=photographs.run, progress=progress
-    )
+    return place_views(search, rows, hints, joined, run=photographs.run, progress=progress)
 
 
 def _measured(
