@@ -17,9 +17,9 @@ are searched like the others, and not fitted. Phases 2 to 5 work in canonical or
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,7 @@ from legcal.calibration.fit_overlays import check_overlays, with_overlays
 from legcal.calibration.four_steps import Steps, four_steps, starts
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit import (
+    DEFAULT_SETTINGS,
     Choices,
     GammaTrials,
     HeldOut,
@@ -106,6 +107,9 @@ TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal 
 # predicts looks like other radii, so that residuals never show it [px].
 LIMB_BIAS = {"bias of many edges": 0.02}
 MAX_LEFT_OUT = 0.25  # of the images, or of the outlines, beyond which common mistakes are tried
+# Of a session that looks wrong: neither other starts nor patience would mend it, and what it
+# contradicts is not to blame.
+_TRIAL = replace(DEFAULT_SETTINGS, other_starts=0, judges_stated_values=False, max_iterations=40)
 MIN_FOUND_AGAIN = 0.5  # of the outlines of an image, or of all
 
 
@@ -282,19 +286,19 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
     NotVisible, NotIdentifiable, DidNotConverge
         As the phases.
     """
-    rows = data.rows_of(file_rows)
+    rows, diagnosed = data.rows_of(file_rows), cache(diagnose)
     try:
         try:
-            return _estimate(data, rows, options)
+            return _estimate(data, rows, options, diagnosed)
         except NotIdentifiable:
             if not data.plan.is_cached:
                 raise
         # Outlines that an earlier run left do not always determine the cameras; images do.
         data = replace(data, plan=plan_dataset(data.dataset, ""))
-        return _estimate(data, rows, options)
+        return _estimate(data, rows, options, diagnosed)
     except (NotVisible, NotIdentifiable, DidNotConverge, DatasetError) as error:
         is_told = isinstance(error, DatasetError) and data.machine.is_redundant  # by the readings
-        diagnosis, notes = () if is_told else diagnose(data), data.dataset.file_notes
+        diagnosis, notes = () if is_told else diagnosed(data), data.dataset.file_notes
         if not (diagnosis or notes):
             raise
         likeliest = [one.sentence for one in diagnosis]
@@ -303,8 +307,16 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         raise refusal from error
 
 
-def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimate:
-    """Go through the phases; images whose outlines are given are not searched."""
+def _estimate(
+    data: OrderedDataset,
+    rows: IntArray,
+    options: Options,
+    diagnosed: Callable[[OrderedDataset], tuple[Diagnosis, ...]],
+) -> Estimate:
+    """Go through the phases; images whose outlines are given are not searched.
+
+    Where many images do not show the legs and a mistake explains that, nothing is searched again.
+    """
     placement, board = rough_placement(data)
     fitted = data.at(rows)
     # Outlines that are kept were measured with some gamma: others of their camera must be as well.
@@ -316,7 +328,7 @@ def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimat
             estimate,
             image_notes=data.plan.notes,
             fit_notes=_notes_on_images(estimate),
-            diagnosis=diagnose(data) if _unused_share(estimate) > MAX_LEFT_OUT else (),
+            diagnosis=diagnosed(data) if _unused_share(estimate) > MAX_LEFT_OUT else (),
         )
     # 2. Recognise, and measure the outlines.
     T_board_camera = None if board is None else board.T_board_camera
@@ -329,11 +341,12 @@ def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimat
     fitted = data.at(rows)
     if options.every_leg and (seen.left_out or seen.placement.unplaced):
         _refuse_too_few(data, rows, seen, options.choices)
+    diagnosis = diagnosed(data) if _left_out_share(data, rows, seen) > MAX_LEFT_OUT else ()
     # 3 and 4. Four steps and joint fit.
-    first = _fit(fitted, seen.outlines, seen.placement, board, options)
+    first = _fit(fitted, seen.outlines, seen.placement, board, options, is_trial=bool(diagnosis))
     # 5. Measure again near that fit, and fit again.
     try:
-        estimate = _measure_again(data, first, seen, board, options)
+        estimate = first if diagnosis else _measure_again(data, first, seen, board, options)
     except (NotVisible, NotIdentifiable, DidNotConverge) as error:
         # A fit with a wrong camera may lead away from outlines that were found before it.
         if not first.solution.camera_notes:
@@ -349,17 +362,15 @@ def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimat
         ),
         fit_notes=_notes_on_images(estimate),
         other_radii=other_radii,
-        diagnosis=diagnose(data) if _is_doubtful(data, rows, seen, estimate) else (),
+        diagnosis=diagnosis or (diagnosed(data) if _unused_share(estimate) > MAX_LEFT_OUT else ()),
     )
 
 
-def _is_doubtful(
-    data: OrderedDataset, rows: IntArray, seen: MeasuredImages, estimate: Estimate
-) -> bool:
-    """Say whether so much was left out that the session itself may be wrong."""
+def _left_out_share(data: OrderedDataset, rows: IntArray, seen: MeasuredImages) -> float:
+    """Return which part of the images was left out: the session itself may be wrong."""
     cameras, view = seen.placement.T_base_camera, data.measurements.view
     left_out = [r for r in rows.tolist() if r in seen.left_out or cameras[view[r]] is None]
-    return max(len(left_out) / len(rows), _unused_share(estimate)) > MAX_LEFT_OUT
+    return len(left_out) / len(rows)
 
 
 def _unused_share(estimate: Estimate) -> float:
@@ -413,8 +424,13 @@ def _fit(
     placement: Placement,
     board: BoardViews | None,
     options: Options,
+    *,
+    is_trial: bool = False,
 ) -> Estimate:
-    """Run the four steps, then the joint fit, with the outlines of all images."""
+    """Run the four steps, then the joint fit, with the outlines of all images.
+
+    A trial is of a session that looks wrong, and does not take long.
+    """
     seen = outlines.at(fitted.rows)
     seen = reject_unused_legs(seen, fitted.measurements, fitted.machine.leg_names)
     if options.every_leg:
@@ -429,6 +445,7 @@ def _fit(
         fitted.measurements,
         seen,
         starts(fitted, seen, placement, steps, board),
+        _TRIAL if is_trial else DEFAULT_SETTINGS,
         axes=fitted.axes,
         board=None if board is None else board.at(fitted.rows),
         choices=choices,
@@ -620,7 +637,7 @@ def outline_key(dataset: Dataset, choices: Choices) -> str:
 def _store_outlines(data: OrderedDataset, estimate: Estimate, key: str) -> list[str]:
     """Leave outlines and notes on images beside the dataset; return a note if that fails."""
     plan = estimate.fitted.plan  # other than that of the data where stored outlines did not suffice
-    if estimate.other_radii or len(plan.detect) == 0:
+    if estimate.other_radii or estimate.diagnosis or len(plan.detect) == 0:
         return []
     outlines = data.order.restore(estimate.outlines)
     note = store_outlines(data.dataset, outlines, key, plan.given, estimate.image_notes)

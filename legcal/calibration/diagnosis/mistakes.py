@@ -25,6 +25,7 @@ _FOCAL_STEP = 1.25  # between them, about
 _SHIFTS = (1, -1, 2, -2)  # rows
 _ZEROS = 8  # steps of the zero of an encoder, in its travel
 _STILL = 0.1  # of such a step: readings that move by less are of an encoder that stands still
+_SAME_END = 0.01  # of the largest reading: ends of a travel as far from zero
 _SAME_RADIUS = 1e-3  # relative: parts that are equally thick are one kind
 
 
@@ -48,22 +49,8 @@ class Assumed:
     focal: float = 1.0  # focal length as a part of the stated one
 
     def joints(self, rows: Sequence[int]) -> tuple[Array, Array]:
-        """Return joint centres in the base link, (n_rows, n_legs, 3) each [m].
-
-        From home the readings of some rows are followed by the equations of the legs alone; what is
-        not reached, and all other rows, are NaN.
-        """
-        machine, motors = self.machine, list(self.machine.motors)
-        first = readings_at(machine, machine.home)[motors]
-        chosen = np.array(rows, dtype=np.intp)
-        q = self.q[chosen][:, motors]
-        poses, part = follow_poses(machine, machine.home, first, q, _STEP)
-        found = np.einsum("kij,nj->kni", poses[:, :, :3], machine.B_platform)
-        found += poses[:, None, :, 3]
-        found[part < 1.0] = np.nan
-        B = np.full((len(self.q), machine.n_legs, 3), np.nan)
-        B[chosen] = found
-        return machine.A_at(self.q[:, list(machine.reads)]), B
+        """Return joint centres in the base link, as :func:`joints_of`."""
+        return joints_of([(self, rows)])[0]
 
     def is_as(self, other: Assumed, rows: Sequence[int]) -> bool:
         """Whether nothing differs from another in some rows."""
@@ -104,6 +91,35 @@ class Mistake:
     # What is true if the same was done the other way: images suit that worse than things as they
     # are, if they suit this better. None where it may well be as good.
     opposite: Assumed | None = None
+
+
+def joints_of(parts: Sequence[tuple[Assumed, Sequence[int]]]) -> list[tuple[Array, Array]]:
+    """Return joint centres of some rows under each of many assumptions, in the base link [m].
+
+    Those at A and at B, (n_rows, n_legs, 3) each. From home the readings are followed by the
+    equations of the legs alone, those of one machine all together; what is not reached, and all
+    other rows, are NaN.
+    """
+    found = list[tuple[Array, Array]]()
+    for one, _ in parts:
+        shape = (len(one.q), one.machine.n_legs, 3)
+        found.append((np.full(shape, np.nan), np.full(shape, np.nan)))
+    for machine in {id(one.machine): one.machine for one, _ in parts}.values():
+        own = [k for k, (one, _) in enumerate(parts) if one.machine is machine]
+        rows = [np.array(parts[k][1], dtype=np.intp) for k in own]
+        q = np.concatenate([parts[k][0].q[some] for k, some in zip(own, rows, strict=True)])
+        motors, ends = list(machine.motors), np.cumsum([len(some) for some in rows])
+        first = readings_at(machine, machine.home)[motors]
+        poses, part = follow_poses(machine, machine.home, first, q[:, motors], _STEP)
+        B = np.einsum("kij,nj->kni", poses[:, :, :3], machine.B_platform)
+        B += poses[:, None, :, 3]
+        B[part < 1.0] = np.nan
+        A = machine.A_at(q[:, list(machine.reads)])
+        for k, some, A_of, B_of in zip(
+            own, rows, np.split(A, ends[:-1]), np.split(B, ends[:-1]), strict=True
+        ):
+            found[k][0][some], found[k][1][some] = A_of, B_of
+    return found
 
 
 def as_given(data: OrderedDataset) -> Assumed:
@@ -325,15 +341,21 @@ def _of_encoders(given: Assumed) -> Iterator[Mistake]:
             "subtract that (legcal inspect shows it), or make a model whose offsets are zero",
             with_readings(readings_of_lengths(own, legs), every),
         )
-    for change, what in ((-own, "the opposite sign"), (ends - own, "the opposite direction")):
-        yield Mistake(
-            "direction of encoders",
-            f"the readings of all {things} look as if they had {what}",
-            "with the readings reversed",
-            "reverse them in the table of readings",
-            with_readings(change, every),
-        )
-        for k in moving:
+    # Where a travel is as far both ways, as of most servos, the other end has the opposite sign.
+    reversible = np.abs(ends) > _SAME_END * np.abs(own).max(axis=0)
+    for change, what, which in (
+        (-own, "the opposite sign", every),
+        (ends - own, "the opposite direction", np.flatnonzero(reversible).tolist()),
+    ):
+        if which:
+            yield Mistake(
+                "direction of encoders",
+                f"the readings of all {things} look as if they had {what}",
+                "with the readings reversed",
+                "reverse them in the table of readings",
+                with_readings(change, every),
+            )
+        for k in (k for k in moving if k in which):
             yield Mistake(
                 "direction of an encoder",
                 f"column {legs[k].prismatic} looks as if it had {what}",

@@ -73,6 +73,8 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
     DidNotConverge
         With one sentence for each prior.
     """
+    if not problem.settings.judges_stated_values:
+        return
     priors, problems = problem.priors, []
     for i, mean, sigma in zip(
         priors.unknown.tolist(), priors.mean.tolist(), priors.sigma.tolist(), strict=True
@@ -213,6 +215,8 @@ def refuse_contradicted_values(
     DidNotConverge
         With one sentence for each value.
     """
+    if not problem.settings.judges_stated_values:
+        return
     choices, now = problem.choices, _values(problem, state)
     stated = {name: (now[name], 0.0) for name in _fixed_by_choice(problem)}
     if with_priors:
