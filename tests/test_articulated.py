@@ -365,9 +365,16 @@ def _with_a_universal_joint(made: Articulated, folder: Path) -> Path:
     return path
 
 
+def _as_four_arms_of_a_delta(_: Articulated, folder: Path) -> Path:
+    """Write a platform of one body on exact parallelograms."""
+    made = machine("i4", turning=False)
+    return replace(made, inside=(), body=np.zeros_like(made.body)).write(folder)
+
+
 @pytest.mark.parametrize(
     ("written", "named"),
     [
+        (_as_four_arms_of_a_delta, r"overconstrained \(1 of the 4 .* with joints at A that move"),
         (_without_motor, "no motor on the base that moves its joint at A"),
         (_with_a_universal_joint, "'hinge1', and found a joint U at its end"),
         (_with_two_joints_in_a_row, "more than the internal joint 'lift' .* needed one"),
