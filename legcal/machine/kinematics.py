@@ -50,6 +50,7 @@ MIN_STEP = 1.0 / 4096.0  # of the way from known readings to the wanted ones
 LONG_STEP = 1.0 / 16.0  # where another way follows if that does not lead there
 RANDOM_ANGLES = 6  # other angles of all legs that are tried
 FEW_RESTARTS = 2  # of legs that do not close from there
+SAME_START = 1e-9  # [m], and of rotation matrices: where a start is the last pose
 FEW_STEPS = 12  # of Newton's method at most, and
 REDUNDANT_STEPS = 40  # where readings contradict each other: convergence is linear there
 
@@ -88,7 +89,7 @@ def forward_kinematics(
     """
     # The legs stand where the call before left them if that is where this one starts
     T_last, configuration = _last.get(mechanism, (None, mechanism.home_configuration))
-    if start is None or T_last is None or not np.array_equal(start.as_matrix(), T_last):
+    if start is None or T_last is None or np.abs(start.as_matrix() - T_last).max() > SAME_START:
         follower = Follower(mechanism, start)
     else:
         follower = Follower(mechanism)
