@@ -62,10 +62,10 @@ def honesty(name: str, calibration: Calibration, truth: Machine) -> Honesty:
     """Compare a calibration with the true model."""
     solution, machine = calibration.solution, calibration.dataset.machine
     truth = truth.with_leg_order(machine.leg_names)
-    legs, parametrization = solution.legs, solution.parametrization
+    legs, parametrization = solution.legs, solution.kinematic.parametrization
     step = vector_of(parametrization, geometries(truth), legs)
     step = step - vector_of(parametrization, legs, legs)
-    C = solution.kinematic_covariance
+    C = solution.kinematic.covariance
     known = np.diagonal(C) > 0.0
     by_pose = pose_sensitivity(
         legs, parametrization, machine.frame_legs, *components(solution.T_Rb_Re)

@@ -84,16 +84,18 @@ def sessions(
 
 def errors(design: Design, session: OutlineSession, found: Solution) -> tuple[float, float, float]:
     """Return e' C^-1 e of the kinematic parameters, and mean squares of the platform [m^2]."""
-    covariance = found.value_covariance
-    truth = vector_of(found.parametrization, design.legs.nominal, session.legs.nominal)
-    away = np.array([found.values[name] for name in found.parametrization.names]) - truth
+    covariance = found.kinematic.value_covariance
+    truth = vector_of(found.kinematic.parametrization, design.legs.nominal, session.legs.nominal)
+    away = np.array([found.values[name] for name in found.kinematic.parametrization.names]) - truth
     free = np.flatnonzero(np.diagonal(covariance) > 0.0)
     sigma = np.sqrt(np.diagonal(covariance)[free])
     correlation = covariance[np.ix_(free, free)] / np.outer(sigma, sigma)
     z = away[free] / sigma
     R, t = components(design.poses)
-    J = pose_sensitivity(found.legs, found.parametrization, design.legs.frame_legs, R, t)[:, 3:]
-    predicted = np.einsum("kia,ab,kib->k", J, found.kinematic_covariance, J, optimize=True)
+    J = pose_sensitivity(found.legs, found.kinematic.parametrization, design.legs.frame_legs, R, t)[
+        :, 3:
+    ]
+    predicted = np.einsum("kia,ab,kib->k", J, found.kinematic.covariance, J, optimize=True)
     displacement, _ = platform_errors(design, found.legs)
     squared = float(np.mean(displacement**2)), float(np.mean(predicted))
     return float(z @ np.linalg.solve(correlation, z)) / len(free), *squared

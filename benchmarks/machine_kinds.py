@@ -211,16 +211,16 @@ def normalised_error(nominal: Machine, calibrated: Path, truth: Path, solution: 
     """
     there, true = (
         vector_of(
-            solution.parametrization,
+            solution.kinematic.parametrization,
             geometries(load_mechanism(path).with_leg_order(nominal.leg_names)),
             geometries(nominal),
         )
         for path in (calibrated, truth)
     )
-    sigma = np.sqrt(np.diagonal(solution.value_covariance))
+    sigma = np.sqrt(np.diagonal(solution.kinematic.value_covariance))
     free = np.flatnonzero(sigma > 0.0)  # gains are fixed
     unit = sigma[free]
-    covariance = solution.value_covariance[np.ix_(free, free)]
+    covariance = solution.kinematic.value_covariance[np.ix_(free, free)]
     value, vector = np.linalg.eigh(covariance / np.outer(unit, unit))
     kept = value > 1e-9
     along = vector[:, kept].T @ ((there - true)[free] / unit)

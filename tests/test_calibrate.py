@@ -64,8 +64,10 @@ def _edited(given: Path, folder: Path, edit: Callable[[dict[str, Any]], Any]) ->
 def _pulls(calibration: Calibration, truth: Path) -> Array:
     """Return the errors of the kinematic parameters that are estimated over their sigmas."""
     solution, legs = calibration.solution, geometries(load_mechanism(truth))
-    true, found = (vector_of(solution.parametrization, g, legs) for g in (legs, solution.legs))
-    sigma = np.sqrt(np.diagonal(solution.value_covariance))
+    true, found = (
+        vector_of(solution.kinematic.parametrization, g, legs) for g in (legs, solution.legs)
+    )
+    sigma = np.sqrt(np.diagonal(solution.kinematic.value_covariance))
     return np.asarray((found - true)[sigma > 0.0] / sigma[sigma > 0.0])
 
 
@@ -169,20 +171,24 @@ def _judged(calibration: Calibration, **changes: Any) -> Calibration:
     return judge(calibration.dataset, solution, calibration.steps, ())
 
 
-@pytest.mark.parametrize("part", ["kinematic_covariance", "held_covariance"])
+@pytest.mark.parametrize("part", ["covariance", "held_covariance"])
 def test_a_model_is_trusted_if_its_change_exceeds_two_sigma(
     planar: tuple[Path, Calibration], part: str
 ) -> None:
     calibration = planar[1]
-    nothing = np.zeros_like(calibration.solution.kinematic_covariance)
-    of_one = {"kinematic_covariance": nothing, "held_covariance": nothing}
-    of_one |= {part: calibration.solution.kinematic_covariance}
-    platform = _judged(calibration, **of_one).platform
+    kinematic = calibration.solution.kinematic
+    nothing = np.zeros_like(kinematic.covariance)
+    of_one = {"covariance": nothing, "held_covariance": nothing, part: kinematic.covariance}
+
+    def judged(of: dict[str, Any]) -> Calibration:
+        return _judged(calibration, kinematic=replace(kinematic, **of))
+
+    platform = judged(of_one).platform
     assert platform is not None
     sigmas = platform.change.mean_displacement / platform.sigma.mean_displacement
     for factor, trusted in ((0.99, True), (1.01, False)):
         scaled = of_one | {part: (0.5 * factor * sigmas) ** 2 * of_one[part]}
-        assert _judged(calibration, **scaled).verdict.trustworthy is trusted
+        assert judged(scaled).verdict.trustworthy is trusted
 
 
 def test_a_contradicted_camera_counts_in_the_verdict(

@@ -150,7 +150,7 @@ def test_exact_outlines_give_the_truth_from_3_mm_and_1_degree_away(
     for pose, true in zip(found.T_Rb_Re, session.truth.T_Rb_Re, strict=True):
         # Where joint centres are held, R_e stands otherwise on the platform, and R_b on the base.
         miss = pose.inv() * true
-        if found.held:
+        if found.kinematic.held:
             miss = (pose * first.inv()).inv() * (true * true_first.inv())
         assert np.linalg.norm(miss.translation) < 1e-8
         assert miss.rotation.magnitude() < 1e-7
@@ -182,7 +182,9 @@ def test_of_a_3_upu_that_only_translates_all_is_found_that_images_and_readings_s
 ) -> None:
     session = far_session("3-upu")
     found = fit_of_everything(session, known_radii=known_radii)
-    assert len(found.held) == (6 if known_radii else 7)  # turns of both axes; without radii, size
+    assert len(found.kinematic.held) == (
+        6 if known_radii else 7
+    )  # turns of both axes; without radii, size
     legs, true_legs = found.legs, session.truth.legs
     R, true_R = (Frames.of(poses)[0] for poses in (found.T_Rb_Re, session.truth.T_Rb_Re))
     size = np.linalg.norm(legs[1].A) / np.linalg.norm(true_legs[1].A)
@@ -378,7 +380,7 @@ def test_a_passive_leg_needs_no_reading() -> None:
     of_others = np.delete(joint_errors(found.parameters), -3)  # leg 4 has no offset to find
     assert np.abs(of_others).max() < 1e-9
     assert "leg4.offset" not in found.names
-    assert found.kinematic_covariance.shape == (29, 29)
+    assert found.kinematic.covariance.shape == (29, 29)
 
 
 def test_encoders_carry_the_scale_so_that_a_wrong_radius_is_found() -> None:
@@ -404,7 +406,7 @@ def test_errors_agree_with_the_covariance(n: int) -> None:
         measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
         found = refine(session.legs, measurements, outlines, start)
         error = joint_errors(found.parameters)
-        normalised.append(error @ np.linalg.solve(found.kinematic_covariance, error) / len(error))
+        normalised.append(error @ np.linalg.solve(found.kinematic.covariance, error) / len(error))
         z.append(error / found.sigma[: len(error)])
         scales.append(found.noise.scale)
         chi2.append(found.chi2 / found.dof)

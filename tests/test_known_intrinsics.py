@@ -67,8 +67,8 @@ def moved(away: Array, covariance: Array | None = COVARIANCE) -> Camera:
 def errors(given: MachineSession, found: Solution) -> float:
     """Return e' C^-1 e of the kinematic parameters over their number."""
     e = given.legs.vector(found.legs) - given.legs.vector(given.truth.legs)
-    sigma = np.sqrt(np.diagonal(found.value_covariance))
-    z, correlation = e / sigma, found.value_covariance / np.outer(sigma, sigma)
+    sigma = np.sqrt(np.diagonal(found.kinematic.value_covariance))
+    z, correlation = e / sigma, found.kinematic.value_covariance / np.outer(sigma, sigma)
     return float(z @ np.linalg.solve(correlation, z)) / len(e)
 
 

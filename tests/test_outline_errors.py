@@ -144,7 +144,7 @@ def test_a_fifth_of_the_outlines_wrong_costs_less_than_half_the_accuracy(
     dirty = shifted(session, outlines, _shifts(session, wrong, rng, alone=which is single))
     found = refine(session.legs, measurements, dirty, session.start)
     clean = _clean(name)
-    sigma = np.sqrt(np.diag(clean.kinematic_covariance))
+    sigma = np.sqrt(np.diag(clean.kinematic.covariance))
     free = sigma > 0.0  # all but twists
     assert not found.outlines.used[wrong].any()
     assert (~found.outlines.used[~wrong]).sum() <= 2
@@ -356,7 +356,7 @@ def test_shared_errors_are_found_and_weighed(session: HexapodSession) -> None:
         outlines = shared_errors(session, rng, 0.06, 0.03)
         found = refine(session.legs, measurements, outlines, start)
         error = joint_errors(found.parameters)
-        normalised.append(error @ np.linalg.solve(found.kinematic_covariance, error) / len(error))
+        normalised.append(error @ np.linalg.solve(found.kinematic.covariance, error) / len(error))
         sizes.append(found.noise.scale)
         assert {"bias", "tilt", "bias_x"} <= {name.rsplit(".", 1)[1] for name in found.biases}
     assert np.mean(sizes) == pytest.approx(1.0, abs=0.1)
@@ -376,7 +376,7 @@ def test_errors_that_come_back_with_a_place_widen_the_covariance() -> None:
         outlines = moved_outlines(noisy_outlines(session, rng), PINHOLE, shift)
         found = refine(session.legs, noisy_readings(session, rng), outlines, start)
         error = joint_errors(found.parameters)
-        normalised.append(error @ np.linalg.solve(found.kinematic_covariance, error) / len(error))
+        normalised.append(error @ np.linalg.solve(found.kinematic.covariance, error) / len(error))
         found_px.append(found.shared_px[PLACES[0]])
     assert 0.7 < np.mean(normalised) < 1.2
     assert np.mean(found_px) == pytest.approx(sigma, rel=0.3)

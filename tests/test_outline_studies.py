@@ -427,9 +427,8 @@ def test_errors_along_what_is_held_do_not_count(
     design, session, solution = open_machine
     stated = as_stated(design, solution)
     n = len(design.parametrization)
-    assert (stated.rank, len(solution.held_basis)) == (n - FREE_3_UPU, FREE_3_UPU)
-    known = solution.parametrization.names
-    held = solution.held_basis[:, [known.index(name) for name in design.parametrization.names]]
+    assert (stated.rank, len(solution.kinematic.held_basis)) == (n - FREE_3_UPU, FREE_3_UPU)
+    _, held = solution.kinematic.of_values(design.parametrization.names)
     error = np.random.default_rng(0).normal(size=n) * 1e-4
     nse = stated.nse(error)
     assert stated.nse(error + 0.01 * held.sum(axis=0)) == pytest.approx(nse, rel=1e-6)
@@ -639,6 +638,7 @@ def test_normalised_errors_of_axes_count_from_the_nominal_ones(tmp_path: Path) -
         written_with(nominal, found, by, tmp_path / name).yaml_path
         for name, by in {"truth": away, "calibrated": away + error}.items()
     ]
-    solution = SimpleNamespace(parametrization=found, value_covariance=np.diag(sigma**2))
+    of_values = SimpleNamespace(parametrization=found, value_covariance=np.diag(sigma**2))
+    solution = SimpleNamespace(kinematic=of_values)
     stated = normalised_error(nominal, written[1], written[0], cast(Solution, solution))
     assert stated == pytest.approx(np.mean((error[1:] / sigma[1:]) ** 2), rel=1e-6)

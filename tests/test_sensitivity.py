@@ -54,7 +54,7 @@ def _steps(found: Solution) -> dict[str, Array]:
 
 def _assert_moved(found: Solution, mistaken: Solution, what: str) -> None:
     """Check that a fit with a part of an error is moved by that part of its effect."""
-    step, names = _steps(found)[what], found.parametrization.names
+    step, names = _steps(found)[what], found.kinematic.parametrization.names
     moved = np.array([mistaken.values[n] - found.values[n] for n in names]) / PART
     assert np.linalg.norm(step) > 1e-8
     np.testing.assert_allclose(moved, step, atol=0.02 * float(np.abs(step).max()))
@@ -135,7 +135,7 @@ def test_legs_on_constraints_move_as_predicted(name: str) -> None:
     mistaken = refine(session.legs, *with_camera(*data, wrong), session.start)
     step = _steps(found)[FOCAL]
     assert np.linalg.norm(step) > 1e-6
-    predicted = moved_legs(found.legs, found.parametrization.place, PART * step)
+    predicted = moved_legs(found.legs, found.kinematic.parametrization.place, PART * step)
     _assert_moved_to(*map(session.legs.vector, (found.legs, mistaken.legs, predicted)))
 
 
@@ -145,10 +145,12 @@ def test_a_wrong_twist_moves_the_fit_as_predicted(model: str) -> None:
     data = (session.legs, *session.noisy(0), session.start)
     found, part = refine(*data), 0.1
     effect = next(s for s in found.sensitivities if "twist" in s.what)
-    name = next(n for n in found.parametrization.names if n.endswith(".twist"))
+    name = next(n for n in found.kinematic.parametrization.names if n.endswith(".twist"))
     twist = found.values[name] + part * np.radians(0.1)
     mistaken = refine(*data, choices=Choices(fixed=frozenset({name}), values={name: twist}))
-    predicted = moved_legs(found.legs, found.parametrization.place, part * effect.steps[:, 0])
+    predicted = moved_legs(
+        found.legs, found.kinematic.parametrization.place, part * effect.steps[:, 0]
+    )
     _assert_moved_to(*map(session.legs.vector, (found.legs, mistaken.legs, predicted)))
 
 
@@ -253,6 +255,8 @@ def test_a_wrong_camera_file_is_noticed_and_what_it_does_is_told(
     right = fitted(session, 0, 1.0)
     assert not [note for note in right.notes if "does not agree" in note]
     assert right.contradicted_cameras == ()
-    off = np.array([solution.values[n] - right.values[n] for n in right.parametrization.names])
+    off = np.array(
+        [solution.values[n] - right.values[n] for n in right.kinematic.parametrization.names]
+    )
     moved = effect.steps[:, 0]
     assert np.linalg.norm(off + moved) < 0.5 * np.linalg.norm(off)  # it says where the truth is

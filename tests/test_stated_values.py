@@ -80,8 +80,8 @@ def test_fixed_parameters_stay_at_nominal_or_at_their_values(session: MachineSes
     assert names.isdisjoint(found.names)
     parameters = session.legs.parametrization.names
     at = [parameters.index("leg2.offset"), parameters.index("leg4.base.x")]
-    assert not found.kinematic_covariance[at].any()
-    assert found.kinematic_covariance[parameters.index("leg1.offset")].any()
+    assert not found.kinematic.covariance[at].any()
+    assert found.kinematic.covariance[parameters.index("leg1.offset")].any()
     value = true_values(session)["leg3.offset"]
     found = fitted(session, fixed_at({"leg3.offset": value}))
     assert found.values["leg3.offset"] == pytest.approx(value, abs=1e-15)
@@ -174,7 +174,7 @@ def test_priors_determine_what_images_do_not() -> None:
     name = "leg2.base.x"
     known = Choices(priors={name: Prior(true_values(session)[name], 1e-5)})
     found = fitted(session, known)
-    assert len(found.held) == len(free.held) - 1
+    assert len(found.kinematic.held) == len(free.kinematic.held) - 1
     assert found.status[name] == "estimated"
     assert found.values[name] == pytest.approx(true_values(session)[name], abs=1e-5)
 
@@ -193,7 +193,7 @@ def test_what_is_held_stays_at_nominal() -> None:
     # Base and platform axes part, as the truth wants, and their means stay.
     assert np.abs(change[pairs].sum(axis=1)).max() < 1e-3
     assert np.abs(change[pairs]).max() > 5e-3
-    assert sum("axis" in words for words in found.held) == 6
+    assert sum("axis" in words for words in found.kinematic.held) == 6
     weak = {name for name, status in found.status.items() if status == "weak"}
     assert weak.isdisjoint(found.names)
 

@@ -151,9 +151,9 @@ def _result_of(calibration: Calibration) -> Result:
     T_base_Rb = machine.T_base_Rb
     parameters = _parameters(calibration)
     kinematic = Kinematic(
-        names=list(solution.parametrization.names),
-        covariance=solution.value_covariance.tolist(),
-        held=solution.held_basis.tolist(),
+        names=list(solution.kinematic.parametrization.names),
+        covariance=solution.kinematic.value_covariance.tolist(),
+        held=solution.kinematic.held_basis.tolist(),
     )
     on_base, on_platform = (_board(calibration, link) for link in LINKS)
     nominal = geometries(machine)
@@ -181,7 +181,7 @@ def _result_of(calibration: Calibration) -> Result:
             )
             for weak in solution.weak
         ],
-        held=list(solution.held),
+        held=list(solution.kinematic.held),
         views={
             views[v].name: ViewPose(
                 T_base_camera=Pose.of(T_base_Rb * solution.T_camera_Rb[v].inv())

@@ -51,8 +51,8 @@ def judge(
     platform = platform_accuracy(
         machine,
         solution.legs,
-        solution.parametrization,
-        solution.kinematic_covariance + solution.held_covariance,
+        solution.kinematic.parametrization,
+        solution.kinematic.total_covariance,
         q,
         solution.T_Rb_Re,
         solution.sensitivities,

@@ -295,11 +295,10 @@ def _compare(
     significance: float,
 ) -> Check:
     """Return what the fit of the new images says against the earlier result."""
-    machine, parametrization = dataset.machine, solution.parametrization
+    machine, parametrization = dataset.machine, solution.kinematic.parametrization
     columns = [parametrization.names.index(name) for name in prior.names]
     values = np.array([solution.values[name] for name in prior.names])
-    held = solution.held_basis[:, columns]
-    covariance = solution.value_covariance[np.ix_(columns, columns)]
+    covariance, held = solution.kinematic.of_values(prior.names)
     covariance = covariance + prior.held_sigma**2 * held.T @ held
     variance_factor = _earlier_noise(solution, earlier)
     found = difference(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -71,6 +71,46 @@ ParameterStatus = Literal["estimated", "fixed", "weak"]
 
 @brief
 @dataclass(frozen=True, eq=False)
+class KinematicUncertainty:
+    """How well all p kinematic parameters are known; covariances are zero of what is fixed."""
+
+    parametrization: Parametrization
+    # (p, p) of steps, as moved_legs and pose_sensitivity have them (axes turn about the vectors of
+    # where they are); zero along what is held
+    covariance: Array
+    # (p, p) how far steps may be off along what is held, if the nominal model is as wrong there as
+    # the fit found it to be elsewhere
+    held_covariance: Array
+    value_covariance: Array  # (p, p) covariance of the values
+    held_basis: Array  # (w, p) how values change along each held direction, by a metre
+    held: tuple[str, ...]  # the directions that are held at nominal, in words
+
+    @property
+    def total_covariance(self) -> Array:
+        """Of steps, (p, p): as far as the fit knows them, and along what is held."""
+        return self.covariance + self.held_covariance
+
+    def of_values(self, names: Sequence[str]) -> tuple[Array, Array]:
+        """Return covariance (n, n) and held basis (w, n) of the values of some parameters."""
+        at = _places(names, self.parametrization.names)
+        return self.value_covariance[np.ix_(at, at)], self.held_basis[:, at]
+
+    def in_order(self, parametrization: Parametrization) -> KinematicUncertainty:
+        """Return the same in the order of another parametrization of these parameters."""
+        at = _places(parametrization.names, self.parametrization.names)
+        value_covariance, held_basis = self.of_values(parametrization.names)
+        return KinematicUncertainty(
+            parametrization,
+            self.covariance[np.ix_(at, at)],
+            self.held_covariance[np.ix_(at, at)],
+            value_covariance,
+            held_basis,
+            self.held,
+        )
+
+
+@brief
+@dataclass(frozen=True, eq=False)
 class Solution:
     """A converged joint fit; axes count as angles from the nominal axis."""
 
@@ -79,7 +119,7 @@ class Solution:
     cameras: tuple[Camera, ...]  # of the views, with the intrinsics that were estimated
     T_Rb_Re: tuple[RigidTransform, ...]  # platform poses
     radii: dict[tuple[int, str], float]  # [m] for each (leg index, part) that was observed
-    parametrization: Parametrization  # all kinematic parameters
+    kinematic: KinematicUncertainty
     # Of every parameter by name [m, rad, px]: kinematic, radii, intrinsics, size of the board.
     values: Mapping[str, float]
     units: Mapping[str, str]
@@ -88,17 +128,8 @@ class Solution:
     covariance: Array  # (n, n) of these, with cameras and poses unknown
     sigma: Array  # (n,)
     prior_sigma: Mapping[str, float]  # of the intrinsics that camera files state one of, by name
-    # (p, p) of steps of all kinematic parameters, as moved_legs and pose_sensitivity have them
-    # (axes turn about the vectors of where they are); zero where fixed, and along what is held.
-    kinematic_covariance: Array
-    # (p, p) how far these may be off along what is held, if the nominal model is as wrong there as
-    # the fit found it to be elsewhere.
-    held_covariance: Array
-    value_covariance: Array  # (p, p) kinematic_covariance of the values
-    held_basis: Array  # (w, p) how values change along each held direction, by a metre
     # the estimated directions known worst, worst first, of what no camera file states
     weak: tuple[WorstDirection, ...]
-    held: tuple[str, ...]  # the directions that are held at nominal
     cost: float  # over all observations, rejected ones too, with claimed covariances: comparable
     chi2: float  # of used outlines, axes, readings and priors
     dof: int
@@ -167,8 +198,6 @@ def assemble_solution(
     parametrization = problem.legs.parametrization
     units = dict(zip(problem.named, problem.units, strict=True))
     units |= dict(zip(parametrization.names, parametrization.units, strict=True))
-    held_values = np.zeros((len(held.basis), len(problem.free)))
-    held_values[:, problem.free] = (held.basis * held.unit)[:, : problem.n_kinematic]
     biases = zip(problem.block("biases").labels, state.biases.tolist(), strict=True)
     cameras = CameraResiduals(problem, state, linear)
     doubts = _CameraDoubts.of(cameras, kept)
@@ -182,24 +211,19 @@ def assemble_solution(
         cameras=state.cameras,
         T_Rb_Re=state.platform_pose.motions,
         radii=dict(zip(problem.outlines.parts, state.radii.tolist(), strict=True)),
-        parametrization=parametrization,
+        kinematic=_kinematic(problem, state, held, kept, covariance),
         values=values,
         units={name: units.get(name, "m") for name in values},
         status=status,
         names=names,
         covariance=estimated,
         sigma=np.sqrt(np.diagonal(estimated)),
-        kinematic_covariance=_of_kinematic(problem, kept),
-        held_covariance=_of_kinematic(problem, held_spread(problem, state, held)),
-        value_covariance=_of_kinematic(problem, covariance),
-        held_basis=held_values,
         weak=worst_directions(
             estimated[np.ix_(shown, shown)],
             tuple(names[i] for i in shown),
             named_units(problem, state)[where][shown],
         ),
         prior_sigma=prior_sigma,
-        held=held.directions,
         cost=cost,
         chi2=chi2,
         dof=dof,
@@ -328,12 +352,28 @@ def _status(problem: FitProblem, held: HeldDirections) -> dict[str, ParameterSta
     return status | dict.fromkeys(held.names, "weak")
 
 
-def _of_kinematic(problem: FitProblem, covariance: Array) -> Array:
-    """Return of the covariance of unknowns that of all kinematic parameters, fixed ones too."""
+def _kinematic(
+    problem: FitProblem, state: State, held: HeldDirections, kept: Array, named: Array
+) -> KinematicUncertainty:
+    """Return the uncertainty of kinematic parameters from that of *kept* and *named* unknowns."""
     free, n = problem.free, problem.n_kinematic
-    wide = np.zeros((len(free), len(free)))
-    wide[np.ix_(free, free)] = covariance[:n, :n]
-    return wide
+
+    def of_every(covariance: Array) -> Array:
+        """Return of the covariance of unknowns that of all these, fixed ones too."""
+        wide = np.zeros((len(free), len(free)))
+        wide[np.ix_(free, free)] = covariance[:n, :n]
+        return wide
+
+    held_basis = np.zeros((len(held.basis), len(free)))
+    held_basis[:, free] = (held.basis * held.unit)[:, :n]
+    return KinematicUncertainty(
+        problem.legs.parametrization,
+        of_every(kept),
+        of_every(held_spread(problem, state, held)),
+        of_every(named),
+        held_basis,
+        held.directions,
+    )
 
 
 def _rms(values: Array) -> float | None:
@@ -394,7 +434,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     names_of_legs, frame_legs = machine.leg_names, machine.frame_legs
     parametrization = parametrize(names_of_legs, geometry, frame_legs, twists=True)
     where = _places(names, solution.names)
-    steps = _places(parametrization.names, solution.parametrization.names)
+    steps = _places(parametrization.names, solution.kinematic.parametrization.names)
     readings = solution.redundant_readings
     file_pose = {worked: pose for pose, worked in enumerate(_poses(order, dataset).tolist())}
     return replace(
@@ -404,17 +444,13 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         cameras=tuple(solution.cameras[v] for v in views),
         T_Rb_Re=tuple(solution.T_Rb_Re[p] for p in _poses(order, dataset).tolist()),
         radii=dict(sorted(radii.items())),
-        parametrization=parametrization,
+        kinematic=solution.kinematic.in_order(parametrization),
         values={name: solution.values[name] for name in ordered},
         units={name: solution.units[name] for name in ordered},
         status={name: solution.status[name] for name in ordered},
         names=names,
         covariance=solution.covariance[np.ix_(where, where)],
         sigma=solution.sigma[where],
-        kinematic_covariance=solution.kinematic_covariance[np.ix_(steps, steps)],
-        held_covariance=solution.held_covariance[np.ix_(steps, steps)],
-        value_covariance=solution.value_covariance[np.ix_(steps, steps)],
-        held_basis=solution.held_basis[:, steps],
         sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),
         outlines=order.restore(solution.outlines),
         redundant_readings=readings
@@ -428,7 +464,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     )
 
 
-def _places(names: tuple[str, ...], among: tuple[str, ...]) -> IntArray:
+def _places(names: Sequence[str], among: tuple[str, ...]) -> IntArray:
     """Return where names stand among the same ones in another order."""
     return np.array([among.index(name) for name in names], dtype=np.intp)
 
