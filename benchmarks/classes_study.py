@@ -189,7 +189,7 @@ def errors_of_fit(
     )
     from_truth = vector_of(parametrization, solution.legs, true)
     errors = dict(zip(parametrization.names, (values - true_values).tolist(), strict=True))
-    sigma = dict(zip(solution.names, solution.sigma.tolist(), strict=True))
+    sigma = dict(zip(solution.estimates.names, solution.estimates.sigma.tolist(), strict=True))
     return {
         "rank": stated.rank,
         "nse": stated.nse(values - true_values),

@@ -86,7 +86,7 @@ def errors(design: Design, session: OutlineSession, found: Solution) -> tuple[fl
     """Return e' C^-1 e of the kinematic parameters, and mean squares of the platform [m^2]."""
     covariance = found.kinematic.value_covariance
     truth = vector_of(found.kinematic.parametrization, design.legs.nominal, session.legs.nominal)
-    away = np.array([found.values[name] for name in found.kinematic.parametrization.names]) - truth
+    away = found.estimates.vector(found.kinematic.parametrization.names) - truth
     free = np.flatnonzero(np.diagonal(covariance) > 0.0)
     sigma = np.sqrt(np.diagonal(covariance)[free])
     correlation = covariance[np.ix_(free, free)] / np.outer(sigma, sigma)

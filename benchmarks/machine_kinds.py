@@ -179,9 +179,10 @@ def datasets(
         platform, solution = calibration.platform, calibration.solution
         if platform is None:
             before, after = (_in_metres(one) for one in both)
+            estimates = solution.estimates
             lengths = [
                 sigma**2
-                for name, sigma in zip(solution.names, solution.sigma, strict=True)
+                for name, sigma in zip(estimates.names, estimates.sigma, strict=True)
                 if name.split(".")[1] in ("base", "platform", "offset", "length")
             ]
             predicted = math.sqrt(float(np.mean(lengths)))

@@ -249,7 +249,7 @@ def test_fit_and_steps_come_nearer_to_the_truth(model: str, tmp_path: Path) -> N
     assert found.platform is not None
     assert by_fit < 3.0 * found.platform.sigma.mean_displacement < 0.2 * before
     assert by_steps < 0.2 * before or model in {"3-upu", "tricept"}
-    twists = {n: s for n, s in found.solution.status.items() if n.endswith(".twist")}
+    twists = {n: s for n, s in found.solution.estimates.status.items() if n.endswith(".twist")}
     assert bool(twists) == any(leg.twist is not None for leg in geometries(made.nominal))
     assert "fixed" not in twists.values()
     assert not [note for note in found.notes if "no model of the four steps" in note]
@@ -290,7 +290,7 @@ def test_axes_are_fitted_without_images(axes: tuple[SimulatedDataset, Path, Cali
     models = [f"{name}.{kind}" for name in ("calibrated", "staged") for kind in ("urdf", "yaml")]
     assert sorted(files_of(output)) == sorted([*models, "result.json"])
     assert not (made.folder / "observations.csv").exists()
-    assert not [name for name in solution.values if "radius" in name]
+    assert not [name for name in solution.estimates.values if "radius" in name]
 
 
 @pytest.mark.system
@@ -398,7 +398,7 @@ def test_hand_held_cameras_need_no_poses(in_the_hand: tuple[SimulatedDataset, Ca
     made, calibration = in_the_hand
     assert len(calibration.solution.T_camera_Rb) == 12
     assert np.sqrt(np.mean(_pulls(calibration, made.truth_path) ** 2)) < 1.8
-    assert abs(calibration.solution.values["board.scale"] - 1.0) < 2e-3
+    assert abs(calibration.solution.estimates.values["board.scale"] - 1.0) < 2e-3
     assert not any("calibration board" in note for note in calibration.notes)
     result = json.loads((made.folder.parent / "result/result.json").read_text())
     assert result["board"]["given"] is None
@@ -593,7 +593,7 @@ def test_the_order_of_photographs_does_not_matter(tmp_path: Path) -> None:
         _change(folder / "measurements.csv", lambda rows: [*rows[:3], *rows[15:18], *rows[30:33]])
     _change(turned / "measurements.csv", lambda rows: rows[::-1])
     one, other = (calibrate(folder).solution for folder in (given, turned))
-    assert one.names == other.names
-    np.testing.assert_allclose(one.sigma, other.sigma, rtol=1e-6)
+    assert one.estimates.names == other.estimates.names
+    np.testing.assert_allclose(one.estimates.sigma, other.estimates.sigma, rtol=1e-6)
     A, turned_A = one.parameters.base_joints, other.parameters.base_joints
     np.testing.assert_allclose(A, turned_A, atol=1e-12)

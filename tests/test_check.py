@@ -161,11 +161,11 @@ def test_images_without_used_outlines_are_refused(
 def test_priors_of_intrinsics_belong_to_the_whole_camera(result: Path, images: Path) -> None:
     new = load_dataset(images)
     assert not any("exact" in note for note in Result.read(result / "result.json").notes)
-    assert "c1.fx" in check(new, result).solution.names
+    assert "c1.fx" in check(new, result).solution.estimates.names
     view = new.measurements.views[0]
     larger = replace(view, camera=replace(view.camera, height=view.camera.height + 1))
     other = replace(new, measurements=replace(new.measurements, views=(larger,)))
-    assert "c1.fx" not in check(other, result).solution.values
+    assert "c1.fx" not in check(other, result).solution.estimates.values
 
 
 def test_notes_on_images_are_passed_on_once(

@@ -178,7 +178,7 @@ def test_a_wrong_axis_hardly_bends_the_answer() -> None:
         for some in (axes, replace(axes, M=M))
     )
     moved = session.errors(bent.parameters) - session.errors(clean.parameters)
-    assert np.abs(moved / clean.sigma).max() < 2.0
+    assert np.abs(moved / clean.estimates.sigma).max() < 2.0
     assert bent.chi2 > clean.chi2 + 1e4
 
 
@@ -223,7 +223,7 @@ def test_errors_of_corners_are_found_in_their_residuals() -> None:
             outlines,
             with_board(session, corners)[1],
             board=with_board(session, replace(corners, sigma_px=factor * corners.sigma_px))[0],
-        ).sigma
+        ).estimates.sigma
         for factor in (0.2, 5.0)
     ]
     np.testing.assert_allclose(claimed[0], claimed[1], rtol=0.05)
@@ -244,7 +244,8 @@ def test_a_few_wrong_corners_do_little() -> None:
         start,
         board=replace(seen, corners=replace(corners, px=px)),
     )
-    assert np.abs((_errors(session, bent) - _errors(session, right)) / right.sigma[:30]).max() < 1.0
+    away = _errors(session, bent) - _errors(session, right)
+    assert np.abs(away / right.estimates.sigma[:30]).max() < 1.0
     assert {corner for _, _, corner in bent.rejected_corners} == {*range(0, BOARD.n_corners, 9)}
     assert any("disagree with the fit and were left out" in note for note in bent.notes)
 
@@ -256,7 +257,7 @@ def test_rejected_corners_and_a_board_in_no_image_are_left_out() -> None:
     seen, start = with_board(session, none)
     solution = refine(session.legs, session.measurements, session.outlines, start, board=seen)
     assert (solution.T_frame_board, solution.rms_corners_px) == ({}, {})
-    assert BOARD_SCALE not in solution.values
+    assert BOARD_SCALE not in solution.estimates.values
 
 
 def biases_of(session: HexapodSession) -> EdgeBiases:
@@ -534,8 +535,8 @@ def test_gammas_that_are_given_or_of_which_nothing_is_known_are_not_estimated(
     for measurements in (session.measurements, without_gamma(session.measurements)):
         found = refine(session.legs, measurements, bare, start)
         assert found.gammas == given.gammas == ()
-        assert found.values == given.values
-        np.testing.assert_array_equal(found.covariance, given.covariance)
+        assert found.estimates.values == given.estimates.values
+        np.testing.assert_array_equal(found.estimates.covariance, given.estimates.covariance)
 
 
 def test_each_camera_has_its_own_gamma(session: HexapodSession) -> None:

@@ -562,7 +562,9 @@ def test_a_step_or_a_fit_that_fails_is_counted_with_its_reason(
 def test_a_parameter_that_was_not_estimated_is_a_failure() -> None:
     design, session = _design("3-rpr"), _session("3-rpr")
     solution = one_fit(session, NOISE.radius_sigma)
-    held = dataclasses.replace(solution, status={**solution.status, "leg1.offset": "weak"})
+    status = {**solution.estimates.status, "leg1.offset": "weak"}
+    found = dataclasses.replace(solution.estimates, status=status)
+    held = dataclasses.replace(solution, estimates=found)
     with pytest.raises(NotIdentifiable, match=r"leg1\.offset"):
         errors_of(design, session, held)
 
@@ -590,9 +592,11 @@ def test_convergence_counts_the_truth_as_right_and_another_answer_as_wrong(
         solution = one_fit(session, radius_sigma)
         legs = tuple(dataclasses.replace(leg, q0=leg.q0 + 1e-3) for leg in solution.legs)
         values = {
-            name: value + 1e-3 * name.endswith("offset") for name, value in solution.values.items()
+            name: value + 1e-3 * name.endswith("offset")
+            for name, value in solution.estimates.values.items()
         }
-        return dataclasses.replace(solution, legs=legs, values=values)
+        estimates = dataclasses.replace(solution.estimates, values=values)
+        return dataclasses.replace(solution, legs=legs, estimates=estimates)
 
     monkeypatch.setattr(convergence_study, "one_fit", shifted)
     (found,) = run_study(study, 1).document()["machines"]

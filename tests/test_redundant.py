@@ -248,7 +248,7 @@ def test_carriages_may_be_redundant(tmp_path: Path) -> None:
     session = machine_session(str(machine.yaml_path))
     found = refine(session.legs, session.measurements, session.outlines, session.start)
     names, truth = found.kinematic.parametrization.names, session.legs.vector(session.truth.legs)
-    values = np.array([found.values[name] for name in names])
+    values = found.estimates.vector(names)
     begun = session.legs.vector(session.start.legs)
     assert np.abs(begun - truth).max() > 0.002
     np.testing.assert_allclose(values, truth, atol=1e-7)
@@ -285,7 +285,7 @@ def test_a_wrong_reading_is_named_with_its_amount_and_does_no_harm(
     assert (one.leg, one.pose, one.image) == (leg, row, m.image[row])
     assert one.off == pytest.approx(off, abs=1e-6)
     assert found.redundant_readings.doubts == ()
-    values = np.array([found.values[name] for name in found.kinematic.parametrization.names])
+    values = found.estimates.vector(found.kinematic.parametrization.names)
     np.testing.assert_allclose(values, session.legs.vector(session.truth.legs), atol=1e-6)
 
 
@@ -332,7 +332,7 @@ def test_a_contradiction_that_no_image_shows_is_left_out_and_accuses_no_motor_al
     assert one.pose == row
     assert {one.motor, *one.alike} == set(session.legs.names)
     assert found.redundant_readings.doubts == ()
-    values = np.array([found.values[name] for name in found.kinematic.parametrization.names])
+    values = found.estimates.vector(found.kinematic.parametrization.names)
     np.testing.assert_allclose(values, session.legs.vector(session.truth.legs), atol=1e-6)
 
 

@@ -55,7 +55,7 @@ def _steps(found: Solution) -> dict[str, Array]:
 def _assert_moved(found: Solution, mistaken: Solution, what: str) -> None:
     """Check that a fit with a part of an error is moved by that part of its effect."""
     step, names = _steps(found)[what], found.kinematic.parametrization.names
-    moved = np.array([mistaken.values[n] - found.values[n] for n in names]) / PART
+    moved = (mistaken.estimates.vector(names) - found.estimates.vector(names)) / PART
     assert np.linalg.norm(step) > 1e-8
     np.testing.assert_allclose(moved, step, atol=0.02 * float(np.abs(step).max()))
 
@@ -146,7 +146,7 @@ def test_a_wrong_twist_moves_the_fit_as_predicted(model: str) -> None:
     found, part = refine(*data), 0.1
     effect = next(s for s in found.sensitivities if "twist" in s.what)
     name = next(n for n in found.kinematic.parametrization.names if n.endswith(".twist"))
-    twist = found.values[name] + part * np.radians(0.1)
+    twist = found.estimates.values[name] + part * np.radians(0.1)
     mistaken = refine(*data, choices=Choices(fixed=frozenset({name}), values={name: twist}))
     predicted = moved_legs(
         found.legs, found.kinematic.parametrization.place, part * effect.steps[:, 0]
@@ -227,8 +227,8 @@ def test_nothing_is_said_where_the_noise_hides_it() -> None:
 def test_a_focal_length_that_is_estimated_is_not_tested() -> None:
     solution = fitted(irregular_hexapod(12), 0, 1.01, frozenset({"c1.fx", "c1.fy"}))
     assert notes_on_focal_lengths(solution) == []
-    sigma = solution.sigma[solution.names.index("c1.fx")]
-    assert abs(solution.values["c1.fx"] - 1290.0) < 4.0 * sigma
+    sigma = solution.estimates.sigma[solution.estimates.names.index("c1.fx")]
+    assert abs(solution.estimates.values["c1.fx"] - 1290.0) < 4.0 * sigma
     assert sigma < 4.0
 
 
@@ -255,8 +255,7 @@ def test_a_wrong_camera_file_is_noticed_and_what_it_does_is_told(
     right = fitted(session, 0, 1.0)
     assert not [note for note in right.notes if "does not agree" in note]
     assert right.contradicted_cameras == ()
-    off = np.array(
-        [solution.values[n] - right.values[n] for n in right.kinematic.parametrization.names]
-    )
+    names = right.kinematic.parametrization.names
+    off = solution.estimates.vector(names) - right.estimates.vector(names)
     moved = effect.steps[:, 0]
     assert np.linalg.norm(off + moved) < 0.5 * np.linalg.norm(off)  # it says where the truth is

@@ -138,18 +138,19 @@ def _change_of_parameters(dataset: Dataset, solution: Solution) -> tuple[float, 
     known = known_parameters(
         dataset.machine, dataset.measurements.views, boards=dataset.boards
     ).by_name
+    found = solution.estimates
     lengths = [
-        (solution.values[name] - known[name].nominal, sigma)
-        for name, sigma in zip(solution.names, solution.sigma.tolist(), strict=True)
+        (found.values[name] - known[name].nominal, sigma)
+        for name, sigma in zip(found.names, found.sigma.tolist(), strict=True)
         if known[name].kind == "kinematic" and known[name].unit == "m"
     ]
     change, sigma = np.sqrt(np.mean(np.square(lengths or [(0.0, 0.0)]), axis=0)).tolist()
-    found = (
+    clause = (
         f"joints and lengths change by {1e3 * change:.3f} mm against the nominal model, known to "
         f"{1e3 * sigma:.3f} mm (1 sigma, both rms); no platform error can be predicted, because "
         f"{dataset.machine.undetermined}"
     )
-    return change, sigma, found
+    return change, sigma, clause
 
 
 def _verdict(improvement: float, sigma: float, found: str) -> Verdict:

@@ -297,7 +297,7 @@ def _compare(
     """Return what the fit of the new images says against the earlier result."""
     machine, parametrization = dataset.machine, solution.kinematic.parametrization
     columns = [parametrization.names.index(name) for name in prior.names]
-    values = np.array([solution.values[name] for name in prior.names])
+    values = solution.estimates.vector(prior.names)
     covariance, held = solution.kinematic.of_values(prior.names)
     covariance = covariance + prior.held_sigma**2 * held.T @ held
     variance_factor = _earlier_noise(solution, earlier)

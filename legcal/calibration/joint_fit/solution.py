@@ -111,6 +111,44 @@ class KinematicUncertainty:
 
 @brief
 @dataclass(frozen=True, eq=False)
+class Estimates:
+    """All parameters by name: kinematic ones, radii, unknown intrinsics, sizes of boards."""
+
+    values: Mapping[str, float]  # [m, rad, px]
+    units: Mapping[str, str]
+    status: Mapping[str, ParameterStatus]  # weak: part of a direction that is held at nominal
+    names: tuple[str, ...]  # the estimated ones, in the order of ``values``
+    covariance: Array  # (n, n) of these, with cameras and poses unknown
+    prior_sigma: Mapping[str, float]  # of the intrinsics that camera files state one of
+    # the estimated directions known worst, worst first, of what no camera file states
+    weak: tuple[WorstDirection, ...]
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (n,) of the estimated ones."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    def vector(self, names: Sequence[str]) -> Array:
+        """Return the values of some parameters, (len(names),)."""
+        return np.array([self.values[name] for name in names])
+
+    def in_order(self, names: Sequence[str]) -> Estimates:
+        """Return the same in the order in which these names, and others, stand."""
+        every = [name for name in names if name in self.values]
+        estimated = tuple(name for name in every if name in self.names)
+        at = _places(estimated, self.names)
+        return replace(
+            self,
+            values={name: self.values[name] for name in every},
+            units={name: self.units[name] for name in every},
+            status={name: self.status[name] for name in every},
+            names=estimated,
+            covariance=self.covariance[np.ix_(at, at)],
+        )
+
+
+@brief
+@dataclass(frozen=True, eq=False)
 class Solution:
     """A converged joint fit; axes count as angles from the nominal axis."""
 
@@ -119,17 +157,8 @@ class Solution:
     cameras: tuple[Camera, ...]  # of the views, with the intrinsics that were estimated
     T_Rb_Re: tuple[RigidTransform, ...]  # platform poses
     radii: dict[tuple[int, str], float]  # [m] for each (leg index, part) that was observed
+    estimates: Estimates
     kinematic: KinematicUncertainty
-    # Of every parameter by name [m, rad, px]: kinematic, radii, intrinsics, size of the board.
-    values: Mapping[str, float]
-    units: Mapping[str, str]
-    status: Mapping[str, ParameterStatus]  # weak: part of a direction that is held at nominal
-    names: tuple[str, ...]  # the estimated parameters, in the order of ``values``
-    covariance: Array  # (n, n) of these, with cameras and poses unknown
-    sigma: Array  # (n,)
-    prior_sigma: Mapping[str, float]  # of the intrinsics that camera files state one of, by name
-    # the estimated directions known worst, worst first, of what no camera file states
-    weak: tuple[WorstDirection, ...]
     cost: float  # over all observations, rejected ones too, with claimed covariances: comparable
     chi2: float  # of used outlines, axes, readings and priors
     dof: int
@@ -182,10 +211,6 @@ def assemble_solution(
     if fit.at_places is not None:
         kept = kept + fit.at_places.covariance
     covariance = named_covariance(problem, state, kept)
-    values, status = _values(problem, state), _status(problem, held)
-    names = tuple(name for name in values if status[name] == "estimated")
-    where = [problem.named.index(name) for name in names]
-    estimated = covariance[np.ix_(where, where)]
     offsets, cost = problem.offsets(state), comparable_cost(problem, state)
     used = offsets[fit.accepted]
     readings = judged_readings(problem, state, linear, normal)
@@ -195,14 +220,9 @@ def assemble_solution(
         float(np.sum(rows.r**2)) for rows in linear.rows.values()
     )
     dof = n_residuals - problem.n_unknowns + len(held.basis)
-    parametrization = problem.legs.parametrization
-    units = dict(zip(problem.named, problem.units, strict=True))
-    units |= dict(zip(parametrization.names, parametrization.units, strict=True))
     biases = zip(problem.block("biases").labels, state.biases.tolist(), strict=True)
     cameras = CameraResiduals(problem, state, linear)
     doubts = _CameraDoubts.of(cameras, kept)
-    prior_sigma = _prior_sigma(problem)
-    shown = [i for i, name in enumerate(names) if name not in prior_sigma]
     gammas = _gammas(problem, state, kept, outlines)
     scale = scale_notes(problem, state)
     return Solution(
@@ -211,19 +231,8 @@ def assemble_solution(
         cameras=state.cameras,
         T_Rb_Re=state.platform_pose.motions,
         radii=dict(zip(problem.outlines.parts, state.radii.tolist(), strict=True)),
+        estimates=_estimates(problem, state, held, covariance),
         kinematic=_kinematic(problem, state, held, kept, covariance),
-        values=values,
-        units={name: units.get(name, "m") for name in values},
-        status=status,
-        names=names,
-        covariance=estimated,
-        sigma=np.sqrt(np.diagonal(estimated)),
-        weak=worst_directions(
-            estimated[np.ix_(shown, shown)],
-            tuple(names[i] for i in shown),
-            named_units(problem, state)[where][shown],
-        ),
-        prior_sigma=prior_sigma,
         cost=cost,
         chi2=chi2,
         dof=dof,
@@ -298,13 +307,6 @@ class _CameraDoubts:
         return tuple(str(one) for one in (*self.tested, *self.others))
 
 
-def _prior_sigma(problem: FitProblem) -> dict[str, float]:
-    """Return the standard deviations that camera files state, by the name of the intrinsic."""
-    priors, of_files = problem.priors, set(problem.calibrated.tolist())
-    stated = zip(priors.unknown.tolist(), priors.sigma.tolist(), strict=True)
-    return {problem.named[i]: sigma for i, sigma in stated if i in of_files}
-
-
 def comparable_cost(problem: FitProblem, state: State) -> float:
     """Return the robust cost of all observations with their claimed covariances."""
     claimed = problem.weighted(NoiseModel())
@@ -331,25 +333,47 @@ def _gammas(
     return tuple(found)
 
 
-def _values(problem: FitProblem, state: State) -> dict[str, float]:
-    """Return the values of all parameters: kinematic, radii, and intrinsics that are unknown."""
-    legs, biases = problem.legs, problem.block("biases").labels
-    names = (radius_name(legs.names[leg], part) for leg, part in problem.outlines.parts)
-    values = dict(zip(legs.parametrization.names, legs.vector(state.legs).tolist(), strict=True))
-    values |= dict(zip(names, state.radii.tolist(), strict=True))
-    named = zip(problem.named, problem.coordinates(state).tolist(), strict=True)
-    return values | {name: value for name, value in named if name not in biases}
-
-
-def _status(problem: FitProblem, held: HeldDirections) -> dict[str, ParameterStatus]:
-    """Return the status of every parameter."""
-    legs, biases = problem.legs, problem.block("biases").labels
-    names = [radius_name(legs.names[leg], part) for leg, part in problem.outlines.parts]
-    status: dict[str, ParameterStatus] = dict.fromkeys(
-        (*legs.parametrization.names, *names), "fixed"
+def _estimates(
+    problem: FitProblem, state: State, held: HeldDirections, covariance: Array
+) -> Estimates:
+    """Return all parameters; *covariance* is that of the named unknowns."""
+    legs, biases, found = problem.legs, problem.block("biases").labels, problem.legs.parametrization
+    radii = [radius_name(legs.names[leg], part) for leg, part in problem.outlines.parts]
+    unknown = [name for name in problem.named if name not in biases]
+    of_unknowns = dict(zip(problem.named, problem.coordinates(state).tolist(), strict=True))
+    values = dict(zip(found.names, legs.vector(state.legs).tolist(), strict=True))
+    values |= dict(zip(radii, state.radii.tolist(), strict=True))
+    values |= {name: of_unknowns[name] for name in unknown}
+    units = dict.fromkeys(radii, "m") | dict(zip(problem.named, problem.units, strict=True))
+    units |= dict(zip(found.names, found.units, strict=True))
+    status: dict[str, ParameterStatus] = dict.fromkeys((*found.names, *radii), "fixed")
+    status |= dict.fromkeys(unknown, "estimated")
+    status |= dict.fromkeys(held.names, "weak")
+    names = tuple(name for name in values if status[name] == "estimated")
+    at = [problem.named.index(name) for name in names]
+    estimated, prior_sigma = covariance[np.ix_(at, at)], _prior_sigma(problem)
+    shown = [i for i, name in enumerate(names) if name not in prior_sigma]
+    weak = worst_directions(
+        estimated[np.ix_(shown, shown)],
+        tuple(names[i] for i in shown),
+        named_units(problem, state)[at][shown],
     )
-    status |= {name: "estimated" for name in problem.named if name not in biases}
-    return status | dict.fromkeys(held.names, "weak")
+    return Estimates(
+        values,
+        {name: units[name] for name in values},
+        status,
+        names,
+        estimated,
+        prior_sigma,
+        weak,
+    )
+
+
+def _prior_sigma(problem: FitProblem) -> dict[str, float]:
+    """Return the standard deviations that camera files state, by the name of the intrinsic."""
+    priors, of_files = problem.priors, set(problem.calibrated.tolist())
+    stated = zip(priors.unknown.tolist(), priors.sigma.tolist(), strict=True)
+    return {problem.named[i]: sigma for i, sigma in stated if i in of_files}
 
 
 def _kinematic(
@@ -429,11 +453,8 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     by_leg = {leg: j for j, leg in enumerate(legs)}
     radii = {(by_leg[leg], part): value for (leg, part), value in solution.radii.items()}
     known = known_parameters(machine, measurements.views, boards=dataset.boards).by_name
-    ordered = [name for name in known if name in solution.values]
-    names = tuple(name for name in ordered if name in solution.names)
     names_of_legs, frame_legs = machine.leg_names, machine.frame_legs
     parametrization = parametrize(names_of_legs, geometry, frame_legs, twists=True)
-    where = _places(names, solution.names)
     steps = _places(parametrization.names, solution.kinematic.parametrization.names)
     readings = solution.redundant_readings
     file_pose = {worked: pose for pose, worked in enumerate(_poses(order, dataset).tolist())}
@@ -444,13 +465,8 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         cameras=tuple(solution.cameras[v] for v in views),
         T_Rb_Re=tuple(solution.T_Rb_Re[p] for p in _poses(order, dataset).tolist()),
         radii=dict(sorted(radii.items())),
+        estimates=solution.estimates.in_order(tuple(known)),
         kinematic=solution.kinematic.in_order(parametrization),
-        values={name: solution.values[name] for name in ordered},
-        units={name: solution.units[name] for name in ordered},
-        status={name: solution.status[name] for name in ordered},
-        names=names,
-        covariance=solution.covariance[np.ix_(where, where)],
-        sigma=solution.sigma[where],
         sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),
         outlines=order.restore(solution.outlines),
         redundant_readings=readings
