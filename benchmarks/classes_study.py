@@ -219,7 +219,7 @@ def standing_where_held(design: Design, session: OutlineSession, solution: Solut
         Start(solution.legs, solution.T_camera_Rb, solution.T_Rb_Re, "found"),
         choices=Choices(free=free),
     )
-    if exact.cost > _EXACT or len(exact.kinematic.held) != len(solution.kinematic.held):
+    if exact.quality.cost > _EXACT or len(exact.kinematic.held) != len(solution.kinematic.held):
         raise DidNotConverge(
             "The errors of a fit could not be judged: found no machine that stands where it holds "
             "what is open and shows the same as the true one, needed one; this is a mistake in "

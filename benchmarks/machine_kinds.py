@@ -77,7 +77,7 @@ def sessions(kind: str, runs: int, seed: int, record: Path | None) -> str:
         try:
             solution = one_fit(session, noise.radius_sigma)
             records.append(errors_of_fit(design, session, solution, noise))
-            if (readings := solution.redundant_readings) is not None:
+            if (readings := solution.quality.redundant_readings) is not None:
                 records[-1]["readings"] = len(readings.wrong), len(readings.doubts)
         except LegcalError as error:
             records.append({"failure": failure_of(error)})
@@ -130,7 +130,7 @@ def with_mistake(folder: Path, machine: Machine, seed: int, added: float, scale:
 
 def named_readings(solution: Solution) -> list[str]:
     """Return what a fit says is wrong with readings, in words."""
-    judged = solution.redundant_readings
+    judged = solution.quality.redundant_readings
     if judged is None:
         return []
     return [

@@ -284,9 +284,9 @@ def test_axes_are_fitted_without_images(axes: tuple[SimulatedDataset, Path, Cali
     solution = calibration.solution
     assert calibration.steps.legs is not None
     assert 0.4 < np.mean(_pulls(calibration, made.truth_path) ** 2) < 1.9
-    assert solution.chi2 / solution.dof == pytest.approx(1.0, abs=0.35)
-    assert solution.rms_axes == pytest.approx(1.0, abs=0.3)
-    assert solution.rms_px is None
+    assert solution.quality.chi2 / solution.quality.dof == pytest.approx(1.0, abs=0.35)
+    assert solution.quality.rms_axes == pytest.approx(1.0, abs=0.3)
+    assert solution.quality.rms_px is None
     models = [f"{name}.{kind}" for name in ("calibrated", "staged") for kind in ("urdf", "yaml")]
     assert sorted(files_of(output)) == sorted([*models, "result.json"])
     assert not (made.folder / "observations.csv").exists()

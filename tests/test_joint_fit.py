@@ -149,7 +149,7 @@ def test_exact_outlines_give_the_truth_from_3_mm_and_1_degree_away(
         assert error < {"m": 1e-8, "rad": 1e-7}[found.estimates.units[parameter]], parameter
     # What is not held is known to a hundredth of a leg at least, some 5 mm. Parameters that far
     # from any that explain all measurements would cost 1; 1e-12 are 5e-9 m and 1e-8 rad.
-    assert found.chi2 < 1e-12
+    assert found.quality.chi2 < 1e-12
     first, true_first = found.T_Rb_Re[0], session.truth.T_Rb_Re[0]
     for pose, true in zip(found.T_Rb_Re, session.truth.T_Rb_Re, strict=True):
         # Where joint centres are held, R_e stands otherwise on the platform, and R_b on the base.
@@ -413,8 +413,8 @@ def test_errors_agree_with_the_covariance(n: int) -> None:
         error = joint_errors(found.parameters)
         normalised.append(error @ np.linalg.solve(found.kinematic.covariance, error) / len(error))
         z.append(error / found.estimates.sigma[: len(error)])
-        scales.append(found.noise.scale)
-        chi2.append(found.chi2 / found.dof)
+        scales.append(found.quality.noise.scale)
+        chi2.append(found.quality.chi2 / found.quality.dof)
     # The mean of n chi-squares of 30 degrees, over 30: 1 with standard deviation 0.26 / sqrt(n);
     # the noise is estimated from some 200 residuals a run, which widens it a little.
     assert np.mean(normalised) == pytest.approx(1.0, abs=1.1 / np.sqrt(n))
@@ -555,7 +555,7 @@ def test_where_the_fit_starts_does_not_show_in_the_result(name: str) -> None:
     names = one.estimates.names
     away = other.estimates.vector(names) - one.estimates.vector(names)
     assert np.abs(away / one.estimates.sigma).max() < 1e-3
-    assert other.cost == pytest.approx(one.cost, rel=1e-6)
+    assert other.quality.cost == pytest.approx(one.quality.cost, rel=1e-6)
 
 
 @pytest.mark.parametrize("name", thinned(MACHINES, ["tricept", "3-rpr"]))
@@ -595,7 +595,7 @@ def test_a_machine_in_another_size_gives_the_same_in_that_size(name: str) -> Non
     )
     assert np.abs((others / unit - values) / found.estimates.sigma).max() < 1e-3
     np.testing.assert_allclose(again.estimates.sigma / unit, found.estimates.sigma, rtol=1e-4)
-    assert again.rms_px == pytest.approx(found.rms_px)
+    assert again.quality.rms_px == pytest.approx(found.quality.rms_px)
 
 
 def scaled(session: MachineSession) -> MachineSession:
@@ -637,8 +637,8 @@ def test_exact_axes_give_the_truth(coplanar: bool) -> None:
     assert np.abs(session.errors(parameters_of_legs(start.legs))).min() > 0.9 * joints
     found = refine(session.legs, session.measurements, no_outlines(), start, axes=session.axes)
     assert np.abs(session.errors(found.parameters)).max() < 1e-9
-    assert found.rms_px is None
-    assert found.rms_axes == pytest.approx(0.0, abs=1e-5)
+    assert found.quality.rms_px is None
+    assert found.quality.rms_axes == pytest.approx(0.0, abs=1e-5)
     assert found.radii == {}
 
 
@@ -650,7 +650,7 @@ def test_axes_beside_outlines_add_to_what_is_known() -> None:
     alone, both = refine(*arguments), refine(*arguments, axes=axes)
     assert np.abs(joint_errors(both.parameters)).max() < 1e-9
     assert np.all(both.estimates.sigma[:30] < alone.estimates.sigma[:30])
-    assert both.dof == alone.dof + 4 * len(axes)
+    assert both.quality.dof == alone.quality.dof + 4 * len(axes)
 
 
 @pytest.mark.parametrize("coplanar", thinned([False, True], [True]))
@@ -671,8 +671,9 @@ def test_errors_reach_the_bound_and_agree_with_their_sigmas(coplanar: bool) -> N
     assert np.mean(claimed) == pytest.approx(1.0, abs=0.12)
     # Parameters share few large errors, so that their own mean squares spread more.
     assert np.mean((errors / sigmas) ** 2) == pytest.approx(1.0, abs=0.3)
-    assert np.mean([found.chi2 / found.dof for found in solutions]) == pytest.approx(1.0, abs=0.02)
-    assert np.mean([found.rms_axes or 0.0 for found in solutions]) < 1.0
+    quality = [found.quality for found in solutions]
+    assert np.mean([one.chi2 / one.dof for one in quality]) == pytest.approx(1.0, abs=0.02)
+    assert np.mean([one.rms_axes or 0.0 for one in quality]) < 1.0
     # What the robust loss does not keep, and no more.
     assert np.all(sigmas.mean(axis=0) > np.sqrt(np.diag(least)))
     assert sigmas.mean() < 1.02 * np.sqrt(np.diag(least)).mean()

@@ -111,7 +111,7 @@ def test_a_tight_prior_pins_and_a_loose_one_adds_information(noisy: MachineSessi
         mean + 0.5 * sigma, abs=0.1 * sigma
     )
     assert half.estimates.sigma[at] == pytest.approx(np.sqrt(0.5) * sigma, rel=0.02)
-    assert half.dof == plain.dof + 1
+    assert half.quality.dof == plain.quality.dof + 1
 
 
 def test_a_freed_radius_has_no_prior(session: MachineSession) -> None:
@@ -126,7 +126,7 @@ def test_a_freed_radius_has_no_prior(session: MachineSession) -> None:
     off = [abs(with_priors.radii[part] - r) for part, r in session.legs.radii.items()]
     assert min(off) > 1e-9
     sigmas = [(with_priors.radii[part] / r - 1.0) / 0.02 for part, r in radii.items()]
-    assert with_priors.chi2 == pytest.approx(np.sum(np.square(sigmas)), rel=1e-3)
+    assert with_priors.quality.chi2 == pytest.approx(np.sum(np.square(sigmas)), rel=1e-3)
     much = {part: 2.2 * r for part, r in session.legs.radii.items()}
     with pytest.raises(DidNotConverge, match="mm; they must agree to a half"):
         fitted(

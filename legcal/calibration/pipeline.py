@@ -718,8 +718,8 @@ def _compression_note(
     names = {data.measurements.image[row] for row in measured}
     facts = {image: found for image, found in data.dataset.facts.items() if image in names}
     effect = compression_effect(
-        photographs, placement, estimate.outlines, facts, solution.noise, data.progress
+        photographs, placement, estimate.outlines, facts, solution.quality.noise, data.progress
     )
     words = "" if effect is None else str(effect)
-    rms, scale = solution.rms_px or 0.0, solution.noise.scale
+    rms, scale = solution.quality.rms_px or 0.0, solution.quality.noise.scale
     return compression_note(data.measurements, facts, rms, scale, words)

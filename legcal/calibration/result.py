@@ -194,7 +194,7 @@ def _result_of(calibration: Calibration) -> Result:
             for one in solution.gammas
         ],
         stages=Stages(staged=_staged(calibration)),
-        residuals=ResidualsBlock.model_validate(solution),
+        residuals=ResidualsBlock.model_validate(solution.quality),
         observations=_observations(calibration),
         board=None if on_base is None else BoardPose.model_validate(on_base),
         platform_board=(
@@ -328,7 +328,7 @@ def _board(calibration: Calibration, link: Link) -> dict[str, Any] | None:
         f"T_{link}_board": Pose.of(T_link_board),
         "given": None if given is None else Pose.of(given),
         "scale": solution.estimates.values.get(board_scale(link), 1.0),
-        "rms_px": solution.rms_corners_px.get(link),
+        "rms_px": solution.quality.rms_corners_px.get(link),
         "corners": len(own),
         "used": int(own.used.sum()),
         "images": len(np.unique(own.row[own.used])),

@@ -45,7 +45,7 @@ def judge(
     """
     machine, measurements = dataset.machine, dataset.measurements
     q = measurements.q_of_poses.copy()
-    readings = solution.redundant_readings
+    readings = solution.quality.redundant_readings
     for wrong in () if readings is None else readings.wrong:
         q[wrong.pose, np.equal(machine.reads, machine.reads[wrong.leg])] = np.nan
     platform = platform_accuracy(

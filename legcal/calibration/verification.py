@@ -142,7 +142,7 @@ class Check:
                 sigma_dE_rad=pair.expected_rotation,
             ),
             images=self.dataset.measurements.n_rows,
-            residuals=FitQuality.model_validate(self.solution),
+            residuals=FitQuality.model_validate(self.solution.quality),
             notes=list(self.notes),
         ).document()
 
@@ -306,7 +306,7 @@ def _compare(
     )
     dof = earlier.document.residuals.dof
     if variance_factor == 1.0:
-        dof = noise_dof(solution.dof, covariance, prior.sigma)
+        dof = noise_dof(solution.quality.dof, covariance, prior.sigma)
     legs = geometries(machine)
     changes = possible_changes(machine, _only(parametrization, columns))
     movement = judge_movement(found, dof, changes, significance)
@@ -334,7 +334,7 @@ def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:
     before = NoiseModel(**earlier.document.residuals.noise.document())
     now, then = (
         float(np.mean(np.trace(noise.covariance(claimed), axis1=1, axis2=2)))
-        for noise in (solution.noise, before)
+        for noise in (solution.quality.noise, before)
     )
     return max(then / now, 1.0)
 

@@ -149,6 +149,22 @@ class Estimates:
 
 @brief
 @dataclass(frozen=True, eq=False)
+class GoodnessOfFit:
+    """How large the residuals of a fit are, and the noise that they show."""
+
+    cost: float  # over all observations, rejected ones too, with claimed covariances: comparable
+    chi2: float  # of used outlines, axes, readings and priors
+    dof: int
+    rms_px: float | None  # of the offsets of used outlines [px]
+    rms_axes: float | None  # of measured axes, over their claimed standard deviations
+    rms_corners_px: Mapping[Link, float]  # of corners of the calibration board on each link [px]
+    noise: NoiseModel  # errors of single outlines
+    shared_px: Mapping[str, float]  # sigmas of common-mode biases by kind [px]; empty without any
+    redundant_readings: JudgedReadings | None  # None where readings cannot disagree
+
+
+@brief
+@dataclass(frozen=True, eq=False)
 class Solution:
     """A converged joint fit; axes count as angles from the nominal axis."""
 
@@ -159,21 +175,13 @@ class Solution:
     radii: dict[tuple[int, str], float]  # [m] for each (leg index, part) that was observed
     estimates: Estimates
     kinematic: KinematicUncertainty
-    cost: float  # over all observations, rejected ones too, with claimed covariances: comparable
-    chi2: float  # of used outlines, axes, readings and priors
-    dof: int
-    rms_px: float | None  # of the offsets of used outlines [px]
-    rms_axes: float | None  # of measured axes, over their claimed standard deviations
-    rms_corners_px: dict[Link, float]  # of corners of the calibration board on each link [px]
+    quality: GoodnessOfFit
     # View, pose (-1 on the base: in all images of the view) and number; poses as the fit counts
     # them
     rejected_corners: tuple[tuple[str, int, int], ...]
     # T_Rb_board and T_Re_board, by the link that the board is fixed to, where images show one
     T_frame_board: dict[Link, RigidTransform]
-    noise: NoiseModel  # errors of single outlines
     gammas: tuple[EstimatedGamma, ...]  # of cameras without a given gamma
-    biases: Mapping[str, float]  # common-mode edge biases by name [px]
-    shared_px: Mapping[str, float]  # their standard deviations by kind [px]; empty without any
     sensitivities: tuple[Sensitivity, ...]  # to mistakes in what was taken as known
     outlines: Outlines  # the table that came in, with what the fit rejected and why
     start: str  # label of the start that led here
@@ -184,7 +192,6 @@ class Solution:
     contradicted_cameras: tuple[str, ...] = ()  # views that stand for such cameras
     left_out: tuple[str, ...] = ()  # legs of views most of whose outlines disagree, unconfirmed
     camera_notes: tuple[str, ...] = ()  # those of the notes that are about these
-    redundant_readings: JudgedReadings | None = None  # None where readings cannot disagree
 
     @property
     def parameters(self) -> KinematicParameters:
@@ -211,16 +218,7 @@ def assemble_solution(
     if fit.at_places is not None:
         kept = kept + fit.at_places.covariance
     covariance = named_covariance(problem, state, kept)
-    offsets, cost = problem.offsets(state), comparable_cost(problem, state)
-    used = offsets[fit.accepted]
-    readings = judged_readings(problem, state, linear, normal)
-    n_rejected = offsets.size - used.size + (0 if readings is None else len(readings.wrong))
-    n_residuals = problem.n_equations + len(problem.priors.mean) - n_rejected
-    chi2 = float(np.sum(linear.prior_r**2)) + sum(
-        float(np.sum(rows.r**2)) for rows in linear.rows.values()
-    )
-    dof = n_residuals - problem.n_unknowns + len(held.basis)
-    biases = zip(problem.block("biases").labels, state.biases.tolist(), strict=True)
+    quality = _quality(fit, normal, len(held.basis))
     cameras = CameraResiduals(problem, state, linear)
     doubts = _CameraDoubts.of(cameras, kept)
     gammas = _gammas(problem, state, kept, outlines)
@@ -233,11 +231,7 @@ def assemble_solution(
         radii=dict(zip(problem.outlines.parts, state.radii.tolist(), strict=True)),
         estimates=_estimates(problem, state, held, covariance),
         kinematic=_kinematic(problem, state, held, kept, covariance),
-        cost=cost,
-        chi2=chi2,
-        dof=dof,
-        rms_px=_rms(used),
-        rms_axes=_rms(linear["axes"].r),
+        quality=quality,
         rejected_corners=tuple(
             (problem.outlines.views[view], pose, corner)
             for view, pose, corner in problem.rejected_corners
@@ -247,37 +241,60 @@ def assemble_solution(
             for corners, T in zip(problem.boards, state.board_pose.motions, strict=True)
             if len(corners)
         },
-        rms_corners_px={
-            corners.link: rms
-            for corners in problem.boards
-            if (rms := _rms(linear[corners.name].r * corners.sigma[:, None])) is not None
-        },
-        noise=fit.noise,
         gammas=gammas,
-        biases={n: v for n, v in biases if not n.endswith(GAMMA_SUFFIX)},
-        shared_px=fit.shared_px,
         sensitivities=sensitivities(cameras, normal, doubts.tested),
-        outlines=_with_rejections(outlines, fit, offsets),
+        outlines=_with_rejections(outlines, fit),
         start=label,
         iterations=fit.iterations,
         posterior=Posterior(problem, state, fit.edge_biases, fit.noise, kept),
         contradicted_cameras=doubts.views,
         left_out=legs_left_out(problem, fit.accepted),
         camera_notes=doubts.notes,
-        redundant_readings=readings,
         notes=(
             *fit.notes,
             *rejected_notes(problem, fit.accepted),
             *corner_notes(problem),
-            *reading_notes(readings),
+            *reading_notes(quality.redundant_readings),
             *reversed_motors(problem, state),
             *map(str, gammas),
             *notes_on_blur(fit.edge_biases, problem.outlines.covariance[fit.accepted]),
             *(scale or contradicted_radii(problem, state, normal)),
-            *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
+            *(_misfit_of_axes(quality) if len(problem.axes) else ()),
             *doubts.notes,
         ),
     )
+
+
+def _quality(fit: Fit, normal: NormalEquations, n_held: int) -> GoodnessOfFit:
+    """Return how well a fit agrees with its data; *n_held* directions are not estimated."""
+    problem, state, linear = fit.problem, fit.state, fit.minimum.linear
+    offsets = problem.offsets(state)
+    used = offsets[fit.accepted]
+    readings = judged_readings(problem, state, linear, normal)
+    n_rejected = offsets.size - used.size + (0 if readings is None else len(readings.wrong))
+    n_residuals = problem.n_equations + len(problem.priors.mean) - n_rejected
+    of_rows = sum(float(np.sum(rows.r**2)) for rows in linear.rows.values())
+    return GoodnessOfFit(
+        cost=_comparable_cost(problem, state),
+        chi2=float(np.sum(linear.prior_r**2)) + of_rows,
+        dof=n_residuals - problem.n_unknowns + n_held,
+        rms_px=_rms(used),
+        rms_axes=_rms(linear["axes"].r),
+        rms_corners_px={
+            corners.link: rms
+            for corners in problem.boards
+            if (rms := _rms(linear[corners.name].r * corners.sigma[:, None])) is not None
+        },
+        noise=fit.noise,
+        shared_px=fit.shared_px,
+        redundant_readings=readings,
+    )
+
+
+def _comparable_cost(problem: FitProblem, state: State) -> float:
+    """Return the robust cost of all observations with their claimed covariances."""
+    claimed = problem.weighted(NoiseModel())
+    return robust_cost(claimed, linearize(claimed, state), claimed.loss)
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,12 +322,6 @@ class _CameraDoubts:
     def notes(self) -> tuple[str, ...]:
         """A sentence on each."""
         return tuple(str(one) for one in (*self.tested, *self.others))
-
-
-def comparable_cost(problem: FitProblem, state: State) -> float:
-    """Return the robust cost of all observations with their claimed covariances."""
-    claimed = problem.weighted(NoiseModel())
-    return robust_cost(claimed, linearize(claimed, state), claimed.loss)
 
 
 def _gammas(
@@ -405,8 +416,9 @@ def _rms(values: Array) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if values.size else None
 
 
-def _misfit_of_axes(chi2: float, dof: int) -> tuple[str, ...]:
+def _misfit_of_axes(quality: GoodnessOfFit) -> tuple[str, ...]:
     """Return a note where axes, whose errors are not estimated, are worse than they claim."""
+    chi2, dof = quality.chi2, quality.dof
     if chi2 <= dof + _SIGNIFICANT * np.sqrt(2.0 * dof):
         return ()
     return (
@@ -416,11 +428,11 @@ def _misfit_of_axes(chi2: float, dof: int) -> tuple[str, ...]:
     )
 
 
-def _with_rejections(outlines: Outlines, fit: Fit, offsets: Array) -> Outlines:
+def _with_rejections(outlines: Outlines, fit: Fit) -> Outlines:
     """Return the table with what the fit rejected, and why."""
     used, reason, problem = outlines.used.copy(), list(outlines.reason), fit.problem
     rejected = np.flatnonzero(~fit.accepted)
-    words = rejection_reasons(problem, fit.state, rejected, offsets)
+    words = rejection_reasons(problem, fit.state, rejected, problem.offsets(fit.state))
     every = np.ones_like(fit.accepted)
     placed = of_determined_poses(problem.weighted(fit.noise), fit.state, every)[rejected]
     for row, why, has_pose in zip(problem.outlines.index[rejected], words, placed, strict=True):
@@ -456,26 +468,23 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     names_of_legs, frame_legs = machine.leg_names, machine.frame_legs
     parametrization = parametrize(names_of_legs, geometry, frame_legs, twists=True)
     steps = _places(parametrization.names, solution.kinematic.parametrization.names)
-    readings = solution.redundant_readings
-    file_pose = {worked: pose for pose, worked in enumerate(_poses(order, dataset).tolist())}
+    poses = _poses(order, dataset).tolist()
+    file_pose = {worked: pose for pose, worked in enumerate(poses)}
+    readings = solution.quality.redundant_readings
     return replace(
         solution,
         legs=geometry,
         T_camera_Rb=tuple(solution.T_camera_Rb[v] for v in views),
         cameras=tuple(solution.cameras[v] for v in views),
-        T_Rb_Re=tuple(solution.T_Rb_Re[p] for p in _poses(order, dataset).tolist()),
+        T_Rb_Re=tuple(solution.T_Rb_Re[p] for p in poses),
         radii=dict(sorted(radii.items())),
         estimates=solution.estimates.in_order(tuple(known)),
         kinematic=solution.kinematic.in_order(parametrization),
         sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),
         outlines=order.restore(solution.outlines),
-        redundant_readings=readings
-        and replace(
-            readings,
-            wrong=tuple(
-                replace(one, leg=int(order.legs[one.leg]), pose=file_pose[one.pose])
-                for one in readings.wrong
-            ),
+        quality=replace(
+            solution.quality,
+            redundant_readings=readings and readings.renumbered(order.legs.tolist(), file_pose),
         ),
     )
 
