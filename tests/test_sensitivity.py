@@ -191,7 +191,7 @@ def test_a_second_mistake_in_a_camera_is_named_beside_the_first() -> None:
     solution = fitted(irregular_hexapod(12), 0, 1.0, frozenset(), **wrong)
     said = [note.partition(" of c1 ")[0] for note in solution.notes if "does not agree" in note]
     assert sorted(said) == ["The focal length", "The principal point"]
-    assert solution.contradicted_cameras == ("c1",)
+    assert solution.camera_doubts.views == ("c1",)
 
 
 def test_a_view_at_another_zoom_than_the_others_of_its_camera_is_named() -> None:
@@ -209,7 +209,7 @@ def test_a_view_at_another_zoom_than_the_others_of_its_camera_is_named() -> None
     assert note.startswith("The focal length of view c2 does not agree with the other views")
     found = float(note.partition("found it ")[2].partition(" +-")[0])
     assert found == pytest.approx(3.0, abs=1.2)
-    assert solution.contradicted_cameras == ("c2",)
+    assert solution.camera_doubts.views == ("c2",)
 
 
 def test_a_right_focal_length_is_left_alone() -> None:
@@ -250,11 +250,11 @@ def test_a_wrong_camera_file_is_noticed_and_what_it_does_is_told(
     (note,) = (note for note in solution.notes if "does not agree" in note)
     assert note.startswith(start)
     assert words in note
-    assert solution.contradicted_cameras == ("c1",)
+    assert solution.camera_doubts.views == ("c1",)
     (effect,) = (s for s in solution.sensitivities if s.what == FOUND_CAMERA)
     right = fitted(session, 0, 1.0)
     assert not [note for note in right.notes if "does not agree" in note]
-    assert right.contradicted_cameras == ()
+    assert right.camera_doubts.views == ()
     names = right.kinematic.parametrization.names
     off = solution.estimates.vector(names) - right.estimates.vector(names)
     moved = effect.steps[:, 0]

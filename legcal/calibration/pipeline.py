@@ -336,9 +336,12 @@ def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimat
         estimate = _measure_again(data, first, seen, board, options)
     except (NotVisible, NotIdentifiable, DidNotConverge) as error:
         # A fit with a wrong camera may lead away from outlines that were found before it.
-        if not first.solution.camera_notes:
+        if not first.solution.camera_doubts.notes:
             raise
-        cameras = (*first.solution.camera_notes, *_camera_notes(data.dataset, first.solution))
+        cameras = (
+            *first.solution.camera_doubts.notes,
+            *_camera_notes(data.dataset, first.solution),
+        )
         raise type(error)([*cameras, *error.problems]) from error
     return replace(
         estimate,
@@ -547,7 +550,7 @@ def _not_found_again(first: Estimate, again: Estimate) -> list[str]:
         if row not in after and o.used[o.row == row].mean() < MIN_FOUND_AGAIN
     }
     few_found = o.used.sum() < MIN_FOUND_AGAIN * first.solution.outlines.used.sum()
-    cameras = first.solution.camera_notes if few_found else ()
+    cameras = first.solution.camera_doubts.notes if few_found else ()
     return [*cameras, *image_notes(first.fitted.measurements, gone)]
 
 
@@ -685,7 +688,7 @@ def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
     return [
         f"The camera of {view} that does not agree is that of "
         f"{dataset.camera_paths[names.index(view)]}."
-        for view in solution.contradicted_cameras
+        for view in solution.camera_doubts.views
     ]
 
 

@@ -50,7 +50,7 @@ class Posterior:
 
     @property
     def biases(self) -> dict[str, float]:
-        """Common-mode edge biases [px] by name, and logarithms of gammas over those measured with."""
+        """Common-mode edge biases by name [px], and logarithms of gammas over the assumed ones."""
         labels = self.problem.block("biases").labels
         return dict(zip(labels, self.state.biases.tolist(), strict=True))
 

@@ -163,6 +163,33 @@ class GoodnessOfFit:
     redundant_readings: JudgedReadings | None  # None where readings cannot disagree
 
 
+@dataclass(frozen=True, eq=False)
+class CameraDoubts:
+    """The cameras that the measurements contradict."""
+
+    tested: Sequence[WrongIntrinsic]  # whose residuals show one error, the clearest
+    others: Sequence[DoubtedCamera]  # that are moved too far for what their files state
+
+    @classmethod
+    def of(cls, cameras: CameraResiduals, covariance: Array) -> CameraDoubts:
+        """Return the doubts where a fit ended, with the covariance of its kept unknowns."""
+        tested = cameras.contradicted()
+        views = {test.view for test in tested}
+        doubted = doubted_cameras(cameras.problem, cameras.state, covariance)
+        return cls(tested, [camera for camera in doubted if camera.view not in views])
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """The views that stand for these cameras."""
+        views = [one.view for one in self.tested] + [one.view for one in self.others]
+        return tuple(dict.fromkeys(views))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A sentence on each."""
+        return tuple(str(one) for one in (*self.tested, *self.others))
+
+
 @brief
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -186,12 +213,11 @@ class Solution:
     outlines: Outlines  # the table that came in, with what the fit rejected and why
     start: str  # label of the start that led here
     iterations: int  # of the solver, all rounds
+    camera_doubts: CameraDoubts
     posterior: Posterior  # what it predicts of other images; in the order that was fitted
     notes: tuple[str, ...] = ()  # one sentence each
     details: tuple[str, ...] = ()  # how it was found, the same
-    contradicted_cameras: tuple[str, ...] = ()  # views that stand for such cameras
     left_out: tuple[str, ...] = ()  # legs of views most of whose outlines disagree, unconfirmed
-    camera_notes: tuple[str, ...] = ()  # those of the notes that are about these
 
     @property
     def parameters(self) -> KinematicParameters:
@@ -220,7 +246,7 @@ def assemble_solution(
     covariance = named_covariance(problem, state, kept)
     quality = _quality(fit, normal, len(held.basis))
     cameras = CameraResiduals(problem, state, linear)
-    doubts = _CameraDoubts.of(cameras, kept)
+    doubts = CameraDoubts.of(cameras, kept)
     gammas = _gammas(problem, state, kept, outlines)
     scale = scale_notes(problem, state)
     return Solution(
@@ -247,9 +273,8 @@ def assemble_solution(
         start=label,
         iterations=fit.iterations,
         posterior=Posterior(problem, state, fit.edge_biases, fit.noise, kept),
-        contradicted_cameras=doubts.views,
+        camera_doubts=doubts,
         left_out=legs_left_out(problem, fit.accepted),
-        camera_notes=doubts.notes,
         notes=(
             *fit.notes,
             *rejected_notes(problem, fit.accepted),
@@ -295,33 +320,6 @@ def _comparable_cost(problem: FitProblem, state: State) -> float:
     """Return the robust cost of all observations with their claimed covariances."""
     claimed = problem.weighted(NoiseModel())
     return robust_cost(claimed, linearize(claimed, state), claimed.loss)
-
-
-@dataclass(frozen=True, eq=False)
-class _CameraDoubts:
-    """What the measurements contradict of the cameras."""
-
-    tested: list[WrongIntrinsic]
-    others: list[DoubtedCamera]  # that are moved too far for what their files state
-
-    @classmethod
-    def of(cls, cameras: CameraResiduals, covariance: Array) -> _CameraDoubts:
-        """Return the doubts where a fit ended, with the covariance of its kept unknowns."""
-        tested = cameras.contradicted()
-        views = {test.view for test in tested}
-        doubted = doubted_cameras(cameras.problem, cameras.state, covariance)
-        return cls(tested, [camera for camera in doubted if camera.view not in views])
-
-    @property
-    def views(self) -> tuple[str, ...]:
-        """The views that stand for these cameras."""
-        views = [one.view for one in self.tested] + [one.view for one in self.others]
-        return tuple(dict.fromkeys(views))
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """A sentence on each."""
-        return tuple(str(one) for one in (*self.tested, *self.others))
 
 
 def _gammas(
