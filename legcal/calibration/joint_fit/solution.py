@@ -271,7 +271,7 @@ def assemble_solution(
         sensitivities=sensitivities(cameras, normal, doubts.tested),
         outlines=_with_rejections(outlines, fit),
         start=label,
-        iterations=fit.iterations,
+        iterations=fit.minimum.iterations,
         posterior=Posterior(problem, state, fit.edge_biases, fit.noise, kept),
         camera_doubts=doubts,
         left_out=legs_left_out(problem, fit.accepted),
