@@ -21,6 +21,7 @@ from legcal.calibration.result import Calibration, Verdict
 from legcal.data import Corners, Dataset, few_views
 from legcal.perception import far_off
 
+_DO_NOT_LOAD = "Do not load this into the controller"
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
 
 
@@ -61,31 +62,8 @@ def judge(
         change, sigma, found = _change_of_parameters(dataset, solution)
     else:
         change, sigma, found = _change_of_platform(platform)
-    if diagnosis:
-        why = f"{diagnosis[0].sentence} As it is, {found}."
-        verdict = Verdict(False, f"Do not load this into the controller: {why}")
-    elif readings is not None and readings.doubts:
-        verdict = Verdict(
-            False,
-            f"Do not load this into the controller: {found}, but {', and '.join(readings.doubts)}.",
-        )
-    elif solution.left_out:
-        verdict = Verdict(
-            False,
-            f"Do not load this into the controller: {found}, but most outlines of a leg that a "
-            f"view shows disagree with that ({', '.join(solution.left_out)}), so that they are of "
-            "something else or the fit is wrong; look at them in the table of observations, and "
-            "correct them or leave the leg out of the legs of that view.",
-        )
-    elif strayed := _strayed_cameras(dataset, solution):
-        verdict = Verdict(
-            False,
-            f"Do not load this into the controller: {found}, but the fit has {strayed} far from "
-            "the rough T_base_camera near which platform poses were looked for, so that these are "
-            "wrong or it is; measure it again, or take images that show more legs.",
-        )
-    else:
-        verdict = _verdict(change, sigma, found)
+    objection = _objection(dataset, solution, diagnosis, found)
+    verdict = Verdict(False, objection) if objection else _verdict(change, sigma, found)
     return Calibration(
         dataset,
         solution,
@@ -97,6 +75,31 @@ def judge(
         corners,
         tuple(diagnosis),
     )
+
+
+def _objection(
+    dataset: Dataset, solution: Solution, diagnosis: Sequence[Diagnosis], found: str
+) -> str:
+    """Return what speaks against a result, however large its improvement; "" where nothing does."""
+    readings = solution.quality.redundant_readings
+    if diagnosis:
+        return f"{_DO_NOT_LOAD}: {diagnosis[0].sentence} As it is, {found}."
+    if readings is not None and readings.doubts:
+        return f"{_DO_NOT_LOAD}: {found}, but {', and '.join(readings.doubts)}."
+    if solution.left_out:
+        return (
+            f"{_DO_NOT_LOAD}: {found}, but most outlines of a leg that a view shows disagree with "
+            f"that ({', '.join(solution.left_out)}), so that they are of something else or the fit "
+            "is wrong; look at them in the table of observations, and correct them or leave the "
+            "leg out of the legs of that view."
+        )
+    if strayed := _strayed_cameras(dataset, solution):
+        return (
+            f"{_DO_NOT_LOAD}: {found}, but the fit has {strayed} far from the rough T_base_camera "
+            "near which platform poses were looked for, so that these are wrong or it is; measure "
+            "it again, or take images that show more legs."
+        )
+    return ""
 
 
 def _strayed_cameras(dataset: Dataset, solution: Solution) -> str:
@@ -159,6 +162,6 @@ def _verdict(improvement: float, sigma: float, found: str) -> Verdict:
         return Verdict(True, f"Calibrated: {found}.")
     return Verdict(
         False,
-        f"Do not load this into the controller: {found}, and a predicted improvement below two "
-        "sigma is no improvement; take more images or better ones.",
+        f"{_DO_NOT_LOAD}: {found}, and a predicted improvement below two sigma is no improvement; "
+        "take more images or better ones.",
     )
