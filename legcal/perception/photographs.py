@@ -301,13 +301,11 @@ def _with_other_radii(
     return found
 
 
-def recognise_and_place(
-    photographs: Photographs, nominal: Placement, report: Report, joined: Joined = None
-) -> Placement:
+def recognise_and_place(photographs: Photographs, nominal: Placement, report: Report) -> Placement:
     """Recognise the legs in the images, and place the cameras by them."""
     nominal, _ = _with_free_poses(photographs, nominal, {}, photographs.detect, report)
     search, hints = photographs.search(nominal), nominal.T_base_camera
-    return _recognised(photographs, search, photographs.detect, hints, report, joined)
+    return _recognised(photographs, search, photographs.detect, hints, report, None)
 
 
 def _with_free_poses(

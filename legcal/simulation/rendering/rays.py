@@ -27,6 +27,7 @@ _TINY = 1e-12
 NEAR = 1e-4  # [m] in front of the camera
 MARGIN = 2  # [px]
 _SPARE = 0.02  # of the picture, around it
+_PIECES = 12  # of each side of a polygon, which the lens bends
 _SHIFT = 4  # bits of a fraction of a pixel
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
@@ -347,9 +348,9 @@ def _cut(polygon: Array, low: Array, high: Array) -> Array:
     return polygon
 
 
-def _dense(polygon: Array, pieces: int = 12) -> Array:
+def _dense(polygon: Array) -> Array:
     """Return more points along the sides of a polygon: the lens bends them."""
-    t = np.arange(pieces)[:, None] / pieces
+    t = np.arange(_PIECES)[:, None] / _PIECES
     side = np.roll(polygon, -1, axis=0) - polygon
     return np.asarray((polygon[:, None] + t * side[:, None]).reshape(-1, 2))
 
