@@ -88,6 +88,7 @@ from legcal.perception import (
     given_outlines,
     hint_notes,
     is_measurable,
+    measure_in_brief,
     measure_photographs,
     nominal_placement,
     place_and_measure,
@@ -320,7 +321,9 @@ def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimat
         )
     # 2. Recognise, and measure the outlines.
     T_board_camera = None if board is None else board.T_board_camera
-    seen = place_and_measure(photographs, placement, data.progress, T_board_camera, together=False)
+    seen = place_and_measure(
+        photographs, placement, data.progress, T_board_camera, method=measure_in_brief
+    )
     seen.placement.require_one()
     other_radii = bool(seen.placement.radii.factor)
     if other_radii:

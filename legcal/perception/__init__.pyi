@@ -50,6 +50,7 @@ from .outline import OutlineLine as OutlineLine
 from .outline import PartLines as PartLines
 from .outline import find_parts as find_parts
 from .outline import measure as measure
+from .outline import measure_in_brief as measure_in_brief
 from .outline import outline_table as outline_table
 from .outline import used_as_before as used_as_before
 from .overlays import Mark as Mark

@@ -28,8 +28,7 @@ def measure_outlines(
     placement: Placement,
     rows: Sequence[int],
     *,
-    together: bool = True,
-    method: Method | None = None,
+    method: Method = measure,
     run: Run = in_turn,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[Outlines, Array]:
@@ -37,12 +36,10 @@ def measure_outlines(
 
     Two outlines for each part of each leg that is looked for, by row; what was not found or cannot
     be trusted is rejected with the reason. And the blur (n_rows,) of all images [px], NaN where
-    none was measured. ``together`` is as for :func:`legcal.perception.outline.measure`, which
-    another method may replace; ``progress`` is called with each row that has been searched.
+    none was measured. ``progress`` is called with each row that has been searched.
     """
     if placement.window is not None:
         rows = [row for row in rows if not np.isnan(placement.window[row]).all()]
-    method = partial(measure, together=together) if method is None else method
     search = replace(search, edge_pairs={})  # of no use to worker processes
     blur, tables = np.full(search.measurements.n_rows, np.nan), []
     task = partial(_of_image, search, placement, method)

@@ -93,8 +93,7 @@ class PartLines(NamedTuple):
 def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, float]:
     """Find, measure and judge the outlines of all parts in one image; return its blur too [px].
 
-    Two outlines for every part of every leg that is looked for, found or not. Unless all blocks of
-    an outline are fitted together, lines are good to a few hundredths of a pixel, in half the time.
+    Two outlines for every part of every leg that is looked for, found or not.
     """
     parts, found = find_parts(search)
     blur = math.nan
@@ -112,6 +111,11 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
             of_leg = near and part.leg.leg < search.n_legs
             found.append(_with_verdict(part, (one, two), near_fit=of_leg))
     return outline_table(search, found), blur
+
+
+def measure_in_brief(search: ImageSearch) -> tuple[Outlines, float]:
+    """Do the same in half the time, to a few hundredths of a pixel: blocks are fitted alone."""
+    return measure(search, together=False)
 
 
 class _Predicted(NamedTuple):

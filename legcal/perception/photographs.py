@@ -38,7 +38,7 @@ from legcal.perception.diagnostics import (
 )
 from legcal.perception.free_poses import ROUNDS, find_free_poses
 from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
-from legcal.perception.outline import WRONG_WIDTH, Method
+from legcal.perception.outline import WRONG_WIDTH, Method, measure, measure_in_brief
 from legcal.perception.placement import (
     NEAR_FIT_PX,
     Joined,
@@ -191,12 +191,11 @@ def place_and_measure(
     report: Report,
     joined: Joined = None,
     *,
-    together: bool = True,
+    method: Method = measure,
 ) -> MeasuredImages:
     """Place the cameras, measure the outlines, and leave out the images that are wrong.
 
-    ``joined`` are T_board_camera of views that show a calibration board, which are placed together;
-    ``together`` is as for :func:`legcal.perception.outline.measure`.
+    ``joined`` are T_board_camera of views that show a calibration board, which are placed together.
     """
     defects, pairs, rough = _inspect_images(photographs, nominal, report, joined)
     photographs.edge_pairs.update(pairs)
@@ -213,11 +212,11 @@ def place_and_measure(
     search = photographs.search(nominal, pairs, rough)
     recognised = partial(_recognised, photographs, search, usable, hints, report, joined)
     placement = recognised()
-    outlines, blur = _measured(photographs, search, placement, report, together=together)
+    outlines, blur = _measured(photographs, search, placement, report, method=method)
     at_nominal = _Measured(photographs, search, placement, outlines, blur)
     measured = at_nominal
     if not free_poses:  # which would follow wrong radii, and these wrong poses
-        measured = _with_other_radii(at_nominal, recognised, report, together=together)
+        measured = _with_other_radii(at_nominal, recognised, report, method=method)
     photographs, search, outlines = measured.photographs, measured.search, measured.outlines
     groups = group_views(photographs.measurements, usable, hints, joined)
     is_own = np.isin(outlines.row, usable)
@@ -227,7 +226,7 @@ def place_and_measure(
         groups,
         measured.placement,
         own,
-        together=together,
+        method=method,
         run=photographs.run,
         progress=_counted(report, "Looking for missing legs", len(usable)),
     )
@@ -265,7 +264,7 @@ def _with_other_radii(
     recognised: Callable[[Collection[LegRadius]], Placement],
     report: Report,
     *,
-    together: bool,
+    method: Method,
 ) -> _Measured:
     """Return what is measured with other radii of parts that were not found, if it is more.
 
@@ -283,7 +282,7 @@ def _with_other_radii(
         search = replace(found.search, cylinders=photographs.cylinders)
         stage = f"{MEASURING} with other radii"
         outlines, blur = _measured(
-            photographs, search, placement, report, together=together, stage=stage
+            photographs, search, placement, report, method=method, stage=stage
         )
         found = replace(found, blur=np.where(np.isnan(blur), found.blur, blur))
         shown = _images_with_more(machine.legs, radii, m.view, found.outlines, outlines)
@@ -380,7 +379,7 @@ def _decided_by_outlines(
             there = {pose: every[n] for pose, every in choices.items() if len(every) > n}
             search = photographs.search(_at_poses(photographs, nominal, there))
             shown = placement.shifted(search, placement.shift)
-            outlines, _ = _measured(photographs, search, shown, report, together=False)
+            outlines, _ = _measured(photographs, search, shown, report, method=measure_in_brief)
             pose = photographs.measurements.pose[outlines.row[outlines.used]]
             for own in there:
                 n_used = int(np.sum(pose == own))
@@ -402,18 +401,12 @@ def measure_photographs(
     placement: Placement,
     report: Report,
     *,
-    together: bool = True,
-    method: Method | None = None,
+    method: Method = measure,
     stage: str = MEASURING,
 ) -> Outlines:
-    """Return all outlines: those measured near a placement, and those kept.
-
-    ``together`` and ``method`` are as for :func:`legcal.perception.detection.measure_outlines`.
-    """
+    """Return all outlines: those measured near a placement, and those kept."""
     search = photographs.search(placement)
-    return _measured(
-        photographs, search, placement, report, together=together, method=method, stage=stage
-    )[0]
+    return _measured(photographs, search, placement, report, method=method, stage=stage)[0]
 
 
 def with_measured_radii(
@@ -472,8 +465,7 @@ def _measured(
     placement: Placement,
     report: Report,
     *,
-    together: bool,
-    method: Method | None = None,
+    method: Method,
     stage: str = MEASURING,
 ) -> tuple[Outlines, Array]:
     """Return all outlines, measured and kept, and the blur of each row [px]."""
@@ -482,7 +474,6 @@ def _measured(
         search,
         placement,
         rows,
-        together=together,
         method=method,
         run=photographs.run,
         progress=_counted(report, stage, len(photographs.detect)),
