@@ -20,6 +20,7 @@ from legcal.brief import brief
 from legcal.calibration.detection import Detection
 from legcal.calibration.diagnosis.diagnosis import MIN_IMAGES, Diagnosis, diagnose, notes_beside
 from legcal.calibration.documents import DiagnosisBlock
+from legcal.calibration.estimate import unseen_legs
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit import Choices
 from legcal.calibration.ordered_dataset import (
@@ -28,7 +29,7 @@ from legcal.calibration.ordered_dataset import (
     order_dataset,
 )
 from legcal.calibration.outline_detection import detected
-from legcal.calibration.pipeline import chosen_parameters, exact_cameras, unseen_legs
+from legcal.calibration.pipeline import chosen_parameters, exact_cameras
 from legcal.data import (
     GOOD_QUALITY,
     Dataset,

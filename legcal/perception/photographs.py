@@ -164,6 +164,12 @@ class MeasuredImages:
     # T_base_platform of every pose that images show, where the readings do not give it
     free_poses: Mapping[int, RigidTransform] = field(default_factory=dict)
 
+    def kept(self, rows: IntArray) -> IntArray:
+        """Return those of some images that were not left out, and whose views were placed."""
+        view, cameras = self.photographs.measurements.view, self.placement.T_base_camera
+        is_kept = [r not in self.left_out and cameras[view[r]] is not None for r in rows.tolist()]
+        return rows[np.array(is_kept, dtype=np.bool_)]
+
 
 def given_outlines(photographs: Photographs) -> Outlines:
     """Return the outlines that are used as they are; edited ones win."""
