@@ -7,7 +7,7 @@
 4. Joint fit of all parameters, started from the nominal model and from the steps.
 5. Measure again: all photographs are searched close to that fit and measured with all care, so
    that nothing depends on where the search began, and 3 and 4 are repeated. Where outlines show
-   the gamma of a camera that is not given, this is done again, up to ``MAX_GAMMA_ROUNDS`` times.
+   the gamma of a camera that is not given, this is done again with others, up to four times.
 6. Judge what the platform gains, and write the result.
 
 Where a dataset has a table of axes in place of images, 2 and 5 have nothing to do. Held-out images
