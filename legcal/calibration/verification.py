@@ -208,8 +208,8 @@ def check(
     tested = _compare(dataset, earlier, solution, prior, significance)
     wrong = (one.sentence for one in found.diagnosis)
     on_images = (*found.image_notes, *found.fit_notes)
-    told = notes_beside(found.diagnosis, on_images, "legcal calibrate --check")
-    notes = (*wrong, *dataset.notes, *told, *solution.notes)
+    of_images = notes_beside(found.diagnosis, on_images, "legcal calibrate --check")
+    notes = (*wrong, *dataset.notes, *of_images, *solution.notes)
     return replace(tested, notes=tuple(dict.fromkeys(notes)))
 
 

@@ -129,7 +129,7 @@ class Machine:
 
     @property
     def at_zero(self) -> str:
-        """What is said of its joints A after their name: where they are told, if they move."""
+        """Words after "joints A": the reading at which their coordinates hold, if they move."""
         return AT_ZERO if self.actuators else ""
 
     @cached_property

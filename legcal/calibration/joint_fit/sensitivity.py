@@ -180,7 +180,7 @@ class WrongIntrinsic:
     """Intrinsics of a camera that the measurements contradict, which its file says."""
 
     units: ClassVar[tuple[tuple[Mapping[str, float], Mapping[str, float]], ...]]  # relative, added
-    keys: ClassVar[tuple[str, ...]]  # what is told of each of these
+    keys: ClassVar[tuple[str, ...]]  # the intrinsics that these are
 
     view: str  # the first one by name if several have the camera
     given: Array  # (u,) in the camera file
