@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -580,15 +580,23 @@ def _mirrored(leg: Leg) -> Leg:
 
 def _of_radii(given: Assumed) -> Iterator[Mistake]:
     """Yield diameters in place of radii, and tubes in place of rods."""
-    radii = sorted({c.radius for leg in given.machine.legs for c in leg.cylinders})
+    legs = given.machine.legs
+    radii = sorted({c.radius for leg in legs for c in leg.cylinders})
     kinds = [r for i, r in enumerate(radii) if i == 0 or r > (1.0 + _SAME_RADIUS) * radii[i - 1]]
+    factors = (0.5, "twice as large as they are"), (2.0, "half of what they are")
 
-    def scaled(factor: float, only: float | None, radius: float) -> float:
-        is_own = only is None or abs(radius - only) <= _SAME_RADIUS * radius
-        return factor * radius if is_own else radius
+    def of_one_kind(factor: float, only: float | None) -> Assumed:
+        def scaled(leg: Leg, radius: float) -> float:
+            is_own = only is None or abs(radius - only) <= _SAME_RADIUS * radius
+            return factor * radius if is_own else radius
+
+        return _with_radii(given, scaled)
+
+    def of_one_leg(factor: float, own: Leg) -> Assumed:
+        return _with_radii(given, lambda leg, r: factor * r if leg is own else r)
 
     which = [(None, "the radii"), *((r, f"the radius {1e3 * r:g} mm") for r in kinds[:2])]
-    for factor, what in ((0.5, "twice as large as they are"), (2.0, "half of what they are")):
+    for factor, what in factors:
         for only, name in which[: 1 if len(kinds) < 2 else None]:
             end = what if only is None else what.replace("they are", "it is")
             yield Mistake(
@@ -597,35 +605,33 @@ def _of_radii(given: Assumed) -> Iterator[Mistake]:
                 f"{'diameter in place of a radius' if factor < 1.0 else 'radius halved twice'}",
                 f"with {name} {_scaled_by(factor)}",
                 "correct the <visual> cylinders of the model",
-                replace(given, machine=_with_radii(given.machine, partial(scaled, factor, only))),
+                of_one_kind(factor, only),
             )
-    for j, leg in enumerate(given.machine.legs):
-        for factor, what in ((0.5, "twice as large as they are"), (2.0, "half of what they are")):
-            cylinders = [list(one.cylinders) for one in given.machine.legs]
-            cylinders[j] = [replace(c, radius=factor * c.radius) for c in leg.cylinders]
-            if leg.cylinders:
-                yield Mistake(
-                    "diameter for radius",
-                    f"the radii of leg {leg.name} in the model look {what}",
-                    f"with the radii {_scaled_by(factor)}",
-                    "correct its <visual> cylinders in the model",
-                    replace(given, machine=given.machine.with_cylinders(cylinders)),
-                    is_small=True,
-                )
-    cylinders = [list(one.cylinders) for one in given.machine.legs]
-    pairs: dict[str, None] = {}  # of radii: those of legs with two
-    for own in cylinders:
-        if len(of_leg := sorted({c.radius for c in own})) == 2:
-            thin, thick = of_leg
-            own[:] = [replace(c, radius=thick if c.radius == thin else thin) for c in own]
-            pairs[f"{1e3 * thin:g} and {1e3 * thick:g} mm"] = None
+    for own in legs:
+        for factor, what in factors if own.cylinders else ():
+            yield Mistake(
+                "diameter for radius",
+                f"the radii of leg {own.name} in the model look {what}",
+                f"with the radii {_scaled_by(factor)}",
+                "correct its <visual> cylinders in the model",
+                of_one_leg(factor, own),
+                is_small=True,
+            )
+    pairs = {leg.name: both for leg in legs if len(both := {c.radius for c in leg.cylinders}) == 2}
+
+    def other(leg: Leg, radius: float) -> float:
+        return next(iter(pairs.get(leg.name, {radius}) - {radius}), radius)
+
     if pairs:
+        every = dict.fromkeys(
+            f"{1e3 * min(both):g} and {1e3 * max(both):g} mm" for both in pairs.values()
+        )
         yield Mistake(
             "tube and rod exchanged",
-            f"the radii of tube and rod look exchanged ({', '.join(pairs)})",
+            f"the radii of tube and rod look exchanged ({', '.join(every)})",
             "with the radii exchanged",
             "exchange the radii in the <visual> cylinders of the model",
-            replace(given, machine=given.machine.with_cylinders(cylinders)),
+            _with_radii(given, other),
         )
 
 
@@ -633,11 +639,13 @@ def _scaled_by(factor: float) -> str:
     return "halved" if factor < 1.0 else "doubled"
 
 
-def _with_radii(machine: Machine, radius: Callable[[float], float]) -> Machine:
-    """Return a machine with other radii of its visible cylinders."""
-    return machine.with_cylinders(
-        [[replace(c, radius=radius(c.radius)) for c in leg.cylinders] for leg in machine.legs]
-    )
+def _with_radii(given: Assumed, radius: Callable[[Leg, float], float]) -> Assumed:
+    """Return what is true with other radii of visible cylinders, by leg and radius."""
+    cylinders = [
+        [replace(c, radius=radius(leg, c.radius)) for c in leg.cylinders]
+        for leg in given.machine.legs
+    ]
+    return replace(given, machine=given.machine.with_cylinders(cylinders))
 
 
 def _of_cameras(given: Assumed) -> Iterator[Mistake]:
