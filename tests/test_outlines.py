@@ -513,8 +513,8 @@ def test_an_edge_where_other_legs_predict_it_needs_no_partner(beside: float, use
 def test_a_width_that_most_outlines_of_a_cylinder_share_speaks_against_none_of_them() -> None:
     photographs, _, fitted = six_photographs()
     true = [leg.cylinders for leg in photographs.machine.legs]
-    wrong = [[replace(one, radius=0.87 * one.radius) for one in cylinders] for cylinders in true]
-    biased = replace(photographs, machine=photographs.machine.with_cylinders(wrong))
+    wrong = photographs.machine.with_radii(lambda _, c: 0.87 * c.radius)
+    biased = replace(photographs, machine=wrong)
     before = measure_photographs(biased, fitted, no_progress)
     other = with_measured_radii(biased, fitted, before)
     assert other is not None

@@ -19,7 +19,7 @@ from legcal.data import Dataset
 from legcal.errors import UsageError
 from legcal.files import RESULT, in_the_way, path_problem, read_json
 from legcal.geometry import components
-from legcal.machine import ends_in_base, measured_readings
+from legcal.machine import ends_in_base, measured_readings, with_radii
 from legcal.perception import placed_arms
 from legcal.progress import Report
 from legcal.workers import Run
@@ -82,9 +82,9 @@ def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
     poses = components(solution.T_Rb_Re)
     q = measured_readings(solution.legs, *poses, measurements.q_of_poses)
     A, B = ends_in_base(solution.legs, machine.T_base_Rb, *poses, q)
-    cylinders = tuple(
-        tuple(replace(c, radius=solution.radii.get((j, c.link), c.radius)) for c in leg.cylinders)
-        for j, leg in enumerate(machine.legs)
+    cylinders = with_radii(
+        [leg.cylinders for leg in machine.legs],
+        lambda j, c: solution.radii.get((j, c.link), c.radius),
     )
     return Detection(
         dataset=dataset,

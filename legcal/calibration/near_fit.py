@@ -116,15 +116,15 @@ def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
 
     Cylinders of a leg that were equally thick stay so: they look like one.
     """
-    cylinders = []
-    for j, leg in enumerate(machine.legs):
-        fitted = {
+    fitted = [
+        {
             c.radius: solution.radii[j, c.link]
             for c in leg.cylinders
             if (j, c.link) in solution.radii
         }
-        cylinders.append([replace(c, radius=fitted.get(c.radius, c.radius)) for c in leg.cylinders])
-    return machine.with_cylinders(cylinders)
+        for j, leg in enumerate(machine.legs)
+    ]
+    return machine.with_radii(lambda j, c: fitted[j].get(c.radius, c.radius))
 
 
 def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredImages) -> Placement:

@@ -88,6 +88,7 @@ from .leg import parameters_of_legs as parameters_of_legs
 from .leg import point_like_legs as point_like_legs
 from .leg import radius_name as radius_name
 from .leg import with_platform_points as with_platform_points
+from .leg import with_radii as with_radii
 from .loader import load_mechanism as load_mechanism
 from .mobility import leg_scale as leg_scale
 from .mobility import singularities as singularities

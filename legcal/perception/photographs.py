@@ -283,8 +283,8 @@ def _with_other_radii(
         radii = placement.radii
         if not radii.factor:
             break
-        cylinders = radii.corrected(found.search.cylinders)
-        photographs = replace(found.photographs, machine=machine.with_cylinders(cylinders))
+        other = machine.with_radii(radii.corrected)
+        photographs = replace(found.photographs, machine=other)
         search = replace(found.search, cylinders=photographs.cylinders)
         stage = f"{MEASURING} with other radii"
         outlines, blur = _measured(
@@ -430,10 +430,8 @@ def with_measured_radii(
     places = {
         v: T.inv() for v, T in enumerate(placement.T_base_camera) if T is not None
     }  # of the base before the cameras
-    part, changed = np.array(outlines.part), False
-    cylinders = []
+    part, found = np.array(outlines.part), dict[tuple[int, float], float]()
     for j, leg in enumerate(machine.legs):
-        radii = {}
         for cylinder in leg.cylinders:
             own = np.flatnonzero(judged & (outlines.leg == j) & (part == cylinder.link))
             if 2 * np.count_nonzero(wrong[own]) <= len(own):
@@ -443,10 +441,11 @@ def with_measured_radii(
             distance = np.sum(outlines.h[own] * A, axis=1) * np.array(EPSILON)[edge - 1]
             of_edges = [np.median(distance[edge == e]) for e in np.unique(edge)]
             if len(of_edges) == len(EPSILON):
-                radii[cylinder.radius] = float(np.mean(of_edges))
-        changed = changed or bool(radii)
-        cylinders.append([replace(c, radius=radii.get(c.radius, c.radius)) for c in leg.cylinders])
-    return replace(photographs, machine=machine.with_cylinders(cylinders)) if changed else None
+                found[j, cylinder.radius] = float(np.mean(of_edges))
+    if not found:
+        return None
+    other = machine.with_radii(lambda j, c: found.get((j, c.radius), c.radius))
+    return replace(photographs, machine=other)
 
 
 def _recognised(

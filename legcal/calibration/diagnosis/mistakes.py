@@ -641,11 +641,10 @@ def _scaled_by(factor: float) -> str:
 
 def _with_radii(given: Assumed, radius: Callable[[Leg, float], float]) -> Assumed:
     """Return what is true with other radii of visible cylinders, by leg and radius."""
-    cylinders = [
-        [replace(c, radius=radius(leg, c.radius)) for c in leg.cylinders]
-        for leg in given.machine.legs
-    ]
-    return replace(given, machine=given.machine.with_cylinders(cylinders))
+    machine = given.machine
+    return replace(
+        given, machine=machine.with_radii(lambda j, c: radius(machine.legs[j], c.radius))
+    )
 
 
 def _of_cameras(given: Assumed) -> Iterator[Mistake]:
