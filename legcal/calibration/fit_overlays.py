@@ -92,7 +92,7 @@ def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
         A_base=A[measurements.pose],
         B_base=B[measurements.pose],
         cylinders=cylinders,
-        T_base_camera=tuple(machine.T_base_Rb * T.inv() for T in solution.T_camera_Rb),
+        T_base_camera=solution.cameras_in_base(machine.T_base_Rb),
         rows=np.array(_rows_with_image(dataset), dtype=np.intp),
         unplaced={},
         image_notes=(),

@@ -135,8 +135,10 @@ def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredIm
     A, B = ends_in_base(solution.legs, T_base_Rb, *poses, q)
     pose = data.measurements.pose
     cameras = tuple(
-        None if known is None else T_base_Rb * T.inv()
-        for known, T in zip(seen.placement.T_base_camera, solution.T_camera_Rb, strict=True)
+        None if known is None else T
+        for known, T in zip(
+            seen.placement.T_base_camera, solution.cameras_in_base(T_base_Rb), strict=True
+        )
     )
     arms = placed_arms(solution.legs, q, pose, T_base=T_base_Rb, radii=solution.radii)
     return Placement.of_fit(A[pose], B[pose], cameras, seen.blur, arms)

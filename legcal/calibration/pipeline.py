@@ -358,8 +358,8 @@ def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
     shown = set(fitted.measurements.view[o.row[o.used]].tolist())
     views = fitted.measurements.views
     cameras = [
-        fitted.machine.T_base_Rb * T.inv() if v in shown else None
-        for v, T in enumerate(estimate.solution.T_camera_Rb)
+        T if v in shown else None
+        for v, T in enumerate(estimate.solution.cameras_in_base(fitted.machine.T_base_Rb))
     ]
     hints = hint_notes([view.name for view in views], [v.T_base_camera for v in views], cameras)
     return (*hints, *image_notes(fitted.measurements, estimate.outliers))

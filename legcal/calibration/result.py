@@ -148,7 +148,7 @@ def _result_of(calibration: Calibration) -> Result:
     if corners is not None:
         rows = np.concatenate([rows, corners.row[corners.used]])
     shown = np.unique(measurements.view[rows]).tolist()
-    T_base_Rb = machine.T_base_Rb
+    cameras = solution.cameras_in_base(machine.T_base_Rb)
     parameters = _parameters(calibration)
     kinematic = Kinematic(
         names=list(solution.kinematic.parametrization.names),
@@ -182,12 +182,7 @@ def _result_of(calibration: Calibration) -> Result:
             for weak in solution.estimates.weak
         ],
         held=list(solution.kinematic.held),
-        views={
-            views[v].name: ViewPose(
-                T_base_camera=Pose.of(T_base_Rb * solution.T_camera_Rb[v].inv())
-            )
-            for v in shown
-        },
+        views={views[v].name: ViewPose(T_base_camera=Pose.of(cameras[v])) for v in shown},
         cameras={v.name: camera_numbers(v.camera) for v in views if v.name in set(owners)},
         gammas=[
             Gamma(views=list(one.views), gamma=one.gamma, sigma=one.gamma * one.sigma)

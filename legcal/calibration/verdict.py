@@ -106,7 +106,7 @@ def _strayed_cameras(dataset: Dataset, solution: Solution) -> str:
     """Return the views whose cameras left the rough poses by which platforms were found, or ""."""
     if dataset.machine.is_determined:
         return ""
-    cameras = [dataset.machine.T_base_Rb * T.inv() for T in solution.T_camera_Rb]
+    cameras = solution.cameras_in_base(dataset.machine.T_base_Rb)
     views = zip(dataset.measurements.views, cameras, strict=True)
     strayed = [
         view.name

@@ -224,6 +224,10 @@ class Solution:
         """Joint centres, and offsets or constant lengths [m]."""
         return parameters_of_legs(self.legs)
 
+    def cameras_in_base(self, T_base_Rb: RigidTransform) -> tuple[RigidTransform, ...]:
+        """Return T_base_camera of every view, R_b laid where the nominal model has it."""
+        return tuple(T_base_Rb * T.inv() for T in self.T_camera_Rb)
+
 
 def assemble_solution(
     fit: Fit,
