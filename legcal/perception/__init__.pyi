@@ -77,4 +77,5 @@ from .placement import Placement as Placement
 from .placement import Search as Search
 from .placement import group_views as group_views
 from .placement import placed_arms as placed_arms
+from .placement import predict_legs_and_arms as predict_legs_and_arms
 from .placement import unplaced_notes as unplaced_notes

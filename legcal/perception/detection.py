@@ -16,8 +16,8 @@ from legcal.perception.outline import (
     measure,
     outline_table,
 )
-from legcal.perception.placement import Placement, Search
-from legcal.vision import PredictedLeg, predict_legs
+from legcal.perception.placement import Placement, Search, predict_legs_and_arms
+from legcal.vision import PredictedLeg
 from legcal.workers import Run, in_turn
 
 NOT_PLACED = "the camera of its view could not be placed"  # a reason
@@ -63,12 +63,8 @@ def _of_image(
     predicted: list[PredictedLeg] = []
     arms = placement.arms
     if T is not None:
-        A, B = (
-            np.concatenate([ends[row], *(arm.ends[row, k : k + 1] for arm in arms.values())])
-            for k, ends in enumerate((placement.A_base, placement.B_base))
-        )
-        cylinders = [*search.cylinders, *([arm.cylinder] for arm in arms.values())]
-        predicted = predict_legs(camera, T, A, B, cylinders, row)
+        ends = placement.A_base, placement.B_base
+        predicted = predict_legs_and_arms(camera, T, ends, search.cylinders, arms, row)
     window = np.concatenate([window, window[list(arms)]])
     if placement.window is None:
         error = np.broadcast_to(placement.joint_error, search.wanted.shape)[view]
