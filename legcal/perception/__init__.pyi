@@ -39,7 +39,6 @@ from .free_poses import require_standing_joints as require_standing_joints
 from .image_quality import Exposure as Exposure
 from .image_quality import measure_exposure as measure_exposure
 from .outline import HIDDEN as HIDDEN
-from .outline import MIN_LENGTH as MIN_LENGTH
 from .outline import MIN_LONE_KEPT as MIN_LONE_KEPT
 from .outline import OUTSIDE as OUTSIDE
 from .outline import WRONG_WIDTH as WRONG_WIDTH
