@@ -73,8 +73,8 @@ class PredictedNoise:
 
     sigma_px: float = 0.35
     correlation: float = 0.0
-    common_px: tuple[float, ...] = (0.05, 0.005, 0.03, 0.01, 0.017, 0.007)
-    places_px: tuple[float, ...] = (0.037, 0.016)
+    common_px: tuple[float, ...] = (0.038, 0.005, 0.03, 0.013, 0.017, 0.006)
+    places_px: tuple[float, ...] = (0.05, 0.019)
     gamma_px: float = 0.1
     source: str = "what photographs of simulated machines show"
 
