@@ -1,7 +1,7 @@
 """Rays of a camera's pixels, and where they meet solids: depths, faces, normals and prints."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -92,9 +92,17 @@ def _undistorted(camera: Camera) -> tuple[Single, Single]:
 
 
 @lru_cache(maxsize=4)
-def pixel_rays(camera: Camera) -> PixelRays:
-    """Return the rays of a camera, the same ones for all of its images."""
-    return PixelRays(camera)
+def pixel_rays(camera: Camera, fineness: int = 1) -> PixelRays:
+    """Return the rays of the parts of a camera's pixels, the same ones for all of its images."""
+    return PixelRays(camera if fineness == 1 else divided(camera, fineness))
+
+
+def divided(camera: Camera, fineness: int) -> Camera:
+    """Return a camera whose pixels are parts of those of another, so many in each row of one."""
+    K = camera.K * [[fineness], [fineness], [1.0]]
+    K[:2, 2] += 0.5 * (fineness - 1)
+    width, height = fineness * camera.width, fineness * camera.height
+    return replace(camera, K=K, width=width, height=height)
 
 
 @lru_cache(maxsize=4)
