@@ -87,12 +87,11 @@ def measure_edges(
         blocks.fit(tried, LAST_ROUNDS)
         if not together:
             break
-        depth = depth_for_blur(tried)
         if near_fit:
             blocks.unmove()
-            depth = blocks.narrow(tried)
+            blocks.narrow(tried)
         kept = blocks.kept()
-        joint = fit_pooled(blocks, kept, tried, depth)
+        joint = fit_pooled(blocks, kept, tried, depth_for_blur(tried))
         blur = joint.blur
         if abs(np.log(blur / tried)) < BLUR_CONVERGED:
             break
