@@ -93,7 +93,7 @@ def draw(width: float, lens: str, rng: np.random.Generator) -> tuple[Grey, Camer
     angle, aside = rng.uniform(0.0, np.pi), rng.uniform(-3.0, 3.0)
     along = np.array([np.cos(angle), np.sin(angle)])
     normal = np.array([-along[1], along[0]])
-    reach = np.arange(-800, 801) * STEP
+    reach = STEP * np.arange(-800.0, 801.0)
     spread = [LENSES[lens](reach)]
     # A pixel's area, seen along the rod, is a box for each of its sides.
     spread += [np.ones(2 * int(0.5 * side / STEP) + 1) for side in np.abs(along)]
