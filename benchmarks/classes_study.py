@@ -177,7 +177,7 @@ def errors_of_fit(
     design: Design, session: OutlineSession, solution: Solution, noise: Noise
 ) -> Record:
     """Return rank, normalised squared errors (stated, and by the bound), and errors over sigmas."""
-    parametrization, n_held = design.parametrization, len(solution.held_basis)
+    parametrization, n_held = design.parametrization, len(solution.kinematic.held_basis)
     there = standing_where_held(design, session, solution)
     best = (_same_bound if n_held == 0 else at_best)(
         there, noise.sigma_q, noise.radius_sigma, n_held
@@ -189,7 +189,7 @@ def errors_of_fit(
     )
     from_truth = vector_of(parametrization, solution.legs, true)
     errors = dict(zip(parametrization.names, (values - true_values).tolist(), strict=True))
-    sigma = dict(zip(solution.names, solution.sigma.tolist(), strict=True))
+    sigma = dict(zip(solution.estimates.names, solution.estimates.sigma.tolist(), strict=True))
     return {
         "rank": stated.rank,
         "nse": stated.nse(values - true_values),
@@ -207,7 +207,7 @@ def standing_where_held(design: Design, session: OutlineSession, solution: Solut
     It is fitted to the exact outlines and readings, from the solution: without noise nothing is
     left of what is determined, and what is open stays.
     """
-    if not solution.held:
+    if not solution.kinematic.held:
         return design
     true = design.legs
     radii = (radius_name(true.names[leg], part) for leg, part in solution.radii)
@@ -219,7 +219,7 @@ def standing_where_held(design: Design, session: OutlineSession, solution: Solut
         Start(solution.legs, solution.T_camera_Rb, solution.T_Rb_Re, "found"),
         choices=Choices(free=free),
     )
-    if exact.cost > _EXACT or len(exact.held) != len(solution.held):
+    if exact.quality.cost > _EXACT or len(exact.kinematic.held) != len(solution.kinematic.held):
         raise DidNotConverge(
             "The errors of a fit could not be judged: found no machine that stands where it holds "
             "what is open and shows the same as the true one, needed one; this is a mistake in "
@@ -237,11 +237,9 @@ def standing_where_held(design: Design, session: OutlineSession, solution: Solut
 
 def as_stated(design: Design, solution: Solution) -> Determined:
     """Return what a fit says of the errors of its values; axes as angles from the nominal ones."""
-    known = solution.parametrization.names  # twists too, which are fixed
-    place, unit = [known.index(name) for name in design.parametrization.names], unit_of(design)
-    tied = tied_directions(design)
-    parts = across(np.concatenate([solution.held_basis[:, place] / unit, tied])) / unit
-    covariance = solution.value_covariance[np.ix_(place, place)]
+    covariance, held = solution.kinematic.of_values(design.parametrization.names)
+    unit, tied = unit_of(design), tied_directions(design)
+    parts = across(np.concatenate([held / unit, tied])) / unit
     return Determined(parts, np.asarray(parts @ covariance @ parts.T))
 
 

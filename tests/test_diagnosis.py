@@ -121,9 +121,7 @@ def _left_handed(d: Dataset) -> Dataset:
 
 
 def _thick(d: Dataset) -> Dataset:
-    cylinders = [[replace(c, radius=2.0 * c.radius) for c in leg.cylinders]
-                 for leg in d.machine.legs]  # fmt: skip
-    return replace(d, machine=d.machine.with_cylinders(cylinders))
+    return replace(d, machine=d.machine.with_radii(lambda _, c: 2.0 * c.radius))
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data import Measurements, Outlines
 from legcal.geometry import Array, IntArray
-from legcal.machine import Cylinder
+from legcal.machine import Cylinder, with_radii
 from legcal.perception.camera_search import (
     START_PICTURES,
     PoseCandidates,
@@ -256,7 +256,7 @@ def _by_other_radii(
     for _ in range(MAX_ITERATIONS):
         if not step.factor:
             break
-        views = views.by_cylinders(radii.corrected(given)).placed_again(run)
+        views = views.by_cylinders(with_radii(given, radii.corrected)).placed_again(run)
         few = views.for_radii()
         step = radii.of_the_same(estimate_radii(few, CONVERGED, alone=not radii.common))
         radii = radii.then(step)
@@ -269,12 +269,14 @@ def _first_radii(views: PlacedViews, run: Run) -> RadiusFactors:
     """Return the radii that the images contradict, as far as the views can be placed."""
     if any(one.is_convincing for one in views.placed):
         return estimate_radii(views.for_radii())
+
+    def scaled(factor: float) -> PlacedViews:
+        cylinders = with_radii(views.search.cylinders, lambda _, c: factor * c.radius)
+        return views.by_cylinders(cylinders)
+
     others = views
     for factor in SCALED:
-        scaled = views.by_cylinders(
-            [[replace(c, radius=factor * c.radius) for c in leg] for leg in views.search.cylinders]
-        )
-        others = scaled.placed_anywhere(range(len(views.groups)), run)
+        others = scaled(factor).placed_anywhere(range(len(views.groups)), run)
         if any(one.is_clear for one in others.placed):
             break
     return estimate_radii(replace(views, placed=others.placed).for_radii())

@@ -392,9 +392,9 @@ def doubted_cameras(
         T = whitening[np.ix_(rows, rows)] / sigma
         moved, left = values[own] - prior.mean[rows], covariance[np.ix_(own, own)]
         share, vector = np.linalg.eigh(np.eye(len(rows)) - T @ left @ T.T)
-        told = share > _MIN_SHARE
-        squared = float(np.sum((vector[:, told].T @ T @ moved) ** 2 / share[told]))
-        if squared <= chdtri(max(int(told.sum()), 1), 2.0 * ndtr(-_SIGNIFICANT)):
+        tested = share > _MIN_SHARE
+        squared = float(np.sum((vector[:, tested].T @ T @ moved) ** 2 / share[tested]))
+        if squared <= chdtri(max(int(tested.sum()), 1), 2.0 * ndtr(-_SIGNIFICANT)):
             continue
         spread = np.sqrt(np.maximum(sigma**2 - np.diagonal(left), _MIN_SHARE * sigma**2))
         k = int(np.argmax(np.abs(moved) / spread))

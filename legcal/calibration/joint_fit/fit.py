@@ -251,14 +251,14 @@ def _from_other_starts(
 
 def _shifted_px(found: Solution) -> float:
     """Return how far a fit moves outlines together, one standard deviation [px]."""
-    return max(found.shared_px.values(), default=0.0)
+    return max(found.quality.shared_px.values(), default=0.0)
 
 
 def _refuse_shifted(found: Solution, most_px: float) -> None:
     """Raise DidNotConverge if a fit explains by light and blur what these cannot have done."""
     shifted = _shifted_px(found)
     if shifted > most_px:
-        kind = max(found.shared_px, key=found.shared_px.__getitem__)
+        kind = max(found.quality.shared_px, key=found.quality.shared_px.__getitem__)
         raise DidNotConverge(
             f"The joint fit ended where outlines are off together ({kind}) by {shifted:.1f} px, "
             f"needed at most {most_px:g} px, which is more than light and blur "

@@ -35,7 +35,7 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
     """Return counts, ranks, and the directions that are known worst."""
     problem, result = calibration.solution.posterior.problem, calibration.result
     free = int(problem.free.sum())
-    n_held = len(calibration.solution.held_basis)
+    n_held = len(calibration.solution.kinematic.held_basis)
     counts = {
         "Equations": f"{problem.n_equations}: "
         + ", ".join(
