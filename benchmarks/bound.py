@@ -97,7 +97,7 @@ def errors_of(design: Design, session: OutlineSession, solution: Solution) -> Re
     ``error`` counts axes as angles from the true ones [m, rad]; ``of_sigma``, over the standard
     deviations that the fit states, and ``nse``, per parameter by its covariance, as it does.
     """
-    missing = [name for name in design.names if solution.status.get(name) != "estimated"]
+    missing = [name for name in design.names if solution.estimates.status.get(name) != "estimated"]
     if missing:
         raise NotIdentifiable(
             f"The errors of a fit could not be judged: found that {', '.join(missing)} were not "
@@ -105,12 +105,12 @@ def errors_of(design: Design, session: OutlineSession, solution: Solution) -> Re
         )
     names, kinematic, true = design.names, design.parametrization, design.legs.nominal
     radii = np.array([design.legs.radii[part] for part in design.parts])
-    found = np.array([solution.values[name] for name in names])
+    found = solution.estimates.vector(names)
     truth = np.concatenate([vector_of(kinematic, true, session.legs.nominal), radii])
     of_truth, from_truth = (vector_of(kinematic, legs, true) for legs in (true, solution.legs))
-    place = [solution.names.index(name) for name in names]
-    sigma = solution.sigma[place]
-    correlation = solution.covariance[np.ix_(place, place)] / np.outer(sigma, sigma)
+    place = [solution.estimates.names.index(name) for name in names]
+    sigma = solution.estimates.sigma[place]
+    correlation = solution.estimates.covariance[np.ix_(place, place)] / np.outer(sigma, sigma)
     of_sigma = (found - truth) / sigma
     error = np.concatenate([from_truth - of_truth, found[len(kinematic) :] - radii])
     return {

@@ -70,7 +70,7 @@ def gain(model: str, level: Level, seed: int, scratch: Path) -> Gain:
         (float(before.displacement.mean()), float(before.rotation.mean())),
         (float(after.displacement.mean()), float(after.rotation.mean())),
         (platform.sigma.mean_displacement, platform.sigma.mean_rotation),
-        calibration.solution.noise.scale,
+        calibration.solution.quality.noise.scale,
         1.0 - float(np.mean(outlines.used)),
         seconds,
     )

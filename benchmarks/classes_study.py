@@ -190,7 +190,7 @@ def errors_of_fit(
     )
     from_truth = vector_of(parametrization, solution.legs, true)
     errors = dict(zip(parametrization.names, (values - true_values).tolist(), strict=True))
-    sigma = dict(zip(solution.names, solution.sigma.tolist(), strict=True))
+    sigma = dict(zip(solution.estimates.names, solution.estimates.sigma.tolist(), strict=True))
     return {
         "rank": stated.rank,
         "nse": stated.nse(values - true_values),
@@ -204,9 +204,8 @@ def held_of(design: Design, solution: Solution) -> Array:
 
     Lines of arms are none of these: where one alone is held, all of them are judged.
     """
-    known = solution.parametrization.names  # twists and arms too
-    place = [known.index(name) for name in design.parametrization.names]
-    held = solution.held_basis[:, place] / unit_of(design)
+    _, held = solution.kinematic.of_values(design.parametrization.names)
+    held = held / unit_of(design)
     return np.asarray(held[np.linalg.norm(held, axis=1) > _JUDGED])
 
 
@@ -231,7 +230,7 @@ def standing_where_held(design: Design, session: OutlineSession, solution: Solut
         Start(solution.legs, solution.T_camera_Rb, solution.T_Rb_Re, "found"),
         choices=Choices(free=free),
     )
-    if exact.cost > _EXACT or len(exact.held) != len(solution.held):
+    if exact.quality.cost > _EXACT or len(exact.kinematic.held) != len(solution.kinematic.held):
         raise DidNotConverge(
             "The errors of a fit could not be judged: found no machine that stands where it holds "
             "what is open and shows the same as the true one, needed one; this is a mistake in "
@@ -249,11 +248,9 @@ def standing_where_held(design: Design, session: OutlineSession, solution: Solut
 
 def as_stated(design: Design, solution: Solution) -> Determined:
     """Return what a fit says of the errors of its values; axes as angles from the nominal ones."""
-    known = solution.parametrization.names  # twists too, which are fixed
-    place, unit = [known.index(name) for name in design.parametrization.names], unit_of(design)
-    tied = tied_directions(design)
+    covariance, _ = solution.kinematic.of_values(design.parametrization.names)
+    unit, tied = unit_of(design), tied_directions(design)
     parts = across(np.concatenate([held_of(design, solution), tied])) / unit
-    covariance = solution.value_covariance[np.ix_(place, place)]
     return Determined(parts, np.asarray(parts @ covariance @ parts.T))
 
 

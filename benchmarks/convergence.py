@@ -122,10 +122,14 @@ def _misses(design: Design, legs: Sequence[Leg]) -> list[float]:
 def _predicted(design: Design, solution: Solution) -> list[float]:
     """Return one standard deviation of them by the covariance of the fit."""
     follow = pose_sensitivity(
-        solution.legs, solution.parametrization, design.legs.frame_legs, design.R, design.t
+        solution.legs,
+        solution.kinematic.parametrization,
+        design.legs.frame_legs,
+        design.R,
+        design.t,
     )
     variance = np.einsum(
-        "kia,ab,kib->ki", follow, solution.kinematic_covariance, follow, optimize=True
+        "kia,ab,kib->ki", follow, solution.kinematic.covariance, follow, optimize=True
     )
     turn, shift = variance[:, :3].sum(axis=1), variance[:, 3:].sum(axis=1)
     return [float(np.sqrt(shift.mean())), float(np.sqrt(turn.mean()))]

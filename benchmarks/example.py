@@ -69,8 +69,8 @@ def main() -> None:
         truth, machine.frame_legs
     )
     n = len(error)
-    pull = error / solution.sigma[:n]
-    together = error @ np.linalg.solve(solution.covariance[:n, :n], error) / n
+    pull = error / solution.estimates.sigma[:n]
+    together = error @ np.linalg.solve(solution.estimates.covariance[:n, :n], error) / n
     print(
         f"normalised squared error: {np.mean(pull**2):.2f} of single parameters, {together:.2f} of "
         "all together"

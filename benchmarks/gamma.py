@@ -52,7 +52,7 @@ def line(name: str, folder: Path, gamma: float, said: float | None) -> str:
     return (
         f"{name:16}{gamma:6.1f} {'-' if said is None else f'{said:.1f}':>5} "
         f"{1e6 * judged.displacement:7.0f} {1e6 * judged.displacement_predicted:7.0f} "
-        f"{judged.pull:7.2f} {judged.joint:6.2f} {solution.rms_px:7.3f} "
+        f"{judged.pull:7.2f} {judged.joint:6.2f} {solution.quality.rms_px:7.3f} "
         f"{', '.join(found):>13} {seconds:5.0f}"
     )
 

@@ -62,10 +62,10 @@ def honesty(name: str, calibration: Calibration, truth: Machine) -> Honesty:
     """Compare a calibration with the true model."""
     solution, machine = calibration.solution, calibration.dataset.machine
     truth = truth.with_leg_order(machine.leg_names)
-    legs, parametrization = solution.legs, solution.parametrization
+    legs, parametrization = solution.legs, solution.kinematic.parametrization
     step = vector_of(parametrization, geometries(truth), legs)
     step = step - vector_of(parametrization, legs, legs)
-    C = solution.kinematic_covariance
+    C = solution.kinematic.covariance
     known = np.diagonal(C) > 0.0
     by_pose = pose_sensitivity(
         legs, parametrization, machine.frame_legs, *components(solution.T_Rb_Re)
@@ -77,7 +77,7 @@ def honesty(name: str, calibration: Calibration, truth: Machine) -> Honesty:
     scaled = C[np.ix_(known, known)] / sigma / sigma[:, None]
     pull = error / sigma
     kinds = dict.fromkeys(KINDS, 0.0)
-    kinds |= solution.shared_px
+    kinds |= solution.quality.shared_px
     return Honesty(
         name,
         len(error),
@@ -88,7 +88,7 @@ def honesty(name: str, calibration: Calibration, truth: Machine) -> Honesty:
         float(np.mean(np.abs(pull) < 1.96)),
         float(np.sqrt(np.mean(np.sum(away**2, axis=1)))),
         float(np.sqrt(np.mean(spread))),
-        solution.noise.scale,
+        solution.quality.noise.scale,
         np.array(list(kinds.values())),
     )
 

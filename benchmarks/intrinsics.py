@@ -84,16 +84,18 @@ def sessions(
 
 def errors(design: Design, session: OutlineSession, found: Solution) -> tuple[float, float, float]:
     """Return e' C^-1 e of the kinematic parameters, and mean squares of the platform [m^2]."""
-    covariance = found.value_covariance
-    truth = vector_of(found.parametrization, design.legs.nominal, session.legs.nominal)
-    away = np.array([found.values[name] for name in found.parametrization.names]) - truth
+    covariance = found.kinematic.value_covariance
+    truth = vector_of(found.kinematic.parametrization, design.legs.nominal, session.legs.nominal)
+    away = found.estimates.vector(found.kinematic.parametrization.names) - truth
     free = np.flatnonzero(np.diagonal(covariance) > 0.0)
     sigma = np.sqrt(np.diagonal(covariance)[free])
     correlation = covariance[np.ix_(free, free)] / np.outer(sigma, sigma)
     z = away[free] / sigma
     R, t = components(design.poses)
-    J = pose_sensitivity(found.legs, found.parametrization, design.legs.frame_legs, R, t)[:, 3:]
-    predicted = np.einsum("kia,ab,kib->k", J, found.kinematic_covariance, J, optimize=True)
+    J = pose_sensitivity(found.legs, found.kinematic.parametrization, design.legs.frame_legs, R, t)[
+        :, 3:
+    ]
+    predicted = np.einsum("kia,ab,kib->k", J, found.kinematic.covariance, J, optimize=True)
     displacement, _ = platform_errors(design, found.legs)
     squared = float(np.mean(displacement**2)), float(np.mean(predicted))
     return float(z @ np.linalg.solve(correlation, z)) / len(free), *squared
@@ -123,7 +125,7 @@ def main() -> None:
                 begin = time.perf_counter()
                 solution = one_fit(given, noise.radius_sigma)
                 took = time.perf_counter() - begin
-                doubted = bool(solution.contradicted_cameras)
+                doubted = bool(solution.camera_doubts.views)
                 found[k].append((*errors(design, given, solution), doubted, took))
         for kind, rows in zip(KINDS, found, strict=True):
             nse, error, predicted, doubted, took = np.mean(rows, axis=0)

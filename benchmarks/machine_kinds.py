@@ -15,7 +15,8 @@ version, name and unit (mm). Two things are asked:
   is off by up to 2 mm, calibrated by ``legcal calibrate``: how many converge, and how many of these
   the verdict trusts; of all that converge the platform error of eq (20) at their readings before
   and after, how the latter compares with the predicted sigma, and the normalised squared error of
-  the parameters (means over seeds). Where motors do not determine the pose, cameras have hints, and
+  the parameters (means over seeds); of photographs also how far used outlines lie inside of the
+  true ones. Where motors do not determine the pose, cameras have hints, and
   errors are those of the parameters in metres (root mean square).
 
 A mistake is made in the readings of each dataset by ``--wrong-reading`` (so much is added to one of
@@ -51,9 +52,12 @@ from outline_sessions import (
 from outline_study import failures_of
 
 from legcal import LegcalError, calibrate, evaluate, load_mechanism
-from legcal.calibration import Evaluation, Solution
+from legcal.calibration import Calibration, Evaluation, Solution
+from legcal.data.outlines import read_observations
+from legcal.geometry import Array
 from legcal.machine import Machine, geometries, vector_of
 from legcal.simulation import Level, SimulationSettings, failure_of, simulate
+from legcal.vision import EPSILON
 
 N_VIEWS, N_POSES = 3, 15
 LENGTH_SIGMA = 0.05  # [mm] of the distance of two joints that motors which turn need
@@ -77,7 +81,7 @@ def sessions(kind: str, runs: int, seed: int, record: Path | None) -> str:
         try:
             solution = one_fit(session, noise.radius_sigma)
             records.append(errors_of_fit(design, session, solution, noise))
-            if (readings := solution.redundant_readings) is not None:
+            if (readings := solution.quality.redundant_readings) is not None:
                 records[-1]["readings"] = len(readings.wrong), len(readings.doubts)
         except LegcalError as error:
             records.append({"failure": failure_of(error)})
@@ -130,7 +134,7 @@ def with_mistake(folder: Path, machine: Machine, seed: int, added: float, scale:
 
 def named_readings(solution: Solution) -> list[str]:
     """Return what a fit says is wrong with readings, in words."""
-    judged = solution.redundant_readings
+    judged = solution.quality.redundant_readings
     if judged is None:
         return []
     return [
@@ -154,7 +158,7 @@ def datasets(
     """Print a line a dataset, and return one on all that were calibrated."""
     machine = load_mechanism(kind) if kind in CARRIED else made(kind, scratch / "nominal")
     model, found, hints = machine.yaml_path, [], not machine.is_determined
-    squared, n_trusted = list[float](), 0
+    squared, inwards, n_trusted = list[float](), list[Array](), 0
     for seed in seeds:
         folder = scratch / f"{kind}-{level}-{seed}"
         result = scratch / f"{folder.name}-result"
@@ -179,9 +183,10 @@ def datasets(
         platform, solution = calibration.platform, calibration.solution
         if platform is None:
             before, after = (_in_metres(one) for one in both)
+            estimates = solution.estimates
             lengths = [
                 sigma**2
-                for name, sigma in zip(solution.names, solution.sigma, strict=True)
+                for name, sigma in zip(estimates.names, estimates.sigma, strict=True)
                 if name.split(".")[1] in ("base", "platform", "offset", "length")
             ]
             predicted = math.sqrt(float(np.mean(lengths)))
@@ -195,12 +200,33 @@ def datasets(
         seconds = time.perf_counter() - begin
         nse = f", nse {squared[-1]:5.2f}"
         print(f"{kind:20}{seed:4}{numbers(found[-1])}{nse}{seconds:6.0f} s", end="")
+        if level is Level.PHOTOGRAPHS:
+            inwards.append(inward_errors(folder, calibration))
+            print(f", edges {np.mean(inwards[-1]):+.3f} px inwards", end="")
         print("" if trusted else f", not trusted: {calibration.verdict.sentence}", flush=True)
         for words in named_readings(solution):
             print(f"  named: {words}", flush=True)
     line = f"{kind:20}{len(found):4} of {len(seeds)} converge from {level}, {n_trusted} trusted"
     line += numbers(np.mean(found, axis=0)) if found else ""
+    if inwards:
+        every = np.concatenate(inwards)
+        line += f", {len(every)} edges {np.mean(every):+.3f} px inwards"
     return line + (f", nse {np.mean(squared):5.2f}" if squared else "")
+
+
+def inward_errors(folder: Path, calibration: Calibration) -> Array:
+    """Return how far used outlines of legs are inside of the true ones, in the middle (n,) [px]."""
+    read, outlines = calibration.dataset, calibration.solution.outlines
+    measurements = read.measurements
+    truth = read_observations(folder / "truth/outlines.csv", read.machine.legs, measurements)
+    lines = dict(zip(truth.row_keys(), truth.h, strict=True))
+    off = list[float]()
+    for i, key in enumerate(outlines.row_keys()):
+        if outlines.used[i] and key in lines:
+            camera = measurements.views[measurements.view[outlines.row[i]]].camera
+            offset = camera.line_offset(lines[key][None], camera.undistort(outlines.ends[i]))
+            off.append(EPSILON[outlines.edge[i] - 1] * float(offset.mean()))
+    return np.array(off)
 
 
 def normalised_error(nominal: Machine, calibrated: Path, truth: Path, solution: Solution) -> float:
@@ -211,16 +237,16 @@ def normalised_error(nominal: Machine, calibrated: Path, truth: Path, solution: 
     """
     there, true = (
         vector_of(
-            solution.parametrization,
+            solution.kinematic.parametrization,
             geometries(load_mechanism(path).with_leg_order(nominal.leg_names)),
             geometries(nominal),
         )
         for path in (calibrated, truth)
     )
-    sigma = np.sqrt(np.diagonal(solution.value_covariance))
+    sigma = np.sqrt(np.diagonal(solution.kinematic.value_covariance))
     free = np.flatnonzero(sigma > 0.0)  # gains are fixed
     unit = sigma[free]
-    covariance = solution.value_covariance[np.ix_(free, free)]
+    covariance = solution.kinematic.value_covariance[np.ix_(free, free)]
     value, vector = np.linalg.eigh(covariance / np.outer(unit, unit))
     kept = value > 1e-9
     along = vector[:, kept].T @ ((there - true)[free] / unit)

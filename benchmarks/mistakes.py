@@ -42,7 +42,7 @@ from legcal.calibration.diagnosis.mistakes import Assumed, as_given, mistakes
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.data import Dataset
 from legcal.geometry import Array
-from legcal.machine import Leg, LegKind, Machine
+from legcal.machine import Cylinder, Leg, LegKind, Machine
 from legcal.perception import (
     LEFT_RIGHT,
     UPSIDE_DOWN,
@@ -205,9 +205,8 @@ def views(session: Session, rng: np.random.Generator) -> Session:
 
 
 def _with_radii(session: Session, radius: Callable[[float], float]) -> Session:
-    legs = session.dataset.machine.legs
-    cylinders = [[replace(c, radius=radius(c.radius)) for c in leg.cylinders] for leg in legs]
-    return _with_machine(session, session.dataset.machine.with_cylinders(cylinders))
+    machine = session.dataset.machine.with_radii(lambda _, c: radius(c.radius))
+    return _with_machine(session, machine)
 
 
 def diameter(session: Session, _: np.random.Generator) -> Session:
@@ -223,11 +222,12 @@ def half_radius(session: Session, _: np.random.Generator) -> Session:
 def tube_and_rod(session: Session, _: np.random.Generator) -> Session:
     """Exchange the radii of tube and rod of each leg."""
     machine = session.dataset.machine
-    cylinders = [
-        [replace(c, radius=other.radius) for c, other in zip(own, own[::-1], strict=True)]
-        for own in (leg.cylinders for leg in machine.legs)
-    ]
-    return _with_machine(session, machine.with_cylinders(cylinders))
+
+    def other(j: int, cylinder: Cylinder) -> float:
+        own = machine.legs[j].cylinders
+        return own[-1 - own.index(cylinder)].radius
+
+    return _with_machine(session, machine.with_radii(other))
 
 
 def handedness(session: Session, _: np.random.Generator) -> Session:

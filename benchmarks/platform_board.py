@@ -84,11 +84,12 @@ def fit_corners(session: SimulatedSession, seed: int) -> tuple[float, int]:
         start = _with_place(start, name, place)
     board = BoardCorners(session.boards, corners)
     found = refine(legs, m, no_outlines(), start, board=board)
-    names = [name for name in found.names if name in p.names]
-    which = [found.names.index(name) for name in names]
-    off = np.array([found.values[name] for name in names])
+    estimates = found.estimates
+    names = [name for name in estimates.names if name in p.names]
+    which = [estimates.names.index(name) for name in names]
+    off = estimates.vector(names)
     off -= legs.vector(true)[[p.names.index(name) for name in names]]
-    covariance = found.covariance[np.ix_(which, which)]
+    covariance = found.estimates.covariance[np.ix_(which, which)]
     return float(off @ np.linalg.solve(covariance, off)), len(off)
 
 

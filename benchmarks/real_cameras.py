@@ -134,13 +134,13 @@ def judged(session: Session, calibration: Calibration, folder: Path) -> Outcome:
     solution, machine = calibration.solution, calibration.dataset.machine
     truth = load_mechanism(next((folder / "truth/models").glob("*.yaml")))
     truth = truth.with_leg_order(machine.leg_names)
-    legs, parametrization = solution.legs, solution.parametrization
+    legs, parametrization = solution.legs, solution.kinematic.parametrization
     step = vector_of(parametrization, geometries(truth), legs)
     step = step - vector_of(parametrization, legs, legs)
     by_pose = pose_sensitivity(
         legs, parametrization, machine.frame_legs, *components(solution.T_Rb_Re)
     )
-    C = solution.kinematic_covariance + solution.held_covariance
+    C = solution.kinematic.total_covariance
     away = by_pose[:, 3:] @ step
     spread = np.einsum("kia,ab,kib->k", by_pose[:, 3:], C, by_pose[:, 3:])
     error, sigma = (float(np.sqrt(np.mean(square))) for square in (np.sum(away**2, axis=1), spread))

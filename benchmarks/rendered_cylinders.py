@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array, Image
 from legcal.simulation import Appearance, Light, prepare_view
-from legcal.simulation.rendering.rays import in_view
+from legcal.simulation.rendering.rays import divided, in_view
 from legcal.simulation.rendering.scene import FrameBuffer, develop
 from legcal.simulation.solids import Material, PlacedSolid, Solid, SolidCylinder
 from legcal.vision import Grey
@@ -172,10 +172,7 @@ def photograph(looks: Looks, rng: np.random.Generator, times: int = PHOTOGRAPHS)
 def _radiance(solid: PlacedSolid, camera: Camera, appearance: Appearance) -> Grey:
     """Return the light of a solid before an even background, in fine pixels."""
     rng = np.random.default_rng(0)
-    K = camera.K * FINE
-    K[:2, 2] += 0.5 * (FINE - 1)
-    K[2, 2] = 1.0
-    camera = replace(camera, K=K, width=FINE * camera.width, height=FINE * camera.height)
+    camera = divided(camera, FINE)
     scene = prepare_view([solid], camera, RigidTransform.identity(), appearance, rng)
     canvas = FrameBuffer(scene.canvas.z.copy(), scene.canvas.terms.sum(axis=0)[None])
     scene.painter.paint(canvas, in_view([solid], scene.T_camera_base))

@@ -29,7 +29,13 @@ from scipy.spatial.transform import RigidTransform
 from legcal.data.dataset import load_dataset
 from legcal.data.outlines import no_outlines
 from legcal.machine import forward_kinematics
-from legcal.perception import Photographs, Placement, measure_photographs, recognise_and_place
+from legcal.perception import (
+    Photographs,
+    Placement,
+    measure_in_brief,
+    measure_photographs,
+    recognise_and_place,
+)
 from legcal.perception.detection import measure_outlines
 from legcal.perception.image_quality import measure_exposure
 from legcal.perception.placement import group_views
@@ -104,12 +110,12 @@ def measure_speed() -> None:
     rough = {row: exposure.blur for row, exposure in zip(rows, exposures, strict=True)}
     search = photographs.search(scene, blur=rough)
     once, blur = watch(
-        "outlines in brief", lambda: measure_outlines(search, near, rows, together=False)
+        "outlines in brief", lambda: measure_outlines(search, near, rows, method=measure_in_brief)
     )
     groups = group_views(photographs.measurements, photographs.detect, scene.T_base_camera, None)
     watch(
         "views fitted, and missing legs",
-        lambda: refine_views(search, groups, near, once, together=False),
+        lambda: refine_views(search, groups, near, once, method=measure_in_brief),
     )
     watch("outlines with all care", lambda: measure_photographs(photographs, near, no_progress))
     view = photographs.measurements.view

@@ -34,12 +34,12 @@ class Articulated:
     """A machine at home, where all motors and joints read 0, in the base but for ``inside``."""
 
     turning: bool  # motors turn arms; else they move carriages
-    motor_point: Array  # (4, 3)
-    motor_axis: Array  # (4, 3)
-    motor: IntArray  # (8,) of each rod
-    A: Array  # (8, 3)
-    B: Array  # (8, 3)
-    body: IntArray  # (8,) 0 the platform, 1 and 2 what ``inside`` carries
+    motor_point: Array  # (n_motors, 3), 4 of those made here
+    motor_axis: Array  # (n_motors, 3)
+    motor: IntArray  # (n_rods,) of each rod, 8 of those made here
+    A: Array  # (n_rods, 3)
+    B: Array  # (n_rods, 3)
+    body: IntArray  # (n_rods,) 0 the platform, 1 and 2 what ``inside`` carries
     inside: tuple[Inside, ...]
 
     def write(self, folder: Path, *, block: bool = True, platform: str = "platform") -> Path:
@@ -51,7 +51,7 @@ class Articulated:
         )
         loops, legs = list[list[str]](), dict[str, str]()
         kind, name = ("revolute", "arm") if self.turning else ("prismatic", "carriage")
-        for k in range(4):
+        for k in range(len(self.motor_point)):
             links.append(_link(f"{name}{k + 1}"))
             joints.append(
                 _joint(f"motor{k + 1}", kind, "base", f"{name}{k + 1}", self.motor_point[k],
@@ -65,7 +65,7 @@ class Articulated:
                 ends, at = ends[::-1], -at
             joints.append(_joint(joint.name, joint.kind, *ends, at, joint.axis))
             seat[i] = f"bar{i}", HOME + joint.point
-        for j in range(8):
+        for j in range(len(self.A)):
             leg, k = f"leg{j + 1}", int(self.motor[j])
             u = self.B[j] - self.A[j]
             length = float(np.linalg.norm(u))
@@ -87,9 +87,9 @@ class Articulated:
                 joints.append(_joint(f"{end}_fix", "fixed", parent, end, self.B[j] - start))
             loops.append([f"{leg}_end", f"{leg}_seat"])
             legs[leg] = f"{leg}_a1"
-        motors = [f"motor{k + 1}" for k in range(4)]
+        motors = [f"motor{k + 1}" for k in range(len(self.motor_point))]
         document: dict[str, object] = {
-            "closed_loop": loops, "type": ["3d"] * 8, "name_mot": motors,
+            "closed_loop": loops, "type": ["3d"] * len(loops), "name_mot": motors,
         }  # fmt: skip
         if block:
             place = seat[{"platform": 0, "bar1": 1, "bar2": 2}[platform]][1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -46,6 +47,13 @@ STEP = 1e-3  # of differences of fourth order
 
 
 Loaded = Callable[[str, bool], Machine]
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    """Replace a text of a file, which has it."""
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
 
 
 @pytest.fixture(scope="module")
@@ -282,25 +290,103 @@ def test_the_platform_is_proposed_where_the_file_names_none(tmp_path: Path) -> N
     assert len(found.internal_joints) == 2
 
 
+def _without_motor(made: Articulated, folder: Path) -> Path:
+    """Write it with a fixed arm."""
+    path = made.write(folder)
+    edit(path.with_suffix(".urdf"), 'name="motor1" type="revolute"', 'name="motor1" type="fixed"')
+    edit(path, "    motor1: 0.0\n", "")
+    edit(path, "- motor1\n", "")
+    return path
+
+
+def _with_two_joints_in_a_row(made: Articulated, folder: Path) -> Path:
+    """Write it with a slider between the platform and a hinge."""
+    path, platform = made.write(folder), '<parent link="platform"/>'
+    hinge, between = '<joint name="hinge1" type="revolute">', '<parent link="between"/>'
+    lift = (
+        f'<link name="between"/><joint name="lift" type="prismatic">{platform}'
+        '<child link="between"/><axis xyz="0 0 1"/>'
+        '<limit lower="-0.1" upper="0.1" effort="1" velocity="1"/></joint>'
+    )
+    edit(path.with_suffix(".urdf"), hinge + platform, lift + hinge + between)
+    return path
+
+
+def _with_more_motors(made: Articulated, folder: Path) -> Path:
+    """Write it with a ninth rod on a fifth motor."""
+
+    def beside(rows: Array, row: list[float]) -> Array:
+        return np.concatenate([rows, [row]])
+
+    return replace(
+        made,
+        motor_point=beside(made.motor_point, [0.1, 0.25, 0.01]),
+        motor_axis=beside(made.motor_axis, [1.0, 0.0, 0.0]),
+        motor=np.append(made.motor, 4),
+        A=beside(made.A, [0.1, 0.5, 0.0]),
+        B=beside(made.B, (HOME + np.array([0.02, 0.01, 0.03])).tolist()),
+        body=np.append(made.body, 0),
+    ).write(folder)
+
+
+def _with_rods_on_the_hinge(made: Articulated, folder: Path) -> Path:
+    """Write it with rods that end on the axis about which their bar turns."""
+    B, hinge, own = made.B.copy(), made.inside[0], made.body == 1
+    B[own] = HOME + hinge.point + np.linspace(-0.05, 0.05, own.sum())[:, None] * hinge.axis
+    return replace(made, B=B).write(folder)
+
+
+def _with_a_motor_through_a_joint(made: Articulated, folder: Path) -> Path:
+    """Write it with the axis of a motor through the joint of its rod."""
+    points = made.motor_point.copy()
+    points[0] = made.A[0]
+    return replace(made, motor_point=points).write(folder)
+
+
+def _with_a_universal_joint(made: Articulated, folder: Path) -> Path:
+    """Write it with a rod that has U on its bar and S on its arm."""
+    path, A, B = made.write(folder), made.A[0], made.B[0]
+    urdf, bar = path.with_suffix(".urdf"), HOME + made.inside[0].point
+    text = urdf.read_text()
+    for name, parent, child, xyz in (
+        ("leg1_a1", "bar1", "leg1_1", B - bar),
+        ("leg1_a2", "leg1_1", "leg1_rod", np.zeros(3)),
+        ("leg1_end_fix", "leg1_rod", "leg1_end", A - B),
+        ("leg1_seat_fix", "arm1", "leg1_seat", A - made.motor_point[0]),
+    ):
+        joint = re.search(rf'<joint name="{name}".*?</joint>', text)
+        assert joint is not None
+        moved = re.sub('parent link="[^"]*"', f'parent link="{parent}"', joint[0])
+        moved = re.sub('child link="[^"]*"', f'child link="{child}"', moved)
+        at = " ".join(repr(float(x)) for x in xyz)
+        text = text.replace(joint[0], re.sub('xyz="[^"]*"', f'xyz="{at}"', moved, count=1))
+    text = re.sub('<joint name="leg1_a3".*?</joint>|<link name="leg1_2"></link>', "", text)
+    urdf.write_text(text)
+    return path
+
+
+def _as_four_arms_of_a_delta(_: Articulated, folder: Path) -> Path:
+    """Write a platform of one body on exact parallelograms."""
+    made = machine("i4", turning=False)
+    return replace(made, inside=(), body=np.zeros_like(made.body)).write(folder)
+
+
 @pytest.mark.parametrize(
-    ("old", "new", "named"),
+    ("written", "named"),
     [
-        (
-            '<joint name="motor1" type="prismatic">',
-            '<joint name="motor1" type="fixed">',
-            "no motor on the base that moves its joint at A",
-        ),
+        (_as_four_arms_of_a_delta, r"overconstrained \(1 of the 4 .* with joints at A that move"),
+        (_without_motor, "no motor on the base that moves its joint at A"),
+        (_with_a_universal_joint, "'hinge1', and found a joint U at its end"),
+        (_with_two_joints_in_a_row, "more than the internal joint 'lift' .* needed one"),
+        (_with_more_motors, "5 motors for the 4 freedoms .* no more motors than freedoms"),
+        (_with_rods_on_the_hinge, "the joint 'hinge1' inside the platform moves no rod at home"),
+        (_with_a_motor_through_a_joint, "'motor1' .* joint at A on the axis of the motor"),
     ],
 )
-def test_rods_on_a_body_of_the_platform_outside_the_class_are_refused(
-    old: str, new: str, named: str, tmp_path: Path
+def test_machines_outside_the_class_are_refused(
+    written: Callable[[Articulated, Path], Path], named: str, tmp_path: Path
 ) -> None:
-    path = machine("h4", turning=False).write(tmp_path)
-    urdf = path.with_suffix(".urdf")
-    text = urdf.read_text()
-    assert old in text
-    urdf.write_text(text.replace(old, new))
-    path.write_text(path.read_text().replace("- motor1\n", "").replace("    motor1: 0.0\n", ""))
+    path = written(machine("h4", turning=True), tmp_path)
     with pytest.raises(OutOfClass, match=named):
         load_mechanism(path)
 

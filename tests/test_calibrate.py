@@ -64,8 +64,10 @@ def _edited(given: Path, folder: Path, edit: Callable[[dict[str, Any]], Any]) ->
 def _pulls(calibration: Calibration, truth: Path) -> Array:
     """Return the errors of the kinematic parameters that are estimated over their sigmas."""
     solution, legs = calibration.solution, geometries(load_mechanism(truth))
-    true, found = (vector_of(solution.parametrization, g, legs) for g in (legs, solution.legs))
-    sigma = np.sqrt(np.diagonal(solution.value_covariance))
+    true, found = (
+        vector_of(solution.kinematic.parametrization, g, legs) for g in (legs, solution.legs)
+    )
+    sigma = np.sqrt(np.diagonal(solution.kinematic.value_covariance))
     return np.asarray((found - true)[sigma > 0.0] / sigma[sigma > 0.0])
 
 
@@ -169,20 +171,24 @@ def _judged(calibration: Calibration, **changes: Any) -> Calibration:
     return judge(calibration.dataset, solution, calibration.steps, ())
 
 
-@pytest.mark.parametrize("part", ["kinematic_covariance", "held_covariance"])
+@pytest.mark.parametrize("part", ["covariance", "held_covariance"])
 def test_a_model_is_trusted_if_its_change_exceeds_two_sigma(
     planar: tuple[Path, Calibration], part: str
 ) -> None:
     calibration = planar[1]
-    nothing = np.zeros_like(calibration.solution.kinematic_covariance)
-    of_one = {"kinematic_covariance": nothing, "held_covariance": nothing}
-    of_one |= {part: calibration.solution.kinematic_covariance}
-    platform = _judged(calibration, **of_one).platform
+    kinematic = calibration.solution.kinematic
+    nothing = np.zeros_like(kinematic.covariance)
+    of_one = {"covariance": nothing, "held_covariance": nothing, part: kinematic.covariance}
+
+    def judged(of: dict[str, Any]) -> Calibration:
+        return _judged(calibration, kinematic=replace(kinematic, **of))
+
+    platform = judged(of_one).platform
     assert platform is not None
     sigmas = platform.change.mean_displacement / platform.sigma.mean_displacement
     for factor, trusted in ((0.99, True), (1.01, False)):
         scaled = of_one | {part: (0.5 * factor * sigmas) ** 2 * of_one[part]}
-        assert _judged(calibration, **scaled).verdict.trustworthy is trusted
+        assert judged(scaled).verdict.trustworthy is trusted
 
 
 def test_a_contradicted_camera_counts_in_the_verdict(
@@ -243,7 +249,7 @@ def test_fit_and_steps_come_nearer_to_the_truth(model: str, tmp_path: Path) -> N
     assert found.platform is not None
     assert by_fit < 3.0 * found.platform.sigma.mean_displacement < 0.2 * before
     assert by_steps < 0.2 * before or model in {"3-upu", "tricept"}
-    twists = {n: s for n, s in found.solution.status.items() if n.endswith(".twist")}
+    twists = {n: s for n, s in found.solution.estimates.status.items() if n.endswith(".twist")}
     assert bool(twists) == any(leg.twist is not None for leg in geometries(made.nominal))
     assert "fixed" not in twists.values()
     assert not [note for note in found.notes if "no model of the four steps" in note]
@@ -278,13 +284,13 @@ def test_axes_are_fitted_without_images(axes: tuple[SimulatedDataset, Path, Cali
     solution = calibration.solution
     assert calibration.steps.legs is not None
     assert 0.4 < np.mean(_pulls(calibration, made.truth_path) ** 2) < 1.9
-    assert solution.chi2 / solution.dof == pytest.approx(1.0, abs=0.35)
-    assert solution.rms_axes == pytest.approx(1.0, abs=0.3)
-    assert solution.rms_px is None
+    assert solution.quality.chi2 / solution.quality.dof == pytest.approx(1.0, abs=0.35)
+    assert solution.quality.rms_axes == pytest.approx(1.0, abs=0.3)
+    assert solution.quality.rms_px is None
     models = [f"{name}.{kind}" for name in ("calibrated", "staged") for kind in ("urdf", "yaml")]
     assert sorted(files_of(output)) == sorted([*models, "result.json"])
     assert not (made.folder / "observations.csv").exists()
-    assert not [name for name in solution.values if "radius" in name]
+    assert not [name for name in solution.estimates.values if "radius" in name]
 
 
 @pytest.mark.system
@@ -392,7 +398,7 @@ def test_hand_held_cameras_need_no_poses(in_the_hand: tuple[SimulatedDataset, Ca
     made, calibration = in_the_hand
     assert len(calibration.solution.T_camera_Rb) == 12
     assert np.sqrt(np.mean(_pulls(calibration, made.truth_path) ** 2)) < 1.8
-    assert abs(calibration.solution.values["board.scale"] - 1.0) < 2e-3
+    assert abs(calibration.solution.estimates.values["board.scale"] - 1.0) < 2e-3
     assert not any("calibration board" in note for note in calibration.notes)
     result = json.loads((made.folder.parent / "result/result.json").read_text())
     assert result["board"]["given"] is None
@@ -587,7 +593,7 @@ def test_the_order_of_photographs_does_not_matter(tmp_path: Path) -> None:
         _change(folder / "measurements.csv", lambda rows: [*rows[:3], *rows[15:18], *rows[30:33]])
     _change(turned / "measurements.csv", lambda rows: rows[::-1])
     one, other = (calibrate(folder).solution for folder in (given, turned))
-    assert one.names == other.names
-    np.testing.assert_allclose(one.sigma, other.sigma, rtol=1e-6)
+    assert one.estimates.names == other.estimates.names
+    np.testing.assert_allclose(one.estimates.sigma, other.estimates.sigma, rtol=1e-6)
     A, turned_A = one.parameters.base_joints, other.parameters.base_joints
     np.testing.assert_allclose(A, turned_A, atol=1e-12)

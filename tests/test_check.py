@@ -161,11 +161,11 @@ def test_images_without_used_outlines_are_refused(
 def test_priors_of_intrinsics_belong_to_the_whole_camera(result: Path, images: Path) -> None:
     new = load_dataset(images)
     assert not any("exact" in note for note in Result.read(result / "result.json").notes)
-    assert "c1.fx" in check(new, result).solution.names
+    assert "c1.fx" in check(new, result).solution.estimates.names
     view = new.measurements.views[0]
     larger = replace(view, camera=replace(view.camera, height=view.camera.height + 1))
     other = replace(new, measurements=replace(new.measurements, views=(larger,)))
-    assert "c1.fx" not in check(other, result).solution.values
+    assert "c1.fx" not in check(other, result).solution.estimates.values
 
 
 def test_notes_on_images_are_passed_on_once(
@@ -455,10 +455,10 @@ def test_edge_biases_that_outlines_share_are_no_movement(tmp_path: Path) -> None
     rng = np.random.default_rng(9)
     first = load_dataset(_simulated(tmp_path / "set", "hexapod", poses=15, views=3, sigma_px=EXACT))
     earlier = calibrate(_with_errors(first, rng, shared=0.05), output=tmp_path / "result")
-    assert max(earlier.solution.shared_px.values()) > 0.02
+    assert max(earlier.solution.quality.shared_px.values()) > 0.02
     new = load_dataset(_simulated(tmp_path / "new", "hexapod", poses=8, sigma_px=EXACT))
     for _ in range(3):
         found = check(_with_errors(new, rng, shared=0.05), tmp_path / "result")
         assert found.movement.p_value > 1e-3
-        for kind, size in earlier.solution.shared_px.items():
-            assert found.solution.shared_px[kind] >= size
+        for kind, size in earlier.solution.quality.shared_px.items():
+            assert found.solution.quality.shared_px[kind] >= size

@@ -225,7 +225,7 @@ def test_a_leg_that_no_view_shows_is_found_from_its_readings(
     before, after = errors(calibration, folder, tmp_path / "out")
     assert calibration.verdict.trustworthy
     assert after < 0.1 * before
-    assert calibration.solution.status["leg6.base.z"] == "estimated"
+    assert calibration.solution.estimates.status["leg6.base.z"] == "estimated"
 
 
 def test_a_platform_that_only_translates_has_its_determined_part_found(tmp_path: Path) -> None:
@@ -236,13 +236,15 @@ def test_a_platform_that_only_translates_has_its_determined_part_found(tmp_path:
     assert after < 0.1 * before
     assert re.search(r"Not determined, and without effect on the platform: \d", notes(calibration))
     solution = calibration.solution
-    assert solution.status["leg1.base_axis.1"] == "weak"
-    spread = solution.held_covariance  # what is held counts in the platform, along itself alone
+    assert solution.estimates.status["leg1.base_axis.1"] == "weak"
+    spread = (
+        solution.kinematic.held_covariance
+    )  # what is held counts in the platform, along itself alone
     rank = np.linalg.matrix_rank(spread, tol=1e-9 * np.abs(spread).max(initial=0.0))
-    assert 0 < rank == len(solution.held_basis)
+    assert 0 < rank == len(solution.kinematic.held_basis)
     known = known_parameters(calibration.dataset.machine, calibration.dataset.measurements.views)
-    lengths = np.array(solution.parametrization.units) == "m"
-    names = solution.parametrization.names
-    change = [solution.values[name] - known.by_name[name].nominal for name in names]
+    lengths = np.array(solution.kinematic.parametrization.units) == "m"
+    names = solution.kinematic.parametrization.names
+    change = [solution.estimates.values[name] - known.by_name[name].nominal for name in names]
     largest = np.sqrt(np.diagonal(spread)[lengths].max())
     assert largest < 2.0 * np.abs(np.array(change)[lengths]).max()

@@ -198,11 +198,8 @@ def test_legs_are_drawn_by_the_radii_that_were_searched_by(
     one_image: RepeatedImages, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def thicker(photographs: Photographs, *others: Any) -> MeasuredImages:
-        cylinders = [
-            [replace(c, radius=c.radius * (2.0 + j)) for c in of_leg]
-            for j, of_leg in enumerate(photographs.cylinders)
-        ]
-        wrong = replace(photographs, machine=photographs.machine.with_cylinders(cylinders))
+        machine = photographs.machine.with_radii(lambda j, c: c.radius * (2.0 + j))
+        wrong = replace(photographs, machine=machine)
         return replace(place_and_measure(photographs, *others), photographs=wrong)
 
     monkeypatch.setattr("legcal.calibration.outline_detection.place_and_measure", thicker)

@@ -13,7 +13,7 @@ import numpy as np
 from six_photographs import FOLDER, six_photographs
 
 from legcal.data import Outlines
-from legcal.perception import measure_photographs
+from legcal.perception import measure_in_brief, measure_photographs
 from legcal.perception.photographs import DETECTOR_VERSION
 from legcal.progress import no_progress
 
@@ -27,7 +27,7 @@ def measured() -> dict[str, list[Any]]:
     """Return the outlines of the six photographs, measured in three ways."""
     photographs, rough, near = six_photographs()
     tables = {
-        "quickly": measure_photographs(photographs, rough, no_progress, together=False),
+        "quickly": measure_photographs(photographs, rough, no_progress, method=measure_in_brief),
         "with care": measure_photographs(photographs, rough, no_progress),
         "near a fit": measure_photographs(photographs, near, no_progress),
     }

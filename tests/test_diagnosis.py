@@ -121,9 +121,7 @@ def _left_handed(d: Dataset) -> Dataset:
 
 
 def _thick(d: Dataset) -> Dataset:
-    cylinders = [[replace(c, radius=2.0 * c.radius) for c in leg.cylinders]
-                 for leg in d.machine.legs]  # fmt: skip
-    return replace(d, machine=d.machine.with_cylinders(cylinders))
+    return replace(d, machine=d.machine.with_radii(lambda _, c: 2.0 * c.radius))
 
 
 @pytest.fixture(scope="module")
@@ -213,6 +211,19 @@ def test_motors_that_move_joints_at_A_are_mistaken_as_encoders_of_legs_are(delta
     given, mirrored = as_given(data).joints(rows), of_kinds["handedness"].true.joints(rows)
     for ends, of_mirror in zip(given, mirrored, strict=True):
         assert np.allclose(ends[rows] * [1.0, -1.0, 1.0], of_mirror[rows], atol=1e-9)
+
+
+@pytest.mark.parametrize(("model", "directions"), [("servo-hexapod", 0), ("linear-delta", 4)])
+def test_of_travels_that_are_as_far_both_ways_a_direction_is_a_sign(
+    model: str, directions: int, tmp_path: Path
+) -> None:
+    """Else one mistake would be named twice, as if images did not tell two apart."""
+    simulate(model, tmp_path / "set", settings(poses=3))
+    data = order_dataset(load_dataset(tmp_path / "set"), in_turn, no_progress)
+    tried = [one.what for one in mistakes(data)]
+    n_motors = len(data.machine.motors)
+    assert sum("opposite sign" in what for what in tried) in (0, n_motors + 1)
+    assert sum("opposite direction" in what for what in tried) == directions
 
 
 @pytest.mark.system

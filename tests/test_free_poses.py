@@ -321,9 +321,9 @@ def test_photographs_of_a_platform_that_motors_leave_a_freedom_are_calibrated(
     assert "no platform error can be predicted" in found.verdict.sentence
     true = load_mechanism(folder / "truth/models/5-sps.yaml")
     solution, legs = found.solution, geometries(true)
-    both = (vector_of(solution.parametrization, g, legs) for g in (solution.legs, legs))
+    both = (vector_of(solution.kinematic.parametrization, g, legs) for g in (solution.legs, legs))
     error = np.subtract(*both)
-    squared = error @ np.linalg.solve(solution.value_covariance, error) / len(error)
+    squared = error @ np.linalg.solve(solution.kinematic.value_covariance, error) / len(error)
     assert 0.3 < squared < 2.2  # 28 numbers
 
 

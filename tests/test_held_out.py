@@ -181,7 +181,7 @@ def _held_out(session: HexapodSession, level: float, seed: int) -> HeldOut:
     )
     begin = replace(disturbed_start(session), T_Rb_Re=start)
     solution = refine(session.legs, fitted, shown, begin)
-    largest = max(map(abs, solution.biases.values()), default=0.0)
+    largest = max(map(abs, solution.posterior.biases.values()), default=0.0)
     assert (largest > 0.02) == (level > 0.0)  # [px]; chance may show less
     poses = start_from(solution.legs, held_out, session.legs, (), near, "").T_Rb_Re
     return compare_held_out(solution.posterior, held_out, kept, poses)

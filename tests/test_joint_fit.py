@@ -83,7 +83,11 @@ def true_values(session: MachineSession) -> dict[str, float]:
 
 def errors(session: MachineSession, found: Solution) -> dict[str, float]:
     truth = true_values(session)
-    return {name: abs(found.values[name] - truth[name]) for name in found.names if name in truth}
+    return {
+        name: abs(found.estimates.values[name] - truth[name])
+        for name in found.estimates.names
+        if name in truth
+    }
 
 
 def shaken_radii(session: MachineSession) -> FittedLegs:
@@ -140,17 +144,17 @@ def test_exact_outlines_give_the_truth_from_3_mm_and_1_degree_away(
     session = far_session(name)
     assert starts_far_away(session)
     found = fit_of_everything(session, known_radii=known_radii)
-    assert {found.units[n] for n in found.names} <= {"m", "rad"}
+    assert {found.estimates.units[n] for n in found.estimates.names} <= {"m", "rad"}
     for parameter, error in errors(session, found).items():
-        assert error < {"m": 1e-8, "rad": 1e-7}[found.units[parameter]], parameter
+        assert error < {"m": 1e-8, "rad": 1e-7}[found.estimates.units[parameter]], parameter
     # What is not held is known to a hundredth of a leg at least, some 5 mm. Parameters that far
     # from any that explain all measurements would cost 1; 1e-12 are 5e-9 m and 1e-8 rad.
-    assert found.chi2 < 1e-12
+    assert found.quality.chi2 < 1e-12
     first, true_first = found.T_Rb_Re[0], session.truth.T_Rb_Re[0]
     for pose, true in zip(found.T_Rb_Re, session.truth.T_Rb_Re, strict=True):
         # Where joint centres are held, R_e stands otherwise on the platform, and R_b on the base.
         miss = pose.inv() * true
-        if found.held:
+        if found.kinematic.held:
             miss = (pose * first.inv()).inv() * (true * true_first.inv())
         assert np.linalg.norm(miss.translation) < 1e-8
         assert miss.rotation.magnitude() < 1e-7
@@ -173,7 +177,7 @@ def test_an_arm_that_is_no_cylinder_is_left_out_as_a_whole_and_bends_nothing(px:
     assert "arm2" in note
     assert "arm1" not in note
     for parameter, error in errors(session, found).items():
-        assert error < {"m": 1e-8, "rad": 1e-7}[found.units[parameter]], parameter
+        assert error < {"m": 1e-8, "rad": 1e-7}[found.estimates.units[parameter]], parameter
 
 
 @pytest.mark.parametrize("known_radii", [False, True])
@@ -182,7 +186,9 @@ def test_of_a_3_upu_that_only_translates_all_is_found_that_images_and_readings_s
 ) -> None:
     session = far_session("3-upu")
     found = fit_of_everything(session, known_radii=known_radii)
-    assert len(found.held) == (6 if known_radii else 7)  # turns of both axes; without radii, size
+    assert len(found.kinematic.held) == (
+        6 if known_radii else 7
+    )  # turns of both axes; without radii, size
     legs, true_legs = found.legs, session.truth.legs
     R, true_R = (Frames.of(poses)[0] for poses in (found.T_Rb_Re, session.truth.T_Rb_Re))
     size = np.linalg.norm(legs[1].A) / np.linalg.norm(true_legs[1].A)
@@ -377,8 +383,8 @@ def test_a_passive_leg_needs_no_reading() -> None:
     found = refine(fitted, replace(session.measurements, q=q), session.outlines, start)
     of_others = np.delete(joint_errors(found.parameters), -3)  # leg 4 has no offset to find
     assert np.abs(of_others).max() < 1e-9
-    assert "leg4.offset" not in found.names
-    assert found.kinematic_covariance.shape == (29, 29)
+    assert "leg4.offset" not in found.estimates.names
+    assert found.kinematic.covariance.shape == (29, 29)
 
 
 def test_encoders_carry_the_scale_so_that_a_wrong_radius_is_found() -> None:
@@ -386,8 +392,9 @@ def test_encoders_carry_the_scale_so_that_a_wrong_radius_is_found() -> None:
     start = disturbed_start(session)
     solution = refine(session.legs, session.measurements, session.outlines, start)
     # The prior, 2 % of the radius, pulls a little; what it costs is within sigma.
-    sigma_radii = solution.sigma[-len(solution.radii) :]
-    assert all(name.split(".")[1] == "radius" for name in solution.names[-len(sigma_radii) :])
+    found, n = solution.estimates, len(solution.radii)
+    sigma_radii = found.sigma[-n:]
+    assert all(name.split(".")[1] == "radius" for name in found.names[-n:])
     for radius, sigma in zip(solution.radii.values(), sigma_radii, strict=True):
         assert radius == pytest.approx(0.0101, abs=3e-6)
         assert sigma < 1e-5
@@ -404,10 +411,10 @@ def test_errors_agree_with_the_covariance(n: int) -> None:
         measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
         found = refine(session.legs, measurements, outlines, start)
         error = joint_errors(found.parameters)
-        normalised.append(error @ np.linalg.solve(found.kinematic_covariance, error) / len(error))
-        z.append(error / found.sigma[: len(error)])
-        scales.append(found.noise.scale)
-        chi2.append(found.chi2 / found.dof)
+        normalised.append(error @ np.linalg.solve(found.kinematic.covariance, error) / len(error))
+        z.append(error / found.estimates.sigma[: len(error)])
+        scales.append(found.quality.noise.scale)
+        chi2.append(found.quality.chi2 / found.quality.dof)
     # The mean of n chi-squares of 30 degrees, over 30: 1 with standard deviation 0.26 / sqrt(n);
     # the noise is estimated from some 200 residuals a run, which widens it a little.
     assert np.mean(normalised) == pytest.approx(1.0, abs=1.1 / np.sqrt(n))
@@ -544,10 +551,11 @@ def test_where_the_fit_starts_does_not_show_in_the_result(name: str) -> None:
     step *= np.where(units == "m", 0.003, np.deg2rad(1.0))
     elsewhere = moved_legs(legs.nominal, legs.parametrization.place, step)
     other = fitted(replace(session, start=replace(session.start, legs=elsewhere)))
-    assert len(one.names) >= len(units) - 1  # the twist of a Tricept is fixed
-    away = np.array([other.values[n] - one.values[n] for n in one.names])
-    assert np.abs(away / one.sigma).max() < 1e-3
-    assert other.cost == pytest.approx(one.cost, rel=1e-6)
+    assert len(one.estimates.names) >= len(units) - 1  # the twist of a Tricept is fixed
+    names = one.estimates.names
+    away = other.estimates.vector(names) - one.estimates.vector(names)
+    assert np.abs(away / one.estimates.sigma).max() < 1e-3
+    assert other.quality.cost == pytest.approx(one.quality.cost, rel=1e-6)
 
 
 @pytest.mark.parametrize("name", thinned(MACHINES, ["tricept", "3-rpr"]))
@@ -569,10 +577,10 @@ def test_relabelling_legs_relabels_the_result(name: str) -> None:
         replace(session.outlines, leg=new[session.outlines.leg]),
         replace(start, legs=tuple(start.legs[i] for i in order)),
     )
-    assert set(again.names) == set(found.names)
-    sigma = dict(zip(found.names, found.sigma.tolist(), strict=True))
-    for parameter, s in zip(again.names, again.sigma.tolist(), strict=True):
-        assert abs(again.values[parameter] - found.values[parameter]) < 1e-3 * s
+    assert set(again.estimates.names) == set(found.estimates.names)
+    sigma = dict(zip(found.estimates.names, found.estimates.sigma.tolist(), strict=True))
+    for parameter, s in zip(again.estimates.names, again.estimates.sigma.tolist(), strict=True):
+        assert abs(again.estimates.values[parameter] - found.estimates.values[parameter]) < 1e-3 * s
         assert s == pytest.approx(sigma[parameter], rel=1e-4)
 
 
@@ -580,14 +588,14 @@ def test_relabelling_legs_relabels_the_result(name: str) -> None:
 def test_a_machine_in_another_size_gives_the_same_in_that_size(name: str) -> None:
     session, found = noisy_fit(name)
     again = fitted(scaled(session))
-    assert again.names == found.names
-    unit = np.where([found.units[n] == "m" for n in found.names], SCALE, 1.0)
+    assert again.estimates.names == found.estimates.names
+    unit = np.where([found.estimates.units[n] == "m" for n in found.estimates.names], SCALE, 1.0)
     values, others = (
-        np.array([solution.values[n] for n in found.names]) for solution in (found, again)
+        solution.estimates.vector(found.estimates.names) for solution in (found, again)
     )
-    assert np.abs((others / unit - values) / found.sigma).max() < 1e-3
-    np.testing.assert_allclose(again.sigma / unit, found.sigma, rtol=1e-4)
-    assert again.rms_px == pytest.approx(found.rms_px)
+    assert np.abs((others / unit - values) / found.estimates.sigma).max() < 1e-3
+    np.testing.assert_allclose(again.estimates.sigma / unit, found.estimates.sigma, rtol=1e-4)
+    assert again.quality.rms_px == pytest.approx(found.quality.rms_px)
 
 
 def scaled(session: MachineSession) -> MachineSession:
@@ -629,8 +637,8 @@ def test_exact_axes_give_the_truth(coplanar: bool) -> None:
     assert np.abs(session.errors(parameters_of_legs(start.legs))).min() > 0.9 * joints
     found = refine(session.legs, session.measurements, no_outlines(), start, axes=session.axes)
     assert np.abs(session.errors(found.parameters)).max() < 1e-9
-    assert found.rms_px is None
-    assert found.rms_axes == pytest.approx(0.0, abs=1e-5)
+    assert found.quality.rms_px is None
+    assert found.quality.rms_axes == pytest.approx(0.0, abs=1e-5)
     assert found.radii == {}
 
 
@@ -641,8 +649,8 @@ def test_axes_beside_outlines_add_to_what_is_known() -> None:
     arguments = (session.legs, session.measurements, session.outlines, disturbed_start(session))
     alone, both = refine(*arguments), refine(*arguments, axes=axes)
     assert np.abs(joint_errors(both.parameters)).max() < 1e-9
-    assert np.all(both.sigma[:30] < alone.sigma[:30])
-    assert both.dof == alone.dof + 4 * len(axes)
+    assert np.all(both.estimates.sigma[:30] < alone.estimates.sigma[:30])
+    assert both.quality.dof == alone.quality.dof + 4 * len(axes)
 
 
 @pytest.mark.parametrize("coplanar", thinned([False, True], [True]))
@@ -652,9 +660,9 @@ def test_errors_reach_the_bound_and_agree_with_their_sigmas(coplanar: bool) -> N
     least = bound(problem, session.truth)
     solutions = [fitted_axes(session, *session.noisy(seed)) for seed in range(n)]
     errors = np.array([session.errors(found.parameters) for found in solutions])
-    sigmas = np.array([found.sigma for found in solutions])
+    sigmas = np.array([found.estimates.sigma for found in solutions])
     claimed = [
-        error @ np.linalg.solve(found.covariance, error) / 30
+        error @ np.linalg.solve(found.estimates.covariance, error) / 30
         for error, found in zip(errors, solutions, strict=True)
     ]
     to_bound = np.einsum("na,ab,nb->n", errors, np.linalg.inv(least), errors) / 30
@@ -663,8 +671,9 @@ def test_errors_reach_the_bound_and_agree_with_their_sigmas(coplanar: bool) -> N
     assert np.mean(claimed) == pytest.approx(1.0, abs=0.12)
     # Parameters share few large errors, so that their own mean squares spread more.
     assert np.mean((errors / sigmas) ** 2) == pytest.approx(1.0, abs=0.3)
-    assert np.mean([found.chi2 / found.dof for found in solutions]) == pytest.approx(1.0, abs=0.02)
-    assert np.mean([found.rms_axes or 0.0 for found in solutions]) < 1.0
+    quality = [found.quality for found in solutions]
+    assert np.mean([one.chi2 / one.dof for one in quality]) == pytest.approx(1.0, abs=0.02)
+    assert np.mean([one.rms_axes or 0.0 for one in quality]) < 1.0
     # What the robust loss does not keep, and no more.
     assert np.all(sigmas.mean(axis=0) > np.sqrt(np.diag(least)))
     assert sigmas.mean() < 1.02 * np.sqrt(np.diag(least)).mean()
@@ -707,8 +716,8 @@ def test_a_fit_with_a_board_is_exact_without_noise(name: str, by_hand: bool) -> 
     assert max(errors(session, solution).values()) < 1e-8
     apart = place_of_board(session).inv() * solution.T_frame_board["base"]
     assert np.linalg.norm(apart.translation) < 1e-8
-    assert solution.values[BOARD_SCALE] == pytest.approx(1.0, abs=1e-8)
-    assert solution.status[BOARD_SCALE] == "estimated"
+    assert solution.estimates.values[BOARD_SCALE] == pytest.approx(1.0, abs=1e-8)
+    assert solution.estimates.status[BOARD_SCALE] == "estimated"
 
 
 def test_corners_join_cameras_and_help_to_find_intrinsics() -> None:
@@ -718,10 +727,13 @@ def test_corners_join_cameras_and_help_to_find_intrinsics() -> None:
     free = Choices(free=frozenset({"c1.fx", "c1.fy"}))
     alone = refine(session.legs, measurements, outlines, session.start, choices=free)
     joined = refine(session.legs, measurements, outlines, start, board=seen, choices=free)
-    sigma = dict(zip(joined.names, joined.sigma.tolist(), strict=True))
-    ratios = [sigma[name] / s for name, s in zip(alone.names, alone.sigma, strict=True)]
+    sigma = dict(zip(joined.estimates.names, joined.estimates.sigma.tolist(), strict=True))
+    ratios = [
+        sigma[name] / s
+        for name, s in zip(alone.estimates.names, alone.estimates.sigma, strict=True)
+    ]
     assert np.median(ratios) < 0.9
-    assert sigma["c1.fx"] < alone.sigma[alone.names.index("c1.fx")]
-    assert abs(joined.values["c1.fx"] - 1290.0) < 4.0 * sigma["c1.fx"]
+    assert sigma["c1.fx"] < alone.estimates.sigma[alone.estimates.names.index("c1.fx")]
+    assert abs(joined.estimates.values["c1.fx"] - 1290.0) < 4.0 * sigma["c1.fx"]
     pulls = [error / sigma[name] for name, error in errors(session, joined).items()]
     assert np.sqrt(np.mean(np.square(pulls))) < 3.0

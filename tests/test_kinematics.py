@@ -26,6 +26,7 @@ from legcal.machine import (
     forward_kinematics_many,
     inverse_kinematics,
     joint_values,
+    kinematics,
     load_mechanism,
     pose_equations,
     random_configurations,
@@ -187,6 +188,27 @@ def test_a_path_of_readings_gives_a_continuous_path_of_poses() -> None:
         step = one.inv() * two
         assert np.linalg.norm(step.translation) < 0.02
         assert step.rotation.magnitude() < 0.05
+
+
+@pytest.mark.parametrize("model", ["hexapod", "delta"])
+def test_calls_that_start_where_the_last_one_ended_close_no_loop_anew(
+    model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = load_mechanism(model)
+    T, q = machine.home, inverse_kinematics(machine, machine.home)
+    forward_kinematics(machine, q, start=T)
+    span = np.array([leg.travel[1] - leg.travel[0] for leg in machine.legs])
+    steps = machine.at_readings(span[list(machine.motors)] * 0.02)
+    T, follower = forward_kinematics(machine, q), Follower(machine)
+    monkeypatch.setattr(kinematics, "close_at", None)
+    for k in range(5):
+        T = forward_kinematics(machine, q + k * steps, start=T)
+        expected = follower.move_to(q + k * steps).as_matrix()
+        np.testing.assert_allclose(T.as_matrix(), expected, atol=1e-12)
+    monkeypatch.undo()
+    elsewhere = forward_kinematics(machine, q + steps, start=machine.home)
+    there = forward_kinematics(machine, q + steps).as_matrix()
+    np.testing.assert_allclose(elsewhere.as_matrix(), there, atol=1e-11)
 
 
 def test_a_start_in_another_assembly_mode_stays_there() -> None:

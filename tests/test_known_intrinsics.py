@@ -67,8 +67,8 @@ def moved(away: Array, covariance: Array | None = COVARIANCE) -> Camera:
 def errors(given: MachineSession, found: Solution) -> float:
     """Return e' C^-1 e of the kinematic parameters over their number."""
     e = given.legs.vector(found.legs) - given.legs.vector(given.truth.legs)
-    sigma = np.sqrt(np.diagonal(found.value_covariance))
-    z, correlation = e / sigma, found.value_covariance / np.outer(sigma, sigma)
+    sigma = np.sqrt(np.diagonal(found.kinematic.value_covariance))
+    z, correlation = e / sigma, found.kinematic.value_covariance / np.outer(sigma, sigma)
     return float(z @ np.linalg.solve(correlation, z)) / len(e)
 
 
@@ -97,8 +97,10 @@ def test_intrinsics_of_exact_pictures_are_found() -> None:
     given = session(None)
     away = np.array([2.0, -1.0, 1.0, -1.0, 0.003, -0.01, 2e-4, -2e-4, 0.0])
     found = fitted(given, moved(away, _covariance(1e4 * SIGMA)))
-    assert [name for name in found.names if name in {f"c1.{name}" for name in NAMES}] == [*FREE]
-    assert not any(name.startswith(("c2", "c3")) for name in found.values)  # views of one camera
+    names = {f"c1.{name}" for name in NAMES}
+    assert [name for name in found.estimates.names if name in names] == [*FREE]
+    others = "c2", "c3"  # views of the same camera
+    assert not any(name.startswith(others) for name in found.estimates.values)
     assert found.cameras[2].K is not LENS.K
     np.testing.assert_allclose(found.cameras[2].K, LENS.K, atol=1e-4)
     assert np.abs(given.legs.vector(found.legs) - given.legs.vector(given.truth.legs)).max() < 1e-7
@@ -111,27 +113,30 @@ def test_a_covariance_says_what_lies_between_exact_and_free() -> None:
         fitted(given, replace(LENS, covariance=_covariance(factor * sigma)))
         for factor in (1e-4, 1.0, 1e4)
     )
-    n = len(exact.names)
-    assert exact.names == tight.names[:n]
+    n = len(exact.estimates.names)
+    assert exact.estimates.names == tight.estimates.names[:n]
     for narrow, broad in ((exact, tight), (wide, free)):
-        np.testing.assert_allclose(narrow.sigma[:n], broad.sigma[:n], rtol=1e-3)
+        np.testing.assert_allclose(narrow.estimates.sigma[:n], broad.estimates.sigma[:n], rtol=1e-3)
         np.testing.assert_allclose(
             given.legs.vector(narrow.legs), given.legs.vector(broad.legs), atol=1e-7
         )
-    assert np.all(stated.sigma[:n] > tight.sigma[:n])
-    assert np.all(stated.sigma[:n] < wide.sigma[:n])
+    assert np.all(stated.estimates.sigma[:n] > tight.estimates.sigma[:n])
+    assert np.all(stated.estimates.sigma[:n] < wide.estimates.sigma[:n])
     # As many priors as unknowns.
-    assert exact.dof == tight.dof == stated.dof == free.dof + len(unknown)
-    assert [stated.prior_sigma[name] for name in unknown] == pytest.approx(SIGMA[:4].tolist())
-    at = [stated.names.index(name) for name in unknown]
-    assert np.all(stated.sigma[at] < SIGMA[:4])
-    assert not {name for direction in wide.weak for name, _ in direction.parts} & {*unknown}
+    dof = {found.quality.dof for found in (exact, tight, stated)}
+    assert dof == {free.quality.dof + len(unknown)}
+    priors = [stated.estimates.prior_sigma[name] for name in unknown]
+    assert priors == pytest.approx(SIGMA[:4].tolist())
+    at = [stated.estimates.names.index(name) for name in unknown]
+    assert np.all(stated.estimates.sigma[at] < SIGMA[:4])
+    weak = {name for direction in wide.estimates.weak for name, _ in direction.parts}
+    assert weak.isdisjoint(unknown)
 
 
 def test_one_file_that_states_a_covariance_speaks_for_the_camera() -> None:
     camera = replace(LENS, covariance=COVARIANCE)
     both, one = fitted(session(), camera), fitted(session(), camera, views=(0, 2))
-    assert one.values == both.values
+    assert one.estimates.values == both.estimates.values
 
 
 def test_what_the_owner_chooses_leaves_the_covariance_of_the_file() -> None:
@@ -142,11 +147,14 @@ def test_what_the_owner_chooses_leaves_the_covariance_of_the_file() -> None:
         priors={"c1.cy": Prior(380.5, 1e-6)},
     )
     stated, chosen = fitted(session(), camera), fitted(session(), camera, choices)
-    assert "c1.fx" not in chosen.values
-    assert "c1.cx" not in chosen.prior_sigma
-    assert chosen.prior_sigma["c1.fy"] == stated.prior_sigma["c1.fy"] == pytest.approx(SIGMA[1])
-    assert chosen.values["c1.cy"] == pytest.approx(380.5, abs=1e-5)
-    sigma = [found.sigma[found.names.index("c1.cx")] for found in (stated, chosen)]
+    assert "c1.fx" not in chosen.estimates.values
+    assert "c1.cx" not in chosen.estimates.prior_sigma
+    fy = [found.estimates.prior_sigma["c1.fy"] for found in (chosen, stated)]
+    assert fy == pytest.approx([SIGMA[1]] * 2)
+    assert chosen.estimates.values["c1.cy"] == pytest.approx(380.5, abs=1e-5)
+    sigma = [
+        found.estimates.sigma[found.estimates.names.index("c1.cx")] for found in (stated, chosen)
+    ]
     assert sigma[1] > sigma[0]
 
 
@@ -168,7 +176,7 @@ def test_a_camera_that_contradicts_its_covariance_is_named(
     found = fitted(session(n_poses=8), moved(away, _covariance(0.3 * SIGMA)))
     (note,) = said_of_cameras(found)
     assert [word for word in said if word not in note] == []
-    assert found.contradicted_cameras == ("c1",)
+    assert found.camera_doubts.views == ("c1",)
 
 
 def test_axes_do_not_depend_on_cameras() -> None:
@@ -177,7 +185,7 @@ def test_axes_do_not_depend_on_cameras() -> None:
     views = [replace(view, camera=moved(0.0 * SIGMA)) for view in measurements.views]
     stated = replace(measurements, views=tuple(views))
     found = refine(exact.legs, stated, no_outlines(), exact.start(), axes=axes)
-    assert not any(name.endswith(".fx") for name in found.values)
+    assert not any(name.endswith(".fx") for name in found.estimates.values)
 
 
 def state_covariance(folder: Path) -> Path:

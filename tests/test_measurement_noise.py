@@ -35,6 +35,7 @@ from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
 from legcal.geometry import Array, normal_basis
 from legcal.machine import Cylinder, JointType, Leg, LegKind, load_mechanism
 from legcal.perception.detection import measure_outlines
+from legcal.perception.outline import measure
 from legcal.perception.placement import Placement, Search
 from legcal.report import noise_table
 from legcal.vision import EPSILON, Camera, outlines_of_axis
@@ -273,7 +274,8 @@ def canny_errors(
     search = Search(lambda row: image, m, A, B, cylinders, shown, names)
     placement = Placement(A, B, (RigidTransform.identity(),))
     canny, ours = (
-        measure_outlines(search, placement, [0], method=method)[0] for method in (canny_parts, None)
+        measure_outlines(search, placement, [0], method=method)[0]
+        for method in (canny_parts, measure)
     )
     error = []
     for i in np.flatnonzero(canny.used).tolist():

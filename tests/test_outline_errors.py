@@ -144,7 +144,7 @@ def test_a_fifth_of_the_outlines_wrong_costs_less_than_half_the_accuracy(
     dirty = shifted(session, outlines, _shifts(session, wrong, rng, alone=which is single))
     found = refine(session.legs, measurements, dirty, session.start)
     clean = _clean(name)
-    sigma = np.sqrt(np.diag(clean.kinematic_covariance))
+    sigma = np.sqrt(np.diag(clean.kinematic.covariance))
     free = sigma > 0.0  # all but twists
     assert not found.outlines.used[wrong].any()
     assert (~found.outlines.used[~wrong]).sum() <= 2
@@ -178,8 +178,8 @@ def test_a_wrong_axis_hardly_bends_the_answer() -> None:
         for some in (axes, replace(axes, M=M))
     )
     moved = session.errors(bent.parameters) - session.errors(clean.parameters)
-    assert np.abs(moved / clean.sigma).max() < 2.0
-    assert bent.chi2 > clean.chi2 + 1e4
+    assert np.abs(moved / clean.estimates.sigma).max() < 2.0
+    assert bent.quality.chi2 > clean.quality.chi2 + 1e4
 
 
 def find(outlines: Outlines, row: int, leg: int, edge: int) -> int:
@@ -223,7 +223,7 @@ def test_errors_of_corners_are_found_in_their_residuals() -> None:
             outlines,
             with_board(session, corners)[1],
             board=with_board(session, replace(corners, sigma_px=factor * corners.sigma_px))[0],
-        ).sigma
+        ).estimates.sigma
         for factor in (0.2, 5.0)
     ]
     np.testing.assert_allclose(claimed[0], claimed[1], rtol=0.05)
@@ -244,7 +244,8 @@ def test_a_few_wrong_corners_do_little() -> None:
         start,
         board=replace(seen, corners=replace(corners, px=px)),
     )
-    assert np.abs((_errors(session, bent) - _errors(session, right)) / right.sigma[:30]).max() < 1.0
+    away = _errors(session, bent) - _errors(session, right)
+    assert np.abs(away / right.estimates.sigma[:30]).max() < 1.0
     assert {corner for _, _, corner in bent.rejected_corners} == {*range(0, BOARD.n_corners, 9)}
     assert any("disagree with the fit and were left out" in note for note in bent.notes)
 
@@ -255,8 +256,8 @@ def test_rejected_corners_and_a_board_in_no_image_are_left_out() -> None:
     none = replace(corners, used=np.zeros(len(corners), dtype=np.bool_))
     seen, start = with_board(session, none)
     solution = refine(session.legs, session.measurements, session.outlines, start, board=seen)
-    assert (solution.T_frame_board, solution.rms_corners_px) == ({}, {})
-    assert BOARD_SCALE not in solution.values
+    assert (solution.T_frame_board, solution.quality.rms_corners_px) == ({}, {})
+    assert BOARD_SCALE not in solution.estimates.values
 
 
 def biases_of(session: HexapodSession) -> EdgeBiases:
@@ -356,9 +357,10 @@ def test_shared_errors_are_found_and_weighed(session: HexapodSession) -> None:
         outlines = shared_errors(session, rng, 0.06, 0.03)
         found = refine(session.legs, measurements, outlines, start)
         error = joint_errors(found.parameters)
-        normalised.append(error @ np.linalg.solve(found.kinematic_covariance, error) / len(error))
-        sizes.append(found.noise.scale)
-        assert {"bias", "tilt", "bias_x"} <= {name.rsplit(".", 1)[1] for name in found.biases}
+        normalised.append(error @ np.linalg.solve(found.kinematic.covariance, error) / len(error))
+        sizes.append(found.quality.noise.scale)
+        kinds = {name.rsplit(".", 1)[1] for name in found.posterior.biases}
+        assert {"bias", "tilt", "bias_x"} <= kinds
     assert np.mean(sizes) == pytest.approx(1.0, abs=0.1)
     assert 0.7 < np.mean(normalised) < 1.5
 
@@ -376,8 +378,8 @@ def test_errors_that_come_back_with_a_place_widen_the_covariance() -> None:
         outlines = moved_outlines(noisy_outlines(session, rng), PINHOLE, shift)
         found = refine(session.legs, noisy_readings(session, rng), outlines, start)
         error = joint_errors(found.parameters)
-        normalised.append(error @ np.linalg.solve(found.kinematic_covariance, error) / len(error))
-        found_px.append(found.shared_px[PLACES[0]])
+        normalised.append(error @ np.linalg.solve(found.kinematic.covariance, error) / len(error))
+        found_px.append(found.quality.shared_px[PLACES[0]])
     assert 0.7 < np.mean(normalised) < 1.2
     assert np.mean(found_px) == pytest.approx(sigma, rel=0.3)
 
@@ -388,7 +390,7 @@ def test_edges_that_lie_inwards_together_are_noted(session: HexapodSession) -> N
     found = refine(session.legs, noisy_readings(session, rng), outlines, disturbed_start(session))
     (note,) = found.notes
     assert "inwards or outwards together by 0." in note
-    assert found.shared_px["bias of many edges"] == pytest.approx(0.4, rel=0.6)
+    assert found.quality.shared_px["bias of many edges"] == pytest.approx(0.4, rel=0.6)
 
 
 def test_independent_errors_are_hardly_taken_for_shared_ones(session: HexapodSession) -> None:
@@ -397,8 +399,8 @@ def test_independent_errors_are_hardly_taken_for_shared_ones(session: HexapodSes
         rng = np.random.default_rng(100 + seed)
         measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
         found = refine(session.legs, measurements, outlines, start)
-        shared.append(max(map(abs, found.biases.values()), default=0.0))
-        assert found.noise.bias_px == found.noise.tilt_px == 0.0
+        shared.append(max(map(abs, found.posterior.biases.values()), default=0.0))
+        assert found.quality.noise.bias_px == found.quality.noise.tilt_px == 0.0
     assert shared.count(0.0) >= 2  # one set in twenty seems to have some
     assert max(shared) < 0.02  # [px], where points of edges scatter by 0.05 px
 
@@ -488,13 +490,12 @@ def test_gamma_of_a_camera_is_found_by_its_outlines(session: HexapodSession) -> 
     assert gamma.sigma == pytest.approx(np.sqrt(of_fit**2 + unseen**2 + LIMB_SIGMA**2))
     assert np.log(gamma.gamma) == pytest.approx(LOG_GAMMA, abs=0.06)  # the fit's own three sigmas
     assert any("The gamma of the camera of views c1, c2, c3 is not given" in n for n in found.notes)
-    assert not any("gamma" in name for name in found.biases)
     as_linear = refine(session.legs, session.measurements, outlines, start)
     right, wrong = (np.sqrt(np.mean(joint_errors(s.parameters) ** 2)) for s in (found, as_linear))
     assert right < wrong
-    assert found.rms_px is not None
-    assert as_linear.rms_px is not None
-    assert found.rms_px < 0.7 * as_linear.rms_px
+    assert found.quality.rms_px is not None
+    assert as_linear.quality.rms_px is not None
+    assert found.quality.rms_px < 0.7 * as_linear.quality.rms_px
 
 
 def test_view_whose_gamma_is_given_keeps_it(session: HexapodSession) -> None:
@@ -534,8 +535,8 @@ def test_gammas_that_are_given_or_of_which_nothing_is_known_are_not_estimated(
     for measurements in (session.measurements, without_gamma(session.measurements)):
         found = refine(session.legs, measurements, bare, start)
         assert found.gammas == given.gammas == ()
-        assert found.values == given.values
-        np.testing.assert_array_equal(found.covariance, given.covariance)
+        assert found.estimates.values == given.estimates.values
+        np.testing.assert_array_equal(found.estimates.covariance, given.estimates.covariance)
 
 
 def test_each_camera_has_its_own_gamma(session: HexapodSession) -> None:

@@ -1,5 +1,6 @@
 """Sub-pixel lines: pixels beside an outline, the limb model, and blocks fitted to it."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -499,15 +500,34 @@ def test_sums_over_pixels_serve_places_and_blurs_nearby(monkeypatch: pytest.Monk
     assert found.blur == pytest.approx(anew.blur, rel=5e-3)
 
 
+def together(parts: Sequence[Blocks]) -> Blocks:
+    """Return the outlines of one image, 40 blocks each."""
+    d, light, weight, position = (
+        np.concatenate([getattr(one, name) for one in parts])
+        for name in ("d", "light", "weight", "position")
+    )
+    bounds, half_width = 40 * np.arange(len(parts) + 1), np.full(len(parts), HALF_WIDTH)
+    both = Blocks.of_pixels(d, light, weight, bounds, position, half_width)
+    both.noise[:] = 0.09
+    return both
+
+
 def test_outlines_that_have_converged_do_not_depend_on_others() -> None:
     slow, quick = outline(GLINT, (0.2, -0.2), 0.5, noise=0.3), outline(BRIGHT, (0.0, 0.0), 0.5)
-    names = "d", "light", "weight"
-    d, light, weight = (np.concatenate([getattr(x, name) for x in (slow, quick)]) for name in names)
-    half_width, position = np.full(2, HALF_WIDTH), np.concatenate([slow.position, quick.position])
-    both = Blocks.of_pixels(d, light, weight, np.array([0, 40, 80]), position, half_width)
-    both.noise[:] = 0.09
-    found = fit_pooled(both, np.ones(80, dtype=np.bool_), 0.5, DEPTH)
+    found = fit_pooled(together([slow, quick]), np.ones(80, dtype=np.bool_), 0.5, DEPTH)
     np.testing.assert_allclose(found.ends, [[0.2, -0.2], [0.0, 0.0]], atol=0.02)
+
+
+def test_an_outline_without_blocks_stays_while_others_move_the_blur_of_the_image() -> None:
+    sharp, soft = (
+        outline(contrast * BRIGHT, (0.0, 0.0), blur, noise=0.3)
+        for contrast, blur in ((1.0, 0.3), (0.3, 0.95))
+    )
+    kept = np.repeat([True, False, True, False], [6, 34, 40, 40])
+    found = fit_pooled(together([sharp, soft, sharp]), kept, 0.6, DEPTH)
+    np.testing.assert_array_equal(found.ends[2], [0.0, 0.0])
+    assert np.all(np.abs(found.ends[:2]) < 0.3)
+    assert np.isnan(found.by_gamma).tolist() == [False, False, True]
 
 
 def read_with(blocks: Blocks, gamma: float) -> Blocks:

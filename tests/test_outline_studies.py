@@ -427,9 +427,8 @@ def test_errors_along_what_is_held_do_not_count(
     design, session, solution = open_machine
     stated = as_stated(design, solution)
     n = len(design.parametrization)
-    assert (stated.rank, len(solution.held_basis)) == (n - FREE_3_UPU, FREE_3_UPU)
-    known = solution.parametrization.names
-    held = solution.held_basis[:, [known.index(name) for name in design.parametrization.names]]
+    assert (stated.rank, len(solution.kinematic.held_basis)) == (n - FREE_3_UPU, FREE_3_UPU)
+    _, held = solution.kinematic.of_values(design.parametrization.names)
     error = np.random.default_rng(0).normal(size=n) * 1e-4
     nse = stated.nse(error)
     assert stated.nse(error + 0.01 * held.sum(axis=0)) == pytest.approx(nse, rel=1e-6)
@@ -563,7 +562,9 @@ def test_a_step_or_a_fit_that_fails_is_counted_with_its_reason(
 def test_a_parameter_that_was_not_estimated_is_a_failure() -> None:
     design, session = _design("3-rpr"), _session("3-rpr")
     solution = one_fit(session, NOISE.radius_sigma)
-    held = dataclasses.replace(solution, status={**solution.status, "leg1.offset": "weak"})
+    status = {**solution.estimates.status, "leg1.offset": "weak"}
+    found = dataclasses.replace(solution.estimates, status=status)
+    held = dataclasses.replace(solution, estimates=found)
     with pytest.raises(NotIdentifiable, match=r"leg1\.offset"):
         errors_of(design, session, held)
 
@@ -591,9 +592,11 @@ def test_convergence_counts_the_truth_as_right_and_another_answer_as_wrong(
         solution = one_fit(session, radius_sigma)
         legs = tuple(dataclasses.replace(leg, q0=leg.q0 + 1e-3) for leg in solution.legs)
         values = {
-            name: value + 1e-3 * name.endswith("offset") for name, value in solution.values.items()
+            name: value + 1e-3 * name.endswith("offset")
+            for name, value in solution.estimates.values.items()
         }
-        return dataclasses.replace(solution, legs=legs, values=values)
+        estimates = dataclasses.replace(solution.estimates, values=values)
+        return dataclasses.replace(solution, legs=legs, estimates=estimates)
 
     monkeypatch.setattr(convergence_study, "one_fit", shifted)
     (found,) = run_study(study, 1).document()["machines"]
@@ -639,6 +642,7 @@ def test_normalised_errors_of_axes_count_from_the_nominal_ones(tmp_path: Path) -
         written_with(nominal, found, by, tmp_path / name).yaml_path
         for name, by in {"truth": away, "calibrated": away + error}.items()
     ]
-    solution = SimpleNamespace(parametrization=found, value_covariance=np.diag(sigma**2))
+    of_values = SimpleNamespace(parametrization=found, value_covariance=np.diag(sigma**2))
+    solution = SimpleNamespace(kinematic=of_values)
     stated = normalised_error(nominal, written[1], written[0], cast(Solution, solution))
     assert stated == pytest.approx(np.mean((error[1:] / sigma[1:]) ** 2), rel=1e-6)

@@ -513,8 +513,8 @@ def test_an_edge_where_other_legs_predict_it_needs_no_partner(beside: float, use
 def test_a_width_that_most_outlines_of_a_cylinder_share_speaks_against_none_of_them() -> None:
     photographs, _, fitted = six_photographs()
     true = [leg.cylinders for leg in photographs.machine.legs]
-    wrong = [[replace(one, radius=0.87 * one.radius) for one in cylinders] for cylinders in true]
-    biased = replace(photographs, machine=photographs.machine.with_cylinders(wrong))
+    wrong = photographs.machine.with_radii(lambda _, c: 0.86 * c.radius)
+    biased = replace(photographs, machine=wrong)
     before = measure_photographs(biased, fitted, no_progress)
     other = with_measured_radii(biased, fitted, before)
     assert other is not None
@@ -525,8 +525,8 @@ def test_a_width_that_most_outlines_of_a_cylinder_share_speaks_against_none_of_t
             for one, of_truth in zip(leg.cylinders, cylinders, strict=True)
         ]
     )
-    changed = ratios > 0.88
+    changed = ratios > 0.87
     assert changed.sum() >= len(ratios) // 2
-    np.testing.assert_allclose(ratios[changed], 1.0, atol=0.05)
+    np.testing.assert_allclose(ratios[changed], 1.0, atol=0.06)
     after = measure_photographs(other, fitted, no_progress)
     assert after.used.sum() > before.used.sum()

@@ -42,9 +42,11 @@ from legcal.machine import (
 from legcal.planning import Setting, planner
 from legcal.planning import places as camera_places
 from legcal.planning.exchange import Session, choose
+from legcal.planning.information import Contributions
 from legcal.planning.planner import Scene, Task
 from legcal.report import plan_table
 from legcal.simulation import Level, ParameterErrors, SimulationSettings, simulate
+from legcal.vision import sample_camera
 
 FEW = Setting(draws=3)
 BOUNDS = "0m:2m,-2m:2m,0.5m:2m"  # of cameras
@@ -282,7 +284,9 @@ def test_arms_that_are_cylinders_count_as_a_calibration_has_them(tmp_path: Path)
         row += len(view.poses.poses)
     assert len(keys & told) >= 0.75 * max(len(keys), len(told))
     found = legcal.calibrate(tmp_path / "shot", output=tmp_path / "out")
-    stated = dict(zip(found.solution.names, found.solution.sigma.tolist(), strict=True))
+    stated = dict(
+        zip(found.solution.estimates.names, found.solution.estimates.sigma.tolist(), strict=True)
+    )
     names = [name for name in plan.names if kind_of_parameter(name) in ARM_KINDS]
     sigma = dict(zip(plan.names, plan.sigma.tolist(), strict=True))
     ratios = [stated[name] / sigma[name] for name in names]
@@ -437,6 +441,45 @@ def test_each_motor_counts_with_its_own_standard_deviation(monkeypatch: pytest.M
     ]
     default, rough, servo = (np.linalg.norm(rows) for rows in known)
     assert default > 1.1 * rough > 1.1 * servo
+
+
+def test_photographs_of_one_site_share_errors_at_its_places() -> None:
+    """They tell as much as generalised least squares gets from all of them."""
+    hexapod, session = load_mechanism("hexapod"), machine_session("hexapod", n_views=1)
+    T_base_camera = hexapod.T_base_Rb * session.truth.T_camera_Rb[0].inv()
+    predictor = planning.Predictor(hexapod, sample_camera(), planning.DEFAULT_NOISE, 2e-6)
+
+    def contributions(*taken: int, is_fit: bool = False) -> Contributions:
+        shown = [np.flatnonzero(session.outlines.row == pose) for pose in taken]
+        image = np.repeat(np.arange(len(taken)), [len(own) for own in shown])
+        return predictor.contributions(
+            {"c1": T_base_camera},
+            np.zeros(len(taken), dtype=np.intp),
+            [session.truth.T_Rb_Re[pose] for pose in taken],
+            replace(session.outlines.choose(np.concatenate(shown)), row=image),
+            is_fit=is_fit,
+        )
+
+    found, fitted = contributions(0, 0, 0), contributions(0, 0, 0, is_fit=True)
+    J = fitted.rows.reshape(-1, len(fitted.names))
+    shared = fitted.shifts.reshape(len(J), -1)
+    information = J.T @ np.linalg.solve(np.eye(len(J)) + shared @ shared.T, J)
+    unit = np.sqrt(np.diagonal(information + found.prior))
+    J = found.all_gains() / unit
+    np.testing.assert_allclose(J.T @ J, information / unit / unit[:, None], atol=1e-9)
+
+    several = contributions(0, 5, 0, 5, 0)
+    assert several.site.tolist() == [0, 1, 0, 1, 0]
+    of = np.array([1, 2, 3])
+    parts = {"rows": several.rows[of], "at_site": several.at_site[of], "site": several.site[of]}
+    searched, left = Session([several]), Session([], [replace(several, **parts)])
+    for image in (0, 1, 2, 3):
+        searched.changed(0, image, 1.0)
+    searched.changed(0, 0, -1.0)  # the other of its site moves up
+    unit = np.sqrt(np.diagonal(left.information))
+    off = (searched.information - left.information) / unit / unit[:, None]
+    np.testing.assert_allclose(off, 0.0, atol=1e-9)
+    np.testing.assert_allclose(searched.machine, left.machine, rtol=0.01, atol=1e-5)
 
 
 def test_what_else_is_in_the_way_is_refused(

@@ -83,8 +83,8 @@ def test_corners_of_the_board_on_the_platform_have_noise_and_outliers_of_their_o
     said = next(note for note in found.notes if "disagree with the fit" in note)
     assert f"{fixed.first + 5} in c1, {row_names(m)[0]}" in said
     right = refine(session.legs, m, no_outlines(), start, board=seen)
-    np.testing.assert_allclose(found.sigma, right.sigma, rtol=0.1)
-    assert found.rms_corners_px["platform"] == pytest.approx(0.05, rel=0.1)
+    np.testing.assert_allclose(found.estimates.sigma, right.estimates.sigma, rtol=0.1)
+    assert found.quality.rms_corners_px["platform"] == pytest.approx(0.05, rel=0.1)
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def test_a_result_that_is_loaded_says_what_the_calibration_said(example_run: Run
     assert "outlines of 45 images used" in repr(loaded)
     table = calibration.table()
     rows = {row["parameter"]: row for row in table}
-    found = calibration.solution.values["leg2.offset"]
+    found = calibration.solution.estimates.values["leg2.offset"]
     assert rows["leg2.offset"]["calibrated"] == pytest.approx(1e3 * found, rel=1e-12)
     assert rows["leg2.offset"]["unit"] == "mm"
     assert table[-1] == list(table)[-1]

@@ -597,7 +597,7 @@ def test_a_wrong_rough_pose_gives_way_to_a_better_one(monkeypatch: pytest.Monkey
     turned = RigidTransform.from_rotation(Rotation.from_euler("z", 120.0, degrees=True)) * T
     search = _search(_Made, made, np.array([made.posed(P) for P in spread]))
     monkeypatch.setattr(  # there are no images to measure outlines in
-        recognition._PlacedViews, "decided_by_outlines", lambda views, g: views.placed[g]
+        recognition.PlacedViews, "decided_by_outlines", lambda views, g: views.placed[g]
     )
     for hint in (T, turned):
         placement = recognition.recognise(search, np.arange(4), [hint])

@@ -247,8 +247,8 @@ def test_carriages_may_be_redundant(tmp_path: Path) -> None:
     assert machine.is_redundant
     session = machine_session(str(machine.yaml_path))
     found = refine(session.legs, session.measurements, session.outlines, session.start)
-    names, truth = found.parametrization.names, session.legs.vector(session.truth.legs)
-    values = np.array([found.values[name] for name in names])
+    names, truth = found.kinematic.parametrization.names, session.legs.vector(session.truth.legs)
+    values = found.estimates.vector(names)
     begun = session.legs.vector(session.start.legs)
     assert np.abs(begun - truth).max() > 0.002
     np.testing.assert_allclose(values, truth, atol=1e-7)
@@ -266,8 +266,8 @@ def test_redundant_carriages_calibrate_with_a_platform_error(tmp_path: Path) -> 
     assert found.verdict.trustworthy
     assert found.platform is not None
     assert found.platform.workspace is not None
-    assert found.solution.redundant_readings is not None
-    assert found.solution.redundant_readings.wrong == ()
+    assert found.solution.quality.redundant_readings is not None
+    assert found.solution.quality.redundant_readings.wrong == ()
 
 
 @pytest.mark.parametrize(("kind", "off"), [("7-ups", 1e-3), ("7-pss", -2e-3)])
@@ -280,12 +280,12 @@ def test_a_wrong_reading_is_named_with_its_amount_and_does_no_harm(
     q[row, leg] += off
     wrong = dataclasses.replace(m, q=q)
     found = refine(session.legs, wrong, session.outlines, session.start)
-    assert found.redundant_readings is not None
-    (one,) = found.redundant_readings.wrong
+    assert found.quality.redundant_readings is not None
+    (one,) = found.quality.redundant_readings.wrong
     assert (one.leg, one.pose, one.image) == (leg, row, m.image[row])
     assert one.off == pytest.approx(off, abs=1e-6)
-    assert found.redundant_readings.doubts == ()
-    values = np.array([found.values[name] for name in found.parametrization.names])
+    assert found.quality.redundant_readings.doubts == ()
+    values = found.estimates.vector(found.kinematic.parametrization.names)
     np.testing.assert_allclose(values, session.legs.vector(session.truth.legs), atol=1e-6)
 
 
@@ -312,9 +312,9 @@ def test_right_readings_that_a_bent_model_contradicts_come_back(
     monkeypatch.setattr("legcal.calibration.joint_fit.rounds.with_judged_readings", too_strict)
     found = refine(session.legs, wrong, session.outlines, session.start)
     assert n_left_out[0] > 5
-    assert found.redundant_readings is not None
-    assert [(one.leg, one.pose) for one in found.redundant_readings.wrong] == [(3, 7)]
-    assert found.redundant_readings.doubts == ()
+    assert found.quality.redundant_readings is not None
+    assert [(one.leg, one.pose) for one in found.quality.redundant_readings.wrong] == [(3, 7)]
+    assert found.quality.redundant_readings.doubts == ()
 
 
 def test_a_contradiction_that_no_image_shows_is_left_out_and_accuses_no_motor_alone(
@@ -327,12 +327,12 @@ def test_a_contradiction_that_no_image_shows_is_left_out_and_accuses_no_motor_al
     wrong = dataclasses.replace(m, q=q)
     outlines = session.outlines.choose(session.outlines.row != row)
     found = refine(session.legs, wrong, outlines, session.start)
-    assert found.redundant_readings is not None
-    (one,) = found.redundant_readings.wrong
+    assert found.quality.redundant_readings is not None
+    (one,) = found.quality.redundant_readings.wrong
     assert one.pose == row
     assert {one.motor, *one.alike} == set(session.legs.names)
-    assert found.redundant_readings.doubts == ()
-    values = np.array([found.values[name] for name in found.parametrization.names])
+    assert found.quality.redundant_readings.doubts == ()
+    values = found.estimates.vector(found.kinematic.parametrization.names)
     np.testing.assert_allclose(values, session.legs.vector(session.truth.legs), atol=1e-6)
 
 
@@ -343,10 +343,10 @@ def test_a_motor_of_another_scale_is_named_and_not_trusted(tmp_path: Path) -> No
     q[:, 2] *= 0.99
     wrong = dataclasses.replace(session.measurements, q=q)
     found = refine(session.legs, wrong, session.outlines, session.start)
-    assert found.redundant_readings is not None
+    assert found.quality.redundant_readings is not None
     assert any(
         f"scale of {session.legs.names[2]} that is -1 % off explains most" in why
-        for why in found.redundant_readings.doubts
+        for why in found.quality.redundant_readings.doubts
     )
 
 
@@ -355,7 +355,7 @@ def test_a_redundant_machine_calibrates_and_a_wrong_reading_is_refused(tmp_path:
     machine, folder = made("4-rpr", tmp_path), tmp_path / "dataset"
     simulate(machine.yaml_path, folder, settings(poses=6, shared_poses=True))
     calibration = legcal.calibrate(folder, output=tmp_path / "result")
-    judged = calibration.solution.redundant_readings
+    judged = calibration.solution.quality.redundant_readings
     written = json.loads((tmp_path / "result/result.json").read_text())["residuals"]
     assert judged is not None
     assert written["redundant_readings"] == {

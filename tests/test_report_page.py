@@ -91,7 +91,8 @@ def test_a_page_has_the_numbers_of_the_result(example_run: Run, page: Any) -> No
 def test_a_prior_of_a_coordinate_is_told_with_its_joint(example_run: Run) -> None:
     calibration, sigma = example_run.calibration, 1e-5
     known = {"leg2.base.x": sigma, "leg1.base.x": sigma}  # the latter is no parameter
-    solution = replace(calibration.solution, prior_sigma=known)
+    estimates = replace(calibration.solution.estimates, prior_sigma=known)
+    solution = replace(calibration.solution, estimates=estimates)
     changed = replace(calibration, solution=solution)
     changed.__dict__["result"] = calibration.result
     rows = {row[0]: row for row in parameter_tables(changed)[0].rows}

@@ -54,8 +54,8 @@ def _steps(found: Solution) -> dict[str, Array]:
 
 def _assert_moved(found: Solution, mistaken: Solution, what: str) -> None:
     """Check that a fit with a part of an error is moved by that part of its effect."""
-    step, names = _steps(found)[what], found.parametrization.names
-    moved = np.array([mistaken.values[n] - found.values[n] for n in names]) / PART
+    step, names = _steps(found)[what], found.kinematic.parametrization.names
+    moved = (mistaken.estimates.vector(names) - found.estimates.vector(names)) / PART
     assert np.linalg.norm(step) > 1e-8
     np.testing.assert_allclose(moved, step, atol=0.02 * float(np.abs(step).max()))
 
@@ -135,7 +135,7 @@ def test_legs_on_constraints_move_as_predicted(name: str) -> None:
     mistaken = refine(session.legs, *with_camera(*data, wrong), session.start)
     step = _steps(found)[FOCAL]
     assert np.linalg.norm(step) > 1e-6
-    predicted = moved_legs(found.legs, found.parametrization.place, PART * step)
+    predicted = moved_legs(found.legs, found.kinematic.parametrization.place, PART * step)
     _assert_moved_to(*map(session.legs.vector, (found.legs, mistaken.legs, predicted)))
 
 
@@ -145,10 +145,12 @@ def test_a_wrong_twist_moves_the_fit_as_predicted(model: str) -> None:
     data = (session.legs, *session.noisy(0), session.start)
     found, part = refine(*data), 0.1
     effect = next(s for s in found.sensitivities if "twist" in s.what)
-    name = next(n for n in found.parametrization.names if n.endswith(".twist"))
-    twist = found.values[name] + part * np.radians(0.1)
+    name = next(n for n in found.kinematic.parametrization.names if n.endswith(".twist"))
+    twist = found.estimates.values[name] + part * np.radians(0.1)
     mistaken = refine(*data, choices=Choices(fixed=frozenset({name}), values={name: twist}))
-    predicted = moved_legs(found.legs, found.parametrization.place, part * effect.steps[:, 0])
+    predicted = moved_legs(
+        found.legs, found.kinematic.parametrization.place, part * effect.steps[:, 0]
+    )
     _assert_moved_to(*map(session.legs.vector, (found.legs, mistaken.legs, predicted)))
 
 
@@ -189,7 +191,7 @@ def test_a_second_mistake_in_a_camera_is_named_beside_the_first() -> None:
     solution = fitted(irregular_hexapod(12), 0, 1.0, frozenset(), **wrong)
     said = [note.partition(" of c1 ")[0] for note in solution.notes if "does not agree" in note]
     assert sorted(said) == ["The focal length", "The principal point"]
-    assert solution.contradicted_cameras == ("c1",)
+    assert solution.camera_doubts.views == ("c1",)
 
 
 def test_a_view_at_another_zoom_than_the_others_of_its_camera_is_named() -> None:
@@ -207,7 +209,7 @@ def test_a_view_at_another_zoom_than_the_others_of_its_camera_is_named() -> None
     assert note.startswith("The focal length of view c2 does not agree with the other views")
     found = float(note.partition("found it ")[2].partition(" +-")[0])
     assert found == pytest.approx(3.0, abs=1.2)
-    assert solution.contradicted_cameras == ("c2",)
+    assert solution.camera_doubts.views == ("c2",)
 
 
 def test_a_right_focal_length_is_left_alone() -> None:
@@ -225,8 +227,8 @@ def test_nothing_is_said_where_the_noise_hides_it() -> None:
 def test_a_focal_length_that_is_estimated_is_not_tested() -> None:
     solution = fitted(irregular_hexapod(12), 0, 1.01, frozenset({"c1.fx", "c1.fy"}))
     assert notes_on_focal_lengths(solution) == []
-    sigma = solution.sigma[solution.names.index("c1.fx")]
-    assert abs(solution.values["c1.fx"] - 1290.0) < 4.0 * sigma
+    sigma = solution.estimates.sigma[solution.estimates.names.index("c1.fx")]
+    assert abs(solution.estimates.values["c1.fx"] - 1290.0) < 4.0 * sigma
     assert sigma < 4.0
 
 
@@ -248,11 +250,12 @@ def test_a_wrong_camera_file_is_noticed_and_what_it_does_is_told(
     (note,) = (note for note in solution.notes if "does not agree" in note)
     assert note.startswith(start)
     assert words in note
-    assert solution.contradicted_cameras == ("c1",)
+    assert solution.camera_doubts.views == ("c1",)
     (effect,) = (s for s in solution.sensitivities if s.what == FOUND_CAMERA)
     right = fitted(session, 0, 1.0)
     assert not [note for note in right.notes if "does not agree" in note]
-    assert right.contradicted_cameras == ()
-    off = np.array([solution.values[n] - right.values[n] for n in right.parametrization.names])
+    assert right.camera_doubts.views == ()
+    names = right.kinematic.parametrization.names
+    off = solution.estimates.vector(names) - right.estimates.vector(names)
     moved = effect.steps[:, 0]
     assert np.linalg.norm(off + moved) < 0.5 * np.linalg.norm(off)  # it says where the truth is

@@ -74,17 +74,17 @@ def test_fixed_parameters_stay_at_nominal_or_at_their_values(session: MachineSes
     found, true = fitted(at_truth, Choices(fixed=names)), true_values(at_truth)
     assert_exact(at_truth, found)
     for name in ("leg2.offset", "leg4.base.x"):
-        assert found.values[name] == true[name]
+        assert found.estimates.values[name] == true[name]
     assert found.radii[0, "leg1_tube"] == session.legs.radii[0, "leg1_tube"]
-    assert all(found.status[name] == "fixed" for name in names)
-    assert names.isdisjoint(found.names)
+    assert all(found.estimates.status[name] == "fixed" for name in names)
+    assert names.isdisjoint(found.estimates.names)
     parameters = session.legs.parametrization.names
     at = [parameters.index("leg2.offset"), parameters.index("leg4.base.x")]
-    assert not found.kinematic_covariance[at].any()
-    assert found.kinematic_covariance[parameters.index("leg1.offset")].any()
+    assert not found.kinematic.covariance[at].any()
+    assert found.kinematic.covariance[parameters.index("leg1.offset")].any()
     value = true_values(session)["leg3.offset"]
     found = fitted(session, fixed_at({"leg3.offset": value}))
-    assert found.values["leg3.offset"] == pytest.approx(value, abs=1e-15)
+    assert found.estimates.values["leg3.offset"] == pytest.approx(value, abs=1e-15)
     assert_exact(session, found)
 
 
@@ -93,23 +93,25 @@ def test_an_axis_fixed_at_an_angle_stays_there(name: str) -> None:
     session = machine_session("3-rps" if "base" in name else "3-spr")
     value = true_values(session)[name]
     found = fitted(session, fixed_at({name: value}))
-    assert found.values[name] == pytest.approx(value, abs=1e-12)
-    assert found.status[name] == "fixed"
+    assert found.estimates.values[name] == pytest.approx(value, abs=1e-12)
+    assert found.estimates.status[name] == "fixed"
     assert_exact(session, found, 1e-7)
 
 
 def test_a_tight_prior_pins_and_a_loose_one_adds_information(noisy: MachineSession) -> None:
     plain = fitted(noisy)
-    at = plain.names.index("leg1.offset")
-    mean, sigma = plain.values["leg1.offset"], float(plain.sigma[at])
+    at = plain.estimates.names.index("leg1.offset")
+    mean, sigma = plain.estimates.values["leg1.offset"], float(plain.estimates.sigma[at])
     pinned = fitted(noisy, Choices(priors={"leg1.offset": Prior(mean + sigma, 1e-9)}))
-    assert pinned.values["leg1.offset"] == pytest.approx(mean + sigma, abs=1e-10)
-    assert pinned.sigma[at] == pytest.approx(1e-9, rel=1e-3)
+    assert pinned.estimates.values["leg1.offset"] == pytest.approx(mean + sigma, abs=1e-10)
+    assert pinned.estimates.sigma[at] == pytest.approx(1e-9, rel=1e-3)
     # A prior as good as the data goes half the way, and the variance is half.
     half = fitted(noisy, Choices(priors={"leg1.offset": Prior(mean + sigma, sigma)}))
-    assert half.values["leg1.offset"] == pytest.approx(mean + 0.5 * sigma, abs=0.1 * sigma)
-    assert half.sigma[at] == pytest.approx(np.sqrt(0.5) * sigma, rel=0.02)
-    assert half.dof == plain.dof + 1
+    assert half.estimates.values["leg1.offset"] == pytest.approx(
+        mean + 0.5 * sigma, abs=0.1 * sigma
+    )
+    assert half.estimates.sigma[at] == pytest.approx(np.sqrt(0.5) * sigma, rel=0.02)
+    assert half.quality.dof == plain.quality.dof + 1
 
 
 def test_a_freed_radius_has_no_prior(session: MachineSession) -> None:
@@ -124,7 +126,7 @@ def test_a_freed_radius_has_no_prior(session: MachineSession) -> None:
     off = [abs(with_priors.radii[part] - r) for part, r in session.legs.radii.items()]
     assert min(off) > 1e-9
     sigmas = [(with_priors.radii[part] / r - 1.0) / 0.02 for part, r in radii.items()]
-    assert with_priors.chi2 == pytest.approx(np.sum(np.square(sigmas)), rel=1e-3)
+    assert with_priors.quality.chi2 == pytest.approx(np.sum(np.square(sigmas)), rel=1e-3)
     much = {part: 2.2 * r for part, r in session.legs.radii.items()}
     with pytest.raises(DidNotConverge, match="mm; they must agree to a half"):
         fitted(
@@ -144,8 +146,8 @@ def test_a_freed_intrinsic_is_found(
 ) -> None:
     wrong_cameras = with_wrong_cameras(session, wrong, key)
     found = fitted(wrong_cameras, Choices(free=frozenset({f"c1.{key}"})))
-    assert found.status[f"c1.{key}"] == "estimated"
-    assert found.values[f"c1.{key}"] == pytest.approx(true, rel=1e-6)
+    assert found.estimates.status[f"c1.{key}"] == "estimated"
+    assert found.estimates.values[f"c1.{key}"] == pytest.approx(true, rel=1e-6)
     assert_exact(session, found, 1e-7)
     # Equal cameras are one camera.
     assert len({camera.K[0, 0] for camera in found.cameras}) == 1
@@ -170,13 +172,13 @@ def test_a_freed_intrinsic_that_nothing_determines_is_refused(session: MachineSe
 def test_priors_determine_what_images_do_not() -> None:
     session = machine_session("3-upu")
     free = fitted(session)
-    assert free.status["leg2.base.x"] == "weak"
+    assert free.estimates.status["leg2.base.x"] == "weak"
     name = "leg2.base.x"
     known = Choices(priors={name: Prior(true_values(session)[name], 1e-5)})
     found = fitted(session, known)
-    assert len(found.held) == len(free.held) - 1
-    assert found.status[name] == "estimated"
-    assert found.values[name] == pytest.approx(true_values(session)[name], abs=1e-5)
+    assert len(found.kinematic.held) == len(free.kinematic.held) - 1
+    assert found.estimates.status[name] == "estimated"
+    assert found.estimates.values[name] == pytest.approx(true_values(session)[name], abs=1e-5)
 
 
 def test_what_is_held_stays_at_nominal() -> None:
@@ -193,9 +195,9 @@ def test_what_is_held_stays_at_nominal() -> None:
     # Base and platform axes part, as the truth wants, and their means stay.
     assert np.abs(change[pairs].sum(axis=1)).max() < 1e-3
     assert np.abs(change[pairs]).max() > 5e-3
-    assert sum("axis" in words for words in found.held) == 6
-    weak = {name for name, status in found.status.items() if status == "weak"}
-    assert weak.isdisjoint(found.names)
+    assert sum("axis" in words for words in found.kinematic.held) == 6
+    weak = {name for name, status in found.estimates.status.items() if status == "weak"}
+    assert weak.isdisjoint(found.estimates.names)
 
 
 def test_two_priors_that_contradict_each_other_are_refused() -> None:
@@ -370,14 +372,13 @@ def test_the_size_of_a_board_can_be_left_to_the_fit_or_known_or_fixed() -> None:
     wrong = _sized(seen, 0.98)
     everything = session.legs, measurements, outlines, start
     found = refine(*everything, board=wrong, choices=Choices(free=frozenset({BOARD_SCALE})))
-    assert found.values[BOARD_SCALE] == pytest.approx(1.0 / 0.98, abs=2e-3)
+    assert found.estimates.values[BOARD_SCALE] == pytest.approx(1.0 / 0.98, abs=2e-3)
     known = Choices(priors={BOARD_SCALE: Prior(1.0 / 0.98, 1e-4)})
-    assert refine(*everything, board=wrong, choices=known).values[BOARD_SCALE] == pytest.approx(
-        1.0 / 0.98, abs=3e-4
-    )
+    found = refine(*everything, board=wrong, choices=known)
+    assert found.estimates.values[BOARD_SCALE] == pytest.approx(1.0 / 0.98, abs=3e-4)
     fixed = Choices(fixed=frozenset({BOARD_SCALE}))
     held = refine(*everything, board=seen, choices=fixed)
-    assert BOARD_SCALE not in held.names
+    assert BOARD_SCALE not in held.estimates.names
     assert "base" in held.T_frame_board
     stated = Choices(priors={BOARD_SCALE: Prior(1.0, 1e-3)})
     with pytest.raises(DidNotConverge, match=rf"prior of {BOARD_SCALE} contradicts"):
@@ -392,4 +393,4 @@ def test_a_size_that_little_is_known_of_is_not_refused() -> None:
     once = replace(corners, used=corners.used & (measurements.view[corners.row] == 0))
     seen, start = with_board(session, once)
     solution = refine(session.legs, measurements, outlines, start, board=seen)
-    assert solution.values[BOARD_SCALE] == pytest.approx(1.0, abs=5e-3)
+    assert solution.estimates.values[BOARD_SCALE] == pytest.approx(1.0, abs=5e-3)

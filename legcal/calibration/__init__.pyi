@@ -29,12 +29,16 @@ from .identify.report import Identifiability as Identifiability
 from .identify.report import Ranks as Ranks
 from .identify.report import WeakDirection as WeakDirection
 from .joint_fit import Prior as Prior
+from .joint_fit.factors import ObservedOutlines as ObservedOutlines
 from .joint_fit.factors import average_images as average_images
 from .joint_fit.fit import bound as bound
 from .joint_fit.fit import refine as refine
 from .joint_fit.outline_errors import KINDS as KINDS
+from .joint_fit.outline_errors import PLACES as PLACES
 from .joint_fit.outline_errors import NoiseModel as NoiseModel
 from .joint_fit.outline_errors import possible_biases as possible_biases
+from .joint_fit.outline_errors import shifts_at_places as shifts_at_places
+from .joint_fit.outline_errors import shifts_of_edges as shifts_of_edges
 from .joint_fit.outline_errors import with_gamma as with_gamma
 from .joint_fit.parameter_choices import NO_CHOICES as NO_CHOICES
 from .joint_fit.parameter_choices import Choices as Choices

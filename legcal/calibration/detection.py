@@ -75,10 +75,11 @@ from legcal.perception import (
     marks_of_corners,
     marks_of_image,
     marks_of_pairs,
+    predict_legs_and_arms,
     short_reason,
 )
 from legcal.progress import Report
-from legcal.vision import Camera, PredictedLeg, predict_legs
+from legcal.vision import Camera, PredictedLeg
 from legcal.workers import Run
 
 DETECTION = OutputKind("detection", "detection.json", "legcal_detection")
@@ -161,14 +162,9 @@ class Detection:
         T = self.T_base_camera[view]
         if T is None:
             return []
-        used, arms = measurements.views[view].legs, self.arms.values()
-        A, B = (
-            np.concatenate([ends[row], *(arm.ends[row, k : k + 1] for arm in arms)])
-            for k, ends in enumerate((self.A_base, self.B_base))
-        )
-        cylinders = [*self.cylinders, *([arm.cylinder] for arm in arms)]
-        owner = [*range(len(legs)), *self.arms]
-        found = predict_legs(measurements.views[view].camera, T, A, B, cylinders, row)
+        used, camera = measurements.views[view].legs, measurements.views[view].camera
+        ends, owner = (self.A_base, self.B_base), [*range(len(legs)), *self.arms]
+        found = predict_legs_and_arms(camera, T, ends, self.cylinders, self.arms, row)
         every = [replace(leg, leg=owner[leg.leg]) for leg in found]
         return [leg for leg in every if used is None or legs[leg.leg].name in used]
 

@@ -20,6 +20,7 @@ from legcal.brief import brief
 from legcal.calibration.detection import Detection
 from legcal.calibration.diagnosis.diagnosis import MIN_IMAGES, Diagnosis, diagnose, notes_beside
 from legcal.calibration.documents import DiagnosisBlock
+from legcal.calibration.estimate import unseen_legs
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit import Choices
 from legcal.calibration.ordered_dataset import (
@@ -28,7 +29,7 @@ from legcal.calibration.ordered_dataset import (
     order_dataset,
 )
 from legcal.calibration.outline_detection import detected
-from legcal.calibration.pipeline import chosen_parameters, exact_cameras, unseen_legs
+from legcal.calibration.pipeline import chosen_parameters, exact_cameras
 from legcal.data import (
     GOOD_QUALITY,
     Dataset,
@@ -300,9 +301,8 @@ def _look_at_files(found: _Found, problems: Sequence[tuple[int, str]]) -> list[i
 
 
 def _look_at_readings(found: _Found, notes: Sequence[str]) -> None:
-    """Compare readings with travel, and their digits with what is stated of their noise."""
-    dataset, q = found.dataset, found.dataset.measurements.q
-    legs = dataset.machine.legs
+    """Compare readings with each other, with travel, and their digits with their stated noise."""
+    dataset = found.dataset
     for note in notes:
         found.add("readings", "warning", note)
     contradicting = contradicting_readings(dataset.machine, dataset.measurements)
@@ -314,37 +314,46 @@ def _look_at_readings(found: _Found, notes: Sequence[str]) -> None:
             f"found {what}; check them, or leave it to the images to show which is wrong.",
             rows,
         )
-    motors = dataset.machine.motors
-    sigma, unit = dataset.measurements.sigma_of(legs), dict[int, Literal["m", "rad"]]()
-    for j, column in zip(motors, reading_columns(legs), strict=True):
-        lower, upper = legs[j].travel
-        unit[j] = legs[j].reading_unit
-        is_known = bool(np.isfinite(upper - lower)) and upper > lower
-        least, greatest = float(q[:, j].min()), float(q[:, j].max())
-        travel = (float(lower), float(upper)) if is_known else None
-        used = (greatest - least) / float(upper - lower) if is_known else None
-        found.encoders.append(
-            EncoderUse(
-                column=column.name,
-                unit=unit[j],
-                least=least,
-                greatest=greatest,
-                travel=travel,
-                used=used,
-            )
-        )
+    found.encoders = _encoder_uses(dataset)
     shares = {one.column: one.used for one in found.encoders if one.used is not None}
-    found.checks["readings"] = f"{len(motors)} encoders"
+    found.checks["readings"] = f"{len(found.encoders)} encoders"
     if shares:
         low, high = (100.0 * end(shares.values()) for end in (min, max))
         found.checks["readings"] += f", {low:.0f} to {high:.0f} % of their travel used"
+    _look_for_still_encoders(found, shares)
+    _look_for_rounded_readings(found)
+
+
+def _encoder_uses(dataset: Dataset) -> list[EncoderUse]:
+    """Return the range of the readings of each encoder, and its share of the travel."""
+    legs, q, uses = dataset.machine.legs, dataset.measurements.q, list[EncoderUse]()
+    for j, column in zip(dataset.machine.motors, reading_columns(legs), strict=True):
+        lower, upper = map(float, legs[j].travel)
+        has_travel = bool(np.isfinite(upper - lower)) and upper > lower
+        least, greatest = float(q[:, j].min()), float(q[:, j].max())
+        uses.append(
+            EncoderUse(
+                column=column.name,
+                unit=legs[j].reading_unit,
+                least=least,
+                greatest=greatest,
+                travel=(lower, upper) if has_travel else None,
+                used=(greatest - least) / (upper - lower) if has_travel else None,
+            )
+        )
+    return uses
+
+
+def _look_for_still_encoders(found: _Found, shares: Mapping[str, float]) -> None:
+    """Look for encoders that read the same in all rows, or use little of their travel."""
     constant = [one.column for one in found.encoders if one.least == one.greatest]
-    if 0 < len(constant) < len(motors):
+    if 0 < len(constant) < len(found.encoders):
         found.add(
             "readings",
             "warning",
-            f"{dataset.table_path}: found the same reading in all rows of {few(constant)}, while "
-            "other encoders move; check that these were recorded, and move these legs as well.",
+            f"{found.dataset.table_path}: found the same reading in all rows of {few(constant)}, "
+            "while other encoders move; check that these were recorded, and move these legs as "
+            "well.",
         )
         shares = {name: share for name, share in shares.items() if name not in constant}
     still = [name for name, share in shares.items() if share < LITTLE_USED]
@@ -357,18 +366,24 @@ def _look_at_readings(found: _Found, notes: Sequence[str]) -> None:
             f"{100 * LITTLE_USED:.0f} % or more of every encoder for poses that tell parameters "
             "apart; take photographs at poses that differ more, and check the unit of readings.",
         )
-    for one in ("m", "rad"):
-        of_unit = [j for j in motors if unit[j] == one]
-        digit = _last_digit(q[:, of_unit])
+
+
+def _look_for_rounded_readings(found: _Found) -> None:
+    """Look for readings whose last digit is coarser than the noise that is stated for them."""
+    dataset, legs = found.dataset, found.dataset.machine.legs
+    sigma = dataset.measurements.sigma_of(legs)
+    for unit in ("m", "rad"):
+        of_unit = [j for j in dataset.machine.motors if legs[j].reading_unit == unit]
+        digit = _last_digit(dataset.measurements.q[:, of_unit])
         if digit is None or digit / np.sqrt(12.0) <= (stated := float(sigma[of_unit].min())):
             continue
-        step = f"{1e3 * digit:g} mm" if one == "m" else f"{digit:g} rad"
+        step = f"{1e3 * digit:g} mm" if unit == "m" else f"{digit:g} rad"
         found.add(
             "readings",
             "warning",
             f"{dataset.table_path}: found readings in steps of {step}, whose rounding alone has a "
-            f"standard deviation of {digit / np.sqrt(12.0):.2g} {one}, needed no more than the "
-            f"encoder_sigma of {stated:.2g} {one} in {dataset.yaml_path.name}; write more digits, "
+            f"standard deviation of {digit / np.sqrt(12.0):.2g} {unit}, needed no more than the "
+            f"encoder_sigma of {stated:.2g} {unit} in {dataset.yaml_path.name}; write more digits, "
             "or state a greater encoder_sigma.",
         )
 

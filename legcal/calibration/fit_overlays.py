@@ -19,7 +19,7 @@ from legcal.data import Dataset
 from legcal.errors import UsageError
 from legcal.files import RESULT, in_the_way, path_problem, read_json
 from legcal.geometry import components
-from legcal.machine import ends_in_base, measured_readings
+from legcal.machine import ends_in_base, measured_readings, with_radii
 from legcal.perception import placed_arms
 from legcal.progress import Report
 from legcal.workers import Run
@@ -82,9 +82,9 @@ def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
     poses = components(solution.T_Rb_Re)
     q = measured_readings(solution.legs, *poses, measurements.q_of_poses)
     A, B = ends_in_base(solution.legs, machine.T_base_Rb, *poses, q)
-    cylinders = tuple(
-        tuple(replace(c, radius=solution.radii.get((j, c.link), c.radius)) for c in leg.cylinders)
-        for j, leg in enumerate(machine.legs)
+    cylinders = with_radii(
+        [leg.cylinders for leg in machine.legs],
+        lambda j, c: solution.radii.get((j, c.link), c.radius),
     )
     return Detection(
         dataset=dataset,
@@ -92,7 +92,7 @@ def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
         A_base=A[measurements.pose],
         B_base=B[measurements.pose],
         cylinders=cylinders,
-        T_base_camera=tuple(machine.T_base_Rb * T.inv() for T in solution.T_camera_Rb),
+        T_base_camera=solution.cameras_in_base(machine.T_base_Rb),
         rows=np.array(_rows_with_image(dataset), dtype=np.intp),
         unplaced={},
         image_notes=(),

@@ -149,7 +149,7 @@ def joints_in_links(
     kinematic : Kinematic
         The covariance of all kinematic parameters by name, zero where they are fixed or held.
     axes : mapping, optional
-        The nominal axes by side and leg, in R_b and R_e; without them none are told.
+        The nominal axes by side and leg, in R_b and R_e; without them none are returned.
 
     Returns
     -------

@@ -7,138 +7,81 @@
 4. Joint fit of all parameters, started from the nominal model and from the steps.
 5. Measure again: all photographs are searched close to that fit and measured with all care, so
    that nothing depends on where the search began, and 3 and 4 are repeated. Where outlines show
-   the gamma of a camera that is not given, this is done again, up to ``MAX_GAMMA_ROUNDS`` times.
+   the gamma of a camera that is not given, this is done again with others, up to four times.
 6. Judge what the platform gains, and write the result.
 
 Where a dataset has a table of axes in place of images, 2 and 5 have nothing to do. Held-out images
 are searched like the others, and not fitted. Phases 2 to 5 work in canonical order;
-:meth:`Estimate.in_file_order` restores the order of the files.
+:meth:`.estimate.Estimate.in_file_order` restores the order of the files.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from legcal.calibration.board import BoardViews, base_of_board, board_notes, observe_board
-from legcal.calibration.compression import compression_effect
 from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose, notes_beside
+from legcal.calibration.estimate import TRIAL, Estimate, fit_outlines
 from legcal.calibration.fit_overlays import check_overlays, with_overlays
-from legcal.calibration.four_steps import Steps, four_steps, starts
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit import (
+    DEFAULT_SETTINGS,
     Choices,
-    GammaTrials,
     HeldOut,
     Prior,
     Solution,
     compare_held_out,
-    in_file_order,
     known_gammas,
     known_parameters,
-    loses_outlines,
-    refine,
     resolve,
 )
+from legcal.calibration.near_fit import measure_again, not_found_again
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
-from legcal.calibration.outlier_images import outlier_images
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, write_result
 from legcal.calibration.verdict import judge
 from legcal.data import (
-    Corners,
     Dataset,
-    Measurements,
-    Outlines,
     Override,
-    along_legs,
-    compression_note,
     dataset_at,
-    few,
     few_views,
     fingerprint,
     image_notes,
     load_dataset,
-    no_outlines,
     overrides_of_call,
     plan_dataset,
     reject_unused_legs,
     split_images,
     store_outlines,
-    through_cameras,
 )
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.files import check_destination, output_path
-from legcal.geometry import IntArray, components
-from legcal.machine import (
-    Machine,
-    ends_in_base,
-    measured_readings,
-)
+from legcal.geometry import IntArray
 from legcal.paper import Criteria, Transformation
 from legcal.perception import (
     MeasuredImages,
-    Photographs,
     Placement,
     detection_settings,
     given_outlines,
     hint_notes,
     is_measurable,
-    measure_photographs,
+    measure_in_brief,
     nominal_placement,
     place_and_measure,
-    placed_arms,
     require_rough_cameras,
     require_standing_joints,
-    used_as_before,
-    with_measured_radii,
 )
 from legcal.progress import Progress, shown_progress
 from legcal.vision import shared_cameras, stated_covariances
 from legcal.workers import Workers, worker_pool
 
 TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal one [rad]
-# Of all outlines that are measured in photographs: light at the limb that no model of shading
-# predicts looks like other radii, so that residuals never show it [px].
-LIMB_BIAS = {"bias of many edges": 0.02}
 MAX_LEFT_OUT = 0.25  # of the images, or of the outlines, beyond which common mistakes are tried
-MIN_FOUND_AGAIN = 0.5  # of the outlines of an image, or of all
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """What the images show and what was fitted to it, in canonical order."""
-
-    fitted: OrderedDataset  # the images that were fitted
-    outlines: Outlines  # of all images
-    steps: Steps
-    solution: Solution
-    corners: Corners | None  # of the calibration board in all images; None without a board
-    image_notes: tuple[str, ...] = ()  # on the images by themselves
-    fit_notes: tuple[str, ...] = ()  # on the images by the fit
-    other_radii: bool = False  # whether the images show other radii than the model has
-    diagnosis: tuple[Diagnosis, ...] = ()  # what looks wrong where many images were left out
-
-    @cached_property
-    def outliers(self) -> dict[int, str]:
-        """What is said of images that contradict the fit, by their row."""
-        return outlier_images(self.fitted.measurements, self.fitted.machine, self.solution)
-
-    def in_file_order(self) -> Estimate:
-        """Return the same with legs, views and images in the order of the files."""
-        dataset, order = self.fitted.in_file_order()
-        restore = self.fitted.order.restore  # of tables of all images
-        return replace(
-            self,
-            outlines=restore(self.outlines),
-            steps=self.steps.in_file_order(order),
-            solution=in_file_order(self.solution, order, dataset),
-            corners=None if self.corners is None else restore(self.corners),
-        )
 
 
 def calibrate(
@@ -282,19 +225,19 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
     NotVisible, NotIdentifiable, DidNotConverge
         As the phases.
     """
-    rows = data.rows_of(file_rows)
+    rows, diagnosed = data.rows_of(file_rows), cache(diagnose)
     try:
         try:
-            return _estimate(data, rows, options)
+            return _estimate(data, rows, options, diagnosed)
         except NotIdentifiable:
             if not data.plan.is_cached:
                 raise
         # Outlines that an earlier run left do not always determine the cameras; images do.
         data = replace(data, plan=plan_dataset(data.dataset, ""))
-        return _estimate(data, rows, options)
+        return _estimate(data, rows, options, diagnosed)
     except (NotVisible, NotIdentifiable, DidNotConverge, DatasetError) as error:
         is_told = isinstance(error, DatasetError) and data.machine.is_redundant  # by the readings
-        diagnosis, notes = () if is_told else diagnose(data), data.dataset.file_notes
+        diagnosis, notes = () if is_told else diagnosed(data), data.dataset.file_notes
         if not (diagnosis or notes):
             raise
         likeliest = [one.sentence for one in diagnosis]
@@ -303,24 +246,34 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         raise refusal from error
 
 
-def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimate:
-    """Go through the phases; images whose outlines are given are not searched."""
+def _estimate(
+    data: OrderedDataset,
+    rows: IntArray,
+    options: Options,
+    diagnosed: Callable[[OrderedDataset], tuple[Diagnosis, ...]],
+) -> Estimate:
+    """Go through the phases; images whose outlines are given are not searched.
+
+    Where many images do not show the legs and a mistake explains that, nothing is searched again.
+    """
     placement, board = rough_placement(data)
     fitted = data.at(rows)
     # Outlines that are kept were measured with some gamma: others of their camera must be as well.
     kept_gammas = known_gammas(data.photographs.keep, data.measurements)
     photographs = data.photographs.with_gammas(kept_gammas)
     if len(photographs.detect) == 0:  # outlines, or axes, are given
-        estimate = _fit(fitted, given_outlines(photographs), placement, board, options)
+        estimate = fit_outlines(fitted, given_outlines(photographs), placement, board, options)
         return replace(
             estimate,
             image_notes=data.plan.notes,
             fit_notes=_notes_on_images(estimate),
-            diagnosis=diagnose(data) if _unused_share(estimate) > MAX_LEFT_OUT else (),
+            diagnosis=diagnosed(data) if _unused_share(estimate) > MAX_LEFT_OUT else (),
         )
     # 2. Recognise, and measure the outlines.
     T_board_camera = None if board is None else board.T_board_camera
-    seen = place_and_measure(photographs, placement, data.progress, T_board_camera, together=False)
+    seen = place_and_measure(
+        photographs, placement, data.progress, T_board_camera, method=measure_in_brief
+    )
     seen.placement.require_one()
     other_radii = bool(seen.placement.radii.factor)
     if other_radii:
@@ -329,37 +282,34 @@ def _estimate(data: OrderedDataset, rows: IntArray, options: Options) -> Estimat
     fitted = data.at(rows)
     if options.every_leg and (seen.left_out or seen.placement.unplaced):
         _refuse_too_few(data, rows, seen, options.choices)
+    left_out = 1.0 - len(seen.kept(rows)) / len(rows)
+    diagnosis = diagnosed(data) if left_out > MAX_LEFT_OUT else ()
     # 3 and 4. Four steps and joint fit.
-    first = _fit(fitted, seen.outlines, seen.placement, board, options)
+    settings = TRIAL if diagnosis else DEFAULT_SETTINGS
+    first = fit_outlines(fitted, seen.outlines, seen.placement, board, options, settings)
     # 5. Measure again near that fit, and fit again.
     try:
-        estimate = _measure_again(data, first, seen, board, options)
+        estimate = first if diagnosis else measure_again(data, first, seen, board, options)
     except (NotVisible, NotIdentifiable, DidNotConverge) as error:
         # A fit with a wrong camera may lead away from outlines that were found before it.
-        if not first.solution.camera_notes:
+        if not first.solution.camera_doubts.notes:
             raise
-        cameras = (*first.solution.camera_notes, *_camera_notes(data.dataset, first.solution))
+        cameras = (
+            *first.solution.camera_doubts.notes,
+            *_camera_notes(data.dataset, first.solution),
+        )
         raise type(error)([*cameras, *error.problems]) from error
     return replace(
         estimate,
         image_notes=(
             *seen.placement.all_notes,
-            *_not_found_again(first, estimate),
+            *not_found_again(first, estimate),
             *estimate.image_notes,
         ),
         fit_notes=_notes_on_images(estimate),
         other_radii=other_radii,
-        diagnosis=diagnose(data) if _is_doubtful(data, rows, seen, estimate) else (),
+        diagnosis=diagnosis or (diagnosed(data) if _unused_share(estimate) > MAX_LEFT_OUT else ()),
     )
-
-
-def _is_doubtful(
-    data: OrderedDataset, rows: IntArray, seen: MeasuredImages, estimate: Estimate
-) -> bool:
-    """Say whether so much was left out that the session itself may be wrong."""
-    cameras, view = seen.placement.T_base_camera, data.measurements.view
-    left_out = [r for r in rows.tolist() if r in seen.left_out or cameras[view[r]] is None]
-    return max(len(left_out) / len(rows), _unused_share(estimate)) > MAX_LEFT_OUT
 
 
 def _unused_share(estimate: Estimate) -> float:
@@ -407,158 +357,14 @@ def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]
     return placement, board
 
 
-def _fit(
-    fitted: OrderedDataset,
-    outlines: Outlines,
-    placement: Placement,
-    board: BoardViews | None,
-    options: Options,
-) -> Estimate:
-    """Run the four steps, then the joint fit, with the outlines of all images."""
-    seen = outlines.at(fitted.rows)
-    seen = reject_unused_legs(seen, fitted.measurements, fitted.machine.leg_names)
-    if options.every_leg:
-        _refuse_unseen_legs(fitted, seen)
-    steps = four_steps(fitted, seen, board, options)
-    fitted.progress("Joint fit", 0, 1)
-    choices = options.choices
-    if any(fitted.measurements.image) and "detected" in seen.source:
-        choices = replace(choices, least_shared_px={**LIMB_BIAS, **choices.least_shared_px})
-    solution = refine(
-        fitted.fitted_legs,
-        fitted.measurements,
-        seen,
-        starts(fitted, seen, placement, steps, board),
-        axes=fitted.axes,
-        board=None if board is None else board.at(fitted.rows),
-        choices=choices,
-    )
-    fitted.progress("Joint fit", 1, 1)
-    corners = None if board is None else board.reject_outliers(solution, fitted)
-    return Estimate(fitted, outlines, steps, solution, corners)
-
-
-def _measure_again(
-    data: OrderedDataset,
-    estimate: Estimate,
-    seen: MeasuredImages,
-    board: BoardViews | None,
-    options: Options,
-) -> Estimate:
-    """Search the photographs again close to the fit, and fit again."""
-    cameras, view = seen.placement.T_base_camera, data.measurements.view
-    rows = [
-        row
-        for row in seen.photographs.detect.tolist()
-        if cameras[view[row]] is not None and row not in seen.left_out
-    ]
-    if not rows:
-        return estimate
-    again = seen.photographs.narrowed(np.array(rows, dtype=np.intp), estimate.outlines)
-
-    def at_fit(near: Estimate, gammas: Mapping[str, float]) -> tuple[Photographs, Placement]:
-        machine = _with_fitted_radii(again.machine, near.solution)
-        photographs = replace(again, machine=machine).with_intrinsics(near.solution.cameras)
-        here = near.fitted.with_fitted_poses(near.solution.T_Rb_Re)
-        every = replace(data, seen_poses=here.seen_poses)
-        placement = _fitted_placement(every, near.solution, seen)
-        return photographs.with_gammas(gammas), placement
-
-    def fitted(near: Estimate, gammas: Mapping[str, float], like: Outlines | None) -> Estimate:
-        photographs, placement = at_fit(near, gammas)
-        here = near.fitted.with_fitted_poses(near.solution.T_Rb_Re)
-        stage = "Measuring outlines near the fit"
-        if gammas:
-            stage += f", gamma {few(sorted({f'{gamma:.2f}' for gamma in gammas.values()}))}"
-        search = replace(photographs, keep=no_outlines())
-        outlines = measure_photographs(search, placement, data.progress, stage=stage)
-        other = None if like is not None else with_measured_radii(search, placement, outlines)
-        if other is not None:
-            stage += " with other radii"
-            with_other = measure_photographs(other, placement, data.progress, stage=stage)
-            outlines = max(outlines, with_other, key=lambda found: int(found.used.sum()))
-        # The table and the next fit have the cameras of the files.
-        lenses = [[view.camera for view in p.measurements.views] for p in (photographs, again)]
-        outlines = again.with_found(through_cameras(outlines, view[outlines.row], *lenses))
-        if like is not None:
-            outlines = used_as_before(outlines, like)
-        return _fit(here, outlines, placement, board, options)
-
-    first = best = fitted(estimate, {}, None)
-    trials = GammaTrials.begun(first.solution, known_gammas(again.keep, again.measurements))
-    while gammas := trials.next():
-        try:
-            there = fitted(best, gammas, first.outlines)
-        except (DidNotConverge, NotIdentifiable, NotVisible):
-            trials = trials.tried(gammas, None)
-            continue
-        trials = trials.tried(gammas, there.solution)
-        if trials.best == len(trials.solutions) - 1:
-            best = there
-    last, refused, gammas = first, trials.found(), {}
-    if refused:
-        found = fitted(best, refused, None)
-        if not loses_outlines(first.outlines, found.outlines):
-            last, refused, gammas = found, {}, refused
-    notes = _compression_note(data, last, *at_fit(last, gammas))
-    return replace(last, image_notes=(*trials.notes(refused), *notes))
-
-
-def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
-    """Return the visible cylinders of the legs with the radii of a fit.
-
-    Cylinders of a leg that were equally thick stay so: they look like one.
-    """
-    cylinders = []
-    for j, leg in enumerate(machine.legs):
-        fitted = {
-            c.radius: solution.radii[j, c.link]
-            for c in leg.cylinders
-            if (j, c.link) in solution.radii
-        }
-        cylinders.append([replace(c, radius=fitted.get(c.radius, c.radius)) for c in leg.cylinders])
-    return machine.with_cylinders(cylinders)
-
-
-def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredImages) -> Placement:
-    """Return where a fit puts the legs, R_b laid on the nominal one; no camera is placed anew."""
-    T_base_Rb, poses = data.machine.T_base_Rb, components(data.poses_by(solution.legs))
-    m = data.measurements
-    q = measured_readings(solution.legs, *poses, m.q_of_poses)
-    A, B = ends_in_base(solution.legs, T_base_Rb, *poses, q)
-    pose = data.measurements.pose
-    cameras = tuple(
-        None if known is None else T_base_Rb * T.inv()
-        for known, T in zip(seen.placement.T_base_camera, solution.T_camera_Rb, strict=True)
-    )
-    arms = placed_arms(solution.legs, q, pose, T_base=T_base_Rb, radii=solution.radii)
-    return Placement.of_fit(A[pose], B[pose], cameras, seen.blur, arms)
-
-
-def _not_found_again(first: Estimate, again: Estimate) -> list[str]:
-    """Return the notes of a first fit on images in which hardly anything is found near it.
-
-    Those on cameras as well, where that is so of all images together.
-    """
-    after, o = again.outliers, again.solution.outlines
-    gone = {
-        row: what
-        for row, what in first.outliers.items()
-        if row not in after and o.used[o.row == row].mean() < MIN_FOUND_AGAIN
-    }
-    few_found = o.used.sum() < MIN_FOUND_AGAIN * first.solution.outlines.used.sum()
-    cameras = first.solution.camera_notes if few_found else ()
-    return [*cameras, *image_notes(first.fitted.measurements, gone)]
-
-
 def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
     """Return rough camera poses that the fit contradicts, and images that contradict the fit."""
     fitted, o = estimate.fitted, estimate.solution.outlines
     shown = set(fitted.measurements.view[o.row[o.used]].tolist())
     views = fitted.measurements.views
     cameras = [
-        fitted.machine.T_base_Rb * T.inv() if v in shown else None
-        for v, T in enumerate(estimate.solution.T_camera_Rb)
+        T if v in shown else None
+        for v, T in enumerate(estimate.solution.cameras_in_base(fitted.machine.T_base_Rb))
     ]
     hints = hint_notes([view.name for view in views], [v.T_base_camera for v in views], cameras)
     return (*hints, *image_notes(fitted.measurements, estimate.outliers))
@@ -568,45 +374,13 @@ def _refuse_too_few(
     data: OrderedDataset, rows: IntArray, seen: MeasuredImages, choices: Choices
 ) -> None:
     """Raise NotIdentifiable if the images that are left do not determine the parameters."""
-    cameras, notes = seen.placement.T_base_camera, seen.placement.all_notes
-    left = [
-        row
-        for row in rows.tolist()
-        if row not in seen.left_out and cameras[data.measurements.view[row]] is not None
-    ]
-    if not left:
+    left, notes = seen.kept(rows), seen.placement.all_notes
+    if not len(left):
         raise NotVisible(list(notes))
     try:
-        check_identifiable(data.at(np.array(left)).in_file_order()[0], choices)
+        check_identifiable(data.at(left).in_file_order()[0], choices)
     except NotIdentifiable as failure:
         raise NotIdentifiable([*failure.problems, *notes]) from None
-
-
-def _refuse_unseen_legs(fitted: OrderedDataset, outlines: Outlines) -> None:
-    """Raise NotVisible if no image shows a leg that its view says it does."""
-    if fitted.axes is not None:
-        return
-    unseen = unseen_legs(fitted.machine, fitted.measurements, outlines)
-    if unseen:
-        raise NotVisible(
-            f"{fitted.dataset.folder}: the machine could not be calibrated: found no used outline "
-            f"of {', '.join(unseen)} in any image, needed some of every leg; add images that show "
-            "it, or name the legs of each view in dataset.yaml to leave it to the readings."
-        )
-
-
-def unseen_legs(machine: Machine, measurements: Measurements, outlines: Outlines) -> list[str]:
-    """Return the legs that views should show, and of which no outline is used."""
-    along = along_legs(outlines, machine.legs)
-    shown = set(along.leg[along.used].tolist())
-    views = [measurements.views[v] for v in np.unique(measurements.view).tolist()]
-    return [
-        leg.name
-        for j, leg in enumerate(machine.legs)
-        if j not in shown
-        and leg.cylinders
-        and any(view.legs is None or leg.name in view.legs for view in views)
-    ]
 
 
 def outline_key(dataset: Dataset, choices: Choices) -> str:
@@ -620,7 +394,7 @@ def outline_key(dataset: Dataset, choices: Choices) -> str:
 def _store_outlines(data: OrderedDataset, estimate: Estimate, key: str) -> list[str]:
     """Leave outlines and notes on images beside the dataset; return a note if that fails."""
     plan = estimate.fitted.plan  # other than that of the data where stored outlines did not suffice
-    if estimate.other_radii or len(plan.detect) == 0:
+    if estimate.other_radii or estimate.diagnosis or len(plan.detect) == 0:
         return []
     outlines = data.order.restore(estimate.outlines)
     note = store_outlines(data.dataset, outlines, key, plan.given, estimate.image_notes)
@@ -685,7 +459,7 @@ def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
     return [
         f"The camera of {view} that does not agree is that of "
         f"{dataset.camera_paths[names.index(view)]}."
-        for view in solution.contradicted_cameras
+        for view in solution.camera_doubts.views
     ]
 
 
@@ -708,18 +482,3 @@ def exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
         f"The intrinsics of the {whose} of {few_views(list(exact))} are taken as exact, since "
         f"{state} no covariance; calibrate with legcal camera, or state what is known with a prior."
     ]
-
-
-def _compression_note(
-    data: OrderedDataset, estimate: Estimate, photographs: Photographs, placement: Placement
-) -> list[str]:
-    """Return a note where outlines were measured in photographs compressed with much loss."""
-    solution, measured = estimate.solution, photographs.detect.tolist()
-    names = {data.measurements.image[row] for row in measured}
-    facts = {image: found for image, found in data.dataset.facts.items() if image in names}
-    effect = compression_effect(
-        photographs, placement, estimate.outlines, facts, solution.noise, data.progress
-    )
-    words = "" if effect is None else str(effect)
-    rms, scale = solution.rms_px or 0.0, solution.noise.scale
-    return compression_note(data.measurements, facts, rms, scale, words)

@@ -148,12 +148,12 @@ def _result_of(calibration: Calibration) -> Result:
     if corners is not None:
         rows = np.concatenate([rows, corners.row[corners.used]])
     shown = np.unique(measurements.view[rows]).tolist()
-    T_base_Rb = machine.T_base_Rb
+    cameras = solution.cameras_in_base(machine.T_base_Rb)
     parameters = _parameters(calibration)
     kinematic = Kinematic(
-        names=list(solution.parametrization.names),
-        covariance=solution.value_covariance.tolist(),
-        held=solution.held_basis.tolist(),
+        names=list(solution.kinematic.parametrization.names),
+        covariance=solution.kinematic.value_covariance.tolist(),
+        held=solution.kinematic.held_basis.tolist(),
     )
     on_base, on_platform = (_board(calibration, link) for link in LINKS)
     nominal = geometries(machine)
@@ -168,7 +168,7 @@ def _result_of(calibration: Calibration) -> Result:
         nominal_axes=turned_from,
         nominal_actuators=_actuators(nominal),
         parameters=parameters,
-        covariance=solution.covariance.tolist(),
+        covariance=solution.estimates.covariance.tolist(),
         kinematic=kinematic,
         links=joints_in_links(machine, parameters, kinematic, turned_from),
         weakest=[
@@ -179,22 +179,17 @@ def _result_of(calibration: Calibration) -> Result:
                 sigma_m=weak.sigma,
                 links=weak_in_links(machine, weak.parts),
             )
-            for weak in solution.weak
+            for weak in solution.estimates.weak
         ],
-        held=list(solution.held),
-        views={
-            views[v].name: ViewPose(
-                T_base_camera=Pose.of(T_base_Rb * solution.T_camera_Rb[v].inv())
-            )
-            for v in shown
-        },
+        held=list(solution.kinematic.held),
+        views={views[v].name: ViewPose(T_base_camera=Pose.of(cameras[v])) for v in shown},
         cameras={v.name: camera_numbers(v.camera) for v in views if v.name in set(owners)},
         gammas=[
             Gamma(views=list(one.views), gamma=one.gamma, sigma=one.gamma * one.sigma)
             for one in solution.gammas
         ],
         stages=Stages(staged=_staged(calibration)),
-        residuals=ResidualsBlock.model_validate(solution),
+        residuals=ResidualsBlock.model_validate(solution.quality),
         observations=_observations(calibration),
         board=None if on_base is None else BoardPose.model_validate(on_base),
         platform_board=(
@@ -234,12 +229,12 @@ def _actuators(legs: Sequence[Leg]) -> dict[str, ActuatorBlock] | None:
 
 def _parameters(calibration: Calibration) -> list[ParameterRow]:
     """Return all kinematic parameters, the radii that were observed, and estimated intrinsics."""
-    solution, dataset = calibration.solution, calibration.dataset
+    found, dataset = calibration.solution.estimates, calibration.dataset
     machine = dataset.machine
-    found = parametrization_of(machine, twists=True)
-    numbers = vector_of(found, solution.legs, geometries(machine)).tolist()
-    values = {**solution.values, **dict(zip(found.names, numbers, strict=True))}
-    sigma = dict(zip(solution.names, solution.sigma.tolist(), strict=True))
+    kinematic = parametrization_of(machine, twists=True)
+    numbers = vector_of(kinematic, calibration.solution.legs, geometries(machine)).tolist()
+    values = {**found.values, **dict(zip(kinematic.names, numbers, strict=True))}
+    sigma = dict(zip(found.names, found.sigma.tolist(), strict=True))
     known = known_parameters(machine, dataset.measurements.views, boards=dataset.boards).by_name
     return [
         ParameterRow(
@@ -247,9 +242,9 @@ def _parameters(calibration: Calibration) -> list[ParameterRow]:
             value=values[name],
             nominal=parameter.nominal,
             sigma=sigma.get(name),
-            prior_sigma=solution.prior_sigma.get(name),
+            prior_sigma=found.prior_sigma.get(name),
             unit=parameter.unit,
-            status=solution.status.get(name, "fixed"),
+            status=found.status.get(name, "fixed"),
         )
         for name, parameter in known.items()
         if name in values
@@ -327,8 +322,8 @@ def _board(calibration: Calibration, link: Link) -> dict[str, Any] | None:
     numbers: dict[str, Any] = {
         f"T_{link}_board": Pose.of(T_link_board),
         "given": None if given is None else Pose.of(given),
-        "scale": solution.values.get(board_scale(link), 1.0),
-        "rms_px": solution.rms_corners_px.get(link),
+        "scale": solution.estimates.values.get(board_scale(link), 1.0),
+        "rms_px": solution.quality.rms_corners_px.get(link),
         "corners": len(own),
         "used": int(own.used.sum()),
         "images": len(np.unique(own.row[own.used])),

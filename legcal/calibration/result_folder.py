@@ -53,7 +53,7 @@ from legcal.machine import (
     write_calibrated_yaml,
     write_urdf,
 )
-from legcal.pages import is_page
+from legcal.pages import PAGE
 from legcal.progress import Report, no_progress
 from legcal.vision import (
     Camera,
@@ -97,7 +97,7 @@ def write_result(
     dataset, solution, steps = calibration.dataset, calibration.solution, calibration.steps
     machine = dataset.machine
     stale = [OBSERVATIONS_NAME, CORNERS_NAME, STAGED_NAME, str(_urdf_of(Path(STAGED_NAME)))]
-    stale += [REPORT_NAME] * is_page(destination / REPORT_NAME)
+    stale += [REPORT_NAME] * PAGE.is_at(destination / REPORT_NAME)
     old = [*map(Path, stale), *earlier_overlays(destination)]
     with result_folder(destination, stale=old) as folder:
         _write_model(machine, solution.legs, folder / RESULT_YAML)

@@ -413,8 +413,8 @@ def _direction_lines(result: Result) -> list[str]:
     """Return which combinations of parameters are least certain, and which are held."""
     worst = [f"{weak.in_words} ({1e3 * weak.sigma_m:.3f} mm)" for weak in result.weakest]
     where = "in R_b and R_e" if any(one.links is None for one in result.weakest) else "in the links"
-    told = f"Least certain combinations (1 sigma, {where}): {'; '.join(worst)}."
-    lines = [told] if worst else []
+    least = f"Least certain combinations (1 sigma, {where}): {'; '.join(worst)}."
+    lines = [least] if worst else []
     if result.held:
         lines.append(
             "Held at nominal, as nothing determines them and they do not move the platform: "

@@ -21,6 +21,7 @@ from legcal.calibration.result import Calibration, Verdict
 from legcal.data import Corners, Dataset, few_views
 from legcal.perception import far_off
 
+_DO_NOT_LOAD = "Do not load this into the controller"
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
 
 
@@ -45,14 +46,14 @@ def judge(
     """
     machine, measurements = dataset.machine, dataset.measurements
     q = measurements.q_of_poses.copy()
-    readings = solution.redundant_readings
+    readings = solution.quality.redundant_readings
     for wrong in () if readings is None else readings.wrong:
         q[wrong.pose, np.equal(machine.reads, machine.reads[wrong.leg])] = np.nan
     platform = platform_accuracy(
         machine,
         solution.legs,
-        solution.parametrization,
-        solution.kinematic_covariance + solution.held_covariance,
+        solution.kinematic.parametrization,
+        solution.kinematic.total_covariance,
         q,
         solution.T_Rb_Re,
         solution.sensitivities,
@@ -61,31 +62,8 @@ def judge(
         change, sigma, found = _change_of_parameters(dataset, solution)
     else:
         change, sigma, found = _change_of_platform(platform)
-    if diagnosis:
-        why = f"{diagnosis[0].sentence} As it is, {found}."
-        verdict = Verdict(False, f"Do not load this into the controller: {why}")
-    elif readings is not None and readings.doubts:
-        verdict = Verdict(
-            False,
-            f"Do not load this into the controller: {found}, but {', and '.join(readings.doubts)}.",
-        )
-    elif solution.left_out:
-        verdict = Verdict(
-            False,
-            f"Do not load this into the controller: {found}, but most outlines of a leg that a "
-            f"view shows disagree with that ({', '.join(solution.left_out)}), so that they are of "
-            "something else or the fit is wrong; look at them in the table of observations, and "
-            "correct them or leave the leg out of the legs of that view.",
-        )
-    elif strayed := _strayed_cameras(dataset, solution):
-        verdict = Verdict(
-            False,
-            f"Do not load this into the controller: {found}, but the fit has {strayed} far from "
-            "the rough T_base_camera near which platform poses were looked for, so that these are "
-            "wrong or it is; measure it again, or take images that show more legs.",
-        )
-    else:
-        verdict = _verdict(change, sigma, found)
+    objection = _objection(dataset, solution, diagnosis, found)
+    verdict = Verdict(False, objection) if objection else _verdict(change, sigma, found)
     return Calibration(
         dataset,
         solution,
@@ -99,11 +77,36 @@ def judge(
     )
 
 
+def _objection(
+    dataset: Dataset, solution: Solution, diagnosis: Sequence[Diagnosis], found: str
+) -> str:
+    """Return what speaks against a result, however large its improvement; "" where nothing does."""
+    readings = solution.quality.redundant_readings
+    if diagnosis:
+        return f"{_DO_NOT_LOAD}: {diagnosis[0].sentence} As it is, {found}."
+    if readings is not None and readings.doubts:
+        return f"{_DO_NOT_LOAD}: {found}, but {', and '.join(readings.doubts)}."
+    if solution.left_out:
+        return (
+            f"{_DO_NOT_LOAD}: {found}, but most outlines of a leg that a view shows disagree with "
+            f"that ({', '.join(solution.left_out)}), so that they are of something else or the fit "
+            "is wrong; look at them in the table of observations, and correct them or leave the "
+            "leg out of the legs of that view."
+        )
+    if strayed := _strayed_cameras(dataset, solution):
+        return (
+            f"{_DO_NOT_LOAD}: {found}, but the fit has {strayed} far from the rough T_base_camera "
+            "near which platform poses were looked for, so that these are wrong or it is; measure "
+            "it again, or take images that show more legs."
+        )
+    return ""
+
+
 def _strayed_cameras(dataset: Dataset, solution: Solution) -> str:
     """Return the views whose cameras left the rough poses by which platforms were found, or ""."""
     if dataset.machine.is_determined:
         return ""
-    cameras = [dataset.machine.T_base_Rb * T.inv() for T in solution.T_camera_Rb]
+    cameras = solution.cameras_in_base(dataset.machine.T_base_Rb)
     views = zip(dataset.measurements.views, cameras, strict=True)
     strayed = [
         view.name
@@ -138,18 +141,19 @@ def _change_of_parameters(dataset: Dataset, solution: Solution) -> tuple[float, 
     known = known_parameters(
         dataset.machine, dataset.measurements.views, boards=dataset.boards
     ).by_name
+    found = solution.estimates
     lengths = [
-        (solution.values[name] - known[name].nominal, sigma)
-        for name, sigma in zip(solution.names, solution.sigma.tolist(), strict=True)
+        (found.values[name] - known[name].nominal, sigma)
+        for name, sigma in zip(found.names, found.sigma.tolist(), strict=True)
         if known[name].kind == "kinematic" and known[name].unit == "m"
     ]
     change, sigma = np.sqrt(np.mean(np.square(lengths or [(0.0, 0.0)]), axis=0)).tolist()
-    found = (
+    clause = (
         f"joints and lengths change by {1e3 * change:.3f} mm against the nominal model, known to "
         f"{1e3 * sigma:.3f} mm (1 sigma, both rms); no platform error can be predicted, because "
         f"{dataset.machine.undetermined}"
     )
-    return change, sigma, found
+    return change, sigma, clause
 
 
 def _verdict(improvement: float, sigma: float, found: str) -> Verdict:
@@ -158,6 +162,6 @@ def _verdict(improvement: float, sigma: float, found: str) -> Verdict:
         return Verdict(True, f"Calibrated: {found}.")
     return Verdict(
         False,
-        f"Do not load this into the controller: {found}, and a predicted improvement below two "
-        "sigma is no improvement; take more images or better ones.",
+        f"{_DO_NOT_LOAD}: {found}, and a predicted improvement below two sigma is no improvement; "
+        "take more images or better ones.",
     )

@@ -142,7 +142,7 @@ class Check:
                 sigma_dE_rad=pair.expected_rotation,
             ),
             images=self.dataset.measurements.n_rows,
-            residuals=FitQuality.model_validate(self.solution),
+            residuals=FitQuality.model_validate(self.solution.quality),
             notes=list(self.notes),
         ).document()
 
@@ -208,8 +208,8 @@ def check(
     tested = _compare(dataset, earlier, solution, prior, significance)
     wrong = (one.sentence for one in found.diagnosis)
     on_images = (*found.image_notes, *found.fit_notes)
-    told = notes_beside(found.diagnosis, on_images, "legcal calibrate --check")
-    notes = (*wrong, *dataset.notes, *told, *solution.notes)
+    of_images = notes_beside(found.diagnosis, on_images, "legcal calibrate --check")
+    notes = (*wrong, *dataset.notes, *of_images, *solution.notes)
     return replace(tested, notes=tuple(dict.fromkeys(notes)))
 
 
@@ -295,11 +295,10 @@ def _compare(
     significance: float,
 ) -> Check:
     """Return what the fit of the new images says against the earlier result."""
-    machine, parametrization = dataset.machine, solution.parametrization
+    machine, parametrization = dataset.machine, solution.kinematic.parametrization
     columns = [parametrization.names.index(name) for name in prior.names]
-    values = np.array([solution.values[name] for name in prior.names])
-    held = solution.held_basis[:, columns]
-    covariance = solution.value_covariance[np.ix_(columns, columns)]
+    values = solution.estimates.vector(prior.names)
+    covariance, held = solution.kinematic.of_values(prior.names)
     covariance = covariance + prior.held_sigma**2 * held.T @ held
     variance_factor = _earlier_noise(solution, earlier)
     found = difference(
@@ -307,7 +306,7 @@ def _compare(
     )
     dof = earlier.document.residuals.dof
     if variance_factor == 1.0:
-        dof = noise_dof(solution.dof, covariance, prior.sigma)
+        dof = noise_dof(solution.quality.dof, covariance, prior.sigma)
     legs = geometries(machine)
     changes = possible_changes(machine, _only(parametrization, columns))
     movement = judge_movement(found, dof, changes, significance)
@@ -335,7 +334,7 @@ def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:
     before = NoiseModel(**earlier.document.residuals.noise.document())
     now, then = (
         float(np.mean(np.trace(noise.covariance(claimed), axis1=1, axis2=2)))
-        for noise in (solution.noise, before)
+        for noise in (solution.quality.noise, before)
     )
     return max(then / now, 1.0)
 

@@ -137,10 +137,10 @@ def _errors(
     here = [calibrated[k] for k in kept]
     try:
         moves = platform_by_parameters(
-            solution.legs, solution.parametrization, machine.frame_legs, here
+            solution.legs, solution.kinematic.parametrization, machine.frame_legs, here
         )
     except NotIdentifiable:  # a place of the grid is singular
         return None
-    sigma = expected_error(moves, solution.kinematic_covariance + solution.held_covariance)
+    sigma = expected_error(moves, solution.kinematic.total_covariance)
     change = PlatformError(*pose_differences(here, [nominal[k] for k in kept]))
     return reached, change, sigma

@@ -239,6 +239,7 @@ def calibrate(
         )
     with loading():
         from legcal import calibration, report
+        from legcal.pages import PAGE
 
         run, summary = calibration.calibrate, report.summary
     arguments: dict[str, Any] = {
@@ -276,7 +277,7 @@ def calibrate(
         return
     page = output / calibration.REPORT_NAME
     if with_report and page.exists():
-        report.PAGE.check_place(page)
+        PAGE.check_place(page)
     given: Path | Dataset = datasets[0]
     true = None
     if truth is not None:
@@ -331,8 +332,9 @@ def _page_of_check(output: Path) -> Path:
 
     Its own page would be lost.
     """
-    from legcal import calibration, report
+    from legcal import calibration
     from legcal.files import RESULT, check_path
+    from legcal.pages import PAGE
 
     check_path(output)
     if RESULT.is_in(output):
@@ -348,7 +350,7 @@ def _page_of_check(output: Path) -> Path:
             "needed a path that can be created; give another output folder."
         ) from error
     page = output / calibration.REPORT_NAME
-    report.PAGE.check_place(page)
+    PAGE.check_place(page)
     return page
 
 

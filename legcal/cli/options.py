@@ -85,10 +85,10 @@ if TYPE_CHECKING:
 
 def check_page(page: Path | None) -> None:
     """Refuse, before any work, a place where no page can be written."""
-    from legcal import report
+    from legcal.pages import PAGE
 
     if page is not None:
-        report.PAGE.check_place(page)
+        PAGE.check_place(page)
 
 
 def write_page(

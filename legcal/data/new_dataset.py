@@ -47,7 +47,6 @@ from legcal.files import (
     result_folder,
     with_schema,
 )
-from legcal.geometry import Array
 from legcal.machine import DATASET_YAML, Leg, Machine, Pulses, load_mechanism, shipped_names
 from legcal.vision import Camera, inspect_image, read_camera
 
@@ -105,10 +104,6 @@ class NewDataset:
         Photographs, readings, and the dataset's folder.
     columns : dict
         What each heading of the table is taken for: a joint, view, image, pose or time.
-    unit : str
-        Unit of the readings in the table.
-    unit_from : str
-        Where the unit was found, in words.
     are_lengths : bool
         Whether the table holds whole lengths of legs.
     rows : tuple of Row
@@ -119,8 +114,8 @@ class NewDataset:
         Pairs of row and photograph.
     views : tuple of str
         The view of each pair.
-    readings : (n_rows, n_motors) array
-        Of the motors, in the order of their legs [m or rad].
+    readings : SheetReadings
+        Of the motors, in the order of their legs, and their unit in the table.
     cameras : dict
         The camera file of each view.
     encoder_sigma : float or mapping
@@ -135,14 +130,12 @@ class NewDataset:
     table: Path
     destination: Path
     columns: Mapping[str, str]
-    unit: str
-    unit_from: str
     are_lengths: bool
     rows: tuple[Row, ...]
     poses: tuple[str, ...]
     matching: Matching
     views: tuple[str, ...]
-    readings: Array
+    readings: SheetReadings
     cameras: Mapping[str, Path]
     encoder_sigma: float | dict[str, float]
     notes: tuple[str, ...]
@@ -158,8 +151,8 @@ class NewDataset:
             dataset=str(self.destination),
             mechanism=self.model,
             columns=dict(self.columns),
-            unit=self.unit,
-            unit_from=self.unit_from,
+            unit=self.readings.unit,
+            unit_from=self.readings.unit_from,
             lengths=self.are_lengths,
             matched=self.matching.how,
             encoder_sigma=self.encoder_sigma,
@@ -170,7 +163,7 @@ class NewDataset:
                     view=view,
                     photograph=photograph.name,
                     image=self.place(photograph),
-                    readings=dict(zip(self.joints, self.readings[k].tolist(), strict=True)),
+                    readings=dict(zip(self.joints, self.readings.q[k].tolist(), strict=True)),
                 )
                 for (k, photograph), view in zip(self.matching.pairs, self.views, strict=True)
             ],
@@ -295,14 +288,12 @@ def plan_new_dataset(
         table=path,
         destination=destination,
         columns=sheet.taken,
-        unit=found.unit,
-        unit_from=found.unit_from,
         are_lengths=lengths,
         rows=rows,
         poses=sheet.text("pose") if "pose" in sheet else (),
         matching=matching,
         views=view_of,
-        readings=found.q,
+        readings=found,
         cameras=of_views,
         encoder_sigma=sigma,
         notes=tuple(notes),
@@ -337,7 +328,7 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
         )
     header = ["view", "image", *(["pose"] if new.poses else []), *new.joints]
     rows = [
-        [view, new.place(photograph), *(new.poses[k : k + 1]), *new.readings[k].tolist()]
+        [view, new.place(photograph), *(new.poses[k : k + 1]), *new.readings.q[k].tolist()]
         for (k, photograph), view in zip(new.matching.pairs, new.views, strict=True)
     ]
     document = {

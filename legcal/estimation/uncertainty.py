@@ -22,6 +22,7 @@ from legcal.geometry import Array, IntArray
 
 _STIFF = 1e6  # information on what is tied, over that of measurements
 _ROUNDING = 1e-12  # of information, in differences
+_N_WORST = 3  # directions that are named
 _MIN_COMPONENT = 0.3  # components of a direction that are named, relative to the largest
 
 
@@ -37,12 +38,12 @@ class WorstDirection:
 
 
 def worst_directions(
-    covariance: Array, names: tuple[str, ...], unit: Array, n_directions: int = 3
+    covariance: Array, names: tuple[str, ...], unit: Array
 ) -> tuple[WorstDirection, ...]:
-    """Return the directions known worst, worst first; parameters count in *unit* (n,) each."""
+    """Return the few directions known worst, worst first; parameters count in *unit* (n,) each."""
     variance, vector = np.linalg.eigh(covariance / unit[:, None] / unit)
     found = []
-    for i in range(min(n_directions, len(names))):
+    for i in range(min(_N_WORST, len(names))):
         v = vector[:, -1 - i] * np.sign(vector[np.argmax(np.abs(vector[:, -1 - i])), -1 - i])
         order = np.argsort(-np.abs(v), kind="stable")
         named = [j for j in order if abs(v[j]) >= _MIN_COMPONENT * abs(v[order[0]])][:4]

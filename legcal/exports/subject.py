@@ -66,9 +66,9 @@ class Rendered:
     figures: Mapping[str, Any] = field(default_factory=dict)  # for ``--json``
 
 
-def one_file(text: str, notes: tuple[str, ...] = ()) -> Rendered:
+def one_file(text: str) -> Rendered:
     """Return the rendering of a format that is one text file."""
-    return Rendered((ExportedFile("", text.encode()),), notes)
+    return Rendered((ExportedFile("", text.encode()),))
 
 
 def other_gains(machine: Machine) -> str:

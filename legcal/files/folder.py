@@ -23,6 +23,7 @@ from legcal.files.schema import read_yaml
 from legcal.signals import held_back_signals, raise_if_stopped
 
 TEMPORARY_SUFFIX = ".legcal-part"
+_HEAD = 1000  # bytes of a file, in which its mark stands
 _MOST_OF_NAME = 40  # letters: a name of the greatest length leaves none for what is added to it
 
 
@@ -70,8 +71,9 @@ class OutputFile:
 
     noun: str  # what is written, with its article, for sentences: "the camera"
     what: str  # what the file is called where it cannot be read: "camera file"
-    key: str  # the entry by which a file of this kind is known; "" if it has none
+    key: str  # the entry by which a YAML file of this kind is known; "" if it has none
     needed: str  # what may stand in its place, for sentences: "a new file or an earlier location"
+    mark: bytes = b""  # by which any other file is known, near its beginning
 
     def check_place(self, path: Path, *, force: bool = False) -> None:
         """Refuse a place where no file can be written, or, without *force*, another one stands."""
@@ -88,17 +90,20 @@ class OutputFile:
                 f"{start} that {path.parent} cannot be written to, needed permission to create "
                 "files in it; give another file."
             )
-        may_go = os.path.isfile(path) if force else self._is_own(path)
+        may_go = os.path.isfile(path) if force else self.is_at(path)
         if os.path.lexists(path) and not may_go:
             raise UsageError(
                 f"{start} another file of that name, needed {self.needed}; give another file."
             )
 
-    def _is_own(self, path: Path) -> bool:
+    def is_at(self, path: Path) -> bool:
         """Say whether a file is of this kind."""
         try:
+            if self.mark:
+                with path.open("rb") as file:
+                    return self.mark in file.read(_HEAD)
             return self.key != "" and self.key in read_yaml(path, self.what)
-        except DatasetError:
+        except (DatasetError, OSError):
             return False
 
     def write(self, path: Path, content: str | bytes, *, force: bool = False) -> None:

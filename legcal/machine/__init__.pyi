@@ -10,12 +10,10 @@ from .configurations import TRAVEL_TOLERANCE as TRAVEL_TOLERANCE
 from .configurations import WORKSPACE_POSES as WORKSPACE_POSES
 from .configurations import WORKSPACE_SEED as WORKSPACE_SEED
 from .configurations import Configurations as Configurations
-from .configurations import beyond_travel as beyond_travel
 from .configurations import random_configurations as random_configurations
 from .configurations import random_poses as random_poses
 from .configurations import random_poses_of_legs as random_poses_of_legs
 from .configurations import random_postures_of_legs as random_postures_of_legs
-from .configurations import random_walk as random_walk
 from .configurations import workspace as workspace
 from .coordinates import COORDINATES as COORDINATES
 from .coordinates import coordinates_of as coordinates_of
@@ -45,7 +43,6 @@ from .equations import freedoms as freedoms
 from .equations import is_constrained as is_constrained
 from .equations import leg_equations as leg_equations
 from .equations import machine_equations as machine_equations
-from .equations import n_pose_constraints as n_pose_constraints
 from .equations import pose_equations as pose_equations
 from .equations import pose_sensitivity as pose_sensitivity
 from .equations import posture_constraints as posture_constraints
@@ -91,6 +88,7 @@ from .leg import parameters_of_legs as parameters_of_legs
 from .leg import point_like_legs as point_like_legs
 from .leg import radius_name as radius_name
 from .leg import with_platform_points as with_platform_points
+from .leg import with_radii as with_radii
 from .loader import load_mechanism as load_mechanism
 from .mobility import leg_scale as leg_scale
 from .mobility import singularities as singularities
@@ -142,7 +140,6 @@ from .redundancy import Contradiction as Contradiction
 from .redundancy import ReadingTests as ReadingTests
 from .redundancy import consistent_readings as consistent_readings
 from .redundancy import contradictions as contradictions
-from .redundancy import determining_readings as determining_readings
 from .redundancy import reading_residuals as reading_residuals
 from .rods import AT_ZERO as AT_ZERO
 from .rods import actuator_index as actuator_index
@@ -166,7 +163,6 @@ from .solved_poses import solve_postures as solve_postures
 from .solver import poses_after as poses_after
 from .solver import solve as solve
 from .table_template import write_template as write_template
-from .ties import TieRows as TieRows
 from .ties import Ties as Ties
 from .ties import by_step as by_step
 from .ties import independent as independent

@@ -34,6 +34,7 @@ from legcal.machine.parameters import Parametrization
 from legcal.machine.rods import (
     actuator_index,
     actuators_of,
+    carried_at_A,
     coordinates_at,
     first_rods,
     internal_index,
@@ -544,11 +545,9 @@ def _lengths(
     hung = {} if q is None else {j: leg.actuator for j, leg in enumerate(legs) if leg.actuator}
     inner, n_actuators = dict[int, JointMotion](), len(set(on) - {-1})
     if q is not None:
-        A = np.repeat(A[None], len(t), axis=0)
-        for j, actuator in hung.items():
-            if by_local:
-                moved[j] = actuator.motion(legs[j].A, q[:, on[j]])
-            A[:, j] = moved[j].A if by_local else actuator.at(legs[j].A, q[:, on[j]])
+        A = carried_at_A(tuple(legs)).at(q)
+        for j, actuator in hung.items() if by_local else ():
+            moved[j] = actuator.motion(legs[j].A, q[:, on[j]])
     B = np.array([leg.B for leg in legs]).reshape(-1, 3)
     inside = internal_index(legs)
     if q is not None and max(inside, default=-1) >= 0:
@@ -566,9 +565,10 @@ def _lengths(
         local[..., LegColumns.A], local[..., LegColumns.B] = -u, u @ R
         local[..., LegColumns.LENGTH] = -1.0
     by_q = np.zeros((*lengths.shape, 0 if q is None else q.shape[1]))
-    for j, actuator in hung.items():
-        by_reading = moved[j].by_q if by_local else actuator.by_reading(A[:, j])
-        by_q[:, j, on[j]] = -_dot(by_reading, u[:, j])
+    if q is not None and hung:
+        carried, own = list(hung), [on[j] for j in hung]
+        by_reading = carried_at_A(tuple(legs)).by_coordinate(q)[:, carried]
+        by_q[:, carried, own] = -np.sum(by_reading * u[:, carried], axis=2)
     for j, motion in moved.items():
         local[:, j, LegColumns.A] = -_back(motion, u[:, j])
         _write_actuator(motion, u[:, j], local[:, j])

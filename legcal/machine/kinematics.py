@@ -9,6 +9,7 @@ and the chain closed where it ends.
 
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -49,6 +50,7 @@ MIN_STEP = 1.0 / 4096.0  # of the way from known readings to the wanted ones
 LONG_STEP = 1.0 / 16.0  # where another way follows if that does not lead there
 RANDOM_ANGLES = 6  # other angles of all legs that are tried
 FEW_RESTARTS = 2  # of legs that do not close from there
+SAME_START = 1e-9  # [m], and of rotation matrices: where a start is the last pose
 FEW_STEPS = 12  # of Newton's method at most, and
 REDUNDANT_STEPS = 40  # where readings contradict each other: convergence is linear there
 
@@ -66,7 +68,8 @@ def forward_kinematics(
         Readings [m, rad]; those of legs without a motor are ignored and may be NaN. Of rods on
         one actuator that of the first counts.
     start : RigidTransform, optional
-        T_base_platform of a pose in the wanted assembly mode; ``mechanism.home`` without it.
+        T_base_platform of a pose in the wanted assembly mode; ``mechanism.home`` without it. What
+        the last call for this machine returned is the quickest.
 
     Returns
     -------
@@ -84,7 +87,20 @@ def forward_kinematics(
     UsageError
         If the readings are too few or not finite.
     """
-    return Follower(mechanism, start).move_to(q)
+    # The legs stand where the call before left them if that is where this one starts
+    T_last, configuration = _last.get(mechanism, (None, mechanism.home_configuration))
+    if start is None or T_last is None or np.abs(start.as_matrix() - T_last).max() > SAME_START:
+        follower = Follower(mechanism, start)
+    else:
+        follower = Follower(mechanism)
+        follower.configuration = configuration
+    pose = follower.move_to(q)
+    _last[mechanism] = pose.as_matrix(), follower.configuration
+    return pose
+
+
+# Pose and configuration at which the last call of forward_kinematics ended
+_last: WeakKeyDictionary[Machine, tuple[Array, Array]] = WeakKeyDictionary()
 
 
 class Follower:
@@ -305,6 +321,8 @@ def _disagreement(
     machine: Machine, T: RigidTransform, readings: Array, which: str = ""
 ) -> DidNotConverge | None:
     """Return the error of readings (n_motors,) that contradict each other, None if they do not."""
+    if not machine.is_redundant:
+        return None
     found = contradictions(machine, [platform_in_base(machine, T)], readings[None])
     if not found:
         return None

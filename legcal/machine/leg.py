@@ -9,7 +9,7 @@ belongs to the platform in a frame of the platform: the links for the legs of a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Literal
@@ -130,6 +130,16 @@ class Cylinder:
         """Return both ends as distances from A along a leg of that length [m]."""
         shift = 0.0 if self.side == "base" else length
         return self.start + shift, self.end + shift
+
+
+def with_radii(
+    cylinders: Sequence[Sequence[Cylinder]], radius: Callable[[int, Cylinder], float]
+) -> tuple[tuple[Cylinder, ...], ...]:
+    """Return the cylinders of all legs with other radii [m], by number of the leg and cylinder."""
+    return tuple(
+        tuple(replace(one, radius=radius(j, one)) for one in of_leg)
+        for j, of_leg in enumerate(cylinders)
+    )
 
 
 def main_cylinders(cylinders: Sequence[Cylinder]) -> dict[str, Cylinder]:

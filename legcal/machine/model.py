@@ -1,6 +1,6 @@
 """A parallel mechanism as loaded: its legs, its frames, and its closed chain (section 2)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +21,7 @@ from legcal.machine.leg import (
     Leg,
     parameters_of_legs,
     with_platform_points,
+    with_radii,
 )
 from legcal.machine.rods import (
     AT_ZERO,
@@ -129,7 +130,7 @@ class Machine:
 
     @property
     def at_zero(self) -> str:
-        """What is said of its joints A after their name: where they are told, if they move."""
+        """Words after "joints A": the reading at which their coordinates hold, if they move."""
         return AT_ZERO if self.actuators else ""
 
     @cached_property
@@ -263,13 +264,11 @@ class Machine:
             spatial=self.spatial,
         )
 
-    def with_cylinders(self, cylinders: Sequence[Sequence[Cylinder]]) -> "Machine":
-        """Return the mechanism with other visible cylinders of its legs."""
-        legs = tuple(
-            replace(leg, cylinders=tuple(of_leg))
-            for leg, of_leg in zip(self.legs, cylinders, strict=True)
-        )
-        return replace(self, legs=legs)
+    def with_radii(self, radius: Callable[[int, Cylinder], float]) -> "Machine":
+        """Return the mechanism with other radii of its visible cylinders, as :func:`with_radii`."""
+        others = with_radii([leg.cylinders for leg in self.legs], radius)
+        legs = zip(self.legs, others, strict=True)
+        return replace(self, legs=tuple(replace(leg, cylinders=own) for leg, own in legs))
 
     def with_leg_order(self, names: Sequence[str]) -> "Machine":
         """Return the same mechanism with its legs, each named once, in another order.

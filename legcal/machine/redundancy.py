@@ -46,21 +46,21 @@ class ReadingTests:
     pose: IntArray  # (n,)
     leg: IntArray  # (n,) whose motor it is
     r: Array  # (n,) residuals over the standard deviations of the readings
-    redundancy: Array  # (n,) variance of r if the reading is right; 0 if nothing else tells of it
+    redundancy: Array  # (n,) variance of r if the reading is right; 0 if nothing else measures it
 
     @cached_property
     def squared(self) -> Array:
-        """Squared residuals over their variance, 0 where nothing else tells of a reading."""
-        told = self.redundancy > 0.0
-        return np.where(told, self.r**2 / np.where(told, self.redundancy, 1.0), 0.0)
+        """Squared residuals over their variance; 0 where nothing else measures what was read."""
+        is_tested = self.redundancy > 0.0
+        return np.where(is_tested, self.r**2 / np.where(is_tested, self.redundancy, 1.0), 0.0)
 
     @cached_property
     def scale(self) -> float:
         """How many times their standard deviations the residuals of most readings are, from 1."""
-        told = self.redundancy > 0.0
-        if not told.any():
+        is_tested = self.redundancy > 0.0
+        if not is_tested.any():
             return 1.0
-        return max(1.0, float(np.sqrt(np.median(self.squared[told]))) / _OF_MEDIAN)
+        return max(1.0, float(np.sqrt(np.median(self.squared[is_tested]))) / _OF_MEDIAN)
 
     def of_pose(self, pose: int, most: float, scale: float) -> list[int]:
         """Return the readings of a pose one of which is wrong, the likeliest first.

@@ -7,11 +7,13 @@ the readings of its actuators, and after them those of the joints inside its pla
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, cross
+from legcal.geometry import Array, IntArray, cross
 from legcal.machine.actuator import Actuator
 from legcal.machine.leg import Leg
 from legcal.machine.solver import solve
@@ -57,20 +59,76 @@ def _places(joints: Sequence[Actuator | None]) -> list[int]:
     return [-1 if joint is None else number[joint.joint] for joint in joints]
 
 
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """Points that ride on joints: p(q) = middle + cos cosine(g q) + sin sine(g q) + slide q."""
+
+    on: IntArray  # (n,) which joint carries each, of those that are counted once; -1 for none
+    gain: Array  # (n,) of joints that turn
+    middle: Array  # (n, 3), as the others [m]
+    cos: Array
+    sin: Array
+    slide: Array
+
+    @classmethod
+    def of(cls, points: Array, joints: Sequence[Actuator | None]) -> Carried:
+        """Return points (n, 3), where their joints are at 0, on a joint each."""
+        middle, cos, sin, slide = points.copy(), *(np.zeros_like(points) for _ in range(3))
+        gain = np.zeros(len(points))
+        for j, joint in enumerate(joints):
+            if joint is None:
+                continue
+            if not joint.turns:
+                slide[j] = joint.gain * joint.axis
+                continue
+            arm, gain[j] = points[j] - joint.point, joint.gain
+            sin[j] = cross(joint.axis, arm)
+            cos[j] = cross(sin[j], joint.axis)
+            middle[j] = points[j] - cos[j]
+        return cls(np.array(_places(joints), dtype=np.intp), gain, middle, cos, sin, slide)
+
+    def at(self, q: Array) -> Array:
+        """Return the points (k, n, 3) at coordinates of joints (k, n_joints)."""
+        own, angle = self._own(q)
+        found = self.middle + self.cos * np.cos(angle) + self.sin * np.sin(angle)
+        return np.asarray(found + self.slide * own)
+
+    def by_coordinate(self, q: Array) -> Array:
+        """Return how each point moves with its joint there, (k, n, 3)."""
+        _, angle = self._own(q)
+        turning = self.sin * np.cos(angle) - self.cos * np.sin(angle)
+        return np.asarray(self.gain[:, None] * turning + self.slide)
+
+    def _own(self, q: Array) -> tuple[Array, Array]:
+        """Return the coordinate of the joint of each point, and its angle, (k, n, 1)."""
+        own = np.zeros((len(q), len(self.on)))
+        carried = self.on >= 0
+        own[:, carried] = q[:, self.on[carried]]
+        return own[..., None], (self.gain * own)[..., None]
+
+
+@lru_cache(maxsize=16)
+def carried_at_A(legs: tuple[Leg, ...]) -> Carried:
+    """Return the joints A of legs, which ride on actuators."""
+    A = np.array([leg.A for leg in legs]).reshape(-1, 3)
+    return Carried.of(A, [leg.actuator for leg in legs])
+
+
+@lru_cache(maxsize=16)
+def carried_at_B(legs: tuple[Leg, ...]) -> Carried:
+    """Return the joints B of legs, which ride on joints inside the platform."""
+    B = np.array([leg.B for leg in legs]).reshape(-1, 3)
+    return Carried.of(B, [leg.internal for leg in legs])
+
+
 def platform_joints_at(legs: Sequence[Leg], s: Array) -> Array:
     """Return B of legs (k, n_legs, 3) [m] in a platform whose internal joints are at s (k, n)."""
-    B = np.empty((len(s), len(legs), 3))
-    for j, (leg, i) in enumerate(zip(legs, internal_index(legs), strict=True)):
-        B[:, j] = leg.B if leg.internal is None else leg.internal.at(leg.B, s[:, i])
-    return B
+    return carried_at_B(tuple(legs)).at(s)
 
 
 def joints_at(legs: Sequence[Leg], q: Array) -> Array:
     """Return the joints A of legs (k, n_legs, 3) [m] at readings of actuators (k, n_actuators)."""
-    A = np.empty((len(q), len(legs), 3))
-    for j, (leg, a) in enumerate(zip(legs, actuator_index(legs), strict=True)):
-        A[:, j] = leg.A if leg.actuator is None else leg.actuator.at(leg.A, q[:, a])
-    return A
+    return carried_at_A(tuple(legs)).at(q)
 
 
 def arms_at(legs: Sequence[Leg], q: Array) -> dict[int, Array]:
@@ -176,23 +234,22 @@ def _missed_lengths(
 
     Without readings q what these can make good is left out of both.
     """
-    rods = [j for j, leg in enumerate(legs) if leg.actuator is not None]
-    on, inside = actuator_index(legs), internal_index(legs)
-    B = _in_base(R, t, platform_joints_at(legs, s))
+    at_A, at_B = carried_at_A(tuple(legs)), carried_at_B(tuple(legs))
+    rods = np.flatnonzero(at_A.on >= 0)
+    B = _in_base(R, t, at_B.at(s))
     read = _readings_at(legs, B) if q is None else q
-    vectors = (B - joints_at(legs, read))[:, rods]
+    vectors = (B - at_A.at(read))[:, rods]
     length = np.linalg.norm(vectors, axis=2)
     u = vectors / length[..., None]
-    values, slopes = length - [legs[j].q0 for j in rods], np.zeros((*length.shape, s.shape[1]))
+    values = length - np.array([leg.q0 for leg in legs])[rods]
+    slopes = np.zeros((*length.shape, s.shape[1]))
+    on_inside = np.flatnonzero(at_B.on[rods] >= 0)
+    by_s = at_B.by_coordinate(s)[:, rods[on_inside]] @ np.swapaxes(R, 1, 2)
+    slopes[:, on_inside, at_B.on[rods[on_inside]]] = np.sum(u[:, on_inside] * by_s, axis=2)
     by_q = np.zeros((*length.shape, read.shape[1]))
-    for row, j in enumerate(rods):
-        leg = legs[j]
-        if leg.internal is not None:
-            by_s = leg.internal.by_reading(leg.internal.at(leg.B, s[:, inside[j]]))
-            slopes[:, row, inside[j]] = np.einsum("ki,kij,kj->k", u[:, row], R, by_s)
-        if q is None and leg.actuator is not None:
-            by_reading = leg.actuator.by_reading(leg.actuator.at(leg.A, read[:, on[j]]))
-            by_q[:, row, on[j]] = np.sum(u[:, row] * by_reading, axis=1)
+    if q is None:
+        by_reading = at_A.by_coordinate(read)[:, rods]
+        by_q[:, np.arange(len(rods)), at_A.on[rods]] = np.sum(u * by_reading, axis=2)
     if q is None:
         by_q /= np.maximum(np.linalg.norm(by_q, axis=1, keepdims=True), 1e-300)
         left = np.eye(len(rods)) - by_q @ np.swapaxes(by_q, 1, 2)

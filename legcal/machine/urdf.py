@@ -382,7 +382,10 @@ def _joint(
         )
     if element.find("mimic") is not None:
         problems.add(
-            element, "has <mimic>, which is not followed", "close the loop in the mechanism YAML"
+            element,
+            "has <mimic>, which is not followed",
+            "close the loop in the mechanism YAML, or make a joint beyond the legs fixed (the tool "
+            "on the rack of an I4)",
         )
     axis = _axis(element, kind, problems)
     limits = _limits(element, kind, problems, travel_needed)

@@ -19,7 +19,7 @@ from .document import Text as Text
 from .document import Verdict as Verdict
 from .document import number as number
 from .document import plain as plain
-from .html import is_page as is_page
+from .html import PAGE as PAGE
 from .html import page_html as page_html
 from .html import time_of_page as time_of_page
 from .svg import change_bars as change_bars

@@ -6,12 +6,12 @@ import os
 from datetime import UTC, datetime
 from functools import cache
 from importlib.resources import files
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
 from legcal.errors import printable
+from legcal.files import OutputFile
 from legcal.pages.document import OutlineEditor, Page, Picture, Plot, Row
 from legcal.version import __version__
 
@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 MARK = "legcal-page"  # the name by which a page of legcal is known
-_HEAD = 1000  # bytes at the beginning of a page, in which it stands
+PAGE = OutputFile(
+    "the page", "page", "", "a new file or an earlier page of legcal", mark=MARK.encode()
+)
 
 
 def time_of_page() -> str:
@@ -30,15 +32,6 @@ def time_of_page() -> str:
     stated = os.environ.get("SOURCE_DATE_EPOCH", "")
     now = datetime.fromtimestamp(int(stated), UTC) if stated.isdecimal() else datetime.now()
     return now.astimezone().strftime("%Y-%m-%d %H:%M %Z")
-
-
-def is_page(path: Path) -> bool:
-    """Say whether a file is a page that legcal wrote."""
-    try:
-        with path.open("rb") as file:
-            return MARK.encode() in file.read(_HEAD)
-    except OSError:
-        return False
 
 
 def page_html(page: Page) -> str:

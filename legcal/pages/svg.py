@@ -12,6 +12,7 @@ from legcal.errors import printable
 from legcal.geometry import Array
 
 INK, DIM, RULE, BLUE, GREY = "#1d2126", "#667080", "#dfe3e8", "#1f5fa8", "#8b929c"
+_MAX_BARS = 14  # of a histogram
 _FONT = 'font-family="system-ui, sans-serif"'
 
 
@@ -161,12 +162,13 @@ def error_bars(
     return canvas.markup()
 
 
-def histogram(values: Array, label: str, n: int = 14) -> Markup:
+def histogram(values: Array, label: str) -> Markup:
     """Return how many values, none below zero, lie where from zero on."""
     left, width, height, top, bottom = 34.0, 440.0, 210.0, 14.0, 40.0
     canvas = Canvas(width, height, label)
     low, high = 0.0, 1.05 * float(values.max()) or 1.0
-    counts, edges = np.histogram(values, bins=min(n, max(4, len(values) // 2)), range=(low, high))
+    n = min(_MAX_BARS, max(4, len(values) // 2))
+    counts, edges = np.histogram(values, bins=n, range=(low, high))
     most = max(int(counts.max()), 1)
     sx, sy = (width - left - 12.0) / (high - low), (height - top - bottom) / most
     base = height - bottom

@@ -33,14 +33,12 @@ from .diagnostics import far_off as far_off
 from .diagnostics import hint_notes as hint_notes
 from .diagnostics import images_left_out as images_left_out
 from .diagnostics import is_measurable as is_measurable
-from .diagnostics import is_visible as is_visible
 from .diagnostics import left_out_notes as left_out_notes
 from .free_poses import require_rough_cameras as require_rough_cameras
 from .free_poses import require_standing_joints as require_standing_joints
 from .image_quality import Exposure as Exposure
 from .image_quality import measure_exposure as measure_exposure
 from .outline import HIDDEN as HIDDEN
-from .outline import MIN_LENGTH as MIN_LENGTH
 from .outline import MIN_LONE_KEPT as MIN_LONE_KEPT
 from .outline import OUTSIDE as OUTSIDE
 from .outline import WRONG_WIDTH as WRONG_WIDTH
@@ -50,6 +48,7 @@ from .outline import OutlineLine as OutlineLine
 from .outline import PartLines as PartLines
 from .outline import find_parts as find_parts
 from .outline import measure as measure
+from .outline import measure_in_brief as measure_in_brief
 from .outline import outline_table as outline_table
 from .outline import used_as_before as used_as_before
 from .overlays import Mark as Mark
@@ -77,4 +76,5 @@ from .placement import Placement as Placement
 from .placement import Search as Search
 from .placement import group_views as group_views
 from .placement import placed_arms as placed_arms
+from .placement import predict_legs_and_arms as predict_legs_and_arms
 from .placement import unplaced_notes as unplaced_notes

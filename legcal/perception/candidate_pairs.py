@@ -62,9 +62,9 @@ class EdgeSegments:
         return len(self.ends)
 
 
-def find_segments(grey: Grey, camera: Camera, long_side: int = LONG_SIDE) -> EdgeSegments:
-    """Return the straight edges of a picture, whose longer side is reduced to ``long_side`` px."""
-    factor = int(np.clip(max(grey.shape) // long_side, 1, MAX_REDUCTION))
+def find_segments(grey: Grey, camera: Camera) -> EdgeSegments:
+    """Return the straight edges of a picture, which is reduced if it is large."""
+    factor = int(np.clip(max(grey.shape) // LONG_SIDE, 1, MAX_REDUCTION))
     pieces = _pieces(reduce(grey, factor))
     focal = float(np.sqrt(abs(np.linalg.det(camera.K[:2, :2]))))
     pixel = factor / focal
@@ -337,7 +337,7 @@ class CandidatePairs:
         )
 
 
-def find_candidate_pairs(segments: EdgeSegments, most: int = MAX_PAIRS) -> CandidatePairs:
+def find_candidate_pairs(segments: EdgeSegments) -> CandidatePairs:
     """Return the best pairs of edges that may be a cylinder."""
     ends, pixel = segments.ends, segments.pixel
     along = ends[:, 1] - ends[:, 0]
@@ -379,8 +379,8 @@ def find_candidate_pairs(segments: EdgeSegments, most: int = MAX_PAIRS) -> Candi
         origin + t[:, None] * axis + v[:, None] * across
         for t, v in ((first, centre[0]), (last, centre[1]))
     )
-    chosen = _best(np.where(good, merit, 0.0), i, j, len(ends), most)
-    chosen = chosen[_distinct(start[chosen], stop[chosen], width.mean(axis=0)[chosen])][:most]
+    chosen = _best(np.where(good, merit, 0.0), i, j, len(ends))
+    chosen = chosen[_distinct(start[chosen], stop[chosen], width.mean(axis=0)[chosen])][:MAX_PAIRS]
     start, stop = start[chosen], stop[chosen]
     full = np.linalg.norm(stop - start, axis=1)
     return CandidatePairs(
@@ -393,13 +393,13 @@ def find_candidate_pairs(segments: EdgeSegments, most: int = MAX_PAIRS) -> Candi
     )
 
 
-def _best(merit: Array, i: IntArray, j: IntArray, n_edges: int, most: int) -> IntArray:
+def _best(merit: Array, i: IntArray, j: IntArray, n_edges: int) -> IntArray:
     """Return the best pairs, few of each edge: more than wanted, some of them may be alike."""
     order = np.argsort(-merit, kind="stable")
     order = order[merit[order] > 0.0]
     used, chosen = [0] * n_edges, list[int]()
     for k, one, two in zip(order.tolist(), i[order].tolist(), j[order].tolist(), strict=True):
-        if len(chosen) == 2 * most:
+        if len(chosen) == 2 * MAX_PAIRS:
             break
         if max(used[one], used[two]) < MAX_PAIRS_OF_EDGE:
             used[one] += 1

@@ -16,8 +16,8 @@ from legcal.perception.outline import (
     measure,
     outline_table,
 )
-from legcal.perception.placement import Placement, Search
-from legcal.vision import PredictedLeg, predict_legs
+from legcal.perception.placement import Placement, Search, predict_legs_and_arms
+from legcal.vision import PredictedLeg
 from legcal.workers import Run, in_turn
 
 NOT_PLACED = "the camera of its view could not be placed"  # a reason
@@ -28,8 +28,7 @@ def measure_outlines(
     placement: Placement,
     rows: Sequence[int],
     *,
-    together: bool = True,
-    method: Method | None = None,
+    method: Method = measure,
     run: Run = in_turn,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[Outlines, Array]:
@@ -37,12 +36,10 @@ def measure_outlines(
 
     Two outlines for each part of each leg that is looked for, by row; what was not found or cannot
     be trusted is rejected with the reason. And the blur (n_rows,) of all images [px], NaN where
-    none was measured. ``together`` is as for :func:`legcal.perception.outline.measure`, which
-    another method may replace; ``progress`` is called with each row that has been searched.
+    none was measured. ``progress`` is called with each row that has been searched.
     """
     if placement.window is not None:
         rows = [row for row in rows if not np.isnan(placement.window[row]).all()]
-    method = partial(measure, together=together) if method is None else method
     search = replace(search, edge_pairs={})  # of no use to worker processes
     blur, tables = np.full(search.measurements.n_rows, np.nan), []
     task = partial(_of_image, search, placement, method)
@@ -66,12 +63,8 @@ def _of_image(
     predicted: list[PredictedLeg] = []
     arms = placement.arms
     if T is not None:
-        A, B = (
-            np.concatenate([ends[row], *(arm.ends[row, k : k + 1] for arm in arms.values())])
-            for k, ends in enumerate((placement.A_base, placement.B_base))
-        )
-        cylinders = [*search.cylinders, *([arm.cylinder] for arm in arms.values())]
-        predicted = predict_legs(camera, T, A, B, cylinders, row)
+        ends = placement.A_base, placement.B_base
+        predicted = predict_legs_and_arms(camera, T, ends, search.cylinders, arms, row)
     window = np.concatenate([window, window[list(arms)]])
     if placement.window is None:
         error = np.broadcast_to(placement.joint_error, search.wanted.shape)[view]

@@ -149,7 +149,6 @@ class Pictures:
     R: Array  # (n_pictures, 3, 3) their camera frames, as in Picture
     t: Array  # (n_pictures, 3)
     corners: Array  # (n_pictures, 2, 2)
-    n_pairs: IntArray  # (n_pictures,) without those that fill up
 
     @classmethod
     def of(cls, pictures: Sequence[Picture]) -> "Pictures":
@@ -181,7 +180,6 @@ class Pictures:
             np.array([p.R for p in pictures]).reshape(-1, 3, 3),
             np.array([p.t for p in pictures]).reshape(-1, 3),
             np.array([p.corners for p in pictures]).reshape(-1, 2, 2),
-            np.array([len(p) for p in pairs], dtype=np.intp),
         )
 
     def __len__(self) -> int:

@@ -38,7 +38,7 @@ from legcal.perception.diagnostics import (
 )
 from legcal.perception.free_poses import ROUNDS, find_free_poses
 from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
-from legcal.perception.outline import WRONG_WIDTH, Method
+from legcal.perception.outline import WRONG_WIDTH, Method, measure, measure_in_brief
 from legcal.perception.placement import (
     NEAR_FIT_PX,
     Joined,
@@ -48,13 +48,13 @@ from legcal.perception.placement import (
     group_views,
 )
 from legcal.perception.radii import LegRadius, RadiusFactors, radius_notes
-from legcal.perception.recognition import recognise
+from legcal.perception.recognition import PlacedViews, place_views
 from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
 from legcal.vision import EPSILON, Camera, look_alike, shared_cameras
 from legcal.workers import Run
 
-DETECTOR_VERSION = 9  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 10  # raise it whenever outlines or notes that are kept come out differently
 MEASURING = "Measuring outlines"  # a stage of progress
 CHOICE_ROUNDS = 2  # in which outlines decide between poses that readings leave open
 FreePosesOf = Mapping[int, tuple[RigidTransform, ...]]  # T_base_platform of poses, likeliest first
@@ -164,6 +164,12 @@ class MeasuredImages:
     # T_base_platform of every pose that images show, where the readings do not give it
     free_poses: Mapping[int, RigidTransform] = field(default_factory=dict)
 
+    def kept(self, rows: IntArray) -> IntArray:
+        """Return those of some images that were not left out, and whose views were placed."""
+        view, cameras = self.photographs.measurements.view, self.placement.T_base_camera
+        is_kept = [r not in self.left_out and cameras[view[r]] is not None for r in rows.tolist()]
+        return rows[np.array(is_kept, dtype=np.bool_)]
+
 
 def given_outlines(photographs: Photographs) -> Outlines:
     """Return the outlines that are used as they are; edited ones win."""
@@ -191,12 +197,11 @@ def place_and_measure(
     report: Report,
     joined: Joined = None,
     *,
-    together: bool = True,
+    method: Method = measure,
 ) -> MeasuredImages:
     """Place the cameras, measure the outlines, and leave out the images that are wrong.
 
-    ``joined`` are T_board_camera of views that show a calibration board, which are placed together;
-    ``together`` is as for :func:`legcal.perception.outline.measure`.
+    ``joined`` are T_board_camera of views that show a calibration board, which are placed together.
     """
     defects, pairs, rough = _inspect_images(photographs, nominal, report, joined)
     photographs.edge_pairs.update(pairs)
@@ -211,13 +216,13 @@ def place_and_measure(
         defects |= doubtful
         usable = np.setdiff1d(usable, list(doubtful))
     search = photographs.search(nominal, pairs, rough)
-    recognised = partial(_recognised, photographs, search, usable, hints, report, joined)
-    placement = recognised()
-    outlines, blur = _measured(photographs, search, placement, report, together=together)
+    views = _placed(photographs, search, usable, hints, report, joined)
+    placement = views.recognised(photographs.run)
+    outlines, blur = _measured(photographs, search, placement, report, method=method)
     at_nominal = _Measured(photographs, search, placement, outlines, blur)
     measured = at_nominal
     if not free_poses:  # which would follow wrong radii, and these wrong poses
-        measured = _with_other_radii(at_nominal, recognised, report, together=together)
+        measured = _with_other_radii(at_nominal, views, report, method=method)
     photographs, search, outlines = measured.photographs, measured.search, measured.outlines
     groups = group_views(photographs.measurements, usable, hints, joined)
     is_own = np.isin(outlines.row, usable)
@@ -227,7 +232,7 @@ def place_and_measure(
         groups,
         measured.placement,
         own,
-        together=together,
+        method=method,
         run=photographs.run,
         progress=_counted(report, "Looking for missing legs", len(usable)),
     )
@@ -262,28 +267,27 @@ class _Measured:
 
 def _with_other_radii(
     found: _Measured,
-    recognised: Callable[[Collection[LegRadius]], Placement],
+    views: PlacedViews,
     report: Report,
     *,
-    together: bool,
+    method: Method,
 ) -> _Measured:
     """Return what is measured with other radii of parts that were not found, if it is more.
 
-    *recognised* places the cameras anew, with other radii of some parts.
+    *views* are where its images were recognised.
     """
     machine, m = found.photographs.machine, found.photographs.measurements
     suspects = _parts_not_found(machine.legs, found.outlines)
     while suspects:
-        placement = recognised(suspects)
-        radii = placement.radii
-        if not radii.factor:
+        placement = views.with_other_radii(suspects, found.photographs.run)
+        if placement is None:
             break
-        cylinders = radii.corrected(found.search.cylinders)
-        photographs = replace(found.photographs, machine=machine.with_cylinders(cylinders))
+        radii = placement.radii
+        photographs = replace(found.photographs, machine=machine.with_radii(radii.corrected))
         search = replace(found.search, cylinders=photographs.cylinders)
         stage = f"{MEASURING} with other radii"
         outlines, blur = _measured(
-            photographs, search, placement, report, together=together, stage=stage
+            photographs, search, placement, report, method=method, stage=stage
         )
         found = replace(found, blur=np.where(np.isnan(blur), found.blur, blur))
         shown = _images_with_more(machine.legs, radii, m.view, found.outlines, outlines)
@@ -301,13 +305,12 @@ def _with_other_radii(
     return found
 
 
-def recognise_and_place(
-    photographs: Photographs, nominal: Placement, report: Report, joined: Joined = None
-) -> Placement:
+def recognise_and_place(photographs: Photographs, nominal: Placement, report: Report) -> Placement:
     """Recognise the legs in the images, and place the cameras by them."""
     nominal, _ = _with_free_poses(photographs, nominal, {}, photographs.detect, report)
     search, hints = photographs.search(nominal), nominal.T_base_camera
-    return _recognised(photographs, search, photographs.detect, hints, report, joined)
+    views = _placed(photographs, search, photographs.detect, hints, report, None)
+    return views.recognised(photographs.run)
 
 
 def _with_free_poses(
@@ -375,14 +378,15 @@ def _decided_by_outlines(
     hints = nominal.T_base_camera
     for _ in range(CHOICE_ROUNDS):
         search = photographs.search(nominal)
-        placement = _recognised(photographs, search, rows, hints, report, joined)
+        views = _placed(photographs, search, rows, hints, report, joined)
+        placement = views.recognised(photographs.run)
         most = dict.fromkeys(choices, -1)
         chosen = dict[int, int]()
         for n in range(max(map(len, choices.values()))):
             there = {pose: every[n] for pose, every in choices.items() if len(every) > n}
             search = photographs.search(_at_poses(photographs, nominal, there))
             shown = placement.shifted(search, placement.shift)
-            outlines, _ = _measured(photographs, search, shown, report, together=False)
+            outlines, _ = _measured(photographs, search, shown, report, method=measure_in_brief)
             pose = photographs.measurements.pose[outlines.row[outlines.used]]
             for own in there:
                 n_used = int(np.sum(pose == own))
@@ -404,18 +408,12 @@ def measure_photographs(
     placement: Placement,
     report: Report,
     *,
-    together: bool = True,
-    method: Method | None = None,
+    method: Method = measure,
     stage: str = MEASURING,
 ) -> Outlines:
-    """Return all outlines: those measured near a placement, and those kept.
-
-    ``together`` and ``method`` are as for :func:`legcal.perception.detection.measure_outlines`.
-    """
+    """Return all outlines: those measured near a placement, and those kept."""
     search = photographs.search(placement)
-    return _measured(
-        photographs, search, placement, report, together=together, method=method, stage=stage
-    )[0]
+    return _measured(photographs, search, placement, report, method=method, stage=stage)[0]
 
 
 def with_measured_radii(
@@ -433,10 +431,8 @@ def with_measured_radii(
     places = {
         v: T.inv() for v, T in enumerate(placement.T_base_camera) if T is not None
     }  # of the base before the cameras
-    part, changed = np.array(outlines.part), False
-    cylinders = []
+    part, found = np.array(outlines.part), dict[tuple[int, float], float]()
     for j, leg in enumerate(machine.legs):
-        radii = {}
         for cylinder in leg.cylinders:
             own = np.flatnonzero(judged & (outlines.leg == j) & (part == cylinder.link))
             if 2 * np.count_nonzero(wrong[own]) <= len(own):
@@ -446,26 +442,24 @@ def with_measured_radii(
             distance = np.sum(outlines.h[own] * A, axis=1) * np.array(EPSILON)[edge - 1]
             of_edges = [np.median(distance[edge == e]) for e in np.unique(edge)]
             if len(of_edges) == len(EPSILON):
-                radii[cylinder.radius] = float(np.mean(of_edges))
-        changed = changed or bool(radii)
-        cylinders.append([replace(c, radius=radii.get(c.radius, c.radius)) for c in leg.cylinders])
-    return replace(photographs, machine=machine.with_cylinders(cylinders)) if changed else None
+                found[j, cylinder.radius] = float(np.mean(of_edges))
+    if not found:
+        return None
+    other = machine.with_radii(lambda j, c: found.get((j, c.radius), c.radius))
+    return replace(photographs, machine=other)
 
 
-def _recognised(
+def _placed(
     photographs: Photographs,
     search: Search,
     rows: IntArray,
     hints: Sequence[RigidTransform | None],
     report: Report,
     joined: Joined,
-    suspects: Collection[LegRadius] = (),
-) -> Placement:
-    """Return what is recognised in some images."""
+) -> PlacedViews:
+    """Return where views have the legs that some images show."""
     progress = _counted(report, "Recognising legs", len(rows))
-    return recognise(
-        search, rows, hints, joined, suspects=suspects, run=photographs.run, progress=progress
-    )
+    return place_views(search, rows, hints, joined, run=photographs.run, progress=progress)
 
 
 def _measured(
@@ -474,8 +468,7 @@ def _measured(
     placement: Placement,
     report: Report,
     *,
-    together: bool,
-    method: Method | None = None,
+    method: Method,
     stage: str = MEASURING,
 ) -> tuple[Outlines, Array]:
     """Return all outlines, measured and kept, and the blur of each row [px]."""
@@ -484,7 +477,6 @@ def _measured(
         search,
         placement,
         rows,
-        together=together,
         method=method,
         run=photographs.run,
         progress=_counted(report, stage, len(photographs.detect)),

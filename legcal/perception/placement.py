@@ -20,7 +20,7 @@ from legcal.machine import Cylinder, Leg, arms_at, cylinder_of_arm
 from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
 from legcal.perception.radii import NO_RADIUS_FACTORS, RadiusFactors
-from legcal.vision import Camera, Grey
+from legcal.vision import Camera, Grey, PredictedLeg, predict_legs
 
 Load = Callable[[int], Grey]  # the image of a row
 Joined = Sequence[RigidTransform | None] | None  # T_board_camera of views that show a board
@@ -96,6 +96,23 @@ class PlacedArm:
     cylinder: Cylinder  # along its line, from its near end
     ends: Array  # (n_rows, 2, 3) in the base link [m]
     error: float  # how far it may be from there: where only the model has it [m]
+
+
+def predict_legs_and_arms(
+    camera: Camera,
+    T_base_camera: RigidTransform,
+    ends: tuple[Array, Array],  # A and B in the base link, (n_rows, n_legs, 3) each [m]
+    cylinders: Sequence[Sequence[Cylinder]],  # of each leg
+    arms: Mapping[int, PlacedArm],
+    row: int,
+) -> list[PredictedLeg]:
+    """Predict every leg that an image should show, and after them its arms, which count on."""
+    A, B = (
+        np.concatenate([of_legs[row], *(arm.ends[row, k : k + 1] for arm in arms.values())])
+        for k, of_legs in enumerate(ends)
+    )
+    every = [*cylinders, *([arm.cylinder] for arm in arms.values())]
+    return predict_legs(camera, T_base_camera, A, B, every, row)
 
 
 def placed_arms(

@@ -101,6 +101,7 @@ def fit_pooled(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> Po
             values[moving] = new
         moved, widened = (np.abs(x - y) for x, y in zip(of_part[1:], before[1:], strict=True))
         still = (moved.max(axis=1) >= CONVERGED[0]) | (widened >= CONVERGED[1])
+        still &= part.seen  # what follows the blur of the image alone has nothing to converge
         if not np.any(still):
             break
         if turn >= ALL_ROUNDS and not np.all(still):

@@ -48,12 +48,9 @@ class RadiusFactors:
     factor: dict[LegRadius, float]  # by how much they differ from the model; others are left out
     common: float = 0.0  # the factor of all parts, if they differ alike; 0 otherwise
 
-    def corrected(self, cylinders: Sequence[Sequence[Cylinder]]) -> list[tuple[Cylinder, ...]]:
-        """Return the cylinders of all legs with the radii that were found."""
-        return [
-            tuple(replace(c, radius=c.radius * self.of(leg, c.radius)) for c in of_leg)
-            for leg, of_leg in enumerate(cylinders)
-        ]
+    def corrected(self, leg: int, cylinder: Cylinder) -> float:
+        """Return the radius that was found of a cylinder of a leg [m]."""
+        return cylinder.radius * self.of(leg, cylinder.radius)
 
     def of(self, leg: int, radius: float) -> float:
         """Return the factor of a part."""

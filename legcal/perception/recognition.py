@@ -6,6 +6,8 @@ none, and a pose that they agree on elsewhere is used, with a note. Where edge p
 outlines measured at the best poses decide.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data import Measurements, Outlines
 from legcal.geometry import Array, IntArray
-from legcal.machine import Cylinder
+from legcal.machine import Cylinder, with_radii
 from legcal.perception.camera_search import (
     START_PICTURES,
     PoseCandidates,
@@ -62,16 +64,27 @@ def recognise(
     hints: Sequence[RigidTransform | None],
     joined: Joined = None,
     *,
-    suspects: Collection[LegRadius] = (),
     progress: Callable[[int], None] | None = None,
     run: Run = in_turn,
 ) -> Placement:
-    """Find the cameras of all views and the legs in the images of rows.
+    """Find the cameras of all views and the legs in the images of rows, as :func:`place_views`."""
+    return place_views(search, rows, hints, joined, progress=progress, run=run).recognised(run)
+
+
+def place_views(
+    search: Search,
+    rows: IntArray,
+    hints: Sequence[RigidTransform | None],
+    joined: Joined = None,
+    *,
+    progress: Callable[[int], None] | None = None,
+    run: Run = in_turn,
+) -> PlacedViews:
+    """Return the poses at which the images of rows show most legs.
 
     ``hints`` are rough T_base_camera of views; those of views without images are kept. ``joined``
     are T_board_camera of views that know how they stand to each other by a board: they are placed
-    together. ``suspects`` parts, by leg and radius [m], are those whose outlines were not found
-    with the radii of the model: they may have others. ``progress`` is called with each row.
+    together. ``progress`` is called with each row.
     """
     groups = group_views(search.measurements, rows, hints, joined)
     n_legs = search.n_legs
@@ -91,38 +104,54 @@ def recognise(
     for k, of_group, one in zip(unclear, of_groups, anywhere, strict=True):
         hint = groups[k].hint
         found[k] = one if hint is None else _better(place_near(of_group, hint, n_legs), one)
-    views = _PlacedViews(search, groups, pictures, [one for one in found if one is not None])
-    radii = NO_RADIUS_FACTORS
-    if suspects:
-        views, radii = _by_other_radii(views, suspects, run)
-    views = replace(views, placed=list(run(views.decided_by_outlines, range(len(groups)))))
-    return _gathered(views, hints, radii, run)
+    placed = [one for one in found if one is not None]
+    return PlacedViews(search, hints, groups, pictures, placed)
 
 
 @dataclass(frozen=True, eq=False)
-class _PlacedViews:
+class PlacedViews:
     """Views, what their images show, and the poses at which these show most legs.
 
     It travels to worker processes.
     """
 
     search: Search
+    hints: Sequence[RigidTransform | None]  # T_base_camera of all views
     groups: Sequence[Group]  # of views that are placed together
     pictures: Mapping[int, Picture]  # by row
     placed: Sequence[PoseCandidates]  # of each group
+
+    def recognised(self, run: Run = in_turn) -> Placement:
+        """Return the cameras of all views and the legs in their images."""
+        return self._decided(NO_RADIUS_FACTORS, run)
+
+    def with_other_radii(
+        self, suspects: Collection[LegRadius], run: Run = in_turn
+    ) -> Placement | None:
+        """Return the same with other radii of some parts, by leg and radius [m]; None without any.
+
+        Their outlines were not found with those of the model.
+        """
+        views, radii = _by_other_radii(self, suspects, run)
+        return views._decided(radii, run) if radii.factor else None
+
+    def _decided(self, radii: RadiusFactors, run: Run) -> Placement:
+        """Return the views together, by outlines where pairs are ambiguous."""
+        placed = list(run(self.decided_by_outlines, range(len(self.groups))))
+        return _gathered(replace(self, placed=placed), radii, run)
 
     def of_group(self, g: int, rows: Sequence[int] | None = None) -> list[Picture]:
         """Return the pictures of a group, all of them or those of some rows."""
         group = self.groups[g]
         return group.pictures(self.pictures, group.rows if rows is None else rows)
 
-    def by_cylinders(self, cylinders: Sequence[Sequence[Cylinder]]) -> "_PlacedViews":
+    def by_cylinders(self, cylinders: Sequence[Sequence[Cylinder]]) -> PlacedViews:
         """Return what images show and should show by other cylinders of the legs."""
         search = replace(self.search, cylinders=cylinders)
         pictures = {row: search.retargeted(row, one) for row, one in self.pictures.items()}
         return replace(self, search=search, pictures=pictures)
 
-    def placed_anywhere(self, which: Sequence[int], run: Run) -> "_PlacedViews":
+    def placed_anywhere(self, which: Sequence[int], run: Run) -> PlacedViews:
         """Return some groups placed anew, by all of their pictures."""
         placed = list(self.placed)
         of_groups = [self.of_group(g) for g in which]
@@ -131,7 +160,7 @@ class _PlacedViews:
             placed[g] = one
         return replace(self, placed=placed)
 
-    def placed_again(self, run: Run) -> "_PlacedViews":
+    def placed_again(self, run: Run) -> PlacedViews:
         """Return the groups placed near where they were, or anywhere if they were not."""
         views = self.placed_anywhere(
             [g for g, one in enumerate(self.placed) if not one.is_convincing], run
@@ -219,15 +248,15 @@ def _better(near: PoseCandidates, anywhere: PoseCandidates) -> PoseCandidates:
 
 
 def _by_other_radii(
-    views: _PlacedViews, suspects: Collection[LegRadius], run: Run
-) -> tuple[_PlacedViews, RadiusFactors]:
+    views: PlacedViews, suspects: Collection[LegRadius], run: Run
+) -> tuple[PlacedViews, RadiusFactors]:
     """Return the views by the radii that images show of suspect parts, corrected in turns."""
     as_given, given = views, views.search.cylinders
     radii = step = _first_radii(views, run).only(suspects)
     for _ in range(MAX_ITERATIONS):
         if not step.factor:
             break
-        views = views.by_cylinders(radii.corrected(given)).placed_again(run)
+        views = views.by_cylinders(with_radii(given, radii.corrected)).placed_again(run)
         few = views.for_radii()
         step = radii.of_the_same(estimate_radii(few, CONVERGED, alone=not radii.common))
         radii = radii.then(step)
@@ -236,16 +265,18 @@ def _by_other_radii(
     return views, radii
 
 
-def _first_radii(views: _PlacedViews, run: Run) -> RadiusFactors:
+def _first_radii(views: PlacedViews, run: Run) -> RadiusFactors:
     """Return the radii that the images contradict, as far as the views can be placed."""
     if any(one.is_convincing for one in views.placed):
         return estimate_radii(views.for_radii())
+
+    def scaled(factor: float) -> PlacedViews:
+        cylinders = with_radii(views.search.cylinders, lambda _, c: factor * c.radius)
+        return views.by_cylinders(cylinders)
+
     others = views
     for factor in SCALED:
-        scaled = views.by_cylinders(
-            [[replace(c, radius=factor * c.radius) for c in leg] for leg in views.search.cylinders]
-        )
-        others = scaled.placed_anywhere(range(len(views.groups)), run)
+        others = scaled(factor).placed_anywhere(range(len(views.groups)), run)
         if any(one.is_clear for one in others.placed):
             break
     return estimate_radii(replace(views, placed=others.placed).for_radii())
@@ -339,16 +370,11 @@ def _gap(one: Array, other: Array) -> float:
     return float(abs(along[0] * step[1] - along[1] * step[0]) / np.linalg.norm(along))
 
 
-def _gathered(
-    found: _PlacedViews,
-    hints: Sequence[RigidTransform | None],
-    radii: RadiusFactors,
-    run: Run,
-) -> Placement:
+def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
     """Put the views together, with the reasons of those that could not be placed."""
     search, groups, placed = found.search, found.groups, found.placed
     views = search.measurements.views
-    T, unplaced = list(hints), dict[str, str]()
+    T, unplaced = list(found.hints), dict[str, str]()
     shift = np.zeros((len(views), search.n_legs, 2, 3))
     error: Array = np.full((len(views), search.n_legs), UNOBSERVED_ERROR)
     unclear = [g for g, one in enumerate(placed) if may_be_mirrored(one)]

@@ -89,6 +89,7 @@ def measure_edges(
             break
         if near_fit:
             blocks.unmove()
+            blocks.narrow(tried)
         kept = blocks.kept()
         joint = fit_pooled(blocks, kept, tried, depth_for_blur(tried))
         blur = joint.blur

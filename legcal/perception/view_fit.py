@@ -38,7 +38,7 @@ from legcal.estimation import (
 from legcal.geometry import Array, BoolArray, IntArray, cross, whitener
 from legcal.machine import main_cylinders
 from legcal.perception.detection import NOT_PLACED, measure_outlines
-from legcal.perception.outline import OUTSIDE
+from legcal.perception.outline import OUTSIDE, Method, measure
 from legcal.perception.pair_matching import MIN_DEPTH, CameraPoses, depth_reversed
 from legcal.perception.placement import Group, Placement, Search
 from legcal.vision import Camera, outlines_of_axis
@@ -471,15 +471,14 @@ def refine_views(
     placement: Placement,
     outlines: Outlines,
     *,
-    together: bool = True,
+    method: Method = measure,
     run: Run = in_turn,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[Placement, Outlines, Fits]:
     """Fit all views to their outlines, and look for the legs that are missing near that.
 
     Return cameras and joint centres by the outlines, the outlines that agree with them (what was
-    looked for and not found keeps its reason), and the fits. ``together`` is as for
-    :func:`legcal.perception.outline.measure`.
+    looked for and not found keeps its reason), and the fits.
     """
     fits = _fits_or_reversed(search, groups, placement, outlines)
     placement = _placed_by_fits(search, groups, placement, fits)
@@ -487,7 +486,7 @@ def refine_views(
     placement = _placed_by_fits(search, groups, placement, fits)
     near = replace(placement, window=_windows(search, groups, fits, outlines))
     rows = sorted(row for group in groups for row in group.rows)
-    again, _ = measure_outlines(search, near, rows, together=together, run=run, progress=progress)
+    again, _ = measure_outlines(search, near, rows, method=method, run=run, progress=progress)
     found = set(zip(again.row[again.used].tolist(), again.leg[again.used].tolist(), strict=True))
     kept = outlines.choose(~_among(outlines, found))
     outlines = join_outlines([kept, again.choose(_among(again, found))])

@@ -25,6 +25,7 @@ _BATCH = 64  # candidates that are judged at once
 _TRIED = 90  # of all candidates, for each image that is chosen
 _MIN_GAIN = 1e-4  # of the criterion, for which images are exchanged
 _MAX_PASSES = 8
+_LEAST_LEFT = 1e-9  # share of a variance, of which updates would be rounding
 
 
 class Session:
@@ -40,10 +41,11 @@ class Session:
         for place, slot in zip(self.places, (*slots, *given), strict=True):
             self.information[np.ix_(place, place)] = slot.prior
         for place, slot in zip(self.places[len(slots) :], given, strict=True):
-            stacked = slot.rows.reshape(-1, slot.rows.shape[2])
+            stacked = slot.all_gains()
             self.information[np.ix_(place, place)] += stacked.T @ stacked
         self.names = names
-        self.slots = list(slots)
+        self.slots, self.given = list(slots), list(given)
+        self._at: dict[tuple[int, int], list[int]] = {}  # the images that are chosen of each site
         self.p = sum(name.startswith(KINEMATIC) for name in names)
         self.covariance = np.linalg.inv(self.information)
 
@@ -54,12 +56,33 @@ class Session:
 
     def changed(self, slot: int, image: int, sign: float) -> None:
         """Add (+1) an image to a slot, or take it away (-1)."""
-        U, place = self.slots[slot].rows[image], self.places[slot]
+        at = self._at.setdefault((slot, int(self.slots[slot].site[image])), [])
+        if sign > 0.0:
+            at.append(image)
+            self._update(slot, image, len(at), 1.0)
+            return
+        place = at.index(image)
+        for k in range(place, len(at)):
+            self._update(slot, at[k], k + 1, -1.0)
+        at.remove(image)
+        for k in range(place, len(at)):
+            self._update(slot, at[k], k + 1, 1.0)
+
+    def _update(self, slot: int, image: int, number: int, sign: float) -> None:
+        """Add (+1) what an image adds as that many-th of its site, or take it away (-1)."""
+        U, place = (
+            self.slots[slot].gains(np.array([image]), np.array([number]))[0],
+            self.places[slot],
+        )
         self.information[np.ix_(place, place)] += sign * (U.T @ U)
-        K = self.covariance[:, place] @ U.T
-        S = np.eye(len(U)) + sign * (U @ K[place])
-        self.covariance = self.covariance - sign * (K @ np.linalg.solve(S, K.T))
-        self.covariance = 0.5 * (self.covariance + self.covariance.T)
+        K = U @ self.covariance[place]
+        S = np.eye(len(U)) + sign * (K[:, place] @ U.T)
+        variances, turn = np.linalg.eigh(S)
+        if variances[0] < _LEAST_LEFT:  # hardly anything is known without these rows
+            self.renewed()
+            return
+        half = (turn / np.sqrt(variances)).T @ K
+        self.covariance -= sign * (half.T @ half)
 
     def renewed(self) -> None:
         """Invert the information, without what updates have rounded."""
@@ -69,11 +92,26 @@ class Session:
         """Return the covariances (n, p, p) of the machine with one of some images more."""
         place = self.places[slot]
         block, p = self.covariance[np.ix_(place, place)], self.p
-        own = self.slots[slot].rows[images]
+        own = self._next(slot, images)
         with_own = own @ block
         S = np.eye(own.shape[1]) + with_own @ np.swapaxes(own, 1, 2)
         half = with_own[..., :p]
         return np.asarray(self.machine - np.swapaxes(half, 1, 2) @ np.linalg.solve(S, half))
+
+    def _next(self, slot: int, images: IntArray) -> Array:
+        """Return the rows (n, r, m) that images add to those chosen of their sites."""
+        own = self.slots[slot]
+        count = [len(self._at.get((slot, site), ())) for site in own.site[images].tolist()]
+        return own.gains(images, 1 + np.array(count))
+
+    def fitted(self) -> Array:
+        """Return the covariance (p, p) of the machine by a fit that errors at places move."""
+        found = self.machine
+        for place, slot in zip(self.places, (*self.slots, *self.given), strict=True):
+            moved = np.einsum("krm,krc->mc", slot.rows, slot.shifts)
+            moved = self.covariance[: self.p, place] @ moved
+            found = found + moved @ moved.T
+        return np.asarray(found, dtype=np.float64)
 
 
 @dataclass

@@ -6,6 +6,11 @@ where it is not given. The platform pose of an image is eliminated; machine, cam
 share are kept, so that an image is a low-rank update: rows U with U^T U added to the information.
 Unknowns have names, those of a view begin with its name; unknown kinematic parameters are
 coordinates inside what the mechanism ties.
+
+**Places.** Edges that come back to the same place of a view err alike again. Photographs of one
+*site*, with all legs where others of them have theirs, share these errors: the second tells less
+than the first. In rows that make shared errors of variances s^2 independent, n photographs tell
+n / (1 + n s^2) of what one would without such errors.
 """
 
 from __future__ import annotations
@@ -24,6 +29,7 @@ from legcal.calibration import (
     FitProblem,
     FittedLegs,
     NoiseModel,
+    ObservedOutlines,
     Prior,
     Start,
     State,
@@ -31,11 +37,13 @@ from legcal.calibration import (
     build_fit,
     fitted_legs,
     possible_biases,
+    shifts_at_places,
+    shifts_of_edges,
     with_gamma,
 )
 from legcal.data import Measurements, Outlines, View
 from legcal.estimation import Frames, linearize
-from legcal.geometry import Array, IntArray
+from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Leg, Machine, owner_of_parameter, reading_of_rod
 from legcal.vision import Camera
 
@@ -57,6 +65,8 @@ class PredictedNoise:
         Of the errors at both ends: -0.5 where errors of pixels are independent.
     common_px : tuple of float
         Standard deviations of the common-mode edge biases, in the order of their kinds [px].
+    places_px : tuple of float
+        Standard deviations of bias and tilt of an edge at a place [px].
     gamma_px : float
         How far an outline moves with the logarithm of the gamma, which counts as not known [px].
     source : str
@@ -65,7 +75,8 @@ class PredictedNoise:
 
     sigma_px: float = 0.35
     correlation: float = 0.0
-    common_px: tuple[float, ...] = (0.02, 0.005, 0.03, 0.01, 0.012, 0.006)
+    common_px: tuple[float, ...] = (0.038, 0.005, 0.03, 0.013, 0.017, 0.006)
+    places_px: tuple[float, ...] = (0.05, 0.019)
     gamma_px: float = 0.1
     source: str = "what photographs of simulated machines show"
 
@@ -82,7 +93,7 @@ class PredictedNoise:
 
 DEFAULT_NOISE = PredictedNoise()
 # White noise of edge points, as simulated outlines have it
-WHITE = PredictedNoise(0.1, -0.5, (0.0,) * 6, 0.0, "independent errors of edge points")
+WHITE = PredictedNoise(0.1, -0.5, (0.0,) * 6, (0.0, 0.0), 0.0, "independent errors of edge points")
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +104,31 @@ class Contributions:
     rows: Array  # (n_images, r, m): of each image, its platform pose eliminated
     prior: Array  # (m, m): what is known without images
     basis: Array  # (n_parameters, p): directions of the kinematic parameters
+    at_site: Array  # (n_images, r) variances of what photographs of a site share, in those rows
+    site: IntArray  # (n_images,)
+    # (n_images, r, c) how errors at places, one standard deviation of each, move the rows; none of
+    # them unless a fit is predicted that does not know them
+    shifts: Array
+
+    def gains(self, images: IntArray, number: IntArray) -> Array:
+        """Return the rows (n, r, m) that images add as that many-th ones of their sites."""
+        shared, number = self.at_site[images], np.reshape(number, (-1, 1))
+        before = number - 1
+        gain = number / (1.0 + number * shared) - before / (1.0 + before * shared)
+        return np.asarray(np.sqrt(gain)[..., None] * self.rows[images])
+
+    def all_gains(self) -> Array:
+        """Return the rows (n_images r, m) that all images add together."""
+        order = np.argsort(self.site, kind="stable")
+        _, first, count = np.unique(self.site[order], return_index=True, return_counts=True)
+        number = np.empty(len(order), dtype=np.intp)
+        number[order] = 1 + np.arange(len(order)) - np.repeat(first, count)
+        rows = self.gains(np.arange(len(order)), number)
+        return rows.reshape(len(order) * rows.shape[1], rows.shape[2])
+
+    def repeated(self, times: float) -> Contributions:
+        """Return what so many photographs at each image add."""
+        return replace(self, rows=self.rows * np.sqrt(times), at_site=self.at_site * times)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +162,14 @@ class Predictor:
         poses: Sequence[RigidTransform],  # T_Rb_Re of each image
         outlines: Outlines,
         legs: Sequence[Leg] | None = None,  # in R_b and R_e, if not the nominal ones
+        *,
+        is_fit: bool = False,
     ) -> Contributions:
-        """Return what images add to the information."""
+        """Return what images add to the information.
+
+        With *is_fit* that of the fit, which takes errors at places for independent ones, and how
+        these move it.
+        """
         n, shown = len(poses), tuple(legs or self.legs.nominal)
         R, t = Frames.of(poses)
         q = np.zeros((n, self.legs.n_legs))
@@ -157,13 +199,16 @@ class Predictor:
             "plan",
         )
         state = problem.begin(start)
-        return self._rows(problem.weighted(NoiseModel()), state, list(views))
+        return self._rows(problem.weighted(NoiseModel()), state, list(views), is_fit=is_fit)
 
-    def _rows(self, problem: FitProblem, state: State, views: Sequence[str]) -> Contributions:
+    def _rows(
+        self, problem: FitProblem, state: State, views: Sequence[str], *, is_fit: bool
+    ) -> Contributions:
         """Return the whitened rows of every image, and the priors of all unknowns."""
         linear, n = linearize(problem, state), problem.n_elements
         tangent = problem.constraint.tangent(problem, state) if problem.constraint else None
-        blocks = []
+        shifts = self._shifts(problem, are_shared=is_fit)
+        blocks, is_outline = [], []
         for factor in problem.factors:
             if not factor.n or factor.element is None:
                 continue
@@ -172,17 +217,25 @@ class Predictor:
             J = np.zeros((factor.n, q, problem.n_kept + 1))
             at = np.arange(factor.n)[:, None, None], np.arange(q)[None, :, None]
             np.add.at(J, (*at, where.index[:, None, :]), found.J)
-            both = np.concatenate([found.J_element, J[..., :-1]], axis=2)
-            both *= np.sqrt(problem.loss.efficiency(q)) if factor.robust else 1.0
-            blocks.append(_by_element(both, factor.element, n))
+            moved = np.zeros((factor.n, q, shifts.shape[2]))
+            if factor.name == "outlines":
+                moved = factor.whitening @ shifts
+            every = np.concatenate([found.J_element, J[..., :-1], moved], axis=2)
+            every *= np.sqrt(problem.loss.efficiency(q)) if factor.robust else 1.0
+            blocks.append(_by_element(every, factor.element, n))
+            is_outline += [factor.name == "outlines"] * blocks[-1].shape[1]
         stacked = np.concatenate(blocks, axis=1)
-        own, kept = np.split(stacked, [stacked.shape[2] - problem.n_kept], axis=2)
+        n_own = stacked.shape[2] - problem.n_kept - shifts.shape[2]
+        own, kept, moved = np.split(stacked, [n_own, n_own + problem.n_kept], axis=2)
         if tangent is not None:
             kept = kept + np.einsum("krd,mkd->krm", own, tangent.Q)
             own = own @ tangent.Z
         U, s, _ = np.linalg.svd(own, full_matrices=False)
         U = U * (s > _RANK * s[:, :1])[:, None]
         kept = kept - U @ (np.swapaxes(U, 1, 2) @ kept)
+        at_site = np.zeros(kept.shape[:2])
+        if not is_fit and np.any(self.noise.places_px):
+            at_site, kept = _apart(kept, U, moved, np.array(is_outline))
         names = _names(problem, views)
         prior = linear.prior_J.T @ linear.prior_J
         weak = np.array([prior[i, i] == 0.0 for i in range(len(prior))])
@@ -196,7 +249,57 @@ class Predictor:
         rows = np.concatenate([kept[..., :k] @ untied, kept[..., k:]], axis=2)
         whole = block_diag(untied.T @ prior[:k, :k] @ untied, prior[k:, k:])
         named = *(f"{KINEMATIC} {i}" for i in range(untied.shape[1])), *names[k:]
-        return Contributions(named, rows, whole, basis)
+        if is_fit:
+            moved = moved - U @ (np.swapaxes(U, 1, 2) @ moved)
+            return Contributions(named, rows, whole, basis, at_site, np.arange(n), moved)
+        site = _sites(problem.outlines, n)
+        return Contributions(named, rows, whole, basis, at_site, site, moved[..., :0])
+
+    def _shifts(self, problem: FitProblem, *, are_shared: bool) -> Array:
+        """Return how errors at places move both ends of outlines (n, 2, c) [px].
+
+        By one standard deviation of each: of each place, or of bias and tilt of each outline alone.
+        """
+        o, sigma = problem.outlines, np.array(self.noise.places_px)
+        if not are_shared or not sigma.any():
+            alone = np.asarray(shifts_of_edges(len(o)) * sigma, dtype=np.float64)
+            return alone if sigma.any() else alone[..., :0]
+        shifts = shifts_at_places(o, np.ones(len(o), dtype=np.bool_))
+        return np.asarray(shifts * np.repeat(sigma, shifts.shape[2] // len(sigma)))
+
+
+def _apart(
+    kept: Array,  # (n, r, m)
+    U: Array,  # (n, r, d): what the pose of an image takes up
+    moved: Array,  # (n, r, 2): by bias and tilt of the outline of each row
+    is_outline: BoolArray,  # (r,)
+) -> tuple[Array, Array]:
+    """Return variances (n, r) of shared errors, and rows turned so that these are independent."""
+    first = int(np.argmax(is_outline))
+    outline = (np.arange(len(is_outline)) - first) // 2  # of two rows each
+    same = (outline[:, None] == outline) & is_outline & is_outline[:, None]
+    shared = (moved @ np.swapaxes(moved, 1, 2)) * same
+    shared = shared - U @ (np.swapaxes(U, 1, 2) @ shared)
+    shared = shared - (shared @ U) @ np.swapaxes(U, 1, 2)
+    variances, turn = np.linalg.eigh(shared)
+    return np.maximum(variances, 0.0), np.swapaxes(turn, 1, 2) @ kept
+
+
+def _sites(outlines: ObservedOutlines, n: int) -> IntArray:
+    """Return the site (n,) of each image: the same where all edges are within a width of a part."""
+    o = outlines
+    middle = np.full((n, len(o.parts), 2, 2), np.nan)  # of images that show the edge
+    middle[o.pose, o.radius, (o.epsilon < 0.0).astype(np.intp)] = o.pixels.mean(axis=1)
+    site, firsts, width = np.zeros(n, dtype=np.intp), list[int](), o.width_px
+    shown = np.isfinite(middle)
+    for k in range(n):
+        alike = np.all(shown[firsts] == shown[k], axis=(1, 2, 3))
+        apart = np.linalg.norm(middle[firsts] - middle[k], axis=-1)
+        near = alike & np.all(~(apart > width), axis=(1, 2))
+        site[k] = int(np.argmax(near)) if near.any() else len(firsts)
+        if not near.any():
+            firsts.append(k)
+    return site
 
 
 def _by_element(rows: Array, element: IntArray, n: int) -> Array:

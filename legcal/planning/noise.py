@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from legcal.calibration import KINDS
+from legcal.calibration import KINDS, PLACES
 from legcal.data import OBSERVATIONS_NAME, OUTLINE_COLUMNS
 from legcal.errors import DatasetError, UsageError
 from legcal.files import read_json, read_table
@@ -57,8 +57,9 @@ def _of_result(found: dict[str, Any], file: Path) -> PredictedNoise:
             sigma = scale * float(np.median(np.sqrt(variance * length / 4.0)))
             correlation = float(np.median(s01 / variance))
     shared = tuple(float(common.get(kind, 0.0)) for kind in KINDS)
+    places = tuple(float(common.get(kind, 0.0)) for kind in PLACES)
     gamma = 0.0 if not any(shared) else DEFAULT_NOISE.gamma_px
-    return PredictedNoise(sigma, max(min(correlation, 0.9), -0.9), shared, gamma, str(file))
+    return PredictedNoise(sigma, max(min(correlation, 0.9), -0.9), shared, places, gamma, str(file))
 
 
 def _of_repeats(found: dict[str, Any], file: Path) -> PredictedNoise:
@@ -67,5 +68,10 @@ def _of_repeats(found: dict[str, Any], file: Path) -> PredictedNoise:
     sigma = float(spread["sd"])
     sigma *= float(np.sqrt(_USUAL_LENGTH / 2.0))
     return PredictedNoise(
-        sigma, DEFAULT_NOISE.correlation, DEFAULT_NOISE.common_px, DEFAULT_NOISE.gamma_px, str(file)
+        sigma,
+        DEFAULT_NOISE.correlation,
+        DEFAULT_NOISE.common_px,
+        DEFAULT_NOISE.places_px,
+        DEFAULT_NOISE.gamma_px,
+        str(file),
     )

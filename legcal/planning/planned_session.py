@@ -11,7 +11,7 @@ from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.calibration import KINDS, PlatformError
+from legcal.calibration import KINDS, PLACES, PlatformError
 from legcal.files import Document, Number, Pose, Version
 from legcal.geometry import Array, BoolArray
 from legcal.machine import Configurations, Leg, Machine
@@ -142,6 +142,7 @@ class Plan:
                 sigma_px=noise.sigma_px,
                 correlation=noise.correlation,
                 common_px=dict(zip(KINDS, noise.common_px, strict=True)),
+                places_px=dict(zip(PLACES, noise.places_px, strict=True)),
                 gamma_px=noise.gamma_px,
                 source=noise.source,
             ),
@@ -189,6 +190,9 @@ class NoiseOfPlan(Document):
     sigma_px: Number
     correlation: Number
     common_px: dict[str, Number]  # standard deviations of common-mode edge biases, by kind
+    places_px: dict[str, Number] = Field(
+        default_factory=dict
+    )  # of errors of an edge that come back with a place
     gamma_px: Number
     source: str
 

@@ -148,6 +148,7 @@ class Scene:
         *,
         surely: bool = True,
         is_shot: bool = False,
+        is_fit: bool = False,
     ) -> Contributions | None:
         """Return what images of poses T_Rb_Re add; None if they show nothing.
 
@@ -159,7 +160,9 @@ class Scene:
             return None
         outlines = seen.outlines(1.0, np.arange(n, dtype=np.intp))
         view = np.zeros(n, dtype=np.intp)
-        found = self.task.predictor.contributions({"here": T}, view, poses, outlines, self.legs)
+        found = self.task.predictor.contributions(
+            {"here": T}, view, poses, outlines, self.legs, is_fit=is_fit
+        )
         if self.task.board is not None:
             found = _tied_by_board(found, T)
             found = replace(found, rows=found.rows * np.reshape(with_board, (-1, 1, 1)))
@@ -343,7 +346,7 @@ def choose_places(
     for k, found in enumerate((*shown, *given)):
         is_own = np.array([": " in name for name in found.names])
         at = np.array([names[name] for name in found.names if ": " not in name])
-        stacked = found.rows.reshape(-1, len(found.names))
+        stacked = found.all_gains().reshape(-1, len(found.names))
         share = n_images / n_views / len(found.rows) if k < len(shown) else 1.0
         G = stacked.T @ stacked * share
         own = G[np.ix_(is_own, is_own)] + found.prior[np.ix_(is_own, is_own)]
@@ -589,7 +592,7 @@ class _Search:
         order = choose(session, n, self.criterion, np.random.default_rng(0), 0, n)
         rows = [(k + 1.0, value) for k, value in enumerate(order.history)]
         for times in _CONTINUED:
-            more = [replace(part, rows=part.rows * np.sqrt(times)) for part in found]
+            more = [part.repeated(times) for part in found]
             rows.append((round(times * n), self.value(more)))
         return np.array(rows)
 
@@ -623,12 +626,12 @@ def drawn_covariance(task: Task, current: Sequence[Candidates], rng: np.random.G
             poses = poses_at_readings(machine, there.legs, own.poses.readings, nearby)
         T = own.place.T_base_camera
         T = T if is_set else task.setting.camera_elsewhere(T, rng)
-        found = there.contributions(T, poses, surely=False, is_shot=is_set)
+        found = there.contributions(T, poses, surely=False, is_shot=is_set, is_fit=True)
         if found is not None:
             parts.append(found)
     session = Session([], parts)
     basis = parts[0].basis
-    return np.asarray(basis @ session.machine @ basis.T)
+    return np.asarray(basis @ session.fitted() @ basis.T)
 
 
 _LIMITS = {

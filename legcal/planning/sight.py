@@ -24,6 +24,7 @@ from legcal.vision import (
     EPSILON,
     Camera,
     in_picture,
+    least_length,
     longest_runs,
     outlines_of_axis,
     rays_past_axes,
@@ -31,7 +32,6 @@ from legcal.vision import (
 )
 
 N_SAMPLES = 24  # points along a part that are tested
-MIN_LENGTH_PX = 20.0  # of a stretch that is measured
 _NEAREST = 0.1  # [m] before the camera
 _OUTSIDE = 1.2  # radii between the camera and an axis, at least
 _PLATE = 1.1  # size of a plate, over that of its joints
@@ -173,7 +173,8 @@ def what_is_seen(
     touching = EPSILON[:, None, None] * radius[part][:, None, None, None] * h[:, :, None]
     ends = camera.project(axis[:, None] - touching)
     length_px = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1).mean(axis=1)
-    kept = length_px >= MIN_LENGTH_PX
+    width_px = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=-1).mean(axis=1)
+    kept = length_px >= least_length(width_px)
     parts = part[kept]
     return Seen(
         image[kept],

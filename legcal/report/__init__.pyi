@@ -19,7 +19,6 @@ from .page.text_page import picture as picture
 from .page.text_page import text_page as text_page
 from .page.verdicts import check_verdict as check_verdict
 from .page.verdicts import identify_verdict as identify_verdict
-from .page.writing import PAGE as PAGE
 from .page.writing import write_page as write_page
 from .page.writing import write_report as write_report
 from .plan import plan_files as plan_files

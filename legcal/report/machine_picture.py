@@ -8,9 +8,7 @@ the frames red (x), green (y) and blue (z). Rails, carriages and arms are brown.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from html import escape
-from pathlib import Path
 
 import numpy as np
 
@@ -34,20 +32,8 @@ _ARM = 34.0  # of the axis of a frame [px]
 _MARK = b"<!-- legcal inspect -->"
 
 
-@dataclass(frozen=True)
-class _Drawing(OutputFile):
-    """An SVG that says which command wrote it."""
-
-    def _is_own(self, path: Path) -> bool:
-        try:
-            with path.open("rb") as file:
-                return _MARK in file.read(200)
-        except OSError:
-            return False
-
-
-MACHINE_PICTURE = _Drawing(
-    "the picture", "picture", "", "a new file or a picture that this command wrote"
+MACHINE_PICTURE = OutputFile(
+    "the picture", "picture", "", "a new file or a picture that this command wrote", mark=_MARK
 )
 
 

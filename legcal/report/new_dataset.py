@@ -29,7 +29,7 @@ def matching_table(new: NewDataset) -> RenderableType:
             new.rows[k].image or new.rows[k].time,
             photograph.name,
             view,
-            f"{size * new.readings[k, 0]:z.3f}",
+            f"{size * new.readings.q[k, 0]:z.3f}",
         )
         for (k, photograph), view in pairs[:_MOST]
     ]
@@ -46,7 +46,7 @@ def matching_table(new: NewDataset) -> RenderableType:
         ),
         [
             printable(f"Columns: {', '.join(columns)}.") if columns else "",
-            f"Unit of the {what}: {new.unit}, {new.unit_from}.",
+            f"Unit of the {what}: {new.readings.unit}, {new.readings.unit_from}.",
             f"Photographs are matched {new.matching.how}.",
         ],
         table(

@@ -36,6 +36,7 @@ from legcal.simulation.visibility import Viewpoint
 from legcal.vision import Camera, sample_camera
 
 PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs seen at a time
+_DISTANCE = 0.9  # [m] of cameras from the middle of the machine, about
 RAISED = 0.030  # [m] out of the plane of the others
 
 _MAX_ERROR = 1e-12  # of the lengths
@@ -74,28 +75,28 @@ class PaperHexapod:
         return {part: float(R) for part, R in zip(self.parts, self.radius, strict=True)}
 
 
-def paper_hexapod(scale: float = 1.0) -> PaperHexapod:
-    """Return the coplanar 6-SPU hexapod of ``models/hexapod.yaml``, lengths times ``scale``."""
+def paper_hexapod() -> PaperHexapod:
+    """Return the coplanar 6-SPU hexapod of ``models/hexapod.yaml``."""
     base_angles = np.deg2rad([210.0, -54.0, -30.0, 66.0, 90.0, 186.0])
     platform_angles = np.deg2rad([210.0, 234.0, -30.0, -6.0, 90.0, 114.0])
     frame_legs = (0, 2, 4)
-    A_base = 0.270 * scale * _ring(base_angles)
-    B_platform = 0.195 * scale * _ring(platform_angles)
+    A_base = 0.270 * _ring(base_angles)
+    B_platform = 0.195 * _ring(platform_angles)
     T_base_Rb = frame_on_points(A_base[list(frame_legs)])
     T_platform_Re = frame_on_points(B_platform[list(frame_legs)])
     T_base_platform = RigidTransform.from_components(
-        [0.0, 0.0, 0.38274 * scale], Rotation.from_euler("z", 36.0, degrees=True)
+        [0.0, 0.0, 0.38274], Rotation.from_euler("z", 36.0, degrees=True)
     )
     parameters = KinematicParameters(
         T_base_Rb.inv().apply(A_base),
         T_platform_Re.inv().apply(B_platform),
-        np.full(6, 0.345 * scale),
+        np.full(6, 0.345),
     )
     return PaperHexapod(
         parameters=_without_rounding(parameters, frame_legs),
         frame_legs=frame_legs,
-        radius=np.full(6, 0.010 * scale),
-        travel=scale * np.tile([0.345, 0.485], (6, 1)),
+        radius=np.full(6, 0.010),
+        travel=np.tile([0.345, 0.485], (6, 1)),
         home=T_base_Rb.inv() * T_base_platform * T_platform_Re,
     )
 
@@ -238,7 +239,6 @@ def hexapod_cameras(
     rng: np.random.Generator,
     *,
     legs: Sequence[Sequence[int]] = PAPER_VIEWS,
-    distance: float = 0.9,
     camera: Camera | None = None,
 ) -> tuple[LegCamera, ...]:
     """Return cameras that stand around a machine, each on the side of the legs it sees."""
@@ -250,12 +250,12 @@ def hexapod_cameras(
     for seen in legs:
         outward = (middle[list(seen)] - centre).mean(axis=0)
         outward[2] = 0.0
-        if np.linalg.norm(outward) < 1e-3 * distance:  # every leg is seen: any side will do
+        if np.linalg.norm(outward) < 1e-3 * _DISTANCE:  # every leg is seen: any side will do
             outward = np.array([*rng.normal(size=2), 0.0])
         outward /= np.linalg.norm(outward)
         lift = rng.uniform(0.0, 0.25)
         toward = np.array([*(outward[:2] * np.cos(lift)), np.sin(lift)])
-        position = centre + distance * rng.uniform(0.95, 1.05) * toward
+        position = centre + _DISTANCE * rng.uniform(0.95, 1.05) * toward
         pose = look_at(position, centre, roll=rng.uniform(-0.1, 0.1))
         cameras.append(LegCamera(camera or sample_camera(), pose, tuple(seen)))
     return tuple(cameras)

@@ -15,10 +15,9 @@ from legcal.geometry import Array, BoolArray, IntArray, cross, matrix_applied
 from legcal.machine import Cylinder, Leg, cylinder_of_arm, main_cylinders
 from legcal.progress import Report, no_progress
 from legcal.simulation.solids import PosedMachine
-from legcal.vision import Camera
+from legcal.vision import Camera, least_length
 
 MIN_SHARE = 0.4  # of a leg's length that one stretch must show
-MIN_LENGTH_PX = 20.0  # a stretch of one cylinder that gives an outline
 SAMPLES = 96  # points along a leg
 _BORDER_PX = 2.0  # of the image, where nothing counts as seen
 _RADIUS_TOLERANCE = 0.01  # relative difference of radii that shows no step
@@ -109,9 +108,8 @@ def legs_in_image(
     free = tested.copy()
     free[tested] = ~posed.hidden(T[:3, 3], matrix_applied(T, beside[tested]), margin[tested])
     both = np.all(free, axis=-1)
-    middle = pixels.mean(axis=-2)
     views = [
-        _leg_view(j, *skin, both[i], middle[i], float(length[i]))
+        _leg_view(j, *skin, both[i], pixels[i], float(length[i]))
         for i, (j, skin) in enumerate(zip([*range(len(legs)), *arms], skins, strict=True))
     ]
     of_arms = {j: view for j, view in zip(arms, views[len(legs) :], strict=True) if view.is_seen}
@@ -185,10 +183,11 @@ def _leg_view(
     radius: Array,
     names: Sequence[str],  # of the cylinder at each sample
     free: BoolArray,
-    pixels: Array,
+    pixels: Array,  # (n, 2, 2) of both outlines
     length: float,
 ) -> LegView:
     """Return what is seen of a leg whose samples are free or not."""
+    middle, width = pixels.mean(axis=1), np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=1)
     first, last = _longest(free)
     if last <= first:
         return LegView(0.0, 0.0, ())
@@ -197,10 +196,11 @@ def _leg_view(
     for name in dict.fromkeys(names):
         chosen = free & np.array([other == name for other in names])
         start, end = _longest(chosen)
-        if name and end > start and np.linalg.norm(pixels[end] - pixels[start]) >= MIN_LENGTH_PX:
+        least = least_length(width[[start, end]].mean())
+        if name and end > start and np.linalg.norm(middle[end] - middle[start]) >= least:
             piece = float(radius[start]), float(s[start]), float(s[end])
             stretches.append(Stretch(leg, name, *piece))
-    length_px = float(np.linalg.norm(pixels[last] - pixels[first]))
+    length_px = float(np.linalg.norm(middle[last] - middle[first]))
     return LegView(share, length_px, tuple(stretches))
 
 
@@ -374,8 +374,8 @@ def _sees_nothing(name: str, legs: Sequence[Leg], views: Sequence[Sequence[LegVi
         longest = max(leg.length_px for view in views for leg in view)
         return (
             f"{start} that legs are at most {longest:.1f} px long in them, needed "
-            f"{MIN_LENGTH_PX:g} px of a tube or rod; move the camera nearer (its place is in "
-            "metres), or give it a longer focal length."
+            f"{least_length(0.0):g} px of a tube or rod, and its width; move the camera "
+            "nearer (its place is in metres), or give it a longer focal length."
         )
     return (
         f"{start} that no image shows a leg (at best {100.0 * most:.0f} % of one), needed an "

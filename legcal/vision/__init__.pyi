@@ -63,6 +63,7 @@ from .visibility import PredictedLeg as PredictedLeg
 from .visibility import Segment as Segment
 from .visibility import hidden_by as hidden_by
 from .visibility import in_picture as in_picture
+from .visibility import least_length as least_length
 from .visibility import longest_runs as longest_runs
 from .visibility import look_alike as look_alike
 from .visibility import predict_legs as predict_legs

@@ -17,6 +17,12 @@ EQUAL_RADII = 0.01  # relative difference below which two cylinders look like on
 END_COVER = 2.0  # length that may be hidden at a joint and beside a thicker cylinder [radii]
 N_SAMPLES = 64  # points along a leg that are tested for visibility
 MIN_DEPTH_SHARE = 0.05  # of the leg length: points nearer to the image plane are cut off
+MIN_LENGTH = (30.0, 1.0)  # of an outline that is measured: [px] and in widths of the leg
+
+
+def least_length(width: float | Array) -> Array:
+    """Return how much of cylinders of a width in the image must be seen to be measured [px]."""
+    return np.maximum(MIN_LENGTH[0], MIN_LENGTH[1] * np.asarray(width))
 
 
 @dataclass(frozen=True)

@@ -124,9 +124,9 @@ def test_python_gives_what_commands_give(tmp_path: Path) -> None:
     calibration = legcal.calibrate(dataset, output=tmp_path / "calibrated")
     document = recorded("3-rpr-axes")["steps"][0]["document"]
     estimated = [p for p in document["parameters"] if p["status"] == "estimated"]
-    assert list(calibration.solution.names) == [p["name"] for p in estimated]
-    for p, sigma in zip(estimated, calibration.solution.sigma, strict=True):
-        found = {"name": p["name"], "value": calibration.solution.values[p["name"]]}
+    assert list(calibration.solution.estimates.names) == [p["name"] for p in estimated]
+    for p, sigma in zip(estimated, calibration.solution.estimates.sigma, strict=True):
+        found = {"name": p["name"], "value": calibration.solution.estimates.values[p["name"]]}
         expected = {"name": p["name"], "value": p["value"], "sigma": p["sigma"]}
         assert differences(expected, found | {"sigma": float(sigma)}) == []
     assert calibration.verdict.sentence

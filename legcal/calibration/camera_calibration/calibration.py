@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
@@ -63,7 +63,7 @@ from legcal.vision import (
 )
 from legcal.workers import Run, Workers, worker_pool
 
-_STAGE = "Searching the board"
+_STAGE, _ADJUSTING = "Searching the board", "Adjusting the camera"
 _N_DESCRIBED = 2  # images of which it is said what they show instead
 _SAME_PLACE = 0.01  # of the diagonal of the board, by which it moved from an image to the next
 
@@ -119,6 +119,40 @@ def calibrate_camera(
     DidNotConverge
         If no camera explains the corners.
     """
+    _check_options(model, output, picture)
+    stated = board_of(board)
+    photographs = _of_one_size(
+        _listed_images([images] if isinstance(images, str | Path) else images)
+    )
+    with shown_progress(progress) as report:
+        with worker_pool(workers) as run:
+            seen = _search(stated, photographs, run, report)
+        shown = _shown_in(stated, photographs, seen)
+        report(_ADJUSTING, 0, 1)
+        table, size = shown.table, photographs.size
+        lens = chosen_lens(table, size) if model is None else given_lens(table, size, model)
+        report(_ADJUSTING, 1, 1)
+    if lens is None:
+        raise DidNotConverge(
+            f"The camera could not be calibrated: found no {model or 'lens model'} that explains "
+            "the corners, needed one; check the board and the model of the lens."
+        )
+    names = [photographs.paths[k].name for k in shown.images]
+    refuse_divided(lens.fit, names)
+    left_out = [f"{names[i]}: {why}" for i, why in lens.fit.left_out.items()]
+    refuse_undetermined(lens.fit, [names[i] for i in lens.fit.images], left_out)
+    result = _result(photographs, shown, lens)
+    if output is not None:
+        write_camera(result, Path(output))
+    if picture is not None:
+        write_picture(result, Path(picture))
+    return result
+
+
+def _check_options(
+    model: DistortionModel | None, output: str | Path | None, picture: str | Path | None
+) -> None:
+    """Raise UsageError for a model that is none, and for files that could not be written."""
     if model is not None and model not in get_args(DistortionModel):
         raise UsageError(
             f"The camera could not be calibrated: found the model {model!r}, needed "
@@ -133,56 +167,42 @@ def calibrate_camera(
                 f"{picture}: the picture could not be written: found the file of the camera there, "
                 "needed one of its own; give another file."
             )
-    stated = board_of(board)
-    paths = _listed_images([images] if isinstance(images, str | Path) else images)
-    size, facts = _common_size(paths)
-    with shown_progress(progress) as report:
-        with worker_pool(workers) as run:
-            seen = _search(stated, paths, size, run, report)
-        flat_board, note = shown_board(stated, seen)
-        if flat_board is None:
-            raise _not_visible(stated, note)
-        found = [one.numbered(flat_board) for one in seen]
-        shown = [k for k, corners in enumerate(found) if len(corners.number) >= MIN_CORNERS]
-        if not shown:
-            raise _not_visible(stated, _shown_instead(stated, paths, size))
-        copies = _copies(found, shown, paths)
-        shown = [k for k in shown if k not in copies]
-        if len(shown) < MIN_IMAGES:
-            same = _by_reason((paths[k].name, why) for k, why in copies.items())
-            raise too_few_images(len(shown), [paths[k].name for k in shown], copies=same)
-        missing = {
-            k: "mirrored, left and right exchanged"
-            for k in range(len(paths) if flat_board.kind != "chessboard" else 0)
-            if len(found[k].number) < MIN_CORNERS
-            and tags_are_mirrored(flat_board, _read(paths[k], size))
-        }
-        report("Adjusting the camera", 0, 1)
-        table = _table(flat_board, [found[k] for k in shown])
-        lens = chosen_lens(table, size) if model is None else given_lens(table, size, model)
-        report("Adjusting the camera", 1, 1)
-    if lens is None:
-        raise DidNotConverge(
-            f"The camera could not be calibrated: found no {model or 'lens model'} that explains "
-            "the corners, needed one; check the board and the model of the lens."
+
+
+@dataclass(frozen=True, eq=False)
+class _Photographs:
+    """Photographs of one size."""
+
+    paths: tuple[Path, ...]
+    facts: tuple[ImageFacts, ...]  # what the file of each says of itself
+    size: ImageSize
+
+    def read(self, k: int) -> Array:
+        """Return the grey levels of one of them."""
+        blank = Camera(np.eye(3), self.size.width, self.size.height)
+        return np.asarray(read_image(self.paths[k], blank))
+
+
+@dataclass(frozen=True, eq=False)
+class _ShownBoard:
+    """A board, and what photographs show of it."""
+
+    board: Board
+    corners: Sequence[NumberedCorners]  # of every photograph
+    images: Sequence[int]  # those that show it in a place of its own
+    unused: Mapping[int, str]  # why others are not used, if not for lack of corners
+    note: str  # of how it differs from what was stated
+
+    @property
+    def table(self) -> BoardImages:
+        """The corners of the images that show it, in one table."""
+        found = [self.corners[k] for k in self.images]
+        return BoardImages(
+            np.repeat(np.arange(len(found)), [len(corners.number) for corners in found]),
+            np.concatenate([self.board.points[corners.number] for corners in found]),
+            np.concatenate([corners.px for corners in found]),
+            np.concatenate([corners.sigma_px for corners in found]),
         )
-    fitted = lens.fit
-    refuse_divided(fitted, [paths[k].name for k in shown])
-    left_out = [f"{paths[shown[k]].name}: {why}" for k, why in fitted.left_out.items()]
-    refuse_undetermined(fitted, [paths[shown[k]].name for k in fitted.images], left_out)
-    result = _result(flat_board, paths, found, shown, copies | missing, lens, note)
-    used = [k for k, image in enumerate(result.images) if image.used]
-    changes = _changes([paths[k] for k in used], [facts[k] for k in used], size)
-    result = replace(
-        result,
-        warnings=(*result.warnings, *changes),
-        photographs=recorded([facts[k] for k in used]),
-    )
-    if output is not None:
-        write_camera(result, Path(output))
-    if picture is not None:
-        write_picture(result, Path(picture))
-    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,46 +210,58 @@ class _CornerSearch:
     """The search of an image, for any process."""
 
     board: Board
-    paths: tuple[Path, ...]
-    size: ImageSize
+    photographs: _Photographs
 
     def __call__(self, k: int) -> SeenBoard:
-        return search_board(self.board, _read(self.paths[k], self.size))
+        return search_board(self.board, self.photographs.read(k))
 
 
-def _read(path: Path, size: ImageSize) -> Array:
-    """Return the grey levels of an image whose size is known."""
-    return np.asarray(read_image(path, Camera(np.eye(3), size.width, size.height)))
-
-
-def _search(
-    board: Board, paths: Sequence[Path], size: ImageSize, run: Run, progress: Report
-) -> list[SeenBoard]:
+def _search(board: Board, photographs: _Photographs, run: Run, progress: Report) -> list[SeenBoard]:
     """Return what every image shows of the board."""
-    progress(_STAGE, 0, len(paths))
-    found = []
-    for seen in run(_CornerSearch(board, tuple(paths), size), range(len(paths))):
+    n, found = len(photographs.paths), list[SeenBoard]()
+    progress(_STAGE, 0, n)
+    for seen in run(_CornerSearch(board, photographs), range(n)):
         found.append(seen)
-        progress(_STAGE, len(found), len(paths))
+        progress(_STAGE, len(found), n)
     return found
 
 
-def _table(board: Board, found: Sequence[NumberedCorners]) -> BoardImages:
-    """Return the corners of some images in one table."""
-    counts = [len(corners.number) for corners in found]
-    return BoardImages(
-        np.repeat(np.arange(len(found)), counts),
-        np.concatenate([board.points[corners.number] for corners in found]),
-        np.concatenate([corners.px for corners in found]),
-        np.concatenate([corners.sigma_px for corners in found]),
-    )
+def _shown_in(stated: Board, photographs: _Photographs, seen: Sequence[SeenBoard]) -> _ShownBoard:
+    """Return the board that images show, and in which.
+
+    Raises
+    ------
+    NotVisible, NotIdentifiable
+        If none does, or too few do.
+    """
+    paths = photographs.paths
+    board, note = shown_board(stated, seen)
+    if board is None:
+        raise _not_visible(stated, note)
+    found = [one.numbered(board) for one in seen]
+    shown = [k for k, corners in enumerate(found) if len(corners.number) >= MIN_CORNERS]
+    if not shown:
+        raise _not_visible(stated, _shown_instead(stated, photographs))
+    copies = _copies(found, shown, paths)
+    own = [k for k in shown if k not in copies]
+    if len(own) < MIN_IMAGES:
+        same = _by_reason((paths[k].name, why) for k, why in copies.items())
+        raise too_few_images(len(own), [paths[k].name for k in own], copies=same)
+    without = set(range(len(paths))).difference(shown) if board.kind != "chessboard" else ()
+    mirrored = {
+        k: "mirrored, left and right exchanged"
+        for k in sorted(without)
+        if tags_are_mirrored(board, photographs.read(k))
+    }
+    return _ShownBoard(board, found, own, copies | mirrored, note)
 
 
-def _shown_instead(board: Board, paths: Sequence[Path], size: ImageSize) -> str:
+def _shown_instead(board: Board, photographs: _Photographs) -> str:
     """Return what images without the board show instead, in words that go after "found"."""
-    described = (describe_image(board, _read(path, size)) for path in paths[:_N_DESCRIBED])
+    n = len(photographs.paths)
+    described = (describe_image(board, photographs.read(k)) for k in range(min(n, _N_DESCRIBED)))
     what = next((words for words in described if words), "nothing like the board")
-    return f"{what} in its {len(paths)} image{'s' * (len(paths) != 1)}"
+    return f"{what} in its {n} image{'s' * (n != 1)}"
 
 
 def _not_visible(board: Board, instead: str) -> NotVisible:
@@ -271,38 +303,31 @@ def _copies(
     return copies
 
 
-def _result(
-    board: Board,
-    paths: Sequence[Path],
-    found: Sequence[NumberedCorners],
-    shown: Sequence[int],
-    unused: Mapping[int, str],
-    lens: ChosenLens,
-    note: str,
-) -> CameraCalibration:
+def _result(photographs: _Photographs, shown: _ShownBoard, lens: ChosenLens) -> CameraCalibration:
     """Return the camera with what it rests on."""
-    fitted = lens.fit
+    fitted, paths, facts = lens.fit, photographs.paths, photographs.facts
     adjusted, seen = fitted.adjusted, fitted.seen
-    used = {shown[k]: i for i, k in enumerate(fitted.images)}
-    left_out = {**unused, **{shown[k]: why for k, why in fitted.left_out.items()}}
+    used = {shown.images[k]: i for i, k in enumerate(fitted.images)}
+    left_out = {**shown.unused, **{shown.images[k]: why for k, why in fitted.left_out.items()}}
     square = np.sum(adjusted.residual**2, axis=1)
     tilt = tilts(fitted)
     images = []
     for k, path in enumerate(paths):
         i = used.get(k)
-        n = len(found[k].number)
-        why = left_out.get(k, "" if k in shown else "the board was not found")
+        n = len(shown.corners[k].number)
+        why = left_out.get(k, "" if k in shown.images else "the board was not found")
         if i is None:
             images.append(ImageResult(path.name, n, 0, None, None, why))
             continue
         here = seen.image == i
         n_used = int(np.count_nonzero(here))
         images.append(ImageResult(path.name, n, n_used, adjusted.rms_px(here), float(tilt[i]), ""))
+    kept = [k for k, image in enumerate(images) if image.used]
     n_dof = max(2 * len(square) - len(adjusted.covariance) - 6 * len(fitted.images), 1)
     return CameraCalibration(
         camera=adjusted.camera,
         covariance=fitted.covariance,
-        board=board,
+        board=shown.board,
         images=tuple(images),
         rms_px=adjusted.rms_px(),
         noise_px=float(np.sqrt(square.sum() / n_dof)),
@@ -314,11 +339,13 @@ def _result(
         validated_px=lens.validated_px,
         corners=np.concatenate([seen.px, adjusted.residual], axis=1),
         warnings=(
-            *([note] if note else []),
+            *([shown.note] if shown.note else []),
             *_left_out(images),
             *lens.warnings,
             *warnings(fitted),
+            *_changes([paths[k] for k in kept], [facts[k] for k in kept], photographs.size),
         ),
+        photographs=recorded([facts[k] for k in kept]),
     )
 
 
@@ -370,8 +397,8 @@ def _matching(name: str) -> list[Path]:
     return [hit for hit in hits if hit.suffix.lower() in suffixes and hit.is_file()]
 
 
-def _common_size(paths: Sequence[Path]) -> tuple[ImageSize, list[ImageFacts]]:
-    """Return the size that all images have, and what the file of each says of itself."""
+def _of_one_size(paths: Sequence[Path]) -> _Photographs:
+    """Return photographs of one size; raise DatasetError where they cannot be read, or differ."""
     sizes: dict[ImageSize, list[Path]] = {}
     facts: list[ImageFacts] = []
     problems = []
@@ -405,7 +432,7 @@ def _common_size(paths: Sequence[Path]) -> tuple[ImageSize, list[ImageFacts]]:
             f"{sizes_in_words}, needed one size; leave out those that another camera took, or that "
             "were scaled, cropped or turned."
         )
-    return next(iter(sizes)), facts
+    return _Photographs(tuple(paths), tuple(facts), next(iter(sizes)))
 
 
 def _changes(paths: Sequence[Path], facts: Sequence[ImageFacts], size: ImageSize) -> Iterator[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -26,20 +25,8 @@ _MARK = b"Software\x00legcal camera"
 Canvas = NDArray[np.uint8]
 
 
-@dataclass(frozen=True)
-class _Picture(OutputFile):
-    """A PNG that says which command wrote it."""
-
-    def _is_own(self, path: Path) -> bool:
-        try:
-            with path.open("rb") as file:
-                return _MARK in file.read(len(_SIGNATURE) + 200)
-        except OSError:
-            return False
-
-
-PICTURE_FILE = _Picture(
-    "the picture", "picture", "", "a new file or a picture that this command wrote"
+PICTURE_FILE = OutputFile(
+    "the picture", "picture", "", "a new file or a picture that this command wrote", mark=_MARK
 )
 
 

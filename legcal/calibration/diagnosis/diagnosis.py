@@ -25,6 +25,7 @@ from legcal.calibration.diagnosis.mistakes import (
     Mistake,
     as_given,
     both,
+    joints_of,
     mistakes,
     moved_cameras,
     rows_of_views,
@@ -63,6 +64,7 @@ _SUITS = 0.5  # of the legs that they should show
 _STARTS = 1, 1, 2  # images that suggest cameras, of all
 _FEW_STARTS = (1,), (1, 1)  # of the first few, and of the next few if these suit no mistake
 _POOL = 3  # cameras of other mistakes that are tried
+_NEAR_GROUPS = 3  # of views, by which mistakes are judged near known cameras first
 _FINALISTS = 6  # mistakes that all images judge
 _SAME_AMOUNT = 2  # of these that differ by how much
 _FIRSTS = 2  # mistakes beside which another one is looked for, where none explains the images
@@ -238,9 +240,9 @@ class _Judge:
         missing = [row for row in rows if row not in data.edge_pairs]
         data.edge_pairs.update(pairs_of_images(search, missing, data.pool))
         self.search = replace(search, edge_pairs={row: data.edge_pairs[row] for row in rows})
-        self.pool: list[list[RigidTransform]] = [self._known(g) for g in range(len(groups))]
+        self.pool: list[list[RigidTransform]] = [self.known(g) for g in range(len(groups))]
         self.of_groups = [
-            self._compare([self.given], g, group.rows, _STARTS)[0] for g, group in enumerate(groups)
+            self.compare([self.given], g, group.rows, _STARTS)[0] for g, group in enumerate(groups)
         ]
         for g, one in enumerate(self.of_groups):
             self.pool[g] += [T for T in one.cameras if T is not None]
@@ -259,7 +261,7 @@ class _Judge:
                 if len(order) < 2 * MIN_IMAGES:
                     continue
                 late = shifted_from(self.data, self.given, v, 0, k).true
-                now, then = self.of_groups[g], self._compare([late], g, group.rows, ())[0]
+                now, then = self.of_groups[g], self.compare([late], g, group.rows, ())[0]
                 gain = dict(zip(now.row.tolist(), then.support - now.support, strict=True))
                 from_on = np.cumsum([gain[row] for row in order][::-1])[::-1]
                 first = int(np.argmax(from_on[MIN_IMAGES : 1 - MIN_IMAGES])) + MIN_IMAGES
@@ -281,7 +283,7 @@ class _Judge:
                 for _ in range(2):  # all that do not agree, then those of them that do
                     if len(rows) >= MIN_IMAGES:
                         true = turned_images(self.data, self.given, rows, turn).true
-                        then = self._compare([true], g, rows, (), [T_own])[0]
+                        then = self.compare([true], g, rows, (), [T_own])[0]
                         rows = then.row[then.agrees].tolist()
                 if len(rows) >= MIN_IMAGES:
                     found.append(turned_images(self.data, self.given, rows, turn))
@@ -298,7 +300,7 @@ class _Judge:
             own = self.of_groups[g]
             places, left = [own.row[own.agrees].tolist()], own.row[~own.agrees].tolist()
             while len(places[-1]) >= _MIN_PLACE and len(left) >= _MIN_PLACE:
-                then = self._compare([self.given], g, left, _STARTS)[0]
+                then = self.compare([self.given], g, left, _STARTS)[0]
                 places.append(then.row[then.agrees].tolist())
                 left = then.row[~then.agrees].tolist()
             places = [rows for rows in places if len(rows) >= _MIN_PLACE]
@@ -318,11 +320,11 @@ class _Judge:
         other.given, other.own = what.true, one
         other.of_groups = [replace(one.at(group.rows), cameras=(T,))
                            for group, T in zip(self.groups, one.cameras, strict=True)]  # fmt: skip
-        other.pool = [[*self._known(g), *([] if T is None else [T])]
+        other.pool = [[*self.known(g), *([] if T is None else [T])]
                       for g, T in enumerate(one.cameras)]  # fmt: skip
         return other
 
-    def _known(self, g: int) -> list[RigidTransform]:
+    def known(self, g: int) -> list[RigidTransform]:
         """Return the cameras of a group that are known before anything is compared."""
         hint = self.groups[g].hint
         return [] if hint is None else [hint, _mirrored_camera(hint)]
@@ -331,24 +333,29 @@ class _Judge:
         """Return the mistakes that some images of the views that disagree most speak for.
 
         These are all images of views that nearly agree, whose cameras are known about, and a few of
-        others; more of them in each of some rounds.
+        others; more of them in each of some rounds. Cameras are searched for only if no mistake
+        suits the images of a few groups near those that are known.
         """
         missing = [float((one.expected - one.support).sum()) for one in self.of_groups]
         left = np.argsort(-np.array(missing), kind="stable").tolist()
+        looks = [_Look(self, tried, g) for g in left[:_NEAR_GROUPS]]
+        near = Agreement.joined([look.before for look in looks])
+        gain = np.sum([look.near_known() for look in looks], axis=0)
+        searches = not _suits(gain.max(initial=0.0) + _total(near), near)
         gain, seen = np.zeros(len(tried)), list[Agreement]()
         done, total = 0, rounds * len(tried)
         for starts in _FEW_STARTS[:rounds]:
             n_images = 0
             while left and n_images < _FEW:
                 g = left.pop(0)
-                asked = self._asked(g)
-                seen.append(self.of_groups[g].at(asked))
-                n_images += 0 if self._nearly_agrees(g) else len(asked)
-                gain += self._gains(tried, g, starts)
+                look = looks.pop(0) if looks else _Look(self, tried, g)
+                seen.append(look.before)
+                n_images += 0 if self.nearly_agrees(g) else len(look.asked)
+                gain += look.gains(starts, searches=searches)
                 done += len(tried)
                 self.data.progress(STAGE, min(done, total - 1), total)
             own = Agreement.joined(seen)
-            if not left or _suits(gain.max() + own.support.sum(), own):
+            if not left or _suits(gain.max() + _total(own), own):
                 break
         # Less than this is gained by chance, also by what is wrong with the images of one group.
         least = _SURE_GAIN * min(float(one.expected.sum()) for one in seen)
@@ -367,56 +374,9 @@ class _Judge:
                 amounts[amount] += 1
         return [tried[k] for k in sorted(found)]  # the commoner first
 
-    def _nearly_agrees(self, g: int) -> bool:
+    def nearly_agrees(self, g: int) -> bool:
         """Say whether the images of a group show half of the legs as things are, or more."""
         return self.of_groups[g].mean >= _SUITS
-
-    def _asked(self, g: int) -> Sequence[int]:
-        """Return the rows of a group that say which mistakes are worth a closer look."""
-        group = self.groups[g]
-        return group.rows if self._nearly_agrees(g) else group.some
-
-    def _gains(self, tried: Sequence[Mistake], g: int, starts: Sequence[int]) -> Array:
-        """Return how many more legs some images of a group show without each mistake.
-
-        Cameras are tried where they are known roughly, and about where those of images that nearly
-        agree are. They are searched for where that suits none, or suits as well as things as they
-        are: a symmetric machine nearly agrees with its mirror image.
-        """
-        group, found, asked = self.groups[g], np.zeros(len(tried)), self._asked(g)
-        before = self.of_groups[g].at(asked)
-        some = [k for k, one in enumerate(tried) if not one.true.is_as(self.given, group.rows)]
-        found[some] = -float(before.support.sum())
-        support = np.zeros(len(tried))
-
-        def look(
-            which: Sequence[int], starts: Sequence[int], known: Sequence[RigidTransform] = ()
-        ) -> None:
-            which_true = [tried[k].true for k in which]
-            agreements = self._compare(which_true, g, asked, starts, known)
-            for k, one in zip(which, agreements, strict=True):
-                if (now := float(one.support.sum())) > support[k]:
-                    support[k], cameras[k] = now, one.cameras[0]
-            best = np.argsort(-support, kind="stable")[:_POOL].tolist()
-            self.pool[g] += [T for k in best if k in which and (T := cameras.get(k)) is not None]
-
-        cameras: dict[int, RigidTransform | None] = {}
-        T_own = self.of_groups[g].cameras[0]
-        if self._nearly_agrees(g) and T_own is not None:
-            look(some, (), [*self._alike(T_own), *self._known(g)])
-            nearly = [k for k in some if support[k] >= _NEARLY * float(before.support.sum())]
-            look([k for k in nearly if not tried[k].is_small], starts)
-        else:
-            look(some, ())
-            if not _suits(support.max(), before):
-                look([k for k in some if not tried[k].is_small], starts)
-                look([k for k in some if tried[k].is_small], ())
-        best = int(np.argmax(support))
-        is_better = support[best] >= float(before.support.sum()) + _MIN_GAIN * before.expected.sum()
-        if is_better and (T_best := cameras[best]) is not None:
-            worse = [k for k in some if support[k] < _ALIKE * support[best]]
-            look([k for k in worse if not tried[k].is_small], (), self._alike(T_best))
-        return found + support
 
     def judged(self, finalists: Sequence[Mistake]) -> list[_Judged]:
         """Return what all images say of some mistakes, with the amounts that suit them best."""
@@ -424,7 +384,7 @@ class _Judge:
         if not found:
             return []
         first = max((one for _, one in found), key=_total)
-        alike = [[] if T is None else self._alike(T) for T in first.cameras]
+        alike = [[] if T is None else self.alike(T) for T in first.cameras]
         for k, (what, one) in enumerate(found):
             if not _is_as_good(one, first):
                 one = _better(one, self.all(what.true, (), alike))
@@ -519,7 +479,7 @@ class _Judge:
         found = list(self.of_groups)
         for g, (group, T) in enumerate(zip(self.groups, one.cameras, strict=True)):
             if T is not None and not what.true.is_as(self.given, group.rows):
-                near = self._compare([self.given], g, group.rows, (), self._alike(T))[0]
+                near = self.compare([self.given], g, group.rows, (), self.alike(T))[0]
                 found[g] = _better(found[g], near)
         return Agreement.joined(found)
 
@@ -534,12 +494,12 @@ class _Judge:
             [
                 self.of_groups[g]
                 if assumed.is_as(self.given, group.rows)
-                else self._compare([assumed], g, group.rows, starts, known[g] if known else ())[0]
+                else self.compare([assumed], g, group.rows, starts, known[g] if known else ())[0]
                 for g, group in enumerate(self.groups)
             ]
         )
 
-    def _alike(self, T_base_camera: RigidTransform) -> list[RigidTransform]:
+    def alike(self, T_base_camera: RigidTransform) -> list[RigidTransform]:
         """Return the cameras that see the same under mistakes that are the same."""
         found = []
         for S in self.symmetries:
@@ -571,7 +531,7 @@ class _Judge:
             for group, T in both
         )
 
-    def _compare(
+    def compare(
         self,
         assumed: Sequence[Assumed],
         g: int,
@@ -590,7 +550,7 @@ class _Judge:
         ]
         assumptions = [
             Assumption(
-                _search(self.search, one, some),
+                _search(self.search, one.machine, *joints),
                 one.flip,
                 one.focal,
                 self.groups[g],
@@ -598,7 +558,7 @@ class _Judge:
                 starts,
                 self._as_far(known or self.pool[g], one.focal),
             )
-            for one, some in parts
+            for (one, some), joints in zip(parts, joints_of(parts), strict=True)
         ]
         found = compare_assumptions(assumptions, self.data.pool)
         of_each = [
@@ -606,6 +566,71 @@ class _Judge:
             for one in assumed
         ]
         return [Agreement.of_places(own, rows) for own in of_each]
+
+
+class _Look:
+    """How many more legs some images of a group show without each of some mistakes.
+
+    Cameras are tried where they are known roughly, and about where those of images that nearly
+    agree are. They are searched for where that suits none, or suits as well as things as they are:
+    a symmetric machine nearly agrees with its mirror image.
+    """
+
+    def __init__(self, judge: _Judge, tried: Sequence[Mistake], g: int) -> None:
+        self.judge, self.tried, self.g = judge, tried, g
+        group, own = judge.groups[g], judge.of_groups[g]
+        self.asked = group.rows if judge.nearly_agrees(g) else group.some
+        self.before = own.at(self.asked)
+        is_as = [one.true.is_as(judge.given, group.rows) for one in tried]
+        self.some = np.flatnonzero(~np.array(is_as, dtype=np.bool_)).tolist()
+        self.support = np.zeros(len(tried))
+        self.cameras: dict[int, RigidTransform | None] = {}
+        self.T_near = own.cameras[0] if judge.nearly_agrees(g) else None
+        self.is_near = False
+
+    def near_known(self) -> Array:
+        """Return the gains near cameras that are known, (n_tried,)."""
+        if not self.is_near:
+            known = [] if self.T_near is None else self.judge.alike(self.T_near)
+            self._at(self.some, (), [*known, *self.judge.known(self.g)] if known else ())
+            self.is_near = True
+        return self._gained()
+
+    def gains(self, starts: Sequence[int], *, searches: bool) -> Array:
+        """Return the gains, (n_tried,), with cameras that *starts* suggest if one *searches*."""
+        self.near_known()
+        tried, before = self.tried, _total(self.before)
+        if self.T_near is not None:
+            nearly = [k for k in self.some if self.support[k] >= _NEARLY * before]
+            self._at([k for k in nearly if not tried[k].is_small], starts)
+        elif searches and not _suits(self.support.max(), self.before):
+            self._at([k for k in self.some if not tried[k].is_small], starts)
+            self._at([k for k in self.some if tried[k].is_small], ())
+        best = int(np.argmax(self.support))
+        is_better = self.support[best] >= before + _MIN_GAIN * self.before.expected.sum()
+        if is_better and (T_best := self.cameras[best]) is not None:
+            worse = [k for k in self.some if self.support[k] < _ALIKE * self.support[best]]
+            self._at([k for k in worse if not tried[k].is_small], (), self.judge.alike(T_best))
+        return self._gained()
+
+    def _gained(self) -> Array:
+        gained = np.zeros(len(self.tried))
+        gained[self.some] = self.support[self.some] - _total(self.before)
+        return gained
+
+    def _at(
+        self, which: Sequence[int], starts: Sequence[int], known: Sequence[RigidTransform] = ()
+    ) -> None:
+        """Look at some mistakes, and keep the cameras that suit most images in the pool."""
+        judge, support = self.judge, self.support
+        which_true = [self.tried[k].true for k in which]
+        agreements = judge.compare(which_true, self.g, self.asked, starts, known)
+        for k, one in zip(which, agreements, strict=True):
+            if (now := _total(one)) > support[k]:
+                support[k], self.cameras[k] = now, one.cameras[0]
+        best = np.argsort(-support, kind="stable")[:_POOL].tolist()
+        found = [self.cameras.get(k) for k in best if k in which]
+        judge.pool[self.g] += [T for T in found if T is not None]
 
 
 def symmetries(machine: Machine) -> list[Array]:
@@ -713,9 +738,7 @@ def _mirrored_camera(T_base_camera: RigidTransform) -> RigidTransform:
     return RigidTransform.from_matrix(_MIRROR_Y @ T_base_camera.as_matrix() @ _MIRROR_X)
 
 
-def _search(search: Search, assumed: Assumed, rows: Sequence[int]) -> Search:
-    """Return what should be seen in some images if something is true."""
-    A, B = assumed.joints(rows)
-    return replace(
-        search, A_base=A, B_base=B, cylinders=[leg.cylinders for leg in assumed.machine.legs]
-    )
+def _search(search: Search, machine: Machine, A: Array, B: Array) -> Search:
+    """Return what should be seen of a machine whose joints are there."""
+    cylinders = [leg.cylinders for leg in machine.legs]
+    return replace(search, A_base=A, B_base=B, cylinders=cylinders)

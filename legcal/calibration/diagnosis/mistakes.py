@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -25,6 +25,7 @@ _FOCAL_STEP = 1.25  # between them, about
 _SHIFTS = (1, -1, 2, -2)  # rows
 _ZEROS = 8  # steps of the zero of an encoder, in its travel
 _STILL = 0.1  # of such a step: readings that move by less are of an encoder that stands still
+_SAME_END = 0.01  # of the largest reading: ends of a travel as far from zero
 _SAME_RADIUS = 1e-3  # relative: parts that are equally thick are one kind
 
 
@@ -48,22 +49,8 @@ class Assumed:
     focal: float = 1.0  # focal length as a part of the stated one
 
     def joints(self, rows: Sequence[int]) -> tuple[Array, Array]:
-        """Return joint centres in the base link, (n_rows, n_legs, 3) each [m].
-
-        From home the readings of some rows are followed by the equations of the legs alone; what is
-        not reached, and all other rows, are NaN.
-        """
-        machine, motors = self.machine, list(self.machine.motors)
-        first = readings_at(machine, machine.home)[motors]
-        chosen = np.array(rows, dtype=np.intp)
-        q = self.q[chosen][:, motors]
-        poses, part = follow_poses(machine, machine.home, first, q, _STEP)
-        found = np.einsum("kij,nj->kni", poses[:, :, :3], machine.B_platform)
-        found += poses[:, None, :, 3]
-        found[part < 1.0] = np.nan
-        B = np.full((len(self.q), machine.n_legs, 3), np.nan)
-        B[chosen] = found
-        return machine.A_at(self.q[:, list(machine.reads)]), B
+        """Return joint centres in the base link, as :func:`joints_of`."""
+        return joints_of([(self, rows)])[0]
 
     def is_as(self, other: Assumed, rows: Sequence[int]) -> bool:
         """Whether nothing differs from another in some rows."""
@@ -106,6 +93,35 @@ class Mistake:
     opposite: Assumed | None = None
 
 
+def joints_of(parts: Sequence[tuple[Assumed, Sequence[int]]]) -> list[tuple[Array, Array]]:
+    """Return joint centres of some rows under each of many assumptions, in the base link [m].
+
+    Those at A and at B, (n_rows, n_legs, 3) each. From home the readings are followed by the
+    equations of the legs alone, those of one machine all together; what is not reached, and all
+    other rows, are NaN.
+    """
+    found = list[tuple[Array, Array]]()
+    for one, _ in parts:
+        shape = (len(one.q), one.machine.n_legs, 3)
+        found.append((np.full(shape, np.nan), np.full(shape, np.nan)))
+    for machine in {id(one.machine): one.machine for one, _ in parts}.values():
+        own = [k for k, (one, _) in enumerate(parts) if one.machine is machine]
+        rows = [np.array(parts[k][1], dtype=np.intp) for k in own]
+        q = np.concatenate([parts[k][0].q[some] for k, some in zip(own, rows, strict=True)])
+        motors, ends = list(machine.motors), np.cumsum([len(some) for some in rows])
+        first = readings_at(machine, machine.home)[motors]
+        poses, part = follow_poses(machine, machine.home, first, q[:, motors], _STEP)
+        B = np.einsum("kij,nj->kni", poses[:, :, :3], machine.B_platform)
+        B += poses[:, None, :, 3]
+        B[part < 1.0] = np.nan
+        A = machine.A_at(q[:, list(machine.reads)])
+        for k, some, A_of, B_of in zip(
+            own, rows, np.split(A, ends[:-1]), np.split(B, ends[:-1]), strict=True
+        ):
+            found[k][0][some], found[k][1][some] = A_of, B_of
+    return found
+
+
 def as_given(data: OrderedDataset) -> Assumed:
     """Return a session as its files have it."""
     n = data.measurements.n_rows
@@ -135,10 +151,13 @@ def mistakes(data: OrderedDataset, given: Assumed | None = None) -> list[Mistake
     That is beside what is ``given``, by default the session as its files have it.
     """
     given = given or as_given(data)
+    encoders = _Encoders(given)
     found = [
         *_of_columns(data, given),
         *_of_rows(data, given),
-        *_of_encoders(given),
+        *_of_units(encoders),
+        *_of_directions(encoders),
+        *_of_zeros(encoders),
         *_of_images(data, given),
         *_of_model(data, given),
         *_of_radii(given),
@@ -279,117 +298,178 @@ def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         )
 
 
-def _of_encoders(given: Assumed) -> Iterator[Mistake]:
-    """Yield readings of another direction, zero or unit, of one encoder or of all."""
-    motors = list(given.machine.motors)
-    legs = [given.machine.legs[j] for j in motors]
-    names = [leg.prismatic for leg in legs]
-    things = "legs" if not any(leg.actuator for leg in legs) else "motors"
-    zeros = "the offsets" if things == "legs" else "the zeros of motors"
+@dataclass(frozen=True, eq=False)
+class _Encoders:
+    """The encoders of a session, what is read of them, and how mistakes speak of them."""
 
-    def with_readings(change: Array, which: Sequence[int]) -> Assumed:
-        q = given.q.copy()
-        q[:, [motors[k] for k in which]] = change
-        return replace(given, q=q)
+    given: Assumed
 
-    own = given.q[:, motors]
-    ends = np.array([sum(leg.travel) for leg in legs])
-    ends = np.where(np.isfinite(ends), ends, own.min(axis=0) + own.max(axis=0))
-    every = list(range(len(legs)))
-    steps = np.array([_zero_step(leg, own[:, k]) for k, leg in enumerate(legs)])
-    # An encoder that stands still has no direction or zero that images of all poses could confirm.
-    moving = np.flatnonzero(np.ptp(own, axis=0) > _STILL * steps).tolist()
-    units = ((LENGTH["mm"], "millimetres"), (LENGTH["cm"], "centimetres"), (INCH, "inches"))
-    has_travel = all(0.0 < leg.travel[1] - leg.travel[0] < np.inf for leg in legs)
-    turning = [k for k, leg in enumerate(legs) if leg.reads_angle]
+    @cached_property
+    def legs(self) -> list[Leg]:
+        """Of each encoder the leg that it reads, or the first one that it moves."""
+        return [self.given.machine.legs[j] for j in self.given.machine.motors]
+
+    @property
+    def names(self) -> list[str]:
+        """Their columns in the table of readings."""
+        return [str(leg.prismatic) for leg in self.legs]
+
+    @property
+    def every(self) -> list[int]:
+        """All of them."""
+        return list(range(len(self.legs)))
+
+    @cached_property
+    def q(self) -> Array:
+        """Readings (n_rows, n_encoders) [m or rad]."""
+        return self.given.q[:, list(self.given.machine.motors)]
+
+    @property
+    def move_legs_alone(self) -> bool:
+        """Whether each reads the length of a leg."""
+        return not any(leg.actuator for leg in self.legs)
+
+    @property
+    def turning(self) -> list[int]:
+        """Those that read angles."""
+        return [k for k, leg in enumerate(self.legs) if leg.reads_angle]
+
+    @cached_property
+    def zero_steps(self) -> Array:
+        """By how much zeros are moved in one step (n_encoders,) [m or rad]."""
+        width = np.array([leg.travel[1] - leg.travel[0] for leg in self.legs])
+        is_known = (width > 0.0) & np.isfinite(width)
+        return np.where(is_known, width, np.ptp(self.q, axis=0)) / _ZEROS
+
+    @property
+    def moving(self) -> list[int]:
+        """Those that do not stand still: images can confirm their direction and their zero."""
+        return np.flatnonzero(np.ptp(self.q, axis=0) > _STILL * self.zero_steps).tolist()
+
+    @property
+    def in_words(self) -> str:
+        """What all of them read, in words."""
+        return "legs" if self.move_legs_alone else "motors"
+
+    def reading(self, q: Array, which: Sequence[int]) -> Assumed:
+        """Return what is true if some of them read something else (n_rows, n_some)."""
+        motors, changed = self.given.machine.motors, self.given.q.copy()
+        changed[:, [motors[k] for k in which]] = q
+        return replace(self.given, q=changed)
+
+
+def _of_units(encoders: _Encoders) -> Iterator[Mistake]:
+    """Yield readings in another unit, and whole leg lengths."""
+    legs, every, turning = encoders.legs, encoders.every, encoders.turning
     sliding = [k for k in every if k not in turning]
-    # Readings in their travel are metres; radians that are taken for degrees are in it as well.
-    units_of = [(scale, unit, sliding) for scale, unit in (() if has_travel else units)]
+    has_travel = all(0.0 < leg.travel[1] - leg.travel[0] < np.inf for leg in legs)
+    lengths = (LENGTH["mm"], "millimetres"), (LENGTH["cm"], "centimetres"), (INCH, "inches")
     angles = (np.pi / 180.0, "degrees"), (180.0 / np.pi, "radians that were taken for degrees")
-    units_of += [(scale, unit, turning) for scale, unit in angles]
-    for scale, unit, which in units_of:
+    # Readings in their travel are metres; radians that are taken for degrees are in it as well.
+    units = [(scale, unit, sliding) for scale, unit in (() if has_travel else lengths)]
+    units += [(scale, unit, turning) for scale, unit in angles]
+    for scale, unit, which in units:
         if which:
-            of = "" if len(which) == len(every) else f" of {few([str(names[k]) for k in which])}"
+            some = few([encoders.names[k] for k in which])
+            of = "" if len(which) == len(every) else f" of {some}"
             yield Mistake(
                 "unit",
                 f"the readings{of} look like {unit}",
                 "taken so",
                 f"multiply these readings by {scale:g}",
-                with_readings(scale * own[:, which], which),
+                encoders.reading(scale * encoders.q[:, which], which),
             )
-    if not any(leg.actuator for leg in legs):
+    if encoders.move_legs_alone:
         yield Mistake(
             "whole lengths",
             "the readings look like whole leg lengths",
             "less the leg length at reading zero",
             "subtract that (legcal inspect shows it), or make a model whose offsets are zero",
-            with_readings(readings_of_lengths(own, legs), every),
+            encoders.reading(readings_of_lengths(encoders.q, legs), every),
         )
-    for change, what in ((-own, "the opposite sign"), (ends - own, "the opposite direction")):
-        yield Mistake(
-            "direction of encoders",
-            f"the readings of all {things} look as if they had {what}",
-            "with the readings reversed",
-            "reverse them in the table of readings",
-            with_readings(change, every),
-        )
-        for k in moving:
+
+
+def _of_directions(encoders: _Encoders) -> Iterator[Mistake]:
+    """Yield readings of the other direction, of one encoder or of all."""
+    q = encoders.q
+    ends = np.array([sum(leg.travel) for leg in encoders.legs])
+    ends = np.where(np.isfinite(ends), ends, q.min(axis=0) + q.max(axis=0))
+    # Where a travel is as far both ways, as of most servos, the other end has the opposite sign.
+    reversible = np.abs(ends) > _SAME_END * np.abs(q).max(axis=0)
+    for reversed_q, what, which in (
+        (-q, "the opposite sign", encoders.every),
+        (ends - q, "the opposite direction", np.flatnonzero(reversible).tolist()),
+    ):
+        if which:
+            yield Mistake(
+                "direction of encoders",
+                f"the readings of all {encoders.in_words} look as if they had {what}",
+                "with the readings reversed",
+                "reverse them in the table of readings",
+                encoders.reading(reversed_q, encoders.every),
+            )
+        for k in (k for k in encoders.moving if k in which):
             yield Mistake(
                 "direction of an encoder",
-                f"column {legs[k].prismatic} looks as if it had {what}",
+                f"column {encoders.names[k]} looks as if it had {what}",
                 "with the column reversed",
                 "reverse the column in the table of readings",
-                with_readings(change[:, k : k + 1], [k]),
+                encoders.reading(reversed_q[:, k : k + 1], [k]),
             )
 
-    def another_zero(which: Sequence[int], m: float) -> Mistake:
-        step = steps[which[0]] if len(which) == 1 else float(steps.mean())
-        amount, unit = (np.degrees(step), "deg") if which[0] in turning else (1e3 * step, "mm")
-        size = f"{abs(m * amount):.0f} {unit} too {'small' if m > 0 else 'large'}"
-        change = with_readings(own[:, which] + m * step, which)
-        added, finer = (
-            f"with that {'added' if m > 0 else 'taken off'}",
-            partial(another_zero, which),
-        )
-        if len(which) > 1:
-            return Mistake(
-                "zero of encoders",
-                f"the readings of all {things} look as if they had another zero: about {size}",
-                added,
-                f"correct the table of readings, or {zeros} in the model",
-                change,
-                is_small=True,
-                amount_of="zero of all encoders",
-                finer=lambda more: finer(m + more),
-            )
-        return Mistake(
-            "zero of an encoder",
-            f"column {legs[which[0]].prismatic} looks as if it had another zero: about {size}",
-            added,
-            "correct the column in the table of readings, or "
-            + (
-                f"the zero of {names[which[0]]} in the model"
-                if legs[which[0]].actuator
-                else "the offset of the leg in the model"
-            ),
-            change,
-            is_small=True,
-            amount_of=f"zero of encoder {which[0]}",
-            finer=lambda more: finer(m + more),
-        )
 
-    are_alike = not (turning and sliding)  # a part of a way and of a turn are no common zero
+def _of_zeros(encoders: _Encoders) -> Iterator[Mistake]:
+    """Yield readings from another zero, of one encoder or of all."""
+    are_alike = len(encoders.turning) in (0, len(encoders.legs))  # else no zero is common
     for m in (*range(-_ZEROS, 0), *range(1, _ZEROS + 1)):
         if are_alike:
-            yield another_zero(every, m)
-        for k in moving:
-            yield another_zero([k], m)
+            yield _zero_of_all(encoders, m)
+        for k in encoders.moving:
+            yield _zero_of_one(encoders, k, m)
 
 
-def _zero_step(leg: Leg, q: Array) -> float:
-    """Return by how much the zero of an encoder is moved in one step [m or rad]."""
-    width = leg.travel[1] - leg.travel[0]
-    return (width if 0.0 < width < np.inf else float(np.ptp(q))) / _ZEROS
+def _zero_of_all(encoders: _Encoders, m: float) -> Mistake:
+    """Return another zero of all encoders, by m steps."""
+    step, is_angle = float(encoders.zero_steps.mean()), bool(encoders.turning)
+    zeros = "the offsets" if encoders.move_legs_alone else "the zeros of motors"
+    return Mistake(
+        "zero of encoders",
+        f"the readings of all {encoders.in_words} look as if they had another zero: about "
+        f"{_too_small(m, step, is_angle=is_angle)}",
+        _with_that(m),
+        f"correct the table of readings, or {zeros} in the model",
+        encoders.reading(encoders.q + m * step, encoders.every),
+        is_small=True,
+        amount_of="zero of all encoders",
+        finer=lambda more: _zero_of_all(encoders, m + more),
+    )
+
+
+def _zero_of_one(encoders: _Encoders, k: int, m: float) -> Mistake:
+    """Return another zero of the k-th encoder, by m steps."""
+    step, name = float(encoders.zero_steps[k]), encoders.names[k]
+    zero = f"the zero of {name}" if encoders.legs[k].actuator else "the offset of the leg"
+    return Mistake(
+        "zero of an encoder",
+        f"column {name} looks as if it had another zero: about "
+        f"{_too_small(m, step, is_angle=k in encoders.turning)}",
+        _with_that(m),
+        f"correct the column in the table of readings, or {zero} in the model",
+        encoders.reading(encoders.q[:, [k]] + m * step, [k]),
+        is_small=True,
+        amount_of=f"zero of encoder {k}",
+        finer=lambda more: _zero_of_one(encoders, k, m + more),
+    )
+
+
+def _too_small(m: float, step: float, *, is_angle: bool) -> str:
+    """Return by how much readings are too small if m steps [m or rad] are missing, in words."""
+    amount, unit = (np.degrees(step), "deg") if is_angle else (1e3 * step, "mm")
+    return f"{abs(m * amount):.0f} {unit} too {'small' if m > 0 else 'large'}"
+
+
+def _with_that(m: float) -> str:
+    return f"with that {'added' if m > 0 else 'taken off'}"
 
 
 def _of_images(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
@@ -522,15 +602,23 @@ def _mirrored(leg: Leg) -> Leg:
 
 def _of_radii(given: Assumed) -> Iterator[Mistake]:
     """Yield diameters in place of radii, and tubes in place of rods."""
-    radii = sorted({c.radius for leg in given.machine.legs for c in leg.cylinders})
+    legs = given.machine.legs
+    radii = sorted({c.radius for leg in legs for c in leg.cylinders})
     kinds = [r for i, r in enumerate(radii) if i == 0 or r > (1.0 + _SAME_RADIUS) * radii[i - 1]]
+    factors = (0.5, "twice as large as they are"), (2.0, "half of what they are")
 
-    def scaled(factor: float, only: float | None, radius: float) -> float:
-        is_own = only is None or abs(radius - only) <= _SAME_RADIUS * radius
-        return factor * radius if is_own else radius
+    def of_one_kind(factor: float, only: float | None) -> Assumed:
+        def scaled(leg: Leg, radius: float) -> float:
+            is_own = only is None or abs(radius - only) <= _SAME_RADIUS * radius
+            return factor * radius if is_own else radius
+
+        return _with_radii(given, scaled)
+
+    def of_one_leg(factor: float, own: Leg) -> Assumed:
+        return _with_radii(given, lambda leg, r: factor * r if leg is own else r)
 
     which = [(None, "the radii"), *((r, f"the radius {1e3 * r:g} mm") for r in kinds[:2])]
-    for factor, what in ((0.5, "twice as large as they are"), (2.0, "half of what they are")):
+    for factor, what in factors:
         for only, name in which[: 1 if len(kinds) < 2 else None]:
             end = what if only is None else what.replace("they are", "it is")
             yield Mistake(
@@ -539,35 +627,33 @@ def _of_radii(given: Assumed) -> Iterator[Mistake]:
                 f"{'diameter in place of a radius' if factor < 1.0 else 'radius halved twice'}",
                 f"with {name} {_scaled_by(factor)}",
                 "correct the <visual> cylinders of the model",
-                replace(given, machine=_with_radii(given.machine, partial(scaled, factor, only))),
+                of_one_kind(factor, only),
             )
-    for j, leg in enumerate(given.machine.legs):
-        for factor, what in ((0.5, "twice as large as they are"), (2.0, "half of what they are")):
-            cylinders = [list(one.cylinders) for one in given.machine.legs]
-            cylinders[j] = [replace(c, radius=factor * c.radius) for c in leg.cylinders]
-            if leg.cylinders:
-                yield Mistake(
-                    "diameter for radius",
-                    f"the radii of leg {leg.name} in the model look {what}",
-                    f"with the radii {_scaled_by(factor)}",
-                    "correct its <visual> cylinders in the model",
-                    replace(given, machine=given.machine.with_cylinders(cylinders)),
-                    is_small=True,
-                )
-    cylinders = [list(one.cylinders) for one in given.machine.legs]
-    pairs: dict[str, None] = {}  # of radii: those of legs with two
-    for own in cylinders:
-        if len(of_leg := sorted({c.radius for c in own})) == 2:
-            thin, thick = of_leg
-            own[:] = [replace(c, radius=thick if c.radius == thin else thin) for c in own]
-            pairs[f"{1e3 * thin:g} and {1e3 * thick:g} mm"] = None
+    for own in legs:
+        for factor, what in factors if own.cylinders else ():
+            yield Mistake(
+                "diameter for radius",
+                f"the radii of leg {own.name} in the model look {what}",
+                f"with the radii {_scaled_by(factor)}",
+                "correct its <visual> cylinders in the model",
+                of_one_leg(factor, own),
+                is_small=True,
+            )
+    pairs = {leg.name: both for leg in legs if len(both := {c.radius for c in leg.cylinders}) == 2}
+
+    def other(leg: Leg, radius: float) -> float:
+        return next(iter(pairs.get(leg.name, {radius}) - {radius}), radius)
+
     if pairs:
+        every = dict.fromkeys(
+            f"{1e3 * min(both):g} and {1e3 * max(both):g} mm" for both in pairs.values()
+        )
         yield Mistake(
             "tube and rod exchanged",
-            f"the radii of tube and rod look exchanged ({', '.join(pairs)})",
+            f"the radii of tube and rod look exchanged ({', '.join(every)})",
             "with the radii exchanged",
             "exchange the radii in the <visual> cylinders of the model",
-            replace(given, machine=given.machine.with_cylinders(cylinders)),
+            _with_radii(given, other),
         )
 
 
@@ -575,10 +661,11 @@ def _scaled_by(factor: float) -> str:
     return "halved" if factor < 1.0 else "doubled"
 
 
-def _with_radii(machine: Machine, radius: Callable[[float], float]) -> Machine:
-    """Return a machine with other radii of its visible cylinders."""
-    return machine.with_cylinders(
-        [[replace(c, radius=radius(c.radius)) for c in leg.cylinders] for leg in machine.legs]
+def _with_radii(given: Assumed, radius: Callable[[Leg, float], float]) -> Assumed:
+    """Return what is true with other radii of visible cylinders, by leg and radius."""
+    machine = given.machine
+    return replace(
+        given, machine=machine.with_radii(lambda j, c: radius(machine.legs[j], c.radius))
     )
 
 

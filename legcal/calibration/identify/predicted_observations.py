@@ -8,8 +8,9 @@ them the arms that are cylinders; a view that shows a leg shows the arm that is 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -468,13 +469,10 @@ def planned_observations(
     It is that of a machine whose every parameter is a micrometre or less from the nominal one, so
     that no symmetry by accident decides. Raises DidNotConverge if the machine cannot move.
     """
-    home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
-    legs, length, rng = machine_near(machine, home)
-    A, B = ends_at_pose(legs, home)
     n_poses = images * len(views)
-    R, t, moving = random_postures_of_legs(
-        legs, machine.frame_legs, home, travel_of(machine), max(n_poses, REACHED), rng
-    )
+    (legs, length, rng), (R, t, moving) = _random_session(machine, max(n_poses, REACHED))
+    rng, home = deepcopy(rng), _home(machine)
+    A, B = ends_at_pose(legs, home)
     seen = np.zeros((len(views), len(legs)), dtype=np.bool_)
     for v, view in enumerate(views):
         seen[v, list(view)] = True
@@ -500,6 +498,23 @@ def planned_observations(
         board=np.full(len(views), board, dtype=np.bool_),
         platform_board=np.full(n_poses, platform_board, dtype=np.bool_),
     )
+
+
+def _home(machine: Machine) -> RigidTransform:
+    """Return T_Rb_Re at home."""
+    return machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
+
+
+@lru_cache(maxsize=4)
+def _random_session(
+    machine: Machine, n_poses: int
+) -> tuple[tuple[tuple[Leg, ...], float, np.random.Generator], tuple[Array, Array, Array]]:
+    """Return what :func:`machine_near` does, and random postures: one plan follows the other."""
+    home = _home(machine)
+    legs, length, rng = machine_near(machine, home)
+    travel = travel_of(machine)
+    postures = random_postures_of_legs(legs, machine.frame_legs, home, travel, n_poses, rng)
+    return (legs, length, rng), postures
 
 
 def recorded_observations(

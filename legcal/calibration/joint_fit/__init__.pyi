@@ -34,6 +34,9 @@ from .problem import build_fit as build_fit
 from .rounds import DISAGREES as DISAGREES
 from .sensitivity import FOUND_CAMERA as FOUND_CAMERA
 from .sensitivity import Sensitivity as Sensitivity
+from .solution import Estimates as Estimates
+from .solution import GoodnessOfFit as GoodnessOfFit
+from .solution import KinematicUncertainty as KinematicUncertainty
 from .solution import Solution as Solution
 from .solution import in_file_order as in_file_order
 from .variables import DEFAULT_SETTINGS as DEFAULT_SETTINGS

@@ -75,6 +75,8 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
     DidNotConverge
         With one sentence for each prior.
     """
+    if not problem.settings.judges_stated_values:
+        return
     priors, problems = problem.priors, []
     for i, mean, sigma in zip(
         priors.unknown.tolist(), priors.mean.tolist(), priors.sigma.tolist(), strict=True
@@ -215,6 +217,8 @@ def refuse_contradicted_values(
     DidNotConverge
         With one sentence for each value.
     """
+    if not problem.settings.judges_stated_values:
+        return
     choices, now = problem.choices, _values(problem, state)
     stated = {name: (now[name], 0.0) for name in _fixed_by_choice(problem)}
     if with_priors:
@@ -390,9 +394,9 @@ def doubted_cameras(
         T = whitening[np.ix_(rows, rows)] / sigma
         moved, left = values[own] - prior.mean[rows], covariance[np.ix_(own, own)]
         share, vector = np.linalg.eigh(np.eye(len(rows)) - T @ left @ T.T)
-        told = share > _MIN_SHARE
-        squared = float(np.sum((vector[:, told].T @ T @ moved) ** 2 / share[told]))
-        if squared <= chdtri(max(int(told.sum()), 1), 2.0 * ndtr(-_SIGNIFICANT)):
+        tested = share > _MIN_SHARE
+        squared = float(np.sum((vector[:, tested].T @ T @ moved) ** 2 / share[tested]))
+        if squared <= chdtri(max(int(tested.sum()), 1), 2.0 * ndtr(-_SIGNIFICANT)):
             continue
         spread = np.sqrt(np.maximum(sigma**2 - np.diagonal(left), _MIN_SHARE * sigma**2))
         k = int(np.argmax(np.abs(moved) / spread))

@@ -63,7 +63,6 @@ _COST_TOLERANCE = 1e-6  # relative: the same minimum
 _POSE_ROUNDS = 8  # in which other poses are looked for, where readings leave them open
 _PART_OF_MODEL = 0.1  # of the errors of a nominal model, which are left then
 _SEED = 2001  # of other starts
-_OTHER_STARTS = 8  # where a fit leaves out a leg of a view, at most
 _OTHER_MODEL = 0.005  # of the mean leg length, angles at it: errors of models that are tried
 _SAME_COST = 0.01  # relative: the same minimum, by first minima
 _ENOUGH_STARTS = 3  # that come to the same minimum: there is no better one near
@@ -223,7 +222,7 @@ def _from_other_starts(
     n = problem.n_kinematic
     unit = np.array([begin.mean_length if unit == "m" else 1.0 for unit in problem.units[:n]])
     n_same = 0
-    for _ in range(_OTHER_STARTS):
+    for _ in range(problem.settings.other_starts):
         step = np.zeros(problem.size)
         step[:n] = _OTHER_MODEL * unit * rng.normal(size=n)
         try:
@@ -244,14 +243,14 @@ def _from_other_starts(
 
 def _shifted_px(found: Solution) -> float:
     """Return how far a fit moves outlines together, one standard deviation [px]."""
-    return max(found.shared_px.values(), default=0.0)
+    return max(found.quality.shared_px.values(), default=0.0)
 
 
 def _refuse_shifted(found: Solution, most_px: float) -> None:
     """Raise DidNotConverge if a fit explains by light and blur what these cannot have done."""
     shifted = _shifted_px(found)
     if shifted > most_px:
-        kind = max(found.shared_px, key=found.shared_px.__getitem__)
+        kind = max(found.quality.shared_px, key=found.quality.shared_px.__getitem__)
         raise DidNotConverge(
             f"The joint fit ended where outlines are off together ({kind}) by {shifted:.1f} px, "
             f"needed at most {most_px:g} px, which is more than light and blur "

@@ -48,6 +48,12 @@ class Posterior:
     noise: NoiseModel
     covariance: Array  # (n_kept, n_kept)
 
+    @property
+    def biases(self) -> dict[str, float]:
+        """Common-mode edge biases by name [px], and logarithms of gammas over the assumed ones."""
+        labels = self.problem.block("biases").labels
+        return dict(zip(labels, self.state.biases.tolist(), strict=True))
+
     def of_images(
         self,
         measurements: Measurements,
@@ -61,7 +67,7 @@ class Posterior:
         possible = possible_biases(found, legs.names, fitted.outlines)
         shifts = possible.of_sizes(self.edge_biases.sigma)
         problem = fitted.with_measurements(measurements, found, shifts)
-        values = dict(zip(fitted.block("biases").labels, state.biases.tolist(), strict=True))
+        values = self.biases
         others = [legs.radii[part] for part in found.parts[len(state.radii) :]]
         return Predicted(
             problem,

@@ -8,7 +8,7 @@ wrong in their place.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -62,6 +62,11 @@ class JudgedReadings:
     rms_expected: float  # the same if they are right: the fit follows each in part
     rms_m: float  # the same as far as they move joints [m]
     doubts: tuple[str, ...]  # why the result cannot be trusted, a sentence each
+
+    def renumbered(self, legs: Sequence[int], poses: Mapping[int, int]) -> JudgedReadings:
+        """Return the same with other numbers of legs and poses."""
+        wrong = (replace(one, leg=legs[one.leg], pose=poses[one.pose]) for one in self.wrong)
+        return replace(self, wrong=tuple(wrong))
 
 
 def with_rough_readings(problem: FitProblem) -> FitProblem:

@@ -475,8 +475,13 @@ def shifts_at_places(outlines: ObservedOutlines, used: BoolArray) -> Array:
     found = sorted(found, key=len, reverse=True)[:_MAX_PLACES]
     shifts = np.zeros((len(o), len(_MODES[0][1]), len(PLACES), len(found)))
     for k, members in enumerate(found):
-        shifts[members, :, :, k] = np.transpose([ends for _, ends in _MODES])
+        shifts[members, :, :, k] = shifts_of_edges(len(members))
     return shifts.reshape(*shifts.shape[:2], -1)
+
+
+def shifts_of_edges(n: int) -> Array:
+    """Return how a unit of bias and of tilt shift both ends of n outlines, (n, 2, 2) [px]."""
+    return np.tile(np.transpose([ends for _, ends in _MODES]), (n, 1, 1))
 
 
 def sigmas_at_places(z: Array, K: Array) -> Array:

@@ -43,7 +43,6 @@ from legcal.data import few
 from legcal.errors import DidNotConverge
 from legcal.estimation import (
     GaussianPrior,
-    Linearization,
     Minimum,
     Residuals,
     explained_share,
@@ -88,14 +87,29 @@ class Fit:
     noise: NoiseModel
     edge_biases: EdgeBiases
     accepted: BoolArray  # (n_outlines,)
-    at_places: AtPlaces | None  # errors that outlines share there, None where residuals show none
-    iterations: int
-    notes: tuple[str, ...]  # what the last round still changed, if it did not converge
+    at_places: AtPlaces | None = None  # errors shared there, None where residuals show none
+    notes: tuple[str, ...] = ()  # what the last round still changed, if it did not converge
 
     @property
     def state(self) -> State:
         """Where the fit ended."""
         return self.minimum.state
+
+    def weighted(self, noise: NoiseModel) -> Fit:
+        """Return the same with outlines of another noise, those that disagree then left out."""
+        accepted = _accepted(self.problem, self.state, noise)
+        problem = self.problem.weighted(noise, accepted)
+        return replace(self, problem=problem, noise=noise, accepted=accepted)
+
+    def with_edge_biases(self, biases: EdgeBiases) -> Fit:
+        """Return the same with these common-mode edge biases in place of others."""
+        problem, state = with_edge_biases(self.problem, self.state, biases)
+        minimum = replace(self.minimum, state=state)
+        return replace(self, problem=problem, minimum=minimum, edge_biases=biases)
+
+    def passed(self, relative_tolerance: float = 0.0) -> Fit:
+        """Return the same near the minimum of its problem, from one with other weights."""
+        return replace(self, minimum=_passed(self.problem, self.minimum, relative_tolerance))
 
     @property
     def shared_px(self) -> dict[str, float]:
@@ -164,85 +178,91 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
         If a solve fails, most outlines or axes disagree with the fit, or the rounds do not
         converge.
     """
-    claimed, noise, settings = problem.outlines.covariance, NoiseModel(), problem.settings
-    accepted = np.ones(len(claimed), dtype=np.bool_)
     possible = possible_biases(problem.outlines, problem.legs.names)
     least = np.zeros(N_KINDS)
     least[: len(KINDS)] = [problem.choices.least_shared_px.get(kind, 0.0) for kind in KINDS]
-    biases = possible.of_sizes(with_gamma(np.zeros(N_KINDS)))
-    problem, minimum = _with_edge_biases(problem, first, biases)
+    none = possible.of_sizes(with_gamma(np.zeros(N_KINDS)))
+    every = np.ones(len(problem.outlines), dtype=np.bool_)
+    begin = Fit(problem, first, NoiseModel(), none, every).with_edge_biases(none)
+    fit, changes = _with_estimated_errors(_without_outliers(begin), possible, least)
+    known: Mapping[str, Residuals] | None = fit.minimum.linear.rows
+    if fit.edge_biases.are_shown:
+        scores = _scores_of_biases(fit, possible)
+        fit = fit.with_edge_biases(expected_biases(possible, *scores, fit.edge_biases, least))
+        known = None
+    fit = replace(fit, minimum=_solved(fit.problem, fit.minimum, known=known))
+    _refuse_disagreement(fit)
+    _refuse_wrong_axes(fit)
+    return replace(
+        fit,
+        at_places=_at_places(fit) if fit.edge_biases.are_shown else None,
+        notes=check_convergence(changes, problem.outlines.covariance, problem.settings),
+    )
+
+
+def _without_outliers(fit: Fit) -> Fit:
+    """Return a fit without wrong readings, outlines and corners, with a rough noise of outlines."""
+    given, settings, claimed = fit.problem, fit.problem.settings, fit.problem.outlines.covariance
     # Wrong readings go before they bend the fit: the first minimum is one with rough readings.
-    if problem.legs.is_redundant:
-        rough, tolerance = with_rough_readings(problem), _REJECTION_TOLERANCE
-        rough, minimum = _without_wrong_readings(rough, rough, minimum, tolerance)
-        every, problem = problem, like_readings(problem, rough)
-        minimum = _passed(problem, minimum, tolerance)
+    if given.legs.is_redundant:
+        rough, tolerance = with_rough_readings(given), _REJECTION_TOLERANCE
+        rough, minimum = _without_wrong_readings(rough, rough, fit.minimum, tolerance)
+        fit = replace(fit, problem=like_readings(given, rough), minimum=minimum).passed(tolerance)
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
-        before = accepted
-        noise = noise_of_the_median(problem.offsets(minimum.state)[before], claimed[before])
-        accepted = _accepted(problem, minimum.state, noise)
-        if np.sum(before != accepted) <= settings.error_tolerance * accepted.sum():
+        before, offsets = fit.accepted, fit.problem.offsets(fit.state)
+        fit = fit.weighted(noise_of_the_median(offsets[before], claimed[before]))
+        if np.sum(before != fit.accepted) <= settings.error_tolerance * fit.accepted.sum():
             break  # rounds of noise reject these
-        problem = problem.weighted(noise, accepted)
-        minimum = _passed(problem, minimum, _REJECTION_TOLERANCE)
-    _refuse_disagreement(problem.offsets(minimum.state), accepted, settings)
-    problem = problem.weighted(noise, accepted)
-    for _ in range(_BOARD_ROUNDS if any(map(len, problem.boards)) else 0):
-        problem = _with_judged_corners(problem, minimum.state)
-        minimum = _passed(problem, minimum, _REJECTION_TOLERANCE)
-    if problem.legs.is_redundant:
-        minimum = _passed(problem, minimum)
-        problem, minimum = _without_wrong_readings(problem, every, minimum)
-    with_possible, changes, are_white = problem.with_biases(possible), NO_CHANGES, False
+        fit = fit.passed(_REJECTION_TOLERANCE)
+    _refuse_disagreement(fit)
+    for _ in range(_BOARD_ROUNDS if any(map(len, given.boards)) else 0):
+        judged = _with_judged_corners(fit.problem, fit.state)
+        fit = replace(fit, problem=judged).passed(_REJECTION_TOLERANCE)
+    if given.legs.is_redundant:
+        fit = fit.passed()
+        problem, minimum = _without_wrong_readings(fit.problem, given, fit.minimum)
+        fit = replace(fit, problem=problem, minimum=minimum)
+    return fit
 
-    def scores_of_biases() -> tuple[Array, Array]:
-        state = minimum.state
-        there = replace(state, biases=_values(problem, state, possible))
-        return scores_of_block(with_possible.weighted(noise, accepted), there, "biases")
 
-    linear = linearize(problem, minimum.state)
-    for _ in range(settings.noise_rounds if len(claimed) else 1):
-        errors_before, accepted_before = _sizes(noise, biases), accepted
-        noise = _noise(problem, minimum.state, linear, noise, accepted)
-        accepted = _accepted(problem, minimum.state, noise)
-        n_changed = int(np.sum(accepted != accepted_before))
-        changes = Changes(errors_before, _sizes(noise, biases), n_changed, int(accepted.sum()))
-        problem = problem.weighted(noise, accepted)
+def _with_estimated_errors(fit: Fit, possible: EdgeBiases, least: Array) -> tuple[Fit, Changes]:
+    """Return a fit with the errors of outlines that its residuals show, and the last changes.
+
+    Noise and sizes of common-mode biases, of the *possible* ones and of the *least* sizes
+    (N_KINDS,), are estimated and all is fitted again, until they converge.
+    """
+    settings, changes, are_white = fit.problem.settings, NO_CHANGES, False
+    fit = _linearized(fit)
+    for _ in range(settings.noise_rounds if len(fit.accepted) else 1):
+        before, fit = fit, fit.weighted(_noise(fit))
+        changes = Changes.of(before, fit)
         if are_white and changes.converged(settings):
-            linear = linearize(problem, minimum.state)
+            fit = _linearized(fit)
             break
-        if accepted.any():
-            # Scores take the step to the minimum with this noise into account.
-            scores = scores_of_biases()
-            biases = estimated_biases(possible, *scores, least, near=biases)
-            are_white = not len(biases) and not len(minimum.state.biases)
-            if not are_white:
-                problem, minimum = _with_edge_biases(problem, minimum, biases)
-        minimum = _passed(problem, minimum)
-        linear = minimum.linear
-        if not accepted.any():
+        if fit.accepted.any():
+            biases = estimated_biases(
+                possible, *_scores_of_biases(fit, possible), least, near=fit.edge_biases
+            )
+            are_white = not len(biases) and not len(fit.state.biases)
+            fit = fit.with_edge_biases(biases)
+        fit = fit.passed()
+        if not fit.accepted.any():
             break
-        changes = replace(changes, after=_sizes(noise, biases))
+        changes = Changes.of(before, fit)
         if changes.converged(settings):
             break
-    known: Mapping[str, Residuals] | None = linear.rows
-    if biases.are_shown:
-        biases, known = expected_biases(possible, *scores_of_biases(), biases, least), None
-        problem, minimum = _with_edge_biases(problem, minimum, biases)
-    minimum = _solved(problem, minimum, known=known)
-    state = minimum.state
-    _refuse_disagreement(problem.offsets(state), accepted, settings)
-    wrong = int(np.sum(minimum.linear["axes"].squared_norms > settings.axis_disagreement**2))
-    if 2 * wrong > len(problem.axes):
-        raise DidNotConverge(
-            f"The joint fit ended where {wrong} of {len(problem.axes)} axes disagree with it by "
-            f"more than {settings.axis_disagreement:g} of their standard deviations; most must "
-            "agree; check the camera poses, the readings, and the units (rad, m) of axes and their "
-            "sigmas."
-        )
-    at_places = _at_places(problem, minimum, accepted) if biases.are_shown else None
-    notes = check_convergence(changes, claimed, settings)
-    return Fit(problem, minimum, noise, biases, accepted, at_places, minimum.iterations, notes)
+    return fit, changes
+
+
+def _linearized(fit: Fit) -> Fit:
+    """Return the same, linearised with the weights that it has now."""
+    linear = linearize(fit.problem, fit.state)
+    return replace(fit, minimum=replace(fit.minimum, linear=linear))
+
+
+def _scores_of_biases(fit: Fit, possible: EdgeBiases) -> tuple[Array, Array]:
+    """Return the scores of all possible biases at the minimum that the noise of a fit leads to."""
+    return scores_of_block(*with_edge_biases(fit.problem, fit.state, possible), "biases")
 
 
 def _without_wrong_readings(
@@ -267,12 +287,10 @@ def _without_wrong_readings(
     return problem, minimum
 
 
-def _at_places(
-    problem: FitProblem, minimum: Minimum[State], accepted: BoolArray
-) -> AtPlaces | None:
+def _at_places(fit: Fit) -> AtPlaces | None:
     """Return the errors at places that the residuals of a fit show, and what they add."""
-    state, linear = minimum.state, minimum.linear
-    shifts = shifts_at_places(problem.outlines, accepted)
+    problem, state, linear = fit.problem, fit.state, fit.minimum.linear
+    shifts = shifts_at_places(problem.outlines, fit.accepted)
     if not shifts.size:
         return None
     columns = {"outlines": problem.factor("outlines").whitening @ shifts}
@@ -313,14 +331,6 @@ def _solved(problem: FitProblem, near: Minimum[State], **options: Any) -> Minimu
     return replace(found, iterations=near.iterations + found.iterations)
 
 
-def _with_edge_biases(
-    problem: FitProblem, minimum: Minimum[State], biases: EdgeBiases
-) -> tuple[FitProblem, Minimum[State]]:
-    """Return problem and minimum with these biases in place of others."""
-    problem, state = with_edge_biases(problem, minimum.state, biases)
-    return problem, replace(minimum, state=state)
-
-
 def with_edge_biases(
     problem: FitProblem, state: State, biases: EdgeBiases
 ) -> tuple[FitProblem, State]:
@@ -335,19 +345,14 @@ def _values(problem: FitProblem, state: State, biases: EdgeBiases) -> Array:
     return np.array([known.get(name, 0.0) for name in biases.names])
 
 
-def _noise(
-    problem: FitProblem,
-    state: State,
-    linear: Linearization,
-    noise: NoiseModel,
-    accepted: BoolArray,
-) -> NoiseModel:
+def _noise(fit: Fit) -> NoiseModel:
     """Return the noise of the accepted outlines at a fit with another noise."""
+    problem, linear, accepted = fit.problem, fit.minimum.linear, fit.accepted
     if not accepted.any():
-        return noise
+        return fit.noise
     claimed = problem.outlines.covariance
-    normal = information(problem, state, linear, problem.loss)
-    L = np.linalg.cholesky(noise.covariance(claimed))
+    normal = information(problem, fit.state, linear, problem.loss)
+    L = np.linalg.cholesky(fit.noise.covariance(claimed))
     share = explained_share(problem, linear, normal, "outlines")
     explained = L @ share @ np.swapaxes(L, -1, -2)
     offsets = np.einsum("nij,nj->ni", L, linear["outlines"].r)
@@ -361,15 +366,29 @@ def _accepted(problem: FitProblem, state: State, noise: NoiseModel) -> BoolArray
     return of_determined_poses(problem.weighted(noise, accepted), state, accepted)
 
 
-def _refuse_disagreement(offsets: Array, accepted: BoolArray, settings: RefinementSettings) -> None:
+def _refuse_disagreement(fit: Fit) -> None:
     """Raise DidNotConverge where the fit does not pass through most of the outlines."""
+    accepted, most_px = fit.accepted, fit.problem.settings.largest_rms_px
     n, n_accepted = len(accepted), int(accepted.sum())
-    rms = float(np.sqrt(np.mean(offsets[accepted] ** 2))) if n_accepted else 0.0
-    if 2 * n_accepted < n or rms > settings.largest_rms_px:
+    used = fit.problem.offsets(fit.state)[accepted]
+    rms = float(np.sqrt(np.mean(used**2))) if n_accepted else 0.0
+    if 2 * n_accepted < n or rms > most_px:
         raise DidNotConverge(
             f"The joint fit ended where {n - n_accepted} of {n} outlines disagree with it "
             f"and the others are {rms:.1f} px off; most must agree, to "
-            f"{settings.largest_rms_px:g} px; check camera poses, readings and outlines."
+            f"{most_px:g} px; check camera poses, readings and outlines."
+        )
+
+
+def _refuse_wrong_axes(fit: Fit) -> None:
+    """Raise DidNotConverge where the fit does not agree with most of the axes."""
+    n, most = len(fit.problem.axes), fit.problem.settings.axis_disagreement
+    wrong = int(np.sum(fit.minimum.linear["axes"].squared_norms > most**2))
+    if 2 * wrong > n:
+        raise DidNotConverge(
+            f"The joint fit ended where {wrong} of {n} axes disagree with it by more than "
+            f"{most:g} of their standard deviations; most must agree; check the camera poses, the "
+            "readings, and the units (rad, m) of axes and their sigmas."
         )
 
 
@@ -431,6 +450,12 @@ class Changes:
     n_changed: int  # outlines that were accepted and are not, or the other way round
     n_accepted: int  # after it
 
+    @classmethod
+    def of(cls, before: Fit, after: Fit) -> Changes:
+        """Return what lies between two fits to the same outlines."""
+        n_changed = int(np.sum(after.accepted != before.accepted))
+        return cls(_sizes(before), _sizes(after), n_changed, int(after.accepted.sum()))
+
     def converged(self, settings: RefinementSettings) -> bool:
         """Say whether another round would change nothing that matters."""
         near = np.allclose(
@@ -442,8 +467,9 @@ class Changes:
 NO_CHANGES = Changes(np.zeros(0), np.zeros(0), 0, 0)
 
 
-def _sizes(noise: NoiseModel, biases: EdgeBiases) -> Array:
+def _sizes(fit: Fit) -> Array:
     """Return all standard deviations of errors in one vector: a factor, the others [px]."""
+    noise, biases = fit.noise, fit.edge_biases
     return np.array([noise.scale, noise.bias_px, noise.tilt_px, *biases.sigma[: len(KINDS)]])
 
 

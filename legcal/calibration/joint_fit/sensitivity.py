@@ -180,7 +180,7 @@ class WrongIntrinsic:
     """Intrinsics of a camera that the measurements contradict, which its file says."""
 
     units: ClassVar[tuple[tuple[Mapping[str, float], Mapping[str, float]], ...]]  # relative, added
-    keys: ClassVar[tuple[str, ...]]  # what is told of each of these
+    keys: ClassVar[tuple[str, ...]]  # the intrinsics that these are
 
     view: str  # the first one by name if several have the camera
     given: Array  # (u,) in the camera file
@@ -348,23 +348,7 @@ class CameraResiduals:
         if not kinds:
             return []
         score, information = self._score(errors)
-        left = [k for k in range(len(kinds)) if np.all(np.diagonal(information)[place[k]] > 0.0)]
-
-        def explained(which: Sequence[int]) -> float:
-            at = np.concatenate([place[k] for k in which])
-            return float(score[at] @ _inverse(information, at) @ score[at])
-
-        wrong, apart, so_far = list[int](), list[float](), 0.0
-        while left:
-            value = {k: explained([*wrong, k]) for k in left}
-            best = max(left, key=value.__getitem__)
-            gain = float(np.sqrt(max(value[best] - so_far, 0.0)))
-            if gain <= _SIGNIFICANT:
-                break
-            left.remove(best)
-            wrong.append(best)
-            apart.append(gain)
-            so_far = value[best]
+        wrong = _forward_selection(score, information, place)
         if not wrong:
             return []
         at = np.concatenate([place[k] for k in wrong])
@@ -372,7 +356,7 @@ class CameraResiduals:
         change, sigma = -covariance @ score[at], np.sqrt(np.diagonal(covariance))
         camera = self.problem.first_cameras[self.problem.outlines.views.index(owner)]
         found = []
-        for k, gain in zip(wrong, apart, strict=True):
+        for k, gain in wrong.items():
             own = np.isin(at, place[k])
             given = np.array([intrinsic_of(camera, key) for key in kinds[k].keys])
             error = np.tensordot(change[own], [errors[i] for i in at[own].tolist()], axes=1)
@@ -444,6 +428,31 @@ class CameraResiduals:
         unseen = np.diagonal(information) <= _ROUNDING * whole
         information[unseen] = information[:, unseen] = score[unseen] = 0.0
         return score, information
+
+
+def _forward_selection(
+    score: Array, information: Array, groups: Sequence[IntArray]
+) -> dict[int, float]:
+    """Return the groups of errors that residuals show, the clearest first.
+
+    Of each, by its number, how many standard deviations it is off beside those before it.
+    """
+    left = [k for k, at in enumerate(groups) if np.all(np.diagonal(information)[at] > 0.0)]
+    chosen, so_far = dict[int, float](), 0.0
+
+    def explained(which: Sequence[int]) -> float:
+        at = np.concatenate([groups[k] for k in which])
+        return float(score[at] @ _inverse(information, at) @ score[at])
+
+    while left:
+        value = {k: explained([*chosen, k]) for k in left}
+        best = max(left, key=value.__getitem__)
+        gain = float(np.sqrt(max(value[best] - so_far, 0.0)))
+        if gain <= _SIGNIFICANT:
+            break
+        left.remove(best)
+        chosen[best], so_far = gain, value[best]
+    return chosen
 
 
 def _inverse(matrix: Array, at: IntArray) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -71,6 +71,127 @@ ParameterStatus = Literal["estimated", "fixed", "weak"]
 
 @brief
 @dataclass(frozen=True, eq=False)
+class KinematicUncertainty:
+    """How well all p kinematic parameters are known; covariances are zero of what is fixed."""
+
+    parametrization: Parametrization
+    # (p, p) of steps, as moved_legs and pose_sensitivity have them (axes turn about the vectors of
+    # where they are); zero along what is held
+    covariance: Array
+    # (p, p) how far steps may be off along what is held, if the nominal model is as wrong there as
+    # the fit found it to be elsewhere
+    held_covariance: Array
+    value_covariance: Array  # (p, p) covariance of the values
+    held_basis: Array  # (w, p) how values change along each held direction, by a metre
+    held: tuple[str, ...]  # the directions that are held at nominal, in words
+
+    @property
+    def total_covariance(self) -> Array:
+        """Of steps, (p, p): as far as the fit knows them, and along what is held."""
+        return self.covariance + self.held_covariance
+
+    def of_values(self, names: Sequence[str]) -> tuple[Array, Array]:
+        """Return covariance (n, n) and held basis (w, n) of the values of some parameters."""
+        at = _places(names, self.parametrization.names)
+        return self.value_covariance[np.ix_(at, at)], self.held_basis[:, at]
+
+    def in_order(self, parametrization: Parametrization) -> KinematicUncertainty:
+        """Return the same in the order of another parametrization of these parameters."""
+        at = _places(parametrization.names, self.parametrization.names)
+        value_covariance, held_basis = self.of_values(parametrization.names)
+        return KinematicUncertainty(
+            parametrization,
+            self.covariance[np.ix_(at, at)],
+            self.held_covariance[np.ix_(at, at)],
+            value_covariance,
+            held_basis,
+            self.held,
+        )
+
+
+@brief
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """All parameters by name: kinematic ones, radii, unknown intrinsics, sizes of boards."""
+
+    values: Mapping[str, float]  # [m, rad, px]
+    units: Mapping[str, str]
+    status: Mapping[str, ParameterStatus]  # weak: part of a direction that is held at nominal
+    names: tuple[str, ...]  # the estimated ones, in the order of ``values``
+    covariance: Array  # (n, n) of these, with cameras and poses unknown
+    prior_sigma: Mapping[str, float]  # of the intrinsics that camera files state one of
+    # the estimated directions known worst, worst first, of what no camera file states
+    weak: tuple[WorstDirection, ...]
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (n,) of the estimated ones."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    def vector(self, names: Sequence[str]) -> Array:
+        """Return the values of some parameters, (len(names),)."""
+        return np.array([self.values[name] for name in names])
+
+    def in_order(self, names: Sequence[str]) -> Estimates:
+        """Return the same in the order in which these names, and others, stand."""
+        every = [name for name in names if name in self.values]
+        estimated = tuple(name for name in every if name in self.names)
+        at = _places(estimated, self.names)
+        return replace(
+            self,
+            values={name: self.values[name] for name in every},
+            units={name: self.units[name] for name in every},
+            status={name: self.status[name] for name in every},
+            names=estimated,
+            covariance=self.covariance[np.ix_(at, at)],
+        )
+
+
+@brief
+@dataclass(frozen=True, eq=False)
+class GoodnessOfFit:
+    """How large the residuals of a fit are, and the noise that they show."""
+
+    cost: float  # over all observations, rejected ones too, with claimed covariances: comparable
+    chi2: float  # of used outlines, axes, readings and priors
+    dof: int
+    rms_px: float | None  # of the offsets of used outlines [px]
+    rms_axes: float | None  # of measured axes, over their claimed standard deviations
+    rms_corners_px: Mapping[Link, float]  # of corners of the calibration board on each link [px]
+    noise: NoiseModel  # errors of single outlines
+    shared_px: Mapping[str, float]  # sigmas of common-mode biases by kind [px]; empty without any
+    redundant_readings: JudgedReadings | None  # None where readings cannot disagree
+
+
+@dataclass(frozen=True, eq=False)
+class CameraDoubts:
+    """The cameras that the measurements contradict."""
+
+    tested: Sequence[WrongIntrinsic]  # whose residuals show one error, the clearest
+    others: Sequence[DoubtedCamera]  # that are moved too far for what their files state
+
+    @classmethod
+    def of(cls, cameras: CameraResiduals, covariance: Array) -> CameraDoubts:
+        """Return the doubts where a fit ended, with the covariance of its kept unknowns."""
+        tested = cameras.contradicted()
+        views = {test.view for test in tested}
+        doubted = doubted_cameras(cameras.problem, cameras.state, covariance)
+        return cls(tested, [camera for camera in doubted if camera.view not in views])
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """The views that stand for these cameras."""
+        views = [one.view for one in self.tested] + [one.view for one in self.others]
+        return tuple(dict.fromkeys(views))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A sentence on each."""
+        return tuple(str(one) for one in (*self.tested, *self.others))
+
+
+@brief
+@dataclass(frozen=True, eq=False)
 class Solution:
     """A converged joint fit; axes count as angles from the nominal axis."""
 
@@ -79,57 +200,33 @@ class Solution:
     cameras: tuple[Camera, ...]  # of the views, with the intrinsics that were estimated
     T_Rb_Re: tuple[RigidTransform, ...]  # platform poses
     radii: dict[tuple[int, str], float]  # [m] for each (leg index, part) that was observed
-    parametrization: Parametrization  # all kinematic parameters
-    # Of every parameter by name [m, rad, px]: kinematic, radii, intrinsics, size of the board.
-    values: Mapping[str, float]
-    units: Mapping[str, str]
-    status: Mapping[str, ParameterStatus]  # weak: part of a direction that is held at nominal
-    names: tuple[str, ...]  # the estimated parameters, in the order of ``values``
-    covariance: Array  # (n, n) of these, with cameras and poses unknown
-    sigma: Array  # (n,)
-    prior_sigma: Mapping[str, float]  # of the intrinsics that camera files state one of, by name
-    # (p, p) of steps of all kinematic parameters, as moved_legs and pose_sensitivity have them
-    # (axes turn about the vectors of where they are); zero where fixed, and along what is held.
-    kinematic_covariance: Array
-    # (p, p) how far these may be off along what is held, if the nominal model is as wrong there as
-    # the fit found it to be elsewhere.
-    held_covariance: Array
-    value_covariance: Array  # (p, p) kinematic_covariance of the values
-    held_basis: Array  # (w, p) how values change along each held direction, by a metre
-    # the estimated directions known worst, worst first, of what no camera file states
-    weak: tuple[WorstDirection, ...]
-    held: tuple[str, ...]  # the directions that are held at nominal
-    cost: float  # over all observations, rejected ones too, with claimed covariances: comparable
-    chi2: float  # of used outlines, axes, readings and priors
-    dof: int
-    rms_px: float | None  # of the offsets of used outlines [px]
-    rms_axes: float | None  # of measured axes, over their claimed standard deviations
-    rms_corners_px: dict[Link, float]  # of corners of the calibration board on each link [px]
+    estimates: Estimates
+    kinematic: KinematicUncertainty
+    quality: GoodnessOfFit
     # View, pose (-1 on the base: in all images of the view) and number; poses as the fit counts
     # them
     rejected_corners: tuple[tuple[str, int, int], ...]
     # T_Rb_board and T_Re_board, by the link that the board is fixed to, where images show one
     T_frame_board: dict[Link, RigidTransform]
-    noise: NoiseModel  # errors of single outlines
     gammas: tuple[EstimatedGamma, ...]  # of cameras without a given gamma
-    biases: Mapping[str, float]  # common-mode edge biases by name [px]
-    shared_px: Mapping[str, float]  # their standard deviations by kind [px]; empty without any
     sensitivities: tuple[Sensitivity, ...]  # to mistakes in what was taken as known
     outlines: Outlines  # the table that came in, with what the fit rejected and why
     start: str  # label of the start that led here
     iterations: int  # of the solver, all rounds
+    camera_doubts: CameraDoubts
     posterior: Posterior  # what it predicts of other images; in the order that was fitted
     notes: tuple[str, ...] = ()  # one sentence each
     details: tuple[str, ...] = ()  # how it was found, the same
-    contradicted_cameras: tuple[str, ...] = ()  # views that stand for such cameras
     left_out: tuple[str, ...] = ()  # legs of views most of whose outlines disagree, unconfirmed
-    camera_notes: tuple[str, ...] = ()  # those of the notes that are about these
-    redundant_readings: JudgedReadings | None = None  # None where readings cannot disagree
 
     @property
     def parameters(self) -> KinematicParameters:
         """Joint centres, and offsets or constant lengths [m]."""
         return parameters_of_legs(self.legs)
+
+    def cameras_in_base(self, T_base_Rb: RigidTransform) -> tuple[RigidTransform, ...]:
+        """Return T_base_camera of every view, R_b laid where the nominal model has it."""
+        return tuple(T_base_Rb * T.inv() for T in self.T_camera_Rb)
 
 
 def assemble_solution(
@@ -151,29 +248,9 @@ def assemble_solution(
     if fit.at_places is not None:
         kept = kept + fit.at_places.covariance
     covariance = named_covariance(problem, state, kept)
-    values, status = _values(problem, state), _status(problem, held)
-    names = tuple(name for name in values if status[name] == "estimated")
-    where = [problem.named.index(name) for name in names]
-    estimated = covariance[np.ix_(where, where)]
-    offsets, cost = problem.offsets(state), comparable_cost(problem, state)
-    used = offsets[fit.accepted]
-    readings = judged_readings(problem, state, linear, normal)
-    n_rejected = offsets.size - used.size + (0 if readings is None else len(readings.wrong))
-    n_residuals = problem.n_equations + len(problem.priors.mean) - n_rejected
-    chi2 = float(np.sum(linear.prior_r**2)) + sum(
-        float(np.sum(rows.r**2)) for rows in linear.rows.values()
-    )
-    dof = n_residuals - problem.n_unknowns + len(held.basis)
-    parametrization = problem.legs.parametrization
-    units = dict(zip(problem.named, problem.units, strict=True))
-    units |= dict(zip(parametrization.names, parametrization.units, strict=True))
-    held_values = np.zeros((len(held.basis), len(problem.free)))
-    held_values[:, problem.free] = (held.basis * held.unit)[:, : problem.n_kinematic]
-    biases = zip(problem.block("biases").labels, state.biases.tolist(), strict=True)
+    quality = _quality(fit, normal, len(held.basis))
     cameras = CameraResiduals(problem, state, linear)
-    doubts = _CameraDoubts.of(cameras, kept)
-    prior_sigma = _prior_sigma(problem)
-    shown = [i for i, name in enumerate(names) if name not in prior_sigma]
+    doubts = CameraDoubts.of(cameras, kept)
     gammas = _gammas(problem, state, kept, outlines)
     scale = scale_notes(problem, state)
     return Solution(
@@ -182,29 +259,9 @@ def assemble_solution(
         cameras=state.cameras,
         T_Rb_Re=state.platform_pose.motions,
         radii=dict(zip(problem.outlines.parts, state.radii.tolist(), strict=True)),
-        parametrization=parametrization,
-        values=values,
-        units={name: units.get(name, "m") for name in values},
-        status=status,
-        names=names,
-        covariance=estimated,
-        sigma=np.sqrt(np.diagonal(estimated)),
-        kinematic_covariance=_of_kinematic(problem, kept),
-        held_covariance=_of_kinematic(problem, held_spread(problem, state, held)),
-        value_covariance=_of_kinematic(problem, covariance),
-        held_basis=held_values,
-        weak=worst_directions(
-            estimated[np.ix_(shown, shown)],
-            tuple(names[i] for i in shown),
-            named_units(problem, state)[where][shown],
-        ),
-        prior_sigma=prior_sigma,
-        held=held.directions,
-        cost=cost,
-        chi2=chi2,
-        dof=dof,
-        rms_px=_rms(used),
-        rms_axes=_rms(linear["axes"].r),
+        estimates=_estimates(problem, state, held, covariance),
+        kinematic=_kinematic(problem, state, held, kept, covariance),
+        quality=quality,
         rejected_corners=tuple(
             (problem.outlines.views[view], pose, corner)
             for view, pose, corner in problem.rejected_corners
@@ -214,74 +271,56 @@ def assemble_solution(
             for corners, T in zip(problem.boards, state.board_pose.motions, strict=True)
             if len(corners)
         },
+        gammas=gammas,
+        sensitivities=sensitivities(cameras, normal, doubts.tested),
+        outlines=_with_rejections(outlines, fit),
+        start=label,
+        iterations=fit.minimum.iterations,
+        posterior=Posterior(problem, state, fit.edge_biases, fit.noise, kept),
+        camera_doubts=doubts,
+        left_out=legs_left_out(problem, fit.accepted),
+        notes=(
+            *fit.notes,
+            *rejected_notes(problem, fit.accepted),
+            *corner_notes(problem),
+            *reading_notes(quality.redundant_readings),
+            *reversed_motors(problem, state),
+            *map(str, gammas),
+            *notes_on_blur(fit.edge_biases, problem.outlines.covariance[fit.accepted]),
+            *(scale or contradicted_radii(problem, state, normal)),
+            *(_misfit_of_axes(quality) if len(problem.axes) else ()),
+            *doubts.notes,
+        ),
+    )
+
+
+def _quality(fit: Fit, normal: NormalEquations, n_held: int) -> GoodnessOfFit:
+    """Return how well a fit agrees with its data; *n_held* directions are not estimated."""
+    problem, state, linear = fit.problem, fit.state, fit.minimum.linear
+    offsets = problem.offsets(state)
+    used = offsets[fit.accepted]
+    readings = judged_readings(problem, state, linear, normal)
+    n_rejected = offsets.size - used.size + (0 if readings is None else len(readings.wrong))
+    n_residuals = problem.n_equations + len(problem.priors.mean) - n_rejected
+    of_rows = sum(float(np.sum(rows.r**2)) for rows in linear.rows.values())
+    return GoodnessOfFit(
+        cost=_comparable_cost(problem, state),
+        chi2=float(np.sum(linear.prior_r**2)) + of_rows,
+        dof=n_residuals - problem.n_unknowns + n_held,
+        rms_px=_rms(used),
+        rms_axes=_rms(linear["axes"].r),
         rms_corners_px={
             corners.link: rms
             for corners in problem.boards
             if (rms := _rms(linear[corners.name].r * corners.sigma[:, None])) is not None
         },
         noise=fit.noise,
-        gammas=gammas,
-        biases={n: v for n, v in biases if not n.endswith(GAMMA_SUFFIX)},
         shared_px=fit.shared_px,
-        sensitivities=sensitivities(cameras, normal, doubts.tested),
-        outlines=_with_rejections(outlines, fit, offsets),
-        start=label,
-        iterations=fit.iterations,
-        posterior=Posterior(problem, state, fit.edge_biases, fit.noise, kept),
-        contradicted_cameras=doubts.views,
-        left_out=legs_left_out(problem, fit.accepted),
-        camera_notes=doubts.notes,
         redundant_readings=readings,
-        notes=(
-            *fit.notes,
-            *rejected_notes(problem, fit.accepted),
-            *corner_notes(problem),
-            *reading_notes(readings),
-            *reversed_motors(problem, state),
-            *map(str, gammas),
-            *notes_on_blur(fit.edge_biases, problem.outlines.covariance[fit.accepted]),
-            *(scale or contradicted_radii(problem, state, normal)),
-            *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
-            *doubts.notes,
-        ),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _CameraDoubts:
-    """What the measurements contradict of the cameras."""
-
-    tested: list[WrongIntrinsic]
-    others: list[DoubtedCamera]  # that are moved too far for what their files state
-
-    @classmethod
-    def of(cls, cameras: CameraResiduals, covariance: Array) -> _CameraDoubts:
-        """Return the doubts where a fit ended, with the covariance of its kept unknowns."""
-        tested = cameras.contradicted()
-        views = {test.view for test in tested}
-        doubted = doubted_cameras(cameras.problem, cameras.state, covariance)
-        return cls(tested, [camera for camera in doubted if camera.view not in views])
-
-    @property
-    def views(self) -> tuple[str, ...]:
-        """The views that stand for these cameras."""
-        views = [one.view for one in self.tested] + [one.view for one in self.others]
-        return tuple(dict.fromkeys(views))
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """A sentence on each."""
-        return tuple(str(one) for one in (*self.tested, *self.others))
-
-
-def _prior_sigma(problem: FitProblem) -> dict[str, float]:
-    """Return the standard deviations that camera files state, by the name of the intrinsic."""
-    priors, of_files = problem.priors, set(problem.calibrated.tolist())
-    stated = zip(priors.unknown.tolist(), priors.sigma.tolist(), strict=True)
-    return {problem.named[i]: sigma for i, sigma in stated if i in of_files}
-
-
-def comparable_cost(problem: FitProblem, state: State) -> float:
+def _comparable_cost(problem: FitProblem, state: State) -> float:
     """Return the robust cost of all observations with their claimed covariances."""
     claimed = problem.weighted(NoiseModel())
     return robust_cost(claimed, linearize(claimed, state), claimed.loss)
@@ -307,33 +346,71 @@ def _gammas(
     return tuple(found)
 
 
-def _values(problem: FitProblem, state: State) -> dict[str, float]:
-    """Return the values of all parameters: kinematic, radii, and intrinsics that are unknown."""
-    legs, biases = problem.legs, problem.block("biases").labels
-    names = (radius_name(legs.names[leg], part) for leg, part in problem.outlines.parts)
-    values = dict(zip(legs.parametrization.names, legs.vector(state.legs).tolist(), strict=True))
-    values |= dict(zip(names, state.radii.tolist(), strict=True))
-    named = zip(problem.named, problem.coordinates(state).tolist(), strict=True)
-    return values | {name: value for name, value in named if name not in biases}
-
-
-def _status(problem: FitProblem, held: HeldDirections) -> dict[str, ParameterStatus]:
-    """Return the status of every parameter."""
-    legs, biases = problem.legs, problem.block("biases").labels
-    names = [radius_name(legs.names[leg], part) for leg, part in problem.outlines.parts]
-    status: dict[str, ParameterStatus] = dict.fromkeys(
-        (*legs.parametrization.names, *names), "fixed"
+def _estimates(
+    problem: FitProblem, state: State, held: HeldDirections, covariance: Array
+) -> Estimates:
+    """Return all parameters; *covariance* is that of the named unknowns."""
+    legs, biases, found = problem.legs, problem.block("biases").labels, problem.legs.parametrization
+    radii = [radius_name(legs.names[leg], part) for leg, part in problem.outlines.parts]
+    unknown = [name for name in problem.named if name not in biases]
+    of_unknowns = dict(zip(problem.named, problem.coordinates(state).tolist(), strict=True))
+    values = dict(zip(found.names, legs.vector(state.legs).tolist(), strict=True))
+    values |= dict(zip(radii, state.radii.tolist(), strict=True))
+    values |= {name: of_unknowns[name] for name in unknown}
+    units = dict.fromkeys(radii, "m") | dict(zip(problem.named, problem.units, strict=True))
+    units |= dict(zip(found.names, found.units, strict=True))
+    status: dict[str, ParameterStatus] = dict.fromkeys((*found.names, *radii), "fixed")
+    status |= dict.fromkeys(unknown, "estimated")
+    status |= dict.fromkeys(held.names, "weak")
+    names = tuple(name for name in values if status[name] == "estimated")
+    at = [problem.named.index(name) for name in names]
+    estimated, prior_sigma = covariance[np.ix_(at, at)], _prior_sigma(problem)
+    shown = [i for i, name in enumerate(names) if name not in prior_sigma]
+    weak = worst_directions(
+        estimated[np.ix_(shown, shown)],
+        tuple(names[i] for i in shown),
+        named_units(problem, state)[at][shown],
     )
-    status |= {name: "estimated" for name in problem.named if name not in biases}
-    return status | dict.fromkeys(held.names, "weak")
+    return Estimates(
+        values,
+        {name: units[name] for name in values},
+        status,
+        names,
+        estimated,
+        prior_sigma,
+        weak,
+    )
 
 
-def _of_kinematic(problem: FitProblem, covariance: Array) -> Array:
-    """Return of the covariance of unknowns that of all kinematic parameters, fixed ones too."""
+def _prior_sigma(problem: FitProblem) -> dict[str, float]:
+    """Return the standard deviations that camera files state, by the name of the intrinsic."""
+    priors, of_files = problem.priors, set(problem.calibrated.tolist())
+    stated = zip(priors.unknown.tolist(), priors.sigma.tolist(), strict=True)
+    return {problem.named[i]: sigma for i, sigma in stated if i in of_files}
+
+
+def _kinematic(
+    problem: FitProblem, state: State, held: HeldDirections, kept: Array, named: Array
+) -> KinematicUncertainty:
+    """Return the uncertainty of kinematic parameters from that of *kept* and *named* unknowns."""
     free, n = problem.free, problem.n_kinematic
-    wide = np.zeros((len(free), len(free)))
-    wide[np.ix_(free, free)] = covariance[:n, :n]
-    return wide
+
+    def of_every(covariance: Array) -> Array:
+        """Return of the covariance of unknowns that of all these, fixed ones too."""
+        wide = np.zeros((len(free), len(free)))
+        wide[np.ix_(free, free)] = covariance[:n, :n]
+        return wide
+
+    held_basis = np.zeros((len(held.basis), len(free)))
+    held_basis[:, free] = (held.basis * held.unit)[:, :n]
+    return KinematicUncertainty(
+        problem.legs.parametrization,
+        of_every(kept),
+        of_every(held_spread(problem, state, held)),
+        of_every(named),
+        held_basis,
+        held.directions,
+    )
 
 
 def _rms(values: Array) -> float | None:
@@ -341,8 +418,9 @@ def _rms(values: Array) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if values.size else None
 
 
-def _misfit_of_axes(chi2: float, dof: int) -> tuple[str, ...]:
+def _misfit_of_axes(quality: GoodnessOfFit) -> tuple[str, ...]:
     """Return a note where axes, whose errors are not estimated, are worse than they claim."""
+    chi2, dof = quality.chi2, quality.dof
     if chi2 <= dof + _SIGNIFICANT * np.sqrt(2.0 * dof):
         return ()
     return (
@@ -352,11 +430,11 @@ def _misfit_of_axes(chi2: float, dof: int) -> tuple[str, ...]:
     )
 
 
-def _with_rejections(outlines: Outlines, fit: Fit, offsets: Array) -> Outlines:
+def _with_rejections(outlines: Outlines, fit: Fit) -> Outlines:
     """Return the table with what the fit rejected, and why."""
     used, reason, problem = outlines.used.copy(), list(outlines.reason), fit.problem
     rejected = np.flatnonzero(~fit.accepted)
-    words = rejection_reasons(problem, fit.state, rejected, offsets)
+    words = rejection_reasons(problem, fit.state, rejected, problem.offsets(fit.state))
     every = np.ones_like(fit.accepted)
     placed = of_determined_poses(problem.weighted(fit.noise), fit.state, every)[rejected]
     for row, why, has_pose in zip(problem.outlines.index[rejected], words, placed, strict=True):
@@ -389,46 +467,31 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     by_leg = {leg: j for j, leg in enumerate(legs)}
     radii = {(by_leg[leg], part): value for (leg, part), value in solution.radii.items()}
     known = known_parameters(machine, measurements.views, boards=dataset.boards).by_name
-    ordered = [name for name in known if name in solution.values]
-    names = tuple(name for name in ordered if name in solution.names)
     names_of_legs, frame_legs = machine.leg_names, machine.frame_legs
     parametrization = parametrize(names_of_legs, geometry, frame_legs, twists=True)
-    where = _places(names, solution.names)
-    steps = _places(parametrization.names, solution.parametrization.names)
-    readings = solution.redundant_readings
-    file_pose = {worked: pose for pose, worked in enumerate(_poses(order, dataset).tolist())}
+    steps = _places(parametrization.names, solution.kinematic.parametrization.names)
+    poses = _poses(order, dataset).tolist()
+    file_pose = {worked: pose for pose, worked in enumerate(poses)}
+    readings = solution.quality.redundant_readings
     return replace(
         solution,
         legs=geometry,
         T_camera_Rb=tuple(solution.T_camera_Rb[v] for v in views),
         cameras=tuple(solution.cameras[v] for v in views),
-        T_Rb_Re=tuple(solution.T_Rb_Re[p] for p in _poses(order, dataset).tolist()),
+        T_Rb_Re=tuple(solution.T_Rb_Re[p] for p in poses),
         radii=dict(sorted(radii.items())),
-        parametrization=parametrization,
-        values={name: solution.values[name] for name in ordered},
-        units={name: solution.units[name] for name in ordered},
-        status={name: solution.status[name] for name in ordered},
-        names=names,
-        covariance=solution.covariance[np.ix_(where, where)],
-        sigma=solution.sigma[where],
-        kinematic_covariance=solution.kinematic_covariance[np.ix_(steps, steps)],
-        held_covariance=solution.held_covariance[np.ix_(steps, steps)],
-        value_covariance=solution.value_covariance[np.ix_(steps, steps)],
-        held_basis=solution.held_basis[:, steps],
+        estimates=solution.estimates.in_order(tuple(known)),
+        kinematic=solution.kinematic.in_order(parametrization),
         sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),
         outlines=order.restore(solution.outlines),
-        redundant_readings=readings
-        and replace(
-            readings,
-            wrong=tuple(
-                replace(one, leg=int(order.legs[one.leg]), pose=file_pose[one.pose])
-                for one in readings.wrong
-            ),
+        quality=replace(
+            solution.quality,
+            redundant_readings=readings and readings.renumbered(order.legs.tolist(), file_pose),
         ),
     )
 
 
-def _places(names: tuple[str, ...], among: tuple[str, ...]) -> IntArray:
+def _places(names: Sequence[str], among: tuple[str, ...]) -> IntArray:
     """Return where names stand among the same ones in another order."""
     return np.array([among.index(name) for name in names], dtype=np.intp)
 

@@ -68,6 +68,8 @@ class RefinementSettings:
     error_tolerance: float = 0.02  # relative change of these errors at which the rounds end
     axis_disagreement: float = 20.0  # beyond, an axis disagrees; if most do, the fit is refused
     largest_rms_px: float = 3.0  # of the offsets of accepted outlines [px]
+    other_starts: int = 8  # where a fit leaves out a leg of a view, at most
+    judges_stated_values: bool = True  # whether those that measurements contradict are refused
     max_iterations: int = 200  # steps to try in each solve
 
 

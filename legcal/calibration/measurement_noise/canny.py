@@ -16,7 +16,6 @@ import numpy as np
 from legcal.data import Outlines
 from legcal.geometry import Array
 from legcal.perception import (
-    MIN_LENGTH,
     MIN_LONE_KEPT,
     ImageSearch,
     LegPart,
@@ -25,7 +24,7 @@ from legcal.perception import (
     find_parts,
     outline_table,
 )
-from legcal.vision import Grey
+from legcal.vision import Grey, least_length
 
 SMOOTHING = 1.0  # of the picture before its gradient is taken [px]
 NO_EDGE = 0.9  # share of the pixels whose gradient is below the upper threshold
@@ -105,7 +104,7 @@ def _line(t: Array, v: Array, start: Array, length: float, free: float) -> _Cann
     chosen = np.zeros(len(t), dtype=np.bool_)
     for _ in range(N_ROUNDS):
         near = np.abs(v - ends[0] - (ends[1] - ends[0]) * t / length) < REACH
-        if np.count_nonzero(near) < 3 or np.ptp(t[near]) < MIN_LENGTH[0]:
+        if np.count_nonzero(near) < 3 or np.ptp(t[near]) < least_length(0.0):
             return None
         ends = _least_squares(t[near], v[near], length)
         if np.array_equal(near, chosen):
@@ -132,7 +131,7 @@ def _least_squares(t: Array, v: Array, length: float) -> Array:
 
 def _reasons(part: LegPart, lines: Sequence[_CannyLine | None]) -> tuple[str, str]:
     """Return why each outline is not to be used, "" if it is."""
-    least = max(MIN_LENGTH[0], MIN_LENGTH[1] * 2.0 * part.half_width)
+    least = least_length(2.0 * part.half_width)
     reasons = []
     for line in lines:
         reason = "" if line is not None else "too few edge points"

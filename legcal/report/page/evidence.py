@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from legcal.calibration import DEFAULT_SETTINGS, UNITS, Calibration, ranks_of_dataset
+from legcal.calibration import UNITS, Calibration, ranks_of_dataset
 from legcal.data import OBSERVATIONS_NAME, Dataset
 from legcal.errors import LegcalError
 from legcal.pages import Cell, Drawing, Facts, Items, Table, Text, matrix, number
@@ -35,7 +35,7 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
     """Return counts, ranks, and the directions that are known worst."""
     problem, result = calibration.solution.posterior.problem, calibration.result
     free = int(problem.free.sum())
-    n_held = len(calibration.solution.held_basis)
+    n_held = len(calibration.solution.kinematic.held_basis)
     counts = {
         "Equations": f"{problem.n_equations}: "
         + ", ".join(
@@ -165,7 +165,7 @@ def note_blocks(calibration: Calibration) -> list[Any]:
 def reproducibility_blocks(calibration: Calibration, command: str, when: str) -> list[Any]:
     """Return version, command, settings, and the hashes of all files that went in."""
     dataset, problem = calibration.dataset, calibration.solution.posterior.problem
-    settings = {name.replace("_", " "): f"{v:g}" for name, v in asdict(DEFAULT_SETTINGS).items()}
+    settings = {name.replace("_", " "): f"{v:g}" for name, v in asdict(problem.settings).items()}
     facts = {
         "Version": f"legcal {__version__}, Python {system.python_version()}, {system.machine()}",
         "Command": command or "from Python",

@@ -149,7 +149,7 @@ def _prior_sigmas(calibration: Calibration) -> dict[str, float]:
     priors, named = problem.priors, problem.named
     numbers = zip(priors.unknown.tolist(), priors.sigma.tolist(), strict=True)
     found = {named[i]: sigma for i, sigma in numbers if i < len(named)}
-    return found | dict(calibration.solution.prior_sigma)
+    return found | dict(calibration.solution.estimates.prior_sigma)
 
 
 def _how(status: str, sigma: float | None, prior: float | None) -> str:

@@ -114,8 +114,8 @@ def _modes(
     modes = [_mode("what the calibration changed", legend, nominal, found, rim, size)]
     length = float(np.mean(np.linalg.norm(found.B[0] - found.A[0], axis=1)))
     legend = ("calibrated", "moved along the direction")
-    for what, step in directions(calibration.result, solution.parametrization, length):
-        moved = placed(moved_legs(solution.legs, solution.parametrization.place, step))
+    for what, step in directions(calibration.result, solution.kinematic.parametrization, length):
+        moved = placed(moved_legs(solution.legs, solution.kinematic.parametrization.place, step))
         modes.append(_mode(what, legend, found, moved, rim, size))
     return modes
 

@@ -55,7 +55,7 @@ def _grounds(calibration: Calibration) -> list[str]:
 def _doubts(calibration: Calibration) -> list[str]:
     """Return what speaks against parts of a result."""
     result, found = calibration.result, []
-    for view in calibration.solution.contradicted_cameras:
+    for view in calibration.solution.camera_doubts.views:
         found.append(f"The outlines contradict the camera of view {view}.")
     found += [f"{one.what} The remedy: {one.remedy}" for one in result.diagnosis or ()]
     held_out = result.holdout

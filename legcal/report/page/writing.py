@@ -2,28 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from legcal.calibration import REPORT_NAME
-from legcal.files import OutputFile
 from legcal.machine import RESULT_YAML, Machine, load_mechanism
-from legcal.pages import Page, is_page, page_html
+from legcal.pages import PAGE, Page, page_html
 
 if TYPE_CHECKING:
     from legcal.calibration import Calibration
-
-
-@dataclass(frozen=True)
-class _Page(OutputFile):
-    """A page that says which program wrote it."""
-
-    def _is_own(self, path: Path) -> bool:
-        return is_page(path)
-
-
-PAGE = _Page("the page", "page", "", "a new file or an earlier page of legcal")
 
 
 def write_page(page: Page, path: Path) -> None:

@@ -88,7 +88,8 @@ class Appearance:
     exposure : float
         Factor on all radiance before it saturates at full scale.
     blur : float
-        Standard deviation of the lens's Gaussian blur [px].
+        Standard deviation of the lens's Gaussian blur [px]. Light is blurred before pixels count
+        it, in pictures of up to 8 megapixels, which takes up to twice the time below 1 px.
     gamma : float
         Grey levels are radiance to the power 1 / gamma; 1 is linear.
     electrons : float

@@ -26,6 +26,8 @@ _FACTORS: dict[Subsampling, int] = {
 _FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # for colours; grey levels are written faster without
 _FIELD_LEVELS = 4  # of blur between the middle and the corners
 _CHANNELS = (-1.0, 0.0, 1.0)  # of chromatic aberration: blue, green, red
+_SAMPLED_BLUR = 1.0  # [px] from which on light that pixels have counted can be blurred
+_MOST_FINE = 2**25  # pixels of a finer picture, for memory
 
 
 @dataclass(frozen=True)
@@ -76,9 +78,32 @@ class CameraPipeline:
         """Return what the names of its files end with."""
         return ".jpg" if self.jpeg else ".png"
 
-    def through_lens(self, light: Single, blur: float) -> Single:
-        """Return light (height, width[, 3]) behind the lens, its blur in the middle in px."""
-        height, width = light.shape[:2]
+    def fineness(self, blur: float, n_pixels: int) -> int:
+        """Return into how many along rows and columns pixels must be divided for a blur [px].
+
+        A lens blurs light before pixels count it. Values of whole pixels cannot tell how light is
+        spread inside them: blurred by less than a pixel, edges would be spread by another shape
+        than a Gaussian, and outlines of a picture would seem to lie inside by a tenth of a pixel.
+        """
+        is_fine = blur < _SAMPLED_BLUR and (blur > 0.0 or self.field_blur > 0.0)
+        return 2 if is_fine and 4 * n_pixels <= _MOST_FINE else 1
+
+    def through_lens(self, light: Single, blur: float, fineness: int = 1) -> Single:
+        """Return what pixels gather of light (height, width[, 3]), its blur in the middle in px.
+
+        The light is that of parts of pixels, ``fineness`` along rows and columns.
+        """
+        light = self._refracted(light, blur, fineness)
+        if fineness > 1:
+            height, width = (size // fineness for size in light.shape[:2])
+            light = np.asarray(cv2.resize(light, (width, height), interpolation=cv2.INTER_AREA))
+        if self.vignetting > 0.0:
+            kept = 1.0 - self.vignetting * _corner_distance(*light.shape[:2]) ** 2
+            light = light * (kept if light.ndim == 2 else kept[..., None])
+        return light
+
+    def _refracted(self, light: Single, blur: float, fineness: int) -> Single:
+        """Return light as the lens spreads it."""
         if self.chromatic > 0.0 and light.ndim == 3:
             light = np.stack(
                 [
@@ -88,18 +113,14 @@ class CameraPipeline:
                 axis=-1,
             )
         if self.field_blur > 0.0:
-            light = self._blurred(light, blur)
-        elif blur > 0.0:
-            light = np.asarray(cv2.GaussianBlur(light, (0, 0), blur))
-        if self.vignetting > 0.0:
-            kept = 1.0 - self.vignetting * _corner_distance(height, width) ** 2
-            light = light * (kept if light.ndim == 2 else kept[..., None])
-        return light
+            return self._blurred(light, blur, fineness)
+        return np.asarray(cv2.GaussianBlur(light, (0, 0), fineness * blur)) if blur else light
 
-    def _blurred(self, light: Single, blur: float) -> Single:
+    def _blurred(self, light: Single, blur: float, fineness: int) -> Single:
         """Return light with a blur that grows from the middle to the corners."""
         height, width = light.shape[:2]
         sigmas = np.hypot(blur, self.field_blur * np.linspace(0.0, 1.0, _FIELD_LEVELS))
+        sigmas *= fineness
         place = _corner_distance(height, width) * (_FIELD_LEVELS - 1)
         blurred = np.zeros_like(light)
         for k, sigma in enumerate(sigmas.tolist()):

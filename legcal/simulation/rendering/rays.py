@@ -1,7 +1,7 @@
 """Rays of a camera's pixels, and where they meet solids: depths, faces, normals and prints."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -27,6 +27,7 @@ _TINY = 1e-12
 NEAR = 1e-4  # [m] in front of the camera
 MARGIN = 2  # [px]
 _SPARE = 0.02  # of the picture, around it
+_PIECES = 12  # of each side of a polygon, which the lens bends
 _SHIFT = 4  # bits of a fraction of a pixel
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
@@ -91,9 +92,17 @@ def _undistorted(camera: Camera) -> tuple[Single, Single]:
 
 
 @lru_cache(maxsize=4)
-def pixel_rays(camera: Camera) -> PixelRays:
-    """Return the rays of a camera, the same ones for all of its images."""
-    return PixelRays(camera)
+def pixel_rays(camera: Camera, fineness: int = 1) -> PixelRays:
+    """Return the rays of the parts of a camera's pixels, the same ones for all of its images."""
+    return PixelRays(camera if fineness == 1 else divided(camera, fineness))
+
+
+def divided(camera: Camera, fineness: int) -> Camera:
+    """Return a camera whose pixels are parts of those of another, so many in each row of one."""
+    K = camera.K * [[fineness], [fineness], [1.0]]
+    K[:2, 2] += 0.5 * (fineness - 1)
+    width, height = fineness * camera.width, fineness * camera.height
+    return replace(camera, K=K, width=width, height=height)
 
 
 @lru_cache(maxsize=4)
@@ -347,9 +356,9 @@ def _cut(polygon: Array, low: Array, high: Array) -> Array:
     return polygon
 
 
-def _dense(polygon: Array, pieces: int = 12) -> Array:
+def _dense(polygon: Array) -> Array:
     """Return more points along the sides of a polygon: the lens bends them."""
-    t = np.arange(pieces)[:, None] / pieces
+    t = np.arange(_PIECES)[:, None] / _PIECES
     side = np.roll(polygon, -1, axis=0) - polygon
     return np.asarray((polygon[:, None] + t * side[:, None]).reshape(-1, 2))
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry import Array, BoolArray, Image, IntArray
-from legcal.simulation.rendering.appearance import Appearance, background
+from legcal.simulation.rendering.appearance import SAMPLES, Appearance, background
 from legcal.simulation.rendering.light import (
     CoarseSurface,
     Lamp,
@@ -170,10 +170,16 @@ def _tint(rng: np.random.Generator) -> tuple[float, float, float]:
     return r, g, b
 
 
-def develop(radiance: Single, appearance: Appearance, rng: np.random.Generator) -> Image:
-    """Return the image of a radiance: lens, saturation, noise, processing, rounding."""
+def develop(
+    radiance: Single, appearance: Appearance, rng: np.random.Generator, fineness: int = 1
+) -> Image:
+    """Return the image of a radiance: lens, saturation, noise, processing, rounding.
+
+    The radiance is that of parts of pixels, ``fineness`` along rows and columns.
+    """
     camera = appearance.pipeline
-    light = camera.through_lens(radiance * np.float32(appearance.exposure), appearance.blur)
+    exposed = radiance * np.float32(appearance.exposure)
+    light = camera.through_lens(exposed, appearance.blur, fineness)
     counts = camera.counted(light, appearance.electrons, appearance.read_noise, rng)
     level = camera.processed(counts, appearance.gamma)
     level *= 255.0 if appearance.bits == 8 else 65535.0
@@ -372,6 +378,7 @@ class RenderedView:
     canvas: FrameBuffer  # the surroundings, their light apart by lamp
     bystanders: tuple[SolidInView, ...]  # what stands around and casts shadows on the machine
     foreground: tuple[SolidInView, ...]  # what hangs in front of it
+    fineness: int  # parts of a pixel along rows and columns that are painted
 
     def render(self, placed: Sequence[PlacedSolid], rng: np.random.Generator) -> Image:
         """Return a photograph of solids in this scene."""
@@ -385,7 +392,7 @@ class RenderedView:
             if len(radiance) == 1
             else np.ascontiguousarray(np.moveaxis(radiance, 0, -1))
         )
-        return develop(grey, self.appearance, rng)
+        return develop(grey, self.appearance, rng, self.fineness)
 
     def _backdrop(self, solids: Sequence[SolidInView]) -> Single:
         """Return the surroundings with the shadows of solids, (1, n_channels, n)."""
@@ -413,7 +420,9 @@ def prepare_view(
     rng: np.random.Generator,
 ) -> RenderedView:
     """Return the scene of a view: its surroundings drawn, lit and painted."""
-    rays = pixel_rays(camera)
+    fineness = appearance.pipeline.fineness(appearance.blur, camera.width * camera.height)
+    rays = pixel_rays(camera, fineness)
+    samples = next(n for n in SAMPLES if n * fineness**2 >= appearance.samples)
     T_camera_base = T_base_camera.inv()
     centre, radius = _around(placed)
     floor = _table(placed, centre, radius, T_base_camera.translation) if appearance.table else ()
@@ -422,13 +431,13 @@ def prepare_view(
     ]
     cables = [_cable(i, centre, radius, T_base_camera, rng) for i in range(appearance.cables)]
     light = _lighting(centre, radius, T_camera_base, appearance)
-    painter = Painter(rays, light, appearance.samples)
+    painter = Painter(rays, light, samples)
     canvas = _empty(rays, light, appearance, rng)
     bystanders = in_view(clutter, T_camera_base)
     painter.paint(canvas, [*in_view(floor, T_camera_base), *bystanders])
     foreground = in_view(cables, T_camera_base)
     return RenderedView(
-        T_camera_base, appearance, painter, canvas, tuple(bystanders), tuple(foreground)
+        T_camera_base, appearance, painter, canvas, tuple(bystanders), tuple(foreground), fineness
     )
 
 

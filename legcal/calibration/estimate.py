@@ -1,0 +1,136 @@
+"""From outlines to parameters: the four steps, then the joint fit that starts from them.
+
+In: a dataset in canonical order, outlines of all of its images and where the legs were looked for.
+Out: an :class:`Estimate`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from legcal.calibration.board import BoardViews
+from legcal.calibration.diagnosis.diagnosis import Diagnosis
+from legcal.calibration.four_steps import Steps, four_steps, starts
+from legcal.calibration.joint_fit import (
+    DEFAULT_SETTINGS,
+    RefinementSettings,
+    Solution,
+    in_file_order,
+    refine,
+)
+from legcal.calibration.ordered_dataset import Options, OrderedDataset
+from legcal.calibration.outlier_images import outlier_images
+from legcal.data import Corners, Measurements, Outlines, along_legs, reject_unused_legs
+from legcal.errors import NotVisible
+from legcal.machine import Machine
+from legcal.perception import Placement
+
+# Of all outlines that are measured in photographs: light at the limb that no model of shading
+# predicts looks like other radii, so that residuals never show it [px].
+LIMB_BIAS = {"bias of many edges": 0.02}
+# Of a session that looks wrong: neither other starts nor patience would mend it, and what it
+# contradicts is not to blame.
+TRIAL = replace(DEFAULT_SETTINGS, other_starts=0, judges_stated_values=False, max_iterations=40)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What the images show and what was fitted to it, in canonical order."""
+
+    fitted: OrderedDataset  # the images that were fitted
+    outlines: Outlines  # of all images
+    steps: Steps
+    solution: Solution
+    corners: Corners | None  # of the calibration board in all images; None without a board
+    image_notes: tuple[str, ...] = ()  # on the images by themselves
+    fit_notes: tuple[str, ...] = ()  # on the images by the fit
+    other_radii: bool = False  # whether the images show other radii than the model has
+    diagnosis: tuple[Diagnosis, ...] = ()  # what looks wrong where many images were left out
+
+    @cached_property
+    def outliers(self) -> dict[int, str]:
+        """What is said of images that contradict the fit, by their row."""
+        return outlier_images(self.fitted.measurements, self.fitted.machine, self.solution)
+
+    def in_file_order(self) -> Estimate:
+        """Return the same with legs, views and images in the order of the files."""
+        dataset, order = self.fitted.in_file_order()
+        restore = self.fitted.order.restore  # of tables of all images
+        return replace(
+            self,
+            outlines=restore(self.outlines),
+            steps=self.steps.in_file_order(order),
+            solution=in_file_order(self.solution, order, dataset),
+            corners=None if self.corners is None else restore(self.corners),
+        )
+
+
+def fit_outlines(
+    fitted: OrderedDataset,
+    outlines: Outlines,
+    placement: Placement,
+    board: BoardViews | None,
+    options: Options,
+    settings: RefinementSettings = DEFAULT_SETTINGS,
+) -> Estimate:
+    """Run the four steps, then the joint fit, with the outlines of all images.
+
+    Raises
+    ------
+    NotVisible
+        If no image shows a leg that its view says it does.
+    NotIdentifiable, DidNotConverge
+        As the joint fit.
+    """
+    seen = outlines.at(fitted.rows)
+    seen = reject_unused_legs(seen, fitted.measurements, fitted.machine.leg_names)
+    if options.every_leg:
+        _refuse_unseen_legs(fitted, seen)
+    steps = four_steps(fitted, seen, board, options)
+    fitted.progress("Joint fit", 0, 1)
+    choices = options.choices
+    if any(fitted.measurements.image) and "detected" in seen.source:
+        choices = replace(choices, least_shared_px={**LIMB_BIAS, **choices.least_shared_px})
+    solution = refine(
+        fitted.fitted_legs,
+        fitted.measurements,
+        seen,
+        starts(fitted, seen, placement, steps, board),
+        settings,
+        axes=fitted.axes,
+        board=None if board is None else board.at(fitted.rows),
+        choices=choices,
+    )
+    fitted.progress("Joint fit", 1, 1)
+    corners = None if board is None else board.reject_outliers(solution, fitted)
+    return Estimate(fitted, outlines, steps, solution, corners)
+
+
+def _refuse_unseen_legs(fitted: OrderedDataset, outlines: Outlines) -> None:
+    """Raise NotVisible if no image shows a leg that its view says it does."""
+    if fitted.axes is not None:
+        return
+    unseen = unseen_legs(fitted.machine, fitted.measurements, outlines)
+    if unseen:
+        raise NotVisible(
+            f"{fitted.dataset.folder}: the machine could not be calibrated: found no used outline "
+            f"of {', '.join(unseen)} in any image, needed some of every leg; add images that show "
+            "it, or name the legs of each view in dataset.yaml to leave it to the readings."
+        )
+
+
+def unseen_legs(machine: Machine, measurements: Measurements, outlines: Outlines) -> list[str]:
+    """Return the legs that views should show, and of which no outline is used."""
+    along = along_legs(outlines, machine.legs)
+    shown = set(along.leg[along.used].tolist())
+    views = [measurements.views[v] for v in np.unique(measurements.view).tolist()]
+    return [
+        leg.name
+        for j, leg in enumerate(machine.legs)
+        if j not in shown
+        and leg.cylinders
+        and any(view.legs is None or leg.name in view.legs for view in views)
+    ]

@@ -1,0 +1,175 @@
+"""Photographs measured again close to a fit, and fitted again.
+
+What is measured there does not depend on where the search began. Where the outlines show the gamma
+of a camera that is not given, all is done again with that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from legcal.calibration.board import BoardViews
+from legcal.calibration.compression import compression_effect
+from legcal.calibration.estimate import Estimate, fit_outlines
+from legcal.calibration.joint_fit import GammaTrials, Solution, known_gammas, loses_outlines
+from legcal.calibration.ordered_dataset import Options, OrderedDataset
+from legcal.data import Outlines, compression_note, few, image_notes, no_outlines, through_cameras
+from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
+from legcal.geometry import components
+from legcal.machine import Machine, ends_in_base, measured_readings
+from legcal.perception import (
+    MeasuredImages,
+    Photographs,
+    Placement,
+    measure_photographs,
+    placed_arms,
+    used_as_before,
+    with_measured_radii,
+)
+
+MIN_FOUND_AGAIN = 0.5  # of the outlines of an image, or of all
+
+
+def measure_again(
+    data: OrderedDataset,
+    estimate: Estimate,
+    seen: MeasuredImages,
+    board: BoardViews | None,
+    options: Options,
+) -> Estimate:
+    """Search the photographs that were kept again, close to a fit, and fit again."""
+    rows = seen.kept(seen.photographs.detect)
+    if not len(rows):
+        return estimate
+    photographs = seen.photographs.narrowed(rows, estimate.outlines)
+    search = _SearchNearFit(data, photographs, seen, board, options)
+    first = best = search.fitted(estimate, {})
+    trials = GammaTrials.begun(
+        first.solution, known_gammas(photographs.keep, photographs.measurements)
+    )
+    while gammas := trials.next():
+        try:
+            there = search.fitted(best, gammas, like=first.outlines)
+        except (DidNotConverge, NotIdentifiable, NotVisible):
+            trials = trials.tried(gammas, None)
+            continue
+        trials = trials.tried(gammas, there.solution)
+        if trials.best == len(trials.solutions) - 1:
+            best = there
+    last, refused, gammas = first, trials.found(), {}
+    if refused:
+        found = search.fitted(best, refused)
+        if not loses_outlines(first.outlines, found.outlines):
+            last, refused, gammas = found, {}, refused
+    notes = _compression_note(data, last, *search.at(last, gammas))
+    return replace(last, image_notes=(*trials.notes(refused), *notes))
+
+
+@dataclass(frozen=True, eq=False)
+class _SearchNearFit:
+    """Photographs that are measured close to a fit, and what else fits have in common."""
+
+    data: OrderedDataset
+    photographs: Photographs  # those that are searched again
+    seen: MeasuredImages  # what was found before any fit
+    board: BoardViews | None
+    options: Options
+
+    def at(self, near: Estimate, gammas: Mapping[str, float]) -> tuple[Photographs, Placement]:
+        """Return the photographs with the radii and cameras of a fit, and where it has the legs."""
+        machine = _with_fitted_radii(self.photographs.machine, near.solution)
+        photographs = replace(self.photographs, machine=machine)
+        photographs = photographs.with_intrinsics(near.solution.cameras).with_gammas(gammas)
+        here = near.fitted.with_fitted_poses(near.solution.T_Rb_Re)
+        every = replace(self.data, seen_poses=here.seen_poses)
+        return photographs, _fitted_placement(every, near.solution, self.seen)
+
+    def fitted(
+        self, near: Estimate, gammas: Mapping[str, float], *, like: Outlines | None = None
+    ) -> Estimate:
+        """Measure near a fit and fit again, with the same outlines used as in *like*, if given."""
+        photographs, placement = self.at(near, gammas)
+        stage = "Measuring outlines near the fit"
+        if gammas:
+            stage += f", gamma {few(sorted({f'{gamma:.2f}' for gamma in gammas.values()}))}"
+        search, progress = replace(photographs, keep=no_outlines()), self.data.progress
+        outlines = measure_photographs(search, placement, progress, stage=stage)
+        other = None if like is not None else with_measured_radii(search, placement, outlines)
+        if other is not None:
+            stage += " with other radii"
+            with_other = measure_photographs(other, placement, progress, stage=stage)
+            outlines = max(outlines, with_other, key=lambda found: int(found.used.sum()))
+        # The table and the next fit have the cameras of the files.
+        both, view = (photographs, self.photographs), self.data.measurements.view
+        lenses = [[one.camera for one in p.measurements.views] for p in both]
+        outlines = through_cameras(outlines, view[outlines.row], *lenses)
+        outlines = self.photographs.with_found(outlines)
+        if like is not None:
+            outlines = used_as_before(outlines, like)
+        here = near.fitted.with_fitted_poses(near.solution.T_Rb_Re)
+        return fit_outlines(here, outlines, placement, self.board, self.options)
+
+
+def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
+    """Return the visible cylinders of the legs with the radii of a fit.
+
+    Cylinders of a leg that were equally thick stay so: they look like one.
+    """
+    fitted = [
+        {
+            c.radius: solution.radii[j, c.link]
+            for c in leg.cylinders
+            if (j, c.link) in solution.radii
+        }
+        for j, leg in enumerate(machine.legs)
+    ]
+    return machine.with_radii(lambda j, c: fitted[j].get(c.radius, c.radius))
+
+
+def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredImages) -> Placement:
+    """Return where a fit puts the legs, R_b laid on the nominal one; no camera is placed anew."""
+    T_base_Rb, poses = data.machine.T_base_Rb, components(data.poses_by(solution.legs))
+    m = data.measurements
+    q = measured_readings(solution.legs, *poses, m.q_of_poses)
+    A, B = ends_in_base(solution.legs, T_base_Rb, *poses, q)
+    pose = data.measurements.pose
+    cameras = tuple(
+        None if known is None else T
+        for known, T in zip(
+            seen.placement.T_base_camera, solution.cameras_in_base(T_base_Rb), strict=True
+        )
+    )
+    arms = placed_arms(solution.legs, q, pose, T_base=T_base_Rb, radii=solution.radii)
+    return Placement.of_fit(A[pose], B[pose], cameras, seen.blur, arms)
+
+
+def not_found_again(first: Estimate, again: Estimate) -> list[str]:
+    """Return the notes of a first fit on images in which hardly anything is found near it.
+
+    Those on cameras as well, where that is so of all images together.
+    """
+    after, o = again.outliers, again.solution.outlines
+    gone = {
+        row: what
+        for row, what in first.outliers.items()
+        if row not in after and o.used[o.row == row].mean() < MIN_FOUND_AGAIN
+    }
+    few_found = o.used.sum() < MIN_FOUND_AGAIN * first.solution.outlines.used.sum()
+    cameras = first.solution.camera_doubts.notes if few_found else ()
+    return [*cameras, *image_notes(first.fitted.measurements, gone)]
+
+
+def _compression_note(
+    data: OrderedDataset, estimate: Estimate, photographs: Photographs, placement: Placement
+) -> list[str]:
+    """Return a note where outlines were measured in photographs compressed with much loss."""
+    solution, measured = estimate.solution, photographs.detect.tolist()
+    names = {data.measurements.image[row] for row in measured}
+    facts = {image: found for image, found in data.dataset.facts.items() if image in names}
+    effect = compression_effect(
+        photographs, placement, estimate.outlines, facts, solution.quality.noise, data.progress
+    )
+    words = "" if effect is None else str(effect)
+    rms, scale = solution.quality.rms_px or 0.0, solution.quality.noise.scale
+    return compression_note(data.measurements, facts, rms, scale, words)
