@@ -322,7 +322,7 @@ def test_corners_are_found_from_a_few_on(monkeypatch: pytest.MonkeyPatch) -> Non
     for first in (2 * i + 2 * j * columns for j in range(grid.rows) for i in range(grid.columns)):
         tag = corners[[first, first + 1, first + columns + 1, first + columns]]
         if first:
-            inside = tag.mean(axis=0) + 0.75 * (tag - tag.mean(axis=0))
+            inside = tag.mean(axis=0) + 0.7 * (tag - tag.mean(axis=0))
             image = cv2.fillConvexPoly(image, np.rint(inside).astype(np.int32), float(image.min()))
     number, px, _ = find_corners(grid, image)
     assert np.array_equal(number, np.arange(grid.n_corners))

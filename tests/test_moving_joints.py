@@ -20,6 +20,7 @@ from legcal.calibration.identify.scale import is_scale_open, scale_sources
 from legcal.calibration.joint_fit import Choices, Prior
 from legcal.errors import NotIdentifiable
 from legcal.machine import (
+    Cylinder,
     actuator_index,
     parametrize,
     random_poses_of_legs,
@@ -158,8 +159,12 @@ def test_ranks_are_the_published_ones_and_radii_carry_the_scale_of_arms(name: st
         assert max(s.sigma or 1.0 for s in found[:3]) < 0.001
         known = Choices(priors={"leg1.length": Prior(0.4, 5e-5)})
         assert not is_scale_open(Analysis(session(name), known))
+        rods = [
+            replace(leg, cylinders=(Cylinder("rod", 0.008, "base", 0.0, leg.q0),))
+            for leg in analysis.predicted.legs
+        ]
         radius = Choices(priors={"leg1.radius.rod": Prior(0.008, 1e-5)})
-        assert not is_scale_open(Analysis(session(name), radius))
+        assert not is_scale_open(Analysis(replace(session(name), legs=tuple(rods)), radius))
         few = scale_sources(Analysis(session(name, images=1)))
         assert [s.sigma for s in few] == [None] * 4  # lengths are open whatever is known
 

@@ -20,8 +20,8 @@ from legcal.vision import Camera, Grey
 
 DEPTH = (2.0, 2.5)  # used distance from an outline: [px] and in blurs
 MAX_DEPTH = 0.8  # largest used depth, in half-widths
-NEAR_DEPTH = (1.0, 2.0)  # the same of narrow parts once lines are known well
-MILD_DEPTH, MAX_NEAR_DEPTH = 0.25, 0.6  # then, in half-widths: used if it is more; most inside
+NEAR_DEPTH = (1.0, 2.0)  # the same inside narrow parts once lines are known well
+MILD_DEPTH, MAX_NEAR_DEPTH = 0.25, 0.6  # then, in half-widths: used if it is more; and at most
 ROWS = 8  # of a block in the first rounds, and in the last ones of a sharp picture
 MIN_ROWS_CLIPPED = 16  # of a block where the background saturates the picture
 MIN_SHARE_CLIPPED = 0.1  # share of the blocks of an image from which on they are that long
@@ -171,18 +171,16 @@ class Blocks:
         ]
 
     def narrow(self, blur: float) -> None:
-        """Leave out pixels that are not needed near the lines of narrow parts.
+        """Leave out pixels far inside narrow parts, which are not needed near the lines.
 
-        The further inside, the less the shading is that of a limb: highlights and shadows begin.
-        The further outside, the more is seen of what lenses do beside a Gaussian blur. Both draw
-        outlines of narrow parts inwards. Lines converge from more pixels than determine them.
+        The further inside, the less the shading is that of a limb: highlights and shadows begin,
+        and draw outlines inwards. Lines converge from more pixels than determine them.
         """
         least = NEAR_DEPTH[0] + NEAR_DEPTH[1] * blur
-        outside = np.clip(MILD_DEPTH * self.half_width, least, depth_for_blur(blur))
-        inside = np.minimum(outside, MAX_NEAR_DEPTH * self.half_width)
+        depth = np.clip(MILD_DEPTH * self.half_width, least, depth_for_blur(blur))
+        depth = np.minimum(depth, MAX_NEAR_DEPTH * self.half_width)
         d = self.d - self.moved[:, None].astype(np.float32)
-        near = (d >= -outside[self.edge, None]) & (d <= inside[self.edge, None])
-        self.weight, self.last = self.weight * near, None
+        self.weight, self.last = self.weight * (d <= depth[self.edge, None]), None
 
     def fit(self, blur: float, n_rounds: int) -> None:
         """Fit the blocks and a line to each edge in turn, until no line moves any more."""
