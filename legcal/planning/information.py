@@ -75,8 +75,8 @@ class PredictedNoise:
 
     sigma_px: float = 0.35
     correlation: float = 0.0
-    common_px: tuple[float, ...] = (0.038, 0.005, 0.03, 0.013, 0.017, 0.006)
-    places_px: tuple[float, ...] = (0.05, 0.019)
+    common_px: tuple[float, ...] = (0.045, 0.003, 0.033, 0.009, 0.014, 0.005)
+    places_px: tuple[float, ...] = (0.024, 0.023)
     gamma_px: float = 0.1
     source: str = "what photographs of simulated machines show"
 
