@@ -1,17 +1,20 @@
 """How fast photographs are rendered: images a second of one core, with everything on.
 
-    OMP_NUM_THREADS=1 python benchmarks/photographs.py [--images 15] [MODEL ...]
+    OMP_NUM_THREADS=1 python benchmarks/photographs.py [--images 15] [--scale 1] [--blur PX]
+        [MODEL ...]
 
-1024 x 768, each shipped mechanism with balls, posts and plates on a table among 15 pieces of
-clutter, two lamps, soft shadows, limb darkening, highlights, lens distortion, blur, gamma and
-noise, a new pose for every image and one scene for all images of a view. Times are those of the
+1024 x 768 times the scale, each shipped mechanism with balls, posts and plates on a table among 15
+pieces of clutter, two lamps, soft shadows, limb darkening, highlights, lens distortion, blur, gamma
+and noise, a new pose for every image and one scene for all images of a view. Times are those of the
 processor: "scene" once a view, "image" the median and "png" the mean of writing it; the last column
-counts all three, 15 images a view.
+counts all three, 15 images a view. In the end the memory that the process had at most is printed.
 """
 
 import argparse
+import resource
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -54,16 +57,23 @@ def seconds(action: Callable[[], object]) -> float:
     return time.process_time() - begin
 
 
-def measure(machine: Machine, n: int) -> str:
+def scaled(camera: Camera, scale: float) -> Camera:
+    """Return a camera with so many times the pixels in each row and column."""
+    K = camera.K * [[scale], [scale], [1.0]]
+    width, height = round(scale * camera.width), round(scale * camera.height)
+    return replace(camera, K=K, width=width, height=height)
+
+
+def measure(machine: Machine, n: int, camera: Camera, look: Appearance) -> str:
     """Return the times of a mechanism as a line of the table."""
     configurations: Array = random_configurations(machine, n, 1).configurations
     solids = dressed(machine)
     poses = [placed(solids, link_poses(machine, q)) for q in configurations]
     T = looking_at(poses[0])
-    prepare_view(poses[0], CAMERA, T, Appearance(), np.random.default_rng(0))  # loads and caches
+    prepare_view(poses[0], camera, T, look, np.random.default_rng(0))  # loads and caches
     rng = np.random.default_rng(0)
     begin = time.process_time()
-    scene = prepare_view(poses[0], CAMERA, T, Appearance(), rng)
+    scene = prepare_view(poses[0], camera, T, look, rng)
     preparing = time.process_time() - begin
     rendering, images = [], []
     for pose in poses:
@@ -82,14 +92,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("models", nargs="*", metavar="MODEL", help="shipped models; all of them")
     parser.add_argument("--images", type=int, default=15, help="photographs of each; 15")
+    parser.add_argument("--scale", type=float, default=1.0, help="of the size of pictures; 1")
+    parser.add_argument("--blur", type=float, default=Appearance().blur, help="of the lens [px]")
     options = parser.parse_args()
     if unknown := set(options.models) - set(shipped):
         parser.error(f"found {', '.join(sorted(unknown))}, needed some of {', '.join(shipped)}")
     if options.images < 1:
         parser.error(f"found {options.images} images, needed at least one")
     print(f"{'[ms]':16}{'solids':>6}{'scene':>9}{'image':>9}{'png':>9}{'images/s':>9}")
+    camera, look = scaled(CAMERA, options.scale), Appearance(blur=options.blur)
     for name in options.models or shipped:
-        print(f"{name:16}{measure(load_mechanism(name), options.images)}", flush=True)
+        line = measure(load_mechanism(name), options.images, camera, look)
+        print(f"{name:16}{line}", flush=True)
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    print(f"{camera.width} x {camera.height} px: at most {most:.1f} GB")
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ import legcal
 from legcal import planning
 from legcal.data import load_dataset
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
+from legcal.geometry import Array
 from legcal.machine import (
     ARM_KINDS,
     Cylinder,
@@ -277,12 +278,12 @@ def test_arms_that_are_cylinders_count_as_a_calibration_has_them(tmp_path: Path)
     shown = load_dataset(tmp_path / "shot").observations
     assert shown is not None
     keys = {key for key in shown.row_keys() if key[2].startswith("arm")}
-    row, told = 0, set()
+    row, planned = 0, set()
     for view in plan.views:
         of_view = view.seen.outlines(0.1, row + np.arange(len(view.poses.poses)))
-        told |= {key for key in of_view.row_keys() if key[2].startswith("arm")}
+        planned |= {key for key in of_view.row_keys() if key[2].startswith("arm")}
         row += len(view.poses.poses)
-    assert len(keys & told) >= 0.75 * max(len(keys), len(told))
+    assert len(keys & planned) >= 0.75 * max(len(keys), len(planned))
     found = legcal.calibrate(tmp_path / "shot", output=tmp_path / "out")
     stated = dict(
         zip(found.solution.estimates.names, found.solution.estimates.sigma.tolist(), strict=True)
@@ -297,6 +298,15 @@ def test_arms_that_are_cylinders_count_as_a_calibration_has_them(tmp_path: Path)
     assert plan.error is not None
     stated_error = found.platform.workspace.mean_displacement
     assert plan.error.mean_displacement == pytest.approx(stated_error, rel=0.15)
+
+
+def test_bias_of_single_outlines_in_a_result_counts_as_errors_at_places(tmp_path: Path) -> None:
+    """It does not fall with their length, and fits to few images cannot tell the two apart."""
+    noise, place = {"scale": 0.7, "bias_px": 0.05, "tilt_px": 0.01}, "tilt of an edge at a place"
+    for shared, places in (({}, (0.05, 0.01)), ({place: 0.02}, (0.05, 0.02))):
+        found = {"legcal_result": 1, "residuals": {"noise": noise, "shared_px": shared}}
+        (tmp_path / "result.json").write_text(json.dumps(found))
+        assert planning.read_noise(tmp_path).places_px == places
 
 
 def test_the_way_between_planned_poses_is_free(planned: planning.Plan) -> None:
@@ -460,13 +470,25 @@ def test_photographs_of_one_site_share_errors_at_its_places() -> None:
             is_fit=is_fit,
         )
 
-    found, fitted = contributions(0, 0, 0), contributions(0, 0, 0, is_fit=True)
-    J = fitted.rows.reshape(-1, len(fitted.names))
-    shared = fitted.shifts.reshape(len(J), -1)
-    information = J.T @ np.linalg.solve(np.eye(len(J)) + shared @ shared.T, J)
+    def least_squares(fitted: Contributions) -> Array:
+        """Return the information of generalised least squares."""
+        J = fitted.rows.reshape(-1, len(fitted.names))
+        shared = fitted.shifts.reshape(len(J), -1)
+        return np.asarray(J.T @ np.linalg.solve(np.eye(len(J)) + shared @ shared.T, J))
+
+    found, information = contributions(0, 0, 0), least_squares(contributions(0, 0, 0, is_fit=True))
     unit = np.sqrt(np.diagonal(information + found.prior))
     J = found.all_gains() / unit
     np.testing.assert_allclose(J.T @ J, information / unit / unit[:, None], atol=1e-9)
+
+    # A fit that knows nothing of them does worse than that, and than it would without them.
+    twice = contributions(*2 * [*range(6)], is_fit=True)
+    fit, best = Session([], [twice]), np.linalg.inv(least_squares(twice) + twice.prior)
+    sigma = np.sqrt(np.diagonal(fit.machine))
+    for least in (best[: fit.p, : fit.p], fit.machine):
+        worse = np.linalg.eigvalsh((fit.fitted() - least) / np.outer(sigma, sigma))
+        assert worse.min() > -1e-6
+        assert worse.max() > 0.1
 
     several = contributions(0, 5, 0, 5, 0)
     assert several.site.tolist() == [0, 1, 0, 1, 0]

@@ -70,10 +70,8 @@ class Session:
 
     def _update(self, slot: int, image: int, number: int, sign: float) -> None:
         """Add (+1) what an image adds as that many-th of its site, or take it away (-1)."""
-        U, place = (
-            self.slots[slot].gains(np.array([image]), np.array([number]))[0],
-            self.places[slot],
-        )
+        U = self.slots[slot].gains(np.array([image]), np.array([number]))[0]
+        place = self.places[slot]
         self.information[np.ix_(place, place)] += sign * (U.T @ U)
         K = U @ self.covariance[place]
         S = np.eye(len(U)) + sign * (K[:, place] @ U.T)
@@ -105,9 +103,12 @@ class Session:
         return own.gains(images, 1 + np.array(count))
 
     def fitted(self) -> Array:
-        """Return the covariance (p, p) of the machine by a fit that errors at places move."""
+        """Return the covariance (p, p) of the machine by a fit of the given images alone.
+
+        Errors at places move it.
+        """
         found = self.machine
-        for place, slot in zip(self.places, (*self.slots, *self.given), strict=True):
+        for place, slot in zip(self.places[len(self.slots) :], self.given, strict=True):
             moved = np.einsum("krm,krc->mc", slot.rows, slot.shifts)
             moved = self.covariance[: self.p, place] @ moved
             found = found + moved @ moved.T

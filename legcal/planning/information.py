@@ -167,7 +167,7 @@ class Predictor:
     ) -> Contributions:
         """Return what images add to the information.
 
-        With *is_fit* that of the fit, which takes errors at places for independent ones, and how
+        With *is_fit* that of a fit that weighs outlines as if they had no errors at places, and how
         these move it.
         """
         n, shown = len(poses), tuple(legs or self.legs.nominal)

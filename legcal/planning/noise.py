@@ -42,8 +42,8 @@ def _useless(path: Path, found: str) -> UsageError:
 
 def _of_result(found: dict[str, Any], file: Path) -> PredictedNoise:
     """Return the noise of a result: what its outlines claim, times what its residuals show."""
-    residuals = found["residuals"]
-    scale, common = float(residuals["noise"]["scale"]), residuals["shared_px"]
+    noise, common = found["residuals"]["noise"], found["residuals"]["shared_px"]
+    scale = float(noise["scale"])
     sigma, correlation = DEFAULT_NOISE.sigma_px, DEFAULT_NOISE.correlation
     table = file.parent / OBSERVATIONS_NAME
     if table.is_file():
@@ -57,7 +57,10 @@ def _of_result(found: dict[str, Any], file: Path) -> PredictedNoise:
             sigma = scale * float(np.median(np.sqrt(variance * length / 4.0)))
             correlation = float(np.median(s01 / variance))
     shared = tuple(float(common.get(kind, 0.0)) for kind in KINDS)
-    places = tuple(float(common.get(kind, 0.0)) for kind in PLACES)
+    # Errors at places are among those of single outlines, and few images show them as these alone.
+    of_edges = float(noise["bias_px"]), float(noise["tilt_px"])
+    at_places = (float(common.get(kind, 0.0)) for kind in PLACES)
+    places = tuple(max(both) for both in zip(of_edges, at_places, strict=True))
     gamma = 0.0 if not any(shared) else DEFAULT_NOISE.gamma_px
     return PredictedNoise(sigma, max(min(correlation, 0.9), -0.9), shared, places, gamma, str(file))
 

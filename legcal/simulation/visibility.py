@@ -374,7 +374,7 @@ def _sees_nothing(name: str, legs: Sequence[Leg], views: Sequence[Sequence[LegVi
         longest = max(leg.length_px for view in views for leg in view)
         return (
             f"{start} that legs are at most {longest:.1f} px long in them, needed "
-            f"{least_length(0.0):g} px of a tube or rod, and its width; move the camera "
+            f"{least_length(0.0):g} px of a tube or rod, and as much as its width; move the camera "
             "nearer (its place is in metres), or give it a longer focal length."
         )
     return (

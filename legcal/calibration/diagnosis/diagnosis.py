@@ -608,7 +608,7 @@ class _Look:
             self._at([k for k in self.some if tried[k].is_small], ())
         best = int(np.argmax(self.support))
         is_better = self.support[best] >= before + _MIN_GAIN * self.before.expected.sum()
-        if is_better and (T_best := self.cameras[best]) is not None:
+        if is_better and (T_best := self.cameras.get(best)) is not None:
             worse = [k for k in self.some if self.support[k] < _ALIKE * self.support[best]]
             self._at([k for k in worse if not tried[k].is_small], (), self.judge.alike(T_best))
         return self._gained()
