@@ -205,7 +205,7 @@ def test_order_does_not_matter(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["3-rpr-photographs", "3-upu-photographs"])
+@pytest.mark.parametrize("name", ["hexapod-photographs", "3-upu-photographs"])
 def test_cached_fresh_and_parallel_runs_agree(name: str, tmp_path: Path) -> None:
     folder = copy_of(name, tmp_path / "set")
     found = []

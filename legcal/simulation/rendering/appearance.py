@@ -89,7 +89,7 @@ class Appearance:
         Factor on all radiance before it saturates at full scale.
     blur : float
         Standard deviation of the lens's Gaussian blur [px]. Light is blurred before pixels count
-        it, in pictures of up to 8 megapixels, which below 1 px takes two to four times the time and
+        it, in pictures of up to 2 megapixels, which below 1 px takes two to four times the time and
         up to four times the memory.
     gamma : float
         Grey levels are radiance to the power 1 / gamma; 1 is linear.

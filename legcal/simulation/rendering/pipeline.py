@@ -27,7 +27,7 @@ _FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # for colours; grey levels are written
 _FIELD_LEVELS = 4  # of blur between the middle and the corners
 _CHANNELS = (-1.0, 0.0, 1.0)  # of chromatic aberration: blue, green, red
 _SAMPLED_BLUR = 1.0  # [px] from which on light that pixels have counted can be blurred
-_MOST_FINE = 2**25  # pixels of a finer picture, for memory
+_MOST_FINE = 2**23  # pixels of a finer picture, for memory
 
 
 @dataclass(frozen=True)
