@@ -24,7 +24,7 @@ from legcal.geometry.types import Array
 from legcal.machine import Machine, forward_kinematics
 from legcal.perception.detection import measure_outlines
 from legcal.perception.placement import Placement, Search
-from legcal.perception.recognition import recognise
+from legcal.perception.recognition import place_views
 from legcal.vision import Grey
 from legcal.vision.cylinder import EPSILON
 
@@ -134,7 +134,7 @@ def main() -> None:
     search, rows = Search(load, measurements, A, B, cylinders, wanted, names), np.arange(len(A))
     for words, hints in (("with", rough), ("without", [None] * len(rough))):
         start = time.perf_counter()
-        placed = recognise(search, rows, hints)
+        placed = place_views(search, rows, hints).recognised()
         print(f"recognition {words} rough camera poses: {time.perf_counter() - start:.2f} s")
     start = time.perf_counter()
     first, _ = measure_outlines(search, placed, rows.tolist())

@@ -39,7 +39,7 @@ from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pai
 from legcal.perception.detection import measure_outlines
 from legcal.perception.pair_matching import CameraPoses, Picture, Pictures, leg_segments
 from legcal.perception.placement import Placement, Search, group_views
-from legcal.perception.recognition import recognise
+from legcal.perception.recognition import place_views
 from legcal.perception.view_fit import refine_views
 from legcal.simulation import silhouette
 from legcal.simulation.visibility import field_of_view
@@ -72,7 +72,7 @@ def find(given: Given) -> Found:
     )  # fmt: skip
     begin = time.process_time()
     rows = np.arange(len(given.images))
-    found = recognise(search, rows, [None])
+    found = place_views(search, rows, [None]).recognised()
     middle = time.process_time()
     outlines, _ = measure_outlines(search, found, rows.tolist())
     groups = group_views(m, rows, [None], None)

@@ -600,7 +600,7 @@ def test_a_wrong_rough_pose_gives_way_to_a_better_one(monkeypatch: pytest.Monkey
         recognition.PlacedViews, "decided_by_outlines", lambda views, g: views.placed[g]
     )
     for hint in (T, turned):
-        placement = recognition.recognise(search, np.arange(4), [hint])
+        placement = recognition.place_views(search, np.arange(4), [hint]).recognised()
         placed = placement.T_base_camera[0]
         assert placed is not None
         assert lp.apart(T, placed)[1] < np.deg2rad(2.0)

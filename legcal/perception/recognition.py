@@ -58,19 +58,6 @@ POSE_JOINT_ERROR = 3e-3  # of the legs as a pose has them [m]
 SAME_PX, SAME_PART = 3.0, 0.7  # of outlines that two poses share: how near, how many of them
 
 
-def recognise(
-    search: Search,
-    rows: IntArray,
-    hints: Sequence[RigidTransform | None],
-    joined: Joined = None,
-    *,
-    progress: Callable[[int], None] | None = None,
-    run: Run = in_turn,
-) -> Placement:
-    """Find the cameras of all views and the legs in the images of rows, as :func:`place_views`."""
-    return place_views(search, rows, hints, joined, progress=progress, run=run).recognised(run)
-
-
 def place_views(
     search: Search,
     rows: IntArray,
