@@ -232,7 +232,7 @@ class Predictor:
             own = own @ tangent.Z
         U, s, _ = np.linalg.svd(own, full_matrices=False)
         U = U * (s > _RANK * s[:, :1])[:, None]
-        kept = kept - U @ (np.swapaxes(U, 1, 2) @ kept)
+        kept = _without(U, kept)
         at_site = np.zeros(kept.shape[:2])
         if not is_fit and np.any(self.noise.places_px):
             at_site, kept = _apart(kept, U, moved, np.array(is_outline))
@@ -250,7 +250,7 @@ class Predictor:
         whole = block_diag(untied.T @ prior[:k, :k] @ untied, prior[k:, k:])
         named = *(f"{KINEMATIC} {i}" for i in range(untied.shape[1])), *names[k:]
         if is_fit:
-            moved = moved - U @ (np.swapaxes(U, 1, 2) @ moved)
+            moved = _without(U, moved)
             return Contributions(named, rows, whole, basis, at_site, np.arange(n), moved)
         site = _sites(problem.outlines, n)
         return Contributions(named, rows, whole, basis, at_site, site, moved[..., :0])
@@ -261,11 +261,17 @@ class Predictor:
         By one standard deviation of each: of each place, or of bias and tilt of each outline alone.
         """
         o, sigma = problem.outlines, np.array(self.noise.places_px)
-        if not are_shared or not sigma.any():
-            alone = np.asarray(shifts_of_edges(len(o)) * sigma, dtype=np.float64)
-            return alone if sigma.any() else alone[..., :0]
+        if not sigma.any():
+            return np.zeros((len(o), 2, 0))
+        if not are_shared:
+            return np.asarray(shifts_of_edges(len(o)) * sigma, dtype=np.float64)
         shifts = shifts_at_places(o, np.ones(len(o), dtype=np.bool_))
         return np.asarray(shifts * np.repeat(sigma, shifts.shape[2] // len(sigma)))
+
+
+def _without(U: Array, X: Array) -> Array:
+    """Return columns X (n, r, c) without their parts along orthonormal ones (n, r, d), or zero."""
+    return X - U @ (np.swapaxes(U, 1, 2) @ X)
 
 
 def _apart(
@@ -279,8 +285,7 @@ def _apart(
     outline = (np.arange(len(is_outline)) - first) // 2  # of two rows each
     same = (outline[:, None] == outline) & is_outline & is_outline[:, None]
     shared = (moved @ np.swapaxes(moved, 1, 2)) * same
-    shared = shared - U @ (np.swapaxes(U, 1, 2) @ shared)
-    shared = shared - (shared @ U) @ np.swapaxes(U, 1, 2)
+    shared = _without(U, np.swapaxes(_without(U, shared), 1, 2))
     variances, turn = np.linalg.eigh(shared)
     return np.maximum(variances, 0.0), np.swapaxes(turn, 1, 2) @ kept
 
