@@ -2,7 +2,8 @@
 
     OMP_NUM_THREADS=1 python benchmarks/machine_kinds.py [KIND ...] [--runs 200] [--seed 0]
                          [--datasets 0] [--level axes|outlines|photographs] [--keep FOLDER]
-                         [--record FILE] [--wrong-reading MM] [--wrong-scale PERCENT]
+                         [--record FILE] [--radii PERCENT] [--wrong-reading MM]
+                         [--wrong-scale PERCENT]
 
 KIND: a table of ``machine_kinds.yaml`` (all of them without), which is a table of joints without
 version, name and unit (mm). Two things are asked:
@@ -17,7 +18,9 @@ version, name and unit (mm). Two things are asked:
   and after, how the latter compares with the predicted sigma, and the normalised squared error of
   the parameters (means over seeds); of photographs also how far used outlines lie inside of the
   true ones. Where motors do not determine the pose, cameras have hints, and
-  errors are those of the parameters in metres (root mean square).
+  errors are those of the parameters in metres (root mean square). Where motors turn, somebody
+  measures the distance of two joints on the base to 0.05 mm, or with ``--radii`` nothing but the
+  radius of each leg, to so many per cent.
 
 A mistake is made in the readings of each dataset by ``--wrong-reading`` (so much is added to one of
 them) and ``--wrong-scale`` (those of one motor are so much larger); row and motor are drawn by the
@@ -55,7 +58,7 @@ from legcal import LegcalError, calibrate, evaluate, load_mechanism
 from legcal.calibration import Calibration, Evaluation, Solution
 from legcal.data.outlines import read_observations
 from legcal.geometry import Array
-from legcal.machine import Machine, geometries, vector_of
+from legcal.machine import Machine, geometries, radius_name, vector_of
 from legcal.simulation import Level, SimulationSettings, failure_of, simulate
 from legcal.vision import EPSILON
 
@@ -154,8 +157,13 @@ def datasets(
     scratch: Path,
     added: float = 0.0,
     scale: float = 1.0,
+    radii: float = 0.0,
 ) -> str:
-    """Print a line a dataset, and return one on all that were calibrated."""
+    """Print a line a dataset, and return one on all that were calibrated.
+
+    *added* [m] and *scale* are of :func:`with_mistake`, and *radii* is what radii are stated to,
+    as a part of them, in place of a length; none if it is 0.
+    """
     machine = load_mechanism(kind) if kind in CARRIED else made(kind, scratch / "nominal")
     model, found, hints = machine.yaml_path, [], not machine.is_determined
     squared, inwards, n_trusted = list[float](), list[Array](), 0
@@ -168,7 +176,12 @@ def datasets(
                 simulate(model, folder, SimulationSettings(level=level, seed=seed, hints=hints))
             begin = time.perf_counter()
             truth = next((folder / "truth/models").glob("*.yaml"))
-            priors = measured_length(truth) if any(a.turns for a in machine.actuators) else []
+            priors = list[str]()
+            if any(actuator.turns for actuator in machine.actuators):
+                measured, rng = load_mechanism(truth), np.random.default_rng(seed)
+                priors = (
+                    stated_radii(measured, radii, rng) if radii else measured_length(measured, rng)
+                )
             read = folder
             if added or scale != 1.0:
                 read = with_mistake(folder, machine, seed, added, scale)
@@ -253,14 +266,23 @@ def normalised_error(nominal: Machine, calibrated: Path, truth: Path, solution: 
     return float(np.mean(along**2 / value[kept]))
 
 
-def measured_length(truth: Path) -> list[str]:
+def measured_length(truth: Machine, rng: np.random.Generator) -> list[str]:
     """Return the distance of two joints on the base as somebody measured it."""
-    machine = load_mechanism(truth)
-    one, other = (machine.A_base[j] for j in machine.frame_legs[:2])
-    names = [f"{machine.leg_names[j]}.base" for j in machine.frame_legs[:2]]
-    error = LENGTH_SIGMA * float(np.random.default_rng(len(str(truth))).normal())
-    length = 1e3 * float(np.linalg.norm(one - other)) + error
+    legs = truth.frame_legs[:2]
+    one, other = truth.A_base[list(legs)]
+    names = [f"{truth.leg_names[j]}.base" for j in legs]
+    length = 1e3 * float(np.linalg.norm(one - other)) + LENGTH_SIGMA * float(rng.normal())
     return [f"{':'.join(names)}={length:.4f}+-{LENGTH_SIGMA}mm"]
+
+
+def stated_radii(truth: Machine, sigma: float, rng: np.random.Generator) -> list[str]:
+    """Return the radii of all legs as somebody measured them; *sigma* is a part of each."""
+    return [
+        f"{radius_name(leg.name, part)}={1e3 * radius * (1.0 + sigma * float(rng.normal())):.4f}"
+        f"+-{1e3 * sigma * radius:.4f}mm"
+        for leg in truth.legs
+        for part, radius in leg.radius_of_part.items()
+    ]
 
 
 def _in_metres(found: Evaluation) -> float:
@@ -288,6 +310,7 @@ def main() -> None:
     parser.add_argument("--level", type=Level, default=Level.OUTLINES, choices=list(Level))
     parser.add_argument("--keep", type=Path, help="folder that keeps datasets for the next run")
     parser.add_argument("--record", type=Path, help="JSON lines of sessions, to go on from later")
+    parser.add_argument("--radii", type=float, default=0.0, help="[%%] stated; none, but a length")
     parser.add_argument("--wrong-reading", type=float, default=0.0, help="[mm] in one; none")
     parser.add_argument("--wrong-scale", type=float, default=0.0, help="[%%] of a motor; none")
     options = parser.parse_args()
@@ -305,7 +328,10 @@ def main() -> None:
             scratch = options.keep or Path(temporary)
             scratch.mkdir(parents=True, exist_ok=True)
             mistake = 1e-3 * options.wrong_reading, 1.0 + 0.01 * options.wrong_scale
-            summary = [datasets(kind, options.level, seeds, scratch, *mistake) for kind in chosen]
+            radii = 0.01 * options.radii
+            summary = [
+                datasets(kind, options.level, seeds, scratch, *mistake, radii) for kind in chosen
+            ]
         print(*summary, sep="\n")
 
 
