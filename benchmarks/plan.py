@@ -123,6 +123,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=0, help="calibrations from outlines")
     parser.add_argument("--rendered", type=int, default=0, help="calibrations from photographs")
     parser.add_argument("--encoder-sigma", help="of motors that turn: 0.5deg")
+    parser.add_argument("--keep", type=Path, help="folder that keeps photographs and results")
     parser.add_argument("--record", type=Path)
     args = parser.parse_args()
     for name in args.machines:
@@ -201,9 +202,10 @@ def compared(name: str, machine: Machine, args: argparse.Namespace) -> dict[str,
                 machine, white, Path(folder) / "white", Level.OUTLINES, args.first, args.runs
             )
         if args.rendered:
-            write_session(plan, Path(folder) / "plan")
+            planned_in = (args.keep or Path(folder)) / name / "plan"
+            write_session(plan, planned_in)
             found["photographs"] = shot(
-                machine, plan, Path(folder) / "plan", Level.PHOTOGRAPHS, args.first, args.rendered
+                machine, plan, planned_in, Level.PHOTOGRAPHS, args.first, args.rendered
             )
     return found
 
@@ -222,7 +224,8 @@ def shot(
     if plan.sigma_by_joint:
         angles = Spread(min(plan.sigma_by_joint.values()), Distribution.NORMAL)
     for seed in range(first, first + runs):
-        folder, out = session.parent / f"shot{seed}", session.parent / f"out{seed}"
+        folder = session.parent / f"shot{seed}"
+        out = session.parent / f"{folder.name}-result"
         try:
             settings = SimulationSettings(
                 plan=session, level=level, seed=seed, lengths=lengths, angles=angles

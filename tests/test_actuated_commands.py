@@ -76,7 +76,9 @@ def test_commands_know_that_joints_at_A_move(
             for leg in nominal.legs
             for part, r in leg.radius_of_part.items()
         }
-        rows = {row["parameter"]: row for row in calibrate(session, priors=stated).table()}
+        by_radii = calibrate(session, priors=stated)
+        assert "largest part of that is the scale of the machine" in by_radii.verdict.sentence
+        rows = {row["parameter"]: row for row in by_radii.table()}
         sigma = rows["leg1.length"]["sigma"] / rows["leg1.length"]["calibrated"]
         assert sigma > 0.1 / 20.0  # edges that all lie 0.1 px inwards, of rods up to 40 px wide
     inspected = said("inspect", name)

@@ -19,7 +19,7 @@ from simulated import settings, small_camera
 import legcal
 from legcal.calibration import build_fit, refine
 from legcal.calibration.joint_fit import free_poses
-from legcal.calibration.joint_fit.diagnostics import naming_missing_lengths
+from legcal.calibration.joint_fit.scale import naming_missing_lengths
 from legcal.data import Measurements, View
 from legcal.errors import LegcalError, NotIdentifiable, UsageError
 from legcal.geometry import Array, look_at

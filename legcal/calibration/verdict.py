@@ -11,6 +11,7 @@ from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit import (
     FOUND_CAMERA,
+    SCALE,
     HeldOut,
     PlatformAccuracy,
     Solution,
@@ -58,12 +59,16 @@ def judge(
         solution.T_Rb_Re,
         solution.sensitivities,
     )
+    remedy = "take more images or better ones"
     if platform is None:
         change, sigma, found = _change_of_parameters(dataset, solution)
     else:
         change, sigma, found = _change_of_platform(platform)
+        if by_scale := _share_of_scale(platform):
+            found += f"; {by_scale}"
+            remedy = "measure the distance of two joints and state it (--length)"
     objection = _objection(dataset, solution, diagnosis, found)
-    verdict = Verdict(False, objection) if objection else _verdict(change, sigma, found)
+    verdict = Verdict(False, objection) if objection else _verdict(change, sigma, found, remedy)
     return Calibration(
         dataset,
         solution,
@@ -136,6 +141,18 @@ def _change_of_platform(platform: PlatformAccuracy) -> tuple[float, float, str]:
     return change.mean_displacement, known_to, found
 
 
+def _share_of_scale(platform: PlatformAccuracy) -> str:
+    """Return a clause on the scale where it is the largest part of the predicted error, or ""."""
+    predicted = (platform.workspace or platform.sigma).mean_displacement
+    parts = [e.error.mean_displacement for e in platform.effects if e.what == SCALE]
+    if not parts or 2.0 * parts[0] ** 2 < predicted**2:
+        return ""
+    return (
+        f"the largest part of that is the scale of the machine ({1e3 * parts[0]:.3f} of "
+        f"{1e3 * predicted:.3f} mm over the workspace), which radii alone say"
+    )
+
+
 def _change_of_parameters(dataset: Dataset, solution: Solution) -> tuple[float, float, str]:
     """Return the change of joints and lengths, its uncertainty, rms [m], and a clause of both."""
     known = known_parameters(
@@ -156,12 +173,12 @@ def _change_of_parameters(dataset: Dataset, solution: Solution) -> tuple[float, 
     return change, sigma, clause
 
 
-def _verdict(improvement: float, sigma: float, found: str) -> Verdict:
+def _verdict(improvement: float, sigma: float, found: str, remedy: str) -> Verdict:
     """Return what an improvement with a standard deviation is worth."""
     if improvement > TRUSTED_SIGMAS * sigma:
         return Verdict(True, f"Calibrated: {found}.")
     return Verdict(
         False,
         f"{_DO_NOT_LOAD}: {found}, and a predicted improvement below two sigma is no improvement; "
-        "take more images or better ones.",
+        f"{remedy}.",
     )

@@ -17,6 +17,7 @@ that reject outlines and estimate their noise, checks of the result, its assembl
 ``rounds``            rejection of outliers and estimation of noise
 ``outlier_readings``  wrong readings of redundant motors: found and left out
 ``diagnostics``       stated priors and fixed values against the measurements
+``scale``             what says how large a machine is: a measured length, or radii alone
 ``sensitivity``       errors of what counts as known; focal lengths tested
 ``held_out``          what a fit predicts of images that were not fitted
 ``platform``          what a fit means at the platform

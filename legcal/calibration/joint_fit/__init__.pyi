@@ -32,6 +32,7 @@ from .problem import FitProblem as FitProblem
 from .problem import arm_sigmas as arm_sigmas
 from .problem import build_fit as build_fit
 from .rounds import DISAGREES as DISAGREES
+from .scale import SCALE as SCALE
 from .sensitivity import FOUND_CAMERA as FOUND_CAMERA
 from .sensitivity import Sensitivity as Sensitivity
 from .solution import Estimates as Estimates

@@ -62,10 +62,8 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
     unseen = [name for name, row in zip(names, information, strict=True) if not np.any(row)]
     scaled = unit[:, None] * information * unit
     value, vector = np.linalg.eigh(0.5 * (scaled + scaled.T))
-    n_open, n_poor = (
-        int(np.sum(value * (sigma * length) ** 2 < 1.0)) for sigma in (_MAX_SIGMA, _HELD_SIGMA)
-    )
-    basis, poor = vector[:, :n_open].T, vector[:, :n_poor].T
+    basis = vector[:, _are_open(value, vector, length)].T
+    poor = vector[:, value * (_HELD_SIGMA * length) ** 2 < 1.0].T
     if len(poor) == 0:
         return HeldDirections(np.zeros((0, problem.n_named)), every_unit)
     others = np.flatnonzero((basis[:, problem.n_kinematic :] ** 2).sum(axis=1) > _MAX_OTHERS**2)
@@ -119,9 +117,10 @@ def refuse_undetermined_inliers(
     scaled = unit[:, None] * marginal(named_information(problem, state, normal), kept) * unit
     N = null_space(basis) if len(basis) else np.eye(len(kept))
     value, vector = np.linalg.eigh(N.T @ scaled @ N)
-    if value[0] * (_MAX_SIGMA * state.mean_length) ** 2 < 1.0:
+    vector = N @ vector
+    if len(opened := np.flatnonzero(_are_open(value, vector, state.mean_length))):
         names = [problem.named[i] for i in kept]
-        words = _in_words(names, N @ vector[:, 0], problem.legs.names)
+        words = _in_words(names, vector[:, opened[0]], problem.legs.names)
         if accepted.all():
             raise NotIdentifiable(
                 f"The fit is not determined: found that its measurements leave {words} open where "
@@ -132,6 +131,16 @@ def refuse_undetermined_inliers(
             f"The fit is not determined: found that the outlines which agree with it leave {words} "
             "open, needed what the rejected ones showed; correct these, or add images."
         )
+
+
+def _are_open(information: Array, direction: Array, length: float) -> BoolArray:
+    """Say which directions (n, k) leave one of the parameters open by a tenth of a leg.
+
+    *information* (k,) is that of each, which has unit length. A scale that is known to a per cent
+    or two moves many parameters, each of them little.
+    """
+    most = _MAX_SIGMA * length / np.abs(direction).max(axis=0)
+    return np.asarray(information * most**2 < 1.0)
 
 
 def held_at_nominal(

@@ -6,8 +6,7 @@ parameter; a fixed value by a wider fit in which it is free.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,10 +33,8 @@ from legcal.estimation import (
 )
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
-    Actuator,
     Leg,
     actuators_of,
-    kind_of_parameter,
     list_in_words,
     owner_of_parameter,
     radius_name,
@@ -60,8 +57,7 @@ _MOST_REJECTED = 0.5  # of those of a leg or a view
 # most of 204 arms that are cylinders in benchmarks/arm_misfits.py), and [px]
 ARM_MISFIT, _ARM_MISFIT_PX = 2.0, 0.03
 _MIN_COUNT = 3  # rejected outlines of a leg or a view, at least, before it is noted
-_RADIUS_SIGMAS = 3.0  # between radii and the model's, of whose prior nobody said a word
-_RADIUS_SPREAD = 0.25  # of their common difference
+RADIUS_SIGMAS = 3.0  # between radii and the model's, of whose prior nobody said a word
 _MAX_NAMES = 4  # names, before they are only counted
 
 
@@ -423,7 +419,7 @@ def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
     )
     stated = [
         name
-        for name in _stated(problem)
+        for name in stated_parameters(problem)
         if any(owner_of_parameter(end, problem.legs.names) in legs for end in name.split(":"))
     ]
     if stated:
@@ -533,25 +529,6 @@ def reversed_motors(problem: FitProblem, state: State) -> tuple[str, ...]:
     )
 
 
-def scale_notes(problem: FitProblem, state: State) -> tuple[str, ...]:
-    """Return a note where all radii come out larger or smaller than the model's by one factor."""
-    free = problem.block("radii").unknown[:, 0] >= 0
-    nominal = np.array([problem.legs.radii[part] for part in problem.outlines.parts])
-    change = (state.radii / nominal - 1.0)[free]
-    if len(change) < _MIN_COUNT:
-        return ()
-    common = float(np.median(change))
-    alike = bool(np.all(np.abs(change - common) < _RADIUS_SPREAD * abs(common)))
-    if not alike or abs(common) < _RADIUS_SIGMAS * problem.settings.radius_sigma:
-        return ()
-    way = "smaller" if common < 0.0 else "larger"
-    return (
-        f"All radii come out {1e2 * abs(common):.0f} % {way} than the model's, so that everything "
-        f"may be that much {way} than it is; check the unit and the scale of the encoders, or the "
-        "radii of the model.",
-    )
-
-
 def contradicted_radii(problem: FitProblem, state: State, normal: NormalEquations) -> list[str]:
     """Return a note on the radii of the model that the measurements contradict.
 
@@ -566,7 +543,7 @@ def contradicted_radii(problem: FitProblem, state: State, normal: NormalEquation
         if name not in radii or name in problem.choices.priors:
             continue
         found = estimate_without_prior(problem, state, normal, i, mean, sigma)
-        if found is not None and found.apart > _RADIUS_SIGMAS:
+        if found is not None and found.apart > RADIUS_SIGMAS:
             said.append(
                 f"{name} {1e3 * found.value:.2f} mm against {1e3 * mean:.2f} +- {1e3 * sigma:.2f} "
                 f"mm ({found.apart:.0f} standard deviations)"
@@ -575,13 +552,13 @@ def contradicted_radii(problem: FitProblem, state: State, normal: NormalEquation
         return []
     return [
         f"The measurements contradict radii of the model: found {'; '.join(said)}, needed at most "
-        f"{_RADIUS_SIGMAS:g} standard deviations; measure these parts and correct the model."
+        f"{RADIUS_SIGMAS:g} standard deviations; measure these parts and correct the model."
     ]
 
 
 def naming_stated_values(problem: FitProblem, failure: LegcalError) -> LegcalError:
     """Return a failure that names first the stated values, if there are any."""
-    stated = _stated(problem)
+    stated = stated_parameters(problem)
     if not stated:
         return failure
     return DidNotConverge(
@@ -594,44 +571,7 @@ def naming_stated_values(problem: FitProblem, failure: LegcalError) -> LegcalErr
     )
 
 
-@contextmanager
-def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
-    """Say first, where a fit fails, that radii alone say how large its machine is, if they do."""
-    try:
-        yield
-    except (DidNotConverge, NotIdentifiable) as failure:
-        stated = {kind_of_parameter(name) for name in _stated(problem) if ":" not in name}
-        measured = len(problem.readings) + sum(map(len, problem.boards))
-        rails = problem.observed.actuator_readings.sigma[
-            [not actuator.turns for actuator in _of_readings(problem)]
-        ]
-        is_length = any(":" in name for name in problem.choices.priors)
-        if measured or len(rails) or is_length or stated & {"base", "platform", "offset", "length"}:
-            raise
-        raise type(failure)(
-            [
-                "The joint fit could not be made: found no measured length, neither a reading of a "
-                "leg nor a board, so that radii alone say how large the machine is, and hardly "
-                "where its platform joints are; "
-                + (
-                    "measure a distance of two joints and state it (--length), or put a "
-                    "calibration board on the base."
-                    if problem.legs.n_actuators
-                    else "put a calibration board on the platform and one on the base, give a leg "
-                    "an encoder, or state measured coordinates of joints (--prior)."
-                ),
-                *failure.problems,
-            ]
-        ) from None
-
-
-def _of_readings(problem: FitProblem) -> list[Actuator]:
-    """Return the actuator of each of their readings."""
-    actuators = actuators_of(problem.legs.nominal)
-    return [actuators[a] for a in problem.observed.actuator_readings.actuator.tolist()]
-
-
-def _stated(problem: FitProblem) -> list[str]:
+def stated_parameters(problem: FitProblem) -> list[str]:
     """Return the parameters with a stated prior or value; not twists about nominal ones."""
     legs = problem.legs
     nominal = zip(legs.parametrization.names, legs.vector(legs.nominal).tolist(), strict=True)

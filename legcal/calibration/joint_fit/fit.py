@@ -18,7 +18,6 @@ from legcal.calibration.joint_fit.determinacy import (
 )
 from legcal.calibration.joint_fit.diagnostics import (
     arms_of_other_widths,
-    naming_missing_lengths,
     naming_stated_values,
     refuse_contradicted_priors,
     refuse_contradicted_values,
@@ -38,6 +37,7 @@ from legcal.calibration.joint_fit.outline_errors import NoiseModel, noise_of_the
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.rounds import first_minimum, fit_in_rounds
+from legcal.calibration.joint_fit.scale import naming_missing_lengths
 from legcal.calibration.joint_fit.solution import Solution, assemble_solution
 from legcal.calibration.joint_fit.variables import (
     DEFAULT_SETTINGS,

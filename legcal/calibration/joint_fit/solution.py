@@ -18,7 +18,6 @@ from legcal.calibration.joint_fit.diagnostics import (
     legs_left_out,
     rejected_notes,
     reversed_motors,
-    scale_notes,
 )
 from legcal.calibration.joint_fit.free_poses import of_determined_poses
 from legcal.calibration.joint_fit.held_out import Posterior
@@ -36,6 +35,7 @@ from legcal.calibration.joint_fit.outline_errors import (
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_reasons
+from legcal.calibration.joint_fit.scale import scale_notes, sensitivity_to_scale
 from legcal.calibration.joint_fit.sensitivity import (
     CameraResiduals,
     Sensitivity,
@@ -272,7 +272,10 @@ def assemble_solution(
             if len(corners)
         },
         gammas=gammas,
-        sensitivities=sensitivities(cameras, normal, doubts.tested),
+        sensitivities=(
+            *sensitivities(cameras, normal, doubts.tested),
+            *sensitivity_to_scale(problem, state, kept),
+        ),
         outlines=_with_rejections(outlines, fit),
         start=label,
         iterations=fit.minimum.iterations,

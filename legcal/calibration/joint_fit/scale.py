@@ -1,0 +1,106 @@
+"""What says how large a machine is: a measured length, or radii alone.
+
+Encoders of arms know angles, and passive legs have none: without a measured length such a machine,
+twice as large with rods twice as thick and cameras twice as far, gives the same measurements.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from legcal.calibration.joint_fit.diagnostics import RADIUS_SIGMAS, stated_parameters
+from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.sensitivity import Sensitivity
+from legcal.calibration.joint_fit.variables import State
+from legcal.errors import DidNotConverge, NotIdentifiable
+from legcal.geometry import Array
+from legcal.machine import LegColumns, actuators_of, kind_of_parameter
+
+SCALE = "the scale, which radii alone say, by one standard deviation"
+_FEWEST = 3  # radii
+_SPREAD = 0.25  # of their common difference
+_LENGTHS = {"base", "platform", "offset", "length"}  # kinds of parameters that say how large it is
+
+
+def has_length(problem: FitProblem) -> bool:
+    """Say whether something measured is a length: a reading, a board or what was stated."""
+    actuators = actuators_of(problem.legs.nominal)
+    read = problem.observed.actuator_readings.actuator.tolist()
+    stated = {kind_of_parameter(name) for name in stated_parameters(problem) if ":" not in name}
+    return (
+        len(problem.readings) > 0
+        or any(len(corners) for corners in problem.boards)
+        or any(not actuators[a].turns for a in read)
+        or any(":" in name for name in problem.choices.priors)
+        or bool(stated & _LENGTHS)
+    )
+
+
+@contextmanager
+def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
+    """Say first, where a fit fails, that radii alone say how large its machine is, if they do."""
+    try:
+        yield
+    except (DidNotConverge, NotIdentifiable) as failure:
+        if has_length(problem):
+            raise
+        raise type(failure)(
+            [
+                "The joint fit could not be made: found no measured length, neither a reading of a "
+                "leg nor a board, so that radii alone say how large the machine is, and hardly "
+                "where its platform joints are; "
+                + (
+                    "measure a distance of two joints and state it (--length), or put a "
+                    "calibration board on the base."
+                    if problem.legs.n_actuators
+                    else "put a calibration board on the platform and one on the base, give a leg "
+                    "an encoder, or state measured coordinates of joints (--prior)."
+                ),
+                *failure.problems,
+            ]
+        ) from None
+
+
+def sensitivity_to_scale(
+    problem: FitProblem, state: State, covariance: Array
+) -> tuple[Sensitivity, ...]:
+    """Return how parameters change with the scale, one standard deviation, if radii alone say it.
+
+    *covariance* is that of the kept unknowns. The scale is the mean length of the rods, over what
+    it is: what it explains of the covariance is what one measured length would take away.
+    """
+    every = problem.legs.parametrization
+    column = every.place[:, LegColumns.LENGTH]
+    rods = np.flatnonzero(column >= 0)
+    if not len(rods) or has_length(problem):
+        return ()
+    by_scale = np.zeros(len(every))
+    by_scale[column[rods]] = 1.0 / (len(rods) * np.array([state.legs[j].q0 for j in rods]))
+    n = problem.n_kinematic
+    by_scale = by_scale[problem.free]
+    moved = covariance[:n, :n] @ by_scale
+    step = np.zeros((len(every), 1))
+    step[problem.free, 0] = moved / np.sqrt(by_scale @ moved)
+    return (Sensitivity(SCALE, step),)
+
+
+def scale_notes(problem: FitProblem, state: State) -> tuple[str, ...]:
+    """Return a note where all radii come out larger or smaller than the model's by one factor."""
+    free = problem.block("radii").unknown[:, 0] >= 0
+    nominal = np.array([problem.legs.radii[part] for part in problem.outlines.parts])
+    change = (state.radii / nominal - 1.0)[free]
+    if len(change) < _FEWEST:
+        return ()
+    common = float(np.median(change))
+    alike = bool(np.all(np.abs(change - common) < _SPREAD * abs(common)))
+    if not alike or abs(common) < RADIUS_SIGMAS * problem.settings.radius_sigma:
+        return ()
+    way = "smaller" if common < 0.0 else "larger"
+    return (
+        f"All radii come out {1e2 * abs(common):.0f} % {way} than the model's, so that everything "
+        f"may be that much {way} than it is; check the unit and the scale of the encoders, or the "
+        "radii of the model.",
+    )
