@@ -62,6 +62,7 @@ from legcal.calibration.joint_fit.outline_errors import (
     EstimatedGamma,
     NoiseModel,
     estimated_biases,
+    sigmas_at_places,
 )
 from legcal.calibration.joint_fit.rounds import (
     NO_CHANGES,
@@ -382,6 +383,17 @@ def test_errors_that_come_back_with_a_place_widen_the_covariance() -> None:
         found_px.append(found.quality.shared_px[PLACES[0]])
     assert 0.7 < np.mean(normalised) < 1.2
     assert np.mean(found_px) == pytest.approx(sigma, rel=0.3)
+
+
+def test_errors_at_places_count_where_residuals_hardly_show_them() -> None:
+    """Each is a third of what a place could tell; residuals often say nothing of them."""
+    sigma, rng, n_places, found = 0.02, np.random.default_rng(0), 40, []
+    K = np.diag(np.full(2 * n_places, (0.58 / sigma) ** 2))
+    for _ in range(100):
+        b = sigma * rng.standard_normal(len(K))
+        found.append(sigmas_at_places(K @ b + np.sqrt(K) @ rng.standard_normal(len(K)), K) ** 2)
+    assert np.min(found) > 0.0
+    assert np.sqrt(np.mean(found)) == pytest.approx(sigma, rel=0.2)
 
 
 def test_edges_that_lie_inwards_together_are_noted(session: HexapodSession) -> None:

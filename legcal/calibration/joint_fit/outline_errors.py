@@ -487,13 +487,12 @@ def shifts_of_edges(n: int) -> Array:
 def sigmas_at_places(z: Array, K: Array) -> Array:
     """Return the standard deviations (2,) of bias and tilt at places, as they are expected [px].
 
-    Zero where residuals show none. *z* (c,) and *K* (c, c) are scores of those of
-    :func:`shifts_at_places`, and their covariance.
+    Not those that are most likely, which are often zero where there are some: poses and cameras
+    follow much of such errors, and residuals say little of them. *z* (c,) and *K* (c, c) are scores
+    of those of :func:`shifts_at_places`, and their covariance.
     """
     effects = Effects(z, K, np.repeat(np.arange(len(PLACES)), len(z) // len(PLACES)))
-    likeliest, _ = estimate_variances(effects, _MIN_BIAS_GAIN)
-    if not likeliest.any():
-        return np.zeros(len(PLACES))
+    likeliest, _ = estimate_variances(effects, 0.0)
     return np.asarray(np.sqrt(expected_variances(effects, likeliest, range(len(PLACES)))))
 
 
