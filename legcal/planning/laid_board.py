@@ -14,13 +14,12 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array, BoolArray, normal_basis
 from legcal.machine import Machine
-from legcal.planning.sight import Bodies, behind_plate
+from legcal.planning.sight import NEAREST, Bodies, behind_plate
 from legcal.vision import Board, Camera, dictionary, facing_board, in_picture, rays_past_axes
 
 _SIDES = 4  # directions beside the machine
 _DISTANCE = 1.05  # half diagonals of the board beyond the base joints
 _MIN_COSINE = 0.45  # between the normal of the print and the line of sight
-_NEAREST = 0.1  # [m] before the camera
 _MODULE_PX = 2.0  # of a module of a marker, across which it looks narrowest
 _MODULES = 6.0  # that a square without a marker counts as
 _FRAME = {"charuco": 2, "aprilgrid": 4}  # modules of the black frame of a marker, both sides
@@ -59,7 +58,7 @@ class LaidBoard:
         normal = self.T_base_board.rotation.as_matrix()[:, 2] * self.board.towards_viewer
         sight = eye - outer
         cosine = sight @ normal / np.linalg.norm(sight, axis=1)
-        if cosine.min() < _MIN_COSINE or not in_picture(camera, P, _NEAREST, margin_px).all():
+        if cosine.min() < _MIN_COSINE or not in_picture(camera, P, NEAREST, margin_px).all():
             return np.zeros(n, dtype=np.bool_)
         if is_read and self._narrowest(camera.project(P)) < _MODULE_PX:
             return np.zeros(n, dtype=np.bool_)

@@ -171,18 +171,24 @@ def places_around(
     for lift in _LIFTS if machine.spatial else _LIFTS_PLANAR:
         for turn in np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False):
             found += places_along(direction_above(up, turn, lift), up, points, camera, setting)
+    start = f"{machine.yaml_path}: no camera could be placed: found"
+    if not found:
+        size = float(np.linalg.norm(np.ptp(points, axis=0)))
+        raise NotVisible(
+            f"{start} no place up to {_DISTANCES[-1] * size:.1f} m around the machine that has all "
+            f"of it in the picture, tripods set to {1e2 * setting.shift:g} cm and "
+            f"{np.degrees(setting.turn):g} deg, needed one; use a camera with a wider view, or "
+            "correct the focal length in its file, or name --places."
+        )
     inside = [place for place in found if place.is_inside(bounds)]
     if not inside:
-        near = min(float(np.linalg.norm(p.T_base_camera.translation)) for p in found or [_NOWHERE])
+        near = min(float(np.linalg.norm(p.T_base_camera.translation)) for p in found)
         raise NotVisible(
-            f"{machine.yaml_path}: no camera could be placed: found none of {len(found)} places "
-            f"around the machine inside --bounds, needed one; the nearest that shows all legs "
-            f"stands {near:.2f} m from the base: give wider bounds or a camera with a wider view."
+            f"{start} none of {len(found)} places around the machine inside --bounds, needed one; "
+            f"the nearest that shows all legs stands {near:.2f} m from the base: give wider bounds "
+            "or a camera with a wider view."
         )
     return inside
-
-
-_NOWHERE = Place(RigidTransform.identity())
 
 
 def places_along(

@@ -35,9 +35,9 @@ from legcal.planning.places import (
 )
 from legcal.planning.planned_session import Plan, PlannedView
 from legcal.planning.poses import candidate_poses, drawn_legs, poses_near, some_of
-from legcal.planning.sight import Bodies, Seen, what_is_seen
+from legcal.planning.sight import NEAREST, Bodies, Seen, what_is_seen
 from legcal.progress import Report, no_progress
-from legcal.vision import Board
+from legcal.vision import Board, in_picture, least_length
 from legcal.workers import Run, in_turn
 
 MIN_POSES, POSES_EACH, MOST_POSES = 20, 6, 320  # candidates, by images
@@ -314,18 +314,57 @@ def _probed(
             found.append((place, contributions))
         progress("Camera places", k + 1, len(places))
     needed = 1 if scene.task.hand_held else scene.task.n_views
-    board, another = "", ""
-    if scene.task.board is not None:
-        board, another = " and the board", ", more pixels or a board of larger squares"
     if not found or (scene.task.places and len(found) < needed):
-        raise NotVisible(
-            f"{machine.yaml_path}: no session could be planned: found {len(found)} of "
-            f"{len(places)} camera places that see legs{board} wherever the tripod is set within "
-            f"{1e2 * scene.task.setting.shift:g} cm and "
-            f"{np.degrees(scene.task.setting.turn):g} deg, needed {needed}; move the places "
-            f"further away or turn them to the machine, or use a camera with a wider view{another}."
-        )
+        used = {id(place) for place, _ in found}
+        blind = [place for place in places if id(place) not in used]
+        raise NotVisible(_unseen(scene, blind, len(places), needed, in_Rb))
     return found
+
+
+_REMEDIES = {
+    "elsewhere": "turn {} to the machine, or move further away",
+    "near": "move {} further away, or use a camera with a wider view",
+    "far": "move {} nearer, or use a camera with a longer focal length or more pixels",
+    "hidden": "move {} to where no plate or other leg is in front of the legs",
+}
+
+
+def _unseen(
+    scene: Scene,
+    blind: Sequence[Place],
+    n_places: int,
+    needed: int,
+    poses: Sequence[RigidTransform],
+) -> str:
+    """Return that too few places see legs, and the remedy for what most of the others lack."""
+    setting, board, another = scene.task.setting, "", ""
+    if scene.task.board is not None:
+        board, another = " and the board", ", or use a board of larger squares"
+    causes = [_why_unseen(scene, place.T_base_camera, poses) for place in blind]
+    remedy = _REMEDIES[max(_REMEDIES, key=causes.count)]
+    names = ", ".join(place.name for place in blind if place.name)
+    return (
+        f"{scene.task.machine.yaml_path}: no session could be planned: found "
+        f"{n_places - len(blind)} of {n_places} camera places that see legs{board} wherever the "
+        f"tripod is set within {1e2 * setting.shift:g} cm and {np.degrees(setting.turn):g} deg, "
+        f"needed {needed}; {remedy.format(names or 'the places')}{another}."
+    )
+
+
+def _why_unseen(scene: Scene, T: RigidTransform, poses: Sequence[RigidTransform]) -> str:
+    """Return why a camera sees no legs at poses T_Rb_Re, a key of the remedies."""
+    camera = scene.task.predictor.camera
+    bodies = Bodies.at(scene.task.machine, scene.legs, poses).before(T)
+    points = np.concatenate([bodies.A, bodies.B]).reshape(-1, 3)
+    if not in_picture(camera, points, NEAREST).any():
+        return "elsewhere"
+    nearest = float(points[:, 2].min())
+    if nearest > NEAREST:
+        stretch = camera.project(bodies.A) - camera.project(bodies.B)
+        if np.linalg.norm(stretch, axis=-1).max() < least_length(0.0):
+            return "far"
+    margin = scene.task.setting.margin(camera, max(nearest, NEAREST))
+    return "hidden" if in_picture(camera, points, NEAREST, margin).all() else "near"
 
 
 def choose_places(
@@ -482,9 +521,9 @@ class _Search:
         )
         needed = f"at least {n}" if more.value < most else "more places"
         raise NotIdentifiable(
-            f"{task.machine.yaml_path}: no session could be planned: found that {task.n_images} "
-            f"images from {places} tell less of the machine than its model does, needed {needed}; "
-            f"{remedy}."
+            f"{task.machine.yaml_path}: no session could be planned: found {task.n_images} "
+            f"image{'s' * (task.n_images != 1)} from {places}, not enough to know the machine "
+            f"better than its model does, needed {needed}; {remedy}."
         )
 
     def better_places(
