@@ -353,7 +353,9 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"cameras": 0}, UsageError, "--cameras 0"),
     ({"criterion": "best"}, UsageError, "mean, worst, d, parameters"),
     ({"criterion": "d", "target": 1e-4}, UsageError, "leave out --criterion"),
-    ({"target": -1.0}, UsageError, "0 to 1 m"),
+    ({"target": 0.0}, UsageError, "more than 0"),
+    ({"seed": -1}, UsageError, "--seed"),
+    ({"parameters": ["leg2.base.x"]}, UsageError, "--criterion parameters"),
     ({"hand_held": True, "cameras": None}, UsageError, "--board"),
     ({"hand_held": True, "board": "chessboard:9x6:25mm", "cameras": 2}, UsageError, "--cameras"),
     ({"board": "chessboard:7x5:25mm"}, DatasetError, "after half a turn"),
@@ -513,8 +515,15 @@ def test_what_else_is_in_the_way_is_refused(
             legcal.plan(**(of | asked))
 
     away = {"xyz": [0.0, 0.0, 3.0], "quat_xyzw": [0.0, 0.0, 0.0, 1.0]}
-    (tmp_path / "away.yaml").write_text(yaml.safe_dump({"places": {"a": away}}))
-    refused(NotVisible, "0 of 1 camera places", places=tmp_path / "away.yaml")
+    for place, remedy in (
+        ({"xyz": [0.0, 90.0, 90.0]}, "move a nearer"),
+        ({"xyz": [0.0, 0.0, 0.2]}, "move a further away"),
+        (away, "0 of 1 camera places .* turn a to the machine"),
+    ):
+        (tmp_path / "away.yaml").write_text(yaml.safe_dump({"places": {"a": place}}))
+        refused(NotVisible, remedy, places=tmp_path / "away.yaml")
+    telephoto = replace(sample_camera(), K=sample_camera().K * [[50.0], [50.0], [1.0]])
+    refused(NotVisible, "wider view, or correct the focal length", camera=telephoto)
     refused(UsageError, "found 1 places for 2", places=tmp_path / "away.yaml", cameras=2)
     refused(NotVisible, "use another board", board="charuco:7x5:4mm:3mm:DICT_4X4_50",
             places=places(tmp_path))  # fmt: skip
