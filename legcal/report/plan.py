@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,9 @@ PLACES, GROWTH, CHECKLIST, PAGE_NAME = "places.svg", "growth.svg", "checklist.tx
 _CAMERA_COLOUR, _BOARD_COLOUR = "#b45309", "#15803d"
 _WORST = 12  # parameters that are told
 _PANEL = (6.0, 5.6)  # [inch]
+_WIDTH = 9.0  # [inch] of the picture of places
+_MOST_NAMES = 4  # of joints or cameras near each other
+_ROOM = 0.1  # of its width, around what it shows
 
 
 def plan_table(plan: Plan, output: Path | None) -> RenderableType:
@@ -222,13 +225,16 @@ def _draw_places(plan: Plan) -> Figure:
     machine = plan.machine
     B = np.asarray(machine.home.apply(machine.B_platform))
     A = B - vectors_A_to_B(machine, machine.home)
-    with new_figure(2, 2, _PANEL) as (figure, axes):
+    with new_figure(2, 1, (_WIDTH, _WIDTH)) as (figure, axes):
         for ax, (i, j), title in zip(
             axes, ((0, 1), (0, 2)), ("from above: x, y [mm]", "from the side: x, z [mm]"),
             strict=True,
         ):  # fmt: skip
             _draw_panel(ax, plan, A, B, i, j)
             ax.set_title(title, fontsize="medium")
+        heights = [_WIDTH * np.ptp(ax.get_ylim()) / np.ptp(ax.get_xlim()) + 0.6 for ax in axes]
+        axes[0].get_gridspec().set_height_ratios(heights)  # type: ignore[union-attr]
+        figure.set_size_inches(_WIDTH, sum(heights))
     return figure
 
 
@@ -236,37 +242,62 @@ def _draw_panel(ax: Axes, plan: Plan, A: Array, B: Array, i: int, j: int) -> Non
     """Draw one panel: coordinates i and j."""
     for a, b in zip(1e3 * A, 1e3 * B, strict=True):
         ax.plot([a[i], b[i]], [a[j], b[j]], color=LEG_COLOUR, linewidth=2.0)
-    for letter, joints, colour in (("A", A, BASE_COLOUR), ("B", B, PLATFORM_COLOUR)):
+    for joints, colour in ((A, BASE_COLOUR), (B, PLATFORM_COLOUR)):
         ax.scatter(1e3 * joints[:, i], 1e3 * joints[:, j], s=16.0, color=colour, zorder=3)
-        for k, joint in enumerate(1e3 * joints):
-            if letter == "A":
-                ax.annotate(f"A{k + 1}", (joint[i], joint[j]), (5.0, 5.0), color=colour,
-                            textcoords="offset points", fontsize="small")  # fmt: skip
     if plan.board is not None:
         outer = 1e3 * plan.board.corners[[0, 1, 2, 3, 0]]
         ax.plot(outer[:, i], outer[:, j], color=_BOARD_COLOUR, linewidth=1.5)
         ax.annotate("board", (outer[0, i], outer[0, j]), (3.0, 3.0), color=_BOARD_COLOUR,
                     textcoords="offset points", fontsize="small")  # fmt: skip
-    for n, view in enumerate(plan.views):
+    for view in plan.views:
         where = 1e3 * view.T_base_camera.translation
         sight = view.T_base_camera.rotation.as_matrix()[:, 2]
         tip = where + 250.0 * sight
         arrow = {"arrowstyle": "->", "color": _CAMERA_COLOUR}
         ax.annotate("", (tip[i], tip[j]), (where[i], where[j]), arrowprops=arrow)
         ax.scatter(where[i], where[j], marker="s", s=40.0, color=_CAMERA_COLOUR, zorder=4)
-        ax.annotate(
-            plain(view.name), (where[i], where[j]), (7.0, -16.0 if n % 2 else 7.0),
-            color=_CAMERA_COLOUR, textcoords="offset points",
-        )  # fmt: skip
         if (i, j) == (0, 1) and not plan.hand_held:
             _draw_distances(ax, where, 1e3 * _measured_joints(plan))
     ax.set_aspect("equal")
-    ax.margins(0.15)
+    ax.margins(0.0)
+    room = _ROOM * float(np.ptp(ax.get_xlim()))
+    joints_of_base = [f"A{k + 1}" for k in range(len(A))]
+    for name, at in _together(joints_of_base, 1e3 * A[:, [i, j]], 0.4 * room):
+        ax.annotate(name, at, (5.0, 5.0), color=BASE_COLOUR, textcoords="offset points",
+                    fontsize="small")  # fmt: skip
+    lenses = 1e3 * np.array([view.T_base_camera.translation for view in plan.views])
+    for n, (name, at) in enumerate(
+        _together([view.name for view in plan.views], lenses[:, [i, j]], 0.2 * room)
+    ):
+        ax.annotate(name, at, (7.0, -16.0 if n % 2 else 7.0), color=_CAMERA_COLOUR,
+                    textcoords="offset points")  # fmt: skip
+    for limits, put in ((ax.get_xlim(), ax.set_xlim), (ax.get_ylim(), ax.set_ylim)):
+        put(limits[0] - room, limits[1] + room)
     ax.grid(alpha=0.2)
 
 
+def _together(
+    names: Sequence[str], points: Array, near: float
+) -> list[tuple[str, tuple[float, float]]]:
+    """Return names of points (n, 2), in one text for those near each other, and where it stands."""
+    groups: list[list[int]] = []
+    for k in range(len(points)):
+        beside = [g for g in groups if np.linalg.norm(points[g] - points[k], axis=1).min() < near]
+        groups = [g for g in groups if g not in beside]
+        groups.append(sorted([k, *(i for g in beside for i in g)]))
+    found = []
+    for group in groups:
+        of_group = [names[k] for k in group]
+        if len(group) > _MOST_NAMES:
+            of_group = [of_group[0], "...", of_group[-1]]
+        x, y = points[group[int(np.argmax(points[group, 0]))]].tolist()
+        found.append((plain(", ".join(of_group)), (x, y)))
+    return found
+
+
 def _draw_distances(ax: Axes, lens: Array, joints: Array) -> None:
-    """Draw from above how far a lens is from joints, each distance along its line [mm]."""
+    """Draw from above how far a lens is from joints (rings), each distance along its line [mm]."""
+    ax.scatter(joints[:, 0], joints[:, 1], s=70.0, facecolors="none", edgecolors=_CAMERA_COLOUR)
     for part, joint in zip(np.linspace(0.2, 0.6, len(joints)), joints, strict=True):
         ax.plot([lens[0], joint[0]], [lens[1], joint[1]], color=_CAMERA_COLOUR,
                 linewidth=0.6, linestyle=":")  # fmt: skip
