@@ -212,7 +212,10 @@ def test_a_session_by_hand_is_shot_with_its_board_where_the_plan_lays_it(
         setting=FEW, places=tmp_path / "high.yaml",
     )  # fmt: skip
     assert held.board is not None
+    held = replace(held, views=(*held.views[:3], replace(held.views[3], via=("2",))))
     planning.write_session(held, tmp_path / "session")
+    (*_, last) = read_rows(tmp_path / "session" / "poses.csv")
+    assert (last["pose"], last["on the way"]) == (held.views[3].name, held.views[1].name)
     settings = SimulationSettings(plan=tmp_path / "session", level=Level.OUTLINES)
     simulate(load_mechanism("3-rpr"), tmp_path / "shot", settings)
     shot = load_dataset(tmp_path / "shot")
@@ -309,21 +312,35 @@ def test_bias_of_single_outlines_in_a_result_counts_as_errors_at_places(tmp_path
         assert planning.read_noise(tmp_path).places_px == places
 
 
+def test_cameras_of_a_machine_that_hangs_stand_upright(small_search: None) -> None:
+    """A tripod stands on the ground, whichever way the platform is."""
+    places = planner._places(
+        Task(
+            planning.Predictor(load_mechanism("delta"), sample_camera(), planning.WHITE, 1e-6), 6, 1
+        ),
+        random_configurations(load_mechanism("delta"), 4, np.random.default_rng(0)),
+    )
+    below = [place.T_base_camera.translation[2] < -0.5 for place in places]
+    assert any(below)
+    assert all(place.T_base_camera.rotation.as_matrix()[2, 1] < 0.0 for place in places)
+
+
 def test_the_way_between_planned_poses_is_free(planned: planning.Plan) -> None:
     machine = planned.machine
     feasibility, columns = Feasibility(machine), slider_columns(machine, machine.motors)[0]
-    for view in planned.views:
-        stations = [machine.home_configuration, *view.poses.configurations]
-        for k, via in enumerate(view.via):
-            stops = [stations[k]]
-            if via:
-                stops.append(stations[0 if via == "home" else int(via)])
-            stops.append(stations[k + 1])
-            for here, there in pairwise(stops):
-                for part in np.linspace(0.1, 1.0, 10):
-                    q = here[columns] + part * (there - here)[columns]
-                    at = follow(machine, here, q)
-                    assert feasibility.problem(at, of_motors=False) is None
+    stations = [machine.home_configuration]
+    for view in planned.views:  # one after the other, without a way home between them
+        stations += [*view.poses.configurations]
+    for k, via in enumerate([via for view in planned.views for via in view.via]):
+        stops = [stations[k]]
+        if via:
+            stops.append(stations[0 if via == "home" else int(via)])
+        stops.append(stations[k + 1])
+        for here, there in pairwise(stops):
+            for part in np.linspace(0.1, 1.0, 10):
+                q = here[columns] + part * (there - here)[columns]
+                at = follow(machine, here, q)
+                assert feasibility.problem(at, of_motors=False) is None
 
 
 def test_updates_of_the_covariance_are_those_of_the_information(planned: planning.Plan) -> None:

@@ -2,7 +2,8 @@
 
 A tripod is set to 5 cm and 5 deg, so a place counts with a margin in the picture
 (:class:`Setting`): from where it stands the joints of all poses are in the picture even if it is
-set that much wrongly, or, nearer, most of them.
+set that much wrongly, or, nearer, most of them. Pictures are upright where z of the base link
+points up, also of machines that hang: a tripod stands on the ground.
 """
 
 from __future__ import annotations
@@ -142,7 +143,7 @@ def read_places(path: Path, machine: Machine) -> list[Place]:
     for name, place in entry.places.items():
         position = np.array(place.xyz)
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        T = look_at(position, middle, up=machine.upward)
+        T = look_at(position, middle)
         if place.quat_xyzw is not None:
             turned = Rotation.from_quat(place.quat_xyzw)
             T = RigidTransform.from_components(position, turned)
@@ -170,7 +171,7 @@ def places_around(
     up, found = machine.upward, []
     for lift in _LIFTS if machine.spatial else _LIFTS_PLANAR:
         for turn in np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False):
-            found += places_along(direction_above(up, turn, lift), up, points, camera, setting)
+            found += places_along(direction_above(up, turn, lift), points, camera, setting)
     start = f"{machine.yaml_path}: no camera could be placed: found"
     if not found:
         size = float(np.linalg.norm(np.ptp(points, axis=0)))
@@ -191,9 +192,7 @@ def places_around(
     return inside
 
 
-def places_along(
-    toward: Array, up: Array, points: Array, camera: Camera, setting: Setting
-) -> list[Place]:
+def places_along(toward: Array, points: Array, camera: Camera, setting: Setting) -> list[Place]:
     """Return the places in a direction from where all, or most, points are in the picture."""
     target = 0.5 * (points.min(axis=0) + points.max(axis=0))
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
@@ -202,11 +201,11 @@ def places_along(
         nearest = distance - reach
         if nearest < _CLEARANCE * size:
             continue
-        T = look_at(target + distance * toward, target, up=up)
+        T = look_at(target + distance * toward, target)
         P = T.inv().apply(points)
         if in_picture(camera, P, 0.0, setting.margin(camera, nearest)).all():
             return [
-                Place(look_at(target + d * toward, target, up=up))
+                Place(look_at(target + d * toward, target))
                 for d in distance * np.array(_NEARER)
                 if d - reach >= _CLEARANCE * size
             ]
@@ -236,13 +235,13 @@ def _coordinate(text: str) -> float:
     return -size if text.startswith("-") else size
 
 
-def near(place: Place, target: Array, up: Array, step: float, rng: np.random.Generator) -> Place:
+def near(place: Place, target: Array, step: float, rng: np.random.Generator) -> Place:
     """Return a place that stands a little elsewhere and looks at the machine."""
     if place.fixed:
         return place
     position = place.T_base_camera.translation
     away = np.linalg.norm(position - target)
-    return Place(look_at(position + step * away * rng.normal(size=3), target, up=up))
+    return Place(look_at(position + step * away * rng.normal(size=3), target))
 
 
 def all_points(machine: Machine, poses: Sequence[RigidTransform]) -> Array:

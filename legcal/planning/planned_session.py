@@ -31,13 +31,20 @@ class PlannedView:
     name: str
     T_base_camera: RigidTransform
     poses: Configurations  # in the order in which they are to be taken
-    via: tuple[str, ...]  # where to go before each pose: "" straight there, else home or a pose
+    via: tuple[str, ...]  # where to go before each pose: "" straight there, home, or the number
+    # of an earlier pose of the session, from 1
     seen: Seen  # of the nominal machine, from the very place
 
     @property
     def shows(self) -> BoolArray:
         """Which legs each image shows, (n_images, n_legs)."""
         return self.seen.legs_in(len(self.poses.poses), self.poses.readings.shape[1])
+
+
+def pose_labels(n_images: int) -> list[str]:
+    """Return the labels of the poses of a session, in the order in which they are taken."""
+    width = max(2, len(str(n_images)))
+    return [f"p{k + 1:0{width}d}" for k in range(n_images)]
 
 
 @brief

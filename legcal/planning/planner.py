@@ -33,7 +33,7 @@ from legcal.planning.places import (
     near,
     places_around,
 )
-from legcal.planning.planned_session import Plan, PlannedView
+from legcal.planning.planned_session import Plan, PlannedView, pose_labels
 from legcal.planning.poses import candidate_poses, drawn_legs, poses_near, some_of
 from legcal.planning.sight import NEAREST, Bodies, Seen, what_is_seen
 from legcal.progress import Report, no_progress
@@ -274,7 +274,7 @@ def _with_laid_board(task: Task, poses: Configurations) -> Task:
         away = np.array([T.translation - middle for T in places])
         away = np.unique((away / np.linalg.norm(away, axis=1)[:, None]).round(6), axis=0)
         away *= FAR * float(np.linalg.norm(np.ptp(points, axis=0)))
-        places = [look_at(middle + step, middle, up=task.machine.upward) for step in away]
+        places = [look_at(middle + step, middle) for step in away]
     best, most = task, 0.0
     for laid in lying(task.board, task.machine):
         trial = replace(task, laid=laid)
@@ -536,8 +536,7 @@ class _Search:
             for _ in range(0 if own.place.fixed else N_NEAR_PLACES):
                 if self.stop():
                     break
-                up = self.task.machine.upward
-                place = near(current[v].place, target, up, PLACE_STEP * step, self.rng)
+                place = near(current[v].place, target, PLACE_STEP * step, self.rng)
                 trial = replace(own, place=place)
                 found = self.scene.of(trial) if place.is_inside(self.task.bounds) else None
                 if found is None or self.scene.showing(trial) is not trial:
@@ -574,15 +573,18 @@ class _Search:
         task, predictor, machine = self.task, self.task.predictor, self.task.machine
         found = self.added(current)
         covariance = self._expected_covariance(current)
-        views, blocked = [], 0
+        ordered, begin = list[Configurations](), machine.home_configuration
         for own in current:
-            order = in_short_order(machine, own.poses)
-            poses = some_of(own.poses, order)
-            via, missing = ways(machine, poses)
-            blocked += missing
+            ordered.append(some_of(own.poses, in_short_order(machine, own.poses, begin)))
+            begin = ordered[-1].configurations[-1]
+        via, blocked = ways(machine, np.concatenate([poses.configurations for poses in ordered]))
+        views, done = [], 0
+        for own, poses in zip(current, ordered, strict=True):
+            of_view = via[done : done + len(poses.poses)]
+            done += len(poses.poses)
             T, in_Rb = own.place.T_base_camera, platforms_in_base(machine, poses.poses)
             seen = self.scene.seen(T, in_Rb, surely=False)
-            views.append(PlannedView(own.place.name, T, poses, via, seen))
+            views.append(PlannedView(own.place.name, T, poses, of_view, seen))
         notes = []
         if blocked:
             notes.append(
@@ -637,19 +639,17 @@ class _Search:
 
 
 def _named(views: Sequence[PlannedView], task: Task) -> tuple[PlannedView, ...]:
-    """Return views with the names of their places, or new ones in turn; hand-held ones by image."""
+    """Return views with the names of their places, or new ones in turn; hand-held ones by pose."""
     if task.hand_held:
         views = [
             replace(
-                view,
-                poses=some_of(view.poses, [k]),
-                via=(view.via[k],),
-                seen=view.seen.only(k),
-                name="",
+                view, poses=some_of(view.poses, [k]), via=(view.via[k],), seen=view.seen.only(k)
             )
             for view in views
             for k in range(len(view.poses.poses))
         ]
+        labels = pose_labels(len(views))
+        return tuple(replace(view, name=own) for view, own in zip(views, labels, strict=True))
     taken = {one.place.name for one in task.given}
     free = (f"c{k}" for k in range(1, 10**6) if f"c{k}" not in taken)
     return tuple(view if view.name else replace(view, name=next(free)) for view in views)
