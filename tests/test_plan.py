@@ -196,6 +196,9 @@ def test_a_better_known_machine_is_what_more_images_and_a_given_session_make(
     assert more.error is not None
     assert planned.error is not None
     assert more.error.mean_displacement < planned.error.mean_displacement
+    assert f"2 photographs beside those of {shot / 'session'}" in more.sentence
+    assert any("6 of 6 photographs" in note for note in more.notes)
+    assert not {*more.labels} & {*planned.labels}  # poses are others
     (view,) = more.views  # a tripod of the list, as the others are called c1 and c2
     k = int(view.name[1:])
     np.testing.assert_allclose(view.T_base_camera.translation, [np.cos(k), np.sin(k), 1.4])

@@ -87,6 +87,11 @@ class Task:
         """The nominal model."""
         return self.predictor.machine
 
+    @property
+    def n_given(self) -> int:
+        """Number of images that were shot already."""
+        return sum(len(one.poses.poses) for one in self.given)
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -614,6 +619,7 @@ class _Search:
             board=task.laid,
             hand_held=task.hand_held,
             given=task.given_name,
+            n_given=task.n_given,
             notes=tuple(notes),
         )
 
@@ -648,7 +654,7 @@ def _named(views: Sequence[PlannedView], task: Task) -> tuple[PlannedView, ...]:
             for view in views
             for k in range(len(view.poses.poses))
         ]
-        labels = pose_labels(len(views))
+        labels = pose_labels(len(views), task.n_given)
         return tuple(replace(view, name=own) for view, own in zip(views, labels, strict=True))
     taken = {one.place.name for one in task.given}
     free = (f"c{k}" for k in range(1, 10**6) if f"c{k}" not in taken)

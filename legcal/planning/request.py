@@ -182,7 +182,7 @@ def plan(
             found = plan_session(task, report, stop, run)
         else:
             found = _fewest(task, target, report, stop, run)
-        return replace(found, notes=(*found.notes, *counted, *run.notes))
+        return replace(found, notes=(*found.notes, *counted, *_to_come(shot), *run.notes))
 
 
 def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[str, ...]]:
@@ -371,6 +371,21 @@ def _on_base(board: str | Path | Board) -> Board:
 def _shot(folder: Path) -> Dataset:
     """Return a dataset, whose images are not looked at."""
     return load_dataset(folder, check_images=False)
+
+
+def _to_come(shot: Dataset | None) -> tuple[str, ...]:
+    """Return a note on photographs of a given dataset that are not there."""
+    if shot is None or shot.observations is not None:
+        return ()
+    n = shot.measurements.n_rows
+    paths = [shot.image_path(row) for row in range(n)]
+    missing = sum(path is not None and not path.is_file() for path in paths)
+    if not missing:
+        return ()
+    return (
+        f"{missing} of {n} photographs of {shot.folder} are not there: the plan counts on them as "
+        "if they were.",
+    )
 
 
 def difference(machine: Machine, other: Machine) -> str:

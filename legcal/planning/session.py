@@ -31,7 +31,7 @@ from legcal.files import (
 from legcal.geometry import roll_pitch_yaw
 from legcal.machine import DATASET_YAML, write_model
 from legcal.planning.order import HOME
-from legcal.planning.planned_session import Plan, pose_labels
+from legcal.planning.planned_session import Plan
 from legcal.vision import board_document, camera_info
 
 CAMERA, MEASUREMENTS = "camera_info.yaml", "measurements.csv"
@@ -91,7 +91,7 @@ def images_of(plan: Plan) -> list[tuple[str, str, str, int, int]]:
 
     All images of a camera in the hand are of one view.
     """
-    labels = pose_labels(plan.n_images)
+    labels = plan.labels
     found: list[tuple[str, str, str, int, int]] = []
     for v, view in enumerate(plan.views):
         name = HAND if plan.hand_held else view.name
@@ -152,7 +152,7 @@ def _measurements(plan: Plan) -> str:
 
 def _poses(plan: Plan) -> str:
     """Return ``poses.csv``."""
-    motors, rows, labels = list(plan.machine.motors), [], pose_labels(plan.n_images)
+    motors, rows, labels = list(plan.machine.motors), [], plan.labels
     shown = [SHOWN_IN[plan.machine.legs[j].reading_unit] for j in motors]
     scale = np.array([size for size, _ in shown])
     for name, image, label, v, k in images_of(plan):

@@ -81,9 +81,21 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
         [plan.sentence, *map(printable, plan.notes)],
         [] if output is None else [
             printable(f"written: {output}"),
-            printable(f"calibrate with: legcal calibrate {output} -o OUT{_with_length(plan)}"),
+            *([printable(_to_be_added(plan))] if plan.given else []),
+            printable(
+                f"calibrate with: legcal calibrate {plan.given or output} -o "
+                f"OUT{_with_length(plan)}"
+            ),
         ],
     )  # fmt: skip
+
+
+def _to_be_added(plan: Plan) -> str:
+    """Return what becomes of a session that adds to another one."""
+    return (
+        "once it is shot, copy the photographs, the views in dataset.yaml and the rows of "
+        f"measurements.csv into {plan.given}"
+    )
 
 
 def _with_length(plan: Plan) -> str:
@@ -170,6 +182,8 @@ with {plan.camera.width} x {plan.camera.height} px and a focal length of \
         "Wait until it rests; write what the encoders say, not the command, into measurements.csv.",
         "Save each photograph under its name in measurements.csv.",
     ]
+    if plan.given:
+        items.append(f"In the end, {_to_be_added(plan).removeprefix('once it is shot, ')}.")
     if plan.board is not None:
         items.insert(1, _board_in_words(plan, plan.board))
     return items
