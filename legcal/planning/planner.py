@@ -18,6 +18,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration import poses_at_readings
 from legcal.errors import NotIdentifiable, NotVisible
+from legcal.files import SHOWN_IN
 from legcal.geometry import Array, BoolArray, look_at
 from legcal.machine import Configurations, Leg, Machine, platforms_in_base
 from legcal.planning.exchange import Chosen, Criterion, Session, choose, exchange
@@ -599,6 +600,11 @@ class _Search:
         if task.goal in (Goal.MEAN, Goal.WORST) and not machine.is_determined:
             notes.append(f"Readings do not give the pose: {machine.undetermined}.")
         parametrization = predictor.legs.parametrization
+        sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+        for name in task.named:
+            i = parametrization.names.index(name)
+            size, unit = SHOWN_IN[parametrization.units[i]]
+            notes.append(f"{name}: {size * sigma[i]:.4f} {unit} expected (1 sigma).")
         return Plan(
             machine=machine,
             camera=predictor.camera,
@@ -610,7 +616,7 @@ class _Search:
             views=_named(views, task),
             value=value,
             error=None if self.work is None else self.work.error(covariance),
-            sigma=np.sqrt(np.maximum(np.diagonal(covariance), 0.0)),
+            sigma=sigma,
             names=parametrization.names,
             units=parametrization.units,
             growth=self._growth(found),

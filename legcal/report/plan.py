@@ -30,6 +30,8 @@ PLACES, GROWTH, CHECKLIST, PAGE_NAME = "places.svg", "growth.svg", "checklist.tx
 _CAMERA_COLOUR, _BOARD_COLOUR = "#b45309", "#15803d"
 _WORST = 12  # parameters that are told
 _PANEL = (6.0, 5.6)  # [inch]
+_LEAST = 6  # images, from which errors are drawn: fewer know next to nothing
+_FEW_TICKS = 5.0  # times the least error, up to which ticks are not those of decades
 _WIDTH = 9.0  # [inch] of the picture of places
 _MOST_NAMES = 4  # of joints or cameras near each other
 _ROOM = 0.1  # of its width, around what it shows
@@ -326,10 +328,11 @@ def _draw_distances(ax: Axes, lens: Array, joints: Array) -> None:
 def _draw_growth(plan: Plan) -> Figure:
     """Return a figure of what is expected over the number of images."""
     planned = plan.growth[:, 0] <= plan.n_images
-    known = np.isfinite(plan.growth[:, 1]) & (plan.growth[:, 0] >= min(6, plan.n_images))
+    least = 1 if plan.given else min(_LEAST, plan.n_images)
+    known = np.isfinite(plan.growth[:, 1]) & (plan.growth[:, 0] >= least)
     scale, unit = _scaled(plan, 1.0)
     what = f"expected, {plan.goal.value}" if unit == "mm" else f"criterion: {plan.goal.value}"
-    from matplotlib.ticker import LogLocator, NullFormatter
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
     with new_figure(1, 1, _PANEL) as (figure, (ax,)):
         for chosen, style, label in (
@@ -346,6 +349,9 @@ def _draw_growth(plan: Plan) -> Figure:
             axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axis.set_major_formatter("{x:g}")
             axis.set_minor_formatter(NullFormatter())
+        drawn = plan.growth[known, 1]
+        if drawn.max() < _FEW_TICKS * drawn.min():
+            ax.yaxis.set_major_locator(MaxNLocator(6))
         ax.set_xlabel("images")
         ax.set_ylabel(f"{what} [{unit}]")
         ax.grid(which="both", alpha=0.2)
