@@ -315,6 +315,19 @@ def test_bias_of_single_outlines_in_a_result_counts_as_errors_at_places(tmp_path
         assert planning.read_noise(tmp_path).places_px == places
 
 
+def test_a_box_between_the_places_around_a_machine_is_used(small_search: None) -> None:
+    """From where a machine is shown as well, wherever that is."""
+    predictor = planning.Predictor(load_mechanism("hexapod"), sample_camera(), planning.WHITE, 1e-6)
+    poses = random_configurations(predictor.machine, 4, np.random.default_rng(0))
+    around = [p.T_base_camera.translation for p in planner._places(Task(predictor, 6, 1), poses)]
+    middle = np.mean(around[:2], axis=0)  # one nearer than the other
+    box = middle[:, None] + [-0.01, 0.01]
+    assert not any(np.all((where > box[:, 0]) & (where < box[:, 1])) for where in around)
+    places = planner._places(Task(predictor, 6, 1, bounds=box), poses)
+    assert places
+    assert all(place.is_inside(box) for place in places)
+
+
 def test_cameras_of_a_machine_that_hangs_stand_upright(small_search: None) -> None:
     """A tripod stands on the ground, whichever way the platform is."""
     places = planner._places(
