@@ -106,6 +106,9 @@ def test_a_planned_session_is_a_dataset_and_simulation_shoots_it(
     readings = np.array([inverse_kinematics(machine, T) for T in poses])
     motors = list(machine.motors)
     assert np.abs(readings - m.q)[:, motors].max() < 1e-9
+    with pytest.raises(DatasetError, match="none of the 6") as refusal:
+        load_dataset(shot / "session")  # before its photographs are taken
+    assert len(refusal.value.problems) == 1
     taken = load_dataset(shot / "shot").measurements
     assert np.abs(taken.q - m.q)[:, motors].max() < 2e-5  # encoders err
     assert taken.view.tolist() == m.view.tolist()
