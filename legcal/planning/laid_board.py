@@ -1,8 +1,9 @@
 """Where a calibration board lies on the base, and which images show it.
 
-It lies flat at the level of the base joints, in their middle or beside them, its print up: there
-most places see it. An image shows it if all of its corners are in the picture, seen from above by
-enough and large enough to be read, and behind no leg, no arm and not the plate of the platform.
+It lies flat at the level of the base joints, in their middle or beside them, its print to the
+platform: there most places see it. An image shows it if all of its corners are in the picture, seen
+from before it by enough and large enough to be read, and behind no leg, no arm and not the plate of
+the platform.
 """
 
 from __future__ import annotations
@@ -33,6 +34,12 @@ class LaidBoard:
     T_base_board: RigidTransform
 
     @property
+    def normal(self) -> Array:
+        """Where the print looks in the base link, (3,)."""
+        z = self.T_base_board.rotation.as_matrix()[:, 2]
+        return np.asarray(z * self.board.towards_viewer)
+
+    @property
     def corners(self) -> Array:
         """The outer corners of the print in the base link, (4, 3) [m]."""
         return np.asarray(self.T_base_board.apply(self.board.extent))
@@ -55,9 +62,8 @@ class LaidBoard:
         n = len(bodies.B)
         outer, eye = self.corners, T_base_camera.translation
         P = T_base_camera.inv().apply(outer)
-        normal = self.T_base_board.rotation.as_matrix()[:, 2] * self.board.towards_viewer
         sight = eye - outer
-        cosine = sight @ normal / np.linalg.norm(sight, axis=1)
+        cosine = sight @ self.normal / np.linalg.norm(sight, axis=1)
         if cosine.min() < _MIN_COSINE or not in_picture(camera, P, NEAREST, margin_px).all():
             return np.zeros(n, dtype=np.bool_)
         if is_read and self._narrowest(camera.project(P)) < _MODULE_PX:

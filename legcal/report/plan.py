@@ -196,13 +196,14 @@ def _board_in_words(plan: Plan, board: LaidBoard) -> str:
     A = _measured_joints(plan)
     far = 1e3 * np.linalg.norm(A - board.middle, axis=1)
     x, y, z = 1e3 * board.middle
+    facing = "up" if board.normal[2] > 0.0 else "down"  # of a machine that hangs
     joints = ", ".join(
         f"{d:.0f} mm from A{j + 1}" for d, j in zip(far, _measured(plan), strict=True)
     )
     return (
-        "Fix the board to the base, flat at the level of its joints, print up, as places.svg shows "
-        f"it: its middle about {joints}, at x {x:z.0f}, y {y:z.0f}, z {z:z.0f} mm in the base "
-        "link. It must not move, and be whole in every image."
+        f"Fix the board to the base, flat at the level of its joints, print {facing}, as "
+        f"places.svg shows it: its middle about {joints}, at x {x:z.0f}, y {y:z.0f}, z {z:z.0f} mm "
+        "in the base link. It must not move, and be whole in every image."
     )
 
 
