@@ -217,8 +217,8 @@ def test_a_session_by_hand_is_shot_with_its_board_where_the_plan_lays_it(
         "3-rpr", images=4, board="chessboard:6x5:40mm", hand_held=True, noise=planning.WHITE,
         setting=FEW, places=tmp_path / "high.yaml",
     )  # fmt: skip
-    assert held.board is not None
     held = replace(held, views=(*held.views[:3], replace(held.views[3], via=("2",))))
+    assert held.board is not None
     planning.write_session(held, tmp_path / "session")
     (*_, last) = read_rows(tmp_path / "session" / "poses.csv")
     assert (last["pose"], last["on the way"]) == (held.views[3].name, held.views[1].name)
