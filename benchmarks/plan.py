@@ -75,7 +75,7 @@ def random_session(
     while len(places) < n_views:
         turn = first + 2.0 * np.pi * (len(places) + rng.uniform(-0.3, 0.3)) / n_views
         toward = direction_above(up, turn, rng.uniform(*_LIFTS[machine.spatial]))
-        places += places_along(toward, up, points, camera, task.setting)[:1]
+        places += places_along(toward, points, camera, task.setting)[:1]
     parts = np.array_split(np.arange(n_images), n_views)
     return [
         Candidates(place, poses_at(machine, [poses.configurations[k] for k in part]))

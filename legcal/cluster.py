@@ -15,6 +15,7 @@ import logging
 import os
 import pickle
 import platform
+import re
 import time
 import warnings
 from collections import OrderedDict, deque
@@ -37,6 +38,7 @@ from legcal.version import __version__
 CONNECTING = 10.0  # [s] in which a scheduler must answer and have a worker
 _CHECKING = 1.0  # [s] between two looks at the workers
 _NO_WORKER = 60.0  # [s] without any worker until work is given up: they may be started again
+_ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?[^/]+:\d+/?|inproc://.+")
 _NAMED = 5  # workers in a message
 _MOST_KEPT = 128 * 2**20  # of arrays that a worker has made of files [bytes]
 _WHEELS = ("numpy", "scipy", "opencv-python-headless", "casadi", "pin", "distributed")
@@ -95,12 +97,21 @@ def _client(address: str, failure: str) -> Any:
             f"{failure}: found no package distributed, needed it for the cluster {address}; "
             "install it (pip install 'legcal[cluster]')."
         ) from error
+    if not _ADDRESS.fullmatch(address):
+        raise UsageError(
+            f"{failure}: found '{address}', needed the address of a Dask scheduler; write it like "
+            "tcp://host:8786."
+        )
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what it says is said here
-    found, too_late = list[Any](), Event()
+    found, too_late, is_another = list[Any](), Event(), Event()
 
     def connect() -> None:
-        with suppress(OSError, ValueError, TypeError):
+        try:
             found.append(Client(address, timeout=CONNECTING, set_as_default=False))  # type: ignore[no-untyped-call]
+        except OSError:
+            pass
+        except (ValueError, TypeError, LookupError, RuntimeError, MemoryError):
+            is_another.set()
         if too_late.is_set():
             for client in found:
                 client.close(timeout=2)
@@ -114,6 +125,12 @@ def _client(address: str, failure: str) -> Any:
         thread.join(CONNECTING + 0.5)
     if not found:
         too_late.set()
+        if is_another.is_set():
+            raise OutOfResources(
+                f"{failure}: found that {address} answers, but not as a Dask scheduler does, "
+                "needed one; see that the port is its own (8786 unless it was started with "
+                "another one), not that of its page (8787)."
+            )
         raise OutOfResources(
             f"{failure}: found no Dask scheduler that answers at {address} within "
             f"{CONNECTING:.0f} s, needed one; see that it runs (dask scheduler) and that the "

@@ -295,6 +295,9 @@ def test_no_answer_and_no_worker_are_said_in_one_sentence(
         with pytest.raises(OutOfResources, match=f"no Dask scheduler that answers at {address}"):
             run_study(Draws(), 3, workers=address)
         assert time.monotonic() - begin < 10.0
+    for address in ("host", "tcp://host", "http://host:8787"):
+        with pytest.raises(UsageError, match="like tcp://host:8786"):
+            run_study(Draws(), 3, workers=address)
     monkeypatch.setattr(cluster, "CONNECTING", 2.0)
     with (
         local_cluster(tmp_path / "cluster", 0) as local,
@@ -303,3 +306,9 @@ def test_no_answer_and_no_worker_are_said_in_one_sentence(
         run_study(Draws(), 3, workers=local.address, output=tmp_path / "out")
     assert json.loads((tmp_path / "out" / CHECKPOINT_NAME).read_text())["seed"] == 0
     assert np.isfinite(run_study(Draws(), 3, output=tmp_path / "out").document()["total"])
+    with socket.create_server(("127.0.0.1", 0)) as page:  # such as that of the scheduler
+        answering = Thread(target=lambda: page.accept()[0].sendall(b"HTTP/1.1 400 Bad Request\r\n"))
+        answering.start()
+        with pytest.raises(OutOfResources, match="not as a Dask scheduler does"):
+            run_study(Draws(), 3, workers=f"tcp://127.0.0.1:{page.getsockname()[1]}")
+        answering.join()

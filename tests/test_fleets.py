@@ -48,7 +48,9 @@ def test_failures_are_named_and_do_not_stop_the_others(tmp_path: Path, good: Pat
     assert (bad.status, bad.kind, bad.name) == ("failed", "DatasetError", "bad")
     assert "found no dataset.yaml" in bad.verdict
     assert not (out / "bad").exists()
-    assert files_of(out / "good") == files_of(good.parent / "result")
+    written = files_of(out / "good")
+    assert json.loads(written.pop("made_of.json"))["dataset"] == str(good)
+    assert written == files_of(good.parent / "result")
     result = load_result(out / "good").result
     assert result.platform is not None
     assert fine.sigma_dX_m == result.platform.sigma_dX_m
@@ -63,7 +65,7 @@ def test_failures_are_named_and_do_not_stop_the_others(tmp_path: Path, good: Pat
     assert float(rows[1]["sigma_mm"]) == pytest.approx(1e3 * fine.sigma_dX_m, rel=1e-5)
 
 
-def test_a_fleet_that_is_resumed_takes_results_that_are_newer_than_their_datasets(
+def test_a_fleet_that_is_resumed_takes_results_of_its_datasets_that_are_newer(
     tmp_path: Path, good: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, own, calibrated = tmp_path / "out", tmp_path / "own", list[str]()
@@ -88,6 +90,11 @@ def test_a_fleet_that_is_resumed_takes_results_that_are_newer_than_their_dataset
     monkeypatch.setattr(fleet, "calibrate", counted)
     assert calibrate_fleet(machines[:1], out, resume=True) == kept
     assert calibrated == ["own", "bad", "own"]
+    asked = FleetOptions({"overlays": False})
+    calibrate_fleet(machines[:1], out, options=asked, resume=True)
+    shutil.copytree(own, tmp_path / "other")  # as old as the first
+    calibrate_fleet([FleetMachine("own", tmp_path / "other")], out, options=asked, resume=True)
+    assert calibrated == ["own", "bad", "own", "own", "other"]
 
 
 @pytest.mark.system
@@ -123,6 +130,7 @@ def test_lists_and_words_that_make_no_fleet_are_refused(
         assert named in capsys.readouterr().err
     for words, named in (
         (["a", "--resume"], "--resume with one dataset"),
+        (["a", "b", "--earlier", "nowhere"], "nowhere"),
         (["a", "--earlier", "b"], "--earlier with one dataset"),
         (["a", "b", "--check", "c"], "several datasets beside --check"),
         ([], "found no DATASET"),

@@ -106,6 +106,9 @@ def test_a_planned_session_is_a_dataset_and_simulation_shoots_it(
     readings = np.array([inverse_kinematics(machine, T) for T in poses])
     motors = list(machine.motors)
     assert np.abs(readings - m.q)[:, motors].max() < 1e-9
+    with pytest.raises(DatasetError, match="none of the 6") as refusal:
+        load_dataset(shot / "session")  # before its photographs are taken
+    assert len(refusal.value.problems) == 1
     taken = load_dataset(shot / "shot").measurements
     assert np.abs(taken.q - m.q)[:, motors].max() < 2e-5  # encoders err
     assert taken.view.tolist() == m.view.tolist()
@@ -196,6 +199,9 @@ def test_a_better_known_machine_is_what_more_images_and_a_given_session_make(
     assert more.error is not None
     assert planned.error is not None
     assert more.error.mean_displacement < planned.error.mean_displacement
+    assert f"2 photographs beside those of {shot / 'session'}" in more.sentence
+    assert any("6 of 6 photographs" in note for note in more.notes)
+    assert not {*more.labels} & {*planned.labels}  # poses are others
     (view,) = more.views  # a tripod of the list, as the others are called c1 and c2
     k = int(view.name[1:])
     np.testing.assert_allclose(view.T_base_camera.translation, [np.cos(k), np.sin(k), 1.4])
@@ -211,8 +217,11 @@ def test_a_session_by_hand_is_shot_with_its_board_where_the_plan_lays_it(
         "3-rpr", images=4, board="chessboard:6x5:40mm", hand_held=True, noise=planning.WHITE,
         setting=FEW, places=tmp_path / "high.yaml",
     )  # fmt: skip
+    held = replace(held, views=(*held.views[:3], replace(held.views[3], via=("2",))))
     assert held.board is not None
     planning.write_session(held, tmp_path / "session")
+    (*_, last) = read_rows(tmp_path / "session" / "poses.csv")
+    assert (last["pose"], last["on the way"]) == (held.views[3].name, held.views[1].name)
     settings = SimulationSettings(plan=tmp_path / "session", level=Level.OUTLINES)
     simulate(load_mechanism("3-rpr"), tmp_path / "shot", settings)
     shot = load_dataset(tmp_path / "shot")
@@ -309,21 +318,48 @@ def test_bias_of_single_outlines_in_a_result_counts_as_errors_at_places(tmp_path
         assert planning.read_noise(tmp_path).places_px == places
 
 
+def test_a_box_between_the_places_around_a_machine_is_used(small_search: None) -> None:
+    """From where a machine is shown as well, wherever that is."""
+    predictor = planning.Predictor(load_mechanism("hexapod"), sample_camera(), planning.WHITE, 1e-6)
+    poses = random_configurations(predictor.machine, 4, np.random.default_rng(0))
+    around = [p.T_base_camera.translation for p in planner._places(Task(predictor, 6, 1), poses)]
+    middle = np.mean(around[:2], axis=0)  # one nearer than the other
+    box = middle[:, None] + [-0.01, 0.01]
+    assert not any(np.all((where > box[:, 0]) & (where < box[:, 1])) for where in around)
+    places = planner._places(Task(predictor, 6, 1, bounds=box), poses)
+    assert places
+    assert all(place.is_inside(box) for place in places)
+
+
+def test_cameras_of_a_machine_that_hangs_stand_upright(small_search: None) -> None:
+    """A tripod stands on the ground, whichever way the platform is."""
+    places = planner._places(
+        Task(
+            planning.Predictor(load_mechanism("delta"), sample_camera(), planning.WHITE, 1e-6), 6, 1
+        ),
+        random_configurations(load_mechanism("delta"), 4, np.random.default_rng(0)),
+    )
+    below = [place.T_base_camera.translation[2] < -0.5 for place in places]
+    assert any(below)
+    assert all(place.T_base_camera.rotation.as_matrix()[2, 1] < 0.0 for place in places)
+
+
 def test_the_way_between_planned_poses_is_free(planned: planning.Plan) -> None:
     machine = planned.machine
     feasibility, columns = Feasibility(machine), slider_columns(machine, machine.motors)[0]
-    for view in planned.views:
-        stations = [machine.home_configuration, *view.poses.configurations]
-        for k, via in enumerate(view.via):
-            stops = [stations[k]]
-            if via:
-                stops.append(stations[0 if via == "home" else int(via)])
-            stops.append(stations[k + 1])
-            for here, there in pairwise(stops):
-                for part in np.linspace(0.1, 1.0, 10):
-                    q = here[columns] + part * (there - here)[columns]
-                    at = follow(machine, here, q)
-                    assert feasibility.problem(at, of_motors=False) is None
+    stations = [machine.home_configuration]
+    for view in planned.views:  # one after the other, without a way home between them
+        stations += [*view.poses.configurations]
+    for k, via in enumerate([via for view in planned.views for via in view.via]):
+        stops = [stations[k]]
+        if via:
+            stops.append(stations[0 if via == "home" else int(via)])
+        stops.append(stations[k + 1])
+        for here, there in pairwise(stops):
+            for part in np.linspace(0.1, 1.0, 10):
+                q = here[columns] + part * (there - here)[columns]
+                at = follow(machine, here, q)
+                assert feasibility.problem(at, of_motors=False) is None
 
 
 def test_updates_of_the_covariance_are_those_of_the_information(planned: planning.Plan) -> None:
@@ -353,7 +389,9 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"cameras": 0}, UsageError, "--cameras 0"),
     ({"criterion": "best"}, UsageError, "mean, worst, d, parameters"),
     ({"criterion": "d", "target": 1e-4}, UsageError, "leave out --criterion"),
-    ({"target": -1.0}, UsageError, "0 to 1 m"),
+    ({"target": 0.0}, UsageError, "more than 0"),
+    ({"seed": -1}, UsageError, "--seed"),
+    ({"parameters": ["leg2.base.x"]}, UsageError, "--criterion parameters"),
     ({"hand_held": True, "cameras": None}, UsageError, "--board"),
     ({"hand_held": True, "board": "chessboard:9x6:25mm", "cameras": 2}, UsageError, "--cameras"),
     ({"board": "chessboard:7x5:25mm"}, DatasetError, "after half a turn"),
@@ -513,8 +551,15 @@ def test_what_else_is_in_the_way_is_refused(
             legcal.plan(**(of | asked))
 
     away = {"xyz": [0.0, 0.0, 3.0], "quat_xyzw": [0.0, 0.0, 0.0, 1.0]}
-    (tmp_path / "away.yaml").write_text(yaml.safe_dump({"places": {"a": away}}))
-    refused(NotVisible, "0 of 1 camera places", places=tmp_path / "away.yaml")
+    for place, remedy in (
+        ({"xyz": [0.0, 90.0, 90.0]}, "move a nearer"),
+        ({"xyz": [0.0, 0.0, 0.2]}, "move a further away"),
+        (away, "0 of 1 camera places .* turn a to the machine"),
+    ):
+        (tmp_path / "away.yaml").write_text(yaml.safe_dump({"places": {"a": place}}))
+        refused(NotVisible, remedy, places=tmp_path / "away.yaml")
+    telephoto = replace(sample_camera(), K=sample_camera().K * [[50.0], [50.0], [1.0]])
+    refused(NotVisible, "wider view, or correct the focal length", camera=telephoto)
     refused(UsageError, "found 1 places for 2", places=tmp_path / "away.yaml", cameras=2)
     refused(NotVisible, "use another board", board="charuco:7x5:4mm:3mm:DICT_4X4_50",
             places=places(tmp_path))  # fmt: skip

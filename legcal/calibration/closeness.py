@@ -20,10 +20,16 @@ def closeness(folder: Path, n_images: int, platform: PlatformAccuracy | None) ->
         plan = read_json(folder / PLAN_NAME)
         planned, expected = int(plan["images"]), plan["expected"]
         dX, dE = float(expected["dX_m"]), float(expected["dE_rad"])
+        beside = plan.get("given")
     except (OSError, ValueError, KeyError, TypeError, DatasetError):
         return ()
     if platform is None or platform.workspace is None or not dX > 0.0:
         return ()
+    if beside:
+        return (
+            f"The session was planned to add to {beside}, whose images the plan counts on: put its "
+            "views and rows there, and calibrate both together.",
+        )
     found = platform.workspace
     ratio = found.mean_displacement / dX
     sentence = (

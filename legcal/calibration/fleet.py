@@ -40,8 +40,10 @@ from legcal.files import (
 from legcal.progress import Progress, shown_progress
 from legcal.workers import Workers, worker_pool
 
+_CACHE = "use_cache"  # results do not depend on it
 FLEET = OutputKind("fleet", "summary.json", "legcal_fleet")
 TABLE_NAME = "summary.csv"
+MADE_OF = "made_of.json"  # in the result folder of a machine: its dataset, and what was asked
 STAGE = "Calibrating machines"
 
 
@@ -90,6 +92,12 @@ class FleetOptions:
     arguments: Mapping[str, Any] = field(default_factory=dict)
     # Called as page(calibration, output, folder): what it writes into the folder appears in output
     page: Callable[[Calibration, Path, Path], None] | None = None
+
+    def made_of(self, machine: FleetMachine) -> str:
+        """Return what a result depends on, as it is written beside it."""
+        asked = {name: self.arguments[name] for name in sorted(self.arguments.keys() - {_CACHE})}
+        found = {"legcal_made_of": 1, "dataset": str(machine.dataset), "options": asked}
+        return json.dumps(found, indent=1, default=str) + "\n"
 
 
 def read_fleet(path: Path) -> list[FleetMachine]:
@@ -142,7 +150,8 @@ def calibrate_fleet(
     workers : int, str or executor
         Calibrate machines there, as :func:`legcal.calibrate` searches images.
     resume : bool
-        Take results that stand in the folder, if they are newer than the files of their dataset.
+        Take results that stand in the folder, if they are of the same dataset and options, and
+        newer than the files of the dataset.
     progress : bool or callable
         True shows a bar on stderr; a function is called as ``progress(stage, done, total)``.
 
@@ -164,7 +173,7 @@ def calibrate_fleet(
     options = options or FleetOptions()
     found: dict[str, MachineRow] = {}
     if resume:
-        found |= {row.name: row for row in map(partial(_kept, folder), machines) if row}
+        found |= {row.name: row for row in map(partial(_kept, options, folder), machines) if row}
     if not (folder / FLEET.marker).exists():
         _write(folder / FLEET.marker, FleetDocument())
     token = stamp_of(folder / FLEET.marker)
@@ -222,16 +231,18 @@ def _check(machines: Sequence[FleetMachine], folder: Path) -> None:
     check_destination(folder, FLEET)
 
 
-def _kept(folder: Path, machine: FleetMachine) -> MachineRow | None:
-    """Return the row of a machine whose result is there and newer than its dataset."""
+def _kept(options: FleetOptions, folder: Path, machine: FleetMachine) -> MachineRow | None:
+    """Return the row of a machine whose result is there, of its dataset, and newer than that."""
     result = folder / machine.name / RESULT_NAME
     try:
+        if (result.parent / MADE_OF).read_text(encoding="utf-8") != options.made_of(machine):
+            return None
         made = os.stat(result).st_mtime_ns
         tables = [*machine.dataset.glob("*.yaml"), *machine.dataset.glob("*.csv")]
         if any(os.stat(path).st_mtime_ns > made for path in tables):
             return None
         return _row(machine, result.parent)
-    except (OSError, DatasetError):
+    except (OSError, ValueError, DatasetError):
         return None
 
 
@@ -299,8 +310,12 @@ def _calibrate(
 ) -> MachineRow:
     """Calibrate a machine; a refusal is what became of it, and no other error is."""
     try:
-        page = options.page
-        beside = None if page is None else lambda found, folder: page(found, output, folder)
+
+        def beside(found: Calibration, folder: Path) -> None:
+            if options.page is not None:
+                options.page(found, output, folder)
+            (folder / MADE_OF).write_text(options.made_of(named), encoding="utf-8")
+
         calibrate(machine.dataset, output=output, beside=beside, **options.arguments)
         row = _row(machine, output)
     except OutOfResources:

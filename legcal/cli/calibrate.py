@@ -168,7 +168,8 @@ def calibrate(
         bool,
         typer.Option(
             "--resume",
-            help="Take results that stand in OUT and are newer than the files of their dataset.",
+            help="Take results that stand in OUT, of the same datasets and options, and newer than "
+            "the files of their dataset.",
             rich_help_panel=_FLEETS,
         ),
     ] = False,
@@ -261,6 +262,11 @@ def calibrate(
         fleet = [] if machines is None else calibration.read_fleet(machines)
         fleet += [calibration.FleetMachine(path.resolve().name, path) for path in datasets]
         if earlier is not None:
+            if not earlier.is_dir():
+                raise UsageError(
+                    f"{earlier}: drift could not be counted: found no such folder, needed that of "
+                    "an earlier fleet; correct --earlier, or leave it out."
+                )
             fleet = [replace(one, earlier=one.earlier or earlier / one.name) for one in fleet]
         page_of_machine = partial(_page_of_machine, command_line()) if with_report else None
         outcome = calibration.calibrate_fleet(

@@ -274,8 +274,20 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         return dataset
     dataset, unusable = inspect_files(dataset)
     if unusable:
-        raise DatasetError([what for _, what in unusable])
+        raise DatasetError(_without_photographs(dataset) or [what for _, what in unusable])
     return dataset
+
+
+def _without_photographs(dataset: Dataset) -> str:
+    """Return what is wrong with a dataset none of whose images is there; nothing if some are."""
+    paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
+    if len(paths) < 2 or any(path is None or path.exists() for path in paths):
+        return ""
+    return (
+        f"{dataset.table_path}: the photographs could not be read: found none of the {len(paths)} "
+        f"that it names, the first of them {dataset.measurements.image[0]}, needed their files in "
+        f"{dataset.folder}; take or copy them there under these names, or correct the column image."
+    )
 
 
 def inspect_files(dataset: Dataset) -> tuple[Dataset, list[tuple[int, str]]]:

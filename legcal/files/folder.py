@@ -155,9 +155,13 @@ def check_destination(destination: Path, kind: OutputKind = RESULT) -> None:
     start = f"{destination}: the {kind.noun} could not be written: found"
     is_new = not destination.is_dir() or not holds_files(destination)
     if kind.marker and not (is_new or kind.is_in(destination)):
+        marker, remedy = f"no {kind.marker} of legcal", ""
+        if (destination / kind.marker).is_file():
+            marker = f"a {kind.marker} that is damaged or not of legcal"
+            remedy = f"remove a damaged {kind.noun}, or "
         raise UsageError(
-            f"{start} a folder with other files and no {kind.marker} of legcal, needed a new or "
-            f"empty folder or that of an earlier {kind.noun}; give another output folder."
+            f"{start} a folder with other files and {marker}, needed a new or empty folder or that "
+            f"of an earlier {kind.noun}; {remedy}give another output folder."
         )
     target = destination if destination.is_dir() else existing_parent(destination)
     if not is_writable(target):

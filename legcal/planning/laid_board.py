@@ -1,8 +1,9 @@
 """Where a calibration board lies on the base, and which images show it.
 
-It lies flat at the level of the base joints, in their middle or beside them, its print up: there
-most places see it. An image shows it if all of its corners are in the picture, seen from above by
-enough and large enough to be read, and behind no leg, no arm and not the plate of the platform.
+It lies flat at the level of the base joints, in their middle or beside them, its print to the
+platform: there most places see it. An image shows it if all of its corners are in the picture, seen
+from before it by enough and large enough to be read, and behind no leg, no arm and not the plate of
+the platform.
 """
 
 from __future__ import annotations
@@ -14,13 +15,12 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array, BoolArray, normal_basis
 from legcal.machine import Machine
-from legcal.planning.sight import Bodies, behind_plate
+from legcal.planning.sight import NEAREST, Bodies, behind_plate
 from legcal.vision import Board, Camera, dictionary, facing_board, in_picture, rays_past_axes
 
 _SIDES = 4  # directions beside the machine
 _DISTANCE = 1.05  # half diagonals of the board beyond the base joints
 _MIN_COSINE = 0.45  # between the normal of the print and the line of sight
-_NEAREST = 0.1  # [m] before the camera
 _MODULE_PX = 2.0  # of a module of a marker, across which it looks narrowest
 _MODULES = 6.0  # that a square without a marker counts as
 _FRAME = {"charuco": 2, "aprilgrid": 4}  # modules of the black frame of a marker, both sides
@@ -32,6 +32,12 @@ class LaidBoard:
 
     board: Board
     T_base_board: RigidTransform
+
+    @property
+    def normal(self) -> Array:
+        """Where the print looks in the base link, (3,)."""
+        z = self.T_base_board.rotation.as_matrix()[:, 2]
+        return np.asarray(z * self.board.towards_viewer)
 
     @property
     def corners(self) -> Array:
@@ -56,10 +62,9 @@ class LaidBoard:
         n = len(bodies.B)
         outer, eye = self.corners, T_base_camera.translation
         P = T_base_camera.inv().apply(outer)
-        normal = self.T_base_board.rotation.as_matrix()[:, 2] * self.board.towards_viewer
         sight = eye - outer
-        cosine = sight @ normal / np.linalg.norm(sight, axis=1)
-        if cosine.min() < _MIN_COSINE or not in_picture(camera, P, _NEAREST, margin_px).all():
+        cosine = sight @ self.normal / np.linalg.norm(sight, axis=1)
+        if cosine.min() < _MIN_COSINE or not in_picture(camera, P, NEAREST, margin_px).all():
             return np.zeros(n, dtype=np.bool_)
         if is_read and self._narrowest(camera.project(P)) < _MODULE_PX:
             return np.zeros(n, dtype=np.bool_)

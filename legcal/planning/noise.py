@@ -28,8 +28,15 @@ def read_noise(path: Path) -> PredictedNoise:
             return _of_result(found, file)
         if "legcal_noise" in found:
             return _of_repeats(found, file)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, DatasetError) as error:
-        raise _useless(path, f"'{error}'" if str(error) else "another file") from error
+    except FileNotFoundError as error:
+        what = "no such file" if file == path else f"a folder without {file.name}"
+        raise _useless(path, what) from error
+    except OSError as error:
+        raise _useless(path, f"'{error.strerror or error}'") from error
+    except KeyError as error:
+        raise _useless(path, f"a document without {error}") from error
+    except (ValueError, TypeError, AttributeError, DatasetError) as error:
+        raise _useless(path, f"'{error}'") from error
     raise _useless(path, "another document")
 
 

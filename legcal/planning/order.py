@@ -24,11 +24,11 @@ _SAME = 1e-6  # [m], and entries of rotations
 _ROUNDS = 20  # of exchanges for a shorter way
 
 
-def in_short_order(machine: Machine, poses: Configurations) -> list[int]:
-    """Return an order of poses in which the motors travel little, beginning near home."""
+def in_short_order(machine: Machine, poses: Configurations, begin: Array) -> list[int]:
+    """Return an order of poses in which the motors travel little, from where a machine begins."""
     columns = slider_columns(machine, machine.motors)[0]
     lower, upper = motor_travel(machine)
-    q = np.concatenate([machine.home_configuration[None], poses.configurations])[:, columns]
+    q = np.concatenate([begin[None], poses.configurations])[:, columns]
     q = q / (upper - lower)
     far = np.abs(q[:, None] - q).max(axis=2)
     order, left = [0], set(range(1, len(q)))
@@ -50,16 +50,17 @@ def in_short_order(machine: Machine, poses: Configurations) -> list[int]:
     return [k - 1 for k in order[1:]]
 
 
-def ways(machine: Machine, poses: Configurations) -> tuple[tuple[str, ...], int]:
+def ways(machine: Machine, configurations: Array) -> tuple[tuple[str, ...], int]:
     """Return what to pass before each pose, and for how many poses no way was found.
 
-    That is "" where the straight way is free, ``home``, or an earlier pose, as its place from 1.
+    The machine begins at home and takes all poses of all views in turn. What it passes is "" where
+    the straight way is free, ``home``, or an earlier pose, as its place from 1.
     """
     if not machine.is_determined:
-        return ("",) * len(poses.poses), 0
+        return ("",) * len(configurations), 0
     feasibility, home = Feasibility(machine), machine.home_configuration
     known: dict[tuple[int, int], bool] = {}
-    stations = [home, *poses.configurations]
+    stations = [home, *configurations]
 
     def is_free(a: int, b: int) -> bool:
         key = min(a, b), max(a, b)

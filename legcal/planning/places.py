@@ -2,7 +2,8 @@
 
 A tripod is set to 5 cm and 5 deg, so a place counts with a margin in the picture
 (:class:`Setting`): from where it stands the joints of all poses are in the picture even if it is
-set that much wrongly, or, nearer, most of them.
+set that much wrongly, or, nearer, most of them. Pictures are upright where z of the base link
+points up, also of machines that hang: a tripod stands on the ground.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ _TURNS = 16  # directions around the machine
 _LIFTS = (0.1, 0.4, 0.75, 1.15)  # [rad] above the plane across the machine
 _LIFTS_PLANAR = (0.65, 1.0, 1.35)  # above the plane of motion
 _NEARER = (1.0, 0.8, 0.65)  # of the distance from where all is in the picture
+_FARTHER = 2.0  # of it, at most, in a box
+_ACROSS = 5  # places along each side of a box
 _DISTANCES = np.geomspace(0.4, 12.0, 60)  # sizes of the machine, that are tried
 _CLEARANCE = 0.3  # of the size, between camera and machine, at least
 _ROUNDING = 1e-9
@@ -142,7 +145,7 @@ def read_places(path: Path, machine: Machine) -> list[Place]:
     for name, place in entry.places.items():
         position = np.array(place.xyz)
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        T = look_at(position, middle, up=machine.upward)
+        T = look_at(position, middle)
         if place.quat_xyzw is not None:
             turned = Rotation.from_quat(place.quat_xyzw)
             T = RigidTransform.from_components(position, turned)
@@ -170,41 +173,76 @@ def places_around(
     up, found = machine.upward, []
     for lift in _LIFTS if machine.spatial else _LIFTS_PLANAR:
         for turn in np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False):
-            found += places_along(direction_above(up, turn, lift), up, points, camera, setting)
-    inside = [place for place in found if place.is_inside(bounds)]
-    if not inside:
-        near = min(float(np.linalg.norm(p.T_base_camera.translation)) for p in found or [_NOWHERE])
+            found += places_along(direction_above(up, turn, lift), points, camera, setting)
+    start = f"{machine.yaml_path}: no camera could be placed: found"
+    if not found:
+        size = float(np.linalg.norm(np.ptp(points, axis=0)))
         raise NotVisible(
-            f"{machine.yaml_path}: no camera could be placed: found none of {len(found)} places "
-            f"around the machine inside --bounds, needed one; the nearest that shows all legs "
-            f"stands {near:.2f} m from the base: give wider bounds or a camera with a wider view."
+            f"{start} no place up to {_DISTANCES[-1] * size:.1f} m around the machine that has all "
+            f"of it in the picture, tripods set to {1e2 * setting.shift:g} cm and "
+            f"{np.degrees(setting.turn):g} deg, needed one; use a camera with a wider view, or "
+            "correct the focal length in its file, or name --places."
+        )
+    inside = [place for place in found if place.is_inside(bounds)]
+    if bounds is not None and len(inside) < _TURNS:  # a box between those places
+        inside += _places_in(bounds, points, camera, setting)
+    if not inside:
+        where = np.array([place.T_base_camera.translation for place in found])
+        spans = [
+            f"{name} {low:.2f} to {high:.2f}"
+            for name, low, high in zip("xyz", where.min(axis=0), where.max(axis=0), strict=True)
+        ]
+        raise NotVisible(
+            f"{start} no place inside --bounds that shows most of it, near enough, needed one; "
+            f"places around the machine have {', '.join(spans)} m: give wider bounds that reach "
+            "one, or a camera with another view."
         )
     return inside
 
 
-_NOWHERE = Place(RigidTransform.identity())
-
-
-def places_along(
-    toward: Array, up: Array, points: Array, camera: Camera, setting: Setting
-) -> list[Place]:
+def places_along(toward: Array, points: Array, camera: Camera, setting: Setting) -> list[Place]:
     """Return the places in a direction from where all, or most, points are in the picture."""
+    target, size, reach = _extent(toward, points)
+    distance = _distance_of_all(toward, points, camera, setting)
+    return [
+        Place(look_at(target + d * toward, target))
+        for d in distance * np.array(_NEARER)
+        if d < np.inf and d - reach >= _CLEARANCE * size
+    ]
+
+
+def _places_in(bounds: Array, points: Array, camera: Camera, setting: Setting) -> list[Place]:
+    """Return places all over a box, from where all, or most, points are in the picture."""
+    grid = np.meshgrid(*(np.linspace(low, high, _ACROSS) for low, high in bounds))
+    found = []
+    for position in np.stack(grid, axis=-1).reshape(-1, 3):
+        away = position - 0.5 * (points.min(axis=0) + points.max(axis=0))
+        d = max(float(np.linalg.norm(away)), _ROUNDING)
+        target, size, reach = _extent(away / d, points)
+        distance = _distance_of_all(away / d, points, camera, setting)
+        if d - reach >= _CLEARANCE * size and min(_NEARER) <= d / distance <= _FARTHER:
+            found.append(Place(look_at(position, target)))
+    return found
+
+
+def _extent(toward: Array, points: Array) -> tuple[Array, float, float]:
+    """Return the middle of points, their size, and how far they reach in a direction [m]."""
     target = 0.5 * (points.min(axis=0) + points.max(axis=0))
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
-    reach = float(((points - target) @ toward).max())
+    return target, size, float(((points - target) @ toward).max())
+
+
+def _distance_of_all(toward: Array, points: Array, camera: Camera, setting: Setting) -> float:
+    """Return from how far all points are in the picture [m], infinity if from nowhere."""
+    target, size, reach = _extent(toward, points)
     for distance in _DISTANCES * size:
         nearest = distance - reach
         if nearest < _CLEARANCE * size:
             continue
-        T = look_at(target + distance * toward, target, up=up)
-        P = T.inv().apply(points)
+        P = look_at(target + distance * toward, target).inv().apply(points)
         if in_picture(camera, P, 0.0, setting.margin(camera, nearest)).all():
-            return [
-                Place(look_at(target + d * toward, target, up=up))
-                for d in distance * np.array(_NEARER)
-                if d - reach >= _CLEARANCE * size
-            ]
-    return []
+            return float(distance)
+    return np.inf
 
 
 def parse_bounds(text: str) -> Array:
@@ -230,13 +268,13 @@ def _coordinate(text: str) -> float:
     return -size if text.startswith("-") else size
 
 
-def near(place: Place, target: Array, up: Array, step: float, rng: np.random.Generator) -> Place:
+def near(place: Place, target: Array, step: float, rng: np.random.Generator) -> Place:
     """Return a place that stands a little elsewhere and looks at the machine."""
     if place.fixed:
         return place
     position = place.T_base_camera.translation
     away = np.linalg.norm(position - target)
-    return Place(look_at(position + step * away * rng.normal(size=3), target, up=up))
+    return Place(look_at(position + step * away * rng.normal(size=3), target))
 
 
 def all_points(machine: Machine, poses: Sequence[RigidTransform]) -> Array:

@@ -31,13 +31,23 @@ class PlannedView:
     name: str
     T_base_camera: RigidTransform
     poses: Configurations  # in the order in which they are to be taken
-    via: tuple[str, ...]  # where to go before each pose: "" straight there, else home or a pose
+    via: tuple[str, ...]  # where to go before each pose: "" straight there, home, or the number
+    # of an earlier pose of the session, from 1
     seen: Seen  # of the nominal machine, from the very place
 
     @property
     def shows(self) -> BoolArray:
         """Which legs each image shows, (n_images, n_legs)."""
         return self.seen.legs_in(len(self.poses.poses), self.poses.readings.shape[1])
+
+
+def pose_labels(n_images: int, n_given: int = 0) -> list[str]:
+    """Return the labels of the poses of a session, in the order in which they are taken.
+
+    Those that it adds to come before: the same label would mean the same pose.
+    """
+    width = max(2, len(str(n_given + n_images)))
+    return [f"p{k + 1:0{width}d}" for k in range(n_given, n_given + n_images)]
 
 
 @brief
@@ -87,6 +97,7 @@ class Plan:
     board: LaidBoard | None = None  # on the base, in every image
     hand_held: bool = False
     given: str = ""  # the dataset that it adds to
+    n_given: int = 0  # its photographs
     notes: tuple[str, ...] = ()
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
 
@@ -96,13 +107,19 @@ class Plan:
         return sum(len(view.poses.poses) for view in self.views)
 
     @property
+    def labels(self) -> list[str]:
+        """Labels of the poses, in the order in which they are taken."""
+        return pose_labels(self.n_images, self.n_given)
+
+    @property
     def sentence(self) -> str:
         """What is expected, in words."""
         if self.error is None:
             return "The error of the platform is not predicted: readings do not give its pose."
+        beside = f" beside those of {self.given}" if self.given else ""
         most = f", at most {1e3 * self.error.max_displacement:.3f} mm" * (self.goal is Goal.WORST)
         return (
-            f"Expected of {self.n_images} photographs: predicted error "
+            f"Expected of {self.n_images} photographs{beside}: predicted error "
             f"{1e3 * self.error.mean_displacement:.3f} mm / "
             f"{np.degrees(self.error.mean_rotation):.4f} deg (1 sigma) over the workspace{most}, "
             f"the mean of {self.setting.draws} sessions with tripods up to "

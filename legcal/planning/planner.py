@@ -18,6 +18,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration import poses_at_readings
 from legcal.errors import NotIdentifiable, NotVisible
+from legcal.files import SHOWN_IN
 from legcal.geometry import Array, BoolArray, look_at
 from legcal.machine import Configurations, Leg, Machine, platforms_in_base
 from legcal.planning.exchange import Chosen, Criterion, Session, choose, exchange
@@ -33,11 +34,11 @@ from legcal.planning.places import (
     near,
     places_around,
 )
-from legcal.planning.planned_session import Plan, PlannedView
+from legcal.planning.planned_session import Plan, PlannedView, pose_labels
 from legcal.planning.poses import candidate_poses, drawn_legs, poses_near, some_of
-from legcal.planning.sight import Bodies, Seen, what_is_seen
+from legcal.planning.sight import NEAREST, Bodies, Seen, what_is_seen
 from legcal.progress import Report, no_progress
-from legcal.vision import Board
+from legcal.vision import Board, in_picture, least_length
 from legcal.workers import Run, in_turn
 
 MIN_POSES, POSES_EACH, MOST_POSES = 20, 6, 320  # candidates, by images
@@ -86,6 +87,11 @@ class Task:
     def machine(self) -> Machine:
         """The nominal model."""
         return self.predictor.machine
+
+    @property
+    def n_given(self) -> int:
+        """Number of images that were shot already."""
+        return sum(len(one.poses.poses) for one in self.given)
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,7 +280,7 @@ def _with_laid_board(task: Task, poses: Configurations) -> Task:
         away = np.array([T.translation - middle for T in places])
         away = np.unique((away / np.linalg.norm(away, axis=1)[:, None]).round(6), axis=0)
         away *= FAR * float(np.linalg.norm(np.ptp(points, axis=0)))
-        places = [look_at(middle + step, middle, up=task.machine.upward) for step in away]
+        places = [look_at(middle + step, middle) for step in away]
     best, most = task, 0.0
     for laid in lying(task.board, task.machine):
         trial = replace(task, laid=laid)
@@ -314,18 +320,57 @@ def _probed(
             found.append((place, contributions))
         progress("Camera places", k + 1, len(places))
     needed = 1 if scene.task.hand_held else scene.task.n_views
-    board, another = "", ""
-    if scene.task.board is not None:
-        board, another = " and the board", ", more pixels or a board of larger squares"
     if not found or (scene.task.places and len(found) < needed):
-        raise NotVisible(
-            f"{machine.yaml_path}: no session could be planned: found {len(found)} of "
-            f"{len(places)} camera places that see legs{board} wherever the tripod is set within "
-            f"{1e2 * scene.task.setting.shift:g} cm and "
-            f"{np.degrees(scene.task.setting.turn):g} deg, needed {needed}; move the places "
-            f"further away or turn them to the machine, or use a camera with a wider view{another}."
-        )
+        used = {id(place) for place, _ in found}
+        blind = [place for place in places if id(place) not in used]
+        raise NotVisible(_unseen(scene, blind, len(places), needed, in_Rb))
     return found
+
+
+_REMEDIES = {
+    "elsewhere": "turn {} to the machine, or move further away",
+    "near": "move {} further away, or use a camera with a wider view",
+    "far": "move {} nearer, or use a camera with a longer focal length or more pixels",
+    "hidden": "move {} to where no plate or other leg is in front of the legs",
+}
+
+
+def _unseen(
+    scene: Scene,
+    blind: Sequence[Place],
+    n_places: int,
+    needed: int,
+    poses: Sequence[RigidTransform],
+) -> str:
+    """Return that too few places see legs, and the remedy for what most of the others lack."""
+    setting, board, another = scene.task.setting, "", ""
+    if scene.task.board is not None:
+        board, another = " and the board", ", or use a board of larger squares"
+    causes = [_why_unseen(scene, place.T_base_camera, poses) for place in blind]
+    remedy = _REMEDIES[max(_REMEDIES, key=causes.count)]
+    names = ", ".join(place.name for place in blind if place.name)
+    return (
+        f"{scene.task.machine.yaml_path}: no session could be planned: found "
+        f"{n_places - len(blind)} of {n_places} camera places that see legs{board} wherever the "
+        f"tripod is set within {1e2 * setting.shift:g} cm and {np.degrees(setting.turn):g} deg, "
+        f"needed {needed}; {remedy.format(names or 'the places')}{another}."
+    )
+
+
+def _why_unseen(scene: Scene, T: RigidTransform, poses: Sequence[RigidTransform]) -> str:
+    """Return why a camera sees no legs at poses T_Rb_Re, a key of the remedies."""
+    camera = scene.task.predictor.camera
+    bodies = Bodies.at(scene.task.machine, scene.legs, poses).before(T)
+    points = np.concatenate([bodies.A, bodies.B]).reshape(-1, 3)
+    if not in_picture(camera, points, NEAREST).any():
+        return "elsewhere"
+    nearest = float(points[:, 2].min())
+    if nearest > NEAREST:
+        stretch = camera.project(bodies.A) - camera.project(bodies.B)
+        if np.linalg.norm(stretch, axis=-1).max() < least_length(0.0):
+            return "far"
+    margin = scene.task.setting.margin(camera, max(nearest, NEAREST))
+    return "hidden" if in_picture(camera, points, NEAREST, margin).all() else "near"
 
 
 def choose_places(
@@ -482,9 +527,9 @@ class _Search:
         )
         needed = f"at least {n}" if more.value < most else "more places"
         raise NotIdentifiable(
-            f"{task.machine.yaml_path}: no session could be planned: found that {task.n_images} "
-            f"images from {places} tell less of the machine than its model does, needed {needed}; "
-            f"{remedy}."
+            f"{task.machine.yaml_path}: no session could be planned: found {task.n_images} "
+            f"image{'s' * (task.n_images != 1)} from {places}, not enough to know the machine "
+            f"better than its model does, needed {needed}; {remedy}."
         )
 
     def better_places(
@@ -497,8 +542,7 @@ class _Search:
             for _ in range(0 if own.place.fixed else N_NEAR_PLACES):
                 if self.stop():
                     break
-                up = self.task.machine.upward
-                place = near(current[v].place, target, up, PLACE_STEP * step, self.rng)
+                place = near(current[v].place, target, PLACE_STEP * step, self.rng)
                 trial = replace(own, place=place)
                 found = self.scene.of(trial) if place.is_inside(self.task.bounds) else None
                 if found is None or self.scene.showing(trial) is not trial:
@@ -535,15 +579,18 @@ class _Search:
         task, predictor, machine = self.task, self.task.predictor, self.task.machine
         found = self.added(current)
         covariance = self._expected_covariance(current)
-        views, blocked = [], 0
+        ordered, begin = list[Configurations](), machine.home_configuration
         for own in current:
-            order = in_short_order(machine, own.poses)
-            poses = some_of(own.poses, order)
-            via, missing = ways(machine, poses)
-            blocked += missing
+            ordered.append(some_of(own.poses, in_short_order(machine, own.poses, begin)))
+            begin = ordered[-1].configurations[-1]
+        via, blocked = ways(machine, np.concatenate([poses.configurations for poses in ordered]))
+        views, done = [], 0
+        for own, poses in zip(current, ordered, strict=True):
+            of_view = via[done : done + len(poses.poses)]
+            done += len(poses.poses)
             T, in_Rb = own.place.T_base_camera, platforms_in_base(machine, poses.poses)
             seen = self.scene.seen(T, in_Rb, surely=False)
-            views.append(PlannedView(own.place.name, T, poses, via, seen))
+            views.append(PlannedView(own.place.name, T, poses, of_view, seen))
         notes = []
         if blocked:
             notes.append(
@@ -553,6 +600,11 @@ class _Search:
         if task.goal in (Goal.MEAN, Goal.WORST) and not machine.is_determined:
             notes.append(f"Readings do not give the pose: {machine.undetermined}.")
         parametrization = predictor.legs.parametrization
+        sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+        for name in task.named:
+            i = parametrization.names.index(name)
+            size, unit = SHOWN_IN[parametrization.units[i]]
+            notes.append(f"{name}: {size * sigma[i]:.4f} {unit} expected (1 sigma).")
         return Plan(
             machine=machine,
             camera=predictor.camera,
@@ -564,7 +616,7 @@ class _Search:
             views=_named(views, task),
             value=value,
             error=None if self.work is None else self.work.error(covariance),
-            sigma=np.sqrt(np.maximum(np.diagonal(covariance), 0.0)),
+            sigma=sigma,
             names=parametrization.names,
             units=parametrization.units,
             growth=self._growth(found),
@@ -573,6 +625,7 @@ class _Search:
             board=task.laid,
             hand_held=task.hand_held,
             given=task.given_name,
+            n_given=task.n_given,
             notes=tuple(notes),
         )
 
@@ -598,19 +651,17 @@ class _Search:
 
 
 def _named(views: Sequence[PlannedView], task: Task) -> tuple[PlannedView, ...]:
-    """Return views with the names of their places, or new ones in turn; hand-held ones by image."""
+    """Return views with the names of their places, or new ones in turn; hand-held ones by pose."""
     if task.hand_held:
         views = [
             replace(
-                view,
-                poses=some_of(view.poses, [k]),
-                via=(view.via[k],),
-                seen=view.seen.only(k),
-                name="",
+                view, poses=some_of(view.poses, [k]), via=(view.via[k],), seen=view.seen.only(k)
             )
             for view in views
             for k in range(len(view.poses.poses))
         ]
+        labels = pose_labels(len(views), task.n_given)
+        return tuple(replace(view, name=own) for view, own in zip(views, labels, strict=True))
     taken = {one.place.name for one in task.given}
     free = (f"c{k}" for k in range(1, 10**6) if f"c{k}" not in taken)
     return tuple(view if view.name else replace(view, name=next(free)) for view in views)

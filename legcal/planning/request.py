@@ -144,7 +144,7 @@ def plan(
     listed = () if places is None else tuple(read_places(Path(places), machine))
     n_views = _n_views(cameras, len(listed), hand_held=hand_held)
     n_images = _n_images(images, images_per_view, n_views, target)
-    _check(criterion, target, bounds, listed, board, hand_held, setting, n_images, n_views)
+    _check(criterion, parameters, target, bounds, listed, board, hand_held, setting, seed)
     shot = given if isinstance(given, Dataset) or given is None else _shot(Path(given))
     before = () if shot is None else _given(machine, shot)
     if camera is None:
@@ -182,7 +182,7 @@ def plan(
             found = plan_session(task, report, stop, run)
         else:
             found = _fewest(task, target, report, stop, run)
-        return replace(found, notes=(*found.notes, *counted, *run.notes))
+        return replace(found, notes=(*found.notes, *counted, *_to_come(shot), *run.notes))
 
 
 def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[str, ...]]:
@@ -305,14 +305,14 @@ def _n_images(images: int | None, per_view: int | None, n_views: int, target: fl
 
 def _check(
     criterion: str,
+    parameters: Sequence[str],
     target: float | None,
     bounds: Array | None,
     places: Sequence[Place],
     board: object,
     hand_held: bool,
     setting: Setting,
-    n_images: int,
-    n_views: int,
+    seed: int,
 ) -> None:
     """Refuse what contradicts itself."""
     start, problems = "The plan could not be made: found", []
@@ -320,8 +320,18 @@ def _check(
         problems.append(
             f"{start} the criterion '{criterion}', needed {', '.join(Goal)}; choose one."
         )
+    if parameters and criterion != Goal.PARAMETERS:
+        problems.append(
+            f"{start} parameters to know well and the criterion '{criterion}', which does not look "
+            "at them, needed --criterion parameters; give it, or leave out --parameter."
+        )
+    if seed < 0:
+        problems.append(f"{start} {seed} as the seed, needed 0 or more; correct --seed.")
     if target is not None and not 0.0 < target < 1.0:
-        problems.append(f"{start} a target of {target:g} m, needed 0 to 1 m; correct --target.")
+        problems.append(
+            f"{start} a target of {target:g} m, needed more than 0 and less than 1 m; correct "
+            "--target."
+        )
     if target is not None and criterion != Goal.MEAN:
         problems.append(
             f"{start} a target and the criterion '{criterion}', needed the mean error of the "
@@ -361,6 +371,21 @@ def _on_base(board: str | Path | Board) -> Board:
 def _shot(folder: Path) -> Dataset:
     """Return a dataset, whose images are not looked at."""
     return load_dataset(folder, check_images=False)
+
+
+def _to_come(shot: Dataset | None) -> tuple[str, ...]:
+    """Return a note on photographs of a given dataset that are not there."""
+    if shot is None or shot.observations is not None:
+        return ()
+    n = shot.measurements.n_rows
+    paths = [shot.image_path(row) for row in range(n)]
+    missing = sum(path is not None and not path.is_file() for path in paths)
+    if not missing:
+        return ()
+    return (
+        f"{missing} of {n} photographs of {shot.folder} are not there: the plan counts on them as "
+        "if they were.",
+    )
 
 
 def difference(machine: Machine, other: Machine) -> str:

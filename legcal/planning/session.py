@@ -91,12 +91,12 @@ def images_of(plan: Plan) -> list[tuple[str, str, str, int, int]]:
 
     All images of a camera in the hand are of one view.
     """
-    width = max(2, len(str(plan.n_images)))
+    labels = plan.labels
     found: list[tuple[str, str, str, int, int]] = []
     for v, view in enumerate(plan.views):
         name = HAND if plan.hand_held else view.name
         for k in range(len(view.poses.poses)):
-            label = f"p{len(found) + 1:0{width}d}"
+            label = labels[len(found)]
             found.append((name, f"images/{name}_{label}.jpg", label, v, k))
     return found
 
@@ -152,14 +152,14 @@ def _measurements(plan: Plan) -> str:
 
 def _poses(plan: Plan) -> str:
     """Return ``poses.csv``."""
-    motors, rows = list(plan.machine.motors), []
+    motors, rows, labels = list(plan.machine.motors), [], plan.labels
     shown = [SHOWN_IN[plan.machine.legs[j].reading_unit] for j in motors]
     scale = np.array([size for size, _ in shown])
     for name, image, label, v, k in images_of(plan):
         view = plan.views[v]
         T, via = view.poses.poses[k], view.via[k]
-        if via and via != HOME:  # an earlier pose of the view, by its number
-            via = images_of(plan)[sum(len(w.poses.poses) for w in plan.views[:v]) + int(via) - 1][2]
+        if via and via != HOME:
+            via = labels[int(via) - 1]
         angles = np.degrees(roll_pitch_yaw(T.rotation.as_matrix()))
         numbers = [*(scale * view.poses.readings[k, motors]), *(1e3 * T.translation), *angles]
         where = 1e3 * view.T_base_camera.translation

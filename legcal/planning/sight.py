@@ -32,7 +32,7 @@ from legcal.vision import (
 )
 
 N_SAMPLES = 24  # points along a part that are tested
-_NEAREST = 0.1  # [m] before the camera
+NEAREST = 0.1  # [m] before the camera
 _OUTSIDE = 1.2  # radii between the camera and an axis, at least
 _PLATE = 1.1  # size of a plate, over that of its joints
 _ROUND = 1.3  # radius of a plate of unknown shape, over that of the circle around its joints
@@ -154,7 +154,7 @@ def what_is_seen(
     s = start[..., None] + (end - start)[..., None] * share
     u_part = u[:, body]
     P = A[:, body, None] + s[..., None] * u_part[:, :, None]  # (n_images, n_parts, N_SAMPLES, 3)
-    seen = (end > start)[..., None] & in_picture(camera, P, _NEAREST, margin_px)
+    seen = (end > start)[..., None] & in_picture(camera, P, NEAREST, margin_px)
     foot = A[:, body] - u_part * np.sum(u_part * A[:, body], axis=-1, keepdims=True)
     seen &= (np.linalg.norm(foot, axis=-1) > _OUTSIDE * radius)[..., None]
     of_body = np.zeros(len(bodies.leg))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,11 @@ PLACES, GROWTH, CHECKLIST, PAGE_NAME = "places.svg", "growth.svg", "checklist.tx
 _CAMERA_COLOUR, _BOARD_COLOUR = "#b45309", "#15803d"
 _WORST = 12  # parameters that are told
 _PANEL = (6.0, 5.6)  # [inch]
+_LEAST = 6  # images, from which errors are drawn: fewer know next to nothing
+_FEW_TICKS = 5.0  # times the least error, up to which ticks are not those of decades
+_WIDTH = 9.0  # [inch] of the picture of places
+_MOST_NAMES = 4  # of joints or cameras near each other
+_ROOM = 0.1  # of its width, around what it shows
 
 
 def plan_table(plan: Plan, output: Path | None) -> RenderableType:
@@ -78,9 +83,21 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
         [plan.sentence, *map(printable, plan.notes)],
         [] if output is None else [
             printable(f"written: {output}"),
-            printable(f"calibrate with: legcal calibrate {output} -o OUT{_with_length(plan)}"),
+            *([printable(_to_be_added(plan))] if plan.given else []),
+            printable(
+                f"calibrate with: legcal calibrate {plan.given or output} -o "
+                f"OUT{_with_length(plan)}"
+            ),
         ],
     )  # fmt: skip
+
+
+def _to_be_added(plan: Plan) -> str:
+    """Return what becomes of a session that adds to another one."""
+    return (
+        "once it is shot, copy the photographs, the views in dataset.yaml and the rows of "
+        f"measurements.csv into {plan.given}"
+    )
 
 
 def _with_length(plan: Plan) -> str:
@@ -167,6 +184,8 @@ with {plan.camera.width} x {plan.camera.height} px and a focal length of \
         "Wait until it rests; write what the encoders say, not the command, into measurements.csv.",
         "Save each photograph under its name in measurements.csv.",
     ]
+    if plan.given:
+        items.append(f"In the end, {_to_be_added(plan).removeprefix('once it is shot, ')}.")
     if plan.board is not None:
         items.insert(1, _board_in_words(plan, plan.board))
     return items
@@ -177,13 +196,14 @@ def _board_in_words(plan: Plan, board: LaidBoard) -> str:
     A = _measured_joints(plan)
     far = 1e3 * np.linalg.norm(A - board.middle, axis=1)
     x, y, z = 1e3 * board.middle
+    facing = "up" if board.normal[2] > 0.0 else "down"  # of a machine that hangs
     joints = ", ".join(
         f"{d:.0f} mm from A{j + 1}" for d, j in zip(far, _measured(plan), strict=True)
     )
     return (
-        "Fix the board to the base, flat at the level of its joints, print up, as places.svg shows "
-        f"it: its middle about {joints}, at x {x:z.0f}, y {y:z.0f}, z {z:z.0f} mm in the base "
-        "link. It must not move, and be whole in every image."
+        f"Fix the board to the base, flat at the level of its joints, print {facing}, as "
+        f"places.svg shows it: its middle about {joints}, at x {x:z.0f}, y {y:z.0f}, z {z:z.0f} mm "
+        "in the base link. It must not move, and be whole in every image."
     )
 
 
@@ -222,13 +242,16 @@ def _draw_places(plan: Plan) -> Figure:
     machine = plan.machine
     B = np.asarray(machine.home.apply(machine.B_platform))
     A = B - vectors_A_to_B(machine, machine.home)
-    with new_figure(2, 2, _PANEL) as (figure, axes):
+    with new_figure(2, 1, (_WIDTH, _WIDTH)) as (figure, axes):
         for ax, (i, j), title in zip(
             axes, ((0, 1), (0, 2)), ("from above: x, y [mm]", "from the side: x, z [mm]"),
             strict=True,
         ):  # fmt: skip
             _draw_panel(ax, plan, A, B, i, j)
             ax.set_title(title, fontsize="medium")
+        heights = [_WIDTH * np.ptp(ax.get_ylim()) / np.ptp(ax.get_xlim()) + 0.6 for ax in axes]
+        axes[0].get_gridspec().set_height_ratios(heights)  # type: ignore[union-attr]
+        figure.set_size_inches(_WIDTH, sum(heights))
     return figure
 
 
@@ -236,37 +259,62 @@ def _draw_panel(ax: Axes, plan: Plan, A: Array, B: Array, i: int, j: int) -> Non
     """Draw one panel: coordinates i and j."""
     for a, b in zip(1e3 * A, 1e3 * B, strict=True):
         ax.plot([a[i], b[i]], [a[j], b[j]], color=LEG_COLOUR, linewidth=2.0)
-    for letter, joints, colour in (("A", A, BASE_COLOUR), ("B", B, PLATFORM_COLOUR)):
+    for joints, colour in ((A, BASE_COLOUR), (B, PLATFORM_COLOUR)):
         ax.scatter(1e3 * joints[:, i], 1e3 * joints[:, j], s=16.0, color=colour, zorder=3)
-        for k, joint in enumerate(1e3 * joints):
-            if letter == "A":
-                ax.annotate(f"A{k + 1}", (joint[i], joint[j]), (5.0, 5.0), color=colour,
-                            textcoords="offset points", fontsize="small")  # fmt: skip
     if plan.board is not None:
         outer = 1e3 * plan.board.corners[[0, 1, 2, 3, 0]]
         ax.plot(outer[:, i], outer[:, j], color=_BOARD_COLOUR, linewidth=1.5)
         ax.annotate("board", (outer[0, i], outer[0, j]), (3.0, 3.0), color=_BOARD_COLOUR,
                     textcoords="offset points", fontsize="small")  # fmt: skip
-    for n, view in enumerate(plan.views):
+    for view in plan.views:
         where = 1e3 * view.T_base_camera.translation
         sight = view.T_base_camera.rotation.as_matrix()[:, 2]
         tip = where + 250.0 * sight
         arrow = {"arrowstyle": "->", "color": _CAMERA_COLOUR}
         ax.annotate("", (tip[i], tip[j]), (where[i], where[j]), arrowprops=arrow)
         ax.scatter(where[i], where[j], marker="s", s=40.0, color=_CAMERA_COLOUR, zorder=4)
-        ax.annotate(
-            plain(view.name), (where[i], where[j]), (7.0, -16.0 if n % 2 else 7.0),
-            color=_CAMERA_COLOUR, textcoords="offset points",
-        )  # fmt: skip
         if (i, j) == (0, 1) and not plan.hand_held:
             _draw_distances(ax, where, 1e3 * _measured_joints(plan))
     ax.set_aspect("equal")
-    ax.margins(0.15)
+    ax.margins(0.0)
+    room = _ROOM * float(np.ptp(ax.get_xlim()))
+    joints_of_base = [f"A{k + 1}" for k in range(len(A))]
+    for name, at in _together(joints_of_base, 1e3 * A[:, [i, j]], 0.4 * room):
+        ax.annotate(name, at, (5.0, 5.0), color=BASE_COLOUR, textcoords="offset points",
+                    fontsize="small")  # fmt: skip
+    lenses = 1e3 * np.array([view.T_base_camera.translation for view in plan.views])
+    for n, (name, at) in enumerate(
+        _together([view.name for view in plan.views], lenses[:, [i, j]], 0.2 * room)
+    ):
+        ax.annotate(name, at, (7.0, -16.0 if n % 2 else 7.0), color=_CAMERA_COLOUR,
+                    textcoords="offset points")  # fmt: skip
+    for limits, put in ((ax.get_xlim(), ax.set_xlim), (ax.get_ylim(), ax.set_ylim)):
+        put(limits[0] - room, limits[1] + room)
     ax.grid(alpha=0.2)
 
 
+def _together(
+    names: Sequence[str], points: Array, near: float
+) -> list[tuple[str, tuple[float, float]]]:
+    """Return names of points (n, 2), in one text for those near each other, and where it stands."""
+    groups: list[list[int]] = []
+    for k in range(len(points)):
+        beside = [g for g in groups if np.linalg.norm(points[g] - points[k], axis=1).min() < near]
+        groups = [g for g in groups if g not in beside]
+        groups.append(sorted([k, *(i for g in beside for i in g)]))
+    found = []
+    for group in groups:
+        of_group = [names[k] for k in group]
+        if len(group) > _MOST_NAMES:
+            of_group = [of_group[0], "...", of_group[-1]]
+        x, y = points[group[int(np.argmax(points[group, 0]))]].tolist()
+        found.append((plain(", ".join(of_group)), (x, y)))
+    return found
+
+
 def _draw_distances(ax: Axes, lens: Array, joints: Array) -> None:
-    """Draw from above how far a lens is from joints, each distance along its line [mm]."""
+    """Draw from above how far a lens is from joints (rings), each distance along its line [mm]."""
+    ax.scatter(joints[:, 0], joints[:, 1], s=70.0, facecolors="none", edgecolors=_CAMERA_COLOUR)
     for part, joint in zip(np.linspace(0.2, 0.6, len(joints)), joints, strict=True):
         ax.plot([lens[0], joint[0]], [lens[1], joint[1]], color=_CAMERA_COLOUR,
                 linewidth=0.6, linestyle=":")  # fmt: skip
@@ -281,10 +329,11 @@ def _draw_distances(ax: Axes, lens: Array, joints: Array) -> None:
 def _draw_growth(plan: Plan) -> Figure:
     """Return a figure of what is expected over the number of images."""
     planned = plan.growth[:, 0] <= plan.n_images
-    known = np.isfinite(plan.growth[:, 1]) & (plan.growth[:, 0] >= min(6, plan.n_images))
+    least = 1 if plan.given else min(_LEAST, plan.n_images)
+    known = np.isfinite(plan.growth[:, 1]) & (plan.growth[:, 0] >= least)
     scale, unit = _scaled(plan, 1.0)
     what = f"expected, {plan.goal.value}" if unit == "mm" else f"criterion: {plan.goal.value}"
-    from matplotlib.ticker import LogLocator, NullFormatter
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
     with new_figure(1, 1, _PANEL) as (figure, (ax,)):
         for chosen, style, label in (
@@ -301,6 +350,9 @@ def _draw_growth(plan: Plan) -> Figure:
             axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axis.set_major_formatter("{x:g}")
             axis.set_minor_formatter(NullFormatter())
+        drawn = plan.growth[known, 1]
+        if drawn.max() < _FEW_TICKS * drawn.min():
+            ax.yaxis.set_major_locator(MaxNLocator(6))
         ax.set_xlabel("images")
         ax.set_ylabel(f"{what} [{unit}]")
         ax.grid(which="both", alpha=0.2)
