@@ -7,8 +7,6 @@ scale; a prior on radii, or on lines of arms, that nobody has stated must not do
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from legcal.calibration.identify.information import (
@@ -20,6 +18,7 @@ from legcal.calibration.identify.information import (
 from legcal.calibration.identify.ranks import Analysis, undetermined
 from legcal.calibration.identify.report import ScaleSource
 from legcal.calibration.joint_fit.variables import RefinementSettings
+from legcal.data import Dataset
 from legcal.estimation import GaussianPrior, Variables, all_free, information_rows, marginal_rows
 from legcal.geometry import Array, IntArray
 from legcal.machine import LegColumns, radius_name
@@ -143,11 +142,25 @@ def _stated_radii(analysis: Analysis) -> Array:
     return np.array([sigma(*part) for part in predicted.parts])
 
 
-def scale_in_words(sources: Sequence[ScaleSource]) -> str:
-    """Return what is needed, as one sentence for a refusal."""
+def refusal_of_scale(dataset: Dataset, analysis: Analysis) -> str:
+    """Return why the scale of a session is open and what to do, as a refusal."""
+    machine = dataset.machine
+    sources = scale_sources(analysis)
+    if dataset.axes is not None:  # radii and boards are of images
+        sources = tuple(source for source in sources if source.source == "length")
     known = [source.assumed for source in sources if source.sigma is not None]
     ways = ", or ".join(known or [source.assumed for source in sources])
+    why, fixed = "readings of arms carry no length", ""
+    if machine.readings_carry_length:  # but for gains
+        why, fixed = "the gains of all motors that slide are free", "fix one of these gains, or "
+    ends = "" if machine.rod_to_measure is None else f" {machine.rod_to_measure[1]}"
+    stated = f"state a measured length (--length{ends}=MEASURED±SIGMAmm)"
+    if dataset.axes is None:
+        stated += (
+            ", or radii that you know better than the model (--prior '*.radius.*=VALUE±SIGMAmm')"
+        )
     return (
-        "found that readings of arms carry no length, so that machine, rods and cameras could all "
-        f"be larger alike, needed something that fixes the scale: {ways}"
+        f"{dataset.folder}: the parameters cannot be identified: found that {why}, so that "
+        "machine, rods and cameras could all be larger alike, needed something that fixes the "
+        f"scale: {ways}; {fixed}{stated}."
     )
