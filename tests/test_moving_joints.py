@@ -225,8 +225,13 @@ def test_an_unknown_scale_is_refused_with_what_would_fix_it(
     monkeypatch.setattr(
         identifiability, "recorded_observations", lambda dataset, twists: session("6-rss")
     )
-    dataset: Any = SimpleNamespace(folder="servo")
-    wanted = "leg1.length measured to 0.05 mm, or a calibration board on the base .* --prior"
+    known = SimpleNamespace(
+        readings_carry_length=False, rod_to_measure=(None, "leg1.base:leg1.platform")
+    )
+    dataset: Any = SimpleNamespace(folder="servo", machine=known, axes=None)
+    wanted = (
+        "leg1.length measured to 0.05 mm, or a calibration board on the base .*=MEASURED.*--prior"
+    )
     with pytest.raises(NotIdentifiable, match=wanted):
         check_identifiable(dataset)
 
