@@ -159,6 +159,8 @@ def test_ranks_are_the_published_ones_and_radii_carry_the_scale_of_arms(name: st
         assert max(s.sigma or 1.0 for s in found[:3]) < 0.001
         known = Choices(priors={"leg1.length": Prior(0.4, 5e-5)})
         assert not is_scale_open(Analysis(session(name), known))
+        vague = Choices(priors={"leg1.length": Prior(0.4, 0.02)})  # radii would set the scale
+        assert is_scale_open(Analysis(session(name), vague))
         rods = [
             replace(leg, cylinders=(Cylinder("rod", 0.008, "base", 0.0, leg.q0),))
             for leg in analysis.predicted.legs
