@@ -18,7 +18,8 @@ from legcal.files import SHOWN_IN
 from legcal.geometry import Array
 from legcal.machine import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR, vectors_A_to_B
 from legcal.pages import Drawing, Items, Picture, Row, page_html
-from legcal.planning import LaidBoard, Plan, rod_to_measure, views_in_words
+from legcal.planning import LaidBoard, Plan, views_in_words
+from legcal.report.machine import length_option
 from legcal.report.page.text_page import text_page
 from legcal.report.render import heading, report, table
 
@@ -58,6 +59,7 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
         (name, *(f"{1e3 * x:.0f}" for x in row)) for name, row in camera_distances(plan).items()
     ]
     legs = ", ".join(names)
+    length = length_option(plan.machine, board=plan.board is not None)
     return report(
         heading(printable(plan.machine.name), f": {views_in_words(plan.views)}"),
         table(
@@ -78,15 +80,9 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
         [plan.sentence, *map(printable, plan.notes)],
         [] if output is None else [
             printable(f"written: {output}"),
-            printable(f"calibrate with: legcal calibrate {output} -o OUT{_with_length(plan)}"),
+            printable(f"calibrate with: legcal calibrate {output} -o OUT{length}"),
         ],
     )  # fmt: skip
-
-
-def _with_length(plan: Plan) -> str:
-    """Return the option that a calibration needs for its scale, if any."""
-    found = rod_to_measure(plan.machine, board=plan.board is not None)
-    return "" if found is None else f" --length {found[1]}=MEASURED±SIGMAmm"
 
 
 def _told(plan: Plan) -> list[tuple[float, float]]:
