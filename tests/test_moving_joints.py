@@ -28,6 +28,7 @@ from legcal.machine import (
 )
 from legcal.paper import count_conditions, enough_readings
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
+from legcal.report import identify_verdict
 from legcal.report.identify import _verdict
 
 RANKS = {"hexaglide": 42, "6-rss": 54, "linear-delta": 36, "delta": 42, "3-prs": 21}
@@ -183,6 +184,8 @@ def test_the_verdict_names_the_scale_as_the_largest_part_of_the_error() -> None:
         notes=(),
     )
     text = " ".join(str(line) for line in _verdict(report))
+    assert "calibrate refuses this machine until a length or radii are stated" in text
+    assert "leg1.length measured to 0.05 mm" in identify_verdict(report).reasons[0]
     assert "With radii alone it is 3.1 mm: the scale is the largest part of it" in text
     assert "better is leg1.length measured to 0.05 mm, or a calibration board on the base" in text
 

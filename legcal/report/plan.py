@@ -165,6 +165,12 @@ with {plan.camera.width} x {plan.camera.height} px and a focal length of \
     ]
     if plan.board is not None:
         items.insert(1, _board_in_words(plan, plan.board))
+    if length := length_option(plan.machine, board=plan.board is not None):
+        items.insert(
+            1,
+            "Measure a rod from joint centre to joint centre: readings of motors that turn carry "
+            f"no length. Calibrate with{length}.",
+        )
     return items
 
 

@@ -122,6 +122,10 @@ def identify_verdict(report: Identifiability) -> Verdict:
         word = "These images cannot determine the machine"
         reasons = [f"Open: {one.direction}." for one in full.weak if not one.harmless]
         return Verdict("bad", word, sentence, reasons)
+    if report.scale:
+        word = "These images can determine all of the machine but its scale"
+        ways = ", or ".join(one.assumed for one in report.scale if one.sigma is not None)
+        return Verdict("doubtful", word, sentence, [f"To fix the scale: {ways}."] if ways else [])
     if not (staged.complete and report.conditions_hold):
         return Verdict("doubtful", "The joint fit can determine it, the steps cannot", sentence, [])
     return Verdict("good", "These images determine the machine", sentence, [])
