@@ -383,6 +383,7 @@ def test_legs_that_nobody_can_see_are_named_before_images_are_searched(tmp_path:
     ("old", "new", "named"),
     [
         (LIMITS, 'lower="-30" upper="70"', ("'arm1'", "-30 to 70 rad", "degrees")),
+        (LIMITS, 'lower="1.0" upper="1.2"', ("'arm1' at 20.00 deg", "57.30 to 68.75 deg")),
         (
             LIMITS,
             'lower="-3.1" upper="3.1"',

@@ -492,7 +492,7 @@ def _not_a_chain(
     urdf: Urdf, steps: list[Step], body: str, base: str, n_onward: int, motors: Sequence[str]
 ) -> str:
     """Return why the leg that starts with some joints is not a chain."""
-    needed = "needed one unbranched chain from base to platform for each leg"
+    needed = "needed one unbranched chain from base to platform for each leg;"
     first = steps[0].connection
     last = steps[-1].connection
     if body != base and n_onward > 1 and len(steps) > 1 and last.joint in motors:
@@ -516,13 +516,13 @@ def _not_a_chain(
         found = f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
         needed = (
             "needed joints whose centres are fixed in the base, or a motor in name_mot that moves "
-            "this link"
+            f"this link; name {_name(first)} in name_mot if a motor turns it, otherwise"
         )
     else:
         found = f"shares link '{body}' with another leg or branches there"
     return (
         f"{urdf.path}: this is not a platform on separate legs: the chain that starts with "
-        f"{_name(first)} {found}, {needed}; check closed_loop, legcal.base and legcal.platform."
+        f"{_name(first)} {found}, {needed} check closed_loop, legcal.base and legcal.platform."
     )
 
 
