@@ -72,11 +72,17 @@ def test_commands_know_that_joints_at_A_move(
         looked = json.loads(said("doctor", session, "--json", "-q", code=1))
         assert [one["column"] for one in looked["encoders"]] == list(truth.motor_names)
         assert {one["unit"] for one in looked["encoders"]} == {"rad"}
+        assert "scale" in json.loads(said("identify", session, "--json"))
+        written = tmp_path / "session" / "dataset.yaml"
+        length = "{'leg1.base:leg1.platform': 400+-0.5mm}"
+        written.write_text(f"{written.read_text()}parameters: {{lengths: {length}}}\n")
+        assert "scale" not in json.loads(said("identify", session, "--json"))
         stated = {
             f"{leg.name}.radius.{part}": (r, 1e-4 * r)
             for leg in nominal.legs
             for part, r in leg.radius_of_part.items()
         }
+        written.write_text(written.read_text().partition("parameters:")[0])
         by_radii = calibrate(session, priors=stated)
         assert "largest part of that is the scale of the machine" in by_radii.verdict.sentence
         assert "--length leg1.base:leg1.platform" in by_radii.verdict.remedy

@@ -28,7 +28,7 @@ from legcal.calibration.identify.remedies import (
 )
 from legcal.calibration.identify.report import Identifiability, Ranks, Recommendation
 from legcal.calibration.identify.scale import is_scale_open, refusal_of_scale, scale_sources
-from legcal.calibration.joint_fit import NO_CHOICES, Choices
+from legcal.calibration.joint_fit import NO_CHOICES, Choices, known_parameters, resolve
 from legcal.data import Dataset
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.files import closest
@@ -100,7 +100,14 @@ def answer(
         )
     from legcal.data import load_dataset
 
-    return identifiability_of_dataset(load_dataset(path, check_images=False))
+    dataset = load_dataset(path, check_images=False)
+    known = known_parameters(
+        dataset.machine,
+        dataset.measurements.views,
+        axes_given=dataset.axes is not None,
+        boards=dataset.boards,
+    )
+    return identifiability_of_dataset(dataset, resolve(dataset.overrides, known))
 
 
 def identifiability(
