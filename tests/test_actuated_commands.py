@@ -46,6 +46,7 @@ def test_commands_know_that_joints_at_A_move(
     compared = said("evaluate", f"{out}/calibrated.yaml", name)
     assert "where their motors read 0" in " ".join(compared.split())
     scene = (tmp_path / "out" / "report.html").read_text()
+    assert " ".join([*known, "--holdout"]) in scene  # what fixes the scale stays in the command
     ends = np.array(json.JSONDecoder().raw_decode(scene.split('"standing": ')[1])[0])
     assert ends.shape == (2, 4 * len(truth.actuators), 3)  # rim and rails or axes, of both models
 
@@ -67,17 +68,24 @@ def test_commands_know_that_joints_at_A_move(
         assert run(monkeypatch, "calibrate", session, "-o", tmp_path / "never", "-q", *free) == 1
         refusal = " ".join(capsys.readouterr().err.split())
         assert "carry no length" in refusal
-        assert "state a measured length with --length" in refusal
+        assert "--length leg1.base:leg1.platform=MEASURED" in refusal
         looked = json.loads(said("doctor", session, "--json", "-q", code=1))
         assert [one["column"] for one in looked["encoders"]] == list(truth.motor_names)
         assert {one["unit"] for one in looked["encoders"]} == {"rad"}
+        assert "scale" in json.loads(said("identify", session, "--json"))
+        written = tmp_path / "session" / "dataset.yaml"
+        length = "{'leg1.base:leg1.platform': 400+-0.5mm}"
+        written.write_text(f"{written.read_text()}parameters: {{lengths: {length}}}\n")
+        assert "scale" not in json.loads(said("identify", session, "--json"))
         stated = {
             f"{leg.name}.radius.{part}": (r, 1e-4 * r)
             for leg in nominal.legs
             for part, r in leg.radius_of_part.items()
         }
+        written.write_text(written.read_text().partition("parameters:")[0])
         by_radii = calibrate(session, priors=stated)
         assert "largest part of that is the scale of the machine" in by_radii.verdict.sentence
+        assert "--length leg1.base:leg1.platform" in by_radii.verdict.remedy
         rows = {row["parameter"]: row for row in by_radii.table()}
         sigma = rows["leg1.length"]["sigma"] / rows["leg1.length"]["calibrated"]
         assert sigma > 0.1 / 20.0  # edges that all lie 0.1 px inwards, of rods up to 40 px wide

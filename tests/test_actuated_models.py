@@ -325,6 +325,7 @@ def test_what_a_table_of_motors_cannot_say(
         ("hexaglide", {"arm_length": 20.0}, ("--arm-length", "--rod-length")),
         ("linear-delta", {"arm_radius": 5.0}, ("--arm-radius", "--rod-length")),
         ("delta", {"rod_length": 100.0}, ("rods of 100 mm", "--rod-length")),
+        ("delta", {"height": 374.0}, ("--height 374", "negative")),
         ("delta", {"rod_length": 100.0, "unit": None}, ("no unit", "--unit mm")),
         ("3-prs", {"rod_length": -1.0}, ("--rod-length -1", "positive")),
         ("orthoglide", {"travel": (5.0, 1.0)}, ("--travel 5 1",)),
@@ -383,6 +384,7 @@ def test_legs_that_nobody_can_see_are_named_before_images_are_searched(tmp_path:
     ("old", "new", "named"),
     [
         (LIMITS, 'lower="-30" upper="70"', ("'arm1'", "-30 to 70 rad", "degrees")),
+        (LIMITS, 'lower="1.0" upper="1.2"', ("'arm1' at 20.00 deg", "57.30 to 68.75 deg")),
         (
             LIMITS,
             'lower="-3.1" upper="3.1"',

@@ -66,6 +66,8 @@ def test_a_length_is_between_two_joints_and_that_of_a_rod_is_its_own() -> None:
             choose([f"{name}=550±0.05mm"], parameters=delta)
     with pytest.raises(UsageError, match="check the number and its unit"):
         choose(["leg1.base:leg3.base=550±0.05m"], parameters=delta)
+    with pytest.raises(UsageError, match=r"0.45 m .* has 0.5567 m apart, needed .* within 15 %"):
+        choose(["leg1.base:leg3.base=450±0.05mm"], parameters=delta)
 
 
 def test_the_four_ways_to_state_a_prior_are_one() -> None:

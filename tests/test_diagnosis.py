@@ -465,6 +465,17 @@ def test_readings_outside_the_travel_are_called_what_they_look_like(
     assert "columns leg1_prismatic, leg2_prismatic" in problem
 
 
+def test_one_motor_that_runs_backwards_is_not_called_another_unit(tmp_path: Path) -> None:
+    session = spoiled(tmp_path / "set", 4, ("c1",))
+    for row in session.rows:
+        row["leg2_prismatic"] = repr(-float(row["leg2_prismatic"]) - 0.01)
+    with pytest.raises(DatasetError) as refusal:
+        load_dataset(session.write())
+    (problem,) = refusal.value.problems
+    assert "column leg2_prismatic" in problem
+    assert "these look like readings with the opposite sign" in problem
+
+
 def test_a_missing_reading_is_not_called_outside_the_travel(tmp_path: Path) -> None:
     session = spoiled(tmp_path / "set", 4, ("c1",))
     session.rows[1]["leg2_prismatic"] = ""

@@ -556,7 +556,13 @@ def _delta(*, parallelograms: bool, elbows: int = 1) -> Drawing:
             drawing.chain(f"arm{j}", "base", np.zeros(3), joints, end=end, kind="3d")
             drawing.legs[f"arm{j}"] = f"j_arm{j}_0"
             continue
-        drawing.add(f"arm{j}", "revolute", "base", pivot, axis)
+        root = "base"
+        for i in range(elbows - 1):
+            drawing.add(f"lower{j}_{i}", "revolute", root, -0.05 * Z, axis)
+            root = f"lower{j}_{i}"
+            drawing.motors.append(f"j_{root}")
+        drawing.add(f"arm{j}", "revolute", root, pivot + 0.05 * (elbows - 1) * Z, axis)
+        drawing.motors.append(f"j_arm{j}")
         drawing.legs[f"leg{j}"] = f"j_arm{j}"
         for k, out in enumerate((-0.03 * axis, 0.03 * axis)):
             rod = _rod(elbow + out, end + out, axis)
@@ -630,6 +636,8 @@ DRIVEN: dict[str, tuple[Callable[[], Drawing], bool, tuple[str, ...]]] = {
     "a Delta with couplers": (_couplers, True, LOOP),
     "arm on arm": (lambda: _delta(parallelograms=False, elbows=2), True, (
         "the leg of motor 'j_arm0_0'", "no slider and 3 joints in different places", "a rod of")),
+    "parallelograms of arm on arm": (lambda: _delta(parallelograms=True, elbows=2), True, (
+        "the motor 'j_arm0' of 2 rods", "'j_lower0_0'", "arms on arms")),
     "3-RRR": (lambda: _planar_arms(3), True, ("a planar machine whose joints at A move",)),
 }  # fmt: skip
 

@@ -28,6 +28,7 @@ from legcal.machine import (
 )
 from legcal.paper import count_conditions, enough_readings
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
+from legcal.report import identify_verdict
 from legcal.report.identify import _verdict
 
 RANKS = {"hexaglide": 42, "6-rss": 54, "linear-delta": 36, "delta": 42, "3-prs": 21}
@@ -159,6 +160,8 @@ def test_ranks_are_the_published_ones_and_radii_carry_the_scale_of_arms(name: st
         assert max(s.sigma or 1.0 for s in found[:3]) < 0.001
         known = Choices(priors={"leg1.length": Prior(0.4, 5e-5)})
         assert not is_scale_open(Analysis(session(name), known))
+        vague = Choices(priors={"leg1.length": Prior(0.4, 0.02)})  # radii would set the scale
+        assert is_scale_open(Analysis(session(name), vague))
         rods = [
             replace(leg, cylinders=(Cylinder("rod", 0.008, "base", 0.0, leg.q0),))
             for leg in analysis.predicted.legs
@@ -181,6 +184,8 @@ def test_the_verdict_names_the_scale_as_the_largest_part_of_the_error() -> None:
         notes=(),
     )
     text = " ".join(str(line) for line in _verdict(report))
+    assert "calibrate refuses this machine until a length or radii are stated" in text
+    assert "leg1.length measured to 0.05 mm" in identify_verdict(report).reasons[0]
     assert "With radii alone it is 3.1 mm: the scale is the largest part of it" in text
     assert "better is leg1.length measured to 0.05 mm, or a calibration board on the base" in text
 
@@ -225,8 +230,13 @@ def test_an_unknown_scale_is_refused_with_what_would_fix_it(
     monkeypatch.setattr(
         identifiability, "recorded_observations", lambda dataset, twists: session("6-rss")
     )
-    dataset: Any = SimpleNamespace(folder="servo")
-    wanted = "leg1.length measured to 0.05 mm, or a calibration board on the base .* --prior"
+    known = SimpleNamespace(
+        readings_carry_length=False, rod_to_measure=(None, "leg1.base:leg1.platform")
+    )
+    dataset: Any = SimpleNamespace(folder="servo", machine=known, axes=None)
+    wanted = (
+        "leg1.length measured to 0.05 mm, or a calibration board on the base .*=MEASURED.*--prior"
+    )
     with pytest.raises(NotIdentifiable, match=wanted):
         check_identifiable(dataset)
 

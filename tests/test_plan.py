@@ -46,6 +46,7 @@ from legcal.planning.exchange import Session, choose
 from legcal.planning.information import Contributions
 from legcal.planning.planner import Scene, Task
 from legcal.report import plan_table
+from legcal.report.plan import checklist
 from legcal.simulation import Level, ParameterErrors, SimulationSettings, simulate
 from legcal.vision import sample_camera
 
@@ -457,6 +458,7 @@ def test_plans_of_motors_that_turn_are_in_degrees_and_name_the_length_to_measure
     console.print(plan_table(plan, tmp_path))
     printed = console.file.getvalue()  # type: ignore[attr-defined]
     assert "-o OUT --length leg1.base:leg1.platform=" in printed
+    assert any("Measure the rod of leg1" in item for item in checklist(plan))
 
 
 def test_each_motor_counts_with_its_own_standard_deviation(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -76,6 +76,7 @@ class Verdict:
 
     trustworthy: bool  # the predicted improvement exceeds two sigma, and nothing speaks against it
     sentence: str  # the same, for people
+    remedy: str = ""  # what would tell more than further images, as a sentence goes on
 
 
 @dataclass(frozen=True, eq=False)

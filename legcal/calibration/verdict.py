@@ -59,16 +59,20 @@ def judge(
         solution.T_Rb_Re,
         solution.sensitivities,
     )
-    remedy = "take more images or better ones"
+    remedy = ""
     if platform is None:
         change, sigma, found = _change_of_parameters(dataset, solution)
     else:
         change, sigma, found = _change_of_platform(platform)
         if by_scale := _share_of_scale(platform):
             found += f"; {by_scale}"
-            remedy = "measure the distance of two joints and state it (--length)"
+            rod = machine.rod_to_measure
+            ends = "" if rod is None else f" {rod[1]}=MEASURED±SIGMAmm"
+            remedy = f"measure the distance of two joints and state it (--length{ends})"
     objection = _objection(dataset, solution, diagnosis, found)
-    verdict = Verdict(False, objection) if objection else _verdict(change, sigma, found, remedy)
+    verdict = (
+        Verdict(False, objection, remedy) if objection else _verdict(change, sigma, found, remedy)
+    )
     return Calibration(
         dataset,
         solution,
@@ -176,9 +180,10 @@ def _change_of_parameters(dataset: Dataset, solution: Solution) -> tuple[float, 
 def _verdict(improvement: float, sigma: float, found: str, remedy: str) -> Verdict:
     """Return what an improvement with a standard deviation is worth."""
     if improvement > TRUSTED_SIGMAS * sigma:
-        return Verdict(True, f"Calibrated: {found}.")
+        return Verdict(True, f"Calibrated: {found}.", remedy)
     return Verdict(
         False,
         f"{_DO_NOT_LOAD}: {found}, and a predicted improvement below two sigma is no improvement; "
-        f"{remedy}.",
+        f"{remedy or 'take more images or better ones'}.",
+        remedy,
     )

@@ -101,4 +101,4 @@ def import_(
     if as_json:
         print_json(found.document(written))
     elif written:
-        print_table(report.written_lines(output, written))
+        print_table(report.written_lines(output, written, found.machine))

@@ -117,4 +117,4 @@ def init(
     if as_json:
         print_json(found.document(written))
     elif written:
-        print_table(report.written_lines(output, written))
+        print_table(report.written_lines(output, written, found.machine))

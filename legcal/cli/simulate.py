@@ -54,7 +54,7 @@ def simulate(
     show(
         as_json,
         lambda: document,
-        lambda: simulation_table(document, repeated=repeated, has_scale=made.has_scale),
+        lambda: simulation_table(document, repeated=repeated, to_measure=made.to_measure),
     )
 
 

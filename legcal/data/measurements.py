@@ -46,6 +46,7 @@ MAX_READING_SPREAD = 10.0  # sigma by which rows of one pose may differ
 INCH = 0.0254  # [m]
 # Parts of the travel: in the unit that is stated, and in another that may be, or surely is, meant
 HARDLY_MOVES, MAY_MOVE, SURELY_MOVES = 0.02, 0.2, 0.5
+WOULD_MOVE = 0.05  # what readings outside the travel would use of it in what they are taken for
 MIN_POSES = 5  # different ones, as an arm needs (6'): fewer are a check, and may be near each other
 USUAL_PULSES = (400.0, 2700.0)  # [us], of hobby servos
 _MAX_SHOWN = 3  # readings quoted in a sentence about many
@@ -229,10 +230,20 @@ def readings_in(
                 f"{table.path}, column {leg.prismatic}: readings are a little outside the travel "
                 f"{travel}: {_some(table, numbers, outside, unit_name)}."
             )
+    mostly = [name for name, _, most in beyond if most]
     cause = ""
-    if any(most for *_, most in beyond):
-        cause = _likely_cause(given, actuated, stated, in_dataset=units is not None)
-    alike = [name for name, _, most in beyond if most and cause]
+    if mostly:
+        # whatever is outside lies inside once divided by enough: there it has to move, too
+        wrong = [j for j, leg in enumerate(actuated) if str(leg.prismatic) in mostly]
+        for some, least in ((range(len(actuated)), WOULD_MOVE), (wrong, WOULD_MOVE), (wrong, 0.0)):
+            cause = cause or _likely_cause(
+                given[:, list(some)],
+                [actuated[j] for j in some],
+                [stated[j] for j in some],
+                in_dataset=units is not None,
+                least=least,
+            )
+    alike = mostly if cause else []
     for name, found, _ in beyond:
         if name in alike[1:]:
             continue
@@ -311,12 +322,17 @@ def doubted_units(
 
 
 def _likely_cause(
-    given: Array, legs: Sequence[Leg], units: Sequence[ReadingUnit], *, in_dataset: bool
+    given: Array,
+    legs: Sequence[Leg],
+    units: Sequence[ReadingUnit],
+    *,
+    in_dataset: bool,
+    least: float = 0.0,
 ) -> str:
     """Return what readings (n_rows, n_legs) look like, and the remedy; "" where it is not clear.
 
-    Of what would bring all of them into their travel, that with which they move in it most. They
-    are as the table has them, in *units*.
+    Of what would bring all of them into their travel, that with which they move in it most, and
+    more than a part of it. They are as the table has them, in *units*.
     """
     groups = dict.fromkeys(
         (leg.reads_angle, unit.name) for leg, unit in zip(legs, units, strict=True)
@@ -325,7 +341,12 @@ def _likely_cause(
         for group in sorted(groups, reverse=True):
             some = [j for j, unit in enumerate(units) if (legs[j].reads_angle, unit.name) == group]
             chosen = [[of[j] for j in some] for of in (legs, units)]
-            cause = _likely_cause(given[:, some], *chosen, in_dataset=in_dataset)  # type: ignore[arg-type]
+            cause = _likely_cause(
+                given[:, some],
+                *chosen,  # type: ignore[arg-type]
+                in_dataset=in_dataset,
+                least=least,
+            )
             if cause:
                 return cause
         return ""
@@ -341,7 +362,7 @@ def _likely_cause(
             if other != name
         )
     width = np.ptp([leg.travel for leg in legs], axis=1)
-    found, most = "", 0.0
+    found, most = "", least
     for meant, what in tried:
         moved = float(np.mean(np.ptp(meant, axis=0) / width))
         if moved > most and np.all(in_travel(meant, legs)):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from legcal.machine.home import legs_outside
+from legcal.machine.home import home_reading_in_words, legs_outside
 from legcal.machine.mobility import singularity
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.schema import LegcalBlock
@@ -28,13 +28,13 @@ def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]
             f"[{xyz}], quat_xyzw [{quat}]; write it down if the machine is assembled this way."
         )
     outside = legs_outside(machine)
-    for j, leg in enumerate(machine.legs):
-        lower, upper = leg.travel
-        if j in outside:
-            notes.append(
-                f"leg '{leg.name}' is at {1e3 * q[j]:.2f} mm at home, outside its travel of "
-                f"{1e3 * lower:.2f} to {1e3 * upper:.2f} mm; check legcal.home or the limits."
-            )
+    for name, reading, travel in dict.fromkeys(
+        home_reading_in_words(machine.legs[j], float(q[j])) for j in outside
+    ):
+        notes.append(
+            f"{name} is at {reading} at home, outside its travel of {travel}; check legcal.home or "
+            "the limits."
+        )
     tied = ties_in_words(machine)
     notes += [] if tied is None else [tied]
     return (*notes, *_unseen_notes(machine), *_motor_notes(machine), *_spin_notes(machine))

@@ -149,6 +149,11 @@ def _describe_named(name: str, family: ActuatedFamily, given: Family) -> Descrip
         if not low < value < high:
             needed = "an angle between 0 and 120 deg" if high == 120.0 else "a positive length"
             problems.append(f"{where}: found {_option(key)} {value:g}, needed {needed}; mend it.")
+    if name == "delta" and stated.get("height", -1.0) >= 0.0:
+        problems.append(
+            f"{where}: found --height {stated['height']:g}, needed a negative one: the platform "
+            "of a Delta is below its base, towards which arms sink; give it the other sign."
+        )
     if given.travel is not None and not -1e9 < given.travel[0] < given.travel[1] < 1e9:
         problems.append(_wrong_travel(where, given.travel))
     if given.name is not None:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, ModelError
+from legcal.files import SHOWN_IN
 from legcal.geometry import Array, motion_of
 from legcal.machine.closing import close_at
 from legcal.machine.equations import (
@@ -25,6 +26,7 @@ from legcal.machine.equations import (
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import B_at, Machine, platform_pose, readings_at
 from legcal.machine.parameters import legs_in_links
+from legcal.machine.rods import actuator_index
 from legcal.machine.solved_poses import project_pose
 from legcal.machine.solver import Equations, Solved, poses_after, solve
 from legcal.machine.topology import level_rotation
@@ -263,14 +265,18 @@ def check_home_travel(machine: Machine) -> None:
     ------
     ModelError
         If an actuated leg is outside its travel by more than the travel itself and by more than
-        1 % of its length.
+        1 % of its length, or a motor that rods hang on by more than its travel.
     """
-    far = {}
-    q = readings_at(machine, machine.home)
+    far: dict[int, float] = {}
+    q, actuators = readings_at(machine, machine.home), actuator_index(machine.legs)
     for j, excess in legs_outside(machine, MAX_OUTSIDE).items():
         leg = machine.legs[j]
-        allowed = _MAX_OUTSIDE_OF_LEG * leg.length_at(float(q[j]))
-        if leg.kind is LegKind.ACTUATED and excess > allowed:
+        if leg.actuator is not None:  # rods may share one
+            is_far = actuators[j] not in {actuators[k] for k in far}
+        else:
+            allowed = _MAX_OUTSIDE_OF_LEG * leg.length_at(float(q[j]))
+            is_far = leg.kind is LegKind.ACTUATED and excess > allowed
+        if is_far:
             far[j] = excess
     if not far:
         return
@@ -278,22 +284,36 @@ def check_home_travel(machine: Machine) -> None:
     leg = machine.legs[worst]
     others = ""
     if len(far) > 1:
-        others = f" ({len(far) - 1} more {'leg is' if len(far) == 2 else 'legs are'} as far off)"
+        what = "leg" if leg.actuator is None else "motor"
+        more = f"{what} is" if len(far) == 2 else f"{what}s are"
+        others = f" ({len(far) - 1} more {more} as far off)"
+    name, reading, travel = home_reading_in_words(leg, float(q[worst]))
     raise ModelError(
-        f"{machine.yaml_path}: legcal.home could not be used: found leg '{leg.name}' at "
-        f"{1e3 * q[worst]:.2f} mm there{others}, needed a reading near its travel of "
-        f"{1e3 * leg.travel[0]:.2f} to {1e3 * leg.travel[1]:.2f} mm; correct legcal.home or the "
-        "limits of the slider."
+        f"{machine.yaml_path}: legcal.home could not be used: found {name} at {reading} "
+        f"there{others}, needed a reading near its travel of {travel}; correct legcal.home or the "
+        f"limits of the {'slider' if leg.actuator is None else 'motor'}."
     )
 
 
+def home_reading_in_words(leg: Leg, q: float) -> tuple[str, str, str]:
+    """Return the leg or the motor that it hangs on, a reading of it, and its travel."""
+    size, unit = SHOWN_IN[leg.reading_unit]
+    name = f"leg '{leg.name}'" if leg.actuator is None else f"motor '{leg.actuator.joint}'"
+    low, high = (size * x for x in leg.travel)
+    return name, f"{size * q:.2f} {unit}", f"{low:.2f} to {high:.2f} {unit}"
+
+
 def legs_outside(machine: Machine, share: float = 0.0) -> dict[int, float]:
-    """Return the legs outside their travel at home by more than a share of it, and how far [m]."""
+    """Return the legs outside their travel at home by more than a share of it, and how far.
+
+    In m, of rods on motors that turn in rad.
+    """
     found = {}
     q = readings_at(machine, machine.home)
     for j, leg in enumerate(machine.legs):
         lower, upper = leg.travel
         excess = max(lower - float(q[j]), float(q[j]) - upper)
-        if leg.kind is not LegKind.CONSTANT and excess > share * (upper - lower):
+        moves = leg.kind is not LegKind.CONSTANT or leg.actuator is not None
+        if moves and excess > share * (upper - lower):
             found[j] = excess
     return found

@@ -748,11 +748,21 @@ def _check_ties(machine: Machine) -> None:
     """
     ties, n = machine_ties(machine), n_pose_constraints(machine.legs)
     if machine.actuators and not machine.internal_joints and n_dependent_at_home(machine):
+        joints = {leg.base_joint for leg in machine.legs} | {
+            leg.platform_joint for leg in machine.legs
+        }
+        remedy = "give its rods spherical joints"
+        if joints == {JointType.SPHERICAL}:
+            remedy = (
+                "leave out rods that hold nothing new (between the same joints as another, a third "
+                "one on a motor, those of a fourth arm), otherwise this machine cannot be "
+                "calibrated this way"
+            )
         raise OutOfClass(
             f"{machine.yaml_path}: the mechanism '{machine.name}' is outside the method: found it "
             f"overconstrained ({n_dependent_at_home(machine)} of the {n} constraints of its joints "
-            "follow from the others) with joints at A that move, needed none that follow; give "
-            "its rods spherical joints."
+            "follow from the others) with joints at A that move, needed none that follow; "
+            f"{remedy}."
         )
     if not is_tied(geometries(machine), ties, parametrization_of(machine, twists=True)):
         raise OutOfClass(

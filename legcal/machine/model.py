@@ -100,6 +100,12 @@ class Machine:
         return not self.actuators or any(leg.is_motor and not leg.reads_angle for leg in self.legs)
 
     @cached_property
+    def rod_to_measure(self) -> tuple[Leg, str] | None:
+        """The first rod on a motor, and what --length calls its ends; None without any."""
+        rod = next((leg for leg in self.legs if leg.actuator is not None), None)
+        return None if rod is None else (rod, f"{rod.name}.base:{rod.name}.platform")
+
+    @cached_property
     def actuators(self) -> tuple[Actuator, ...]:
         """What moves joints at A, each once, in the base link."""
         return actuators_of(self.legs)

@@ -144,7 +144,9 @@ def _paths(
                 problem = ""
                 if len(onward) > 1 and not _is_an_arm(steps):
                     problem = _several_bodies(bodies, urdf, steps, body, (base, platform))
-                raise OutOfClass(problem or _not_a_chain(urdf, steps, body, base, len(onward)))
+                raise OutOfClass(
+                    problem or _not_a_chain(urdf, steps, body, base, len(onward), motors)
+                )
             connection = onward[0]
         paths.append(steps)
     stray = [c for c in bodies.connections if id(c) not in used]
@@ -486,10 +488,26 @@ def _reached(
     return on_base, on_platform
 
 
-def _not_a_chain(urdf: Urdf, steps: list[Step], body: str, base: str, n_onward: int) -> str:
+def _not_a_chain(
+    urdf: Urdf, steps: list[Step], body: str, base: str, n_onward: int, motors: Sequence[str]
+) -> str:
     """Return why the leg that starts with some joints is not a chain."""
-    needed = "needed one unbranched chain from base to platform for each leg"
+    needed = "needed one unbranched chain from base to platform for each leg;"
     first = steps[0].connection
+    last = steps[-1].connection
+    if body != base and n_onward > 1 and len(steps) > 1 and last.joint in motors:
+        moves = first.joint in motors
+        return (
+            f"{urdf.path}: the leg that starts with {_name(first)} is outside the method: found "
+            f"the motor '{last.joint}' of {n_onward} rods beyond {_name(first)}, needed the motor "
+            "of an arm or a carriage on the base itself; "
+            + (
+                "arms on arms cannot be calibrated this way."
+                if moves
+                else "make joints between it and the base fixed if they do not move, otherwise "
+                "this machine cannot be calibrated this way."
+            )
+        )
     if body == base:
         found = "returns to the base"
     elif n_onward == 0:
@@ -498,13 +516,13 @@ def _not_a_chain(urdf: Urdf, steps: list[Step], body: str, base: str, n_onward: 
         found = f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
         needed = (
             "needed joints whose centres are fixed in the base, or a motor in name_mot that moves "
-            "this link"
+            f"this link; name {_name(first)} in name_mot if a motor turns it, otherwise"
         )
     else:
         found = f"shares link '{body}' with another leg or branches there"
     return (
         f"{urdf.path}: this is not a platform on separate legs: the chain that starts with "
-        f"{_name(first)} {found}, {needed}; check closed_loop, legcal.base and legcal.platform."
+        f"{_name(first)} {found}, {needed} check closed_loop, legcal.base and legcal.platform."
     )
 
 

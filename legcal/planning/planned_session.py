@@ -266,10 +266,7 @@ def rod_to_measure(machine: Machine, *, board: bool) -> tuple[Leg, str] | None:
 
     None where readings or a board carry lengths.
     """
-    if board or machine.readings_carry_length:
-        return None
-    rod = next(leg for leg in machine.legs if leg.actuator is not None)
-    return rod, f"{rod.name}.base:{rod.name}.platform"
+    return None if board or machine.readings_carry_length else machine.rod_to_measure
 
 
 def views_in_words(views: Sequence[PlannedView]) -> str:

@@ -242,6 +242,11 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
     if report.identifiable:
         rest = f", but for {harmless} directions that do not move the platform" if harmless else ""
         lines.append(f"Identifiable: the joint fit determines all parameters{rest}.")
+        if report.scale:
+            lines.append(
+                "But for the scale: calibrate refuses this machine until a length or radii are "
+                "stated (--length, --prior), or a board is seen."
+            )
         if not report.staged.complete:
             lines.append("The steps alone do not: calibration starts from the nominal model.")
     else:

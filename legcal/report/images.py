@@ -104,16 +104,13 @@ def detection_table(found: Detection, output: Path) -> RenderableType:
     )
 
 
-_NO_SCALE = (
-    "Readings of motors that turn carry no length, and nothing else in this dataset does: simulate "
-    "with --length leg1.base:leg1.platform=0.05mm, or calibrate with --length or --prior."
-)
-
-
 def simulation_table(
-    document: dict[str, Any], *, repeated: bool, has_scale: bool = True
+    document: dict[str, Any], *, repeated: bool, to_measure: str = ""
 ) -> RenderableType:
-    """Return the document of ``simulate``: how many images of each view show each leg."""
+    """Return the document of ``simulate``: how many images of each view show each leg.
+
+    *to_measure* is the distance that would fix the scale, where nothing in the dataset does.
+    """
     n_images, n_poses, left_out = (document[key] for key in ("images", "poses", "left_out"))
     views = document["views"]
     legs = list(dict.fromkeys(name for view in views.values() for name in view["legs"]))
@@ -136,7 +133,14 @@ def simulation_table(
             _hidden(views.values(), n_images),
             f"{document['extreme_poses']} of {n_poses} poses have every motor near an end of its "
             "travel.",
-            "" if has_scale else Text(_NO_SCALE, style="yellow"),
+            Text(
+                "Readings of motors that turn carry no length, and nothing else in this dataset "
+                f"does: simulate with --length {to_measure}=0.05mm, or calibrate with --length "
+                "or --prior.",
+                style="yellow",
+            )
+            if to_measure
+            else "",
         ],
         [
             Text(line, overflow="fold")

@@ -14,11 +14,19 @@ from scipy.spatial.transform import Rotation
 from legcal.calibration import Location
 from legcal.files import SHOWN_IN
 from legcal.geometry import roll_pitch_yaw
+from legcal.machine import Machine
+from legcal.planning import rod_to_measure
 from legcal.report.render import heading, report, table
 
 _TURNS = ("roll, x", "pitch, y", "yaw, z")
 _WIDTH = 80  # characters of a terminal
 _MAX_ROWS = 60  # of residuals; the file has them all
+
+
+def length_option(machine: Machine, *, board: bool) -> str:
+    """Return the option with which a calibration is told its scale, "" where it needs none."""
+    found = rod_to_measure(machine, board=board)
+    return "" if found is None else f" --length {found[1]}=MEASURED±SIGMAmm"
 
 
 def inspect_table(description: dict[str, Any]) -> RenderableType:

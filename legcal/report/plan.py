@@ -19,6 +19,7 @@ from legcal.geometry import Array
 from legcal.machine import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR, vectors_A_to_B
 from legcal.pages import Drawing, Items, Picture, Row, page_html
 from legcal.planning import LaidBoard, Plan, rod_to_measure, views_in_words
+from legcal.report.machine import length_option
 from legcal.report.page.text_page import text_page
 from legcal.report.render import heading, report, table
 
@@ -63,6 +64,7 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
         (name, *(f"{1e3 * x:.0f}" for x in row)) for name, row in camera_distances(plan).items()
     ]
     legs = ", ".join(names)
+    length = length_option(plan.machine, board=plan.board is not None)
     return report(
         heading(printable(plan.machine.name), f": {views_in_words(plan.views)}"),
         table(
@@ -85,8 +87,7 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
             printable(f"written: {output}"),
             *([printable(_to_be_added(plan))] if plan.given else []),
             printable(
-                f"calibrate with: legcal calibrate {plan.given or output} -o "
-                f"OUT{_with_length(plan)}"
+                f"calibrate with: legcal calibrate {plan.given or output} -o OUT{length}"
             ),
         ],
     )  # fmt: skip
@@ -98,12 +99,6 @@ def _to_be_added(plan: Plan) -> str:
         "once it is shot, copy the photographs, the views in dataset.yaml and the rows of "
         f"measurements.csv into {plan.given}"
     )
-
-
-def _with_length(plan: Plan) -> str:
-    """Return the option that a calibration needs for its scale, if any."""
-    found = rod_to_measure(plan.machine, board=plan.board is not None)
-    return "" if found is None else f" --length {found[1]}=MEASURED±SIGMAmm"
 
 
 def _told(plan: Plan) -> list[tuple[float, float]]:
@@ -188,6 +183,14 @@ with {plan.camera.width} x {plan.camera.height} px and a focal length of \
         items.append(f"In the end, {_to_be_added(plan).removeprefix('once it is shot, ')}.")
     if plan.board is not None:
         items.insert(1, _board_in_words(plan, plan.board))
+    measured = rod_to_measure(plan.machine, board=plan.board is not None)
+    if measured is not None:
+        items.insert(
+            1,
+            f"Measure the rod of {measured[0].name} from joint centre to joint centre: readings of "
+            "motors that turn carry no length. Calibrate with"
+            f"{length_option(plan.machine, board=False)}.",
+        )
     return items
 
 

@@ -87,7 +87,7 @@ class SimulatedDataset:
     seen: Array
     left_out: int
     n_extreme: int
-    has_scale: bool
+    to_measure: str  # the distance that would fix the scale, where nothing in the dataset does
 
 
 def simulate(
@@ -174,6 +174,8 @@ def simulate(
         write_truth(folder / TRUTH_NAME, session, settings, files)
     seen = [[leg.is_seen for leg in shown] for shown in session.scene.images.shown]
     readings = session.poses.readings[np.unique(session.scene.images.pose)]
+    has_scale = truth.readings_carry_length or bool(measured or session.boards)
+    rod = None if has_scale else truth.rod_to_measure
     return SimulatedDataset(
         folder=destination,
         level=settings.level,
@@ -184,7 +186,7 @@ def simulate(
         seen=np.array(seen),
         left_out=session.left_out,
         n_extreme=int(np.sum(are_extreme(truth, readings))),
-        has_scale=truth.readings_carry_length or bool(measured or session.boards),
+        to_measure="" if rod is None else rod[1],
     )
 
 

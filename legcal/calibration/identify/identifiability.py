@@ -27,8 +27,8 @@ from legcal.calibration.identify.remedies import (
     recommend,
 )
 from legcal.calibration.identify.report import Identifiability, Ranks, Recommendation
-from legcal.calibration.identify.scale import is_scale_open, scale_in_words, scale_sources
-from legcal.calibration.joint_fit import NO_CHOICES, Choices
+from legcal.calibration.identify.scale import is_scale_open, refusal_of_scale, scale_sources
+from legcal.calibration.joint_fit import NO_CHOICES, Choices, known_parameters, resolve
 from legcal.data import Dataset
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.files import closest
@@ -100,7 +100,14 @@ def answer(
         )
     from legcal.data import load_dataset
 
-    return identifiability_of_dataset(load_dataset(path, check_images=False))
+    dataset = load_dataset(path, check_images=False)
+    known = known_parameters(
+        dataset.machine,
+        dataset.measurements.views,
+        axes_given=dataset.axes is not None,
+        boards=dataset.boards,
+    )
+    return identifiability_of_dataset(dataset, resolve(dataset.overrides, known))
 
 
 def identifiability(
@@ -231,11 +238,7 @@ def check_identifiable(
     if not full.complete:
         raise NotIdentifiable(_refusal(dataset, identifiability_of_dataset(dataset, choices)))
     if analysis.predicted.actuators and is_scale_open(analysis):
-        raise NotIdentifiable(
-            f"{dataset.folder}: the parameters cannot be identified: "
-            f"{scale_in_words(scale_sources(analysis))}; state a measured length with "
-            "--length, or radii with --prior."
-        )
+        raise NotIdentifiable(refusal_of_scale(dataset, analysis))
     tied = ties_in_words(dataset.machine)
     notes = [] if tied is None else [tied]
     if any(not weak.harmless for weak in staged.weak):

@@ -7,7 +7,7 @@ scale; a prior on radii, or on lines of arms, that nobody has stated must not do
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from legcal.calibration.identify.information import (
 from legcal.calibration.identify.ranks import Analysis, undetermined
 from legcal.calibration.identify.report import ScaleSource
 from legcal.calibration.joint_fit.variables import RefinementSettings
+from legcal.data import Dataset
 from legcal.estimation import GaussianPrior, Variables, all_free, information_rows, marginal_rows
 from legcal.geometry import Array, IntArray
 from legcal.machine import LegColumns, radius_name
@@ -28,6 +29,7 @@ from legcal.vision import Link
 LENGTH_SIGMA = 5e-5  # [m] of a length that somebody measures
 _OPEN = 1e-6  # of their mean, in directions that are not determined: lengths are open
 _KNOWN = 1e-9  # [m] of a radius that is known
+_VAGUE = RefinementSettings.radius_sigma / 2.0  # of the scale
 _LINKS: tuple[Link, ...] = ("base", "platform")
 
 
@@ -63,9 +65,20 @@ def scale_sources(analysis: Analysis) -> tuple[ScaleSource, ...]:
 def is_scale_open(analysis: Analysis) -> bool:
     """Say whether radii alone fix something that they were taken to be known for.
 
-    Of radii those count as known that are fixed or have a stated prior.
+    Of radii those count as known that are fixed or have a stated prior. A stated length or radius
+    that says no more of the scale than half of what all radii are taken to be known to does not
+    count: these would set it in silence.
     """
-    return _n_open(analysis, _stated_radii(analysis)) > _n_open(analysis, 0.0)
+    stated = _stated_radii(analysis)
+    if _n_open(analysis, stated) > _n_open(analysis, 0.0):
+        return True
+    if not analysis.choices.priors:
+        return False
+    known, seen = (_sigma(analysis, _information(analysis, radii)) for radii in (stated, 0.0))
+    if known is None or seen is None or known**2 - seen**2 <= _VAGUE**2:
+        return False
+    nothing = Analysis(analysis.predicted, replace(analysis.choices, priors={}))
+    return _n_open(nothing, _stated_radii(nothing)) > _n_open(nothing, 0.0)
 
 
 def _n_open(analysis: Analysis, sigma_radius: Array | float) -> int:
@@ -75,6 +88,13 @@ def _n_open(analysis: Analysis, sigma_radius: Array | float) -> int:
 
 def _source(analysis: Analysis, name: str, words: str, information: Array) -> ScaleSource:
     """Return what a source gives: nothing where images leave lengths open all the same."""
+    sigma = _sigma(analysis, information)
+    motion = None if sigma is None else analysis.motion.sigma(information)
+    return ScaleSource(name, words, sigma, motion)
+
+
+def _sigma(analysis: Analysis, information: Array) -> float | None:
+    """Return the standard deviation of the scale as a part of it, None where it is open."""
     predicted = analysis.predicted
     columns = predicted.columns(LegColumns.LENGTH)
     lengths = np.array([leg.q0 for leg in predicted.legs])[: len(columns)]
@@ -83,11 +103,10 @@ def _source(analysis: Analysis, name: str, words: str, information: Array) -> Sc
     hidden = undetermined(predicted, information)
     leaves_more = len(hidden) > _n_open(analysis, 0.0)
     if leaves_more or np.linalg.norm(hidden @ mean) > _OPEN * np.linalg.norm(mean):
-        return ScaleSource(name, words, None, None)
+        return None
     _, singular, basis = np.linalg.svd(information, full_matrices=False)
     seen = singular > 0.0
-    sigma = float(np.linalg.norm(basis[seen] @ mean / singular[seen]))
-    return ScaleSource(name, words, sigma, analysis.motion.sigma(information))
+    return float(np.linalg.norm(basis[seen] @ mean / singular[seen]))
 
 
 def _information(
@@ -143,11 +162,27 @@ def _stated_radii(analysis: Analysis) -> Array:
     return np.array([sigma(*part) for part in predicted.parts])
 
 
-def scale_in_words(sources: Sequence[ScaleSource]) -> str:
-    """Return what is needed, as one sentence for a refusal."""
+def refusal_of_scale(dataset: Dataset, analysis: Analysis) -> str:
+    """Return why the scale of a session is open and what to do, as a refusal."""
+    machine = dataset.machine
+    sources = scale_sources(analysis)
+    if dataset.axes is not None:  # radii and boards are of images
+        sources = tuple(source for source in sources if source.source == "length")
     known = [source.assumed for source in sources if source.sigma is not None]
     ways = ", or ".join(known or [source.assumed for source in sources])
+    why, fixed = "readings of arms carry no length", ""
+    if machine.readings_carry_length:  # but for gains
+        why, fixed = "the gains of all motors that slide are free", "fix one of these gains, or "
+    if _n_open(analysis, _stated_radii(analysis)) == _n_open(analysis, 0.0):  # something is stated
+        why += f", that what is stated tells the scale to no better than {100 * _VAGUE:g} %"
+    ends = "" if machine.rod_to_measure is None else f" {machine.rod_to_measure[1]}"
+    stated = f"state a measured length (--length{ends}=MEASURED±SIGMAmm)"
+    if dataset.axes is None:
+        stated += (
+            ", or radii that you know better than the model (--prior '*.radius.*=VALUE±SIGMAmm')"
+        )
     return (
-        "found that readings of arms carry no length, so that machine, rods and cameras could all "
-        f"be larger alike, needed something that fixes the scale: {ways}"
+        f"{dataset.folder}: the parameters cannot be identified: found that {why}, so that "
+        "machine, rods and cameras could all be larger alike, needed something that fixes the "
+        f"scale: {ways}; {fixed}{stated}."
     )

@@ -95,6 +95,7 @@ class Choices:
 NO_CHOICES = Choices()
 
 ParameterKind = Literal["kinematic", "radius", "intrinsic", "board"]
+_MEASURED_RATIO = 1.15  # between a measured distance of joints and that of a model that is usable
 _RATIO = 10.0  # between a radius or length and its nominal value: more is a mistake of the unit
 _FOCAL_RATIO = 2.0
 _COEFFICIENT = 1e3  # of distortion; far more than any lens has
@@ -382,8 +383,7 @@ def _no_match(override: Override, known: KnownParameters) -> str:
         return (
             f"{override.where} could not be used: found no two joints whose distance is that, "
             "needed LEG.base:LEG.base or LEG.platform:LEG.platform of different legs, or both ends "
-            "of a rod, with a value and its sigma; the first legs are "
-            f"{', '.join(dict.fromkeys(n.split('.')[0] for n in known.by_name if '.base' in n))}."
+            f"of a rod, with a value and its sigma; {closest(override.name, known.lengths)}"
         )
     others = [
         name for name in known.others if name == override.name or fnmatchcase(name, override.name)
@@ -413,7 +413,15 @@ def _misstated(override: Override, name: str, parameter: KnownParameter) -> str:
             f"needed {needed}; correct the unit."
         )
     if parameter.least <= stated.value <= parameter.most:
-        return ""
+        lengths = sorted((stated.value, parameter.nominal))
+        if ":" not in override.name or lengths[1] <= _MEASURED_RATIO * lengths[0]:
+            return ""
+        return (
+            f"{override.where} could not be used: found {_with_unit(stated.value, parameter)} "
+            f"between joints that the model has {_with_unit(parameter.nominal, parameter)} apart, "
+            f"needed a distance within {100.0 * (_MEASURED_RATIO - 1.0):.0f} % of that; check the "
+            "number, its unit and between which joints it was measured, or correct the model."
+        )
     return (
         f"{override.where} could not be used: found {_with_unit(stated.value, parameter)} for "
         f"{name}, needed one between {parameter.least:.4g} and {parameter.most:.4g}, not so far "

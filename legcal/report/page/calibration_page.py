@@ -36,7 +36,7 @@ def calibration_page(
     machine = calibration.dataset.machine
     when = time_of_page()
     sections = (
-        ("next", "What to do next", [Items(next_steps(calibration, str(folder)), True)]),
+        ("next", "What to do next", [Items(next_steps(calibration, str(folder), command), True)]),
         ("platform", "Platform error", platform_blocks(calibration)),
         ("truth", "Against the truth", against),
         ("parameters", "Parameters", [*parameter_tables(calibration), *change_charts(calibration)]),

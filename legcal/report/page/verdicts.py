@@ -64,12 +64,14 @@ def _doubts(calibration: Calibration) -> list[str]:
     return found
 
 
-def next_steps(calibration: Calibration, folder: str) -> list[str]:
-    """Return what to do next, the first thing first."""
+def next_steps(calibration: Calibration, folder: str, command: str) -> list[str]:
+    """Return what to do next, the first thing first; *command* has made the result, if any has."""
     result, steps = calibration.result, list[str]()
     dataset, out = shlex.quote(str(calibration.dataset.folder)), shlex.quote(folder)
     for one in result.diagnosis or ():
         steps.append(f"{one.remedy} Then calibrate again.")
+    if remedy := calibration.verdict.remedy:
+        steps.append(f"{remedy[0].upper()}{remedy[1:]}, and calibrate again.")
     if calibration.verdict.trustworthy:
         steps.append(
             "Load calibrated.urdf, or the numbers of the table below, into the controller, and "
@@ -77,8 +79,8 @@ def next_steps(calibration: Calibration, folder: str) -> list[str]:
         )
         if result.holdout is None and calibration.dataset.machine.is_determined:
             steps.append(
-                "See how well it predicts images that it has not seen: legcal calibrate "
-                f"{dataset} -o {out} --holdout 0.2."
+                "See how well it predicts images that it has not seen: "
+                f"{command or f'legcal calibrate {dataset} -o {out}'} --holdout 0.2."
             )
         steps.append(
             "Where the base stands in the cell and the tool on the platform is not seen in "
@@ -88,7 +90,7 @@ def next_steps(calibration: Calibration, folder: str) -> list[str]:
             "In some months, or after a collision, photograph a few poses and ask whether anything "
             f"moved: legcal calibrate NEW --check {out}."
         )
-    elif not result.diagnosis:
+    elif not (result.diagnosis or remedy):
         weak = f" What is known worst: {result.weakest[0].in_words}." if result.weakest else ""
         steps.append(f"Take more images, at poses further apart and from other places.{weak}")
         steps.append(
@@ -120,6 +122,10 @@ def identify_verdict(report: Identifiability) -> Verdict:
         word = "These images cannot determine the machine"
         reasons = [f"Open: {one.direction}." for one in full.weak if not one.harmless]
         return Verdict("bad", word, sentence, reasons)
+    if report.scale:
+        word = "These images can determine all of the machine but its scale"
+        ways = ", or ".join(one.assumed for one in report.scale if one.sigma is not None)
+        return Verdict("doubtful", word, sentence, [f"To fix the scale: {ways}."] if ways else [])
     if not (staged.complete and report.conditions_hold):
         return Verdict("doubtful", "The joint fit can determine it, the steps cannot", sentence, [])
     return Verdict("good", "These images determine the machine", sentence, [])
