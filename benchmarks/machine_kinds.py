@@ -2,8 +2,8 @@
 
     OMP_NUM_THREADS=1 python benchmarks/machine_kinds.py [KIND ...] [--runs 200] [--seed 0]
                          [--datasets 0] [--level axes|outlines|photographs] [--keep FOLDER]
-                         [--record FILE] [--radii PERCENT] [--wrong-reading MM]
-                         [--wrong-scale PERCENT]
+                         [--record FILE] [--error KIND=SIZE] [--radii PERCENT]
+                         [--wrong-reading MM] [--wrong-scale PERCENT]
 
 KIND: a table of ``machine_kinds.yaml`` (all of them without), which is a table of joints without
 version, name and unit (mm). Two things are asked:
@@ -13,12 +13,12 @@ version, name and unit (mm). Two things are asked:
   normalised squared error on all that is determined, as ``classes_study.py`` counts them; of
   redundant machines also how many of their readings, which are right, are called wrong;
 - datasets (``--datasets``) of ``legcal simulate`` without hints at ``--level``, whose true machine
-  is off by up to 2 mm, calibrated by ``legcal calibrate``: how many converge, and how many of these
-  the verdict trusts; of all that converge the platform error of eq (20) at their readings before
-  and after, how the latter compares with the predicted sigma, and the normalised squared error of
-  the parameters (means over seeds); of photographs also how far used outlines lie inside of the
-  true ones. Where motors do not determine the pose, cameras have hints, and
-  errors are those of the parameters in metres (root mean square). Where motors turn, somebody
+  is off by up to 2 mm and 0.1 deg or by ``--error``, calibrated by ``legcal calibrate``: how many
+  converge, and how many of these the verdict trusts; of all that converge the platform error of eq
+  (20) at their readings before and after, how the latter compares with the predicted sigma, and the
+  normalised squared error of the parameters (means over seeds); of photographs also how far used
+  outlines lie inside of the true ones. Where motors do not determine the pose, cameras have hints,
+  and errors are those of the parameters in metres (root mean square). Where motors turn, somebody
   measures the distance of two joints on the base to 0.05 mm, or with ``--radii`` nothing but the
   radius of each leg, to so many per cent.
 
@@ -59,7 +59,8 @@ from legcal.calibration import Calibration, Evaluation, Solution
 from legcal.data.outlines import read_observations
 from legcal.geometry import Array
 from legcal.machine import Machine, geometries, radius_name, vector_of
-from legcal.simulation import Level, SimulationSettings, failure_of, simulate
+from legcal.simulation import Level, Request, failure_of, simulate
+from legcal.simulation.settings import requested
 from legcal.vision import EPSILON
 
 N_VIEWS, N_POSES = 3, 15
@@ -158,11 +159,13 @@ def datasets(
     added: float = 0.0,
     scale: float = 1.0,
     radii: float = 0.0,
+    errors: list[str] | None = None,
 ) -> str:
     """Print a line a dataset, and return one on all that were calibrated.
 
     *added* [m] and *scale* are of :func:`with_mistake`, and *radii* is what radii are stated to,
-    as a part of them, in place of a length; none if it is 0.
+    as a part of them, in place of a length; none if it is 0. *errors* are those of
+    ``legcal simulate --error``.
     """
     machine = load_mechanism(kind) if kind in CARRIED else made(kind, scratch / "nominal")
     model, found, hints = machine.yaml_path, [], not machine.is_determined
@@ -173,7 +176,8 @@ def datasets(
         begin = time.perf_counter()
         try:
             if not folder.exists():
-                simulate(model, folder, SimulationSettings(level=level, seed=seed, hints=hints))
+                asked = Request(level=level, seed=seed, hints=hints, error=errors)
+                simulate(model, folder, requested(asked, machine))
             begin = time.perf_counter()
             truth = next((folder / "truth/models").glob("*.yaml"))
             priors = list[str]()
@@ -310,6 +314,7 @@ def main() -> None:
     parser.add_argument("--level", type=Level, default=Level.OUTLINES, choices=list(Level))
     parser.add_argument("--keep", type=Path, help="folder that keeps datasets for the next run")
     parser.add_argument("--record", type=Path, help="JSON lines of sessions, to go on from later")
+    parser.add_argument("--error", action="append", help="of the machine, as of legcal simulate")
     parser.add_argument("--radii", type=float, default=0.0, help="[%%] stated; none, but a length")
     parser.add_argument("--wrong-reading", type=float, default=0.0, help="[mm] in one; none")
     parser.add_argument("--wrong-scale", type=float, default=0.0, help="[%%] of a motor; none")
@@ -330,7 +335,8 @@ def main() -> None:
             mistake = 1e-3 * options.wrong_reading, 1.0 + 0.01 * options.wrong_scale
             radii = 0.01 * options.radii
             summary = [
-                datasets(kind, options.level, seeds, scratch, *mistake, radii) for kind in chosen
+                datasets(kind, options.level, seeds, scratch, *mistake, radii, options.error)
+                for kind in chosen
             ]
         print(*summary, sep="\n")
 
