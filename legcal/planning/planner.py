@@ -207,8 +207,9 @@ def plan_session(
 ) -> Plan:
     """Return the plan of a session.
 
-    What places show, and the draws by which it is judged, are worked out by *run*; plans do not
-    depend on it.
+    Its steps look at the nominal machine before cameras where they are planned. A round of steps
+    is kept where the mean over machines and tripods as they may be is better. What places show, and
+    these draws, are worked out by *run*; plans do not depend on it.
 
     Raises DidNotConverge, NotVisible or NotIdentifiable if there are no poses, no places, or too
     few images.
@@ -235,15 +236,19 @@ def plan_session(
     current, least, value = search.chosen(shown, poses)
     target = _framed(task, poses)
     middle = 0.5 * (target.min(axis=0) + target.max(axis=0))
+    expected = search.expected_covariance(current)
     for turn in range(ROUNDS):
         if stop():
             break
         step = 0.5**turn
-        current = search.better_places(current, step, middle)
-        current, value = search.better_poses(current, step, least)
+        placed = search.better_places(current, step, middle)
+        polished, reached = search.better_poses(placed, step, least)
+        there = search.expected_covariance(polished)
+        if search.value_of(there) < search.value_of(expected):
+            current, value, expected = polished, reached, there
         progress("Polishing", turn + 1, ROUNDS)
     was_stopped = stop()
-    plan = search.judged(current, value)
+    plan = search.judged(current, value, expected)
     if was_stopped:
         note = "The search was stopped: this is the best plan that it had found."
         plan = replace(plan, notes=(note, *plan.notes))
@@ -574,11 +579,24 @@ class _Search:
         )
         return _of_images(widened, better), better.value
 
-    def judged(self, current: Sequence[Candidates], value: float) -> Plan:
-        """Return the plan with what sessions as they will be are expected to give."""
+    def value_of(self, covariance: Array) -> float:
+        """Return the criterion of a covariance (p, p) of the parameters."""
+        inverse = np.linalg.pinv(self.basis)
+        return float(self.criterion((inverse @ covariance @ inverse.T)[None])[0])
+
+    def expected_covariance(self, current: Sequence[Candidates]) -> Array:
+        """Return the mean covariance (p, p) of the parameters in sessions as they may be."""
+        n, covariances = self.task.setting.draws, []
+        rngs = np.random.default_rng(self.task.seed + 1).spawn(n)
+        for drawn in self.run(partial(drawn_covariance, self.task, current), rngs):
+            covariances.append(drawn)
+            self.progress("Draws", len(covariances), n)
+        return np.asarray(np.mean(covariances, axis=0))
+
+    def judged(self, current: Sequence[Candidates], value: float, covariance: Array) -> Plan:
+        """Return the plan with what sessions as they may be are expected to give, (p, p)."""
         task, predictor, machine = self.task, self.task.predictor, self.task.machine
         found = self.added(current)
-        covariance = self._expected_covariance(current)
         ordered, begin = list[Configurations](), machine.home_configuration
         for own in current:
             ordered.append(some_of(own.poses, in_short_order(machine, own.poses, begin)))
@@ -628,15 +646,6 @@ class _Search:
             n_given=task.n_given,
             notes=tuple(notes),
         )
-
-    def _expected_covariance(self, current: Sequence[Candidates]) -> Array:
-        """Return the mean covariance (p, p) of the parameters in sessions as they may be."""
-        n, covariances = self.task.setting.draws, []
-        rngs = np.random.default_rng(self.task.seed + 1).spawn(n)
-        for drawn in self.run(partial(drawn_covariance, self.task, current), rngs):
-            covariances.append(drawn)
-            self.progress("Draws", len(covariances), n)
-        return np.asarray(np.mean(covariances, axis=0))
 
     def _growth(self, found: Sequence[Contributions]) -> Array:
         """Return numbers of images and the criterion with so many, (n, 2), beyond those planned."""
