@@ -22,6 +22,7 @@ from legcal.perception import (
     MeasuredImages,
     Photographs,
     Placement,
+    is_visible,
     measure_photographs,
     placed_arms,
     used_as_before,
@@ -142,6 +143,19 @@ def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredIm
     )
     arms = placed_arms(solution.legs, q, pose, T_base=T_base_Rb, radii=solution.radii)
     return Placement.of_fit(A[pose], B[pose], cameras, seen.blur, arms)
+
+
+def shown_near(estimate: Estimate, placement: Placement) -> Placement:
+    """Return the placement without what was said of images most of which a fit uses after all."""
+    o = estimate.solution.outlines
+    shown = o.choose(is_visible(o))
+    used = {row: shown.used[shown.row == row] for row in placement.barely}
+    barely = {
+        row: what
+        for row, what in placement.barely.items()
+        if not len(used[row]) or used[row].mean() < MIN_FOUND_AGAIN
+    }
+    return replace(placement, barely=barely)
 
 
 def not_found_again(first: Estimate, again: Estimate) -> list[str]:

@@ -27,6 +27,7 @@ from legcal.data import (
     Outlines,
     are_of_arms,
     few_views,
+    image_notes,
     inverse,
     join_outlines,
     load_dataset,
@@ -200,7 +201,7 @@ def _image_notes(data: OrderedDataset, placement: Placement) -> list[str]:
     views = data.measurements.views
     hints = [view.T_base_camera for view in views]
     notes = hint_notes([view.name for view in views], hints, placement.T_base_camera, BEFORE_FIT)
-    return [*notes, *placement.notes]
+    return [*notes, *placement.notes, *image_notes(data.measurements, placement.barely)]
 
 
 def _gamma_notes(data: OrderedDataset) -> list[str]:

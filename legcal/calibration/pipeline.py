@@ -40,7 +40,7 @@ from legcal.calibration.joint_fit import (
     known_parameters,
     resolve,
 )
-from legcal.calibration.near_fit import measure_again, not_found_again
+from legcal.calibration.near_fit import measure_again, not_found_again, shown_near
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, write_result
@@ -302,7 +302,7 @@ def _estimate(
     return replace(
         estimate,
         image_notes=(
-            *seen.placement.all_notes,
+            *shown_near(estimate, seen.placement).all_notes(data.measurements),
             *not_found_again(first, estimate),
             *estimate.image_notes,
         ),
@@ -374,7 +374,7 @@ def _refuse_too_few(
     data: OrderedDataset, rows: IntArray, seen: MeasuredImages, choices: Choices
 ) -> None:
     """Raise NotIdentifiable if the images that are left do not determine the parameters."""
-    left, notes = seen.kept(rows), seen.placement.all_notes
+    left, notes = seen.kept(rows), seen.placement.all_notes(data.measurements)
     if not len(left):
         raise NotVisible(list(notes))
     try:

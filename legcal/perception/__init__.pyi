@@ -33,6 +33,7 @@ from .diagnostics import far_off as far_off
 from .diagnostics import hint_notes as hint_notes
 from .diagnostics import images_left_out as images_left_out
 from .diagnostics import is_measurable as is_measurable
+from .diagnostics import is_visible as is_visible
 from .diagnostics import left_out_notes as left_out_notes
 from .free_poses import require_rough_cameras as require_rough_cameras
 from .free_poses import require_standing_joints as require_standing_joints

@@ -20,7 +20,6 @@ from legcal.data import (
     Outlines,
     by_cause,
     few_views,
-    image_notes,
     images_in_words,
     is_edited,
 )
@@ -101,7 +100,7 @@ def find_wrong_images(
     defects: Mapping[int, str],
     run: Run,
 ) -> tuple[Placement, dict[int, str]]:
-    """Return the placement with notes, and why images are left out, by row.
+    """Return the placement with what is said of images, and why they are left out, by row.
 
     ``rows`` were searched; ``defects`` are what is wrong with single images. A view all of whose
     images have one is not placed, with one note.
@@ -117,17 +116,16 @@ def find_wrong_images(
     reasons = dict(defects)
     single = {row: why for row, why in sorted(defects.items()) if view[row] not in defective}
     notes = left_out_notes(search.measurements, single, dict.fromkeys(single, TAKE_AGAIN))
-    why, remedies, odd = dict[int, str](), dict[int, str](), dict[int, str]()
+    why, remedies, barely = dict[int, str](), dict[int, str](), dict[int, str]()
     for row, explanation in zip(suspects, run(task, suspects), strict=True):
         reason, said, remedy = image_verdict(search.measurements, row, explanation, usual, found)
         if reason:
             reasons[row], why[row], remedies[row] = reason, said, remedy
         else:
-            odd[row] = f"{said}; {remedy}."
+            barely[row] = f"{said}; {remedy}."
     notes += left_out_notes(search.measurements, why, remedies)
-    notes += image_notes(search.measurements, odd)
     notes += _leg_notes(search, placement, outlines, found, reasons)
-    return replace(placement, notes=(*placement.notes, *notes)), reasons
+    return replace(placement, notes=(*placement.notes, *notes), barely=barely), reasons
 
 
 def reject_images(outlines: Outlines, reasons: Mapping[int, str]) -> Outlines:

@@ -13,7 +13,7 @@ from types import MappingProxyType
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data import Measurements, by_cause, few_views
+from legcal.data import Measurements, by_cause, few_views, image_notes
 from legcal.errors import NotVisible
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Cylinder, Leg, arms_at, cylinder_of_arm
@@ -156,6 +156,8 @@ class Placement:
     radii: RadiusFactors = NO_RADIUS_FACTORS  # that images contradict; cameras are placed by theirs
     unplaced: dict[str, str] = field(default_factory=dict)  # why views have no camera, by name
     notes: tuple[str, ...] = ()  # what else a reader should know
+    # What is said of images that show little of the legs, by row: near a fit they may show more
+    barely: Mapping[int, str] = field(default_factory=dict)
     # by the legs that have them as parts; looked for once cameras are placed
     arms: Mapping[int, PlacedArm] = field(default_factory=dict)
 
@@ -188,10 +190,10 @@ class Placement:
         if self.unplaced and all(T is None for T in self.T_base_camera):
             raise NotVisible(unplaced_notes(self.unplaced))
 
-    @property
-    def all_notes(self) -> tuple[str, ...]:
-        """What a reader should know, with the views that could not be placed."""
-        return (*unplaced_notes(self.unplaced), *self.notes)
+    def all_notes(self, measurements: Measurements) -> tuple[str, ...]:
+        """Return what a reader should know, also of views without a camera, and of images."""
+        on_images = image_notes(measurements, self.barely)
+        return (*unplaced_notes(self.unplaced), *self.notes, *on_images)
 
 
 def unplaced_notes(unplaced: Mapping[str, str]) -> list[str]:

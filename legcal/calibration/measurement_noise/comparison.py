@@ -128,7 +128,7 @@ def measure_noise(
         ),
         notes=(
             *dataset.notes,
-            *placement.all_notes,
+            *placement.all_notes(measurements),
             *hints,
             *noise_notes(measurements, methods),
         ),
