@@ -562,7 +562,7 @@ def test_what_else_is_in_the_way_is_refused(
         refused(NotVisible, remedy, places=tmp_path / "away.yaml")
     telephoto = replace(sample_camera(), K=sample_camera().K * [[50.0], [50.0], [1.0]])
     refused(NotVisible, "wider view, or correct the focal length", camera=telephoto)
-    refused(UsageError, "found 1 places for 2", places=tmp_path / "away.yaml", cameras=2)
+    refused(UsageError, "found 1 place for 2", places=tmp_path / "away.yaml", cameras=2)
     refused(NotVisible, "use another board", board="charuco:7x5:4mm:3mm:DICT_4X4_50",
             places=places(tmp_path))  # fmt: skip
     for name in ("dataset.yaml", "plan.json"):  # their views are places too

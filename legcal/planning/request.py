@@ -268,8 +268,8 @@ def _n_views(cameras: int | None, n_places: int, *, hand_held: bool) -> int:
     n = _whole("--cameras", n if cameras is None else cameras, 1, MOST_VIEWS)
     if n_places and n > n_places:
         raise UsageError(
-            f"The plan could not be made: found {n_places} places for {n} cameras, needed one for "
-            "each; add places or give fewer --cameras."
+            f"The plan could not be made: found {n_places} place{'s' * (n_places != 1)} for {n} "
+            "cameras, needed one for each; add places or give fewer --cameras."
         )
     if hand_held and cameras is not None and cameras > 1:
         raise UsageError(

@@ -25,5 +25,6 @@ def fleet_table(document: FleetDocument, output: Path) -> RenderableType:
     lines += [f"{row.name}: no drift. {row.drift_note}" for row in first if row.drift_note]
     lines += [f"Note: {note}" for note in document.notes]
     counts = ", ".join(f"{n} {status}" for status, n in sorted(document.counts.items()))
-    lines.append(f"{len(document.machines)} machines: {counts}. All of it: {output}/summary.csv.")
+    n = len(document.machines)
+    lines.append(f"{n} machine{'s' * (n != 1)}: {counts}. All of it: {output}/summary.csv.")
     return report(table(*headings, rows=rows), lines)
