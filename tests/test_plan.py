@@ -189,6 +189,20 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     assert any("stopped" in note for note in document["notes"])
 
 
+def test_a_stopped_search_says_that_it_missed_its_target() -> None:
+    found = legcal.plan(
+        "3-rpr",
+        target=1e-6,
+        cameras=2,
+        bounds=planning.parse_bounds(BOUNDS),
+        setting=FEW,
+        stop=lambda: True,
+    )
+    assert found.error is not None
+    missed = f"reach {1e3 * found.error.mean_displacement:.3f} mm, not 0.001 mm"
+    assert any(missed in note for note in found.notes)
+
+
 def test_a_better_known_machine_is_what_more_images_and_a_given_session_make(
     planned: planning.Plan, shot: Path, tmp_path: Path
 ) -> None:

@@ -220,7 +220,10 @@ def _fewest(
         else:
             least = max(least, n)
         if stop():
-            return best or found
+            if best is not None:
+                return best
+            missed = f"It is expected to reach {1e3 * error:.3f} mm, not {1e3 * target:g} mm."
+            return replace(found, notes=(*found.notes, missed))
         enough = _images_for(found, error, target)
         if enough > MOST_IMAGES and best is None:
             break
