@@ -28,12 +28,14 @@ from legcal.data import Outlines
 from legcal.errors import NotIdentifiable
 from legcal.geometry import BoolArray
 from legcal.machine import load_mechanism
+from legcal.perception import photographs
 from legcal.perception.diagnostics import (
     NOTHING_LIKE,
     ImageExplanation,
     OutlineCount,
     _best,
     _usual,
+    find_wrong_images,
     hint_notes,
     image_verdict,
     reject_images,
@@ -558,6 +560,26 @@ def test_some_wrong_outlines_do_not_make_an_image_an_outlier(fitted: Calibration
         wrong = (o.row == 1) & (np.isin(o.leg, legs) | np.isin(o.edge, edges))
         fit = replace(solution, outlines=_with_rejected(o, wrong))
         assert outlier_images(replace(m, q=q), machine, fit) == {}
+
+
+def test_an_image_in_which_nothing_like_the_legs_was_found_counts_if_a_fit_finds_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = spoiled(tmp_path / "missed", 5)
+    made.change("c2", 1, _elsewhere)
+
+    def missed(*searched: Any) -> Any:
+        placement, reasons = find_wrong_images(*searched)
+        said = {0: "was left out: found nothing; look at it.", **placement.barely}
+        return replace(placement, barely=said), {0: NOTHING_LIKE, **reasons}
+
+    monkeypatch.setattr(photographs, "find_wrong_images", missed)
+    found = calibrate(made.write(), use_cache=False)
+    outlines = found.solution.outlines
+    used = [outlines.used[outlines.row == row].mean() for row in range(15)]
+    assert np.flatnonzero(np.array(used) < 0.5).tolist() == [6]
+    (note,) = (note for note in found.notes if "was left out" in note)
+    assert "images/c2" in note
 
 
 @pytest.mark.slow

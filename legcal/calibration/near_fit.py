@@ -6,8 +6,10 @@ of a camera that is not given, all is done again with that.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from legcal.calibration.board import BoardViews
 from legcal.calibration.compression import compression_effect
@@ -19,12 +21,14 @@ from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.geometry import components
 from legcal.machine import Machine, ends_in_base, measured_readings
 from legcal.perception import (
+    NOTHING_LIKE,
     MeasuredImages,
     Photographs,
     Placement,
     is_visible,
     measure_photographs,
     placed_arms,
+    reject_images,
     used_as_before,
     with_measured_radii,
 )
@@ -39,10 +43,15 @@ def measure_again(
     board: BoardViews | None,
     options: Options,
 ) -> Estimate:
-    """Search the photographs that were kept again, close to a fit, and fit again."""
+    """Search photographs again, close to a fit, and fit again.
+
+    Those that were kept, and those in which nothing like the legs was found before any fit: they
+    count if most outlines are found now.
+    """
     rows = seen.kept(seen.photographs.detect)
     if not len(rows):
         return estimate
+    rows = np.sort(np.append(rows, np.array(seen.unlike, dtype=np.intp)))
     photographs = seen.photographs.narrowed(rows, estimate.outlines)
     search = _SearchNearFit(data, photographs, seen, board, options)
     first = best = search.fitted(estimate, {})
@@ -105,6 +114,8 @@ class _SearchNearFit:
         both, view = (photographs, self.photographs), self.data.measurements.view
         lenses = [[one.camera for one in p.measurements.views] for p in both]
         outlines = through_cameras(outlines, view[outlines.row], *lenses)
+        still = hardly_shown(outlines, self.seen.unlike)
+        outlines = reject_images(outlines, dict.fromkeys(still, NOTHING_LIKE))
         outlines = self.photographs.with_found(outlines)
         if like is not None:
             outlines = used_as_before(outlines, like)
@@ -147,15 +158,15 @@ def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredIm
 
 def shown_near(estimate: Estimate, placement: Placement) -> Placement:
     """Return the placement without what was said of images most of which a fit uses after all."""
-    o = estimate.solution.outlines
-    shown = o.choose(is_visible(o))
-    used = {row: shown.used[shown.row == row] for row in placement.barely}
-    barely = {
-        row: what
-        for row, what in placement.barely.items()
-        if not len(used[row]) or used[row].mean() < MIN_FOUND_AGAIN
-    }
-    return replace(placement, barely=barely)
+    still = hardly_shown(estimate.solution.outlines, placement.barely)
+    return replace(placement, barely={row: placement.barely[row] for row in still})
+
+
+def hardly_shown(outlines: Outlines, rows: Iterable[int]) -> list[int]:
+    """Return the images of some of which less than half of the outlines is used."""
+    shown = outlines.choose(is_visible(outlines))
+    used = {row: shown.used[shown.row == row] for row in rows}
+    return [row for row, own in used.items() if not len(own) or own.mean() < MIN_FOUND_AGAIN]
 
 
 def not_found_again(first: Estimate, again: Estimate) -> list[str]:

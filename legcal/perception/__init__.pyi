@@ -28,6 +28,7 @@ from .candidate_pairs import CandidatePairs as CandidatePairs
 from .detection import NOT_PLACED as NOT_PLACED
 from .diagnostics import BEFORE_FIT as BEFORE_FIT
 from .diagnostics import FAR_OFF as FAR_OFF
+from .diagnostics import NOTHING_LIKE as NOTHING_LIKE
 from .diagnostics import TAKE_AGAIN as TAKE_AGAIN
 from .diagnostics import far_off as far_off
 from .diagnostics import hint_notes as hint_notes
@@ -35,6 +36,7 @@ from .diagnostics import images_left_out as images_left_out
 from .diagnostics import is_measurable as is_measurable
 from .diagnostics import is_visible as is_visible
 from .diagnostics import left_out_notes as left_out_notes
+from .diagnostics import reject_images as reject_images
 from .free_poses import require_rough_cameras as require_rough_cameras
 from .free_poses import require_standing_joints as require_standing_joints
 from .image_quality import Exposure as Exposure

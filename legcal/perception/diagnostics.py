@@ -119,7 +119,9 @@ def find_wrong_images(
     why, remedies, barely = dict[int, str](), dict[int, str](), dict[int, str]()
     for row, explanation in zip(suspects, run(task, suspects), strict=True):
         reason, said, remedy = image_verdict(search.measurements, row, explanation, usual, found)
-        if reason:
+        if reason == NOTHING_LIKE:
+            reasons[row], barely[row] = reason, f"was left out: {said}; {remedy}."
+        elif reason:
             reasons[row], why[row], remedies[row] = reason, said, remedy
         else:
             barely[row] = f"{said}; {remedy}."

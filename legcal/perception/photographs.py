@@ -32,6 +32,7 @@ from legcal.machine import Cylinder, Leg, Machine, joints_at, measured_readings,
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.detection import measure_outlines
 from legcal.perception.diagnostics import (
+    NOTHING_LIKE,
     find_wrong_images,
     is_measurable,
     reject_images,
@@ -54,7 +55,7 @@ from legcal.progress import Report
 from legcal.vision import EPSILON, Camera, look_alike, shared_cameras
 from legcal.workers import Run
 
-DETECTOR_VERSION = 11  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 12  # raise it whenever outlines or notes that are kept come out differently
 MEASURING = "Measuring outlines"  # a stage of progress
 CHOICE_ROUNDS = 2  # in which outlines decide between poses that readings leave open
 FreePosesOf = Mapping[int, tuple[RigidTransform, ...]]  # T_base_platform of poses, likeliest first
@@ -163,6 +164,16 @@ class MeasuredImages:
     blur: tuple[float, ...]  # usual one of each view [px]; NaN where none was measured
     # T_base_platform of every pose that images show, where the readings do not give it
     free_poses: Mapping[int, RigidTransform] = field(default_factory=dict)
+
+    @property
+    def unlike(self) -> list[int]:
+        """Images of placed views that were left out since nothing like the legs was found."""
+        view, cameras = self.photographs.measurements.view, self.placement.T_base_camera
+        return [
+            row
+            for row, why in self.left_out.items()
+            if why == NOTHING_LIKE and cameras[view[row]] is not None
+        ]
 
     def kept(self, rows: IntArray) -> IntArray:
         """Return those of some images that were not left out, and whose views were placed."""

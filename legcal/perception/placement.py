@@ -156,7 +156,8 @@ class Placement:
     radii: RadiusFactors = NO_RADIUS_FACTORS  # that images contradict; cameras are placed by theirs
     unplaced: dict[str, str] = field(default_factory=dict)  # why views have no camera, by name
     notes: tuple[str, ...] = ()  # what else a reader should know
-    # What is said of images that show little of the legs, by row: near a fit they may show more
+    # What is said of images that show little or nothing of the legs, by row: near a fit they may
+    # show more
     barely: Mapping[int, str] = field(default_factory=dict)
     # by the legs that have them as parts; looked for once cameras are placed
     arms: Mapping[int, PlacedArm] = field(default_factory=dict)
