@@ -202,9 +202,13 @@ REFUSED: dict[str, tuple[dict[str, str | None], str, str]] = {  # files, destina
     "a file": ({"out": "mine"}, "out", "out: .*found a file"),
     "below a file": ({"file": "mine"}, "file/out", "file is a file"),
     "other files": ({"notes.txt": "mine"}, "", r"other files and no result\.json"),
-    "no JSON": ({"notes.txt": "mine", "result.json": "{"}, "", r"no result\.json"),
-    "other JSON": ({"notes.txt": "mine", "result.json": '{"a": 1}'}, "", r"no result\.json"),
-    "a list": ({"notes.txt": "mine", "result.json": "[]"}, "", r"no result\.json"),
+    "no JSON": ({"notes.txt": "mine", "result.json": "{"}, "", r"result\.json that is damaged"),
+    "other JSON": (
+        {"notes.txt": "mine", "result.json": '{"a": 1}'},
+        "",
+        r"result\.json that is damaged",
+    ),
+    "a list": ({"notes.txt": "mine", "result.json": "[]"}, "", r"result\.json that is damaged"),
     "a folder in the way": (
         {"out/result.json": RESULT, "out/calibrated.urdf/a.txt": "mine"},
         "out",

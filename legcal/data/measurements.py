@@ -235,9 +235,11 @@ def readings_in(
     if mostly:
         # whatever is outside lies inside once divided by enough: there it has to move, too
         wrong = [j for j, leg in enumerate(actuated) if str(leg.prismatic) in mostly]
-        for some, least in ((range(len(actuated)), WOULD_MOVE), (wrong, WOULD_MOVE), (wrong, 0.0)):
+        every = list(range(len(actuated)))
+        tries = (every, WOULD_MOVE), (wrong, WOULD_MOVE), (wrong, 0.0), (every, 0.0)
+        for some, least in tries:
             cause = cause or _likely_cause(
-                given[:, list(some)],
+                given[:, some],
                 [actuated[j] for j in some],
                 [stated[j] for j in some],
                 in_dataset=units is not None,
