@@ -562,6 +562,7 @@ def test_some_wrong_outlines_do_not_make_an_image_an_outlier(fitted: Calibration
         assert outlier_images(replace(m, q=q), machine, fit) == {}
 
 
+@pytest.mark.system
 def test_an_image_in_which_nothing_like_the_legs_was_found_counts_if_a_fit_finds_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

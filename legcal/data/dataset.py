@@ -281,7 +281,7 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
 def _without_photographs(dataset: Dataset) -> str:
     """Return what is wrong with a dataset none of whose images is there; nothing if some are."""
     paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
-    if len(paths) < 2 or any(path is None or path.exists() for path in paths):
+    if len(paths) < 2 or any(path is None or os.path.exists(path) for path in paths):
         return ""
     return (
         f"{dataset.table_path}: the photographs could not be read: found none of the {len(paths)} "

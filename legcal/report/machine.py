@@ -15,7 +15,6 @@ from legcal.calibration import Location
 from legcal.files import SHOWN_IN
 from legcal.geometry import roll_pitch_yaw
 from legcal.machine import Machine
-from legcal.planning import rod_to_measure
 from legcal.report.render import heading, report, table
 
 _TURNS = ("roll, x", "pitch, y", "yaw, z")
@@ -25,7 +24,7 @@ _MAX_ROWS = 60  # of residuals; the file has them all
 
 def length_option(machine: Machine, *, board: bool) -> str:
     """Return the option with which a calibration is told its scale, "" where it needs none."""
-    found = rod_to_measure(machine, board=board)
+    found = None if board or machine.readings_carry_length else machine.rod_to_measure
     return "" if found is None else f" --length {found[1]}=MEASURED±SIGMAmm"
 
 
