@@ -288,6 +288,7 @@ def test_what_is_seen_is_what_the_simulation_shows(planned: planning.Plan, tmp_p
     assert missing <= 0.1 * agreeing
 
 
+@pytest.mark.system
 def test_arms_that_are_cylinders_count_as_a_calibration_has_them(tmp_path: Path) -> None:
     """They are seen where the simulation shows them, and their lines become as well known."""
     machine = create_model(read_family("delta", arm_radius=8.0), tmp_path).machine
