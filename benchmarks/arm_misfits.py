@@ -49,7 +49,7 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, cross
 from legcal.machine import Machine, arms_at
 from legcal.perception.outline import WIDTH_TOLERANCE, WRONG_WIDTH
-from legcal.planning import LENGTH_SIGMA, rod_to_measure
+from legcal.planning import LENGTH_SIGMA
 from legcal.simulation import Level, SimulationSettings, moved_outlines, noisy_outlines, simulate
 
 N_VIEWS, N_POSES = 3, 15
@@ -163,7 +163,7 @@ def of_photographs(machine: str, shape: str, seed: int, n_poses: int, folder: Pa
         other = folder / "true" / urdf.relative_to(folder / "nominal")
         other.write_text(_with_bars(other.read_text(), nominal, SHAPES[shape][0]))
         true = load_mechanism(true.yaml_path)
-    rod = rod_to_measure(nominal, board=False)
+    rod = nominal.rod_for_scale(has_length=False)
     lengths = {} if rod is None else {rod[1]: LENGTH_SIGMA}
     settings = SimulationSettings(
         level=Level.PHOTOGRAPHS, seed=seed, poses=n_poses, lengths=lengths, hints=False

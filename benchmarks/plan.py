@@ -46,7 +46,6 @@ from legcal.planning import (
     all_points,
     drawn_covariance,
     places_along,
-    rod_to_measure,
     surely_reached,
     workspace_of,
     write_session,
@@ -143,7 +142,7 @@ def compare(name: str, args: argparse.Namespace) -> dict[str, object]:
 
 def compared(name: str, machine: Machine, args: argparse.Namespace) -> dict[str, object]:
     """Return the figures of one machine, whose files are there."""
-    choices, rod = NO_CHOICES, rod_to_measure(machine, board=False)
+    choices, rod = NO_CHOICES, machine.rod_for_scale(has_length=False)
     if rod is not None:
         known = Prior(rod[0].q0, LENGTH_SIGMA)
         choices = Choices(priors={f"{rod[0].name}.length": known})
@@ -218,7 +217,7 @@ def shot(
     The standard error of their ratio is that of the mean square of the runs.
     """
     dX, dE, stated, turned, failed = [], [], [], [], []
-    rod = rod_to_measure(machine, board=False)
+    rod = machine.rod_for_scale(has_length=False)
     lengths = {} if rod is None else {rod[1]: LENGTH_SIGMA}
     angles = None
     if plan.sigma_by_joint:

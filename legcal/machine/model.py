@@ -105,6 +105,10 @@ class Machine:
         rod = next((leg for leg in self.legs if leg.actuator is not None), None)
         return None if rod is None else (rod, f"{rod.name}.base:{rod.name}.platform")
 
+    def rod_for_scale(self, *, has_length: bool) -> tuple[Leg, str] | None:
+        """Return the rod to measure, None where readings or something measured carry lengths."""
+        return None if has_length or self.readings_carry_length else self.rod_to_measure
+
     @cached_property
     def actuators(self) -> tuple[Actuator, ...]:
         """What moves joints at A, each once, in the base link."""

@@ -17,7 +17,6 @@ from .places import places_along as places_along
 from .planned_session import Plan as Plan
 from .planned_session import PlanDocument as PlanDocument
 from .planned_session import PlannedView as PlannedView
-from .planned_session import rod_to_measure as rod_to_measure
 from .planned_session import views_in_words as views_in_words
 from .planner import Candidates as Candidates
 from .planner import Scene as Scene

@@ -14,7 +14,7 @@ from legcal.brief import brief
 from legcal.calibration import KINDS, PLACES, PlatformError
 from legcal.files import Document, Number, Pose, Version
 from legcal.geometry import Array, BoolArray
-from legcal.machine import Configurations, Leg, Machine
+from legcal.machine import Configurations, Machine
 from legcal.planning.goals import Goal
 from legcal.planning.information import PredictedNoise
 from legcal.planning.laid_board import LaidBoard
@@ -259,14 +259,6 @@ class PlanDocument(Document):
     growth: list[Growth]
     limits: dict[str, Number]  # the criterion [m] if an error were not there, or images without end
     notes: list[str]
-
-
-def rod_to_measure(machine: Machine, *, board: bool) -> tuple[Leg, str] | None:
-    """Return the rod whose length has to be measured, and what --length calls its joints.
-
-    None where readings or a board carry lengths.
-    """
-    return None if board or machine.readings_carry_length else machine.rod_to_measure
 
 
 def views_in_words(views: Sequence[PlannedView]) -> str:

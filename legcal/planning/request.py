@@ -25,7 +25,7 @@ from legcal.planning.places import (
     Setting,
     read_places,
 )
-from legcal.planning.planned_session import Plan, rod_to_measure
+from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Task, plan_session
 from legcal.progress import Progress, Report, shown_progress
 from legcal.vision import (
@@ -187,7 +187,7 @@ def plan(
 
 def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[str, ...]]:
     """Return the length that a plan counts on where readings carry none, and a note on it."""
-    found = rod_to_measure(machine, board=board)
+    found = machine.rod_for_scale(has_length=board)
     if found is None:
         return NO_CHOICES, ()
     rod, ends = found

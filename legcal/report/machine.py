@@ -24,7 +24,7 @@ _MAX_ROWS = 60  # of residuals; the file has them all
 
 def length_option(machine: Machine, *, board: bool) -> str:
     """Return the option with which a calibration is told its scale, "" where it needs none."""
-    found = None if board or machine.readings_carry_length else machine.rod_to_measure
+    found = machine.rod_for_scale(has_length=board)
     return "" if found is None else f" --length {found[1]}=MEASURED±SIGMAmm"
 
 

@@ -18,7 +18,7 @@ from legcal.files import SHOWN_IN
 from legcal.geometry import Array
 from legcal.machine import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR, vectors_A_to_B
 from legcal.pages import Drawing, Items, Picture, Row, page_html
-from legcal.planning import LaidBoard, Plan, rod_to_measure, views_in_words
+from legcal.planning import LaidBoard, Plan, views_in_words
 from legcal.report.machine import length_option
 from legcal.report.page.text_page import text_page
 from legcal.report.render import heading, report, table
@@ -183,7 +183,7 @@ with {plan.camera.width} x {plan.camera.height} px and a focal length of \
         items.append(f"In the end, {_to_be_added(plan).removeprefix('once it is shot, ')}.")
     if plan.board is not None:
         items.insert(1, _board_in_words(plan, plan.board))
-    measured = rod_to_measure(plan.machine, board=plan.board is not None)
+    measured = plan.machine.rod_for_scale(has_length=plan.board is not None)
     if measured is not None:
         items.insert(
             1,

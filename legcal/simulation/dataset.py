@@ -174,8 +174,7 @@ def simulate(
         write_truth(folder / TRUTH_NAME, session, settings, files)
     seen = [[leg.is_seen for leg in shown] for shown in session.scene.images.shown]
     readings = session.poses.readings[np.unique(session.scene.images.pose)]
-    has_scale = truth.readings_carry_length or bool(measured or session.boards)
-    rod = None if has_scale else truth.rod_to_measure
+    rod = truth.rod_for_scale(has_length=bool(measured or session.boards))
     return SimulatedDataset(
         folder=destination,
         level=settings.level,
