@@ -6,14 +6,18 @@ sight, which is sqrt(rho (2 - rho)) at the depth rho = D / R inside the outline 
 half-width R. Diffuse light gives sums of 1, r and r^2, darkening towards the limb higher powers,
 and a highlight near the limb is a bump in r. All is blurred by a Gaussian.
 
-All blocks of an outline are fitted together with seven functions, expanded in powers of rho up to
-rho^2, which is good to a part in a hundred up to rho = 0.8 (:func:`profile_functions` of
-:func:`powers`); single blocks with five of them (:func:`simple_functions`):
+Powers of r up to r^4 are expanded in powers of rho up to rho^2, which is good to a part in a hundred
+up to rho = 0.8. All blocks of an outline are fitted together with seven functions
+(:func:`profile_functions` of :func:`powers`):
 
-    background      outside the outline
+    background      everywhere
     its slope       outside, by the depth that is looked at
-    surface         inside, as it is seen edge-on
-    r, ..., r^4     inside
+    five surfaces   inside, less the background: sums of 1, r, ..., r^4
+
+How much of each there may be is known from cylinders under lamps anywhere, matte to glossy: their
+five surfaces are the principal directions of what such cylinders send (``SURFACES``), and sizes are
+those of the median cylinder (``SURFACE_SIGMA``). Single blocks are fitted with five functions that
+most limbs are made of (:func:`simple_functions`).
 """
 
 from functools import cache
@@ -68,6 +72,18 @@ def powers(z: Array) -> tuple[Array, Array]:
 
 BACKGROUND, SLOPE, SURFACE = 0, 1, 2
 N_AMPLITUDES = 7
+# Rows: the principal directions of r^0 to r^4, and standard deviations of these, in contrasts, by
+# benchmarks/limb_light.py.
+SURFACES = np.array(
+    [
+        [-0.359, -0.386, -0.517, -0.504, -0.449],
+        [-0.621, -0.539, 0.112, 0.361, 0.425],
+        [-0.694, 0.649, 0.229, -0.055, -0.205],
+        [0.063, -0.366, 0.698, 0.063, -0.609],
+        [0.001, 0.076, -0.425, 0.780, -0.452],
+    ]
+)
+SURFACE_SIGMA = np.array([0.54, 0.99, 1.03, 1.04, 7.35])
 
 _ROOT = float(np.sqrt(2.0))
 # Rows: r^0 to r^4 by rho^0, rho^(1/2), rho, rho^(3/2), rho^2.
@@ -82,6 +98,13 @@ _OF_DEPTH = np.array(
 )
 
 
+# The functions of profiles, by those below.
+_PROFILE = np.zeros((N_AMPLITUDES, N_AMPLITUDES))
+_PROFILE[BACKGROUND, [BACKGROUND, SURFACE]] = 1.0
+_PROFILE[SLOPE, SLOPE] = 1.0
+_PROFILE[SURFACE:, SURFACE:] = SURFACES
+
+
 def profile_functions(
     half_width: Array, blur: Array, depth: Array | float
 ) -> tuple[Array, Array, Array]:
@@ -91,6 +114,14 @@ def profile_functions(
     logarithm of the blur. Half-widths and blurs (n,) in px; ``depth`` is the unit of the
     background's slope [px], that of all or of each (n,).
     """
+    values, slopes, widenings = _functions_of_r(half_width, blur, depth)
+    return _PROFILE @ values, _PROFILE @ slopes, _PROFILE @ widenings
+
+
+def _functions_of_r(
+    half_width: Array, blur: Array, depth: Array | float
+) -> tuple[Array, Array, Array]:
+    """Return the background and its slope, both outside, and r^0 to r^4, as profile_functions."""
     n = len(blur)
     values, slopes, widenings = (np.zeros((n, N_AMPLITUDES, N_POWERS)) for _ in range(3))
     values[:, BACKGROUND, [ONE, STEP]] = 1.0, -1.0
@@ -116,7 +147,7 @@ def profile_functions(
 
 
 N_SIMPLE = 5
-# Constant, slope of the background, step, limb, and depth, of the functions above.
+# Constant, slope of the background, step, limb, and depth, by the functions of r.
 _SIMPLE = np.zeros((N_SIMPLE, N_AMPLITUDES))
 _SIMPLE[0, [BACKGROUND, SURFACE]] = 1.0
 _SIMPLE[1, SLOPE] = _SIMPLE[2, SURFACE] = _SIMPLE[3, SURFACE + 1] = 1.0
@@ -129,5 +160,5 @@ def simple_functions(half_width: Array, blur: Array) -> tuple[Array, Array]:
     Constant, slope of the background, step, limb r, and depth, both as parts of the half-width; and
     their derivatives by the distance inside the outline [1/px]. Half-widths and blurs (n,) in px.
     """
-    values, slopes, _ = profile_functions(half_width, blur, half_width)
+    values, slopes, _ = _functions_of_r(half_width, blur, half_width)
     return _SIMPLE @ values, _SIMPLE @ slopes

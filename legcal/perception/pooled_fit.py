@@ -15,7 +15,14 @@ import numpy as np
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.blocks import Blocks
 from legcal.perception.light import Samples
-from legcal.perception.limb import N_AMPLITUDES, N_POWERS, powers, profile_functions
+from legcal.perception.limb import (
+    N_AMPLITUDES,
+    N_POWERS,
+    SURFACE,
+    SURFACE_SIGMA,
+    powers,
+    profile_functions,
+)
 from legcal.perception.pixel_sums import (
     PixelBins,
     PixelSums,
@@ -27,9 +34,9 @@ from legcal.perception.pixel_sums import (
 
 # Standard deviations of amplitudes, in contrasts of the outline, as limb.py orders them: of
 # what an outline has in common, of its changes along the outline, and of single blocks.
-COMMON = np.array([1e3, 0.3, 1e3, 1.5, 1.5, 1.0, 1.0])
-ALONG = np.array([1.0, 0.3, 1.0, 1.0, 1.0, 1.0, 1.0])
-OF_BLOCKS = np.array([2.0, 1.0, 0.3, 0.1, 0.1, 0.05, 0.05])
+COMMON = np.array([1e3, 0.3, *SURFACE_SIGMA])
+ALONG = np.array([1.0, 0.3, *(0.3 * SURFACE_SIGMA)])
+OF_BLOCKS = np.array([2.0, 1.0, *(0.2 * SURFACE_SIGMA)])
 N_ALONG = 3  # polynomials along an outline: constant, linear, quadratic
 PRIOR_BLUR = 0.7  # of the logarithm of the blur, a priori
 BLUR_SCATTER = 0.05  # that outlines of one image seem to have, in its logarithm
@@ -48,6 +55,10 @@ NOISE_ROUNDS, NOISE_CONVERGED = 3, 0.2  # of its estimate, at most; and of its l
 MIN_LIGHT = 1e-3  # of the mean light of a block
 
 COMMON_BLUR_SIGMA = 0.03  # of the logarithm of the blur of an outline, about that of the image
+# An outline whose light is unusual, or whose blur is not that of the others once both pull at each
+# other, is known less well: as from a Student t prior of so many degrees of freedom.
+DEGREES, EXPECTED_ODDITY = 5.0, 4.0  # and the squares of pulls that outlines have where all is well
+BLUR_PULL = 0.01  # of the logarithm of the blur of an outline, where all is well
 ROUNDS, ALL_ROUNDS = 10, 2  # at most; and before those that have converged are left out
 
 ONE, OTHER = (0, 1, 2, 1, 2, 2), (0, 0, 0, 1, 1, 2)  # pairs of polynomials
@@ -121,6 +132,7 @@ def fit_pooled(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> Po
     at_ends = np.array([[1.0, -1.0], [1.0, 1.0]])
     line = [SHIFT, N_UNKNOWNS + SHIFT]
     of_lines = at_ends @ covariance[:, line][:, :, line] @ at_ends.T
+    of_lines *= pool.oddity(at, even)[:, None, None]
     return PooledLines(at.line @ at_ends.T, of_lines, float(np.exp(even)), by_gamma)
 
 
@@ -394,6 +406,13 @@ class _Pool:
         log_blurs = np.asarray(np.clip(at.log_blur + widen, least, most))
         after = _Iterate(at.amplitude + step[..., :N_AMPLITUDES], at.line + move, log_blurs)
         return after, covariance, shared
+
+    def oddity(self, at: _Iterate, log_blur: float) -> Array:
+        """Return by how much more covariances (n_edges,) are than where all is as expected."""
+        surface = at.amplitude[:, 0, SURFACE:]
+        squares = np.sum(self.precision[:, 0, SURFACE:N_AMPLITUDES] * surface**2, axis=1)
+        squares += ((at.log_blur - log_blur) / BLUR_PULL) ** 2
+        return np.asarray((DEGREES + squares) / (DEGREES + EXPECTED_ODDITY))
 
     @cached_property
     def precision(self) -> Array:
