@@ -3,8 +3,8 @@
     python benchmarks/limb_light.py [--surfaces 100000] [--seed 0]
 
 Draws surfaces under two lamps anywhere (most of them before the surface) and even light, matte with
-a highlight: Lambert's law and lobes about half-way between lamp and camera (Blinn), exponents 5 to
-200. The light along the depth is fitted by powers of r up to r^4, less the background, which has
+a highlight: Lambert's law, darker towards the limb or not, and lobes about half-way between lamp
+and camera (Blinn), exponents 5 to 200. The light along the depth is fitted by powers of r up to r^4, less the background, which has
 the mean light of another such surface. Prints the principal directions of these coefficients in
 units of the contrast, their median sizes as standard deviations, and what the powers leave: the
 first two are ``SURFACES`` and ``SURFACE_SIGMA`` of ``legcal.perception.limb``.
@@ -18,7 +18,7 @@ from legcal.geometry import Array
 from legcal.perception.limb import SURFACE_SIGMA, SURFACES
 
 LAMPS, IN_FRONT = 2, 0.8
-EXPONENTS, GLOSS, EVEN = (5.0, 200.0), (0.0, 1.0), (0.02, 0.5)
+EXPONENTS, GLOSS, EVEN, DARKENING = (5.0, 200.0), (0.0, 1.0), (0.02, 0.5), 0.6
 BACKGROUND_SPREAD = 0.5  # of the logarithm of its light
 DEPTH, N_DEPTHS = 0.6, 120  # in half-widths
 MEDIAN_SIZE = 0.6745  # of a unit Gaussian
@@ -27,7 +27,9 @@ LEAST_CONTRAST = 0.1  # of the median one: surfaces with less show no edge
 
 def surfaces(n: int, rng: np.random.Generator, r: Array) -> Array:
     """Return the light (n, n_depths) of surfaces where normals have cosines r to the camera."""
-    light = np.repeat(rng.uniform(*EVEN, size=(n, 1)), len(r), axis=1)
+    darkening = np.maximum(rng.uniform(-DARKENING, DARKENING, size=(n, 1)), 0.0)
+    albedo = 1.0 - darkening + darkening * r
+    light = albedo * rng.uniform(*EVEN, size=(n, 1))
     sine = np.sqrt(1.0 - r**2)
     for _ in range(LAMPS):
         power = rng.uniform(0.0, 1.0, (n, 1))
@@ -39,7 +41,8 @@ def surfaces(n: int, rng: np.random.Generator, r: Array) -> Array:
         matte, shine = (x[:, [0]] * sine + x[:, [2]] * r for x in (lamp, half))
         exponent = np.exp(rng.uniform(*np.log(EXPONENTS), size=(n, 1)))
         gloss = rng.uniform(*GLOSS, size=(n, 1))
-        light += power * (np.maximum(matte, 0.0) + gloss * np.exp((shine - 1.0) * exponent))
+        highlight = gloss * np.exp((shine - 1.0) * exponent)
+        light += power * (albedo * np.maximum(matte, 0.0) + highlight)
     return light
 
 

@@ -449,6 +449,10 @@ def test_slopes_and_widenings_are_derivatives_of_profiles(blur: float) -> None:
     assert slopes.shape == (1, N_AMPLITUDES, N_POWERS)
 
 
+def test_surfaces_are_told_apart() -> None:
+    np.testing.assert_allclose(SURFACES @ SURFACES.T, np.eye(5), atol=3e-3)
+
+
 @pytest.mark.parametrize("amplitude", [BRIGHT, DARK, GLINT], ids=["bright", "dark", "glint"])
 @pytest.mark.parametrize(("blur", "change"), [(0.4, 0.6), (0.9, 0.0)])
 def test_exact_profiles_give_line_and_blur(amplitude: Array, blur: float, change: float) -> None:
