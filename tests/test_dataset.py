@@ -204,6 +204,9 @@ def test_rows_of_one_label_share_a_pose_and_the_mean_reading(folder: Folder) -> 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_reading_outside_the_travel_is_noted_or_refused(folder: Folder, sign: float) -> None:
     end, travel = (0.144 if sign > 0.0 else -0.004), 0.148
+    folder.rows[1][JOINTS[0]] = end + sign * 0.0005 * travel  # noise, as at an end of the travel
+    folder.write()
+    assert not load_dataset(folder.path).notes
     folder.rows[1][JOINTS[0]] = end + sign * 0.04 * travel
     folder.write()
     (note,) = load_dataset(folder.path).notes

@@ -42,6 +42,9 @@ from legcal.machine import TRAVEL_MARGIN, Leg
 from legcal.vision import Camera
 
 MAX_NAMED = 5  # views or other things, in one sentence
+NOTED_MARGIN = (
+    1e-3  # of the travel: readings outside by less are within it but for rounding and noise
+)
 MAX_READING_SPREAD = 10.0  # sigma by which rows of one pose may differ
 INCH = 0.0254  # [m]
 # Parts of the travel: in the unit that is stated, and in another that may be, or surely is, meant
@@ -198,7 +201,8 @@ def readings_in(
 ) -> tuple[Array, tuple[str, ...]]:
     """Return the readings in a table (n_rows, n_motors) [m or rad], and notes on odd ones.
 
-    Readings outside their travel by more than 5 % of it are refused, others are noted. Refused is
+    Readings outside their travel by more than 5 % of it are refused, others are noted if it is more
+    than rounding and noise. Refused is
     as well what hardly moves in its unit and makes use of the travel in a larger one; where that is
     not sure, as of few poses, it is noted. *units* are those that a dataset states, None of tables
     in m and rad.
@@ -215,7 +219,8 @@ def readings_in(
         lower, upper = leg.travel
         if not 0.0 < upper - lower < np.inf:
             continue
-        outside = (column < lower) | (column > upper)
+        beyond_travel = np.maximum(lower - column, column - upper)
+        outside = beyond_travel > NOTED_MARGIN * (upper - lower)
         far = outside & ~leg.in_travel(column)
         unit_name, ends = one.name, sorted(map(one.reading, leg.travel))
         travel = f"{ends[0]:g} to {ends[1]:g} {unit_name} (the joint limits of the model)"
