@@ -4,10 +4,11 @@
 
 Draws surfaces under two lamps anywhere (most of them before the surface) and even light, matte with
 a highlight: Lambert's law, darker towards the limb or not, and lobes about half-way between lamp
-and camera (Blinn), exponents 5 to 200. The light along the depth is fitted by powers of r up to r^4, less the background, which has
-the mean light of another such surface. Prints the principal directions of these coefficients in
-units of the contrast, their median sizes as standard deviations, and what the powers leave: the
-first two are ``SURFACES`` and ``SURFACE_SIGMA`` of ``legcal.perception.limb``.
+and camera (Blinn), exponents 5 to 200. The light along the depth is fitted by powers of r up to
+r^4, less the background, which has the mean light of another such surface. Prints the principal
+directions of these coefficients in units of the contrast, their median sizes as standard
+deviations, and what the powers leave: the first two are ``SURFACES`` and ``SURFACE_SIGMA`` of
+``legcal.perception.limb``.
 """
 
 import argparse
@@ -36,7 +37,7 @@ def surfaces(n: int, rng: np.random.Generator, r: Array) -> Array:
         lamp = rng.normal(size=(n, 3))
         lamp /= np.linalg.norm(lamp, axis=1, keepdims=True)
         lamp[:, 2] = np.where(rng.random(n) < IN_FRONT, np.abs(lamp[:, 2]), lamp[:, 2])
-        half = lamp + [0.0, 0.0, 1.0]
+        half = lamp + np.array([0.0, 0.0, 1.0])
         half /= np.linalg.norm(half, axis=1, keepdims=True)
         matte, shine = (x[:, [0]] * sine + x[:, [2]] * r for x in (lamp, half))
         exponent = np.exp(rng.uniform(*np.log(EXPONENTS), size=(n, 1)))

@@ -6,8 +6,8 @@ sight, which is sqrt(rho (2 - rho)) at the depth rho = D / R inside the outline 
 half-width R. Diffuse light gives sums of 1, r and r^2, darkening towards the limb higher powers,
 and a highlight near the limb is a bump in r. All is blurred by a Gaussian.
 
-Powers of r up to r^4 are expanded in powers of rho up to rho^2, which is good to a part in a hundred
-up to rho = 0.8. All blocks of an outline are fitted together with seven functions
+Powers of r up to r^4 are expanded in powers of rho up to rho^2, which is good to a part in a
+hundred up to rho = 0.8. All blocks of an outline are fitted together with seven functions
 (:func:`profile_functions` of :func:`powers`):
 
     background      everywhere
