@@ -40,7 +40,7 @@ def surfaces(n: int, rng: np.random.Generator, r: Array) -> Array:
         half = lamp + np.array([0.0, 0.0, 1.0])
         half /= np.linalg.norm(half, axis=1, keepdims=True)
         matte, shine = (x[:, [0]] * sine + x[:, [2]] * r for x in (lamp, half))
-        exponent = np.exp(rng.uniform(*np.log(EXPONENTS), size=(n, 1)))
+        exponent = EXPONENTS[0] * (EXPONENTS[1] / EXPONENTS[0]) ** rng.uniform(size=(n, 1))
         gloss = rng.uniform(*GLOSS, size=(n, 1))
         highlight = gloss * np.exp((shine - 1.0) * exponent)
         light += power * (albedo * np.maximum(matte, 0.0) + highlight)
