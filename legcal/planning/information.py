@@ -56,6 +56,9 @@ _RANK = 1e-7  # of the largest singular value
 class PredictedNoise:
     """Errors of outlines, whatever the contrast.
 
+    By default shared errors are about the largest of a simulated machine
+    (``benchmarks/shared_errors.py``): plans that count on less rely on it.
+
     Attributes
     ----------
     sigma_px : float
