@@ -231,7 +231,8 @@ def test_an_unknown_scale_is_refused_with_what_would_fix_it(
         identifiability, "recorded_observations", lambda dataset, twists: session("6-rss")
     )
     known = SimpleNamespace(
-        readings_carry_length=False, rod_to_measure=(None, "leg1.base:leg1.platform")
+        readings_carry_length=False,
+        length_option="--length leg1.base:leg1.platform=MEASURED±SIGMAmm",
     )
     dataset: Any = SimpleNamespace(folder="servo", machine=known, axes=None)
     wanted = (

@@ -105,6 +105,12 @@ class Machine:
         rod = next((leg for leg in self.legs if leg.actuator is not None), None)
         return None if rod is None else (rod, f"{rod.name}.base:{rod.name}.platform")
 
+    @property
+    def length_option(self) -> str:
+        """The option of ``legcal calibrate`` that states this rod's length; bare without any."""
+        rod = self.rod_to_measure
+        return "--length" if rod is None else f"--length {rod[1]}=MEASURED±SIGMAmm"
+
     def rod_for_scale(self, *, has_length: bool) -> tuple[Leg, str] | None:
         """Return the rod to measure, None where readings or something measured carry lengths."""
         return None if has_length or self.readings_carry_length else self.rod_to_measure
