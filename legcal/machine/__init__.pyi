@@ -116,6 +116,7 @@ from .parameters import free_coordinates as free_coordinates
 from .parameters import from_vector as from_vector
 from .parameters import geometries as geometries
 from .parameters import is_held_by_default as is_held_by_default
+from .parameters import is_spatial as is_spatial
 from .parameters import kind_of_parameter as kind_of_parameter
 from .parameters import legs_in_links as legs_in_links
 from .parameters import moved_legs as moved_legs

@@ -39,6 +39,7 @@ from legcal.machine.parameters import (
     Parametrization,
     free_coordinates,
     geometries,
+    is_spatial,
     moved_legs,
     parametrization_of,
 )
@@ -159,7 +160,7 @@ def ties_of(
     defined = any(not legs[j].is_fixed_to_platform for j in frame_legs)
     n_zeros = len(internal_joints_of(legs))
     ties = Ties(tuple(frame_legs), tuple(fixed) if defined else (), n_zeros=n_zeros)
-    n_dependent = 0 if home is None or len(frame_legs) < 3 else _n_dependent(legs, home)
+    n_dependent = 0 if home is None or not is_spatial(frame_legs) else _n_dependent(legs, home)
     if home is None or n_dependent == 0:
         return ties
     for n in _POSES:
@@ -239,7 +240,7 @@ def n_dependent_at_home(machine: Machine) -> int:
 
 def n_nearly_dependent(machine: Machine) -> int:
     """Return how many constraints of joints follow from the others but for 1 mrad."""
-    if len(machine.frame_legs) < 3:
+    if not machine.spatial:
         return 0
     return _n_dependent(geometries(machine), _home(machine), _NEARLY)
 

@@ -42,6 +42,7 @@ from legcal.machine import (
     independent,
     internal_index,
     internal_joints_of,
+    is_spatial,
     joints_at,
     leg_labels,
     list_in_words,
@@ -204,7 +205,7 @@ class PredictedObservations:
     @property
     def spatial(self) -> bool:
         """Whether the platform moves in space and not in a plane."""
-        return len(self.frame_legs) == 3
+        return is_spatial(self.frame_legs)
 
     @cached_property
     def views(self) -> tuple[tuple[int, ...], ...]:
