@@ -22,6 +22,7 @@ from .coordinates import poses_at_coordinates as poses_at_coordinates
 from .coordinates import turned_back as turned_back
 from .cylinders import COAXIAL as COAXIAL
 from .diagnostics import singularity_note as singularity_note
+from .dimensions import Dimensions as Dimensions
 from .directions import SHOWN as SHOWN
 from .directions import describe_direction as describe_direction
 from .directions import leg_labels as leg_labels
