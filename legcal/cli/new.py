@@ -68,9 +68,5 @@ def new(
     )
 
 
-_own = parameters_of(new)
-declare(
-    new,
-    [_own["table"], _own["output"], *declared(Dimensions)]
-    + [_own["template"], _own["force"], _own["as_json"]],
-)
+_table, _output, *_others = parameters_of(new)
+declare(new, [_table, _output, *declared(Dimensions), *_others])

@@ -98,9 +98,10 @@ def declared(request: type) -> Iterator[inspect.Parameter]:
         )
 
 
-def parameters_of(command: Callable[..., None]) -> Mapping[str, inspect.Parameter]:
-    """Return the parameters of a command that it writes out itself."""
-    return inspect.signature(command, eval_str=True).parameters
+def parameters_of(command: Callable[..., None]) -> list[inspect.Parameter]:
+    """Return the parameters of a command that it writes out itself, without ``**options``."""
+    own = inspect.signature(command, eval_str=True).parameters.values()
+    return [each for each in own if each.kind is not inspect.Parameter.VAR_KEYWORD]
 
 
 def declare(command: Callable[..., None], order: Sequence[inspect.Parameter]) -> None:

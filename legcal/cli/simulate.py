@@ -58,10 +58,6 @@ def simulate(
     )
 
 
-_own = parameters_of(simulate)
+_model, _output, _force, *_usual = parameters_of(simulate)
 _level, _seed, *_others = declared(Request)
-declare(
-    simulate,
-    [_own["model"], _own["output"], _level, _seed, _own["force"], *_others]
-    + [_own["quiet"], _own["as_json"]],
-)
+declare(simulate, [_model, _output, _level, _seed, _force, *_others, *_usual])
