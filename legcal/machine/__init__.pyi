@@ -12,7 +12,6 @@ from .configurations import WORKSPACE_SEED as WORKSPACE_SEED
 from .configurations import Configurations as Configurations
 from .configurations import random_configurations as random_configurations
 from .configurations import random_poses as random_poses
-from .configurations import random_poses_of_legs as random_poses_of_legs
 from .configurations import random_postures_of_legs as random_postures_of_legs
 from .configurations import workspace as workspace
 from .coordinates import COORDINATES as COORDINATES

@@ -52,7 +52,6 @@ from legcal.machine import (
     on_ties,
     parametrization_of,
     platform_joints_at,
-    random_poses_of_legs,
     random_postures_of_legs,
     ties_of,
 )
@@ -539,11 +538,11 @@ def recorded_observations(
         R, t = Frames.of(nominal_poses(machine, m)[0])
     else:
         travel = travel_of(machine)
-        R, t = random_poses_of_legs(legs, machine.frame_legs, home, travel, m.n_poses, rng)
+        R, t, _ = random_postures_of_legs(legs, machine.frame_legs, home, travel, m.n_poses, rng)
     parametrization = parametrization_of(machine, twists=twists)
     R_reached, t_reached = R, t
     if 3 * len(t) < len(parametrization):  # too few to tell what no pose would show
-        more = random_poses_of_legs(
+        more = random_postures_of_legs(
             legs, machine.frame_legs, home, travel_of(machine), REACHED - len(t), rng
         )
         R_reached, t_reached = np.concatenate([R, more[0]]), np.concatenate([t, more[1]])
