@@ -459,7 +459,7 @@ def test_poses_out_of_reach_are_refused_and_rare_ones_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     machine, rng = legcal.load_mechanism("hexapod"), np.random.default_rng(1)
-    home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
+    home = machine.home_of_frames
     away = np.tile([5.0, 5.0], (6, 1))
     away[0] = [0.01, 0.01]
     with pytest.raises(DidNotConverge, match="0 of 3 random poses"):

@@ -181,8 +181,7 @@ def machine_ties(machine: Machine) -> Ties:
 
 def _home(machine: Machine) -> Array:
     """Return the home of R_e in R_b, (3, 4)."""
-    home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
-    return np.asarray(home.as_matrix()[:3])
+    return np.asarray(machine.home_of_frames.as_matrix()[:3])
 
 
 def independent(rows: TieRows, by_unknowns: Array, n: int | None = None) -> tuple[Array, Array]:

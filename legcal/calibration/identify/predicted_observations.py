@@ -471,7 +471,7 @@ def planned_observations(
     """
     n_poses = images * len(views)
     (legs, length, rng), (R, t, moving) = _random_session(machine, max(n_poses, REACHED))
-    rng, home = deepcopy(rng), _home(machine)
+    rng, home = deepcopy(rng), machine.home_of_frames
     A, B = ends_at_pose(legs, home)
     seen = np.zeros((len(views), len(legs)), dtype=np.bool_)
     for v, view in enumerate(views):
@@ -500,17 +500,12 @@ def planned_observations(
     )
 
 
-def _home(machine: Machine) -> RigidTransform:
-    """Return T_Rb_Re at home."""
-    return machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
-
-
 @lru_cache(maxsize=4)
 def _random_session(
     machine: Machine, n_poses: int
 ) -> tuple[tuple[tuple[Leg, ...], float, np.random.Generator], tuple[Array, Array, Array]]:
     """Return what :func:`machine_near` does, and random postures: one plan follows the other."""
-    home = _home(machine)
+    home = machine.home_of_frames
     legs, length, rng = machine_near(machine, home)
     travel = travel_of(machine)
     postures = random_postures_of_legs(legs, machine.frame_legs, home, travel, n_poses, rng)
@@ -531,8 +526,7 @@ def recorded_observations(
     Raises DatasetError if readings are out of reach of the model by more than its errors may be.
     """
     machine, m = dataset.machine, dataset.measurements
-    to_Rb, from_Re = machine.T_base_Rb.inv(), machine.T_platform_Re
-    home = to_Rb * machine.home * from_Re
+    to_Rb, home = machine.T_base_Rb.inv(), machine.home_of_frames
     legs, length, rng = machine_near(machine, home)
     if machine.is_determined:
         R, t = Frames.of(nominal_poses(machine, m)[0])

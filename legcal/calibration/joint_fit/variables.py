@@ -270,7 +270,7 @@ def fitted_legs(machine: Machine) -> FittedLegs:
             for i, leg in enumerate(machine.legs)
             for part, r in leg.radius_of_part.items()
         },
-        machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re,
+        machine.home_of_frames,
         machine.is_redundant,
     )
 
