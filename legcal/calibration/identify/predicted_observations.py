@@ -543,13 +543,7 @@ def recorded_observations(
     used = np.unique(m.view)
     views = [m.views[v] for v in used]
     seen = np.array(
-        [
-            [
-                bool(leg.cylinders) and (view.legs is None or leg.name in view.legs)
-                for leg in machine.legs
-            ]
-            for view in views
-        ]
+        [[bool(leg.cylinders) and view.uses(leg.name) for leg in machine.legs] for view in views]
     )
     if dataset.axes is not None:
         shown_legs = np.zeros((len(m.views), len(machine.leg_names)), dtype=np.bool_)
