@@ -34,6 +34,7 @@ from legcal.files import read_yaml
 from legcal.geometry import Array, IntArray
 from legcal.machine import (
     ActuatorColumns,
+    Dimensions,
     Leg,
     LegKind,
     Machine,
@@ -132,13 +133,13 @@ def made(kind: str, folder: Path) -> Machine:
     folder.mkdir(parents=True, exist_ok=True)
     if kind in ROUND_ARMS:
         family, radius = ROUND_ARMS[kind]
-        size = {"arm_radius": radius}
-        described = description_of(None, family=family, unit="mm", name=kind, dimensions=size)
+        size = Dimensions(family=family, unit="mm", name=kind, arm_radius=radius)
+        described = description_of(None, size)
         return create_model(described, folder, force=True).machine
     table = folder / f"{kind}-table.yaml"
     text = {"legcal_table": 1, "name": kind, "unit": "mm", **kinds()[kind]}
     table.write_text(yaml.safe_dump(text, sort_keys=False))
-    described = description_of(table, family=None, unit=None, name=None, dimensions={})
+    described = description_of(table, Dimensions())
     return create_model(described, folder, force=True).machine
 
 

@@ -10,7 +10,14 @@ from layouts import LegSpec, MachineSpec
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry import Array
-from legcal.machine import LegKind, Machine, create_model, description_of, main_cylinders
+from legcal.machine import (
+    Dimensions,
+    LegKind,
+    Machine,
+    create_model,
+    description_of,
+    main_cylinders,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
@@ -141,13 +148,12 @@ def write_table(folder: Path, **changes: Any) -> Path:
 
 def read_table(path: Path, unit: str | None = None, name: str | None = None) -> Any:
     """Return what a table describes."""
-    return description_of(path, family=None, unit=unit, name=name, dimensions={})
+    return description_of(path, Dimensions(unit=unit, name=name))
 
 
 def read_family(family: str, unit: str | None = "mm", **dimensions: Any) -> Any:
     """Return what a family with some dimensions describes."""
-    name = dimensions.pop("name", None)
-    return description_of(None, family=family, unit=unit, name=name, dimensions=dimensions)
+    return description_of(None, Dimensions(family=family, unit=unit, **dimensions))
 
 
 def made(folder: Path, **changes: Any) -> Machine:

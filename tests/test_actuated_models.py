@@ -18,6 +18,7 @@ from legcal.exports import Subject, export
 from legcal.geometry import Array
 from legcal.machine import (
     ARM_KINDS,
+    Dimensions,
     Machine,
     create_model,
     description_of,
@@ -207,8 +208,7 @@ def test_a_csv_gives_the_same_model_as_its_yaml(tmp_path: Path) -> None:
         rows.append(",".join(map(str, ["RSS", *a, *b, 400, 5, motor, *cells, "mm"])))
     path = tmp_path / "delta.csv"
     path.write_text("\n".join(rows))
-    height = {"height": table["home"]["xyz"][2]}
-    described = description_of(path, family=None, unit=None, name=None, dimensions=height)
+    described = description_of(path, Dimensions(height=table["home"]["xyz"][2]))
     machine, shipped = create_model(described, tmp_path).machine, load_mechanism("delta")
     check_same(machine, read_table(TABLES / "delta.yaml"))
     np.testing.assert_allclose(machine.home.as_matrix(), shipped.home.as_matrix(), atol=1e-10)

@@ -278,3 +278,16 @@ def test_the_three_commands_of_the_readme_lead_from_files_to_a_calibration(
     )
     assert found < 0.2 * nominal
     assert found < 2e-4
+
+
+def test_the_commands_that_take_a_cluster_are_those_that_the_page_names() -> None:
+    def takes_it(command: Any) -> bool:
+        parts = [command, *getattr(command, "commands", {}).values()]
+        return any("--cluster" in option.opts for part in parts for option in part.params)
+
+    text = (ROOT / "docs" / "scale.md").read_text(encoding="utf-8")
+    (sentence,) = re.findall(
+        r"uses a Dask cluster that runs already\.(.*?) take it\.", text, re.DOTALL
+    )
+    taking = {name for name, command in _root().commands.items() if takes_it(command)}
+    assert taking == set(re.findall(r"`(\w+)`", sentence))

@@ -60,7 +60,7 @@ from legcal.machine import (
     geometries,
     moved_legs,
     parametrize,
-    random_poses_of_legs,
+    random_postures_of_legs,
 )
 from legcal.machine import leg_equations as linearize_leg
 from legcal.vision import outlines_of_axis
@@ -459,11 +459,11 @@ def test_poses_out_of_reach_are_refused_and_rare_ones_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     machine, rng = legcal.load_mechanism("hexapod"), np.random.default_rng(1)
-    home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
+    home = machine.home_of_frames
     away = np.tile([5.0, 5.0], (6, 1))
     away[0] = [0.01, 0.01]
     with pytest.raises(DidNotConverge, match="0 of 3 random poses"):
-        random_poses_of_legs(geometries(machine), machine.frame_legs, home, away, 3, rng)
+        random_postures_of_legs(geometries(machine), machine.frame_legs, home, away, 3, rng)
     monkeypatch.setattr(
         "legcal.machine.configurations._Drive.is_regular",
         lambda _self, _R, t, _wanted: rng.random(len(t)) < 0.75,  # in each of five steps

@@ -33,6 +33,7 @@ OUTSIDE = {
     "cluster",
     "errors",
     "figures",
+    "option_fields",
     "processors",
     "progress",
     "signals",

@@ -23,7 +23,7 @@ from legcal.machine import (
     Cylinder,
     actuator_index,
     parametrize,
-    random_poses_of_legs,
+    random_postures_of_legs,
     readings_of_rods,
 )
 from legcal.paper import count_conditions, enough_readings
@@ -231,7 +231,8 @@ def test_an_unknown_scale_is_refused_with_what_would_fix_it(
         identifiability, "recorded_observations", lambda dataset, twists: session("6-rss")
     )
     known = SimpleNamespace(
-        readings_carry_length=False, rod_to_measure=(None, "leg1.base:leg1.platform")
+        readings_carry_length=False,
+        length_option="--length leg1.base:leg1.platform=MEASURED±SIGMAmm",
     )
     dataset: Any = SimpleNamespace(folder="servo", machine=known, axes=None)
     wanted = (
@@ -247,7 +248,7 @@ def test_random_poses_are_closed_and_inside_the_travel_of_actuators(name: str) -
     home = RigidTransform.from_components(t0, Rotation.from_matrix(R0))
     travel = np.array([leg.actuator.travel for leg in legs if leg.actuator])
     rng = np.random.default_rng(0)
-    R, t = random_poses_of_legs(legs, frame_legs(6), home, travel, 12, rng)
+    R, t, _ = random_postures_of_legs(legs, frame_legs(6), home, travel, 12, rng)
     q = readings_of_rods(legs, R, t)
     assert np.ptp(q, axis=0).min() > 0.3 * np.ptp(travel, axis=1).min()
     for leg, a, (low, high) in zip(legs, actuator_index(legs), travel, strict=True):

@@ -15,6 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, UsageError
 from legcal.machine import (
+    Dimensions,
     LegKind,
     Machine,
     create_model,
@@ -80,9 +81,7 @@ def test_shipped_models_are_what_their_tables_give(table: Path, tmp_path: Path) 
 
 def test_a_table_is_as_good_as_csv(tmp_path: Path) -> None:
     (table,) = (ROOT / "models" / "tables").glob("*.csv")
-    described = description_of(
-        table, family=None, unit=None, name=None, dimensions={"height": 820.0}
-    )
+    described = description_of(table, Dimensions(height=820.0))
     made = create_model(described, tmp_path)
     for path, folder in ((made.yaml_path, "models"), (made.urdf_path, "urdf")):
         assert path.read_bytes() == (ROOT / folder / path.name).read_bytes()

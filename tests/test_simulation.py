@@ -29,7 +29,7 @@ def test_the_hexapod_in_memory_is_the_shipped_one() -> None:
     assert np.all(shipped.sign == 1)
     found = to_vector(machine.parameters, machine.frame_legs)
     assert np.allclose(found, to_vector(shipped.parameters, shipped.frame_legs), rtol=0, atol=1e-15)
-    home = shipped.T_base_Rb.inv() * shipped.home * shipped.T_platform_Re
+    home = shipped.home_of_frames
     assert np.allclose(machine.home.as_matrix(), home.as_matrix(), rtol=0.0, atol=2e-5)
     for j, leg in enumerate(shipped.legs):
         assert {cylinder.radius for cylinder in leg.cylinders} == {machine.radius[j]}

@@ -291,13 +291,12 @@ def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -
 
 def _misplaced(dataset: Dataset, solution: Solution) -> list[str]:
     """Return notes on boards that are far from where the dataset has them."""
-    notes, machine = [], dataset.machine
-    frames = {"base": machine.T_base_Rb, "platform": machine.T_platform_Re}
+    notes = []
     for fixed in dataset.boards:
         given, found = fixed.T_link_board, solution.T_frame_board.get(fixed.link)
         if given is None or found is None:
             continue
-        place = frames[fixed.link] * found
+        place = dataset.machine.T_link_frame(fixed.link) * found
         if not _agree(given, place):
             far, turned = pose_distance(given, place)
             key, which = f"T_{fixed.link}_board", "" if fixed.link == "base" else " on the platform"

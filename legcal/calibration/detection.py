@@ -158,15 +158,14 @@ class Detection:
         Arms come after them, each as another one of the leg that has it as a part.
         """
         measurements, legs = self.dataset.measurements, self.dataset.machine.legs
-        view = int(measurements.view[row])
-        T = self.T_base_camera[view]
+        view = measurements.views[measurements.view[row]]
+        T = self.T_base_camera[int(measurements.view[row])]
         if T is None:
             return []
-        used, camera = measurements.views[view].legs, measurements.views[view].camera
         ends, owner = (self.A_base, self.B_base), [*range(len(legs)), *self.arms]
-        found = predict_legs_and_arms(camera, T, ends, self.cylinders, self.arms, row)
+        found = predict_legs_and_arms(view.camera, T, ends, self.cylinders, self.arms, row)
         every = [replace(leg, leg=owner[leg.leg]) for leg in found]
-        return [leg for leg in every if used is None or legs[leg.leg].name in used]
+        return [leg for leg in every if view.uses(legs[leg.leg].name)]
 
     @cached_property
     def left_out(self) -> dict[int, str]:

@@ -130,7 +130,5 @@ def unseen_legs(machine: Machine, measurements: Measurements, outlines: Outlines
     return [
         leg.name
         for j, leg in enumerate(machine.legs)
-        if j not in shown
-        and leg.cylinders
-        and any(view.legs is None or leg.name in view.legs for view in views)
+        if j not in shown and leg.cylinders and any(view.uses(leg.name) for view in views)
     ]

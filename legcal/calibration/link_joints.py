@@ -75,7 +75,7 @@ class _LinkFrame:
         return cls(
             side,
             machine.base if is_base else machine.platform,
-            machine.T_base_Rb if is_base else machine.T_platform_Re,
+            machine.T_link_frame(side),
             np.array([leg.A if is_base else leg.B for leg in legs]),
             found.place[:, LegColumns.A if is_base else LegColumns.B],
             found.names,

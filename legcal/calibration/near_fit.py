@@ -163,7 +163,7 @@ def shown_near(estimate: Estimate, placement: Placement) -> Placement:
 
 
 def hardly_shown(outlines: Outlines, rows: Iterable[int]) -> list[int]:
-    """Return the images of some of which less than half of the outlines is used."""
+    """Return the images of some of which less than half of the visible outlines is used."""
     shown = outlines.choose(is_visible(outlines))
     used = {row: shown.used[shown.row == row] for row in rows}
     return [row for row, own in used.items() if not len(own) or own.mean() < MIN_FOUND_AGAIN]
@@ -174,15 +174,12 @@ def not_found_again(first: Estimate, again: Estimate) -> list[str]:
 
     Those on cameras as well, where that is so of all images together.
     """
-    after, o = again.outliers, again.solution.outlines
-    gone = {
-        row: what
-        for row, what in first.outliers.items()
-        if row not in after and o.used[o.row == row].mean() < MIN_FOUND_AGAIN
-    }
-    few_found = o.used.sum() < MIN_FOUND_AGAIN * first.solution.outlines.used.sum()
+    before, found = first.outliers, again.solution.outlines
+    gone = hardly_shown(found, [row for row in before if row not in again.outliers])
+    few_found = found.used.sum() < MIN_FOUND_AGAIN * first.solution.outlines.used.sum()
     cameras = first.solution.camera_doubts.notes if few_found else ()
-    return [*cameras, *image_notes(first.fitted.measurements, gone)]
+    notes = image_notes(first.fitted.measurements, {row: before[row] for row in gone})
+    return [*cameras, *notes]
 
 
 def _compression_note(

@@ -311,9 +311,8 @@ def _board(calibration: Calibration, link: Link) -> dict[str, Any] | None:
     fixed, T_frame_board = dataset.board_on(link), solution.T_frame_board.get(link)
     if fixed is None or T_frame_board is None or corners is None:
         return None
-    machine = dataset.machine
-    T_link_frame = machine.T_base_Rb if link == "base" else machine.T_platform_Re
-    given, T_link_board = fixed.T_link_board, T_link_frame * T_frame_board
+    T_link_board = dataset.machine.T_link_frame(link) * T_frame_board
+    given = fixed.T_link_board
     off = None
     if given is not None:
         apart = given.inv() * T_link_board

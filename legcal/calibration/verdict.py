@@ -66,9 +66,7 @@ def judge(
         change, sigma, found = _change_of_platform(platform)
         if by_scale := _share_of_scale(platform):
             found += f"; {by_scale}"
-            rod = machine.rod_to_measure
-            ends = "" if rod is None else f" {rod[1]}=MEASURED±SIGMAmm"
-            remedy = f"measure the distance of two joints and state it (--length{ends})"
+            remedy = f"measure the distance of two joints and state it ({machine.length_option})"
     objection = _objection(dataset, solution, diagnosis, found)
     verdict = (
         Verdict(False, objection, remedy) if objection else _verdict(change, sigma, found, remedy)

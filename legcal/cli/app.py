@@ -25,13 +25,13 @@ from legcal.cli.commands import (
     identify,
     inspect,
     locate,
-    new,
     noise,
 )
 from legcal.cli.example import example
 from legcal.cli.export import export
 from legcal.cli.import_ import import_
 from legcal.cli.init import init
+from legcal.cli.new import new
 from legcal.cli.options import INTERRUPTED, print_failure
 from legcal.cli.plan import plan
 from legcal.cli.schema import schema

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -340,152 +339,6 @@ def _point(text: str) -> list[float]:
             "platform; write them like 0,0,0.05 or 0mm,0mm,50mm."
         )
     return [value.value for value in values]
-
-
-def new(
-    table: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[TABLE]", help="A YAML or CSV table of the legs.", show_default=False
-        ),
-    ] = None,
-    output: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="DIR", help="The folder of models/ and urdf/."),
-    ] = ...,  # type: ignore[assignment]
-    family: Annotated[
-        str | None,
-        typer.Option(
-            help="Instead of a table: number and type of legs, 6-UPS; or hexaglide, 3-prs, "
-            "linear-delta, orthoglide, delta or servo-hexapod, whose dimensions have defaults."
-        ),
-    ] = None,
-    unit: Annotated[str | None, typer.Option(help="Unit of all lengths: mm or m.")] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the model and its files.")] = None,
-    base_radius: Annotated[
-        float | None, typer.Option(help="Radius of the circle of base joints.")
-    ] = None,
-    platform_radius: Annotated[
-        float | None, typer.Option(help="Radius of the circle of platform joints.")
-    ] = None,
-    height: Annotated[
-        float | None, typer.Option(help="Height of the platform above the base.")
-    ] = None,
-    base_spread: Annotated[
-        float | None,
-        typer.Option(
-            help="Angle between the base joints of a pair (6 legs), in degrees; default 30."
-        ),
-    ] = None,
-    platform_spread: Annotated[
-        float | None,
-        typer.Option(help="Angle between the platform joints of a pair, in degrees; default 30."),
-    ] = None,
-    turn: Annotated[
-        float | None,
-        typer.Option(help="Rotation of the platform about z, in degrees; default 0, planar 30."),
-    ] = None,
-    offset: Annotated[float | None, typer.Option(help="Leg length at reading zero.")] = None,
-    travel: Annotated[
-        tuple[float, float] | None,
-        typer.Option(help="Lowest and highest reading; degrees where motors turn."),
-    ] = None,
-    min_length: Annotated[
-        float | None,
-        typer.Option(help="Shortest length of a leg, where readings are zero; without --offset."),
-    ] = None,
-    max_length: Annotated[
-        float | None, typer.Option(help="Longest length of a leg, in place of --travel.")
-    ] = None,
-    leg_radius: Annotated[float | None, typer.Option(help="Radius of tube and rod.")] = None,
-    arm_length: Annotated[
-        float | None, typer.Option(help="Length of the arms of a delta, or horns of servos.")
-    ] = None,
-    arm_radius: Annotated[
-        float | None, typer.Option(help="Radius of arms that are cylinders; boxes without it.")
-    ] = None,
-    rod_length: Annotated[
-        float | None, typer.Option(help="Length of rods on carriages or arms.")
-    ] = None,
-    rod_spacing: Annotated[
-        float | None, typer.Option(help="Distance of the two rods of a parallelogram.")
-    ] = None,
-    type_of_legs: Annotated[
-        str | None, typer.Option("--type", help="Type of the legs of a table that has none: UPS.")
-    ] = None,
-    platform_in: Annotated[
-        Literal["base", "platform"] | None,
-        typer.Option(
-            help="What the platform joints of a table are coordinates of: the platform, or the "
-            "base with the machine at home."
-        ),
-    ] = None,
-    tilt: Annotated[
-        float | None,
-        typer.Option(help="Tilt of R and U axes from their default, in degrees; default 0."),
-    ] = None,
-    template: Annotated[
-        bool,
-        typer.Option(
-            "--template", help="Write a commented table to start from, as YAML and CSV in mm."
-        ),
-    ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Write a model, YAML and URDF, from a table of joints or a few dimensions."""
-    from rich.text import Text
-
-    from legcal import machine, report
-
-    dimensions = {
-        "base_radius": base_radius,
-        "platform_radius": platform_radius,
-        "height": height,
-        "base_spread": base_spread,
-        "platform_spread": platform_spread,
-        "turn": turn,
-        "offset": offset,
-        "travel": travel,
-        "min_length": min_length,
-        "max_length": max_length,
-        "leg_radius": leg_radius,
-        "arm_length": arm_length,
-        "arm_radius": arm_radius,
-        "rod_length": rod_length,
-        "rod_spacing": rod_spacing,
-        "type": type_of_legs,
-        "platform_in": platform_in,
-        "tilt": tilt,
-    }
-    if template:
-        given = [table, family, unit, *dimensions.values()]
-        if any(value is not None for value in given):
-            raise UsageError(
-                "The template could not be written: found other options beside --template, needed "
-                "--output and --name only; leave them out, and write your numbers in the table."
-            )
-        yaml, csv = machine.write_template(output, name, force=force)
-        lines = f"written: {yaml} {csv}", f"Next: legcal new {shlex.quote(str(yaml))} -o ."
-        show(
-            as_json,
-            lambda: {"paths": {"yaml": str(yaml), "csv": str(csv)}},
-            lambda: report.report([Text(line, overflow="ignore") for line in lines]),
-        )
-        return
-    model = machine.description_of(
-        table, family=family, unit=unit, name=name, dimensions=dimensions
-    )
-    created = machine.create_model(model, output, force=force)
-    description = machine.machine_document(created.machine)
-    description["diagnostics"] = [*model.notes, *description["diagnostics"]]
-    paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
-    written = f"written: {paths['yaml']} {paths['urdf']}"
-    show(
-        as_json,
-        lambda: description | {"paths": paths},
-        lambda: report.report(report.inspect_table(description), Text(written, overflow="ignore")),
-    )
 
 
 def noise(

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import gc
+import inspect
 import json
 import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -81,6 +82,33 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from legcal.pages import Verdict
+
+
+def declared(request: type) -> Iterator[inspect.Parameter]:
+    """Return the fields of a dataclass (``legcal.option_fields``) as parameters of a command."""
+    types = get_type_hints(request)
+    for field in fields(request):
+        how = dict(field.metadata["option"])
+        option = typer.Option(*how.pop("flags"), **how)
+        yield inspect.Parameter(
+            field.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=field.default,
+            annotation=Annotated[types[field.name], option],
+        )
+
+
+def parameters_of(command: Callable[..., None]) -> list[inspect.Parameter]:
+    """Return the parameters of a command that it writes out itself, without ``**options``."""
+    own = inspect.signature(command, eval_str=True).parameters.values()
+    return [each for each in own if each.kind is not inspect.Parameter.VAR_KEYWORD]
+
+
+def declare(command: Callable[..., None], order: Sequence[inspect.Parameter]) -> None:
+    """Give a command the signature that Typer reads: its parameters in the order of the help."""
+    parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in order]
+    command.__annotations__ = {p.name: p.annotation for p in parameters}
+    vars(command)["__signature__"] = inspect.Signature(parameters)
 
 
 def check_page(page: Path | None) -> None:

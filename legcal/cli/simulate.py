@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Iterator
-from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any
 
 import typer
 
@@ -15,7 +12,10 @@ from legcal.cli.options import (
     JsonOption,
     ModelArgument,
     QuietOption,
+    declare,
+    declared,
     image_workers,
+    parameters_of,
     show,
 )
 from legcal.simulation import Request
@@ -58,29 +58,6 @@ def simulate(
     )
 
 
-def _requested() -> Iterator[inspect.Parameter]:
-    """Return the fields of a request as parameters of a command."""
-    types = get_type_hints(Request)
-    for field in fields(Request):
-        how = dict(field.metadata["option"])
-        option = typer.Option(*how.pop("flags"), **how)
-        yield inspect.Parameter(
-            field.name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=field.default,
-            annotation=Annotated[types[field.name], option],
-        )
-
-
-def _declare() -> None:
-    """Give the command the signature that Typer reads: its own options in the order of the help."""
-    own = inspect.signature(simulate, eval_str=True).parameters
-    level, seed, *others = _requested()
-    order = [own["model"], own["output"], level, seed, own["force"], *others]
-    order += [own["quiet"], own["as_json"]]
-    parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in order]
-    simulate.__annotations__ = {p.name: p.annotation for p in parameters}
-    vars(simulate)["__signature__"] = inspect.Signature(parameters)
-
-
-_declare()
+_model, _output, _force, *_usual = parameters_of(simulate)
+_level, _seed, *_others = declared(Request)
+declare(simulate, [_model, _output, _level, _seed, _force, *_others, *_usual])

@@ -312,11 +312,7 @@ def _invisible(dataset: Dataset) -> list[str]:
     machine = dataset.machine
     add = "add <visual> cylinders along them, with their radii, to the URDF"
     shown = {leg.name for leg in machine.legs if leg.cylinders}
-    views = [
-        view.name
-        for view in dataset.measurements.views
-        if not shown.intersection(machine.leg_names if view.legs is None else view.legs)
-    ]
+    views = [view.name for view in dataset.measurements.views if not any(map(view.uses, shown))]
     if views:
         return [
             f"{dataset.yaml_path}: {few_views(views)} could not be used: found no leg of which the "
@@ -413,9 +409,7 @@ def read_given_axes(
     axes = read_axes(path, leg_names, measurements)
     views = [measurements.views[v] for v in measurements.view[axes.row].tolist()]
     names = [leg_names[leg] for leg in axes.leg.tolist()]
-    is_used = [
-        view.legs is None or name in view.legs for view, name in zip(views, names, strict=True)
-    ]
+    is_used = [view.uses(name) for view, name in zip(views, names, strict=True)]
     used = np.flatnonzero(is_used)
     if len(used) == 0:
         raise DatasetError(

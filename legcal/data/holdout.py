@@ -78,8 +78,7 @@ def _shown(dataset: Dataset) -> BoolArray:
         given[row] = True
     for row in np.flatnonzero(~given).tolist():
         view = int(measurements.view[row])
-        legs = measurements.views[view].legs
-        shown[row, view] = [legs is None or name in legs for name in names]
+        shown[row, view] = [measurements.views[view].uses(name) for name in names]
     return shown.reshape(measurements.n_rows, -1)
 
 

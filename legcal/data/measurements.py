@@ -65,6 +65,10 @@ class View:
     legs: tuple[str, ...] | None = None  # use only these legs in this view; None for all
     hand_held: bool = False  # one image of a camera in the hand, which only the board can place
 
+    def uses(self, leg: str) -> bool:
+        """Say whether a leg, by its name, is to be used in this view."""
+        return self.legs is None or leg in self.legs
+
 
 @brief
 @dataclass(frozen=True, eq=False)

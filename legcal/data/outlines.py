@@ -205,13 +205,8 @@ def reject_unused_legs(
     """Return outlines with those rejected whose leg the dataset leaves out of their view."""
     views = [measurements.views[v] for v in measurements.view[outlines.row].tolist()]
     names = [leg_names[leg] for leg in outlines.leg.tolist()]
-    out = np.array(
-        [
-            view.legs is not None and name not in view.legs
-            for view, name in zip(views, names, strict=True)
-        ],
-        dtype=np.bool_,
-    )
+    used = [view.uses(name) for view, name in zip(views, names, strict=True)]
+    out = ~np.array(used, dtype=np.bool_)
     return outlines.reject(out, [f"view {view.name} does not use this leg" for view in views])
 
 

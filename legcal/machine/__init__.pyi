@@ -12,7 +12,6 @@ from .configurations import WORKSPACE_SEED as WORKSPACE_SEED
 from .configurations import Configurations as Configurations
 from .configurations import random_configurations as random_configurations
 from .configurations import random_poses as random_poses
-from .configurations import random_poses_of_legs as random_poses_of_legs
 from .configurations import random_postures_of_legs as random_postures_of_legs
 from .configurations import workspace as workspace
 from .coordinates import COORDINATES as COORDINATES
@@ -22,6 +21,7 @@ from .coordinates import poses_at_coordinates as poses_at_coordinates
 from .coordinates import turned_back as turned_back
 from .cylinders import COAXIAL as COAXIAL
 from .diagnostics import singularity_note as singularity_note
+from .dimensions import Dimensions as Dimensions
 from .directions import SHOWN as SHOWN
 from .directions import describe_direction as describe_direction
 from .directions import leg_labels as leg_labels
@@ -116,6 +116,7 @@ from .parameters import free_coordinates as free_coordinates
 from .parameters import from_vector as from_vector
 from .parameters import geometries as geometries
 from .parameters import is_held_by_default as is_held_by_default
+from .parameters import is_spatial as is_spatial
 from .parameters import kind_of_parameter as kind_of_parameter
 from .parameters import legs_in_links as legs_in_links
 from .parameters import moved_legs as moved_legs

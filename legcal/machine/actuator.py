@@ -240,6 +240,18 @@ class Actuator:
             return np.asarray(A + self.gain * q[:, None] * self.axis)
         return np.asarray(self.point + self.rotations(q) @ (A - self.point))
 
+    def path(self, A: Array) -> tuple[Array, Array, Array, Array]:
+        """Return middle, cos, sin and slide (3,) of a joint centre that is at A (3,) at reading 0.
+
+        It is at middle + cos cosine(g q) + sin sine(g q) + slide q.
+        """
+        zero = np.zeros(3)
+        if not self.turns:
+            return A, zero, zero, self.gain * self.axis
+        sin = cross(self.axis, A - self.point)
+        cos = cross(sin, self.axis)
+        return A - cos, cos, sin, zero
+
     def by_reading(self, A: Array) -> Array:
         """Return how joint centres that are at A (k, 3) move with the reading, (k, 3)."""
         if not self.turns:

@@ -307,30 +307,6 @@ def _outside(machine: Machine, values: Array) -> BoolArray:
     return np.asarray(outside | (machine.lengths_at(values) <= 0.0))
 
 
-def random_poses_of_legs(
-    legs: Sequence[Leg],
-    frame_legs: Sequence[int],
-    home: RigidTransform,
-    travel: Array,
-    count: int,
-    rng: np.random.Generator,
-) -> tuple[Array, Array]:
-    """Return random poses (count, 3, 3) and (count, 3) [m] of R_e in R_b inside the travel.
-
-    They are those of legs in R_b and R_e that no file describes: many at once, without a chain.
-    *home* is T_Rb_Re near a closed pose of the wanted assembly mode, *travel* (n_legs, 2) the
-    shortest and longest length of each leg [m], equal for legs of constant length; of rods on
-    actuators the least and largest reading of these [m or rad].
-
-    Raises
-    ------
-    DidNotConverge
-        If the machine cannot move inside its travel.
-    """
-    R, t, _ = random_postures_of_legs(legs, frame_legs, home, travel, count, rng)
-    return R, t
-
-
 def random_postures_of_legs(
     legs: Sequence[Leg],
     frame_legs: Sequence[int],
@@ -339,14 +315,18 @@ def random_postures_of_legs(
     count: int,
     rng: np.random.Generator,
 ) -> tuple[Array, Array, Array]:
-    """Return the same with readings of actuators and internal coordinates there, (count, n).
+    """Return random poses (count, 3, 3) and (count, 3) [m] of R_e in R_b inside the travel.
 
-    Internal joints too are inside their travel.
+    With them come the readings of actuators and internal coordinates there, (count, n); internal
+    joints too are inside their travel. Poses are those of legs in R_b and R_e that no file
+    describes: many at once, without a chain. *home* is T_Rb_Re near a closed pose of the wanted
+    assembly mode, *travel* (n_legs, 2) the shortest and longest length of each leg [m], equal for
+    legs of constant length; of rods on actuators the least and largest reading of these [m or rad].
 
     Raises
     ------
     DidNotConverge
-        As :func:`random_poses_of_legs`.
+        If the machine cannot move inside its travel.
     """
     start = solve_poses(legs, frame_legs, home.rotation.as_matrix()[None], home.translation[None])
     drive = _Drive(legs, frame_legs, start.R, start.t)

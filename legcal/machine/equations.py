@@ -30,7 +30,7 @@ from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
 from legcal.machine.actuator import ActuatorColumns, JointMotion
 from legcal.machine.leg import EquationKind, JointType, Leg, LegColumns, LegKind
 from legcal.machine.model import Machine
-from legcal.machine.parameters import Parametrization
+from legcal.machine.parameters import Parametrization, is_spatial
 from legcal.machine.rods import (
     actuator_index,
     actuators_of,
@@ -427,7 +427,7 @@ def is_constrained(machine: Machine) -> bool:
 
 def freedoms(frame_legs: Sequence[int]) -> tuple[int, ...]:
     """Return which of the six components of a platform's motion in R_b are possible at all."""
-    return (0, 1, 2, 3, 4, 5) if len(frame_legs) == 3 else (2, 3, 4)
+    return (0, 1, 2, 3, 4, 5) if is_spatial(frame_legs) else (2, 3, 4)
 
 
 _SINGULAR = 1e-9  # of the largest singular value

@@ -1,8 +1,7 @@
 """Machines of a family: legs of one type on circles or in pairs, with a few dimensions."""
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,9 @@ from legcal.machine.actuated_family import (
 from legcal.machine.assembly import across_leg
 from legcal.machine.description import NEEDED_TYPE, Description, Home, LegEntry, LegType, leg_type
 from legcal.machine.description_table import in_metres, read_description
+from legcal.machine.dimensions import Dimensions
 from legcal.machine.leg import MAX_LEGS, JointType, LegKind
+from legcal.option_fields import flag
 
 _FAMILY = re.compile(r"([0-9]{1,2})-([A-Z]+)")
 SPREAD = 30.0  # [deg] between the two joints of a pair
@@ -30,35 +31,13 @@ TURN_IN_PLANE = 30.0  # [deg]; without, the legs of a planar platform meet in on
 SHORTEST, STROKE, RADIUS = 0.8, 0.4, 0.02  # parts of the length at home
 
 
-@dataclass(frozen=True)
-class Family:
-    """The dimensions of a machine, lengths in ``unit`` and angles in degrees."""
-
-    family: str  # number and type of the legs, ``6-UPS``, or a name of FAMILIES, ``delta``
-    unit: str | None = None  # unit of the lengths; required
-    base_radius: float | None = None  # of the circle on which the base joints lie; required
-    platform_radius: float | None = None  # of the circle on which the platform joints lie; required
-    height: float | None = None  # height of the platform over the base at home
-    base_spread: float | None = None  # angle between the two joints of a pair on the base, 6 legs
-    platform_spread: float | None = None  # the same on the platform
-    turn: float | None = None  # turn of the platform about z at home
-    offset: float | None = None  # leg length at reading zero; by default 0.8 of the length at home
-    travel: tuple[float, float] | None = None  # lowest and highest reading
-    leg_radius: float | None = None  # radius of tube and rod; by default 0.02 of the length at home
-    tilt: float = 0.0  # of axes out of the horizontal; those at the platform the other way
-    name: str | None = None  # name of the model; the family in small letters by default
-    arm_length: float | None = None  # of the arms, of families that have some
-    arm_radius: float | None = None  # of arms that are cylinders; boxes by default
-    rod_length: float | None = None  # of rods on carriages or arms
-    rod_spacing: float | None = None  # of the two rods of a parallelogram
-
-
-def describe_family(given: Family) -> Description:
+def describe_family(given: Dimensions) -> Description:
     """Return the machine of a family: joints on circles, its legs at home with default lengths."""
-    name = ALIASES.get(given.family.lower(), given.family.lower())
+    family = str(given.family)
+    name = ALIASES.get(family.lower(), family.lower())
     if name in FAMILIES:
         return _describe_named(name, FAMILIES[name], given)
-    match = _FAMILY.fullmatch(given.family)
+    match = _FAMILY.fullmatch(family)
     of_legs = None if match is None else leg_type(match[2])
     if (
         match is None
@@ -67,7 +46,7 @@ def describe_family(given: Family) -> Description:
         or not 2 <= int(match[1]) <= MAX_LEGS
     ):
         raise UsageError(
-            f"The family could not be read: found '{given.family}', needed a number of legs "
+            f"The family could not be read: found '{family}', needed a number of legs "
             f"from 2 to {MAX_LEGS} and their type, such as 6-UPS: {NEEDED_TYPE.split('; for')[0]}; "
             f"or, with rods that hang on motors, {', '.join(FAMILIES)}; correct --family."
         )
@@ -84,6 +63,7 @@ def describe_family(given: Family) -> Description:
     A = metres(given.base_radius) * _unit_circle(base_angles)
     B = metres(given.platform_radius) * _unit_circle(platform_angles)
     turn = given.turn if given.turn is not None else TURN_IN_PLANE * of_legs.is_planar
+    tilt = float(np.radians(given.tilt or 0.0))
     z_turn = Rotation.from_euler("z", turn, degrees=True)
     T = RigidTransform.from_components([0.0, 0.0, metres(given.height)], z_turn)
     legs = []
@@ -103,9 +83,7 @@ def describe_family(given: Family) -> Description:
                 offset = in_metres(given.offset, unit)
             if given.travel is not None:
                 travel = metres(given.travel[0]), metres(given.travel[1])
-        base_axis, platform_axis = _tilted_axes(
-            of_legs, vector, A[j], float(np.radians(given.tilt))
-        )
+        base_axis, platform_axis = _tilted_axes(of_legs, vector, A[j], tilt)
         if platform_axis is not None:
             platform_axis = np.asarray(T.rotation.inv().apply(platform_axis))
         legs.append(
@@ -115,23 +93,21 @@ def describe_family(given: Family) -> Description:
             )
         )  # fmt: skip
     home = Home.of((0.0, 0.0, metres(given.height)), z_turn)
-    name = given.name or given.family.lower()
-    return Description(name, f"--family {given.family}", unit, tuple(legs), home, None)
+    name = given.name or family.lower()
+    return Description(name, f"--family {family}", unit, tuple(legs), home, None)
 
 
-def _describe_named(name: str, family: ActuatedFamily, given: Family) -> Description:
+def _describe_named(name: str, family: ActuatedFamily, given: Dimensions) -> Description:
     """Return a machine whose rods hang on motors, its dimensions by default those of its family."""
     where = f"The family {given.family} could not be built"
     known = (*family.dimensions, *OPTIONAL.get(name, ()))
     stated = {
-        key: value
-        for key in ("base_radius", "platform_radius", "height", "arm_length", "arm_radius",
-                    "rod_length", "rod_spacing", "leg_radius", "base_spread", "platform_spread",
-                    "offset", "turn")
-        if (value := getattr(given, key)) is not None
-    } | ({"tilt": given.tilt} if given.tilt else {})  # fmt: skip
+        key: float(value)
+        for key, value in given.stated().items()
+        if isinstance(value, float | int) and (value or key != "tilt")
+    }
     problems = [
-        f"{where}: found {_option(key)}, needed some of {', '.join(map(_option, known))} and "
+        f"{where}: found {flag(key)}, needed some of {', '.join(map(flag, known))} and "
         "--travel; leave it out."
         for key in stated
         if key not in known
@@ -140,7 +116,7 @@ def _describe_named(name: str, family: ActuatedFamily, given: Family) -> Descrip
     in_lengths = not family.turns and given.travel is not None
     if given.unit is None and (lengths or in_lengths):
         problems.append(
-            f"{where}: found {_option([*lengths, 'travel'][0])} and no unit of lengths, needed m "
+            f"{where}: found {flag([*lengths, 'travel'][0])} and no unit of lengths, needed m "
             "or mm; give --unit mm."
         )
     for key, value in stated.items():
@@ -148,7 +124,7 @@ def _describe_named(name: str, family: ActuatedFamily, given: Family) -> Descrip
         high = 120.0 if key.endswith("spread") else 1e9
         if not low < value < high:
             needed = "an angle between 0 and 120 deg" if high == 120.0 else "a positive length"
-            problems.append(f"{where}: found {_option(key)} {value:g}, needed {needed}; mend it.")
+            problems.append(f"{where}: found {flag(key)} {value:g}, needed {needed}; mend it.")
     if name == "delta" and stated.get("height", -1.0) >= 0.0:
         problems.append(
             f"{where}: found --height {stated['height']:g}, needed a negative one: the platform "
@@ -179,11 +155,6 @@ def _describe_named(name: str, family: ActuatedFamily, given: Family) -> Descrip
         ) from error
 
 
-def _option(dimension: str) -> str:
-    """Return the option of a dimension."""
-    return f"--{dimension.replace('_', '-')}"
-
-
 def _wrong_travel(where: str, travel: tuple[float, float]) -> str:
     """Return that the ends of a travel are in the wrong order."""
     return (
@@ -201,7 +172,7 @@ def _wrong_name(where: str, name: str) -> list[str]:
     return []
 
 
-def _wrong_dimensions(given: Family, of_legs: LegType) -> list[str]:
+def _wrong_dimensions(given: Dimensions, of_legs: LegType) -> list[str]:
     """Return what is missing or impossible among the dimensions."""
     in_plane = of_legs.is_planar
     where = f"The family {given.family} could not be built"
@@ -233,7 +204,7 @@ def _wrong_dimensions(given: Family, of_legs: LegType) -> list[str]:
                 f"{where}: found {option} {angle:g} deg, needed an angle between 0 and 120 deg; "
                 "mend it."
             )
-    if not abs(given.tilt) <= 80.0:
+    if not abs(given.tilt or 0.0) <= 80.0:
         problems.append(
             f"{where}: found --tilt {given.tilt:g} deg, needed at most 80 deg either way; mend it."
         )
@@ -250,7 +221,7 @@ def _wrong_dimensions(given: Family, of_legs: LegType) -> list[str]:
     return problems
 
 
-def _unused_dimensions(given: Family, count: int, of_legs: LegType) -> list[str]:
+def _unused_dimensions(given: Dimensions, count: int, of_legs: LegType) -> list[str]:
     """Return which given dimensions a machine of this family does not have."""
     in_plane = of_legs.is_planar
     no_axes = not (of_legs.base.has_axis or of_legs.platform.has_axis)
@@ -274,7 +245,7 @@ def _unused_dimensions(given: Family, count: int, of_legs: LegType) -> list[str]
     ]
 
 
-def _angles(count: int, given: Family) -> tuple[Array, Array]:
+def _angles(count: int, given: Dimensions) -> tuple[Array, Array]:
     """Return the angles of the joints on base and platform [rad]."""
     if count != 6:
         even = 2.0 * np.pi * np.arange(count) / count
@@ -315,18 +286,20 @@ def _default(length: float) -> float:
     return max(round(length, 4), 1e-4)
 
 
-def _lengths_of_family(family: str, given: dict[str, Any]) -> None:
-    """Replace shortest and longest length by the offset and the travel that they make."""
-    low, high = given.pop("min_length", None), given.pop("max_length", None)
+def _with_travel(given: Dimensions) -> Dimensions:
+    """Return dimensions with offset and travel in place of a shortest and a longest length."""
+    low, high = given.min_length, given.max_length
     if low is None and high is None:
-        return
-    if low is None or high is None or not low < high or {"offset", "travel"} & given.keys():
+        return given
+    stated = given.offset is not None or given.travel is not None
+    if low is None or high is None or not low < high or stated:
         raise UsageError(
-            f"The family {family} could not be built: found --min-length {low} and --max-length "
-            f"{high}, needed both, the shorter first, in place of --offset and --travel; correct "
-            "them."
+            f"The family {given.family} could not be built: found --min-length {low} and "
+            f"--max-length {high}, needed both, the shorter first, in place of --offset and "
+            "--travel; correct them."
         )
-    given |= {"offset": low, "travel": (0.0, round(high - low, 9))}
+    travel = (0.0, round(high - low, 9))
+    return replace(given, offset=low, travel=travel, min_length=None, max_length=None)
 
 
 _BESIDE = {  # entries of a table for options that may stand beside it
@@ -341,17 +314,10 @@ _BESIDE = {  # entries of a table for options that may stand beside it
 }
 
 
-def description_of(
-    table: Path | None,
-    *,
-    family: str | None,
-    unit: str | None,
-    name: str | None,
-    dimensions: Mapping[str, Any],
-) -> Description:
-    """Return the machine that a table or a family describes."""
-    given = {key: value for key, value in dimensions.items() if value is not None}
-    options = {key: given.pop(key) for key in list(given) if key in _BESIDE and table is not None}
+def description_of(table: Path | None, given: Dimensions) -> Description:
+    """Return the machine that a table, with what may stand beside it, or a family describes."""
+    family, unit = given.family, given.unit
+    stated = replace(given, family=None, unit=None, name=None).stated()
     if (table is None) == (family is None):
         found = "neither" if table is None else "both"
         raise UsageError(
@@ -363,23 +329,21 @@ def description_of(
             f"The unit could not be used: found '{unit}', needed mm or m; correct --unit."
         )
     if table is None:
-        beside = [f"--{key.replace('_', '-')}" for key in ("type", "platform_in") if key in given]
+        beside = [flag(key) for key in ("type", "platform_in") if key in stated]
         if beside:
             raise UsageError(
                 f"The family {family} could not be built: found {' and '.join(beside)}, needed it "
                 "beside a table only; leave it out."
             )
-        _lengths_of_family(str(family), given)
-        return describe_family(Family(family=str(family), unit=unit, name=name, **given))
-    if given:
-        named = ", ".join(f"--{key.replace('_', '-')}" for key in given)
+        return describe_family(_with_travel(given))
+    if of_family := [flag(key) for key in stated if key not in _BESIDE]:
         raise UsageError(
-            f"The model could not be written: found {named} beside a table, needed them with "
-            "--family only; write them in the table."
+            f"The model could not be written: found {', '.join(of_family)} beside a table, needed "
+            "them with --family only; write them in the table."
         )
-    entries: dict[str, Any] = {_BESIDE[key]: value for key, value in options.items()}
+    entries: dict[str, Any] = {_BESIDE[key]: value for key, value in stated.items()}
     if "home" in entries:
         entries["home"] = {"height": entries["home"]}
     if "travel" in entries:
         entries["travel"] = list(entries["travel"])
-    return read_description(table, unit, name, entries)
+    return read_description(table, unit, given.name, entries)

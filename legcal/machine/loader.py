@@ -70,6 +70,7 @@ from legcal.machine.solved_poses import MAX_POSE_ERROR
 from legcal.machine.spanning_tree import Source
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
 from legcal.machine.topology import (
+    Normals,
     any_joint,
     check_bodies,
     check_plane,
@@ -207,39 +208,15 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     check_bodies(block, bodies, urdf, yaml_path)
     ends = bodies.T_body_link[block.base], bodies.T_body_link[block.platform]
     normals = plane_of_motion(chains)
-    _check_count(chains, spatial=normals is None, path=yaml_path)
-    if normals is not None and any(chain.actuator is not None for chain in chains):
-        raise OutOfClass(
-            f"{yaml_path}: this mechanism is outside the method: found a planar machine whose "
-            "joints at A move on carriages or arms, needed a machine in space, or sliders along "
-            "the legs; this machine cannot be calibrated this way."
-        )
-    if block.platform_joint is not None:
-        virtual = urdf.joints[block.platform_joint]
-        turn = bodies.T_body_link[virtual.parent][:3, :3].T
-        normal = None if normals is None else turn @ normals[0]
-        check_plane(virtual, normal, yaml_path)
+    _check_legs(chains, spatial=normals is None, path=yaml_path)
+    check_plane(block, bodies, urdf, normals, yaml_path)
     in_plane = None if normals is None else normals_in_links(normals, ends)
     shown = visual_cylinders(urdf)
     if normals is not None:
         chains = at_visible_heights(chains, shown, bodies)
-    known = {joint: entry.gain for joint, entry in (block.motors or {}).items()}
-    gains = {str(c.motor): known.get(str(c.motor), 1.0) for c in chains if c.actuator is not None}
-    try:
-        chain = ClosedChain(
-            urdf.text, closures, normals_of_closures(in_plane, closures, block, urdf), gains
-        )
-    except ModelError as error:
-        raise ModelError([f"{urdf.path}: {problem}" for problem in error.problems]) from error
+    chain = _closed_chain(urdf, closures, in_plane, block, chains)
     home = None if block.home is None else block.home.motion()
-    actuators = {
-        chain.motor: actuator_of(
-            chain, ends[0], _travel(chain, urdf), urdf.joints[str(chain.motor)].child
-        )
-        for chain in reversed(chains)  # its point is where the first leg has it
-        if chain.actuator is not None
-    }
-    actuators = _as_stated(actuators, block, yaml_path)
+    actuators = _actuators(chains, block, urdf, ends[0], yaml_path)
     inside = {
         step.name: internal_joint_of(chain, ends[1], *_moved_by(step, urdf))
         for chain in reversed(chains)
@@ -283,17 +260,41 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     return machine
 
 
-def _as_stated(
-    found: Mapping[str | None, Actuator | None], block: LegcalBlock, path: Path
+def _closed_chain(
+    urdf: Urdf,
+    closures: Sequence[Closure],
+    in_plane: Normals | None,
+    block: LegcalBlock,
+    chains: Sequence[LegChain],
+) -> ClosedChain:
+    """Return the tree with its closures, and actuators with their gains."""
+    known = {joint: entry.gain for joint, entry in (block.motors or {}).items()}
+    gains = {str(c.motor): known.get(str(c.motor), 1.0) for c in chains if c.actuator is not None}
+    try:
+        normals = normals_of_closures(in_plane, closures, block, urdf)
+        return ClosedChain(urdf.text, closures, normals, gains)
+    except ModelError as error:
+        raise ModelError([f"{urdf.path}: {problem}" for problem in error.problems]) from error
+
+
+def _actuators(
+    chains: Sequence[LegChain], block: LegcalBlock, urdf: Urdf, T_body_base: Array, path: Path
 ) -> dict[str | None, Actuator | None]:
-    """Return the actuators with what the YAML says of them beside the URDF.
+    """Return the actuators by their joints, with what the YAML says of them beside the URDF.
 
     Raises
     ------
     ModelError
         With one sentence for each motor of which it says what cannot be.
     """
-    problems, stated = [], dict(found)
+    stated = {
+        chain.motor: actuator_of(
+            chain, T_body_base, _travel(chain, urdf), urdf.joints[str(chain.motor)].child
+        )
+        for chain in reversed(chains)  # its point is where the first leg has it
+        if chain.actuator is not None
+    }
+    problems = []
     for name, entry in (block.motors or {}).items():
         actuator, where = stated.get(name), f"{path}: legcal.motors.{name} could not be used"
         if actuator is None:
@@ -492,14 +493,14 @@ def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
         raise ModelError(problems)
 
 
-def _check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:
-    """Check that there are as many legs as define a frame, not far more, no fixed one in a plane.
+def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:
+    """Check how many legs there are and, in a plane, that they are of those that the class has.
 
     Raises
     ------
     OutOfClass
         If there are fewer, or more than MAX_LEGS, or a leg of a planar mechanism is fixed to
-        the platform.
+        the platform or hangs on an actuator.
     """
     n_d = n_frame_legs(spatial=spatial)
     if len(chains) < n_d:
@@ -520,6 +521,12 @@ def _check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> No
             f"{path}: the leg of joint '{any_joint(fixed[0])}' is outside the method: found it "
             "fixed to the platform of a planar mechanism, needed a revolute joint there; this "
             "machine cannot be calibrated this way."
+        )
+    if not spatial and any(chain.actuator is not None for chain in chains):
+        raise OutOfClass(
+            f"{path}: this mechanism is outside the method: found a planar machine whose "
+            "joints at A move on carriages or arms, needed a machine in space, or sliders along "
+            "the legs; this machine cannot be calibrated this way."
         )
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -104,6 +104,12 @@ class Machine:
         """The first rod on a motor, and what --length calls its ends; None without any."""
         rod = next((leg for leg in self.legs if leg.actuator is not None), None)
         return None if rod is None else (rod, f"{rod.name}.base:{rod.name}.platform")
+
+    @property
+    def length_option(self) -> str:
+        """The option of ``legcal calibrate`` that states this rod's length; bare without any."""
+        rod = self.rod_to_measure
+        return "--length" if rod is None else f"--length {rod[1]}=MEASURED±SIGMAmm"
 
     def rod_for_scale(self, *, has_length: bool) -> tuple[Leg, str] | None:
         """Return the rod to measure, None where readings or something measured carry lengths."""
@@ -237,6 +243,15 @@ class Machine:
         """The frame on the platform joint centres of the frame legs, in the platform link."""
         points = np.array([self.legs_of_frames[j].B for j in self.frame_legs])
         return frame_on_points(points, self.platform_normal)
+
+    def T_link_frame(self, link: Literal["base", "platform"]) -> RigidTransform:
+        """Return the frame on the joints of a link, R_b or R_e, in that link."""
+        return self.T_base_Rb if link == "base" else self.T_platform_Re
+
+    @property
+    def home_of_frames(self) -> RigidTransform:
+        """T_Rb_Re at home."""
+        return self.T_base_Rb.inv() * self.home * self.T_platform_Re
 
     @cached_property
     def parameters(self) -> KinematicParameters:

@@ -185,6 +185,11 @@ def n_frame_legs(*, spatial: bool) -> int:
     return 3 if spatial else 2
 
 
+def is_spatial(frame_legs: Sequence[int]) -> bool:
+    """Say whether legs whose joints define a frame are of a platform in space, not in a plane."""
+    return len(frame_legs) == n_frame_legs(spatial=True)
+
+
 def free_coordinates(n_legs: int, frame_legs: Sequence[int]) -> BoolArray:
     """Return which joint coordinates, (n_legs, 3), are not zero by the frame's definition.
 
@@ -192,7 +197,7 @@ def free_coordinates(n_legs: int, frame_legs: Sequence[int]) -> BoolArray:
     are no parameters.
     """
     free = np.ones((n_legs, 3), dtype=np.bool_)
-    free[:, 2] = len(frame_legs) == 3
+    free[:, 2] = is_spatial(frame_legs)
     for rank, leg in enumerate(frame_legs):
         free[leg, rank:] = False
     return free

@@ -61,7 +61,7 @@ def _places(joints: Sequence[Actuator | None]) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class Carried:
-    """Points that ride on joints: p(q) = middle + cos cosine(g q) + sin sine(g q) + slide q."""
+    """Many points that ride on joints, each on its path (:meth:`Actuator.path`)."""
 
     on: IntArray  # (n,) which joint carries each, of those that are counted once; -1 for none
     gain: Array  # (n,) of joints that turn
@@ -76,15 +76,9 @@ class Carried:
         middle, cos, sin, slide = points.copy(), *(np.zeros_like(points) for _ in range(3))
         gain = np.zeros(len(points))
         for j, joint in enumerate(joints):
-            if joint is None:
-                continue
-            if not joint.turns:
-                slide[j] = joint.gain * joint.axis
-                continue
-            arm, gain[j] = points[j] - joint.point, joint.gain
-            sin[j] = cross(joint.axis, arm)
-            cos[j] = cross(sin[j], joint.axis)
-            middle[j] = points[j] - cos[j]
+            if joint is not None:
+                middle[j], cos[j], sin[j], slide[j] = joint.path(points[j])
+                gain[j] = joint.gain if joint.turns else 0.0
         return cls(np.array(_places(joints), dtype=np.intp), gain, middle, cos, sin, slide)
 
     def at(self, q: Array) -> Array:

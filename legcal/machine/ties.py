@@ -39,6 +39,7 @@ from legcal.machine.parameters import (
     Parametrization,
     free_coordinates,
     geometries,
+    is_spatial,
     moved_legs,
     parametrization_of,
 )
@@ -159,7 +160,7 @@ def ties_of(
     defined = any(not legs[j].is_fixed_to_platform for j in frame_legs)
     n_zeros = len(internal_joints_of(legs))
     ties = Ties(tuple(frame_legs), tuple(fixed) if defined else (), n_zeros=n_zeros)
-    n_dependent = 0 if home is None or len(frame_legs) < 3 else _n_dependent(legs, home)
+    n_dependent = 0 if home is None or not is_spatial(frame_legs) else _n_dependent(legs, home)
     if home is None or n_dependent == 0:
         return ties
     for n in _POSES:
@@ -180,8 +181,7 @@ def machine_ties(machine: Machine) -> Ties:
 
 def _home(machine: Machine) -> Array:
     """Return the home of R_e in R_b, (3, 4)."""
-    home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
-    return np.asarray(home.as_matrix()[:3])
+    return np.asarray(machine.home_of_frames.as_matrix()[:3])
 
 
 def independent(rows: TieRows, by_unknowns: Array, n: int | None = None) -> tuple[Array, Array]:
@@ -239,7 +239,7 @@ def n_dependent_at_home(machine: Machine) -> int:
 
 def n_nearly_dependent(machine: Machine) -> int:
     """Return how many constraints of joints follow from the others but for 1 mrad."""
-    if len(machine.frame_legs) < 3:
+    if not machine.spatial:
         return 0
     return _n_dependent(geometries(machine), _home(machine), _NEARLY)
 

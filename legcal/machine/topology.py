@@ -34,7 +34,7 @@ from legcal.machine.leg import Axis, LegChain, Step
 from legcal.machine.parameters import n_frame_legs
 from legcal.machine.schema import LegcalBlock
 from legcal.machine.spanning_tree import reference_poses
-from legcal.machine.urdf import Urdf, UrdfJoint
+from legcal.machine.urdf import Urdf
 
 Normals = tuple[Array, Array]
 VIRTUAL = ("floating", "planar")
@@ -343,7 +343,9 @@ def check_bodies(block: LegcalBlock, bodies: Bodies, urdf: Urdf, path: Path) -> 
         )
 
 
-def check_plane(joint: UrdfJoint, normal: Array | None, path: Path) -> None:
+def check_plane(
+    block: LegcalBlock, bodies: Bodies, urdf: Urdf, normals: Normals | None, path: Path
+) -> None:
     """Check that a planar virtual joint lets the platform move as its legs do.
 
     Raises
@@ -351,15 +353,19 @@ def check_plane(joint: UrdfJoint, normal: Array | None, path: Path) -> None:
     OutOfClass
         If the mechanism moves in space or in another plane.
     """
+    if block.platform_joint is None:
+        return
+    joint = urdf.joints[block.platform_joint]
     if joint.type != "planar":
         return
-    if normal is None:
+    if normals is None:
         raise OutOfClass(
             f"{path}: legcal.platform_joint '{joint.name}' is not covered: found a planar joint, "
             "needed a floating one, because the axes of the legs do not let the platform move in "
             "one plane; correct its type."
         )
     z = joint.T_parent_origin.rotation.apply([0.0, 0.0, 1.0])
+    normal = bodies.T_body_link[joint.parent][:3, :3].T @ normals[0]
     if not parallel(z, normal):
         tilt = 90.0 - np.degrees(off_square(z, normal))
         raise OutOfClass(

@@ -20,6 +20,7 @@ from legcal.machine import (
     LegKind,
     Machine,
     geometries,
+    is_spatial,
     parameters_of_legs,
     point_like_legs,
 )
@@ -46,7 +47,7 @@ class NominalMachine:
     @property
     def spatial(self) -> bool:
         """Whether the platform moves in space and not in a plane."""
-        return len(self.frame_legs) == 3
+        return is_spatial(self.frame_legs)
 
     @cached_property
     def parameters(self) -> KinematicParameters:

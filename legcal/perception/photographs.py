@@ -96,7 +96,7 @@ class Photographs:
         """Which legs to use in each view, (n_views, n_legs)."""
         return np.array(
             [
-                [view.legs is None or name in view.legs for name in self.machine.leg_names]
+                [view.uses(name) for name in self.machine.leg_names]
                 for view in self.measurements.views
             ],
             dtype=np.bool_,

@@ -22,10 +22,10 @@ _WIDTH = 80  # characters of a terminal
 _MAX_ROWS = 60  # of residuals; the file has them all
 
 
-def length_option(machine: Machine, *, board: bool) -> str:
-    """Return the option with which a calibration is told its scale, "" where it needs none."""
+def scale_option(machine: Machine, *, board: bool) -> str:
+    """Return what a command to calibrate ends with to fix the scale, "" where it needs nothing."""
     found = machine.rod_for_scale(has_length=board)
-    return "" if found is None else f" --length {found[1]}=MEASURED±SIGMAmm"
+    return "" if found is None else f" {machine.length_option}"
 
 
 def inspect_table(description: dict[str, Any]) -> RenderableType:

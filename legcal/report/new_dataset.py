@@ -14,7 +14,7 @@ from legcal.errors import printable
 from legcal.files import SHOWN_IN
 from legcal.machine import Machine
 from legcal.recordings import Import
-from legcal.report.machine import length_option
+from legcal.report.machine import scale_option
 from legcal.report.render import heading, report, table
 
 _MOST = 200  # rows that are shown
@@ -75,7 +75,7 @@ def matching_table(new: NewDataset) -> RenderableType:
 def written_lines(destination: Path, written: Sequence[Path], machine: Machine) -> RenderableType:
     """Return what was written, and the command that goes on from there."""
     names = ", ".join(path.name for path in written)
-    folder, length = shlex.quote(str(destination)), length_option(machine, board=False)
+    folder, length = shlex.quote(str(destination)), scale_option(machine, board=False)
     return report(
         [
             Text(printable(f"Written to {destination}: {names}."), overflow="ignore"),

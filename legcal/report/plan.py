@@ -19,7 +19,7 @@ from legcal.geometry import Array
 from legcal.machine import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR, vectors_A_to_B
 from legcal.pages import Drawing, Items, Picture, Row, page_html
 from legcal.planning import LaidBoard, Plan, views_in_words
-from legcal.report.machine import length_option
+from legcal.report.machine import scale_option
 from legcal.report.page.text_page import text_page
 from legcal.report.render import heading, report, table
 
@@ -64,7 +64,7 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
         (name, *(f"{1e3 * x:.0f}" for x in row)) for name, row in camera_distances(plan).items()
     ]
     legs = ", ".join(names)
-    length = length_option(plan.machine, board=plan.board is not None)
+    length = scale_option(plan.machine, board=plan.board is not None)
     return report(
         heading(printable(plan.machine.name), f": {views_in_words(plan.views)}"),
         table(
@@ -188,8 +188,8 @@ with {plan.camera.width} x {plan.camera.height} px and a focal length of \
         items.insert(
             1,
             f"Measure the rod of {measured[0].name} from joint centre to joint centre: readings of "
-            "motors that turn carry no length. Calibrate with"
-            f"{length_option(plan.machine, board=False)}.",
+            "motors that turn carry no length. Calibrate with "
+            f"{plan.machine.length_option}.",
         )
     return items
 

@@ -11,6 +11,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from legcal.option_fields import option
+
 _MACHINE, _MOTION, _CAMERAS = "The true machine", "Poses and images", "Cameras"
 _NOISE, _LOOK = "Noise", "Photographs"
 
@@ -41,16 +43,11 @@ def _option(
     text: str,
     panel: str | None = None,
     *,
-    flags: tuple[str, ...] = (),  # as typer.Option takes them; by default of the field's name
-    metavar: str | None = None,
-    shown: str | None = None,  # as the default, where None stands for it
     only: Level | None = None,  # level that it has an effect on, if only on one
+    **how: Any,
 ) -> dict[str, Any]:
     """Return what the command line and :func:`requested` know of a field beside its type."""
-    how = {"flags": flags, "help": text, "rich_help_panel": panel, "metavar": metavar}
-    if shown is not None:
-        how["show_default"] = shown
-    return {"option": how, "only": only}
+    return option(text, panel, **how) | {"only": only}
 
 
 @dataclass(frozen=True, kw_only=True)

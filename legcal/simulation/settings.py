@@ -36,6 +36,7 @@ from legcal.files import (
     validate,
 )
 from legcal.machine import Leg, LegKind, Machine, kind_of_parameter, parametrization_of
+from legcal.option_fields import flags_of
 from legcal.simulation.board import KINDS as BOARD_KINDS
 from legcal.simulation.observe import TableNoise
 from legcal.simulation.rendering.appearance import Appearance, Light
@@ -582,8 +583,7 @@ def _refuse_other_levels(request: Request) -> None:
         if level in (None, request.level) or value is None:
             continue
         if not (option.name == "pixel_noise" and of_corners):
-            flags = option.metadata["option"]["flags"] or (f"--{option.name.replace('_', '-')}",)
-            given = flags[0].split("/")[1 if value is False else 0]
+            given = flags_of(option)[0].split("/")[1 if value is False else 0]
             problems.append(
                 f"{given} could not be used: found --level "
                 f"{request.level}, needed --level {level}, the only one that it has an effect on; "

@@ -52,6 +52,7 @@ from legcal.machine import (
 SIGMA_EXACT = 1e-7  # [m]: of what the mechanism itself demands
 INTRINSICS = ("fx", "fy", "cx", "cy")
 _MAX_INTRINSICS_SIGMA = 0.1  # of a focal length: what is known to no better is not determined
+_WHOLE = slice(None)  # all numbers of a variable are touched
 _BOARD = 0.5  # half the side of a board on the platform, of how far its joints are apart
 _OPEN = 0.05  # component of an open direction from which on an intrinsic is part of it
 
@@ -229,19 +230,10 @@ def problem_of(
     in each image depends on (n_images, n_bodies), and the derivatives (n_images, n_bodies, 4, d) of
     what it shows.
     """
-    n_f, n_p, n_poses = predicted.n_motions, len(predicted.unit), len(predicted.t)
-    n_images, n_bodies = images.shape[:2]
-    n, m, whole = n_images * n_bodies, len(equations.leg), slice(None)
     if predicted.arms:
         more = (*more, _lines(predicted, arms))
-    J = np.concatenate([images[..., n_f:], *(by for _, _, by in more)], axis=3).reshape(n, 4, -1)
-    ties = predicted.ties[None] / SIGMA_EXACT
-    if lengths is not None:
-        ties = np.concatenate([ties, lengths[None]], axis=1)
-    tied = Residuals.of(np.zeros(ties.shape[:2]), ties)
-    shown = Residuals.of(np.zeros((n, 4)), J, images[..., :n_f].reshape(n, 4, n_f))
     on_platform = _platform_board(predicted)
-    demanded = Residuals.of(np.zeros((n_poses, m)), equations.by_parameters, equations.by_pose)
+    n_f, n_p, n_poses = predicted.n_motions, len(predicted.unit), len(predicted.t)
     parameters = Variables(
         "parameters",
         all_free(1, n_p),
@@ -260,38 +252,50 @@ def problem_of(
         ),
         eliminated=Variables("pose", all_free(n_poses, n_f)),
         factors=(
-            Factor(
-                "images",
-                lambda _: shown,
-                (
-                    ("camera", np.repeat(predicted.frame[predicted.view], n_bodies), whole),
-                    ("parameters", np.zeros(n, dtype=np.intp), whole),
-                    *((variables.name, element.ravel(), whole) for variables, element, _ in more),
-                ),
-                n,
-                4,
-                np.repeat(predicted.pose, n_bodies),
-            ),
-            Factor(
-                "legs",
-                lambda _: demanded,
-                (("parameters", np.zeros(n_poses, dtype=np.intp), whole),),
-                n_poses,
-                m,
-                np.arange(n_poses),
-            ),
-            Factor(
-                "ties",
-                lambda _: tied,
-                (("parameters", np.zeros(1, dtype=np.intp), whole),),
-                1,
-                ties.shape[1],
-            ),
+            _images(predicted, images, more),
+            _legs(equations, n_poses),
+            _ties(predicted, lengths),
             *on_platform,
         ),
     )
     zeros = {b.name: np.zeros(b.n_unknowns) for b in problem.variables}
     return problem, _Nominal(pose=np.zeros((n_poses, n_f)), **zeros)
+
+
+def _images(
+    predicted: PredictedObservations,
+    images: Array,
+    more: Sequence[tuple[Variables, IntArray, Array]],
+) -> Factor[_Nominal]:
+    """Return the factor of what images show of bodies."""
+    n_f, (n_images, n_bodies) = predicted.n_motions, images.shape[:2]
+    n = n_images * n_bodies
+    J = np.concatenate([images[..., n_f:], *(by for _, _, by in more)], axis=3).reshape(n, 4, -1)
+    shown = Residuals.of(np.zeros((n, 4)), J, images[..., :n_f].reshape(n, 4, n_f))
+    touches = (
+        ("camera", np.repeat(predicted.frame[predicted.view], n_bodies), _WHOLE),
+        ("parameters", np.zeros(n, dtype=np.intp), _WHOLE),
+        *((variables.name, element.ravel(), _WHOLE) for variables, element, _ in more),
+    )
+    return Factor("images", lambda _: shown, touches, n, 4, np.repeat(predicted.pose, n_bodies))
+
+
+def _legs(equations: WhitenedEquations, n_poses: int) -> Factor[_Nominal]:
+    """Return the factor of what legs demand of poses, readings among it."""
+    m = len(equations.leg)
+    demanded = Residuals.of(np.zeros((n_poses, m)), equations.by_parameters, equations.by_pose)
+    touches = (("parameters", np.zeros(n_poses, dtype=np.intp), _WHOLE),)
+    return Factor("legs", lambda _: demanded, touches, n_poses, m, np.arange(n_poses))
+
+
+def _ties(predicted: PredictedObservations, lengths: Array | None) -> Factor[_Nominal]:
+    """Return the factor of what ties parameters to each other, and of measured lengths."""
+    ties = predicted.ties[None] / SIGMA_EXACT
+    if lengths is not None:
+        ties = np.concatenate([ties, lengths[None]], axis=1)
+    tied = Residuals.of(np.zeros(ties.shape[:2]), ties)
+    touches = (("parameters", np.zeros(1, dtype=np.intp), _WHOLE),)
+    return Factor("ties", lambda _: tied, touches, 1, ties.shape[1])
 
 
 def _lines(
@@ -343,8 +347,8 @@ def _platform_board(predicted: PredictedObservations) -> tuple[Factor[_Nominal],
         np.concatenate([moved(arm, by_place)[..., columns], none], axis=2),
     )
     touches = (
-        ("camera", predicted.frame[view], slice(None)),
-        ("platform_board", one, slice(None)),
+        ("camera", predicted.frame[view], _WHOLE),
+        ("platform_board", one, _WHOLE),
     )
     return (Factor("platform_board", lambda _: shown, touches, len(place), 2, pose),)
 

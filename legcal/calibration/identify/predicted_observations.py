@@ -42,6 +42,7 @@ from legcal.machine import (
     independent,
     internal_index,
     internal_joints_of,
+    is_spatial,
     joints_at,
     leg_labels,
     list_in_words,
@@ -51,7 +52,6 @@ from legcal.machine import (
     on_ties,
     parametrization_of,
     platform_joints_at,
-    random_poses_of_legs,
     random_postures_of_legs,
     ties_of,
 )
@@ -204,7 +204,7 @@ class PredictedObservations:
     @property
     def spatial(self) -> bool:
         """Whether the platform moves in space and not in a plane."""
-        return len(self.frame_legs) == 3
+        return is_spatial(self.frame_legs)
 
     @cached_property
     def views(self) -> tuple[tuple[int, ...], ...]:
@@ -471,7 +471,7 @@ def planned_observations(
     """
     n_poses = images * len(views)
     (legs, length, rng), (R, t, moving) = _random_session(machine, max(n_poses, REACHED))
-    rng, home = deepcopy(rng), _home(machine)
+    rng, home = deepcopy(rng), machine.home_of_frames
     A, B = ends_at_pose(legs, home)
     seen = np.zeros((len(views), len(legs)), dtype=np.bool_)
     for v, view in enumerate(views):
@@ -500,17 +500,12 @@ def planned_observations(
     )
 
 
-def _home(machine: Machine) -> RigidTransform:
-    """Return T_Rb_Re at home."""
-    return machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
-
-
 @lru_cache(maxsize=4)
 def _random_session(
     machine: Machine, n_poses: int
 ) -> tuple[tuple[tuple[Leg, ...], float, np.random.Generator], tuple[Array, Array, Array]]:
     """Return what :func:`machine_near` does, and random postures: one plan follows the other."""
-    home = _home(machine)
+    home = machine.home_of_frames
     legs, length, rng = machine_near(machine, home)
     travel = travel_of(machine)
     postures = random_postures_of_legs(legs, machine.frame_legs, home, travel, n_poses, rng)
@@ -531,31 +526,24 @@ def recorded_observations(
     Raises DatasetError if readings are out of reach of the model by more than its errors may be.
     """
     machine, m = dataset.machine, dataset.measurements
-    to_Rb, from_Re = machine.T_base_Rb.inv(), machine.T_platform_Re
-    home = to_Rb * machine.home * from_Re
+    to_Rb, home = machine.T_base_Rb.inv(), machine.home_of_frames
     legs, length, rng = machine_near(machine, home)
     if machine.is_determined:
         R, t = Frames.of(nominal_poses(machine, m)[0])
     else:
         travel = travel_of(machine)
-        R, t = random_poses_of_legs(legs, machine.frame_legs, home, travel, m.n_poses, rng)
+        R, t, _ = random_postures_of_legs(legs, machine.frame_legs, home, travel, m.n_poses, rng)
     parametrization = parametrization_of(machine, twists=twists)
     R_reached, t_reached = R, t
     if 3 * len(t) < len(parametrization):  # too few to tell what no pose would show
-        more = random_poses_of_legs(
+        more = random_postures_of_legs(
             legs, machine.frame_legs, home, travel_of(machine), REACHED - len(t), rng
         )
         R_reached, t_reached = np.concatenate([R, more[0]]), np.concatenate([t, more[1]])
     used = np.unique(m.view)
     views = [m.views[v] for v in used]
     seen = np.array(
-        [
-            [
-                bool(leg.cylinders) and (view.legs is None or leg.name in view.legs)
-                for leg in machine.legs
-            ]
-            for view in views
-        ]
+        [[bool(leg.cylinders) and view.uses(leg.name) for leg in machine.legs] for view in views]
     )
     if dataset.axes is not None:
         shown_legs = np.zeros((len(m.views), len(machine.leg_names)), dtype=np.bool_)

@@ -175,8 +175,7 @@ def refusal_of_scale(dataset: Dataset, analysis: Analysis) -> str:
         why, fixed = "the gains of all motors that slide are free", "fix one of these gains, or "
     if _n_open(analysis, _stated_radii(analysis)) == _n_open(analysis, 0.0):  # something is stated
         why += f", that what is stated tells the scale to no better than {100 * _VAGUE:g} %"
-    ends = "" if machine.rod_to_measure is None else f" {machine.rod_to_measure[1]}"
-    stated = f"state a measured length (--length{ends}=MEASURED±SIGMAmm)"
+    stated = f"state a measured length ({machine.length_option})"
     if dataset.axes is None:
         stated += (
             ", or radii that you know better than the model (--prior '*.radius.*=VALUE±SIGMAmm')"

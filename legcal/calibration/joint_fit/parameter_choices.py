@@ -253,7 +253,7 @@ def _no_parameters(machine: Machine) -> dict[str, str]:
                 name = f"{leg.name}.{side}.{letter}"
                 if name in known:
                     continue
-                is_zero = not free[j, axis] and (axis < 2 or len(machine.frame_legs) == 3)
+                is_zero = not free[j, axis] and (axis < 2 or machine.spatial)
                 others[name] = (
                     f"a coordinate that is zero by the definition of {frame}"
                     if is_zero

@@ -26,7 +26,10 @@ _LENGTHS = {"base", "platform", "offset", "length"}  # kinds of parameters that 
 
 
 def has_length(problem: FitProblem) -> bool:
-    """Say whether something measured is a length: a reading, a board or what was stated."""
+    """Say whether something measured is a length: a reading, a board or what was stated.
+
+    A list and no rank, as ``is_scale_open`` of identify is: it must serve where a fit failed.
+    """
     actuators = actuators_of(problem.legs.nominal)
     read = problem.observed.actuator_readings.actuator.tolist()
     stated = {kind_of_parameter(name) for name in stated_parameters(problem) if ":" not in name}

@@ -34,6 +34,7 @@ from legcal.machine import (
     freedoms,
     geometries,
     independent,
+    is_spatial,
     moved_legs,
     parametrize,
     posture_constraints,
@@ -229,7 +230,7 @@ class FittedLegs:
     @property
     def spatial(self) -> bool:
         """Whether the platform moves in space and not in a plane."""
-        return len(self.frame_legs) == 3
+        return is_spatial(self.frame_legs)
 
     @cached_property
     def sign(self) -> IntArray:
@@ -269,7 +270,7 @@ def fitted_legs(machine: Machine) -> FittedLegs:
             for i, leg in enumerate(machine.legs)
             for part, r in leg.radius_of_part.items()
         },
-        machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re,
+        machine.home_of_frames,
         machine.is_redundant,
     )
 

@@ -1,0 +1,72 @@
+"""``legcal new``: most of its options are the fields of :class:`legcal.machine.Dimensions`."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from legcal.cli.options import JsonOption, declare, declared, parameters_of, show
+from legcal.errors import UsageError
+from legcal.machine import Dimensions
+
+
+def new(
+    table: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[TABLE]", help="A YAML or CSV table of the legs.", show_default=False
+        ),
+    ] = None,
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="DIR", help="The folder of models/ and urdf/."),
+    ] = ...,  # type: ignore[assignment]
+    template: Annotated[
+        bool,
+        typer.Option(
+            "--template", help="Write a commented table to start from, as YAML and CSV in mm."
+        ),
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
+    as_json: JsonOption = False,
+    **options: Any,
+) -> None:
+    """Write a model, YAML and URDF, from a table of joints or a few dimensions."""
+    from rich.text import Text
+
+    from legcal import machine, report
+
+    given = Dimensions(**options)
+    if template:
+        if table is not None or replace(given, name=None).stated():
+            raise UsageError(
+                "The template could not be written: found other options beside --template, needed "
+                "--output and --name only; leave them out, and write your numbers in the table."
+            )
+        yaml, csv = machine.write_template(output, given.name, force=force)
+        lines = f"written: {yaml} {csv}", f"Next: legcal new {shlex.quote(str(yaml))} -o ."
+        show(
+            as_json,
+            lambda: {"paths": {"yaml": str(yaml), "csv": str(csv)}},
+            lambda: report.report([Text(line, overflow="ignore") for line in lines]),
+        )
+        return
+    model = machine.description_of(table, given)
+    created = machine.create_model(model, output, force=force)
+    description = machine.machine_document(created.machine)
+    description["diagnostics"] = [*model.notes, *description["diagnostics"]]
+    paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
+    written = f"written: {paths['yaml']} {paths['urdf']}"
+    show(
+        as_json,
+        lambda: description | {"paths": paths},
+        lambda: report.report(report.inspect_table(description), Text(written, overflow="ignore")),
+    )
+
+
+_table, _output, *_others = parameters_of(new)
+declare(new, [_table, _output, *declared(Dimensions), *_others])
