@@ -120,14 +120,14 @@ def plan(
     """Plan a session: poses and camera places that determine a machine best."""
     from legcal import planning, report
     from legcal.files import LENGTH, parse_quantity
-    from legcal.signals import held_back_signals, is_waiting
+    from legcal.signals import first_signal_waits, is_waiting
 
     def length(text: str | None, option: str) -> float | None:
         return None if text is None else parse_quantity(text, LENGTH, option)
 
     planning.check_session(output, force=force)
     error = length(model_error, "--model-error") or 0.0
-    with held_back_signals():  # Ctrl-C ends the search: the best so far is written
+    with first_signal_waits():  # Ctrl-C ends the search: the best so far is written
         found = planning.plan(
             model,
             images=images,
