@@ -42,6 +42,7 @@ from .measurements import reading_columns as reading_columns
 from .measurements import readings_in as readings_in
 from .measurements import readings_of_lengths as readings_of_lengths
 from .measurements import row_names as row_names
+from .new_dataset import DATASET_FOLDER as DATASET_FOLDER
 from .new_dataset import MIN_SIGMA as MIN_SIGMA
 from .new_dataset import NewDataset as NewDataset
 from .new_dataset import plan_new_dataset as plan_new_dataset

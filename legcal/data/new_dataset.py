@@ -50,7 +50,7 @@ from legcal.files import (
 from legcal.machine import DATASET_YAML, Leg, Machine, Pulses, load_mechanism, shipped_names
 from legcal.vision import Camera, inspect_image, read_camera
 
-KIND = OutputKind("dataset", "", "legcal_dataset")  # other files may stand beside it
+DATASET_FOLDER = OutputKind("dataset", "", "legcal_dataset")  # other files may stand beside it
 MEASUREMENTS = "measurements.csv"
 ONE_VIEW = "c1"
 MIN_SIGMA = 1e-6  # [m], of readings whose noise nobody stated
@@ -310,7 +310,7 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
     OutOfResources
         If the folder does not take it.
     """
-    check_path(new.destination, KIND)
+    check_path(new.destination, DATASET_FOLDER)
     cameras = list(dict.fromkeys(new.cameras.values()))
     names = {camera: f"camera_info{f'_{k + 1}' * bool(k)}.yaml" for k, camera in enumerate(cameras)}
     own = [DATASET_YAML, MEASUREMENTS, *names.values()]
@@ -338,7 +338,7 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
         "encoder_sigma": new.encoder_sigma,
         "views": {view: {"camera": names[camera]} for view, camera in new.cameras.items()},
     }
-    with result_folder(new.destination, KIND) as folder:
+    with result_folder(new.destination, DATASET_FOLDER) as folder:
         for name, content in contents.items():
             (folder / name).write_bytes(content)
         for name, path in linked.items():
@@ -360,7 +360,7 @@ def _link(path: Path, place: Path) -> None:
 
 def _check_place(folder: Path, destination: Path) -> None:
     """Refuse to write into the folder of the photographs."""
-    check_path(destination, KIND)
+    check_path(destination, DATASET_FOLDER)
     if destination.resolve().is_relative_to(folder.resolve()):
         raise UsageError(
             f"{destination}: the dataset could not be written: found a place in the folder of the "
