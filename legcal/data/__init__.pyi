@@ -69,6 +69,7 @@ from .photograph_notes import GOOD_QUALITY as GOOD_QUALITY
 from .photograph_notes import compressed as compressed
 from .photograph_notes import compression_note as compression_note
 from .photograph_notes import notes_on_photographs as notes_on_photographs
+from .reading_units import sigma_too_large as sigma_too_large
 from .reading_units import sigmas_of as sigmas_of
 from .reading_units import sigmas_of_legs as sigmas_of_legs
 from .reading_units import usual_sigma as usual_sigma

@@ -30,7 +30,7 @@ from legcal.data.photograph_matching import (
     match,
     with_likely_views,
 )
-from legcal.data.reading_units import are_commands, sigma_in, usual_sigma
+from legcal.data.reading_units import are_commands, sigma_in, sigma_too_large, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
 from legcal.errors import DatasetError, UsageError
 from legcal.files import (
@@ -413,8 +413,10 @@ def _sigmas(
         if isinstance(given, str):
             given = parse_quantity(given, LENGTH, "--encoder-sigma")
         if not isinstance(given, Mapping):
-            return _sigma(given, float(readings.digits.min()))
+            return _sigma(given, float(readings.digits.min()), motors)
     if isinstance(given, Mapping):
+        for leg in motors:
+            _check_sigma(given.get(str(leg.prismatic), 0.0), leg)
         return dict(given), []
     found, notes = dict[str, float](), list[str]()
     for leg, unit, digit in zip(motors, readings.units, readings.digits.tolist(), strict=True):
@@ -443,7 +445,7 @@ def _sigmas(
     return found, notes
 
 
-def _sigma(given: float | None, digit: float) -> tuple[float, list[str]]:
+def _sigma(given: float | None, digit: float, motors: Sequence[Leg]) -> tuple[float, list[str]]:
     """Return the standard deviation of a reading [m], and a note where nobody stated it."""
     if given is not None:
         least, most = ENCODER_SIGMAS
@@ -452,6 +454,8 @@ def _sigma(given: float | None, digit: float) -> tuple[float, list[str]]:
                 f"The standard deviation of a reading could not be used: found {given:g} m, needed "
                 f"{least:g} to {most:g} m; correct --encoder-sigma."
             )
+        for leg in motors:
+            _check_sigma(given, leg)
         return given, []
     sigma = max(digit, MIN_SIGMA)
     why = "the last digit of the table" if sigma > MIN_SIGMA else "that of a good encoder"
@@ -459,6 +463,15 @@ def _sigma(given: float | None, digit: float) -> tuple[float, list[str]]:
         f"encoder_sigma is {1e6 * sigma:g} um, {why}: give --encoder-sigma if "
         "readings are known better or worse."
     ]
+
+
+def _check_sigma(given: float, leg: Leg) -> None:
+    """Refuse a standard deviation [m or rad] that no encoder has."""
+    if too_large := sigma_too_large(given, leg):
+        raise UsageError(
+            f"The standard deviation of a reading could not be used: found {too_large[0]}, needed "
+            f"{too_large[1]}; correct --encoder-sigma."
+        )
 
 
 def _view(row: Row, photograph: Photograph) -> str:
