@@ -4,7 +4,8 @@ Only the command line installs handlers (:func:`stopped_by_signals`); in a progr
 legcal those of Python and of the program stay. The first signal raises KeyboardInterrupt in the
 main thread. Libraries may swallow it on its way (in imports, destructors, callbacks of solvers): it
 is raised again until it gets through, and nothing is recorded any more (:func:`raise_if_stopped`).
-The second signal ends the process, whatever it does.
+The second signal ends the process, whatever it does. In blocks whose work so far is worth its end
+(:func:`first_signal_waits`) there is one signal more.
 """
 
 import signal
@@ -26,6 +27,8 @@ class _SignalState:
     handling = False  # inside stopped_by_signals
     stopped = False  # a signal was heard
     holding = 0  # depth of held_back_signals
+    first_waits = False  # inside first_signal_waits
+    waiting = 0  # the number of the signal that was heard there
 
 
 @contextmanager
@@ -41,7 +44,10 @@ def stopped_by_signals() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in _NUMBERS}
     heard = [number for number in _NUMBERS if before[number] is not signal.SIG_IGN]
 
-    def stop(_number: int, _frame: FrameType | None) -> None:
+    def stop(found: int, _frame: FrameType | None) -> None:
+        if _SignalState.first_waits and not _SignalState.waiting:
+            _SignalState.waiting = found
+            return
         for number in heard:  # by the system, as Python may be kept from answering
             signal.signal(number, signal.SIG_DFL)
         _SignalState.stopped = True
@@ -107,7 +113,7 @@ def raise_if_stopped() -> None:
 
 @contextmanager
 def held_back_signals() -> Iterator[None]:
-    """Let signals wait for the end of a short block; a longer one looks at :func:`is_waiting`.
+    """Let signals wait for the end of a short block.
 
     Threads and processes that are started in the block hear none either: they inherit that.
     """
@@ -122,9 +128,30 @@ def held_back_signals() -> Iterator[None]:
     raise_if_stopped()  # another thread may have taken it
 
 
+@contextmanager
+def first_signal_waits() -> Iterator[None]:
+    """Let the first signal wait for the end of a long block, which looks at :func:`is_waiting`.
+
+    A second signal stops the block at once, as the first one does elsewhere, and a third ends the
+    process.
+    """
+    _SignalState.first_waits = True
+    try:
+        yield
+    finally:
+        number, _SignalState.waiting = _SignalState.waiting, 0
+        _SignalState.first_waits = False
+        if number and not _SignalState.stopped:
+            signal.raise_signal(number)
+
+
 def is_waiting() -> bool:
     """Say whether a signal waits for the end of a block."""
-    return _SignalState.stopped or (_HAS_MASK and not signal.sigpending().isdisjoint(_NUMBERS))
+    return (
+        _SignalState.stopped
+        or _SignalState.waiting != 0
+        or (_HAS_MASK and not signal.sigpending().isdisjoint(_NUMBERS))
+    )
 
 
 def leave_interrupts_to_parent() -> None:

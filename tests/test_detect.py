@@ -465,6 +465,30 @@ def test_texts_stand_inside_the_picture_and_apart() -> None:
         assert all(abs(x - p) >= 80 or abs(y - q) >= 20 for p, q in corners[:i])
 
 
+def test_texts_of_rods_in_parallel_pairs_stand_apart() -> None:
+    width, height, distance = 1600, 1200, 25.0
+    tops = np.array([700.0, 500.0]) + 20.0 * np.array(
+        [[0, 0], [1, 1], [4, 2], [5, 2], [8, 1], [9, 0]]
+    )
+    feet = np.array([[450, 900], [470, 920], [780, 800], [800, 800], [1150, 930], [1170, 910]])
+    share = np.linspace(0.0, 1.0, 40)[:, None]
+    rods = [a + share * (b - a) for a, b in zip(tops, feet, strict=True)]
+    stubs = [np.array([780.0 + x, 820.0]) + share * [20.0, 2.0] for x in (0.0, 25.0, 50.0)]
+    curves = [*rods, *stubs]
+    places = LabelPlaces(width, height, np.concatenate(curves))
+    sizes = [(420, 50), (150, 30), (420, 50), (420, 50), (150, 30), (420, 50), *3 * [(240, 50)]]
+    boxes = []
+    for curve, size in zip(curves, sizes, strict=True):
+        corner, leader = places.place(curve, size, distance)
+        boxes.append(np.array([corner, np.add(corner, size)]))
+        assert np.linalg.norm(curve - leader[0], axis=1).min() < 1e-9  # on its own rod
+        assert np.linalg.norm(np.diff(leader, axis=0)) < 250.0
+    for i, box in enumerate(boxes):
+        assert np.all(box >= 0)
+        assert np.all(box <= [width, height])
+        assert all(np.any((box[0] >= o[1]) | (box[1] <= o[0])) for o in boxes[:i])
+
+
 def test_reasons_are_counted_without_their_figures() -> None:
     assert short_reason("width inconsistent with the radius, 12 px for 14 px") == (
         "width inconsistent with the radius"

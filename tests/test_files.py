@@ -1,9 +1,11 @@
 """Folders of files appear complete or not at all; quantities carry their unit."""
 
+import errno
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import textwrap
 import time
 from collections.abc import Callable
@@ -11,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import run
 
 from legcal.errors import UsageError
 from legcal.files import (
@@ -244,15 +247,42 @@ def test_a_pipe_in_the_way_of_a_result_is_refused_and_stays(tmp_path: Path) -> N
     assert pipe.is_fifo()
 
 
-def test_folders_without_permission_and_without_a_name_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_without_a_name_is_refused() -> None:
     with pytest.raises(UsageError, match="an empty text, needed the path of a folder"):
         output_path("")
     assert output_path(".") == Path()
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    with pytest.raises(UsageError, match="needed permission"):
-        check_destination(tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "number"),
+    [(tempfile, "mkdtemp", errno.EROFS), (Path, "write_bytes", errno.ENOSPC)],
+)
+def test_places_that_take_no_files_are_refused_before_any_work(
+    module: Any,
+    name: str,
+    number: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def refused(*_found: Any, **_more: Any) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(module, name, refused)
+    out, page, film = tmp_path / "out", tmp_path / "page.html", tmp_path / "none.mp4"
+    for words in (
+        ("simulate", "3-rpr", "-o", out),
+        ("plan", "3-rpr", "-o", out),
+        ("study", "paper", "-o", out),
+        ("example", "-o", out),
+        ("identify", "3-rpr", "--page", page),
+        ("import", film, "--model", "3-rpr", "--camera", "none.yaml", "-o", out),
+    ):
+        assert run(monkeypatch, *words) == 2
+        said = capsys.readouterr().err
+        assert f"{tmp_path} takes no files ('{os.strerror(number)}'), needed" in said
+        assert said.count("\n") == 1
+        assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

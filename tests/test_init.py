@@ -317,6 +317,7 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (FLAT, {}, ("--views", "c9"), ("c9", "--views")),
     (FLAT, {}, ("--views", ".,c9"), ("found none in 'c9'", "--views")),
     (FLAT, {}, ("--encoder-sigma", "5m"), ("5 m", "--encoder-sigma")),
+    (FLAT, {}, ("--encoder-sigma", "50mm"), ("50 mm", "20% of the travel", "--encoder-sigma")),
     (FLAT, {}, ("--encoder-sigma", "0um"), ("0 m", "--encoder-sigma")),
     (("IMG_1.HEIC", "IMG_2.HEIC"), {}, (), ("2 of another format", "IMG_1.HEIC", "JPEG")),
     ((), {}, (), ("no such folder",)),

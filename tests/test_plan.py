@@ -189,6 +189,33 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     assert any("stopped" in note for note in document["notes"])
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("place", ["legcal.cli.plan._previews", "legcal.planning.session._poses"])
+def test_a_second_signal_ends_a_plan_at_once_and_leaves_no_session(
+    place: str,
+    number: signal.Signals,
+    planned: planning.Plan,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def stopped(*_found: Any, **_more: Any) -> planning.Plan:
+        signal.raise_signal(signal.SIGINT)
+        return planned
+
+    def stopped_again(*_found: Any) -> Any:
+        signal.raise_signal(number)
+        pytest.fail("the second signal was not answered")
+
+    monkeypatch.setattr(planning, "plan", stopped)
+    monkeypatch.setattr("legcal.cli.plan._previews", lambda _: {})
+    monkeypatch.setattr("legcal.report.plan_files", lambda *_: {})
+    monkeypatch.setattr(place, stopped_again)
+    assert run(monkeypatch, *WORDS, "-o", tmp_path / "session") == 130
+    assert capsys.readouterr().err == "legcal: Stopped before the end.\n"
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_stopped_search_says_that_it_missed_its_target() -> None:
     found = legcal.plan(
         "3-rpr",

@@ -1,5 +1,8 @@
 """Readings in degrees, radians and pulses of servos, stated and taken for each other."""
 
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +15,11 @@ from dataset_folder import SERVOS, dataset_of_readings
 from machines import ROOT, read_table
 from photograph_files import jpeg
 
-from legcal.data import load_dataset
-from legcal.errors import LegcalError, ModelError
+import legcal
+from legcal.data import Dataset, load_dataset, sigmas_of
+from legcal.errors import LegcalError, ModelError, UsageError
 from legcal.machine import create_model, load_mechanism, write_model
+from legcal.simulation import Distribution, Level, SimulationSettings, Spread
 
 ANGLES = 0.5 * np.sin(np.arange(24.0).reshape(4, 6))  # [rad]
 BOTH_WAYS = np.concatenate([ANGLES, -ANGLES])
@@ -108,6 +113,39 @@ def test_units_that_are_taken_for_others_are_told_before_images_are_looked_at(
         load_dataset(dataset_of_readings(tmp_path, readings, entry))
     (said, *_) = caught.value.problems
     assert all(word in said for word in named), said
+
+
+def test_sigmas_beyond_a_share_of_the_travel_or_of_a_turn_are_refused_wherever_they_are_given(
+    tmp_path: Path,
+) -> None:
+    machine, folder = load_mechanism("hexapod"), tmp_path / "dataset"
+    travel = machine.legs[0].travel[1] - machine.legs[0].travel[0]
+    shutil.copytree(ROOT / "examples/hexapod", folder)
+    entry = yaml.safe_load((folder / "dataset.yaml").read_text())
+
+    def load(stated: object) -> Dataset:
+        (folder / "dataset.yaml").write_text(yaml.safe_dump(entry | {"encoder_sigma": stated}))
+        return load_dataset(folder, check_images=False)
+
+    assert load(0.19 * travel).measurements.sigma_q == 0.19 * travel
+    sigma = 0.21 * travel
+    noisy = SimulationSettings(Level.OUTLINES, readings=Spread(sigma, Distribution.NORMAL))
+    ways: list[Callable[[], object]] = [
+        lambda: load(sigma),
+        lambda: load(dict.fromkeys(machine.motor_names, sigma)),
+        lambda: legcal.plan(machine, encoder_sigma=sigma),
+        lambda: legcal.locate(machine, "none.csv", encoder_sigma=f"{1e6 * sigma:.0f}um"),
+        lambda: legcal.simulate(machine, tmp_path / "out", noisy),
+    ]
+    for give in ways:
+        with pytest.raises(LegcalError) as refusal:
+            give()
+        assert f"{1e3 * sigma:.3g} mm, needed at most" in refusal.value.problems[0]
+        assert "20% of the travel of 'leg1_prismatic'" in refusal.value.problems[0]
+    endless = replace(load_mechanism("delta").legs[0], travel=(-np.inf, np.inf))
+    assert sigmas_of("70deg", [endless]) == {"arm1": pytest.approx(np.radians(70.0))}
+    with pytest.raises(UsageError, match="found 80 deg, needed at most 20% of a turn, 72 deg"):
+        sigmas_of("80deg", [endless])
 
 
 @pytest.mark.parametrize(

@@ -180,7 +180,7 @@ def identify(
         bool,
         typer.Option(
             "--hand-held",
-            help="Every image of a view is taken from a place of its own; with --board.",
+            help="Every image of a view is taken from a place of its own; with --board and --view.",
         ),
     ] = False,
     page: PageOption = None,

@@ -54,8 +54,8 @@ WorkersOption = Annotated[
     int | None,
     typer.Option(
         callback=_possible_number,
-        help="Number of processes; by default one for each core (for images at most "
-        f"{MAX_IMAGE_WORKERS}). Results do not depend on it.",
+        help="Number of processes; by default one for each core (for images and plans at "
+        f"most {MAX_IMAGE_WORKERS}). Results do not depend on it.",
     ),
 ]
 

@@ -32,12 +32,14 @@ def plan(
     ],
     images: Annotated[
         int | None,
-        typer.Option(help="Photographs of the whole session (in identify: per view); 45."),
+        typer.Option(help="Photographs to take in all (in identify: per view); 45."),
     ] = None,
     images_per_view: Annotated[
         int | None, typer.Option(help="Photographs of each view, in place of --images.")
     ] = None,
-    cameras: Annotated[int | None, typer.Option(help="Camera places; 3.")] = None,
+    cameras: Annotated[
+        int | None, typer.Option(help="Camera places; 3, or all of --places if these are fewer.")
+    ] = None,
     target: Annotated[
         str | None,
         typer.Option(
@@ -55,11 +57,18 @@ def plan(
         ),
     ] = "mean",
     parameter: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="A parameter to know well; repeat it.")
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="A parameter to know well, with --criterion parameters; may be repeated.",
+        ),
     ] = None,
     camera: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Camera file; 1024 x 768 px, 43 deg wide by default."),
+        typer.Option(
+            metavar="FILE",
+            help="Camera file; by default that of --given, or 1024 x 768 px, 43 deg wide.",
+        ),
     ] = None,
     noise: Annotated[
         Path | None,
@@ -106,7 +115,8 @@ def plan(
     encoder_sigma: Annotated[
         str | None,
         typer.Option(
-            help="Sigma of a reading; 2um, of motors that turn 0.1mrad, of hobby servos 0.5deg.",
+            help="Sigma of a reading; by default that of --given, or 2um, of motors that turn "
+            "0.1mrad, of hobby servos 0.5deg.",
             show_default=False,
         ),
     ] = None,
@@ -120,14 +130,14 @@ def plan(
     """Plan a session: poses and camera places that determine a machine best."""
     from legcal import planning, report
     from legcal.files import LENGTH, parse_quantity
-    from legcal.signals import held_back_signals, is_waiting
+    from legcal.signals import first_signal_waits, is_waiting
 
     def length(text: str | None, option: str) -> float | None:
         return None if text is None else parse_quantity(text, LENGTH, option)
 
     planning.check_session(output, force=force)
     error = length(model_error, "--model-error") or 0.0
-    with held_back_signals():  # Ctrl-C ends the search: the best so far is written
+    with first_signal_waits():  # Ctrl-C ends the search: the best so far is written
         found = planning.plan(
             model,
             images=images,

@@ -42,6 +42,7 @@ from .measurements import reading_columns as reading_columns
 from .measurements import readings_in as readings_in
 from .measurements import readings_of_lengths as readings_of_lengths
 from .measurements import row_names as row_names
+from .new_dataset import DATASET_FOLDER as DATASET_FOLDER
 from .new_dataset import MIN_SIGMA as MIN_SIGMA
 from .new_dataset import NewDataset as NewDataset
 from .new_dataset import plan_new_dataset as plan_new_dataset
@@ -68,6 +69,7 @@ from .photograph_notes import GOOD_QUALITY as GOOD_QUALITY
 from .photograph_notes import compressed as compressed
 from .photograph_notes import compression_note as compression_note
 from .photograph_notes import notes_on_photographs as notes_on_photographs
+from .reading_units import sigma_too_large as sigma_too_large
 from .reading_units import sigmas_of as sigmas_of
 from .reading_units import sigmas_of_legs as sigmas_of_legs
 from .reading_units import usual_sigma as usual_sigma

@@ -31,6 +31,7 @@ from legcal.data.reading_units import (
     legs_with_readings,
     reading_units,
     sigma_in,
+    sigma_too_large,
 )
 from legcal.errors import DatasetError
 from legcal.files import closest, describe, path_problem
@@ -172,6 +173,12 @@ def _encoder_sigmas(
                 f"'{turning[0]}' turns, needed one for each motor in its unit; write "
                 f"encoder_sigma: {{{every}}}, with your values."
             )
+        for leg in of_motor.values():
+            if too_large := sigma_too_large(stated, leg):
+                raise DatasetError(
+                    f"{path}: encoder_sigma could not be used: found {too_large[0]}, needed "
+                    f"{too_large[1]}; give one standard deviation of a reading in metres."
+                )
         return stated, {}
     motors = machine.motor_names
     for name in stated:

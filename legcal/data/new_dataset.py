@@ -30,7 +30,7 @@ from legcal.data.photograph_matching import (
     match,
     with_likely_views,
 )
-from legcal.data.reading_units import are_commands, sigma_in, usual_sigma
+from legcal.data.reading_units import are_commands, sigma_in, sigma_too_large, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
 from legcal.errors import DatasetError, UsageError
 from legcal.files import (
@@ -50,7 +50,7 @@ from legcal.files import (
 from legcal.machine import DATASET_YAML, Leg, Machine, Pulses, load_mechanism, shipped_names
 from legcal.vision import Camera, inspect_image, read_camera
 
-KIND = OutputKind("dataset", "", "legcal_dataset")  # other files may stand beside it
+DATASET_FOLDER = OutputKind("dataset", "", "legcal_dataset")  # other files may stand beside it
 MEASUREMENTS = "measurements.csv"
 ONE_VIEW = "c1"
 MIN_SIGMA = 1e-6  # [m], of readings whose noise nobody stated
@@ -310,7 +310,7 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
     OutOfResources
         If the folder does not take it.
     """
-    check_path(new.destination, KIND)
+    check_path(new.destination, DATASET_FOLDER)
     cameras = list(dict.fromkeys(new.cameras.values()))
     names = {camera: f"camera_info{f'_{k + 1}' * bool(k)}.yaml" for k, camera in enumerate(cameras)}
     own = [DATASET_YAML, MEASUREMENTS, *names.values()]
@@ -338,7 +338,7 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
         "encoder_sigma": new.encoder_sigma,
         "views": {view: {"camera": names[camera]} for view, camera in new.cameras.items()},
     }
-    with result_folder(new.destination, KIND) as folder:
+    with result_folder(new.destination, DATASET_FOLDER) as folder:
         for name, content in contents.items():
             (folder / name).write_bytes(content)
         for name, path in linked.items():
@@ -360,7 +360,7 @@ def _link(path: Path, place: Path) -> None:
 
 def _check_place(folder: Path, destination: Path) -> None:
     """Refuse to write into the folder of the photographs."""
-    check_path(destination, KIND)
+    check_path(destination, DATASET_FOLDER)
     if destination.resolve().is_relative_to(folder.resolve()):
         raise UsageError(
             f"{destination}: the dataset could not be written: found a place in the folder of the "
@@ -413,8 +413,10 @@ def _sigmas(
         if isinstance(given, str):
             given = parse_quantity(given, LENGTH, "--encoder-sigma")
         if not isinstance(given, Mapping):
-            return _sigma(given, float(readings.digits.min()))
+            return _sigma(given, float(readings.digits.min()), motors)
     if isinstance(given, Mapping):
+        for leg in motors:
+            _check_sigma(given.get(str(leg.prismatic), 0.0), leg)
         return dict(given), []
     found, notes = dict[str, float](), list[str]()
     for leg, unit, digit in zip(motors, readings.units, readings.digits.tolist(), strict=True):
@@ -443,7 +445,7 @@ def _sigmas(
     return found, notes
 
 
-def _sigma(given: float | None, digit: float) -> tuple[float, list[str]]:
+def _sigma(given: float | None, digit: float, motors: Sequence[Leg]) -> tuple[float, list[str]]:
     """Return the standard deviation of a reading [m], and a note where nobody stated it."""
     if given is not None:
         least, most = ENCODER_SIGMAS
@@ -452,6 +454,8 @@ def _sigma(given: float | None, digit: float) -> tuple[float, list[str]]:
                 f"The standard deviation of a reading could not be used: found {given:g} m, needed "
                 f"{least:g} to {most:g} m; correct --encoder-sigma."
             )
+        for leg in motors:
+            _check_sigma(given, leg)
         return given, []
     sigma = max(digit, MIN_SIGMA)
     why = "the last digit of the table" if sigma > MIN_SIGMA else "that of a good encoder"
@@ -459,6 +463,15 @@ def _sigma(given: float | None, digit: float) -> tuple[float, list[str]]:
         f"encoder_sigma is {1e6 * sigma:g} um, {why}: give --encoder-sigma if "
         "readings are known better or worse."
     ]
+
+
+def _check_sigma(given: float, leg: Leg) -> None:
+    """Refuse a standard deviation [m or rad] that no encoder has."""
+    if too_large := sigma_too_large(given, leg):
+        raise UsageError(
+            f"The standard deviation of a reading could not be used: found {too_large[0]}, needed "
+            f"{too_large[1]}; correct --encoder-sigma."
+        )
 
 
 def _view(row: Row, photograph: Photograph) -> str:

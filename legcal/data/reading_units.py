@@ -17,7 +17,16 @@ import numpy as np
 from pydantic import GetJsonSchemaHandler, model_validator
 
 from legcal.errors import DatasetError, UsageError
-from legcal.files import ANGLE, LENGTH, FileSchema, Number, closest, describe, split_quantity
+from legcal.files import (
+    ANGLE,
+    LENGTH,
+    SHOWN_IN,
+    FileSchema,
+    Number,
+    closest,
+    describe,
+    split_quantity,
+)
 from legcal.geometry import Array
 from legcal.machine import Leg, Pulses
 
@@ -213,6 +222,21 @@ def sigmas_of(stated: float | str, legs: Sequence[Leg]) -> dict[str, float]:
         raise UsageError(f"The encoder sigma could not be used: {error}") from error
 
 
+def sigma_too_large(sigma: float, leg: Leg) -> tuple[str, str] | None:
+    """Return a standard deviation [m or rad] of a motor's readings and what is needed, in words.
+
+    None if no encoder would have to be worse than any is.
+    """
+    width, what = leg.travel[1] - leg.travel[0], f"the travel of '{leg.prismatic}'"
+    if not 0.0 < width < math.inf:
+        width, what = (math.tau, "a turn") if leg.reads_angle else (math.inf, what)
+    if sigma <= MOST_SIGMA * width:
+        return None
+    size, unit = SHOWN_IN[leg.reading_unit]
+    needed = f"at most {MOST_SIGMA:.0%} of {what}, {MOST_SIGMA * size * width:.4g} {unit}"
+    return f"{float(f'{size * sigma:.3g}'):g} {unit}", needed
+
+
 def sigma_in(stated: float | str, unit: ReadingUnit, leg: Leg) -> float:
     """Return a standard deviation of readings [m or rad]: a number in their unit, or with its own.
 
@@ -232,11 +256,13 @@ def sigma_in(stated: float | str, unit: ReadingUnit, leg: Leg) -> float:
             f"({', '.join(sizes)}), or one in the unit of the readings ({unit.name}); correct it."
         )
     sigma = number * abs(sizes[name])
-    width = leg.travel[1] - leg.travel[0]
-    if leg.reads_angle and 0.0 < width < math.inf and sigma > MOST_SIGMA * width:
+    if too_large := sigma_too_large(sigma, leg):
+        found, (shown, needed) = f"{number:g} {name}", too_large
+        remedy = "correct it"
+        if stated == number:
+            other, words = ("deg", "degrees") if leg.reads_angle else ("um", "micrometres")
+            remedy = f"write its unit behind it ('{number:g}{other}' if it is in {words})"
         raise ValueError(
-            f"found {number:g} {name}, which is {math.degrees(sigma):.3g} deg, needed at most "
-            f"{MOST_SIGMA:.0%} of the travel of {math.degrees(width):.4g} deg; write its unit "
-            f"behind it ('{number:g}deg' if it is in degrees)."
+            f"found {found}{f', which is {shown}' * (found != shown)}, needed {needed}; {remedy}."
         )
     return sigma

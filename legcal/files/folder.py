@@ -85,11 +85,9 @@ class OutputFile:
                 f"{start} no folder {path.parent}, needed one that exists; create it or give "
                 "another file."
             )
-        if not os.access(path.parent, os.W_OK | os.X_OK):
-            raise UsageError(
-                f"{start} that {path.parent} cannot be written to, needed permission to create "
-                "files in it; give another file."
-            )
+        said = _takes_no_files(path.parent)
+        if said:
+            raise UsageError(f"{start} {said}; give another file.")
         may_go = os.path.isfile(path) if force else self.is_at(path)
         if os.path.lexists(path) and not may_go:
             raise UsageError(
@@ -163,16 +161,10 @@ def check_destination(destination: Path, kind: OutputKind = RESULT) -> None:
             f"{start} a folder with other files and {marker}, needed a new or empty folder or that "
             f"of an earlier {kind.noun}; {remedy}give another output folder."
         )
-    target = destination if destination.is_dir() else existing_parent(destination)
-    if not is_writable(target):
-        raise UsageError(
-            f"{start} that {target} cannot be written to, needed permission to create files "
-            "in it; give another output folder."
-        )
 
 
 def check_path(destination: Path, kind: OutputKind = RESULT) -> None:
-    """Refuse a path at which no folder is and none can be made."""
+    """Refuse a path at which no folder is and none can be made, or that takes no files."""
     start = f"{destination}: the {kind.noun} could not be written: found"
     remedy = "needed a path that can be created; give another output folder."
     try:
@@ -192,6 +184,9 @@ def check_path(destination: Path, kind: OutputKind = RESULT) -> None:
         raise UsageError(
             f"{start} a file of that name, needed a folder; give another output folder."
         )
+    said = _takes_no_files(destination if destination.is_dir() else existing_parent(destination))
+    if said:
+        raise UsageError(f"{start} {said}; give another output folder.")
 
 
 def in_the_way(destination: Path, kind: OutputKind, found: str) -> str:
@@ -202,9 +197,20 @@ def in_the_way(destination: Path, kind: OutputKind, found: str) -> str:
     )
 
 
-def is_writable(folder: Path) -> bool:
-    """Say whether files can be created in a folder."""
-    return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
+def _takes_no_files(folder: Path) -> str:
+    """Return what keeps files from being created in a folder and what is needed, or "".
+
+    One is created: permissions say nothing of disks that are full or read-only, or of ``/proc``.
+    """
+    try:
+        with temporary_folder(folder, "try") as own:
+            (own / "file").write_bytes(b"legcal")
+    except OSError as error:
+        return (
+            f"that {folder} takes no files ('{error.strerror or error}'), needed permission and "
+            "room to create some"
+        )
+    return ""
 
 
 def holds_files(folder: Path) -> bool:
@@ -304,7 +310,7 @@ def _workshop(destination: Path) -> Path:
     if not destination.is_dir():
         return parent
     is_near = parent.stat().st_dev == destination.stat().st_dev
-    return parent if is_near and is_writable(parent) else destination
+    return parent if is_near and not _takes_no_files(parent) else destination
 
 
 def _replace_files(new: Path, destination: Path, old: Path, stale: Iterable[Path]) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Literal, NamedTuple
 
 import cv2
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legcal.data import Corners, Outlines
-from legcal.geometry import Array, Image
+from legcal.geometry import Array, BoolArray, Image
 from legcal.perception.candidate_pairs import find_candidate_pairs, find_segments
 from legcal.perception.outline import OUTSIDE
 from legcal.vision import Camera, Grey, PredictedLeg
@@ -57,9 +58,12 @@ _DASH, _GAP = 9.0, 7.0  # in widths of a line
 _CROSS = 5.0  # arms of a corner, in widths of a line
 
 _PLACES = (0.5, 0.3, 0.7, 0.15, 0.85)  # along a curve
+_FARTHER = (0.0, 1.0, 2.5, 5.0)  # from the curve, in the least distance of a text
+_APART = 0.25  # of that distance between two texts
 _ORDER = 0.02  # of the area of a text, by which an earlier place is preferred
 _ON_LINE = 0.1  # of the area of a text, that each point of a line under it costs
-_ON_TEXT, _OUTSIDE = 4.0, 10.0  # times the area on other texts, and outside the picture
+_ON_TEXT = 4.0  # times the areas of a text and of what it hides of another
+_LEADER_POINTS = 8
 
 
 class Mark(NamedTuple):
@@ -338,36 +342,54 @@ class LabelPlaces:
     ) -> tuple[tuple[int, int], Array]:
         """Return the left top corner of a text (width, height) [px] beside a curve (n, 2).
 
-        It keeps its place, at least a distance from the curve [px]; and a leader (2, 2) to it.
+        It keeps its place, at least a distance from the curve [px] where the picture has room; and
+        a leader (2, 2) to it.
         """
         extent = np.array(size, dtype=np.float64)
+        limit = np.floor(np.maximum([self.width, self.height] - extent, 0.0))
         candidates = []
-        for place in _PLACES:
+        for farther, place in product(_FARTHER, _PLACES):
             i = min(int(place * len(curve)), len(curve) - 2)
             along = curve[i + 1] - curve[i]
             normal = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9)
-            reach = distance + 0.5 * float(np.abs(normal) @ extent)
-            for side in (reach, -reach, reach + distance, -reach - distance):
-                candidates.append((curve[i], curve[i] + side * normal - 0.5 * extent))
+            reach = (1.0 + farther) * distance + 0.5 * float(np.abs(normal) @ extent)
+            # A text above or below its curve may begin or end there, one at its side stand askew.
+            shift = 0.5 * extent * (np.abs(normal) < np.abs(normal).max())
+            for side, shifted in product((reach, -reach), (0.0, 1.0, -1.0)):
+                middle = curve[i] + side * normal + shifted * shift
+                corner = np.clip(np.rint(middle - 0.5 * extent), 0.0, limit)
+                candidates.append((curve[i], corner))
         costs = [
-            self._cost(corner, extent) + _ORDER * k * extent.prod()
-            for k, (_, corner) in enumerate(candidates)
+            self._cost(corner, extent, _leader(anchor, corner, extent)) + _ORDER * k * extent.prod()
+            for k, (anchor, corner) in enumerate(candidates)
         ]
-        anchor, best = candidates[int(np.argmin(costs))]
-        limit = np.maximum([self.width, self.height] - extent, 0.0)
-        corner = np.clip(np.rint(best), 0.0, np.floor(limit))
-        self.boxes.append(np.concatenate([corner, corner + extent]))
-        leader = np.array([anchor, np.clip(anchor, corner, corner + extent)])
-        return (int(corner[0]), int(corner[1])), leader
+        anchor, corner = candidates[int(np.argmin(costs))]
+        leader = _leader(anchor, corner, extent)
+        self.lines = np.concatenate([self.lines, leader])
+        gap = _APART * distance
+        self.boxes.append(np.concatenate([corner - gap, corner + extent + gap]))
+        return (int(corner[0]), int(corner[1])), leader[[0, -1]]
 
-    def _cost(self, corner: Array, extent: Array) -> float:
+    def _cost(self, corner: Array, extent: Array, leader: Array) -> float:
         """Return the cost of a place, as an area [px^2]."""
-        area = float(extent.prod())
+        area, cost = float(extent.prod()), 0.0
         low, high = corner, corner + extent
-        inside = np.minimum(high, [self.width, self.height]) - np.maximum(low, 0.0)
-        cost = _OUTSIDE * (area - float(np.maximum(inside, 0.0).prod()))
+        crossed = int(np.count_nonzero(_is_in(self.lines, low, high)))
         for box in self.boxes:
             overlap = np.minimum(high, box[2:]) - np.maximum(low, box[:2])
-            cost += _ON_TEXT * float(np.maximum(overlap, 0.0).prod())
-        under = np.all((self.lines > low) & (self.lines < high), axis=1)
-        return cost + _ON_LINE * area * float(np.count_nonzero(under))
+            if np.all(overlap > 0.0):
+                cost += _ON_TEXT * (area + float(overlap.prod()))
+            crossed += int(np.count_nonzero(_is_in(leader, box[:2], box[2:])))
+        return cost + _ON_LINE * area * crossed
+
+
+def _leader(anchor: Array, corner: Array, extent: Array) -> Array:
+    """Return the points (n, 2) of the line from a curve to a text."""
+    share = np.linspace(0.0, 1.0, _LEADER_POINTS)[:, None]
+    return anchor + share * (np.clip(anchor, corner, corner + extent) - anchor)
+
+
+def _is_in(points: Array, low: Array, high: Array) -> BoolArray:
+    """Say which points (n, 2) are in a box."""
+    inside: BoolArray = np.all((points > low) & (points < high), axis=1)
+    return inside

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from legcal.data import (
+    DATASET_FOLDER,
     MIN_SIGMA,
     few,
     plan_new_dataset,
@@ -225,6 +226,7 @@ def plan_import(
     """
     machine = load_mechanism(model).require_rigid_platform()
     destination = Path(destination)
+    check_path(destination, DATASET_FOLDER)
     recordings = [open_recording(Path(path), machine, image_topic, joint_topic) for path in sources]
     if (image_topic or joint_topic) and not any(isinstance(one, Bag) for one in recordings):
         raise UsageError(
@@ -409,7 +411,7 @@ def import_recordings(
     UsageError
         If files are in the way and *force* is not given.
     """
-    check_path(found.destination)
+    check_path(found.destination, DATASET_FOLDER)
     motors = [found.machine.legs[j] for j in found.machine.motors]
     joints = [f"{leg.prismatic} [{leg.reading_unit}]" for leg in motors]
     try:

@@ -17,6 +17,7 @@ from legcal.data import (
     CORNERS_NAME,
     OBSERVATIONS_NAME,
     Measurements,
+    sigma_too_large,
     write_axis_table,
     write_corners,
     write_observations,
@@ -225,16 +226,12 @@ def _write_photographs(
 
 
 def _check_readings(nominal: Machine, settings: SimulationSettings) -> None:
-    """Refuse errors of readings that are larger than what is read."""
+    """Refuse errors of readings that no dataset may state."""
     for leg in (nominal.legs[j] for j in nominal.motors):
-        size, travel = settings.reading_errors(leg).size, float(np.ptp(leg.travel))
-        if size > travel:
-            found, most = (x if leg.reading_unit == "m" else np.degrees(x) for x in (size, travel))
-            unit = "m" if leg.reading_unit == "m" else "deg"
+        if too_large := sigma_too_large(settings.reading_errors(leg).sigma, leg):
             raise UsageError(
-                f"The readings could not be simulated: found errors of {found:g} {unit}, needed at "
-                f"most the travel of motor '{leg.motor_label}', {most:g} {unit}; give them with "
-                "the unit that is meant."
+                "The readings could not be simulated: found a standard deviation of "
+                f"{too_large[0]}, needed {too_large[1]}; give errors with the unit that is meant."
             )
 
 

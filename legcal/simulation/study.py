@@ -22,7 +22,7 @@ import numpy as np
 
 from legcal.brief import brief
 from legcal.errors import DidNotConverge, LegcalError, OutOfResources, UsageError
-from legcal.files import TEMPORARY_SUFFIX, OutputKind, SparseDocument, result_folder
+from legcal.files import TEMPORARY_SUFFIX, OutputKind, SparseDocument, check_path, result_folder
 from legcal.processors import processors
 from legcal.progress import Progress, shown_progress
 from legcal.simulation.checkpoint import (
@@ -266,6 +266,7 @@ def _folder(output: Path | None) -> Iterator[Path]:
             yield Path(folder)
         return
     try:
+        check_path(output, _STUDY)
         _check_folder(output)
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -277,20 +278,16 @@ def _folder(output: Path | None) -> Iterator[Path]:
 
 
 def _check_folder(output: Path) -> None:
-    """Refuse a path that holds something else than a study."""
-    start = f"{output}: the study could not be written: found"
-    if output.exists() and not output.is_dir():
-        raise UsageError(
-            f"{start} a file of that name, needed a folder; give another output folder."
-        )
+    """Refuse a folder that holds something else than a study."""
     checkpoint = output / CHECKPOINT_NAME
     if not output.is_dir() or is_begun(checkpoint):
         return
     others = [path for path in output.iterdir() if not path.name.endswith(TEMPORARY_SUFFIX)]
     if any(path != checkpoint or path.is_dir() for path in others):
         raise UsageError(
-            f"{start} a folder with other files and no {CHECKPOINT_NAME} of a study, needed a new "
-            "or empty folder or that of the same study; give another output folder."
+            f"{output}: the study could not be written: found a folder with other files and no "
+            f"{CHECKPOINT_NAME} of a study, needed a new or empty folder or that of the same "
+            "study; give another output folder."
         )
 
 
