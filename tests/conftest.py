@@ -49,39 +49,43 @@ def _temporary_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Non
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _commands_and_shipped_models_are_read_once() -> Iterator[None]:
-    """Read the signatures of commands, and each shipped model or copy of one, once a process."""
+def _commands_and_models_are_read_once() -> Iterator[None]:
+    """Read the signatures of commands, and each model or copy of one, once a process."""
     read, load = read_source, loader._load
-    shipped = {path.read_bytes(): path for path in find_model("hexapod").parent.glob("*.yaml")}
-    sources: dict[Path, Source] = {}
-    machines: dict[tuple[Path, str, str], Machine] = {}
+    sources: dict[bytes, Source] = {}
+    machines: dict[tuple[str, ...], Machine] = {}
 
-    def original_of(model: str | Path) -> Source | None:
-        """Return the shipped model that a file is a copy of, if it is, its URDF beside it."""
-        path = Path(model)
-        if path.suffix != ".yaml" or not path.is_file() or path.read_bytes() not in shipped:
+    def as_read_before(path: Path, content: bytes) -> Source | None:
+        """Return the source of a file of this content if the URDF beside it is the same too."""
+        source = sources.get(content)
+        if source is None:
             return None
-        original = shipped[path.read_bytes()]
-        if original not in sources:
-            sources[original] = read(original)
-        source = sources[original]
-        urdf = path.parent / os.path.relpath(source.urdf.path, original.parent)
+        urdf = path.parent / os.path.relpath(source.urdf.path, source.path.parent)
         if not urdf.is_file() or urdf.read_bytes() != source.urdf.content:
             return None
         return replace(source, path=path, urdf=replace(source.urdf, path=urdf))
 
     def read_once(model: str | Path) -> Source:
-        return original_of(find_model(model)) or read(model)
+        path = find_model(model)
+        if path.suffix != ".yaml" or not path.is_file():
+            return read(model)
+        content = path.read_bytes()
+        source = as_read_before(path, content)
+        if source is None:
+            source = read(model)
+            if source.file.legcal is not None and source.file.legcal.urdf is not None:
+                sources[content] = source
+        return source
 
     def load_once(source: Source) -> Machine:
-        original = original_of(source.path)
-        if original is None or original.urdf.path != source.urdf.path:
+        if source.words or source.notes or source.poses is not None:
             return load(source)
-        key = (shipped[source.path.read_bytes()], source.file.model_dump_json(), source.urdf.text)
+        key = (source.path.name, source.urdf.path.name, repr(source.file), source.urdf.text)
         if key not in machines:
-            machines[key] = load(replace(sources[key[0]], file=source.file))
+            machines[key] = load(source)
         found = machines[key]
-        return replace(found, yaml_path=source.path, urdf_path=source.urdf.path, urdf=source.urdf)
+        urdf = replace(found.urdf, path=source.urdf.path)
+        return replace(found, yaml_path=source.path, urdf_path=urdf.path, urdf=urdf)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(typer.main, "get_command", cache(typer.main.get_command))

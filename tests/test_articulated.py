@@ -139,9 +139,9 @@ class Written:
     def image_at(self, q: Array) -> Array:
         """Return an image's unknowns at readings, followed from home."""
         image, free = np.zeros(self.n_image), np.r_[:6, 10 : self.n_image]
-        for part in np.linspace(0.0, 1.0, 6)[1:]:
+        for part, n_steps in ((1.0 / 3.0, 2), (2.0 / 3.0, 2), (1.0, 5)):
             image[6:10] = part * q
-            for _ in range(5):
+            for _ in range(n_steps):
                 slopes = self.slopes(self.closure, image, "image")[:, free]
                 missed = self.closure(self.at(image))[0]
                 image[free] -= np.linalg.lstsq(slopes, missed, rcond=1e-7)[0]

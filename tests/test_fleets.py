@@ -154,6 +154,6 @@ def test_a_terminal_shows_every_failure_whole(
     for place in places:
         place.mkdir(parents=True)
     monkeypatch.setenv("COLUMNS", "50")
-    run_command(monkeypatch, "calibrate", *places, "-o", tmp_path / "out")
+    run_command(monkeypatch, "calibrate", *places, "-o", tmp_path / "out", "--workers", "1")
     told = " ".join(capsys.readouterr().out.split())
     assert told.count("a table of readings (legcal init).") == len(places)

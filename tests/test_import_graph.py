@@ -3,6 +3,7 @@
 import ast
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -54,8 +55,14 @@ def _modules() -> dict[str, Path]:
 @cache
 def _statements(module: str) -> list[ast.Import | ast.ImportFrom]:
     """Return what a module says to import, wherever it says so."""
-    nodes = ast.walk(ast.parse(_modules()[module].read_text()))
-    return [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
+    found, waiting = [], [ast.parse(_modules()[module].read_text())]  # no expression imports
+    while waiting:
+        node: Any = waiting.pop()
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            found.append(node)
+        for block in ("body", "handlers", "orelse", "finalbody", "cases"):
+            waiting += getattr(node, block, [])
+    return found
 
 
 @cache

@@ -82,10 +82,16 @@ def test_figures_show_every_view_and_every_parameter(example_run: Run) -> None:
     assert labels == [row.name for row in estimated]
 
 
-def test_a_fit_without_outlines_has_no_residuals_to_draw(tmp_path: Path) -> None:
+def test_progress_can_be_switched_on_and_a_fit_without_outlines_has_no_residuals_to_draw(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     simulated(tmp_path / "set", "3-rpr", level=Level.AXES, views=3, poses=6)
+    legcal.calibrate(tmp_path / "set", progress=True)
+    assert "Joint fit: 1/1" in capsys.readouterr().err
+    calibration = legcal.calibrate(tmp_path / "set", progress=False)
+    assert capsys.readouterr().err == ""
     with pytest.raises(UsageError, match="found a fit without outlines"):
-        legcal.calibrate(tmp_path / "set").plot_residuals()
+        calibration.plot_residuals()
 
 
 def test_arrays_of_a_machine_go_into_scipy_and_pinocchio() -> None:
@@ -97,13 +103,6 @@ def test_arrays_of_a_machine_go_into_scipy_and_pinocchio() -> None:
     changed = machine.A_base
     changed[:] = 0.0  # a copy: the machine stays as it is
     assert np.abs(machine.A_base).max() > 0.1
-
-
-def test_progress_can_be_switched_on(example_run: Run, capsys: pytest.CaptureFixture[str]) -> None:
-    legcal.calibrate(example_run.folder, progress=True)
-    assert "Joint fit: 1/1" in capsys.readouterr().err
-    legcal.calibrate(example_run.folder, progress=False)
-    assert capsys.readouterr().err == ""
 
 
 def test_a_machine_is_drawn_with_numbered_joints_and_hostile_names(tmp_path: Path) -> None:

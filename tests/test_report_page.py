@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -271,6 +272,7 @@ def test_calibrate_writes_the_report_unless_it_should_not(
     assert not (out / "report.html").exists()
 
 
+@pytest.mark.usefixtures("page")  # of an earlier result: it goes
 @pytest.mark.parametrize(
     ("error", "said"),
     [
@@ -289,9 +291,9 @@ def test_a_page_that_fails_loses_nothing_else(
     def fails(*_: Any) -> None:
         raise error
 
-    out, words = tmp_path / "out", ("calibrate", example_run.folder, "-o", tmp_path / "out")
-    write_result(example_run.calibration, out)
-    legcal.write_report(example_run.calibration, out)  # of an earlier result: it goes
+    out = Path(shutil.copytree(example_run.output, tmp_path / "out"))
+    assert (out / "report.html").exists()
+    words = ("calibrate", example_run.folder, "-o", out)
     monkeypatch.setattr("legcal.calibration.calibrate", _writing(example_run.calibration))
     monkeypatch.setattr("legcal.report.page.calibration_page.verdict_of", fails)
     assert run(monkeypatch, *words, "--json") == 0
@@ -377,19 +379,20 @@ def test_overlays_that_cannot_be_drawn_are_left_out_and_told(
         legcal.calibrate(moved, output=tmp_path / "out", overlays=True)
 
 
+@pytest.mark.usefixtures("page")  # which writes the report of the result
 def test_pages_of_earlier_results_go_and_files_of_others_stay(
     example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    calibration, page = example_run.calibration, tmp_path / "report.html"
-    write_result(calibration, tmp_path)
-    legcal.write_report(calibration, tmp_path)
-    write_result(calibration, tmp_path)  # which that page does not describe
+    out = Path(shutil.copytree(example_run.output, tmp_path / "out"))
+    calibration, page = example_run.calibration, out / "report.html"
+    assert page.exists()
+    write_result(calibration, out)  # which that page does not describe
     assert not page.exists()
     page.write_text("mine")
-    write_result(calibration, tmp_path)
+    write_result(calibration, out)
     assert page.read_text() == "mine"
     monkeypatch.setattr("legcal.calibration.calibrate", lambda *_, **__: pytest.fail("too late"))
-    assert run(monkeypatch, "calibrate", example_run.folder, "-o", tmp_path) == 2
+    assert run(monkeypatch, "calibrate", example_run.folder, "-o", out) == 2
 
 
 def test_other_commands_write_what_they_print_as_a_page(
@@ -419,7 +422,7 @@ def test_other_commands_write_what_they_print_as_a_page(
 def test_a_check_writes_a_page_and_never_over_that_of_a_result(
     example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = spoiled(tmp_path / "few", 2).write()  # photographs, at half their size
+    few = spoiled(tmp_path / "few", 1).write()  # photographs, at half their size
     words = ("calibrate", few, "--check", example_run.output, "-o")
     before = (example_run.output / "report.html").read_bytes()
     assert run(monkeypatch, *words, example_run.output) == 2

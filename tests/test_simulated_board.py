@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from boards import CHARUCO
+from simulated import small_camera
 
 from legcal.data import load_dataset
 from legcal.errors import DatasetError, NotVisible
@@ -96,7 +97,8 @@ def test_every_hand_held_image_has_its_own_place_and_the_board_gives_it(held: Pa
 
 
 def test_photographs_show_the_board_where_it_is(tmp_path: Path) -> None:
-    settings = SimulationSettings(poses=1, views=1, board="aprilgrid", seed=3)
+    camera = small_camera(tmp_path, 640, 480)
+    settings = SimulationSettings(poses=1, views=1, board="aprilgrid", seed=3, camera=camera)
     simulate(machine(), tmp_path / "seen", settings)
     dataset = load_dataset(tmp_path / "seen")
     assert dataset.corners is None
