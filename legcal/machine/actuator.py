@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -117,9 +118,14 @@ class Line:
     point: Array  # (3,) any point of it [m]
     axis: Array  # (3,) unit
 
+    @cached_property
+    def across(self) -> Array:
+        """Two directions across its axis (2, 3), by which it turns and moves."""
+        return normal_basis(self.axis)
+
     def moved(self, step: Array) -> Line:
         """Return the line after a step (4,): turns of its axis, and displacements across it."""
-        point = self.point + step[2:] @ normal_basis(self.axis)
+        point = self.point + step[2:] @ self.across
         return Line(point, turned_axis(self.axis, step[:2]))
 
     def in_frame(self, T_to_from: Array) -> Line:
@@ -133,14 +139,14 @@ class Line:
         from that point.
         """
         crossing = self._crossing(nominal)[0] - nominal.point
-        place = normal_basis(nominal.axis) @ crossing
+        place = nominal.across @ crossing
         return np.array([*axis_angles(self.axis, nominal.axis), *place])
 
     def numbers_slope(self, nominal: Line) -> Array:
         """Return the derivative (4, 4) of :meth:`numbers` by a step of :meth:`moved`."""
-        slope, basis, w0 = np.zeros((4, 4)), normal_basis(self.axis), nominal.axis
+        slope, basis, w0 = np.zeros((4, 4)), self.across, nominal.axis
         _, s, along = self._crossing(nominal)
-        onto = normal_basis(w0) @ (np.eye(3) - np.outer(self.axis, w0) / along)
+        onto = nominal.across @ (np.eye(3) - np.outer(self.axis, w0) / along)
         slope[:2, :2] = axis_angles_slope(self.axis, w0)
         slope[2:, :2] = s * onto @ cross(basis, self.axis).T
         slope[2:, 2:] = onto @ basis.T
@@ -155,7 +161,7 @@ class Line:
     @staticmethod
     def with_numbers(nominal: Line, numbers: Array) -> Line:
         """Return the line that has these four numbers; the inverse of :meth:`numbers`."""
-        point = nominal.point + numbers[2:] @ normal_basis(nominal.axis)
+        point = nominal.point + numbers[2:] @ nominal.across
         return Line(point, turned_axis(nominal.axis, numbers[:2]))
 
 
@@ -177,7 +183,7 @@ class Arm:
 
     def ends_slope(self) -> Array:
         """Return the derivatives of both ends (2, 3, 4) by a step of :meth:`Line.moved`."""
-        basis = normal_basis(self.line.axis)
+        basis = self.line.across
         half = np.array([-0.5, 0.5])[:, None, None] * self.length
         turned = half * cross(basis, self.line.axis).T
         return np.concatenate([turned, np.broadcast_to(basis.T, turned.shape)], axis=2)
@@ -200,7 +206,7 @@ class Actuator:
     # the guide of an I4 does not: it moves together with motors
     follows: bool = True
 
-    @property
+    @cached_property
     def line(self) -> Line:
         """The axis of a revolute."""
         return Line(self.point, self.axis)
@@ -261,7 +267,7 @@ class Actuator:
     def motion(self, A: Array, q: Array) -> JointMotion:
         """Return the same with its derivatives."""
         q = np.asarray(q, dtype=np.float64)
-        k, basis = len(q), normal_basis(self.axis)
+        k, basis = len(q), self.line.across
         if not self.turns:
             across = cross(basis, self.axis)  # (2, 3)
             return JointMotion(

@@ -222,7 +222,9 @@ def _is_written_down(machine: Machine) -> bool:
     has_stand_ins = isinstance(stand_ins, yaml.SequenceNode) and bool(stand_ins.value)
     if not isinstance(_entry(document, "legcal"), yaml.MappingNode) or has_stand_ins:
         return False
-    named = {tuple(pair) for pair in yaml.safe_load(content)["closed_loop"]}
+    loops = _entry(document, "closed_loop")
+    pairs = loops.value if isinstance(loops, yaml.SequenceNode) else []
+    named = {tuple(frame.value for frame in pair.value) for pair in pairs}
     return named == {(c.frame_1, c.frame_2) for c in machine.chain.closures}
 
 

@@ -334,7 +334,7 @@ def _options() -> Iterable[Refusal]:
         ("pixel-size", "--level outlines --pixel-noise 1e308px", ("1e+308", "100 px")),
         ("encoder-negative", "--encoder-noise -2um", ("--encoder-noise", "-2")),
         ("encoder-kind", "--encoder-noise 2um:gauss", ("--encoder-noise", "'gauss'")),
-        ("encoder-size", "--encoder-noise 1m", ("0.148 m",)),
+        ("encoder-size", "--encoder-noise 1m", ("29.6 mm",)),
         ("error-negative", "--error joints=-2mm", ("--error", "joints", "-2")),
         ("error-unit", "--error joints=0.1deg", ("joints", "mm", "um")),
         ("error-angle", "--error axes=2mm", ("axes", "deg")),
