@@ -30,7 +30,7 @@ def n_seen(machine: Machine) -> int:
     Every number of every leg is moved, twists apart, which count as known; in a plane those in it.
     """
     legs, home = geometries(machine), platform_in_base(machine, machine.home)
-    rng, n = np.random.default_rng(1), 14
+    rng, n = np.random.default_rng(1), 6
     shape = n, len(legs)
     q = np.full(shape, np.nan)
     lengths = np.linalg.norm([home.apply(leg.B) - leg.A for leg in legs], axis=1)

@@ -89,8 +89,11 @@ def test_the_first_signal_interrupts_and_the_second_ends_the_process(name: str) 
     raise_if_stopped()
 
 
-def test_an_interrupt_that_is_swallowed_is_raised_again_but_not_in_its_clean_up() -> None:
+def test_an_interrupt_that_is_swallowed_is_raised_again_but_not_in_its_clean_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     cleaned = []
+    monkeypatch.setattr("legcal.signals._AGAIN", 0.2)
 
     @stopped_by_signals()
     def work() -> None:
@@ -99,7 +102,7 @@ def test_an_interrupt_that_is_swallowed_is_raised_again_but_not_in_its_clean_up(
                 signal.raise_signal(signal.SIGINT)
             time.sleep(20.0)
         finally:
-            time.sleep(1.5)
+            time.sleep(0.3)
             cleaned.append(True)
 
     with handled(signal.SIGINT, signal.default_int_handler), pytest.raises(KeyboardInterrupt):

@@ -299,6 +299,7 @@ def _processes_of(group: int) -> list[str]:
     return found
 
 
+@pytest.mark.system
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes in /proc")
 def test_a_killed_study_leaves_no_process_and_is_continued(tmp_path: Path) -> None:
     with _running(tmp_path) as process:
