@@ -329,6 +329,8 @@ def test_what_a_table_of_motors_cannot_say(
         ("delta", {"rod_length": 100.0, "unit": None}, ("no unit", "--unit mm")),
         ("3-prs", {"rod_length": -1.0}, ("--rod-length -1", "positive")),
         ("orthoglide", {"travel": (5.0, 1.0)}, ("--travel 5 1",)),
+        ("delta", {"travel": (-0.5, 1.2)}, ("looks like radians", "--travel -28.65 68.75")),
+        ("linear-delta", {"leg_radius": 40.0}, ("60 mm apart", "80 mm thick", "--rod-spacing")),
         ("6-UPS", {"rod_length": 100.0}, ("--rod-length",)),
         ("6-UPS", {"arm_radius": 5.0}, ("--arm-radius", "without arms")),
         ("5-PSS", {}, ("'5-PSS'", "hexaglide")),
