@@ -266,6 +266,7 @@ def test_rods_of_other_joints_are_loaded_as_they_were_stated(tmp_path: Path) -> 
 
 ARMS: dict[str, Any] = yaml.safe_load((TABLES / "delta.yaml").read_text())
 ARM1 = ARMS["actuators"]["arm1"]
+HOME_BELOW = {"xyz": [0, 0, -900], "rpy_deg": [0, 0, 0]}  # farther than its rods reach
 
 
 def _arm1(**changes: Any) -> dict[str, Any]:
@@ -300,6 +301,8 @@ def _arm1(**changes: Any) -> dict[str, Any]:
         ({"actuators": None, "hangs_on": None}, ("'leg1'", "no motor", "RSS")),
         ({"lengths": None}, ("'leg1'", "no length")),
         ({"travel": [0, 1]}, ("travel", "'leg1'", "with P only")),
+        (_arm1(point=[320, 0, 0]), ("'leg1'", "on the axis of 'arm1'", "needed an arm")),
+        ({"home": HOME_BELOW}, ("'leg5', 'leg6' 702.718 mm long", "400 mm there")),
         ({"lengths": 200}, ("'arm1'", "82.6898 and 118.505 deg", "-30 to 70 deg")),
         ({"lengths": [400, 420, *[400] * 4]}, ("home", "'leg2'", "400 mm long instead of 420 mm")),
         (_arm1(travel_deg=[40, 70]), ("'arm1'", "20 and", "40 to 70 deg")),
@@ -329,6 +332,8 @@ def test_what_a_table_of_motors_cannot_say(
         ("delta", {"rod_length": 100.0, "unit": None}, ("no unit", "--unit mm")),
         ("3-prs", {"rod_length": -1.0}, ("--rod-length -1", "positive")),
         ("orthoglide", {"travel": (5.0, 1.0)}, ("--travel 5 1",)),
+        ("delta", {"travel": (-0.5, 1.2)}, ("looks like radians", "--travel -28.65 68.75")),
+        ("linear-delta", {"leg_radius": 40.0}, ("60 mm apart", "80 mm thick", "--rod-spacing")),
         ("6-UPS", {"rod_length": 100.0}, ("--rod-length",)),
         ("6-UPS", {"arm_radius": 5.0}, ("--arm-radius", "without arms")),
         ("5-PSS", {}, ("'5-PSS'", "hexaglide")),

@@ -580,3 +580,14 @@ def test_lines_near_a_limb_that_rises_from_the_background_stay_there() -> None:
     np.testing.assert_array_equal(blocks.lines[0].ends, [0.0, 0.0])
     found = fit_pooled(blocks, blocks.kept(), 0.55, DEPTH)
     assert np.all(np.abs(found.ends[0]) < 3.0 * np.sqrt(np.diag(found.covariance[0])))
+
+
+def test_an_outline_whose_blur_is_not_that_of_the_others_is_known_less_well() -> None:
+    def sigma(blur: float, among: float) -> float:
+        others = [outline(BRIGHT, (0.0, 0.0), among, noise=1.0, seed=k) for k in range(1, 6)]
+        blocks = together([outline(BRIGHT, (0.0, 0.0), blur, noise=1.0), *others])
+        found = fit_pooled(blocks, np.ones(len(blocks.d), dtype=np.bool_), among, DEPTH)
+        return float(np.sqrt(found.covariance[0, 0, 0]))
+
+    alone = sigma(0.6, 0.6)
+    assert sigma(0.6, 0.5) > 1.5 * alone

@@ -14,6 +14,7 @@ from fuzzing.mutations import mutate
 from photograph_files import exif, jpeg, png, tiff
 
 from legcal import calibrate, calibrate_camera, load_dataset
+from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.data import compression_note
 from legcal.errors import DatasetError, NotVisible
 from legcal.vision import ImageFacts, read_camera, read_facts
@@ -176,13 +177,27 @@ def test_portrait_mode_is_said_once_for_all_views(folder: Folder) -> None:
     assert f"Outlines in {NAMES[1]}, {NAMES[2]} of views c1, c2" in note
 
 
-def test_a_refusal_names_what_may_be_its_cause(folder: Folder) -> None:
+def test_a_refusal_names_what_may_be_its_cause(
+    folder: Folder, monkeypatch: pytest.MonkeyPatch
+) -> None:
     del folder.entry["views"]["c2"]["legs"]
     (note,) = notes(folder, {1: phone(zoom=2.0)})
     with pytest.raises(NotVisible) as refused:
         calibrate(folder.path)
     assert len(refused.value.problems) > 1
     assert refused.value.problems[-1] == note
+    # Where a mistake explains them, what follows from it is counted and accuses nobody.
+    n = len(refused.value.problems) - 1
+    mistake = Diagnosis(
+        "columns exchanged", "columns a and b look exchanged", (), "with them exchanged", 6, 1, 6,
+        0.9, "exchange their headers",
+    )  # fmt: skip
+    monkeypatch.setattr("legcal.calibration.pipeline.diagnose", lambda data: (mistake,))
+    with pytest.raises(NotVisible) as refused:
+        calibrate(folder.path)
+    first, follow, last = refused.value.problems
+    assert (first, last) == (mistake.sentence, note)
+    assert follow.startswith(f"{n} more thing")
 
 
 @pytest.mark.parametrize(

@@ -115,6 +115,30 @@ def test_units_that_are_taken_for_others_are_told_before_images_are_looked_at(
     assert all(word in said for word in named), said
 
 
+def test_motors_that_turn_the_other_way_are_told_by_a_travel_that_is_uneven(tmp_path: Path) -> None:
+    """Where the travel goes further one way, less than half of reversed readings are outside."""
+    angles = np.radians(20.0 + 100.0 * np.sin(np.arange(24.0).reshape(8, 3)) / 2.0)
+    arms = ("arm1", "arm2", "arm3")
+    entry = {"encoder_sigma": dict.fromkeys(arms, 1e-4)}
+    folder = dataset_of_readings(tmp_path, angles, entry, "delta", arms)
+    load_dataset(folder, check_images=False)
+    dataset_of_readings(tmp_path, -angles, entry, "delta", arms)
+    with pytest.raises(LegcalError) as caught:
+        load_dataset(folder)
+    (said,) = caught.value.problems
+    assert "columns arm1, arm2, arm3" in said
+    assert "opposite sign" in said
+
+
+@pytest.mark.parametrize("sigma", ["0.5deg", "0.1deg"])
+def test_readings_are_outside_the_travel_by_more_than_noise(sigma: str, tmp_path: Path) -> None:
+    angles = ANGLES.copy()
+    angles[1, 2] = np.radians(46.0)
+    entry = {"encoder_sigma": dict.fromkeys(SERVOS, sigma)}
+    notes = load_dataset(dataset_of_readings(tmp_path, angles, entry), check_images=False).notes
+    assert sum("outside the travel" in note for note in notes) == (sigma == "0.1deg")
+
+
 def test_sigmas_beyond_a_share_of_the_travel_or_of_a_turn_are_refused_wherever_they_are_given(
     tmp_path: Path,
 ) -> None:

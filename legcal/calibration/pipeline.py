@@ -217,8 +217,8 @@ def calibrate(
 def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Options) -> Estimate:
     """Recognise and measure all images, and fit some of them: phases 2 to 5 of the method.
 
-    A refusal also has what looks wrong with the session, and what files of photographs say against
-    their camera: they may be the cause.
+    A refusal also has what looks wrong with the session, in place of what follows from that, and
+    what files of photographs say against their camera: they may be the cause.
 
     Raises
     ------
@@ -241,7 +241,8 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         if not (diagnosis or notes):
             raise
         likeliest = [one.sentence for one in diagnosis]
-        refusal = type(error)([*likeliest, *error.problems, *notes])
+        beside = notes_beside(diagnosis, error.problems, "legcal calibrate")
+        refusal = type(error)([*likeliest, *beside, *notes])
         refusal.diagnosis = tuple(one.document().document() for one in diagnosis)
         raise refusal from error
 

@@ -42,9 +42,10 @@ from legcal.machine import TRAVEL_MARGIN, Leg
 from legcal.vision import Camera
 
 MAX_NAMED = 5  # views or other things, in one sentence
-NOTED_MARGIN = (
-    1e-3  # of the travel: readings outside by less are within it but for rounding and noise
-)
+# Of the travel, and in standard deviations: readings outside by less are within it but for rounding
+# and noise.
+ROUNDED, NOISY = 1e-3, 3.0
+MANY, FEWEST = 0.25, 2  # of the rows: where so many are outside, it may be for one cause
 MAX_READING_SPREAD = 10.0  # sigma by which rows of one pose may differ
 INCH = 0.0254  # [m]
 # Parts of the travel: in the unit that is stated, and in another that may be, or surely is, meant
@@ -201,31 +202,36 @@ def reading_columns(
 
 
 def readings_in(
-    table: Table, legs: Sequence[Leg], units: Mapping[str, ReadingUnit] | None = None
+    table: Table,
+    legs: Sequence[Leg],
+    units: Mapping[str, ReadingUnit] | None = None,
+    sigma: Array | None = None,
 ) -> tuple[Array, tuple[str, ...]]:
     """Return the readings in a table (n_rows, n_motors) [m or rad], and notes on odd ones.
 
     Readings outside their travel by more than 5 % of it are refused, others are noted if it is more
-    than rounding and noise. Refused is
-    as well what hardly moves in its unit and makes use of the travel in a larger one; where that is
-    not sure, as of few poses, it is noted. *units* are those that a dataset states, None of tables
-    in m and rad.
+    than rounding and noise. Refused is as well what hardly moves in its unit and makes use of the
+    travel in a larger one; where that is not sure, as of few poses, it is noted. *units* and
+    standard deviations *sigma* (n_motors,) are those of a dataset; without units, tables are in m
+    and rad.
     """
     actuated = legs_with_readings(legs)
+    noise = np.zeros(len(actuated)) if sigma is None else NOISY * sigma
     given = table.numbers(str(leg.prismatic) for leg in actuated)
     stated = [(units or {}).get(str(leg.prismatic), default_unit(leg)) for leg in actuated]
     readings = np.empty_like(given)
     for j, unit in enumerate(stated):
         readings[:, j] = unit.values(given[:, j])
     notes = []
-    beyond: list[tuple[str, str, bool]] = []  # column, what was found of it, whether of most rows
-    for leg, one, numbers, column in zip(actuated, stated, given.T, readings.T, strict=True):
+    beyond: list[tuple[str, str, bool]] = []  # column, what was found of it, whether of many rows
+    each = zip(actuated, stated, given.T, readings.T, noise.tolist(), strict=True)
+    for leg, one, numbers, column, of_noise in each:
         lower, upper = leg.travel
         if not 0.0 < upper - lower < np.inf:
             continue
         beyond_travel = np.maximum(lower - column, column - upper)
-        outside = beyond_travel > NOTED_MARGIN * (upper - lower)
-        far = outside & ~leg.in_travel(column)
+        outside = beyond_travel > max(ROUNDED * (upper - lower), of_noise)
+        far = (beyond_travel > 0.0) & ~leg.in_travel(column)
         unit_name, ends = one.name, sorted(map(one.reading, leg.travel))
         travel = f"{ends[0]:g} to {ends[1]:g} {unit_name} (the joint limits of the model)"
         if np.any(far):
@@ -233,17 +239,19 @@ def readings_in(
                 f"found {_some(table, numbers, far, unit_name)}, needed {travel} with a margin of "
             )
             found += f"{TRAVEL_MARGIN:.0%}"
-            beyond.append((str(leg.prismatic), found, 2 * np.sum(far) >= len(column)))
+            n = len(column)
+            many = np.count_nonzero(far) >= max(MANY * n, min(FEWEST, n))
+            beyond.append((str(leg.prismatic), found, bool(many)))
         elif np.any(outside):
             notes.append(
                 f"{table.path}, column {leg.prismatic}: readings are a little outside the travel "
                 f"{travel}: {_some(table, numbers, outside, unit_name)}."
             )
-    mostly = [name for name, _, most in beyond if most]
+    often = [name for name, _, most in beyond if most]
     cause = ""
-    if mostly:
+    if often:
         # whatever is outside lies inside once divided by enough: there it has to move, too
-        wrong = [j for j, leg in enumerate(actuated) if str(leg.prismatic) in mostly]
+        wrong = [j for j, leg in enumerate(actuated) if str(leg.prismatic) in often]
         every = list(range(len(actuated)))
         tries = (every, WOULD_MOVE), (wrong, WOULD_MOVE), (wrong, 0.0), (every, 0.0)
         for some, least in tries:
@@ -254,7 +262,7 @@ def readings_in(
                 in_dataset=units is not None,
                 least=least,
             )
-    alike = mostly if cause else []
+    alike = often if cause else []
     for name, found, _ in beyond:
         if name in alike[1:]:
             continue
@@ -496,7 +504,9 @@ def read_measurements(
             needed = f"a view of the dataset file; {closest(name, view_index)}"
             table.refuse(row, f"the unknown view {describe(name)}", needed, "view")
     _refuse_images(table, images, folder)
-    readings, notes = readings_in(table, legs, units)
+    motors = legs_with_readings(legs)
+    sigma = sigmas_of_legs(motors, sigma_q, sigma_by_joint)
+    readings, notes = readings_in(table, legs, units, sigma)
     pose, labels = _poses(table.text("pose"))
     q = np.full((len(table), len(legs)), math.nan)
     q[:, [not leg.has_value for leg in legs]] = 0.0
@@ -510,8 +520,7 @@ def read_measurements(
         pose_labels=labels if "pose" in table else (),
         sigma_by_joint=sigma_by_joint,
     )
-    motors = legs_with_readings(legs)
-    shared = _shared_readings(table, legs, pose, readings, measurements.sigma_of(motors))
+    shared = _shared_readings(table, legs, pose, readings, sigma)
     column = {leg.prismatic: i for i, leg in enumerate(motors)}
     for j, leg in enumerate(legs):
         if leg.is_motor:

@@ -71,13 +71,21 @@ def describe_actuated_family(
     Raises
     ------
     ValueError
-        If its rods are too short to reach the platform; the text says which dimension is at fault.
+        If its rods are too short to reach the platform, or are one in the other; the text says
+        which dimension is at fault, and goes on after what was found.
     """
     usual = {
         key: value if key.endswith("spread") else in_metres(value, "mm")
         for key, value in family.dimensions.items()
     }
     size = usual | dict(given)
+    width, spacing = 2.0 * size["leg_radius"], size.get("rod_spacing", np.inf)
+    if not width < spacing:
+        raise ValueError(
+            f"two rods {1e3 * spacing:.6g} mm apart that are {1e3 * width:.6g} mm thick, needed "
+            "them beside each other; enlarge --rod-spacing, or give half of their diameter as "
+            "--leg-radius."
+        )
     low, high = travel or family.travel
     if family.turns:
         ends = float(np.radians(low)), float(np.radians(high))
@@ -116,7 +124,8 @@ def _leg_over(length: float, beside: float, what: str) -> float:
     """Return the other leg of a right triangle below a rod."""
     if not abs(beside) < length:
         raise ValueError(
-            f"rods of {1e3 * length:.6g} mm that reach {1e3 * abs(beside):.6g} mm {what}"
+            f"rods of {1e3 * length:.6g} mm that reach {1e3 * abs(beside):.6g} mm {what}, needed "
+            "longer rods; enlarge --rod-length, or correct the other dimensions."
         )
     return float(np.sqrt(length**2 - beside**2))
 

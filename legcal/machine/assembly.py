@@ -339,16 +339,14 @@ class _ClosingEquations:
         matrix = T.as_matrix()[None]
         legs = self._at(self.readings_near(T))
         found = pose_equations(legs, matrix[:, :3, :3], matrix[:, :3, 3], by_local=False)
-        words = []
+        words, lengths = list[str](), dict[str, list[str]]()  # of legs that are off alike
         for j, kind, value in zip(found.leg, found.kinds, found.values[0], strict=True):
             leg = legs[j]
             length = float(np.linalg.norm(T.apply(leg.B) - leg.A))
             if kind is EquationKind.LENGTH:
                 if abs(value) > CLOSED * self.size:
-                    words.append(
-                        f"leg '{leg.name}' {1e3 * length:.6g} mm long instead of "
-                        f"{1e3 * leg.q0:.6g} mm"
-                    )
+                    off = f"{1e3 * length:.6g} mm long instead of {1e3 * leg.q0:.6g} mm"
+                    lengths.setdefault(off, []).append(leg.name)
                 continue
             angle = np.degrees(np.arccos(min(1.0, abs(float(value)) / length)))
             if 90.0 - angle > 1e-6:
@@ -357,6 +355,7 @@ class _ClosingEquations:
                     f"the {side} axis of leg '{leg.name}' at {angle:.4g} deg to the leg "
                     "instead of 90 deg, which an R joint needs,"
                 )
+        words[:0] = [f"{legs_in_words(names)} {off}" for off, names in lengths.items()]
         return words or ["axes of a planar mechanism that are not parallel"]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.files import motion_from_xyz_quat
-from legcal.geometry import Array
+from legcal.geometry import Array, distance_to_line
 from legcal.machine.actuator import Actuator, ActuatorKind
 from legcal.machine.classification import PERPENDICULAR
 from legcal.machine.leg import (
@@ -225,6 +225,17 @@ def wrong_sizes(described: Description) -> list[str]:
                 f"{described.source}: the {side} joints could not be used: found them "
                 f"{reach:.4g} m apart with lengths in {described.unit}, needed at most "
                 f"{MAX_LENGTH:g} m; {_about_the_unit(described.unit, too_long=True)}."
+            )
+    for leg in described.legs:
+        motor = leg.actuator
+        if motor is None or not motor.turns:
+            continue
+        if distance_to_line(leg.A_base, motor.axis, motor.point) < MIN_LENGTH:
+            problems.append(
+                f"{described.source}: leg '{leg.name}' could not be used: found its base joint on "
+                f"the axis of '{motor.joint}', which turns without moving it, needed an arm of "
+                f"{1e3 * MIN_LENGTH:g} mm at least between them; correct the joint, or point and "
+                "axis of the motor."
             )
     return problems
 

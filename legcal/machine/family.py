@@ -132,6 +132,13 @@ def _describe_named(name: str, family: ActuatedFamily, given: Dimensions) -> Des
         )
     if given.travel is not None and not -1e9 < given.travel[0] < given.travel[1] < 1e9:
         problems.append(_wrong_travel(where, given.travel))
+    elif given.travel is not None and family.turns and np.ptp(given.travel) <= np.pi:
+        low, high = given.travel
+        problems.append(
+            f"{where}: found --travel {low:g} {high:g}, which hardly turns a motor in degrees and "
+            "looks like radians, needed degrees; write --travel "
+            f"{np.degrees(low):.4g} {np.degrees(high):.4g}."
+        )
     if given.name is not None:
         problems += _wrong_name(where, given.name)
     if problems:
@@ -149,10 +156,7 @@ def _describe_named(name: str, family: ActuatedFamily, given: Dimensions) -> Des
     try:
         return describe_actuated_family(given.name or name, source, family, size, travel, unit)
     except ValueError as error:
-        raise UsageError(
-            f"{where}: found {error}, needed longer rods; enlarge --rod-length, or correct the "
-            "other dimensions."
-        ) from error
+        raise UsageError(f"{where}: found {error}") from error
 
 
 def _wrong_travel(where: str, travel: tuple[float, float]) -> str:

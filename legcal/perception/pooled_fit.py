@@ -56,8 +56,9 @@ MIN_LIGHT = 1e-3  # of the mean light of a block
 
 COMMON_BLUR_SIGMA = 0.03  # of the logarithm of the blur of an outline, about that of the image
 # An outline whose light is unusual, or whose blur is not that of the others once both pull at each
-# other, is known less well: as from a Student t prior of so many degrees of freedom.
-DEGREES, EXPECTED_ODDITY = 5.0, 4.0  # and the squares of pulls that outlines have where all is well
+# other, is known less well, and a plain one better: as from a Student t prior of so many degrees of
+# freedom.
+DEGREES, EXPECTED_ODDITY = 5.0, 4.0  # and the sum of squared pulls of outlines where all is well
 BLUR_PULL = 0.01  # of the logarithm of the blur of an outline, where all is well
 ROUNDS, ALL_ROUNDS = 10, 2  # at most; and before those that have converged are left out
 
@@ -408,7 +409,7 @@ class _Pool:
         return after, covariance, shared
 
     def oddity(self, at: _Iterate, log_blur: float) -> Array:
-        """Return by how much more covariances (n_edges,) are than where all is as expected."""
+        """Return by how much covariances (n_edges,) are those of outlines that are as expected."""
         surface = at.amplitude[:, 0, SURFACE:]
         squares = np.sum(self.precision[:, 0, SURFACE:N_AMPLITUDES] * surface**2, axis=1)
         squares += ((at.log_blur - log_blur) / BLUR_PULL) ** 2
