@@ -409,7 +409,7 @@ class _Pool:
         return after, covariance, shared
 
     def oddity(self, at: _Iterate, log_blur: float) -> Array:
-        """Return by how much covariances (n_edges,) are those of outlines that are as expected."""
+        """Return the factors (n_edges,) of covariances; 1 of outlines that are as expected."""
         surface = at.amplitude[:, 0, SURFACE:]
         squares = np.sum(self.precision[:, 0, SURFACE:N_AMPLITUDES] * surface**2, axis=1)
         squares += ((at.log_blur - log_blur) / BLUR_PULL) ** 2
