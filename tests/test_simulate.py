@@ -550,3 +550,11 @@ def test_a_name_of_the_greatest_length_is_a_name_and_an_empty_one_is_none(tmp_pa
     assert (tmp_path / ("ä" * 127) / "dataset.yaml").exists()
     with pytest.raises(UsageError, match="dataset could not be written: found an empty text"):
         simulate("hexapod", "", FEW)
+
+
+@pytest.mark.parametrize(("model", "unit"), [("hexapod", "mm"), ("delta", "deg")])
+def test_noise_of_readings_without_unit_is_told_the_units_of_the_motors(
+    model: str, unit: str
+) -> None:
+    with pytest.raises(UsageError, match=rf"--encoder-noise .*such as 0.5{unit}"):
+        requested(Request(encoder_noise="0.5"), load_mechanism(model))

@@ -318,8 +318,8 @@ def _look_at_readings(found: _Found, notes: Sequence[str]) -> None:
     shares = {one.column: one.used for one in found.encoders if one.used is not None}
     found.checks["readings"] = f"{len(found.encoders)} encoders"
     if shares:
-        low, high = (100.0 * end(shares.values()) for end in (min, max))
-        found.checks["readings"] += f", {low:.0f} to {high:.0f} % of their travel used"
+        used = _range([100.0 * share for share in shares.values()])
+        found.checks["readings"] += f", {used} % of their travel used"
     _look_for_still_encoders(found, shares)
     _look_for_rounded_readings(found)
 
@@ -649,7 +649,7 @@ def _median(values: Sequence[float]) -> float:
 
 def _range(values: Sequence[float]) -> str:
     """Return values from the least to the greatest, in words."""
-    least, greatest = f"{min(values):.2g}", f"{max(values):.2g}"
+    least, greatest = (f"{float(f'{end(values):.2g}'):g}" for end in (min, max))
     return least if least == greatest else f"{least} to {greatest}"
 
 

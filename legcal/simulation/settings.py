@@ -477,9 +477,11 @@ def requested(request: Request, nominal: Machine) -> SimulationSettings:
 
 def _encoder_noise(text: str, nominal: Machine) -> dict[str, Spread]:
     """Return the errors of readings [m], or of motors that turn [rad] where it is an angle."""
+    turns = any(leg.reads_angle for leg in nominal.legs)
     if not any(text.partition(":")[0].endswith(unit) for unit in ANGLE):
-        return {"readings": _spread(text, LENGTH, Distribution.NORMAL, "--encoder-noise")}
-    if not any(leg.reads_angle for leg in nominal.legs):
+        units = {**ANGLE, **LENGTH} if turns else LENGTH  # that a refusal names
+        return {"readings": _spread(text, units, Distribution.NORMAL, "--encoder-noise")}
+    if not turns:
         raise UsageError(
             f"--encoder-noise could not be used: found {describe(text)} and no motor that turns, "
             "needed a length such as 2um; correct it."
