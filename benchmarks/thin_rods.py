@@ -12,7 +12,8 @@ of the background, direction of the rod and gamma are drawn too.
 Outlines are measured as they are near a fit: from lines that are off by ``START`` at each end, with
 the blur known to a tenth. "bias" is the mean error in the middle of outlines, positive towards the
 inside, "median" their median, "rms" their root mean square, all of those within ``GROSS`` ("gross"
-counts the others, which widths reject); "stated" is the median of the stated standard deviations,
+counts the others, which widths reject); "counted" is their rms as a fit counts them, by the squares
+of stated precisions; "stated" is the median of the stated standard deviations,
 "pull" the root mean square of errors over these. "follows" is by how much of a shift of its start
 inwards an outline moves.
 """
@@ -154,9 +155,11 @@ def row(lens: str, width: float, found: Array) -> str:
     """Return a line of the table."""
     good = np.abs(found[:, 0]) < GROSS
     error, sigma, follows = found[good].T
+    weight = sigma**-2 / np.mean(sigma**-2)
     return (
         f"{lens:10}{width:6g}{len(found):6d}{np.count_nonzero(~good):6d}{error.mean():+8.3f}"
-        f"{np.median(error):+8.3f}{np.sqrt(np.mean(error**2)):7.3f}{np.median(sigma):8.3f}"
+        f"{np.median(error):+8.3f}{np.sqrt(np.mean(error**2)):7.3f}"
+        f"{np.sqrt(np.mean((weight * error) ** 2)):9.3f}{np.median(sigma):8.3f}"
         f"{np.sqrt(np.mean((error / sigma) ** 2)):6.2f}{np.mean(np.clip(follows, 0.0, 1.0)):9.2f}"
     )
 
@@ -170,7 +173,7 @@ def main() -> None:
     options = parser.parse_args()
     print(
         f"{'lens':10}{'width':>6}{'n':>6}{'gross':>6}{'bias':>8}{'median':>8}{'rms':>7}"
-        f"{'stated':>8}{'pull':>6}{'follows':>9}"
+        f"{'counted':>9}{'stated':>8}{'pull':>6}{'follows':>9}"
     )
     for lens in options.lens:
         for width in WIDTHS:
