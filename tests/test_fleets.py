@@ -112,6 +112,14 @@ def test_machines_that_workers_do_not_see_are_sent_and_their_results_sent_back(
     assert calibrate_fleet(machines, out) == here
     assert files_of(out) == files_of(tmp_path / "here")
 
+    def refuse(path: Path) -> bytes:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    unread = calibrate_fleet(machines, tmp_path / "unread")
+    assert [one.kind for one in unread.machines] == ["DatasetError"] * 2
+    assert "'Permission denied'" in unread.machines[1].verdict
+
 
 def test_lists_and_words_that_make_no_fleet_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -265,14 +265,28 @@ def _where_they_lie(machines: Sequence[FleetMachine]) -> Iterator[_Row]:
         yield machine, stamp_of(machine.dataset / "dataset.yaml"), None
 
 
-def _sent(machines: Sequence[FleetMachine], found: Mapping[str, MachineRow]) -> Iterator[_Row]:
-    """Yield machines that are not done with all of their files, which are read one by one."""
+def _sent(machines: Sequence[FleetMachine], found: dict[str, MachineRow]) -> Iterator[_Row]:
+    """Yield machines that are not done with all of their files, which are read one by one.
+
+    Those whose files cannot be read have failed.
+    """
     for machine in machines:
-        if machine.name not in found:
+        if machine.name in found:
+            continue
+        try:
             files = _files_in(machine.dataset, "dataset/")
             if machine.earlier is not None:
                 files |= _files_in(machine.earlier, "earlier/")
-            yield machine, None, files
+        except OSError as error:
+            found[machine.name] = _failed(
+                machine,
+                DatasetError(
+                    f"{error.filename}: the file could not be sent to workers: found "
+                    f"'{error.strerror}', needed one that can be read; correct its permissions."
+                ),
+            )
+            continue
+        yield machine, None, files
 
 
 def _files_in(folder: Path, name: str = "") -> dict[str, bytes]:
@@ -329,14 +343,20 @@ def _calibrate(
     except OutOfResources:
         raise
     except LegcalError as error:
-        return MachineRow(
-            name=named.name,
-            dataset=str(named.dataset),
-            status="failed",
-            verdict=str(error).replace(str(machine.dataset), str(named.dataset)),
-            kind=type(error).__name__,
-        )
+        return _failed(named, error, str(machine.dataset))
     return row.model_copy(update={"dataset": str(named.dataset)})
+
+
+def _failed(machine: FleetMachine, error: LegcalError, there: str = "") -> MachineRow:
+    """Return the row of a machine that failed; its dataset was *there* meanwhile."""
+    here = str(machine.dataset)
+    return MachineRow(
+        name=machine.name,
+        dataset=here,
+        status="failed",
+        verdict=str(error).replace(there or here, here),
+        kind=type(error).__name__,
+    )
 
 
 def _row(machine: FleetMachine, output: Path) -> MachineRow:
