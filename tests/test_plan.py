@@ -455,7 +455,8 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"setting": Setting(shift=50.0)}, UsageError, "off by 50 m"),
     ({"setting": Setting(length=3.0)}, UsageError, "a model error of 3 m"),
     ({"setting": Setting(length=0.5), "images": 4}, DidNotConverge, "; say with --model-error"),
-    ({"bounds": np.array([[5.0, 6.0]] * 3), "images": 4}, NotVisible, "wider bounds"),
+    ({"bounds": np.array([[5.0, 6.0]] * 3), "images": 4}, NotVisible, "bounds, nearer"),
+    ({"bounds": np.array([[0.3, 0.31]] * 3), "images": 4}, NotVisible, "bounds, farther"),
 ]
 
 
