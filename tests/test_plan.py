@@ -449,6 +449,7 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"board": "chessbord:9x6"}, UsageError, "chessbord"),
     ({"given": "nowhere"}, DatasetError, "nowhere"),
     ({"noise": "nowhere"}, UsageError, "--noise"),
+    ({"noise": __file__}, UsageError, "found no JSON document"),
     ({"places": "nowhere.yaml"}, DatasetError, "nowhere.yaml"),
     ({"encoder_sigma": "0.5deg"}, UsageError, "encoder sigma"),
     ({"setting": Setting(draws=0)}, UsageError, "0 draws"),
