@@ -452,6 +452,7 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"noise": __file__}, UsageError, "found no JSON document"),
     ({"places": "nowhere.yaml"}, DatasetError, "nowhere.yaml"),
     ({"encoder_sigma": "0.5deg"}, UsageError, "encoder sigma"),
+    ({"encoder_sigma": "2"}, UsageError, "without a unit"),
     ({"setting": Setting(draws=0)}, UsageError, "0 draws"),
     ({"setting": Setting(shift=50.0)}, UsageError, "off by 50 m"),
     ({"setting": Setting(length=3.0)}, UsageError, "a model error of 3 m"),
