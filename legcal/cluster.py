@@ -92,6 +92,7 @@ def _client(address: str, failure: str) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             from distributed import Client
+            from tornado.websocket import WebSocketError
     except ImportError as error:
         raise UsageError(
             f"{failure}: found no package distributed, needed it for the cluster {address}; "
@@ -103,15 +104,17 @@ def _client(address: str, failure: str) -> Any:
             "tcp://host:8786."
         )
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what it says is said here
-    found, too_late, is_another = list[Any](), Event(), Event()
+    found, failed, too_late = list[Any](), list[Exception](), Event()
 
     def connect() -> None:
         try:
             found.append(Client(address, timeout=CONNECTING, set_as_default=False))  # type: ignore[no-untyped-call]
         except OSError:
             pass
-        except (ValueError, TypeError, LookupError, RuntimeError, MemoryError):
-            is_another.set()
+        except (
+            ValueError, TypeError, LookupError, RuntimeError, MemoryError, WebSocketError,
+        ) as error:  # fmt: skip
+            failed.append(error)
         if too_late.is_set():
             for client in found:
                 client.close(timeout=2)
@@ -125,7 +128,13 @@ def _client(address: str, failure: str) -> Any:
         thread.join(CONNECTING + 0.5)
     if not found:
         too_late.set()
-        if is_another.is_set():
+        scheme = address.partition("://")[0] if "://" in address else "tcp"
+        if failed and scheme != "tcp" and isinstance(failed[0], ValueError | TypeError):
+            raise UsageError(
+                f"{failure}: found that Dask cannot use {address} here ('{failed[0]}'), needed an "
+                f"address that it can; set Dask up for {scheme}, or use tcp://host:8786."
+            )
+        if failed:
             raise OutOfResources(
                 f"{failure}: found that {address} answers, but not as a Dask scheduler does, "
                 "needed one; see that the port is its own (8786 unless it was started with "

@@ -280,6 +280,13 @@ def test_workers_that_differ_are_named_and_those_without_this_legcal_refused(
             run_study(Draws(), 3, workers=local.address)
 
 
+def _answer(page: socket.socket) -> None:
+    """Answer one connection as a web server does that is asked something else."""
+    with page.accept()[0] as connection:
+        connection.recv(4096)
+        connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 0\r\n\r\n")
+
+
 @pytest.mark.system
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_no_answer_and_no_worker_are_said_in_one_sentence(
@@ -298,6 +305,9 @@ def test_no_answer_and_no_worker_are_said_in_one_sentence(
     for address in ("host", "tcp://host", "http://host:8787"):
         with pytest.raises(UsageError, match="like tcp://host:8786"):
             run_study(Draws(), 3, workers=address)
+    for address in ("tls://127.0.0.1:1", "inproc://here"):  # certificates, another process
+        with pytest.raises(UsageError, match="Dask cannot use"):
+            run_study(Draws(), 3, workers=address)
     monkeypatch.setattr(cluster, "CONNECTING", 2.0)
     with (
         local_cluster(tmp_path / "cluster", 0) as local,
@@ -306,9 +316,10 @@ def test_no_answer_and_no_worker_are_said_in_one_sentence(
         run_study(Draws(), 3, workers=local.address, output=tmp_path / "out")
     assert json.loads((tmp_path / "out" / CHECKPOINT_NAME).read_text())["seed"] == 0
     assert np.isfinite(run_study(Draws(), 3, output=tmp_path / "out").document()["total"])
-    with socket.create_server(("127.0.0.1", 0)) as page:  # such as that of the scheduler
-        answering = Thread(target=lambda: page.accept()[0].sendall(b"HTTP/1.1 400 Bad Request\r\n"))
-        answering.start()
-        with pytest.raises(OutOfResources, match="not as a Dask scheduler does"):
-            run_study(Draws(), 3, workers=f"tcp://127.0.0.1:{page.getsockname()[1]}")
-        answering.join()
+    for scheme in ("tcp", "ws"):  # a page, such as that of the scheduler
+        with socket.create_server(("127.0.0.1", 0)) as page:
+            answering = Thread(target=_answer, args=(page,))
+            answering.start()
+            with pytest.raises(OutOfResources, match="not as a Dask scheduler does"):
+                run_study(Draws(), 3, workers=f"{scheme}://127.0.0.1:{page.getsockname()[1]}")
+            answering.join()

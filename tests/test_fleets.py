@@ -112,6 +112,14 @@ def test_machines_that_workers_do_not_see_are_sent_and_their_results_sent_back(
     assert calibrate_fleet(machines, out) == here
     assert files_of(out) == files_of(tmp_path / "here")
 
+    def refuse(path: Path) -> bytes:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    unread = calibrate_fleet(machines, tmp_path / "unread")
+    assert [one.kind for one in unread.machines] == ["DatasetError"] * 2
+    assert "'Permission denied'" in unread.machines[1].verdict
+
 
 def test_lists_and_words_that_make_no_fleet_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -124,6 +132,7 @@ def test_lists_and_words_that_make_no_fleet_are_refused(
         ("dataset,name\na,summary.json\n", "the name 'summary.json'"),
         ("dataset,mane\na,b\n", "unknown column 'mane'"),
         ("dataset\n", "no row"),
+        (f"dataset,name\na,{256 * 'x'}\n", "a folder can have"),
     ):
         table.write_text(text)
         assert run_command(monkeypatch, "calibrate", "--list", table, "-o", out) == 2
@@ -145,6 +154,17 @@ def test_lists_and_words_that_make_no_fleet_are_refused(
         calibrate_fleet([FleetMachine("a", tmp_path)], mine)
     with pytest.raises(DatasetError):
         fleet.read_fleet(tmp_path / "none.csv")
+
+
+def test_machines_without_a_name_have_that_of_the_folder_of_their_dataset(tmp_path: Path) -> None:
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "dataset.yaml").touch()
+    (own / "machines.csv").write_text("dataset\n.\ndataset.yaml\n../other\n..\n")
+    machines = fleet.read_fleet(own / "machines.csv")
+    assert [one.name for one in machines] == ["own", "own", "other", tmp_path.name]
+    with pytest.raises(UsageError, match="the name ''"):
+        calibrate_fleet([FleetMachine("", own)], tmp_path / "out")
 
 
 def test_a_terminal_shows_every_failure_whole(

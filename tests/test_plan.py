@@ -125,6 +125,14 @@ def test_the_expected_error_is_that_of_a_calibration_which_says_so(
     stated = found.platform.workspace.mean_displacement
     assert planned.error.mean_displacement == pytest.approx(stated, rel=0.25)
     assert any("times the plan" in note for note in found.notes)
+    (shot / "shot" / "plan.json").write_text("{")
+    again = legcal.calibrate(shot / "shot")
+    assert any("plan.json cannot be read" in note for note in again.notes)
+    for text in ("{", "[]", "{}"):
+        (shot / "shot" / "plan.json").write_text(text)
+        settings = SimulationSettings(plan=shot / "shot", level=Level.OUTLINES)
+        with pytest.raises(UsageError, match=r"found no plan\.json in it that can be read"):
+            simulate(load_mechanism("3-rpr"), shot / "again", settings)
 
 
 def places(folder: Path, **more: Any) -> Path:
@@ -441,12 +449,16 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"board": "chessbord:9x6"}, UsageError, "chessbord"),
     ({"given": "nowhere"}, DatasetError, "nowhere"),
     ({"noise": "nowhere"}, UsageError, "--noise"),
+    ({"noise": __file__}, UsageError, "found no JSON document"),
     ({"places": "nowhere.yaml"}, DatasetError, "nowhere.yaml"),
     ({"encoder_sigma": "0.5deg"}, UsageError, "encoder sigma"),
+    ({"encoder_sigma": "2"}, UsageError, "without a unit"),
     ({"setting": Setting(draws=0)}, UsageError, "0 draws"),
-    ({"setting": Setting(shift=50.0)}, UsageError, "of 50 and"),
-    ({"setting": Setting(length=0.5), "images": 4}, DidNotConverge, "--model-error"),
-    ({"bounds": np.array([[5.0, 6.0]] * 3), "images": 4}, NotVisible, "wider bounds"),
+    ({"setting": Setting(shift=50.0)}, UsageError, "off by 50 m"),
+    ({"setting": Setting(length=3.0)}, UsageError, "a model error of 3 m"),
+    ({"setting": Setting(length=0.5), "images": 4}, DidNotConverge, "; say with --model-error"),
+    ({"bounds": np.array([[5.0, 6.0]] * 3), "images": 4}, NotVisible, "bounds, nearer"),
+    ({"bounds": np.array([[0.3, 0.31]] * 3), "images": 4}, NotVisible, "bounds, farther"),
 ]
 
 
@@ -500,7 +512,9 @@ def test_plans_of_motors_that_turn_are_in_degrees_and_name_the_length_to_measure
     console.print(plan_table(plan, tmp_path))
     printed = console.file.getvalue()  # type: ignore[attr-defined]
     assert "-o OUT --length leg1.base:leg1.platform=" in printed
-    assert any("Measure the rod of leg1" in item for item in checklist(plan))
+    listed = checklist(plan)
+    assert any("Measure the rod of leg1" in item for item in listed)
+    assert any("where motors read arm1 20.00 deg" in item for item in listed)
 
 
 def test_each_motor_counts_with_its_own_standard_deviation(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -607,6 +621,7 @@ def test_what_else_is_in_the_way_is_refused(
     refused(UsageError, "found 1 place for 2", places=tmp_path / "away.yaml", cameras=2)
     refused(NotVisible, "use another board", board="charuco:7x5:4mm:3mm:DICT_4X4_50",
             places=places(tmp_path))  # fmt: skip
+    refused(NotVisible, "; use a board of larger squares", board="chessboard:9x6:5mm")
     for name in ("dataset.yaml", "plan.json"):  # their views are places too
         refused(UsageError, "found 2 places for 3", places=shot / "session" / name, cameras=3)
     refused(UsageError, "leg9.base.x", criterion="parameters", parameters=["leg9.base.x"],

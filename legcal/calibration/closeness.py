@@ -16,12 +16,21 @@ AS_PLANNED = 1.3  # times the error that was expected: no more needs no remark o
 
 def closeness(folder: Path, n_images: int, platform: PlatformAccuracy | None) -> tuple[str, ...]:
     """Return a sentence on a planned session; nothing where a dataset was not planned."""
+    file = folder / PLAN_NAME
     try:
-        plan = read_json(folder / PLAN_NAME)
+        plan = read_json(file)
+    except FileNotFoundError:
+        return ()
+    except (OSError, ValueError, DatasetError):
+        return (
+            f"{file} cannot be read: how close the session came to its plan is not known; copy the "
+            "file from the planned session.",
+        )
+    try:
         planned, expected = int(plan["images"]), plan["expected"]
         dX, dE = float(expected["dX_m"]), float(expected["dE_rad"])
         beside = plan.get("given")
-    except (OSError, ValueError, KeyError, TypeError, DatasetError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         return ()
     if platform is None or platform.workspace is None or not dX > 0.0:
         return ()

@@ -43,6 +43,7 @@ from legcal.workers import Workers, worker_pool
 _CACHE = "use_cache"  # results do not depend on it
 FLEET = OutputKind("fleet", "summary.json", "legcal_fleet")
 TABLE_NAME = "summary.csv"
+_LONGEST_NAME = 255  # [bytes] of a folder
 MADE_OF = "made_of.json"  # in the result folder of a machine: its dataset, and what was asked
 STAGE = "Calibrating machines"
 
@@ -54,6 +55,11 @@ class FleetMachine:
     name: str  # of its result folder
     dataset: Path  # its folder
     earlier: Path | None = None  # result folder that its drift is counted from
+
+    @classmethod
+    def of(cls, dataset: Path, name: str = "", earlier: Path | None = None) -> FleetMachine:
+        """Return a machine that has the name of its dataset's folder where it has none."""
+        return cls(name or _folder_of(dataset).name, dataset, earlier)
 
 
 class MachineRow(Document):
@@ -119,11 +125,7 @@ def read_fleet(path: Path) -> list[FleetMachine]:
     table.check()
     rows = zip(*(table.text(name) for name in ("dataset", "name", "earlier")), strict=True)
     return [
-        FleetMachine(
-            name or Path(dataset).name,
-            path.parent / dataset,
-            path.parent / earlier if earlier else None,
-        )
+        FleetMachine.of(path.parent / dataset, name, path.parent / earlier if earlier else None)
         for dataset, name, earlier in rows
     ]
 
@@ -205,9 +207,14 @@ def calibrate_fleet(
 
 def _absolute(machine: FleetMachine) -> FleetMachine:
     """Return a machine whose files workers in other folders find."""
-    folder = machine.dataset.absolute()
     earlier = None if machine.earlier is None else machine.earlier.absolute()
-    return replace(machine, dataset=folder.parent if folder.is_file() else folder, earlier=earlier)
+    return replace(machine, dataset=_folder_of(machine.dataset), earlier=earlier)
+
+
+def _folder_of(dataset: Path) -> Path:
+    """Return the folder of a dataset, which may be given by its ``dataset.yaml``."""
+    folder = Path(os.path.abspath(dataset))  # "." and ".." have no name
+    return folder.parent if folder.is_file() else folder
 
 
 def _check(machines: Sequence[FleetMachine], folder: Path) -> None:
@@ -217,7 +224,8 @@ def _check(machines: Sequence[FleetMachine], folder: Path) -> None:
         raise UsageError(f"{start} no machine, needed one or more; name their datasets.")
     for machine in machines:
         name = machine.name
-        if Path(name).name != name or name.startswith(".") or name in (FLEET.marker, TABLE_NAME):
+        is_one = bool(name) and Path(name).name == name and len(os.fsencode(name)) <= _LONGEST_NAME
+        if not is_one or name.startswith(".") or name in (FLEET.marker, TABLE_NAME):
             raise UsageError(
                 f"{start} the name '{name}' of {machine.dataset}, needed one that a folder can "
                 "have; give another in the column name of the list."
@@ -257,14 +265,28 @@ def _where_they_lie(machines: Sequence[FleetMachine]) -> Iterator[_Row]:
         yield machine, stamp_of(machine.dataset / "dataset.yaml"), None
 
 
-def _sent(machines: Sequence[FleetMachine], found: Mapping[str, MachineRow]) -> Iterator[_Row]:
-    """Yield machines that are not done with all of their files, which are read one by one."""
+def _sent(machines: Sequence[FleetMachine], found: dict[str, MachineRow]) -> Iterator[_Row]:
+    """Yield machines that are not done with all of their files, which are read one by one.
+
+    Those whose files cannot be read have failed.
+    """
     for machine in machines:
-        if machine.name not in found:
+        if machine.name in found:
+            continue
+        try:
             files = _files_in(machine.dataset, "dataset/")
             if machine.earlier is not None:
                 files |= _files_in(machine.earlier, "earlier/")
-            yield machine, None, files
+        except OSError as error:
+            found[machine.name] = _failed(
+                machine,
+                DatasetError(
+                    f"{error.filename}: the file could not be sent to workers: found "
+                    f"'{error.strerror}', needed one that can be read; correct its permissions."
+                ),
+            )
+            continue
+        yield machine, None, files
 
 
 def _files_in(folder: Path, name: str = "") -> dict[str, bytes]:
@@ -321,14 +343,20 @@ def _calibrate(
     except OutOfResources:
         raise
     except LegcalError as error:
-        return MachineRow(
-            name=named.name,
-            dataset=str(named.dataset),
-            status="failed",
-            verdict=str(error).replace(str(machine.dataset), str(named.dataset)),
-            kind=type(error).__name__,
-        )
+        return _failed(named, error, str(machine.dataset))
     return row.model_copy(update={"dataset": str(named.dataset)})
+
+
+def _failed(machine: FleetMachine, error: LegcalError, there: str = "") -> MachineRow:
+    """Return the row of a machine that failed; its dataset was *there* meanwhile."""
+    here = str(machine.dataset)
+    return MachineRow(
+        name=machine.name,
+        dataset=here,
+        status="failed",
+        verdict=str(error).replace(there or here, here),
+        kind=type(error).__name__,
+    )
 
 
 def _row(machine: FleetMachine, output: Path) -> MachineRow:

@@ -260,7 +260,7 @@ def calibrate(
                 "whose machine it is; leave it out."
             )
         fleet = [] if machines is None else calibration.read_fleet(machines)
-        fleet += [calibration.FleetMachine(path.resolve().name, path) for path in datasets]
+        fleet += [calibration.FleetMachine.of(path) for path in datasets]
         if earlier is not None:
             if not earlier.is_dir():
                 raise UsageError(

@@ -250,6 +250,11 @@ def sigma_in(stated: float | str, unit: ReadingUnit, leg: Leg) -> float:
     number, name = (
         (stated, unit.name) if isinstance(stated, float | int) else split_quantity(stated)
     )
+    if number > 0.0 and not name:
+        raise ValueError(
+            f"found {describe(stated)} without a unit, needed one of {', '.join(sizes)} behind the "
+            "number; write it."
+        )
     if not (math.isfinite(number) and number > 0.0) or name not in sizes:
         raise ValueError(
             f"found {describe(stated)}, needed a positive number and its unit "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,8 @@ def read_noise(path: Path) -> PredictedNoise:
         raise _useless(path, f"'{error.strerror or error}'") from error
     except KeyError as error:
         raise _useless(path, f"a document without {error}") from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise _useless(path, "no JSON document") from error
     except (ValueError, TypeError, AttributeError, DatasetError) as error:
         raise _useless(path, f"'{error}'") from error
     raise _useless(path, "another document")

@@ -188,14 +188,24 @@ def places_around(
         inside += _places_in(bounds, points, camera, setting)
     if not inside:
         where = np.array([place.T_base_camera.translation for place in found])
+        distance, least = (
+            (1.0, 1.0)
+            if bounds is None
+            else _distances(bounds.mean(axis=1), points, camera, setting)
+        )
+        where_to = " that reach one"
+        if distance > _FARTHER * least:
+            where_to = ", nearer to the machine"
+        elif distance < min(_NEARER) * least:
+            where_to = ", farther from the machine"
         spans = [
             f"{name} {low:.2f} to {high:.2f}"
             for name, low, high in zip("xyz", where.min(axis=0), where.max(axis=0), strict=True)
         ]
         raise NotVisible(
             f"{start} no place inside --bounds that shows most of it, near enough, needed one; "
-            f"places around the machine have {', '.join(spans)} m: give wider bounds that reach "
-            "one, or a camera with another view."
+            f"places around the machine have {', '.join(spans)} m: give wider bounds{where_to}, or "
+            "a camera with another view."
         )
     return inside
 
@@ -217,12 +227,20 @@ def _places_in(bounds: Array, points: Array, camera: Camera, setting: Setting) -
     found = []
     for position in np.stack(grid, axis=-1).reshape(-1, 3):
         away = position - 0.5 * (points.min(axis=0) + points.max(axis=0))
-        d = max(float(np.linalg.norm(away)), _ROUNDING)
+        d, distance = _distances(position, points, camera, setting)
         target, size, reach = _extent(away / d, points)
-        distance = _distance_of_all(away / d, points, camera, setting)
         if d - reach >= _CLEARANCE * size and min(_NEARER) <= d / distance <= _FARTHER:
             found.append(Place(look_at(position, target)))
     return found
+
+
+def _distances(
+    position: Array, points: Array, camera: Camera, setting: Setting
+) -> tuple[float, float]:
+    """Return how far a position is from the middle of points, and from how far all are seen [m]."""
+    away = position - 0.5 * (points.min(axis=0) + points.max(axis=0))
+    d = max(float(np.linalg.norm(away)), _ROUNDING)
+    return d, _distance_of_all(away / d, points, camera, setting)
 
 
 def _extent(toward: Array, points: Array) -> tuple[Array, float, float]:

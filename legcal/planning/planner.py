@@ -337,6 +337,8 @@ _REMEDIES = {
     "near": "move {} further away, or use a camera with a wider view",
     "far": "move {} nearer, or use a camera with a longer focal length or more pixels",
     "hidden": "move {} to where no plate or other leg is in front of the legs",
+    "board": "move {} to where all of the board is in the picture, or use a smaller one",
+    "small": "use a board of larger squares, or a camera with a longer focal length or more pixels",
 }
 
 
@@ -348,9 +350,8 @@ def _unseen(
     poses: Sequence[RigidTransform],
 ) -> str:
     """Return that too few places see legs, and the remedy for what most of the others lack."""
-    setting, board, another = scene.task.setting, "", ""
-    if scene.task.board is not None:
-        board, another = " and the board", ", or use a board of larger squares"
+    setting = scene.task.setting
+    board = "" if scene.task.board is None else " and the board"
     causes = [_why_unseen(scene, place.T_base_camera, poses) for place in blind]
     remedy = _REMEDIES[max(_REMEDIES, key=causes.count)]
     names = ", ".join(place.name for place in blind if place.name)
@@ -358,13 +359,16 @@ def _unseen(
         f"{scene.task.machine.yaml_path}: no session could be planned: found "
         f"{n_places - len(blind)} of {n_places} camera places that see legs{board} wherever the "
         f"tripod is set within {1e2 * setting.shift:g} cm and {np.degrees(setting.turn):g} deg, "
-        f"needed {needed}; {remedy.format(names or 'the places')}{another}."
+        f"needed {needed}; {remedy.format(names or 'the places')}."
     )
 
 
 def _why_unseen(scene: Scene, T: RigidTransform, poses: Sequence[RigidTransform]) -> str:
-    """Return why a camera sees no legs at poses T_Rb_Re, a key of the remedies."""
+    """Return why a camera sees no legs, or no board, at poses T_Rb_Re, a key of the remedies."""
     camera = scene.task.predictor.camera
+    if len(scene.seen(T, poses, surely=True).leg):  # the board alone is missing
+        is_in_view = scene.board_is_shown(T, poses, surely=True, is_read=False).any()
+        return "small" if is_in_view else "board"
     bodies = Bodies.at(scene.task.machine, scene.legs, poses).before(T)
     points = np.concatenate([bodies.A, bodies.B]).reshape(-1, 3)
     if not in_picture(camera, points, NEAREST).any():

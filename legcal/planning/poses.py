@@ -28,7 +28,7 @@ from legcal.machine import (
     poses_at,
     slider_columns,
 )
-from legcal.planning.places import Setting
+from legcal.planning.places import USUAL, Setting
 from legcal.progress import Report, no_progress
 
 N_REACHING = 10  # machines that must reach a pose,
@@ -58,11 +58,17 @@ def candidate_poses(
         kept = surely_reached(machine, legs, setting, drawn)
         found += [drawn.configurations[k] for k in np.flatnonzero(kept)]
     if len(found) < max(_MIN_SHARE * n, 1):
+        remedies = [
+            "check legcal.home and the limits of the joints",
+            "say with --model-error that it is known better",
+        ]
+        if setting.length > USUAL.length:
+            remedies.reverse()
         raise DidNotConverge(
             f"{machine.yaml_path}: no session could be planned: found {len(found)} of {n} poses "
             "that the machine still reaches at the same readings if its joints are "
-            f"{1e3 * setting.length:g} mm off, needed {_MIN_SHARE * n:.0f}; check legcal.home and "
-            "the limits of the joints, or say with --model-error that it is known better."
+            f"{1e3 * setting.length:g} mm off, needed {_MIN_SHARE * n:.0f}; "
+            f"{', or '.join(remedies)}."
         )
     return poses_at(machine, found)
 

@@ -257,11 +257,15 @@ def _unreached(task: Task, found: Plan, target: float) -> str:
     if without and found.limits[without] < 0.8 * found.value:
         share = error * found.limits[without] / found.value
         limit = f"{without} (without them {1e3 * share:.3f} mm)"
+    more = ""
+    n, value = found.growth[found.growth[:, 0] <= MOST_IMAGES][-1]
+    if n > found.n_images:
+        more = f" and about {1e3 * error * value / found.value:.3f} mm with {n:.0f} of their kind"
     return (
         f"{task.machine.yaml_path}: the target of {1e3 * target:g} mm could not be planned: found "
-        f"{1e3 * error:.3f} mm with {found.n_images} images, limited by {limit}, needed fewer such "
-        "errors; use better light or a camera of a longer focal length, more --cameras, --board, "
-        "or a larger --target."
+        f"{1e3 * error:.3f} mm with {found.n_images} images{more}, limited by {limit}, needed "
+        "fewer such errors; use better light or a camera of a longer focal length, more --cameras, "
+        "--board, or a larger --target."
     )
 
 
@@ -349,16 +353,19 @@ def _check(
             f"{start} a camera in the hand without a board, needed a calibration board on the base "
             "in every image, which alone tells where it was; describe it with --board."
         )
-    lengths, angles = (setting.shift, setting.length), (setting.turn, setting.angle)
-    if not (
-        all(0.0 <= x <= MAX_LENGTH for x in lengths)
-        and all(0.0 <= x <= MAX_ANGLE for x in angles)
-        and 1 <= setting.draws <= MAX_DRAWS
+    for what, size, most, unit, remedy in (
+        ("a model error of", setting.length, MAX_LENGTH, "m", "correct --model-error"),
+        ("axes off by", setting.angle, MAX_ANGLE, "rad", "correct the setting"),
+        ("cameras off by", setting.shift, MAX_LENGTH, "m", "correct the setting"),
+        ("cameras turned by", setting.turn, MAX_ANGLE, "rad", "correct the setting"),
     ):
+        if not 0.0 <= size <= most:
+            problems.append(
+                f"{start} {what} {size:g} {unit}, needed 0 to {most:g} {unit}; {remedy}."
+            )
+    if not 1 <= setting.draws <= MAX_DRAWS:
         problems.append(
-            f"{start} tolerances of {lengths[0]:g} and {lengths[1]:g} m, {angles[0]:g} and "
-            f"{angles[1]:g} rad and {setting.draws} draws, needed 0 to {MAX_LENGTH:g} m, 0 to "
-            f"{MAX_ANGLE:g} rad and 1 to {MAX_DRAWS}; correct --model-error, or the setting."
+            f"{start} {setting.draws} draws, needed 1 to {MAX_DRAWS}; correct the setting."
         )
     if problems:
         raise UsageError(problems)

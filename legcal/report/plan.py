@@ -12,11 +12,12 @@ import numpy as np
 from markupsafe import Markup
 from rich.console import RenderableType
 
+from legcal.data import reading_columns
 from legcal.errors import printable
 from legcal.figures import new_figure, plain
 from legcal.files import SHOWN_IN
 from legcal.geometry import Array
-from legcal.machine import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR, vectors_A_to_B
+from legcal.machine import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR, poses_at, vectors_A_to_B
 from legcal.pages import Drawing, Items, Picture, Row, page_html
 from legcal.planning import LaidBoard, Plan, views_in_words
 from legcal.report.machine import scale_option
@@ -175,7 +176,8 @@ with {plan.camera.width} x {plan.camera.height} px and a focal length of \
         "nor background.",
         "A background that differs from the legs in brightness along their whole length.",
         "A remote release or two seconds of delay; lossless files, or JPEG of quality 95.",
-        "Lead the machine as poses.csv says, in its order, by way of what stands in 'on the way'.",
+        "Lead the machine as poses.csv says, in its order, by way of what stands in 'on the way'. "
+        f"It begins at home, where motors read {_home_in_words(plan)}.",
         "Wait until it rests; write what the encoders say, not the command, into measurements.csv.",
         "Save each photograph under its name in measurements.csv.",
     ]
@@ -192,6 +194,19 @@ with {plan.camera.width} x {plan.camera.height} px and a focal length of \
             f"{plan.machine.length_option}.",
         )
     return items
+
+
+def _home_in_words(plan: Plan) -> str:
+    """Return the readings of the motors at home."""
+    machine = plan.machine
+    readings = poses_at(machine, [machine.home_configuration]).readings[0]
+    motors = [machine.legs[j] for j in machine.motors]
+    columns = reading_columns(machine.legs)
+    found = []
+    for column, leg, q in zip(columns, motors, readings[list(machine.motors)], strict=True):
+        size, unit = SHOWN_IN[leg.reading_unit]
+        found.append(f"{column.name} {size * q:z.2f} {unit}")
+    return ", ".join(found)
 
 
 def _board_in_words(plan: Plan, board: LaidBoard) -> str:
@@ -282,9 +297,9 @@ def _draw_panel(ax: Axes, plan: Plan, A: Array, B: Array, i: int, j: int) -> Non
     ax.margins(0.0)
     room = _ROOM * float(np.ptp(ax.get_xlim()))
     joints_of_base = [f"A{k + 1}" for k in range(len(A))]
-    for name, at in _together(joints_of_base, 1e3 * A[:, [i, j]], 0.4 * room):
-        ax.annotate(name, at, (5.0, 5.0), color=BASE_COLOUR, textcoords="offset points",
-                    fontsize="small")  # fmt: skip
+    for n, (name, at) in enumerate(_together(joints_of_base, 1e3 * A[:, [i, j]], 0.4 * room)):
+        ax.annotate(name, at, (5.0, -12.0 if n % 2 else 5.0), color=BASE_COLOUR,
+                    textcoords="offset points", fontsize="small")  # fmt: skip
     lenses = 1e3 * np.array([view.T_base_camera.translation for view in plan.views])
     for n, (name, at) in enumerate(
         _together([view.name for view in plan.views], lenses[:, [i, j]], 0.2 * room)
@@ -299,7 +314,10 @@ def _draw_panel(ax: Axes, plan: Plan, A: Array, B: Array, i: int, j: int) -> Non
 def _together(
     names: Sequence[str], points: Array, near: float
 ) -> list[tuple[str, tuple[float, float]]]:
-    """Return names of points (n, 2), in one text for those near each other, and where it stands."""
+    """Return names of points (n, 2), in one text for those near each other, and where it stands.
+
+    From left to right: above and below in turn, neighbours do not meet.
+    """
     groups: list[list[int]] = []
     for k in range(len(points)):
         beside = [g for g in groups if np.linalg.norm(points[g] - points[k], axis=1).min() < near]
@@ -312,7 +330,7 @@ def _together(
             of_group = [of_group[0], "...", of_group[-1]]
         x, y = points[group[int(np.argmax(points[group, 0]))]].tolist()
         found.append((plain(", ".join(of_group)), (x, y)))
-    return found
+    return sorted(found, key=lambda text: text[1])
 
 
 def _draw_distances(ax: Axes, lens: Array, joints: Array) -> None:
@@ -340,7 +358,7 @@ def _draw_growth(plan: Plan) -> Figure:
 
     with new_figure(1, 1, _PANEL) as (figure, (ax,)):
         for chosen, style, label in (
-            (known & planned, "-o", "planned"),
+            (known & planned, "-o", "planned"),  # above the others, where it is one point
             (
                 known & (~planned | (plan.growth[:, 0] == plan.n_images)),
                 "--o",
@@ -348,7 +366,8 @@ def _draw_growth(plan: Plan) -> Figure:
             ),
         ):
             n, value = plan.growth[chosen].T
-            ax.loglog(n, scale * value, style, markersize=3.0, label=label)
+            ax.loglog(n, scale * value, style, markersize=3.0, label=label,
+                      zorder=3.0 if label == "planned" else 2.0)  # fmt: skip
         for axis in (ax.xaxis, ax.yaxis):
             axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axis.set_major_formatter("{x:g}")

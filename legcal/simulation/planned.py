@@ -86,7 +86,10 @@ class PlannedSession:
 def read_plan(folder: Path, nominal: Machine) -> PlannedSession:
     """Return a planned session of a machine. Raises UsageError if it is none, or of another one."""
     try:
-        plan = validate(PlanDocument, dict(read_json(folder / PLAN_NAME)), folder / PLAN_NAME)
+        document = read_json(folder / PLAN_NAME)
+        if not isinstance(document, dict) or "legcal_plan" not in document:
+            raise ValueError("another document")
+        plan = validate(PlanDocument, document, folder / PLAN_NAME)
         places = [view.T_base_camera.motion() for view in plan.views.values()]
         laid = None if plan.T_base_board is None else plan.T_base_board.motion()
     except (OSError, ValueError, TypeError) as error:
