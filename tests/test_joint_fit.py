@@ -180,6 +180,22 @@ def test_an_arm_that_is_no_cylinder_is_left_out_as_a_whole_and_bends_nothing(px:
         assert error < {"m": 1e-8, "rad": 1e-7}[found.estimates.units[parameter]], parameter
 
 
+@pytest.mark.parametrize("factor", [1.0, 1.015])
+def test_a_stated_length_that_is_another_one_is_doubted(factor: float) -> None:
+    """Images of a machine whose motors turn suit any size."""
+    session = far_session("delta")
+    rod = session.truth.legs[0]
+    known = {f"{rod.name}.length": Prior(factor * rod.q0, 5e-5)}
+    radii = frozenset(radius_name(session.legs.names[j], part) for j, part in session.legs.radii)
+    choices = Choices(priors=known, free=radii)
+    found = refine(
+        session.legs, session.measurements, session.outlines, session.start, choices=choices
+    )
+    doubts = [note for note in found.notes if f"{rod.name}.length says how large" in note]
+    assert len(doubts) == (factor > 1.0)
+    assert all("1.5 % longer than the model's" in note for note in doubts)
+
+
 @pytest.mark.parametrize("known_radii", [False, True])
 def test_of_a_3_upu_that_only_translates_all_is_found_that_images_and_readings_show(
     known_radii: bool,

@@ -44,7 +44,8 @@ def overrides_of_call(
     found: list[Override] = []
     problems: list[str] = []
     for action, text, value in entries:
-        where = f"The {_WORDS[action]} {describe(text)}"
+        word = "length" if action == "prior" and ":" in text else _WORDS[action]
+        where = f"The {word} {describe(text)}"
         try:
             found.append(read_override(action, text, where, value))
         except ValueError as error:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 PLACES, GROWTH, CHECKLIST, PAGE_NAME = "places.svg", "growth.svg", "checklist.txt", "plan.html"
 _CAMERA_COLOUR, _BOARD_COLOUR = "#b45309", "#15803d"
-_WORST = 12  # parameters that are told
+_WORST = 12  # parameters that are told, as many of each unit
 _PANEL = (6.0, 5.6)  # [inch]
 _LEAST = 6  # images, from which errors are drawn: fewer know next to nothing
 _FEW_TICKS = 5.0  # times the least error, up to which ticks are not those of decades
@@ -51,14 +51,19 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
         )
         for view in plan.views
     ]
-    worst = np.argsort(-np.nan_to_num(plan.sigma), kind="stable")[:_WORST]
+    known = [i for i in np.argsort(-plan.sigma, kind="stable").tolist() if plan.sigma[i] > 0.0]
+    by_unit = {
+        unit: [i for i in known if plan.units[i] == unit] for unit in sorted(set(plan.units))
+    }
+    of_units = [of_unit for of_unit in by_unit.values() if of_unit]
+    worst = [i for of_unit in of_units for i in of_unit[: _WORST // len(of_units)]]
     parameters = [
         (
             plan.names[i],
             f"{SHOWN_IN[plan.units[i]][0] * plan.sigma[i]:.4f}",
             SHOWN_IN[plan.units[i]][1],
         )
-        for i in worst.tolist()
+        for i in worst
     ]
     growth = [(f"{n:.0f}", _shown(plan, value)) for n, value in _told(plan)]
     distances = [

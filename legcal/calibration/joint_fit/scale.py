@@ -17,11 +17,12 @@ from legcal.calibration.joint_fit.sensitivity import Sensitivity
 from legcal.calibration.joint_fit.variables import State
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array
-from legcal.machine import LegColumns, actuators_of, kind_of_parameter
+from legcal.machine import LegColumns, actuators_of, kind_of_parameter, list_in_words
 
 SCALE = "the scale, which radii alone say, by one standard deviation"
 _FEWEST = 3  # radii
 _SPREAD = 0.25  # of their common difference
+_OTHER_LENGTH = 0.0075  # of rods, from which on a stated distance may be another one
 _LENGTHS = {"base", "platform", "offset", "length"}  # kinds of parameters that say how large it is
 
 
@@ -91,6 +92,38 @@ def sensitivity_to_scale(
 
 
 def scale_notes(problem: FitProblem, state: State) -> tuple[str, ...]:
+    """Return notes where a machine comes out larger or smaller than its model by one factor."""
+    return (*_of_stated_lengths(problem, state), *_of_radii(problem, state))
+
+
+def _of_stated_lengths(problem: FitProblem, state: State) -> tuple[str, ...]:
+    """Return a note where stated distances alone say the scale, and make rods another length.
+
+    Images agree with a machine of any size: nothing else tells that another distance was measured.
+    """
+    priors = problem.choices.priors
+    stated = [n for n in priors if ":" in n or kind_of_parameter(n) == "length"]
+    turn = all(actuator.turns for actuator in actuators_of(problem.legs.nominal))
+    if not stated or not turn or len(problem.readings) or any(map(len, problem.boards)):
+        return ()
+    rods = [
+        fitted.q0 / nominal.q0 - 1.0
+        for fitted, nominal in zip(state.legs, problem.legs.nominal, strict=True)
+        if nominal.q0 > 0.0
+    ]
+    common = float(np.median(rods)) if rods else 0.0
+    if abs(common) < _OTHER_LENGTH:
+        return ()
+    way = "shorter" if common < 0.0 else "longer"
+    return (
+        f"Rods come out {1e2 * abs(common):.1f} % {way} than the model's, since "
+        f"{list_in_words(stated)} says how large the machine is, and images suit any size; if the "
+        "model is not that far off, another distance was measured: measure it once more, or a "
+        "second one.",
+    )
+
+
+def _of_radii(problem: FitProblem, state: State) -> tuple[str, ...]:
     """Return a note where all radii come out larger or smaller than the model's by one factor."""
     free = problem.block("radii").unknown[:, 0] >= 0
     nominal = np.array([problem.legs.radii[part] for part in problem.outlines.parts])
