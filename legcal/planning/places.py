@@ -183,16 +183,14 @@ def places_around(
             f"{np.degrees(setting.turn):g} deg, needed one; use a camera with a wider view, or "
             "correct the focal length in its file, or name --places."
         )
+    if bounds is None:
+        return found
     inside = [place for place in found if place.is_inside(bounds)]
-    if bounds is not None and len(inside) < _TURNS:  # a box between those places
+    if len(inside) < _TURNS:  # a box between those places
         inside += _places_in(bounds, points, camera, setting)
     if not inside:
         where = np.array([place.T_base_camera.translation for place in found])
-        distance, least = (
-            (1.0, 1.0)
-            if bounds is None
-            else _distances(bounds.mean(axis=1), points, camera, setting)
-        )
+        _, distance, least = _distances(bounds.mean(axis=1), points, camera, setting)
         where_to = " that reach one"
         if distance > _FARTHER * least:
             where_to = ", nearer to the machine"
@@ -226,9 +224,8 @@ def _places_in(bounds: Array, points: Array, camera: Camera, setting: Setting) -
     grid = np.meshgrid(*(np.linspace(low, high, _ACROSS) for low, high in bounds))
     found = []
     for position in np.stack(grid, axis=-1).reshape(-1, 3):
-        away = position - 0.5 * (points.min(axis=0) + points.max(axis=0))
-        d, distance = _distances(position, points, camera, setting)
-        target, size, reach = _extent(away / d, points)
+        toward, d, distance = _distances(position, points, camera, setting)
+        target, size, reach = _extent(toward, points)
         if d - reach >= _CLEARANCE * size and min(_NEARER) <= d / distance <= _FARTHER:
             found.append(Place(look_at(position, target)))
     return found
@@ -236,11 +233,14 @@ def _places_in(bounds: Array, points: Array, camera: Camera, setting: Setting) -
 
 def _distances(
     position: Array, points: Array, camera: Camera, setting: Setting
-) -> tuple[float, float]:
-    """Return how far a position is from the middle of points, and from how far all are seen [m]."""
+) -> tuple[Array, float, float]:
+    """Return the direction of a position from points, how far it is, and from how far all show.
+
+    Distances are those from the middle of the points [m].
+    """
     away = position - 0.5 * (points.min(axis=0) + points.max(axis=0))
     d = max(float(np.linalg.norm(away)), _ROUNDING)
-    return d, _distance_of_all(away / d, points, camera, setting)
+    return away / d, d, _distance_of_all(away / d, points, camera, setting)
 
 
 def _extent(toward: Array, points: Array) -> tuple[Array, float, float]:

@@ -12,7 +12,6 @@ import numpy as np
 from markupsafe import Markup
 from rich.console import RenderableType
 
-from legcal.data import reading_columns
 from legcal.errors import printable
 from legcal.figures import new_figure, plain
 from legcal.files import SHOWN_IN
@@ -205,12 +204,11 @@ def _home_in_words(plan: Plan) -> str:
     """Return the readings of the motors at home."""
     machine = plan.machine
     readings = poses_at(machine, [machine.home_configuration]).readings[0]
-    motors = [machine.legs[j] for j in machine.motors]
-    columns = reading_columns(machine.legs)
     found = []
-    for column, leg, q in zip(columns, motors, readings[list(machine.motors)], strict=True):
+    for j in machine.motors:
+        leg = machine.legs[j]
         size, unit = SHOWN_IN[leg.reading_unit]
-        found.append(f"{column.name} {size * q:z.2f} {unit}")
+        found.append(f"{leg.prismatic} {size * readings[j]:z.2f} {unit}")
     return ", ".join(found)
 
 
@@ -362,17 +360,13 @@ def _draw_growth(plan: Plan) -> Figure:
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
     with new_figure(1, 1, _PANEL) as (figure, (ax,)):
-        for chosen, style, label in (
-            (known & planned, "-o", "planned"),  # above the others, where it is one point
-            (
-                known & (~planned | (plan.growth[:, 0] == plan.n_images)),
-                "--o",
-                "more of their kind",
-            ),
+        more = known & (~planned | (plan.growth[:, 0] == plan.n_images))
+        for chosen, style, label, above in (  # planned ones in front, where they are one point
+            (known & planned, "-o", "planned", 3.0),
+            (more, "--o", "more of their kind", 2.0),
         ):
             n, value = plan.growth[chosen].T
-            ax.loglog(n, scale * value, style, markersize=3.0, label=label,
-                      zorder=3.0 if label == "planned" else 2.0)  # fmt: skip
+            ax.loglog(n, scale * value, style, markersize=3.0, label=label, zorder=above)
         for axis in (ax.xaxis, ax.yaxis):
             axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axis.set_major_formatter("{x:g}")

@@ -31,15 +31,22 @@ def has_length(problem: FitProblem) -> bool:
 
     A list and no rank, as ``is_scale_open`` of identify is: it must serve where a fit failed.
     """
+    stated = {kind_of_parameter(name) for name in stated_parameters(problem) if ":" not in name}
+    return (
+        _images_have_length(problem)
+        or any(":" in name for name in problem.choices.priors)
+        or bool(stated & _LENGTHS)
+    )
+
+
+def _images_have_length(problem: FitProblem) -> bool:
+    """Say whether what was measured with the images is a length: a reading, or a board."""
     actuators = actuators_of(problem.legs.nominal)
     read = problem.observed.actuator_readings.actuator.tolist()
-    stated = {kind_of_parameter(name) for name in stated_parameters(problem) if ":" not in name}
     return (
         len(problem.readings) > 0
         or any(len(corners) for corners in problem.boards)
         or any(not actuators[a].turns for a in read)
-        or any(":" in name for name in problem.choices.priors)
-        or bool(stated & _LENGTHS)
     )
 
 
@@ -103,8 +110,7 @@ def _of_stated_lengths(problem: FitProblem, state: State) -> tuple[str, ...]:
     """
     priors = problem.choices.priors
     stated = [n for n in priors if ":" in n or kind_of_parameter(n) == "length"]
-    turn = all(actuator.turns for actuator in actuators_of(problem.legs.nominal))
-    if not stated or not turn or len(problem.readings) or any(map(len, problem.boards)):
+    if not stated or _images_have_length(problem):
         return ()
     rods = [
         fitted.q0 / nominal.q0 - 1.0
