@@ -44,13 +44,18 @@ from outline_sessions import (
 from legcal import LegcalError, calibrate, evaluate, load_mechanism
 from legcal.calibration.joint_fit import fit
 from legcal.calibration.joint_fit.diagnostics import arm_misfits, wrong_arms
-from legcal.data import Outlines, are_of_arms
+from legcal.data.outlines import Outlines, are_of_arms
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, cross
-from legcal.machine import Machine, arms_at
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array
+from legcal.machine.model import Machine
+from legcal.machine.rods import arms_at
 from legcal.perception.outline import WIDTH_TOLERANCE, WRONG_WIDTH
-from legcal.planning import LENGTH_SIGMA
-from legcal.simulation import Level, SimulationSettings, moved_outlines, noisy_outlines, simulate
+from legcal.planning.request import LENGTH_SIGMA
+from legcal.simulation.dataset import simulate
+from legcal.simulation.observe import moved_outlines, noisy_outlines
+from legcal.simulation.request import Level
+from legcal.simulation.settings import SimulationSettings
 
 N_VIEWS, N_POSES = 3, 15
 _CIRCLE = np.array([[np.cos(t), np.sin(t)] for t in np.linspace(0.0, 2.0 * np.pi, 720)])

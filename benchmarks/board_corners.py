@@ -20,10 +20,11 @@ import numpy as np
 from board_photographs import CHESSBOARD, PrintedBoard, board_poses, photograph_board
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception import NumberedCorners, search_board
-from legcal.simulation import Appearance
-from legcal.vision import APRIL_TAGS, Board, Camera
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.perception.board_corners import NumberedCorners, search_board
+from legcal.simulation.rendering.appearance import Appearance
+from legcal.vision.board import APRIL_TAGS, Board
+from legcal.vision.camera import Camera
 
 BOARDS = {
     "chessboard": CHESSBOARD,

@@ -20,11 +20,13 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array
-from legcal.simulation import Appearance, mild_lens
+from legcal.geometry.types import Array
 from legcal.simulation.board import BoardPrint
+from legcal.simulation.cameras import mild_lens
+from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.pipeline import CAMERAS, CameraPipeline
-from legcal.vision import Board, Camera
+from legcal.vision.board import Board
+from legcal.vision.camera import Camera
 
 CHESSBOARD = Board("chessboard", 10, 7, 0.025)
 N_RAYS, _STEP = 55, 34  # of a pixel that an edge may cross: a Fibonacci lattice

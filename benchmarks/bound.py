@@ -40,10 +40,11 @@ from outline_study import (
 )
 from rich.console import RenderableType
 
-from legcal.calibration import Solution
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.errors import NotIdentifiable
-from legcal.machine import vector_of
-from legcal.simulation import Record, has_keys, is_failure, is_number
+from legcal.machine.parameters import vector_of
+from legcal.simulation.checkpoint import has_keys, is_failure, is_number
+from legcal.simulation.study import Record
 
 ERRORS = StartErrors(0.002, float(np.deg2rad(1.0)), 0.015, float(np.deg2rad(1.5)), full=False)
 LARGEST_RATIO = 1.02

@@ -23,7 +23,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from legcal import LegcalError, calibrate, evaluate, load_dataset
-from legcal.simulation import Level, SimulationSettings, simulate
+from legcal.simulation.dataset import simulate
+from legcal.simulation.request import Level
+from legcal.simulation.settings import SimulationSettings
 
 MODELS = Path(__file__).parents[1] / "models"
 HEADER = (

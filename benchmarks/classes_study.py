@@ -53,13 +53,19 @@ from outline_study import (
 )
 from rich.console import RenderableType
 
-from legcal.calibration import Choices, Solution, Start, refine
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.parameter_choices import Choices
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.variables import Start
 from legcal.errors import DidNotConverge, LegcalError
-from legcal.geometry import Array, components
-from legcal.machine import Leg, radius_name, vector_of
-from legcal.paper import Criteria
-from legcal.report import report
-from legcal.simulation import Record, failure_of, has_keys, is_failure, is_number
+from legcal.geometry.motions import components
+from legcal.geometry.types import Array
+from legcal.machine.leg import Leg, radius_name
+from legcal.machine.parameters import vector_of
+from legcal.paper.criteria import Criteria
+from legcal.report.render import report
+from legcal.simulation.checkpoint import has_keys, is_failure, is_number
+from legcal.simulation.study import Record, failure_of
 
 NOMINAL, FIT = "nominal", "fit"
 STEPS: tuple[Criteria, ...] = ("literal", "default")

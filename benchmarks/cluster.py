@@ -31,7 +31,8 @@ from legcal import load_dataset
 from legcal.calibration.ordered_dataset import order_dataset
 from legcal.calibration.pipeline import rough_placement
 from legcal.progress import no_progress
-from legcal.simulation import PaperStudy, run_study
+from legcal.simulation.paper import PaperStudy
+from legcal.simulation.study import run_study
 from legcal.workers import Workers, in_turn, worker_pool
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "hexapod"

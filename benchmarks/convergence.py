@@ -32,9 +32,11 @@ from outline_study import (
 )
 from rich.console import RenderableType
 
-from legcal.calibration import Solution
-from legcal.machine import Leg, pose_sensitivity
-from legcal.simulation import Record, has_keys, is_failure, is_number
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.machine.equations import pose_sensitivity
+from legcal.machine.leg import Leg
+from legcal.simulation.checkpoint import has_keys, is_failure, is_number
+from legcal.simulation.study import Record
 
 FAR = 5.0  # standard deviations
 ENOUGH = 0.99  # of the runs must be right

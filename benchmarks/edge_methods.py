@@ -10,8 +10,8 @@ from legcal.calibration.measurement_noise.canny import edge_points
 from legcal.geometry.types import Array
 from legcal.perception.profiles import Edge
 from legcal.perception.subpixel_edges import measure_edges
-from legcal.vision import Grey
 from legcal.vision.cylinder import EPSILON
+from legcal.vision.image_file import Grey
 
 REACH = 2.5  # from the start, of a point that belongs to an outline [px]
 

@@ -12,10 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from legcal import calibrate, load_dataset, load_mechanism
-from legcal.calibration import Calibration
 from legcal.calibration.joint_fit.variables import platform_poses
+from legcal.calibration.result import Calibration
 from legcal.data.axes import axes_from_outlines
-from legcal.machine import KinematicParameters, point_like_legs, pose_differences, to_vector
+from legcal.machine.kinematics import pose_differences
+from legcal.machine.leg import KinematicParameters, point_like_legs
+from legcal.machine.parameters import to_vector
 from legcal.paper.four_steps import run_steps
 from legcal.paper.nominal import nominal_machine
 

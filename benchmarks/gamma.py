@@ -20,7 +20,8 @@ from honesty import honesty
 
 from legcal import Appearance, LegcalError, calibrate, load_dataset, load_mechanism
 from legcal.data.dataset import Dataset
-from legcal.simulation import SimulationSettings, simulate
+from legcal.simulation.dataset import simulate
+from legcal.simulation.settings import SimulationSettings
 
 ENCODED = 2.2
 HEADER = (

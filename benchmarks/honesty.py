@@ -21,12 +21,15 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from legcal import calibrate, load_mechanism
-from legcal.calibration import Calibration
 from legcal.calibration.joint_fit.outline_errors import KINDS
-from legcal.geometry import components
+from legcal.calibration.result import Calibration
+from legcal.geometry.motions import components
 from legcal.geometry.types import Array
-from legcal.machine import Machine, geometries, pose_sensitivity, vector_of
-from legcal.simulation import SimulationSettings, simulate
+from legcal.machine.equations import pose_sensitivity
+from legcal.machine.model import Machine
+from legcal.machine.parameters import geometries, vector_of
+from legcal.simulation.dataset import simulate
+from legcal.simulation.settings import SimulationSettings
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "examples/hexapod", ROOT / "tests/data/hexapod-truth/models/hexapod.yaml"

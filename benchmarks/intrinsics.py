@@ -39,12 +39,15 @@ from outline_sessions import (
     platform_errors,
 )
 
-from legcal.calibration import Solution
 from legcal.calibration.camera_calibration.adjustment import robust_fit
-from legcal.data import View
-from legcal.geometry import Array, components
-from legcal.machine import pose_sensitivity, vector_of
-from legcal.vision import Camera, ImageSize, intrinsic_names, intrinsic_values, with_intrinsics
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.data.measurements import View
+from legcal.geometry.motions import components
+from legcal.geometry.types import Array
+from legcal.machine.equations import pose_sensitivity
+from legcal.machine.parameters import vector_of
+from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
+from legcal.vision.image_file import ImageSize
 
 KINDS = ("true camera", "drawn, exact", "drawn, covariance")
 

@@ -18,15 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from legcal.geometry.types import Array
-from legcal.machine import (
-    Follower,
-    Machine,
-    forward_kinematics,
-    inverse_kinematics,
-    load_mechanism,
-    random_configurations,
-    singularity,
-)
+from legcal.machine.configurations import random_configurations
+from legcal.machine.kinematics import Follower, forward_kinematics, inverse_kinematics
+from legcal.machine.loader import load_mechanism
+from legcal.machine.mobility import singularity
+from legcal.machine.model import Machine
 
 MODELS = Path(__file__).parents[1] / "models"
 STEP = 0.01  # of the travel

@@ -15,7 +15,7 @@ import argparse
 
 import numpy as np
 
-from legcal.geometry import Array
+from legcal.geometry.types import Array
 from legcal.perception.limb import SURFACE_SIGMA, SURFACES
 
 LAMPS, IN_FRONT = 2, 0.8

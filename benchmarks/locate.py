@@ -24,7 +24,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import Location, ToolPoses, load_mechanism, locate
 from legcal.geometry.types import Array
-from legcal.machine import Machine, random_configurations
+from legcal.machine.configurations import random_configurations
+from legcal.machine.model import Machine
 
 POSES = 20
 SIGMA_POSITION = 0.02e-3  # [m]

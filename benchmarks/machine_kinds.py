@@ -55,13 +55,19 @@ from outline_sessions import (
 from outline_study import failures_of
 
 from legcal import LegcalError, calibrate, evaluate, load_mechanism
-from legcal.calibration import Calibration, Evaluation, Solution
+from legcal.calibration.evaluation import Evaluation
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.result import Calibration
 from legcal.data.outlines import read_observations
-from legcal.geometry import Array
-from legcal.machine import Machine, geometries, radius_name, vector_of
-from legcal.simulation import Level, Request, failure_of, simulate
+from legcal.geometry.types import Array
+from legcal.machine.leg import radius_name
+from legcal.machine.model import Machine
+from legcal.machine.parameters import geometries, vector_of
+from legcal.simulation.dataset import simulate
+from legcal.simulation.request import Level, Request
 from legcal.simulation.settings import requested
-from legcal.vision import EPSILON
+from legcal.simulation.study import failure_of
+from legcal.vision.cylinder import EPSILON
 
 N_VIEWS, N_POSES = 3, 15
 LENGTH_SIGMA = 0.05  # [mm] of the distance of two joints that motors which turn need

@@ -40,20 +40,16 @@ from legcal import ParameterErrors, SimulationSettings, Spread, load_dataset, si
 from legcal.calibration.diagnosis.diagnosis import diagnose
 from legcal.calibration.diagnosis.mistakes import Assumed, as_given, mistakes
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
-from legcal.data import Dataset
-from legcal.geometry import Array
-from legcal.machine import Cylinder, Leg, LegKind, Machine
-from legcal.perception import (
-    LEFT_RIGHT,
-    UPSIDE_DOWN,
-    CandidatePairs,
-    Placement,
-    pairs_of_images,
-)
-from legcal.perception.agreement import as_if
-from legcal.perception.placement import sensor_extent
+from legcal.data.dataset import Dataset
+from legcal.geometry.types import Array
+from legcal.machine.leg import Cylinder, Leg, LegKind
+from legcal.machine.model import Machine
+from legcal.perception.agreement import as_if, pairs_of_images
+from legcal.perception.camera_search import LEFT_RIGHT, UPSIDE_DOWN
+from legcal.perception.candidate_pairs import CandidatePairs
+from legcal.perception.placement import Placement, sensor_extent
 from legcal.progress import no_progress
-from legcal.simulation import Level
+from legcal.simulation.request import Level
 from legcal.workers import Run, worker_pool
 
 MODELS = ("hexapod", "3-rps", "3-upu", "tricept")

@@ -22,19 +22,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2, norm
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array
-from legcal.machine import (
-    Leg,
-    actuator_index,
-    arms_at,
-    by_step,
-    freedoms,
-    independent,
-    joints_at,
-    moved_legs,
-    pose_equations,
-)
-from legcal.simulation import silhouette
+from legcal.geometry.types import Array
+from legcal.machine.equations import freedoms, pose_equations
+from legcal.machine.leg import Leg
+from legcal.machine.parameters import moved_legs
+from legcal.machine.rods import actuator_index, arms_at, joints_at
+from legcal.machine.ties import by_step, independent
+from legcal.simulation.visibility import silhouette
 
 _STEP = 1e-6  # [m] or [rad] of differences
 _RANK = 1e-9  # of the largest singular value

@@ -17,61 +17,52 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration import (
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.variables import (
     DEFAULT_SETTINGS,
     FittedLegs,
     RefinementSettings,
-    Solution,
     Start,
     cameras_from_hints,
     platform_poses,
-    refine,
     start_from,
 )
-from legcal.data import Measurements, Outlines, View, axes_from_outlines
+from legcal.data.axes import axes_from_outlines
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines
 from legcal.errors import DidNotConverge
-from legcal.files import read_yaml
-from legcal.geometry import Array, IntArray
-from legcal.machine import (
-    ActuatorColumns,
-    Dimensions,
-    Leg,
-    LegKind,
-    Machine,
-    Parametrization,
+from legcal.files.schema import read_yaml
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.actuator import ActuatorColumns
+from legcal.machine.dimensions import Dimensions
+from legcal.machine.family import description_of
+from legcal.machine.kinematics import platform_in_base, pose_differences
+from legcal.machine.leg import Leg, LegKind, radius_name
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.model_builder import create_model
+from legcal.machine.parameters import Parametrization, geometries, moved_legs, parametrize
+from legcal.machine.rods import (
     actuator_index,
     arms_at,
-    create_model,
-    description_of,
     ends_at_poses,
-    geometries,
-    load_mechanism,
-    moved_legs,
-    on_ties,
-    parametrize,
-    platform_in_base,
-    pose_differences,
-    radius_name,
     reading_legs,
     readings_of_rods,
-    solve_poses,
 )
-from legcal.paper import Criteria, NominalMachine, run_steps
-from legcal.simulation import (
-    RAISED,
-    OutlineNoise,
-    Scene,
-    cameras_around,
-    draw_poses,
-    dressed,
-    mild_lens,
-    noisy_outlines,
-    outlines_of,
-    pose_machine,
-    take_images,
-    write_model_with,
-)
-from legcal.vision import Camera
+from legcal.machine.solved_poses import solve_poses
+from legcal.machine.ties import on_ties
+from legcal.paper.criteria import Criteria
+from legcal.paper.four_steps import run_steps
+from legcal.paper.nominal import NominalMachine
+from legcal.simulation.cameras import cameras_around, mild_lens
+from legcal.simulation.hexapod import RAISED
+from legcal.simulation.observe import OutlineNoise, Scene, noisy_outlines, outlines_of
+from legcal.simulation.poses import draw_poses
+from legcal.simulation.solids import dressed, pose_machine
+from legcal.simulation.truth import write_model_with
+from legcal.simulation.visibility import take_images
+from legcal.vision.camera import Camera
 
 COPLANAR, NONCOPLANAR = "6-spu-coplanar", "6-spu-noncoplanar"
 MACHINES = (NONCOPLANAR, COPLANAR, "3-upu-tilted", "3-rpr")

@@ -32,13 +32,9 @@ from rich.text import Text
 from legcal.cli.options import print_failure
 from legcal.errors import LegcalError, UsageError
 from legcal.processors import processors
-from legcal.report import report, table
-from legcal.simulation import (
-    Record,
-    failure_of,
-    has_keys,
-    run_study,
-)
+from legcal.report.render import report, table
+from legcal.simulation.checkpoint import has_keys
+from legcal.simulation.study import Record, failure_of, run_study
 
 Found = dict[str, Any]
 """What all sessions of a machine showed, as in the document: its name, ``met``, figures."""

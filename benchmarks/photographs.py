@@ -23,9 +23,12 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
-from legcal.machine import Machine, load_mechanism, random_configurations
-from legcal.simulation import Appearance, dressed, prepare_view
-from legcal.simulation.solids import PlacedSolid, link_poses, placed
+from legcal.machine.configurations import random_configurations
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.simulation.rendering.appearance import Appearance
+from legcal.simulation.rendering.scene import prepare_view
+from legcal.simulation.solids import PlacedSolid, dressed, link_poses, placed
 from legcal.vision.camera import Camera
 
 MODELS = Path(__file__).parents[1] / "models"

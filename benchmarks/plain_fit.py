@@ -15,7 +15,7 @@ from scipy.sparse import coo_array, csr_array
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import State
 from legcal.geometry.types import Array, BoolArray
-from legcal.machine import free_coordinates
+from legcal.machine.parameters import free_coordinates
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,30 +28,26 @@ from outline_sessions import ROUND_ARMS, made
 from scipy.stats import spearmanr
 
 import legcal
-from legcal.calibration import NO_CHOICES, Choices, Prior
-from legcal.data import sigmas_of
+from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
+from legcal.data.reading_units import sigmas_of
 from legcal.errors import LegcalError, NotIdentifiable
-from legcal.geometry import Array, direction_above
-from legcal.machine import Machine, feasible_poses, load_mechanism, poses_at
-from legcal.planning import (
-    DEFAULT_NOISE,
-    LENGTH_SIGMA,
-    WHITE,
-    Candidates,
-    Place,
-    Plan,
-    Predictor,
-    Scene,
-    Task,
-    all_points,
-    drawn_covariance,
-    places_along,
-    surely_reached,
-    workspace_of,
-    write_session,
-)
-from legcal.simulation import Distribution, Level, SimulationSettings, Spread, simulate
-from legcal.vision import sample_camera
+from legcal.geometry.lines import direction_above
+from legcal.geometry.types import Array
+from legcal.machine.feasibility import feasible_poses, poses_at
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.planning.goals import workspace_of
+from legcal.planning.information import DEFAULT_NOISE, WHITE, Predictor
+from legcal.planning.places import Place, all_points, places_along
+from legcal.planning.planned_session import Plan
+from legcal.planning.planner import Candidates, Scene, Task, drawn_covariance
+from legcal.planning.poses import surely_reached
+from legcal.planning.request import LENGTH_SIGMA
+from legcal.planning.session import write_session
+from legcal.simulation.dataset import simulate
+from legcal.simulation.request import Level
+from legcal.simulation.settings import Distribution, SimulationSettings, Spread
+from legcal.vision.camera import sample_camera
 
 MACHINES = ("hexapod", "3-upu-tilted", "3-rpr", "3-rps", "tricept")
 _LIFTS = {True: (0.1, 0.7), False: (0.8, 1.3)}  # [rad] of random places; planar machines: False

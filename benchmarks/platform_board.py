@@ -23,17 +23,17 @@ import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import calibrate, evaluate, load_mechanism, simulate
-from legcal.calibration.joint_fit import fitted_legs, refine, start_from
 from legcal.calibration.joint_fit.factors import BoardCorners
-from legcal.calibration.joint_fit.variables import Start
-from legcal.data import found_corners
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.variables import Start, fitted_legs, start_from
+from legcal.data.corners import found_corners
 from legcal.data.outlines import no_outlines
 from legcal.errors import LegcalError
-from legcal.geometry import Array
-from legcal.machine import geometries, moved_legs
-from legcal.simulation import SimulationSettings
+from legcal.geometry.types import Array
+from legcal.machine.parameters import geometries, moved_legs
 from legcal.simulation.request import Level
 from legcal.simulation.session import SimulatedSession, simulate_session, streams
+from legcal.simulation.settings import SimulationSettings
 
 SIGMA_PX = 0.05
 WRONG_M = 0.002

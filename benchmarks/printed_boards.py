@@ -29,18 +29,15 @@ from camera_sessions import together
 
 from legcal.calibration.camera_calibration.adjustment import RobustFit, robust_fit
 from legcal.calibration.camera_calibration.starts import from_scratch, part_of
-from legcal.geometry import Array
-from legcal.perception import BoardImages, Sheet, find_corners
-from legcal.simulation import Appearance, mild_lens
+from legcal.geometry.types import Array
+from legcal.perception.board_adjustment import BoardImages, Sheet
+from legcal.perception.board_corners import find_corners
+from legcal.simulation.cameras import mild_lens
+from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.pipeline import CAMERAS
-from legcal.vision import (
-    Board,
-    Camera,
-    ImageSize,
-    intrinsic_names,
-    intrinsic_values,
-    read_image,
-)
+from legcal.vision.board import Board
+from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values
+from legcal.vision.image_file import ImageSize, read_image
 
 BOARD = Board("chessboard", 10, 7, 0.025)
 CAMERA = Camera(

@@ -13,25 +13,29 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.ordered_dataset import nominal_poses
 from legcal.data.measurements import Measurements, View
-from legcal.geometry import look_at
+from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array, BoolArray, Image
-from legcal.machine import Cylinder as Visible
-from legcal.machine import LegKind, Machine, load_mechanism
-from legcal.simulation import (
-    Appearance,
-    LegView,
-    Light,
-    ParameterErrors,
-    Sampling,
-    Spread,
-    commanded_poses,
+from legcal.machine.leg import Cylinder as Visible
+from legcal.machine.leg import LegKind
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.simulation.poses import commanded_poses
+from legcal.simulation.rendering.appearance import Appearance, Light
+from legcal.simulation.rendering.scene import prepare_view
+from legcal.simulation.request import Sampling
+from legcal.simulation.settings import ParameterErrors, Spread
+from legcal.simulation.solids import (
+    Box,
+    Material,
+    PlacedSolid,
+    PosedMachine,
+    Solid,
+    SolidCylinder,
     dressed,
-    legs_in_image,
     pose_machine,
-    prepare_view,
-    write_true_model,
 )
-from legcal.simulation.solids import Box, Material, PlacedSolid, PosedMachine, Solid, SolidCylinder
+from legcal.simulation.truth import write_true_model
+from legcal.simulation.visibility import LegView, legs_in_image
 from legcal.vision.camera import Camera
 
 SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))

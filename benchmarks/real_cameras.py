@@ -36,11 +36,16 @@ import numpy as np
 from board_photographs import PrintedBoard, photograph_boards
 
 from legcal import LegcalError, calibrate, calibrate_camera, load_mechanism
-from legcal.calibration import Calibration
-from legcal.geometry import Array, components
-from legcal.machine import geometries, pose_sensitivity, vector_of
-from legcal.simulation import Appearance, SimulationSettings, mild_lens, simulate
+from legcal.calibration.result import Calibration
+from legcal.geometry.motions import components
+from legcal.geometry.types import Array
+from legcal.machine.equations import pose_sensitivity
+from legcal.machine.parameters import geometries, vector_of
+from legcal.simulation.cameras import mild_lens
+from legcal.simulation.dataset import simulate
+from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.pipeline import CAMERAS
+from legcal.simulation.settings import SimulationSettings
 from legcal.workers import worker_pool
 
 MODELS = "hexapod", "3-rps", "3-upu"

@@ -29,7 +29,7 @@ from plain_fit import PlainFit
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.problem import build_fit
-from legcal.estimation import minimise
+from legcal.estimation.solver import minimise
 
 SIZES = (45, 450, 4500)
 REPEATS = 5

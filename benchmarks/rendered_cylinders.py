@@ -11,13 +11,13 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array, Image
-from legcal.simulation import Appearance, Light, prepare_view
+from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.rays import divided, in_view
-from legcal.simulation.rendering.scene import FrameBuffer, develop
+from legcal.simulation.rendering.scene import FrameBuffer, develop, prepare_view
 from legcal.simulation.solids import Material, PlacedSolid, Solid, SolidCylinder
-from legcal.vision import Grey
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
+from legcal.vision.image_file import Grey
 from legcal.vision.visibility import Band, bands_of_legs
 
 PHOTOGRAPHS = 3  # of every scene

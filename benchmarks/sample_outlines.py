@@ -21,12 +21,13 @@ from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
-from legcal.machine import Machine, forward_kinematics
+from legcal.machine.kinematics import forward_kinematics
+from legcal.machine.model import Machine
 from legcal.perception.detection import measure_outlines
 from legcal.perception.placement import Placement, Search
 from legcal.perception.recognition import place_views
-from legcal.vision import Grey
 from legcal.vision.cylinder import EPSILON
+from legcal.vision.image_file import Grey
 
 ROOT = Path(__file__).resolve().parents[1]
 DATASET = ROOT / "examples" / "hexapod"

@@ -41,8 +41,7 @@ from legcal.perception.pair_matching import CameraPoses, Picture, Pictures, leg_
 from legcal.perception.placement import Placement, Search, group_views
 from legcal.perception.recognition import place_views
 from legcal.perception.view_fit import refine_views
-from legcal.simulation import silhouette
-from legcal.simulation.visibility import field_of_view
+from legcal.simulation.visibility import field_of_view, silhouette
 from legcal.workers import worker_pool
 
 WRONG_PX = 3.0  # an outline this far from the true one is another edge

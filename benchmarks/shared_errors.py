@@ -20,11 +20,20 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from legcal.calibration import KINDS, PLACES, fitted_legs, possible_biases, shifts_at_places
 from legcal.calibration.joint_fit.factors import observed_outlines
-from legcal.data import OBSERVATIONS_NAME, Measurements, Outlines, load_dataset, read_outlines
-from legcal.estimation import Effects, estimate_variances
-from legcal.geometry import Array, whitener
+from legcal.calibration.joint_fit.outline_errors import (
+    KINDS,
+    PLACES,
+    possible_biases,
+    shifts_at_places,
+)
+from legcal.calibration.joint_fit.variables import fitted_legs
+from legcal.data.dataset import OBSERVATIONS_NAME, load_dataset, read_outlines
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines
+from legcal.estimation.variances import Effects, estimate_variances
+from legcal.geometry.covariances import whitener
+from legcal.geometry.types import Array
 
 _OTHER = 1.0  # [px]
 _ROUNDS = 4  # in which the scale of claimed errors follows

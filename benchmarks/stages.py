@@ -25,24 +25,21 @@ import numpy as np
 
 from legcal import calibrate, evaluate
 from legcal.errors import DidNotConverge, LegcalError
-from legcal.machine import KinematicParameters
-from legcal.paper import Criteria
+from legcal.machine.leg import KinematicParameters
+from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_steps
-from legcal.simulation import (
-    OutlineNoise,
+from legcal.simulation.dataset import SimulatedDataset, simulate
+from legcal.simulation.hexapod import (
     PaperHexapod,
-    SimulatedDataset,
-    SimulationSettings,
-    TableNoise,
     extreme_poses,
     hexapod_cameras,
     hexapod_session,
-    nominal_of,
     paper_hexapod,
     perturb,
-    platform_errors,
-    simulate,
 )
+from legcal.simulation.observe import OutlineNoise, TableNoise
+from legcal.simulation.paper import nominal_of, platform_errors
+from legcal.simulation.settings import SimulationSettings
 
 NOISES: dict[str, OutlineNoise | TableNoise] = {
     "outlines, 0.001 px a point, 300 points": OutlineNoise(1e-3, 300),

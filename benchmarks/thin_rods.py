@@ -23,11 +23,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from legcal.geometry import Array
+from legcal.geometry.types import Array
 from legcal.perception.profiles import Edge
 from legcal.perception.subpixel_edges import measure_edges
-from legcal.vision import Band, Camera, Grey
+from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
+from legcal.vision.image_file import Grey
+from legcal.vision.visibility import Band
 
 WIDTHS = (6.0, 9.0, 13.0, 20.0, 60.0)  # [px]
 SIDE, LENGTH = 260, 200.0  # of the picture, and of the used piece of the rod [px]

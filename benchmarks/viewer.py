@@ -23,7 +23,9 @@ from functools import partial
 
 import numpy as np
 
-from legcal.viewer import Address, Window, open_source
+from legcal.viewer.address import Address
+from legcal.viewer.source import open_source
+from legcal.viewer.window import Window
 
 HAND = 200.0  # values a second
 AMPLITUDE = 0.2  # of the travel

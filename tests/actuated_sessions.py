@@ -12,18 +12,12 @@ from legcal.calibration.identify.predicted_observations import (
     PredictedObservations,
     default_cameras,
 )
-from legcal.geometry import Array, BoolArray, frame_on_points
-from legcal.machine import (
-    Actuator,
-    ActuatorKind,
-    JointType,
-    Leg,
-    LegKind,
-    actuator_index,
-    actuators_of,
-    parametrize,
-    rod_mode,
-)
+from legcal.geometry.motions import frame_on_points
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.actuator import Actuator, ActuatorKind
+from legcal.machine.leg import JointType, Leg, LegKind
+from legcal.machine.parameters import parametrize
+from legcal.machine.rods import actuator_index, actuators_of, rod_mode
 
 S = JointType.SPHERICAL
 UP = np.array([0.0, 0.0, 1.0])

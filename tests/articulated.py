@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from legcal.geometry import Array, IntArray
+from legcal.geometry.types import Array, IntArray
 
 HOME = np.array([0.012, -0.017, -0.45])  # of the platform, which is not turned, below the base
 UP, ACROSS = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])

@@ -7,7 +7,8 @@ from rendering import photograph
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array, Image
-from legcal.simulation import Appearance, PlacedBoard
+from legcal.simulation.board import PlacedBoard
+from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.solids import Box, Material, PlacedSolid, Solid
 from legcal.vision.board import APRIL_TAGS, Board
 from legcal.vision.camera import Camera

@@ -10,8 +10,9 @@ from rendering import photograph
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
-from legcal.perception import BoardImages, Sheet
-from legcal.simulation import Appearance, PlacedBoard
+from legcal.perception.board_adjustment import BoardImages, Sheet
+from legcal.simulation.board import PlacedBoard
+from legcal.simulation.rendering.appearance import Appearance
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import ImageSize

@@ -15,9 +15,10 @@ import typer.main
 from hexapod_example import Run, copy_of_the_example
 
 from legcal import calibrate
-from legcal.machine import Machine, loader
+from legcal.machine import loader
 from legcal.machine.files import find_model
 from legcal.machine.formats import read_source
+from legcal.machine.model import Machine
 from legcal.machine.spanning_tree import Source
 
 # Plugins that other packages bring into Hypothesis (trio's, with selenium) warn when they load.

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
-from legcal.machine import Machine, load_mechanism
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
 
 ROOT = Path(__file__).parents[1]
 HEXAPOD = ROOT / "examples" / "hexapod" / "models" / "hexapod.yaml"

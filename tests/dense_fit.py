@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from scipy.linalg import null_space
 
-from legcal.calibration.joint_fit import FitProblem, State
-from legcal.estimation import Linearization, Problem, linearize
-from legcal.geometry import Array
-from legcal.machine import posture_constraints
+from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.variables import State
+from legcal.estimation.problem import Linearization, Problem, linearize
+from legcal.geometry.types import Array
+from legcal.machine.equations import posture_constraints
 
 STEP = 1e-6
 

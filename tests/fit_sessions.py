@@ -14,47 +14,57 @@ import numpy as np
 from outline_sessions import closed_poses, moved_poses, true_machine
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal import simulation
 from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.variables import FittedLegs, Start, fitted_legs, start_from
-from legcal.data import LegAxes, Measurements, Outlines, View
-from legcal.data.axes import axes_of_table
+from legcal.data.axes import LegAxes, axes_of_table
 from legcal.data.corners import Corners, found_corners
-from legcal.geometry import Array, components, look_at, motions_of
-from legcal.machine import (
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines
+from legcal.geometry.motions import components, look_at, motions_of
+from legcal.geometry.types import Array
+from legcal.machine.kinematics import platform_in_base
+from legcal.machine.leg import (
     KinematicParameters,
     Leg,
     LegKind,
-    Machine,
-    actuator_index,
-    arms_at,
-    ends_at_poses,
+    parameters_of_legs,
+    point_like_legs,
+)
+from legcal.machine.model import Machine
+from legcal.machine.parameters import (
     free_coordinates,
     from_vector,
     geometries,
-    measured_readings,
     moved_legs,
-    parameters_of_legs,
-    platform_in_base,
-    point_like_legs,
-    readings_of_rods,
     to_vector,
 )
-from legcal.simulation import (
+from legcal.machine.rods import (
+    actuator_index,
+    arms_at,
+    ends_at_poses,
+    measured_readings,
+    readings_of_rods,
+)
+from legcal.simulation import observe
+from legcal.simulation.hexapod import (
     PAPER_VIEWS,
+    hexapod_cameras,
+    hexapod_session,
+    paper_hexapod,
+    perturb,
+)
+from legcal.simulation.observe import (
     OutlineNoise,
     Scene,
     TableNoise,
-    Viewpoint,
-    hexapod_cameras,
+    axes_in_images,
     moved_outlines,
     outlines_of,
-    paper_hexapod,
-    perturb,
     plain_scene,
 )
-from legcal.simulation.observe import axes_in_images
-from legcal.vision import Board, Camera, FixedBoard
+from legcal.simulation.visibility import Viewpoint
+from legcal.vision.board import Board, FixedBoard
+from legcal.vision.camera import Camera
 
 K = np.array([[1290.0, 0.0, 518.0], [0.0, 1280.0, 380.0], [0.0, 0.0, 1.0]])
 PINHOLE = Camera(K, 1024, 768)
@@ -106,7 +116,7 @@ class MachineSession:
         """Return readings and outlines with the errors that they claim."""
         rng, m = np.random.default_rng(seed), self.measurements
         q = m.q + m.sigma_q * rng.standard_normal(m.q.shape)
-        return replace(m, q=q), simulation.noisy_outlines(self.outlines, m.views[0].camera, rng)
+        return replace(m, q=q), observe.noisy_outlines(self.outlines, m.views[0].camera, rng)
 
 
 def shifted(session: MachineSession, outlines: Outlines, offsets: Array) -> Outlines:
@@ -379,7 +389,7 @@ def irregular_hexapod(
 
 def noisy_outlines(session: HexapodSession, rng: np.random.Generator) -> Outlines:
     """Return outlines with Gaussian errors of their claimed covariances."""
-    return simulation.noisy_outlines(session.outlines, session.measurements.views[0].camera, rng)
+    return observe.noisy_outlines(session.outlines, session.measurements.views[0].camera, rng)
 
 
 def noisy_readings(session: HexapodSession, rng: np.random.Generator) -> Measurements:
@@ -570,11 +580,11 @@ def axes_session(
     rng = np.random.default_rng(3)
     machine = perturb(paper_hexapod(), rng, 0.002, coplanar=coplanar)
     cameras = hexapod_cameras(machine, rng, legs=legs)
-    session = simulation.hexapod_session(
+    session = hexapod_session(
         machine, cameras, rng, noise=TableNoise(), noisy=False, n_poses=n_poses, n_images=n_images
     )
     # Rough camera poses, about 1 degree and 1 cm wrong.
-    near = simulation.hexapod_session(machine, cameras, rng, noise=TableNoise(), n_poses=1)
+    near = hexapod_session(machine, cameras, rng, noise=TableNoise(), n_poses=1)
     legs_true = point_like_legs(machine.parameters)
     return AxesSession(
         FittedLegs(machine.leg_names, legs_true, machine.frame_legs, {}),

@@ -25,12 +25,12 @@ from legcal.calibration.measurement_noise.document import NoiseDocument
 from legcal.data.dataset_file import DatasetEntry
 from legcal.data.new_dataset import NewDatasetDocument
 from legcal.exports.formats import ExportDocument
-from legcal.files import Document
 from legcal.files.published import write_schemas
+from legcal.files.schema import Document
 from legcal.machine.description_table import TableFile
 from legcal.machine.inspection import Inspection
 from legcal.machine.schema import MechanismFile
-from legcal.planning import PlanDocument
+from legcal.planning.planned_session import PlanDocument
 from legcal.recordings.importing import ImportDocument
 from legcal.simulation.dataset import SimulationDocument
 from legcal.simulation.paper_report import PaperDocument

@@ -13,7 +13,7 @@ import yaml
 from csv_rows import read_rows, write_rows
 from numpy.typing import NDArray
 
-from legcal.calibration import Calibration
+from legcal.calibration.result import Calibration
 
 ROOT = Path(__file__).parents[1]
 HEXAPOD = ROOT / "examples" / "hexapod"

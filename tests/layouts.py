@@ -9,7 +9,9 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array, normal_basis, roll_pitch_yaw
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.rotations import roll_pitch_yaw
+from legcal.geometry.types import Array
 
 EYE = RigidTransform.identity()
 PASSED = 0.05  # [m] by which every slider is out at home

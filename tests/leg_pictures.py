@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
-from legcal.machine import Cylinder
+from legcal.machine.leg import Cylinder
 from legcal.perception.candidate_pairs import EdgeSegments, find_candidate_pairs
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
 from legcal.vision.cylinder import outlines_of_axis

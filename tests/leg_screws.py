@@ -10,7 +10,7 @@ import numpy as np
 from layouts import LegSpec, MachineSpec
 from scipy.linalg import null_space
 
-from legcal.geometry import Array
+from legcal.geometry.types import Array
 
 
 class Freedoms(NamedTuple):

@@ -9,15 +9,12 @@ import yaml
 from layouts import LegSpec, MachineSpec
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array
-from legcal.machine import (
-    Dimensions,
-    LegKind,
-    Machine,
-    create_model,
-    description_of,
-    main_cylinders,
-)
+from legcal.geometry.types import Array
+from legcal.machine.dimensions import Dimensions
+from legcal.machine.family import description_of
+from legcal.machine.leg import LegKind, main_cylinders
+from legcal.machine.model import Machine
+from legcal.machine.model_builder import create_model
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))

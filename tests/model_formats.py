@@ -10,7 +10,7 @@ from layouts import numbers, origin
 from lxml import etree
 from scipy.spatial.transform import RigidTransform
 
-from legcal.machine import Machine
+from legcal.machine.model import Machine
 
 FORMATS = (
     "mjcf bodies",

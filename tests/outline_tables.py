@@ -7,7 +7,7 @@ import numpy as np
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import ENCODING, QUALITY, Outlines
 from legcal.geometry.types import Array
-from legcal.machine import Cylinder, JointType, Leg, LegKind
+from legcal.machine.leg import Cylinder, JointType, Leg, LegKind
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 

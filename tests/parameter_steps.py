@@ -6,19 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.geometry import Array
-from legcal.machine import (
-    KinematicParameters,
-    Leg,
-    Machine,
-    Parametrization,
-    geometries,
-    load_mechanism,
-    moved_legs,
-    reframed,
-    write_calibrated_yaml,
-    write_urdf,
-)
+from legcal.geometry.types import Array
+from legcal.machine.leg import KinematicParameters, Leg
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
+from legcal.machine.parameters import Parametrization, geometries, moved_legs, reframed
 
 
 def random_covariance(

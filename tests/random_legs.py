@@ -6,8 +6,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from legcal.geometry import Array, normal_basis
-from legcal.machine import JointType, Leg, LegKind, leg_equations
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array
+from legcal.machine.equations import leg_equations
+from legcal.machine.leg import JointType, Leg, LegKind
 
 
 def leg_and_pose(joints: str, seed: int) -> tuple[Leg, Array, Array]:

@@ -11,11 +11,14 @@ import yaml
 from csv_rows import write_rows
 from scipy.spatial.transform import RigidTransform
 
-from legcal.files import motion_to_xyz_quat
-from legcal.geometry import look_at
+from legcal.files.motions import motion_to_xyz_quat
+from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array, Image
-from legcal.machine import Machine, load_mechanism, random_configurations
-from legcal.simulation import Appearance, prepare_view
+from legcal.machine.configurations import random_configurations
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.simulation.rendering.appearance import Appearance
+from legcal.simulation.rendering.scene import prepare_view
 from legcal.simulation.solids import PlacedSolid
 from legcal.vision.camera import Camera
 from legcal.vision.visibility import visible_segments

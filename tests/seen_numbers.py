@@ -2,17 +2,13 @@
 
 import numpy as np
 
-from legcal.geometry import Array, cross
-from legcal.machine import (
-    Leg,
-    LegColumns,
-    LegKind,
-    Machine,
-    geometries,
-    moved_legs,
-    platform_in_base,
-    solve_poses,
-)
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array
+from legcal.machine.kinematics import platform_in_base
+from legcal.machine.leg import Leg, LegColumns, LegKind
+from legcal.machine.model import Machine
+from legcal.machine.parameters import geometries, moved_legs
+from legcal.machine.solved_poses import solve_poses
 
 
 def lines_of(legs: tuple[Leg, ...], machine: Machine, R: Array, t: Array, q: Array) -> Array:

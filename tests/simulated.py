@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.simulation import Level, SimulatedDataset, SimulationSettings, simulate
+from legcal.simulation.dataset import SimulatedDataset, simulate
+from legcal.simulation.request import Level
+from legcal.simulation.settings import SimulationSettings
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import camera_info
 

@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data import load_dataset, no_outlines
-from legcal.perception import Photographs, Placement
+from legcal.data.dataset import load_dataset
+from legcal.data.outlines import no_outlines
+from legcal.perception.photographs import Photographs
+from legcal.perception.placement import Placement
 from legcal.workers import in_turn
 
 FOLDER = Path(__file__).parent / "data" / "six-photographs"

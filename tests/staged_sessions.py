@@ -13,13 +13,12 @@ from legcal.calibration.identify.predicted_observations import (
     at_base_joints,
     at_platform_joints,
 )
-from legcal.data import LegAxes, Measurements, View, axes_from_outlines
-from legcal.geometry import Array, BoolArray, normal_basis
-from legcal.machine import (
-    JointType,
-    KinematicParameters,
-    Leg,
-    LegKind,
+from legcal.data.axes import LegAxes, axes_from_outlines
+from legcal.data.measurements import Measurements, View
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.leg import JointType, KinematicParameters, Leg, LegKind
+from legcal.machine.parameters import (
     Parametrization,
     from_vector,
     moved_legs,
@@ -27,22 +26,22 @@ from legcal.machine import (
     to_vector,
     vector_of,
 )
-from legcal.paper import Criteria, NominalMachine, run_base_steps, run_steps
-from legcal.paper.four_steps import StagedResult
+from legcal.paper.criteria import Criteria
+from legcal.paper.four_steps import StagedResult, run_base_steps, run_steps
 from legcal.paper.joints_in_base import JointsInBase
 from legcal.paper.joints_in_camera import JointsInCamera
-from legcal.simulation import (
+from legcal.paper.nominal import NominalMachine
+from legcal.simulation.hexapod import (
     PAPER_VIEWS,
     HexapodSession,
-    OutlineNoise,
     PaperHexapod,
-    TableNoise,
     hexapod_cameras,
     hexapod_session,
-    nominal_of,
     paper_hexapod,
     perturb,
 )
+from legcal.simulation.observe import OutlineNoise, TableNoise
+from legcal.simulation.paper import nominal_of
 
 
 @dataclass(frozen=True, eq=False)

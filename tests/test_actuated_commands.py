@@ -9,8 +9,9 @@ import yaml
 from command_line import run
 from thinned import thinned
 
-from legcal.calibration import calibrate, load_result
-from legcal.machine import load_mechanism
+from legcal.calibration.pipeline import calibrate
+from legcal.calibration.result_folder import load_result
+from legcal.machine.loader import load_mechanism
 
 
 @pytest.mark.parametrize(

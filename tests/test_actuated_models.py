@@ -11,32 +11,30 @@ from dataset_folder import dataset_of_readings
 from machines import ROOT, check_same, read_family, read_table
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration import calibrate
-from legcal.data import load_dataset
+from legcal.calibration.pipeline import calibrate
+from legcal.data.dataset import load_dataset
 from legcal.errors import LegcalError, ModelError, NotIdentifiable, UsageError
-from legcal.exports import Subject, export
-from legcal.geometry import Array
-from legcal.machine import (
+from legcal.exports.formats import export
+from legcal.exports.subject import Subject
+from legcal.geometry.types import Array
+from legcal.machine.configurations import random_configurations
+from legcal.machine.dimensions import Dimensions
+from legcal.machine.family import description_of
+from legcal.machine.home import home_of_legs
+from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine, joint_values, readings_at
+from legcal.machine.model_builder import create_model
+from legcal.machine.model_writer import write_model
+from legcal.machine.parameters import (
     ARM_KINDS,
-    Dimensions,
-    Machine,
-    create_model,
-    description_of,
-    forward_kinematics,
     geometries,
-    home_of_legs,
-    inverse_kinematics,
-    joint_values,
     kind_of_parameter,
-    load_mechanism,
     moved_legs,
     parametrization_of,
-    random_configurations,
-    readings_at,
     vector_of,
-    write_model,
 )
-from legcal.simulation import write_model_with
+from legcal.simulation.truth import write_model_with
 
 TABLES = ROOT / "models" / "tables"
 COUNTS = {  # parameters with radii known, of the motors alone, and those that define the frames

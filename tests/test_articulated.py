@@ -21,18 +21,15 @@ from legcal.calibration.identify.identifiability import conditions_of, identifia
 from legcal.calibration.identify.predicted_observations import planned_observations
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.scale import is_scale_open
-from legcal.data import load_dataset
+from legcal.data.dataset import load_dataset
 from legcal.errors import OutOfClass, UsageError
-from legcal.geometry import Array, normal_basis
-from legcal.machine import (
-    Follower,
-    Machine,
-    forward_kinematics,
-    inverse_kinematics,
-    load_mechanism,
-    machine_document,
-    parametrization_of,
-)
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array
+from legcal.machine.inspection import machine_document
+from legcal.machine.kinematics import Follower, forward_kinematics, inverse_kinematics
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.parameters import parametrization_of
 
 KINDS = list(product(("h4", "i4"), (False, True)))
 # Parameters with all gauges, and those that images determine: of an I4 inside its ties

@@ -11,17 +11,12 @@ from dataset_folder import Folder, folder
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from legcal.data import (
-    Corners,
-    Measurements,
-    View,
-    canonical_order,
-    load_dataset,
-    write_corners,
-)
-from legcal.data.corners import COLUMNS, read_corners
+from legcal.data.corners import COLUMNS, Corners, read_corners, write_corners
+from legcal.data.dataset import load_dataset
+from legcal.data.image_tables import canonical_order
+from legcal.data.measurements import Measurements, View
 from legcal.errors import DatasetError
-from legcal.vision import FixedBoard
+from legcal.vision.board import FixedBoard
 
 __all__ = ["folder"]
 BOARD = {"kind": "charuco", "squares_x": 4, "squares_y": 3, "square": 0.03, "marker": 0.02,

@@ -24,36 +24,28 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.board import observe_board
-from legcal.data import Corners, Measurements, View, found_corners, join_corners
+from legcal.data.corners import Corners, found_corners, join_corners
+from legcal.data.measurements import Measurements, View
 from legcal.errors import DatasetError, NotVisible
-from legcal.perception import (
+from legcal.perception.board_corners import (
     SeenBoard,
     board_in_words,
-    camera_poses_by_board,
     describe_image,
     detect_corners,
     find_corners,
-    plane_poses,
     require_board,
     search_board,
     shown_board,
     tags_are_mirrored,
 )
+from legcal.perception.board_poses import camera_poses_by_board, plane_poses
 from legcal.perception.corner_lattice import Lattice, find_lattice
 from legcal.progress import no_progress
 from legcal.simulation.board import INK, BoardPrint
-from legcal.vision import (
-    Board,
-    Camera,
-    FixedBoard,
-    Grey,
-    board_document,
-    charuco_board,
-    parse_board,
-    possible_scale,
-    reduced,
-    rescaled,
-)
+from legcal.vision.board import Board, FixedBoard, charuco_board
+from legcal.vision.board_file import board_document, parse_board
+from legcal.vision.camera import Camera
+from legcal.vision.image_file import Grey, possible_scale, reduced, rescaled
 from legcal.workers import in_turn
 
 PATH = Path("dataset.yaml")

@@ -14,26 +14,25 @@ import pytest
 from dataset_folder import JOINTS, Folder, folder, hexapod
 from outline_tables import assert_same, outlines_of
 
-from legcal.data import (
-    CACHE_NAME,
-    OBSERVATIONS_NAME,
-    Dataset,
+from legcal.data.cache import (
     DetectionPlan,
-    Outlines,
     fingerprint,
+    plan_dataset,
+    plan_detection,
+    store_outlines,
+)
+from legcal.data.dataset import CACHE_NAME, OBSERVATIONS_NAME, Dataset, load_dataset
+from legcal.data.outlines import (
+    Outlines,
     is_edited,
     join_outlines,
-    load_dataset,
     merge_edited,
     no_outlines,
-    plan_dataset,
-    store_outlines,
     write_observations,
 )
-from legcal.data.cache import plan_detection
 from legcal.errors import DatasetError
-from legcal.geometry import BoolArray
-from legcal.perception import detection_settings
+from legcal.geometry.types import BoolArray
+from legcal.perception.photographs import detection_settings
 
 __all__ = ["folder"]
 

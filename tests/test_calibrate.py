@@ -22,23 +22,26 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import files_of, settings, simulated
 
 from legcal import calibrate, evaluate, load_dataset, load_mechanism, load_result, simulate
-from legcal.calibration import Calibration, poses_at_readings
 from legcal.calibration.board import BoardViews, base_of_board, board_notes
 from legcal.calibration.four_steps import Steps
-from legcal.calibration.joint_fit import FOUND_CAMERA, Sensitivity
+from legcal.calibration.joint_fit.platform import poses_at_readings
+from legcal.calibration.joint_fit.sensitivity import FOUND_CAMERA, Sensitivity
+from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import write_result
 from legcal.calibration.verdict import judge
-from legcal.data import found_corners
+from legcal.data.corners import found_corners
 from legcal.errors import (
     DatasetError,
     DidNotConverge,
     NotIdentifiable,
     NotVisible,
 )
-from legcal.geometry import Array
-from legcal.machine import geometries, pose_differences, vector_of
-from legcal.simulation import Level, SimulatedDataset
-from legcal.vision import Board, FixedBoard
+from legcal.geometry.types import Array
+from legcal.machine.kinematics import pose_differences
+from legcal.machine.parameters import geometries, vector_of
+from legcal.simulation.dataset import SimulatedDataset
+from legcal.simulation.request import Level
+from legcal.vision.board import Board, FixedBoard
 
 Row = dict[str, str]
 Rows = list[Row]

@@ -22,7 +22,6 @@ from camera_sessions import (
 from thinned import thinned
 
 from legcal import calibrate_camera
-from legcal.calibration import CameraCalibration
 from legcal.calibration.camera_calibration import calibration
 from legcal.calibration.camera_calibration.adjustment import RobustFit, robust_fit
 from legcal.calibration.camera_calibration.diagnostics import (
@@ -30,13 +29,18 @@ from legcal.calibration.camera_calibration.diagnostics import (
     refuse_undetermined,
     warnings,
 )
+from legcal.calibration.camera_calibration.document import CameraCalibration
 from legcal.calibration.camera_calibration.lens import chosen_lens, given_lens
 from legcal.calibration.camera_calibration.picture import write_picture
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible, UsageError
-from legcal.geometry import Array
-from legcal.perception import BoardImages, SeenBoard
-from legcal.vision import Board, DistortionModel, board_of, intrinsic_values
+from legcal.geometry.types import Array
+from legcal.perception.board_adjustment import BoardImages
+from legcal.perception.board_corners import SeenBoard
+from legcal.vision.board import Board
+from legcal.vision.board_file import board_of
+from legcal.vision.camera import intrinsic_values
 from legcal.vision.camera_file import read_camera
+from legcal.vision.distortion import DistortionModel
 
 MODELS: tuple[DistortionModel, ...] = ("plumb_bob", "rational_polynomial", "equidistant")
 SPEC = "chessboard:9x6:30mm"

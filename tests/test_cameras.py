@@ -13,23 +13,21 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from legcal.errors import DatasetError, NotVisible
-from legcal.geometry import Array, distance_to_line, moment
-from legcal.vision import (
+from legcal.geometry.lines import distance_to_line, moment
+from legcal.geometry.types import Array
+from legcal.vision.camera import (
     DISTORTION_MODELS,
-    EPSILON,
     Camera,
-    DistortionModel,
-    axis_of_outlines,
-    camera_info,
     intrinsic_names,
     intrinsic_unit,
     intrinsic_values,
-    outlines_of_axis,
-    read_camera,
     shared_cameras,
     undistort_with_derivatives,
     with_intrinsics,
 )
+from legcal.vision.camera_file import camera_info, read_camera
+from legcal.vision.cylinder import EPSILON, axis_of_outlines, outlines_of_axis
+from legcal.vision.distortion import DistortionModel
 
 FAST = settings(deadline=None, max_examples=40)
 SIZE = 1024, 768

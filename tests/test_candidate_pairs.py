@@ -14,9 +14,9 @@ from legcal.perception.candidate_pairs import (
     find_candidate_pairs,
     find_segments,
 )
-from legcal.vision import Grey
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
+from legcal.vision.image_file import Grey
 
 F = 500.0
 

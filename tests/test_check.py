@@ -14,7 +14,6 @@ from machines import read_family
 from simulated import files_of, simulated
 
 from legcal import calibrate, check
-from legcal.calibration import Result
 from legcal.calibration.change_detection import (
     Change,
     Movement,
@@ -23,21 +22,22 @@ from legcal.calibration.change_detection import (
     noise_dof,
     possible_changes,
 )
-from legcal.data import Dataset, load_dataset
+from legcal.calibration.documents import Result
+from legcal.data.dataset import Dataset, load_dataset
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible
-from legcal.geometry import Array, frame_on_points
-from legcal.machine import (
-    Actuator,
-    Line,
-    create_model,
+from legcal.geometry.motions import frame_on_points
+from legcal.geometry.types import Array
+from legcal.machine.actuator import Actuator, Line
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model_builder import create_model
+from legcal.machine.parameters import (
     geometries,
-    load_mechanism,
     moved_legs,
     parametrization_of,
     turns_between,
     vector_of,
 )
-from legcal.simulation import OutlineNoise, shifted_outlines
+from legcal.simulation.observe import OutlineNoise, shifted_outlines
 
 MODEL = "3-rpr"
 EXACT = 1e-4  # [px]: errors of outlines to which others are added

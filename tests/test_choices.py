@@ -10,7 +10,7 @@ from chosen import HEXAPOD, choose, known
 from dataset_folder import Folder, folder
 
 from legcal import calibrate, load_dataset, load_mechanism
-from legcal.calibration.joint_fit import (
+from legcal.calibration.joint_fit.parameter_choices import (
     NO_CHOICES,
     Choices,
     Prior,
@@ -19,7 +19,7 @@ from legcal.calibration.joint_fit import (
 )
 from legcal.data.overrides import overrides_of_call
 from legcal.errors import DatasetError, UsageError
-from legcal.machine import parametrization_of
+from legcal.machine.parameters import parametrization_of
 
 __all__ = ["folder"]
 

@@ -119,7 +119,7 @@ def test_failures_have_their_exit_code_and_are_said_once(
     def fail(model: str) -> None:
         raise error
 
-    monkeypatch.setattr("legcal.machine.load_mechanism", fail)
+    monkeypatch.setattr("legcal.machine.loader.load_mechanism", fail)
     assert run(monkeypatch, "inspect", "hexapod") == code
     printed = capsys.readouterr()
     assert printed.out == ""

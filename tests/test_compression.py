@@ -12,11 +12,13 @@ import pytest
 from six_photographs import six_photographs
 
 from legcal.calibration.compression import compression_effect
-from legcal.calibration.joint_fit import NoiseModel
-from legcal.data import Outlines
-from legcal.perception import Photographs, Placement, measure_photographs
+from legcal.calibration.joint_fit.outline_errors import NoiseModel
+from legcal.data.outlines import Outlines
+from legcal.perception.photographs import Photographs, measure_photographs
+from legcal.perception.placement import Placement
 from legcal.progress import no_progress
-from legcal.vision import Grey, ImageFacts
+from legcal.vision.image_facts import ImageFacts
+from legcal.vision.image_file import Grey
 from legcal.workers import in_turn
 
 

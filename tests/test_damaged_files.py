@@ -14,7 +14,7 @@ from fuzzing.subjects import SUBJECTS
 from legcal import LegcalError, load_mechanism
 from legcal.errors import DatasetError
 from legcal.files.schema import _PLAIN_TEXT, _Loader, _QuickLoader
-from legcal.vision import read_camera
+from legcal.vision.camera_file import read_camera
 
 PARTS = 16  # of 2000 files
 

@@ -27,11 +27,13 @@ from dataset_folder import (
 )
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data import Measurements, load_dataset
+from legcal.data.dataset import load_dataset
+from legcal.data.measurements import Measurements
 from legcal.errors import DatasetError, LegcalError, ModelError
-from legcal.geometry import Image
-from legcal.machine import Machine
-from legcal.vision import Camera, image_size, inspect_image, read_image
+from legcal.geometry.types import Image
+from legcal.machine.model import Machine
+from legcal.vision.camera import Camera
+from legcal.vision.image_file import image_size, inspect_image, read_image
 
 __all__ = ["folder"]
 

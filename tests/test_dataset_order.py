@@ -10,18 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from outline_tables import LEG_NAMES, assert_same, outlines_of, recorded
 
-from legcal.data import (
-    Dataset,
-    Measurements,
+from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.holdout import dataset_at, split_images
+from legcal.data.image_tables import (
     Order,
     canonical_order,
-    dataset_at,
     inverse,
-    load_dataset,
     measurements_at,
     reorder_measurements,
-    split_images,
 )
+from legcal.data.measurements import Measurements
 from legcal.errors import NotIdentifiable, UsageError
 
 FAST = settings(deadline=None, max_examples=25)

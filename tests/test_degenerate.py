@@ -15,10 +15,10 @@ from simulated import settings, simulated
 
 import legcal
 from legcal import calibrate, simulate
-from legcal.calibration import Calibration
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
+from legcal.calibration.result import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
-from legcal.machine import Machine
+from legcal.machine.model import Machine
 
 LINE = [[-300.0, 0.0, 0.0], [0.0, 0.0, 0.0], [300.0, 0.0, 0.0]]
 SHORT_LINE = [[-120.0, 0.0, 0.0], [0.0, 0.0, 0.0], [120.0, 0.0, 0.0]]

@@ -25,7 +25,7 @@ from legcal.data.image_tables import canonical_order
 from legcal.data.outlines import QUALITY, Outlines, read_observations
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
-from legcal.machine import Cylinder
+from legcal.machine.leg import Cylinder
 from legcal.perception.overlays import (
     COLOURS,
     LabelPlaces,

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from six_photographs import FOLDER, six_photographs
 
-from legcal.data import Outlines
-from legcal.perception import measure_in_brief, measure_photographs
-from legcal.perception.photographs import DETECTOR_VERSION
+from legcal.data.outlines import Outlines
+from legcal.perception.outline import measure_in_brief
+from legcal.perception.photographs import DETECTOR_VERSION, measure_photographs
 from legcal.progress import no_progress
 
 VALUES = FOLDER / "values.json"

@@ -18,11 +18,13 @@ from legcal.calibration.diagnosis import diagnosis
 from legcal.calibration.diagnosis.diagnosis import diagnose
 from legcal.calibration.diagnosis.mistakes import Assumed, Mistake, as_given, mistakes
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
-from legcal.data import Dataset, dataset_at, row_names
+from legcal.data.dataset import Dataset
+from legcal.data.holdout import dataset_at
+from legcal.data.measurements import row_names
 from legcal.errors import DatasetError, NotVisible
-from legcal.geometry import Array
+from legcal.geometry.types import Array
 from legcal.progress import no_progress
-from legcal.simulation import simulate
+from legcal.simulation.dataset import simulate
 from legcal.workers import in_turn
 
 COLUMNS = [f"leg{k}_prismatic" for k in range(1, 7)]

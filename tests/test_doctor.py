@@ -16,10 +16,9 @@ from photograph_files import exif, jpeg
 from simulated import simulated
 
 from legcal import SimulationSettings, doctor, simulate
-from legcal.calibration import Examination
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
-from legcal.calibration.examination import CHECKS, Finding
-from legcal.simulation import Level
+from legcal.calibration.examination import CHECKS, Examination, Finding
+from legcal.simulation.request import Level
 
 COLUMNS = [f"leg{k}_prismatic" for k in range(1, 7)]
 

@@ -19,7 +19,7 @@ from pydantic import BaseModel
 from legcal import evaluate, load_mechanism
 from legcal.cli.app import app
 from legcal.data.dataset_file import DatasetEntry
-from legcal.files import parse_yaml, validate
+from legcal.files.schema import parse_yaml, validate
 from legcal.machine.description_table import TableFile
 from legcal.machine.schema import MechanismFile
 

@@ -13,20 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from legcal import load_mechanism
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, normal_basis
-from legcal.machine import (
-    EquationKind,
-    JointType,
-    Leg,
-    LegColumns,
-    LegKind,
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array
+from legcal.machine.equations import leg_equations, pose_equations, pose_sensitivity
+from legcal.machine.leg import EquationKind, JointType, Leg, LegColumns, LegKind
+from legcal.machine.parameters import (
     Parametrization,
     geometries,
-    leg_equations,
     parametrization_of,
     parametrize,
-    pose_equations,
-    pose_sensitivity,
     to_vector,
     vector_of,
 )

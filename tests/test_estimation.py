@@ -7,26 +7,20 @@ import pytest
 from scipy.integrate import quad
 
 from legcal.errors import DidNotConverge
-from legcal.estimation import (
-    Effects,
+from legcal.estimation.loss import Huber, PseudoHuber
+from legcal.estimation.problem import (
     Factor,
     GaussianPrior,
-    Huber,
     Problem,
-    PseudoHuber,
     Residuals,
     Variables,
     all_free,
-    estimate_variances,
-    expected_variances,
-    information,
     linearize,
-    minimise,
-    named_covariance,
-    normal_equations,
-    robust_cost,
 )
-from legcal.geometry import Array, IntArray
+from legcal.estimation.solver import information, minimise, normal_equations, robust_cost
+from legcal.estimation.uncertainty import named_covariance
+from legcal.estimation.variances import Effects, estimate_variances, expected_variances
+from legcal.geometry.types import Array, IntArray
 
 N_SHARED, N_ELEMENTS, N_EACH = 3, 5, 6
 LOSS = PseudoHuber(0.1**-0.5)

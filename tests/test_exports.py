@@ -30,18 +30,16 @@ from thinned import thinned
 import legcal
 from legcal import load_mechanism
 from legcal.errors import DatasetError, LegcalError, ModelError, OutOfClass, UsageError
-from legcal.exports import FORMATS, ExportOptions, Subject, export, formats_of, load_subject
+from legcal.exports.formats import FORMATS, export, formats_of
 from legcal.exports.identifiers import identifiers
-from legcal.geometry import Array
-from legcal.machine import (
-    COORDINATES,
-    Machine,
-    forward_kinematics,
-    inverse_kinematics,
-    own_coordinates,
-    random_poses,
-)
-from legcal.simulation import ParameterErrors, Spread, write_true_model
+from legcal.exports.subject import ExportOptions, Subject, load_subject
+from legcal.geometry.types import Array
+from legcal.machine.configurations import random_poses
+from legcal.machine.coordinates import COORDINATES, own_coordinates
+from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.model import Machine
+from legcal.simulation.settings import ParameterErrors, Spread
+from legcal.simulation.truth import write_true_model
 
 NAMES = ("hexapod", "3-rps", "3-upu", "tricept", "3-rpr")
 ACTUATED = ("delta", "servo-hexapod", "3-prs", "hexaglide", "linear-delta", "orthoglide")

@@ -39,28 +39,30 @@ from thinned import thinned
 
 from legcal import load_mechanism
 from legcal.calibration import outlier_images as outlier_images_module
-from legcal.calibration.joint_fit import (
-    DISAGREES,
-    Choices,
-    FitProblem,
-    Prior,
-    State,
-    build_fit,
-    refine,
-)
+from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.outline_errors import N_KINDS, EdgeBiases
+from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
+from legcal.calibration.joint_fit.problem import FitProblem, build_fit
+from legcal.calibration.joint_fit.rounds import DISAGREES
+from legcal.calibration.joint_fit.variables import State
 from legcal.calibration.location import fit as location_fit
 from legcal.calibration.location.fit import fit
 from legcal.calibration.location.tool_poses import PoseNoise
 from legcal.calibration.outlier_images import outlier_images
-from legcal.data import axes_from_outlines, no_outlines
+from legcal.data.axes import axes_from_outlines
+from legcal.data.outlines import no_outlines
 from legcal.errors import DidNotConverge
-from legcal.estimation import Frames, Problem, PseudoHuber, linearize, normal_equations, solver
-from legcal.geometry import Array
-from legcal.perception import adjust_board, board_adjustment, view_fit
+from legcal.estimation import solver
+from legcal.estimation.loss import PseudoHuber
+from legcal.estimation.problem import Frames, Problem, linearize
+from legcal.estimation.solver import normal_equations
+from legcal.geometry.types import Array
+from legcal.perception import board_adjustment, view_fit
+from legcal.perception.board_adjustment import adjust_board
 from legcal.perception.placement import Search, group_views
 from legcal.perception.view_fit import fit_view
-from legcal.vision import Camera, intrinsic_names, outlines_of_axis
+from legcal.vision.camera import Camera, intrinsic_names
+from legcal.vision.cylinder import outlines_of_axis
 
 CARRIED = ("delta", "delta-round-arms", "3-prs")  # whose joints at A move
 K = 0.1

@@ -25,7 +25,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import load_dataset, load_mechanism
 from legcal.errors import DatasetError, ModelError, OutOfResources, UsageError
-from legcal.files import check_destination, closest, parse_yaml, result_folder, write_atomically
+from legcal.files.folder import check_destination, result_folder, write_atomically
+from legcal.files.schema import closest, parse_yaml
 from legcal.signals import raise_if_stopped, stopped_by_signals
 from legcal.workers import KeptArrays, Run, worker_pool
 

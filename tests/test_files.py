@@ -16,16 +16,8 @@ import pytest
 from command_line import run
 
 from legcal.errors import UsageError
-from legcal.files import (
-    ANGLE,
-    LENGTH,
-    PIXELS,
-    check_destination,
-    output_path,
-    parse_quantity,
-    result_folder,
-    write_atomically,
-)
+from legcal.files.folder import check_destination, output_path, result_folder, write_atomically
+from legcal.files.quantity import ANGLE, LENGTH, PIXELS, parse_quantity
 
 RESULT = '{"legcal_result": 1}'
 REPLACED = {"calibrated.urdf": "new", "notes.txt": "mine", "result.json": RESULT}

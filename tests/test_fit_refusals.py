@@ -16,21 +16,24 @@ from fit_sessions import (
     noisy_outlines,
 )
 
-from legcal.calibration.joint_fit import (
-    FitProblem,
+from legcal.calibration.joint_fit import fit
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.variables import (
     Start,
     cameras_from_hints,
-    fit,
     fitted_legs,
     platform_poses,
-    refine,
     start_from,
 )
-from legcal.data import LegAxes, Outlines, View, no_outlines
+from legcal.data.axes import LegAxes
+from legcal.data.measurements import View
+from legcal.data.outlines import Outlines, no_outlines
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, NotIdentifiable
-from legcal.files import motion_from_xyz_quat
-from legcal.machine import load_mechanism, point_like_legs
-from legcal.simulation import moved_outlines
+from legcal.files.motions import motion_from_xyz_quat
+from legcal.machine.leg import point_like_legs
+from legcal.machine.loader import load_mechanism
+from legcal.simulation.observe import moved_outlines
 
 
 @pytest.fixture(scope="module")

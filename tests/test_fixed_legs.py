@@ -13,8 +13,8 @@ from seen_numbers import n_seen
 from thinned import thinned
 
 from legcal import identifiability
-from legcal.calibration.joint_fit import refine
-from legcal.machine import load_mechanism
+from legcal.calibration.joint_fit.fit import refine
+from legcal.machine.loader import load_mechanism
 
 A, P = "actuated", "passive"
 KINDS: dict[str, tuple[list[str], list[str], tuple[int, ...]]] = {

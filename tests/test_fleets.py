@@ -12,17 +12,13 @@ from characterisation.running import fits_schema
 from command_line import run as run_command
 from simulated import files_of, simulated
 
-from legcal.calibration import (
-    FleetMachine,
-    FleetOptions,
-    calibrate,
-    calibrate_fleet,
-    fleet,
-    load_result,
-)
+from legcal.calibration import fleet
+from legcal.calibration.fleet import FleetMachine, FleetOptions, calibrate_fleet
+from legcal.calibration.pipeline import calibrate
+from legcal.calibration.result_folder import load_result
 from legcal.cluster import Stamp
 from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.simulation import Level
+from legcal.simulation.request import Level
 
 
 @pytest.fixture(scope="module")

@@ -17,20 +17,26 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings, small_camera
 
 import legcal
-from legcal.calibration import build_fit, refine
 from legcal.calibration.joint_fit import free_poses
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.scale import naming_missing_lengths
-from legcal.data import Measurements, View
+from legcal.data.measurements import Measurements, View
 from legcal.errors import LegcalError, NotIdentifiable, UsageError
-from legcal.geometry import Array, look_at
-from legcal.machine import Machine, create_model, geometries, load_mechanism, vector_of
-from legcal.perception import require_standing_joints
+from legcal.geometry.motions import look_at
+from legcal.geometry.types import Array
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.model_builder import create_model
+from legcal.machine.parameters import geometries, vector_of
 from legcal.perception.candidate_pairs import find_candidate_pairs
-from legcal.perception.free_poses import find_free_poses
+from legcal.perception.free_poses import find_free_poses, require_standing_joints
 from legcal.perception.pair_matching import leg_segments
 from legcal.perception.placement import Search
-from legcal.simulation import Level, simulate
-from legcal.vision import Camera, outlines_of_axis
+from legcal.simulation.dataset import simulate
+from legcal.simulation.request import Level
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import outlines_of_axis
 from legcal.workers import in_turn
 
 __all__ = ["folder"]  # a fixture

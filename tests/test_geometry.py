@@ -6,24 +6,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.files import motion_from_xyz_quat, motion_to_xyz_quat
-from legcal.geometry import (
-    Array,
+from legcal.files.motions import motion_from_xyz_quat, motion_to_xyz_quat
+from legcal.geometry.lines import (
     distance_to_line,
-    frame_on_points,
     moment,
-    motion_of,
     nearest_point_to_line,
     nearest_point_to_origin,
-    nearest_rotation,
     normal_basis,
-    product,
-    register_points,
-    roll_pitch_yaw,
-    rotation_between,
     segment_distance,
-    turned,
 )
+from legcal.geometry.motions import frame_on_points, motion_of, product, register_points
+from legcal.geometry.rotations import nearest_rotation, roll_pitch_yaw, rotation_between, turned
+from legcal.geometry.types import Array
 
 FAST = settings(deadline=None, max_examples=25)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -11,9 +11,10 @@ import pytest
 from photograph_files import exif
 from test_init import init, own_folder, table
 
-from legcal.data import load_dataset
+from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError
-from legcal.vision import Camera, decode_image, image_suffixes, inspect_image
+from legcal.vision.camera import Camera
+from legcal.vision.image_file import decode_image, image_suffixes, inspect_image
 
 ROOT = Path(__file__).parent
 BOX = b"\0\0\0\x18ftypheic\0\0\0\0"

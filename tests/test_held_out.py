@@ -18,23 +18,24 @@ from outline_sessions import Noise, StartErrors, design_of, draw_session
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
-from legcal.calibration.joint_fit import (
-    HeldOut,
-    NoiseModel,
-    Start,
-    build_fit,
-    compare_held_out,
-    possible_biases,
-    refine,
-    start_from,
-)
 from legcal.calibration.joint_fit import held_out as held_out_module
-from legcal.calibration.joint_fit.held_out import PosesByOutlines, Posterior, poses_by_outlines
-from legcal.calibration.joint_fit.outline_errors import N_KINDS
-from legcal.data import Measurements, Outlines
-from legcal.geometry import Array, IntArray, motions_of
-from legcal.machine import Leg
-from legcal.simulation import moved_outlines
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.held_out import (
+    HeldOut,
+    PosesByOutlines,
+    Posterior,
+    compare_held_out,
+    poses_by_outlines,
+)
+from legcal.calibration.joint_fit.outline_errors import N_KINDS, NoiseModel, possible_biases
+from legcal.calibration.joint_fit.problem import build_fit
+from legcal.calibration.joint_fit.variables import Start, start_from
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines
+from legcal.geometry.motions import motions_of
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.leg import Leg
+from legcal.simulation.observe import moved_outlines
 
 MACHINES = ("6-spu-coplanar", "hexaglide", "3-prs", "3-upu-tilted", "3-rpr")
 N_SEEDS = 2

@@ -24,21 +24,14 @@ from thinned import thinned
 
 from legcal import identifiability
 from legcal.errors import DidNotConverge, ModelError
-from legcal.geometry import Array
-from legcal.machine import (
-    LegKind,
-    Machine,
-    forward_kinematics,
-    inverse_kinematics,
-    leg_scale,
-    legs_outside,
-    load_mechanism,
-    platform_pose,
-    pose_equations,
-    readings_at,
-    slider_columns,
-)
-from legcal.machine.mobility import free_motions
+from legcal.geometry.types import Array
+from legcal.machine.equations import pose_equations
+from legcal.machine.home import legs_outside
+from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.leg import LegKind
+from legcal.machine.loader import load_mechanism
+from legcal.machine.mobility import free_motions, leg_scale
+from legcal.machine.model import Machine, platform_pose, readings_at, slider_columns
 
 machine_of = cache(load_mechanism)
 CARRIED = Layout((LegLayout(cut="carry"), *[LegLayout(sphere=k % 2 == 0) for k in range(6)]))

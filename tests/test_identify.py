@@ -22,31 +22,29 @@ from rich.console import Console
 from thinned import thinned
 
 import legcal
-from legcal.calibration import Identifiability, WeakDirection, legs_in_words, views_in_words
 from legcal.calibration.identify.identifiability import (
     check_identifiable,
     identifiability_of_dataset,
 )
 from legcal.calibration.identify.predicted_observations import (
+    legs_in_words,
     planned_observations,
     recorded_observations,
+    views_in_words,
 )
+from legcal.calibration.identify.report import Identifiability, WeakDirection
 from legcal.calibration.identify.steps import locate_joints
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
-from legcal.data import Dataset, load_dataset
 from legcal.data.corners import found_corners
+from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.holdout import dataset_at
 from legcal.errors import NotIdentifiable, UsageError
-from legcal.machine import (
-    Machine,
-    create_model,
-    describe_direction,
-    leg_labels,
-    list_in_words,
-    parametrization_of,
-)
+from legcal.machine.directions import describe_direction, leg_labels, list_in_words
+from legcal.machine.model import Machine
+from legcal.machine.model_builder import create_model
+from legcal.machine.parameters import parametrization_of
 from legcal.report.identify import _hidden, _two_digits, identify_table
-from legcal.vision import Board, FixedBoard
+from legcal.vision.board import Board, FixedBoard
 
 MODELS = sorted(path.stem for path in SHIPPED_YAML.parent.glob("*.yaml"))
 LEGS = tuple(f"leg{j}" for j in range(1, 7))

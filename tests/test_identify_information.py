@@ -37,33 +37,23 @@ from legcal.calibration.identify.predicted_observations import (
 )
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.scale import is_scale_open
-from legcal.calibration.joint_fit import Choices, Prior
-from legcal.data import load_dataset
+from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
+from legcal.data.dataset import load_dataset
 from legcal.errors import DidNotConverge
-from legcal.estimation import (
-    compress,
-    eliminate,
-    information,
-    information_rows,
-    linearize,
-    marginal,
-    marginal_rows,
-)
-from legcal.geometry import Array
-from legcal.machine import (
-    EquationKind,
-    LegKind,
-    Machine,
-    arms_at,
-    create_model,
-    forward_kinematics_many,
-    geometries,
-    moved_legs,
-    parametrize,
-    random_postures_of_legs,
-)
-from legcal.machine import leg_equations as linearize_leg
-from legcal.vision import outlines_of_axis
+from legcal.estimation.problem import linearize
+from legcal.estimation.solver import information
+from legcal.estimation.square_root import compress, eliminate, information_rows, marginal_rows
+from legcal.estimation.uncertainty import marginal
+from legcal.geometry.types import Array
+from legcal.machine.configurations import random_postures_of_legs
+from legcal.machine.equations import leg_equations as linearize_leg
+from legcal.machine.kinematics import forward_kinematics_many
+from legcal.machine.leg import EquationKind, LegKind
+from legcal.machine.model import Machine
+from legcal.machine.model_builder import create_model
+from legcal.machine.parameters import geometries, moved_legs, parametrize
+from legcal.machine.rods import arms_at
+from legcal.vision.cylinder import outlines_of_axis
 
 FAST = settings(deadline=None, max_examples=8)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -18,14 +18,16 @@ from thinned import thinned
 
 import legcal
 from legcal import identifiability
-from legcal.calibration import Identifiability
 from legcal.calibration.identify.predicted_observations import (
     PredictedObservations,
     planned_observations,
 )
 from legcal.calibration.identify.ranks import Analysis
-from legcal.geometry import Array, cross_matrices
-from legcal.machine import Leg, LegKind, Machine
+from legcal.calibration.identify.report import Identifiability
+from legcal.geometry.rotations import cross_matrices
+from legcal.geometry.types import Array
+from legcal.machine.leg import Leg, LegKind
+from legcal.machine.model import Machine
 from legcal.paper import joints_in_base, offsets
 from legcal.paper.conditions import count_conditions, three_legs_at_once, two_directions
 from legcal.paper.joints_in_base import JointsInBase, register_views
@@ -35,7 +37,8 @@ from legcal.paper.leg_directions import directions_through_joints
 from legcal.paper.platform import RigidProblem, build_rigid_platform
 from legcal.paper.platform_printed import build_mean_distances
 from legcal.paper.unknowns import Unknowns
-from legcal.simulation import PaperHexapod, nominal_of
+from legcal.simulation.hexapod import PaperHexapod
+from legcal.simulation.paper import nominal_of
 
 MODELS = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
 WEAK_JOINT = ((0, 1, 2, 3, 4), (0, 1, 2, 3, 4), (4, 5))

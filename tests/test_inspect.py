@@ -16,18 +16,16 @@ from rich.console import Console
 from simulated import simulated
 
 from legcal import evaluate, load_mechanism
-from legcal.calibration import Evaluation
+from legcal.calibration.evaluation import Evaluation
 from legcal.errors import DidNotConverge, ModelError
-from legcal.machine import (
-    Pulses,
-    create_model,
-    geometries,
-    machine_document,
-    write_calibrated_yaml,
-    write_urdf,
-)
-from legcal.report import accuracy_table, inspect_table
-from legcal.simulation import Level
+from legcal.machine.actuator import Pulses
+from legcal.machine.inspection import machine_document
+from legcal.machine.model_builder import create_model
+from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
+from legcal.machine.parameters import geometries
+from legcal.report.calibration import accuracy_table
+from legcal.report.machine import inspect_table
+from legcal.simulation.request import Level
 
 
 def _printed(what: object) -> str:

@@ -38,36 +38,29 @@ from thinned import thinned
 
 from legcal.calibration.identify.predicted_observations import PredictedObservations
 from legcal.calibration.identify.ranks import Analysis
-from legcal.calibration.joint_fit import (
-    Choices,
+from legcal.calibration.joint_fit.determinacy import open_directions
+from legcal.calibration.joint_fit.factors import average_images
+from legcal.calibration.joint_fit.fit import bound, refine
+from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
+from legcal.calibration.joint_fit.problem import build_fit
+from legcal.calibration.joint_fit.rounds import first_minimum
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.variables import (
     FittedLegs,
-    Prior,
     RefinementSettings,
-    Solution,
     Start,
     State,
-    average_images,
-    bound,
-    build_fit,
-    refine,
+    with_values,
 )
-from legcal.calibration.joint_fit.determinacy import open_directions
-from legcal.calibration.joint_fit.rounds import first_minimum
-from legcal.calibration.joint_fit.variables import with_values
-from legcal.data import LegAxes, Measurements, View, axes_from_outlines, no_outlines
-from legcal.estimation import Frames, information, linearize
-from legcal.geometry import Array
-from legcal.machine import (
-    ARM_KINDS,
-    Leg,
-    LegKind,
-    kind_of_parameter,
-    moved_legs,
-    parameters_of_legs,
-    parametrize,
-    radius_name,
-)
-from legcal.simulation import moved_outlines
+from legcal.data.axes import LegAxes, axes_from_outlines
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import no_outlines
+from legcal.estimation.problem import Frames, linearize
+from legcal.estimation.solver import information
+from legcal.geometry.types import Array
+from legcal.machine.leg import Leg, LegKind, parameters_of_legs, radius_name
+from legcal.machine.parameters import ARM_KINDS, kind_of_parameter, moved_legs, parametrize
+from legcal.simulation.observe import moved_outlines
 
 MACHINES = ("3-rps", "tricept", "hexapod-rod", "3-rpr")
 SCALE = 2.5

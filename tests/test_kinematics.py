@@ -15,25 +15,20 @@ from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.geometry import Array
-from legcal.machine import (
-    Configurations,
+from legcal.geometry.types import Array
+from legcal.machine import kinematics
+from legcal.machine.configurations import Configurations, random_configurations, random_poses
+from legcal.machine.equations import pose_equations
+from legcal.machine.kinematics import (
     Follower,
-    LegKind,
-    Machine,
     follow,
     forward_kinematics,
     forward_kinematics_many,
     inverse_kinematics,
-    joint_values,
-    kinematics,
-    load_mechanism,
-    pose_equations,
-    random_configurations,
-    random_poses,
-    slider_columns,
-    vectors_A_to_B,
 )
+from legcal.machine.leg import LegKind
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine, joint_values, slider_columns, vectors_A_to_B
 
 machine_of = cache(load_mechanism)
 DRAWN = 8

@@ -13,11 +13,14 @@ from hexapod_example import spoiled
 from simulated import simulated
 
 from legcal import calibrate, check
-from legcal.calibration import Result
-from legcal.calibration.joint_fit import Choices, Prior, Solution, refine
-from legcal.data import load_dataset, no_outlines
-from legcal.geometry import Array
-from legcal.vision import Camera, intrinsic_names, intrinsic_values, with_intrinsics
+from legcal.calibration.documents import Result
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.data.dataset import load_dataset
+from legcal.data.outlines import no_outlines
+from legcal.geometry.types import Array
+from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 
 NAMES = intrinsic_names(LENS)
 SIGMA = np.array([3.0, 3.0, 1.5, 1.5, 0.004, 0.02, 3e-4, 3e-4, 0.0])  # k3 is held at zero

@@ -6,21 +6,20 @@ import numpy as np
 import pytest
 from staged_sessions import exact_session
 
-from legcal.data import LegAxes, Outlines, axes_from_outlines, join_axes
-from legcal.data.axes import outline_derivative
+from legcal.data.axes import LegAxes, axes_from_outlines, join_axes, outline_derivative
+from legcal.data.outlines import Outlines
 from legcal.errors import NotVisible
-from legcal.geometry import Array
 from legcal.geometry.lines import distance_to_line
-from legcal.simulation import (
+from legcal.geometry.types import Array
+from legcal.simulation.hexapod import (
     HexapodSession,
-    OutlineNoise,
     hexapod_cameras,
     hexapod_session,
     paper_hexapod,
     perturb,
-    shifted_outlines,
 )
-from legcal.vision import Camera, sample_camera
+from legcal.simulation.observe import OutlineNoise, shifted_outlines
+from legcal.vision.camera import Camera, sample_camera
 
 LENS = replace(sample_camera(), distortion=np.array([-0.2, 0.1, 0.001, -0.002, 0.0]))
 

@@ -11,7 +11,8 @@ from seen_numbers import n_seen
 from thinned import thinned
 
 from legcal import identifiability
-from legcal.machine import geometries, load_mechanism
+from legcal.machine.loader import load_mechanism
+from legcal.machine.parameters import geometries
 
 A, P, C = "actuated", "passive", "constant"
 KINDS: dict[str, MachineSpec] = {

@@ -14,24 +14,24 @@ from hexapod_example import Run
 from simulated import settings
 
 import legcal
-from legcal.calibration import joints_in_links
 from legcal.calibration.change_detection import possible_changes
 from legcal.calibration.documents import Kinematic, ParameterRow
-from legcal.calibration.link_joints import weak_in_links
-from legcal.geometry import Array
-from legcal.machine import (
-    Machine,
+from legcal.calibration.link_joints import joints_in_links, weak_in_links
+from legcal.geometry.types import Array
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
+from legcal.machine.parameters import (
     geometries,
-    load_mechanism,
     moved_legs,
     nominal_axes,
     parametrization_of,
     vector_of,
-    write_calibrated_yaml,
-    write_urdf,
 )
-from legcal.simulation import Level, ParameterErrors, simulate
-from legcal.vision import LINKS
+from legcal.simulation.dataset import simulate
+from legcal.simulation.request import Level
+from legcal.simulation.settings import ParameterErrors
+from legcal.vision.board import LINKS
 
 OBLIQUE = "nategh-agheli"  # its R_b is turned against its base link by 170 deg
 

@@ -34,7 +34,8 @@ from legcal import (
     locate,
     write_location,
 )
-from legcal.calibration import location_document, write_located_model
+from legcal.calibration.location.document import location_document
+from legcal.calibration.location.urdf import write_located_model
 from legcal.errors import (
     DatasetError,
     DidNotConverge,
@@ -43,8 +44,9 @@ from legcal.errors import (
     NotIdentifiable,
     UsageError,
 )
-from legcal.geometry import Array, rotation_matrices
-from legcal.machine import platform_pose
+from legcal.geometry.rotations import rotation_matrices
+from legcal.geometry.types import Array
+from legcal.machine.model import platform_pose
 
 KNOWN: dict[str, Any] = {"position_sigma": SIGMA_POSITION, "angle_sigma": SIGMA_ANGLE}
 

@@ -31,8 +31,9 @@ from legcal.calibration.location.frames import (
 )
 from legcal.calibration.location.search import search, solve_by_kronecker, solve_by_opencv
 from legcal.calibration.location.tool_poses import PoseNoise, motions_by_readings
-from legcal.geometry import Array, nearest_rotation, rotation_matrices
-from legcal.machine import forward_kinematics
+from legcal.geometry.rotations import nearest_rotation, rotation_matrices
+from legcal.geometry.types import Array
+from legcal.machine.kinematics import forward_kinematics
 
 STATED = (np.array([SIGMA_POSITION, SIGMA_ANGLE]), (True, True))
 UNKNOWN = (np.array([1e-3, 1e-2]), (False, False))

@@ -16,12 +16,14 @@ from rich.console import Console
 from scipy.spatial.transform import RigidTransform
 
 from legcal import measure_noise
-from legcal.calibration import QUANTITIES, DatasetNoise, PooledSpread
 from legcal.calibration.measurement_noise.canny import canny_parts, edge_points
 from legcal.calibration.measurement_noise.comparison import find_repeats, noise_notes
+from legcal.calibration.measurement_noise.document import DatasetNoise
 from legcal.calibration.measurement_noise.repeatability import (
+    QUANTITIES,
     AxisValues,
     LegOrientation,
+    PooledSpread,
     Repeats,
     Sample,
     axis_values,
@@ -29,16 +31,21 @@ from legcal.calibration.measurement_noise.repeatability import (
     pool,
     sample_of,
 )
-from legcal.data import LegAxes, Measurements, Outlines, View, load_dataset
-from legcal.data.axes import outline_derivative
+from legcal.data.axes import LegAxes, outline_derivative
+from legcal.data.dataset import load_dataset
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
-from legcal.geometry import Array, normal_basis
-from legcal.machine import Cylinder, JointType, Leg, LegKind, load_mechanism
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array
+from legcal.machine.leg import Cylinder, JointType, Leg, LegKind
+from legcal.machine.loader import load_mechanism
 from legcal.perception.detection import measure_outlines
 from legcal.perception.outline import measure
 from legcal.perception.placement import Placement, Search
-from legcal.report import noise_table
-from legcal.vision import EPSILON, Camera, outlines_of_axis
+from legcal.report.noise import noise_table
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import EPSILON, outlines_of_axis
 
 RADIUS = 0.012
 LENS = np.array([-0.3, 0.1, 0.001, -0.002, 0.0])

@@ -20,21 +20,20 @@ from thinned import thinned
 
 from legcal import load_mechanism
 from legcal.errors import LegcalError, UsageError
-from legcal.geometry import Array
-from legcal.machine import (
-    Machine,
-    geometries,
-    readings_at,
+from legcal.geometry.types import Array
+from legcal.machine.chain import ClosedChain
+from legcal.machine.mjcf import MjcfReader
+from legcal.machine.model import Machine, readings_at
+from legcal.machine.model_writer import (
     reload_and_check,
     write_calibrated_yaml,
     write_model,
     write_urdf,
 )
-from legcal.machine.chain import ClosedChain
-from legcal.machine.mjcf import MjcfReader
+from legcal.machine.parameters import geometries
 from legcal.machine.spanning_tree import close_loop
 from legcal.machine.urdf import Problems, parse_xml
-from legcal.simulation import draw_poses
+from legcal.simulation.poses import draw_poses
 
 machine_of = cache(load_mechanism)
 

@@ -18,16 +18,12 @@ from machines import MACHINES, SHIPPED_URDF, SHIPPED_YAML, of_types
 from thinned import thinned
 
 from legcal.errors import UsageError
-from legcal.geometry import Array, normal_basis
-from legcal.machine import (
-    Leg,
-    LegKind,
-    Machine,
-    forward_kinematics,
-    inverse_kinematics,
-    load_mechanism,
-    readings_at,
-)
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array
+from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.leg import Leg, LegKind
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine, readings_at
 
 LAYOUTS = {
     "hung from the base": Layout(),

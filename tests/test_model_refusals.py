@@ -20,7 +20,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import load_mechanism
 from legcal.errors import LegcalError, ModelError, OutOfClass
-from legcal.geometry import Array
+from legcal.geometry.types import Array
 
 Z = np.array([0.0, 0.0, 1.0])
 

@@ -17,19 +17,16 @@ from legcal.calibration.identify.predicted_observations import PredictedObservat
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.report import RmsMotion
 from legcal.calibration.identify.scale import is_scale_open, scale_sources
-from legcal.calibration.joint_fit import Choices, Prior
+from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.errors import NotIdentifiable
-from legcal.machine import (
-    Cylinder,
-    actuator_index,
-    parametrize,
-    random_postures_of_legs,
-    readings_of_rods,
-)
-from legcal.paper import count_conditions, enough_readings
+from legcal.machine.configurations import random_postures_of_legs
+from legcal.machine.leg import Cylinder
+from legcal.machine.parameters import parametrize
+from legcal.machine.rods import actuator_index, readings_of_rods
+from legcal.paper.conditions import count_conditions, enough_readings
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
-from legcal.report import identify_verdict
 from legcal.report.identify import _verdict
+from legcal.report.page.verdicts import identify_verdict
 
 RANKS = {"hexaglide": 42, "6-rss": 54, "linear-delta": 36, "delta": 42, "3-prs": 21}
 TURNING = ("6-rss", "delta")

@@ -14,18 +14,15 @@ from machines import ROOT, SHIPPED, TRIPOD, check_same, made, read_family, read_
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, UsageError
-from legcal.machine import (
-    Dimensions,
-    LegKind,
-    Machine,
-    create_model,
-    description_of,
-    forward_kinematics,
-    inverse_kinematics,
-    load_mechanism,
-    shipped_names,
-    singularity,
-)
+from legcal.machine.dimensions import Dimensions
+from legcal.machine.family import description_of
+from legcal.machine.files import shipped_names
+from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.leg import LegKind
+from legcal.machine.loader import load_mechanism
+from legcal.machine.mobility import singularity
+from legcal.machine.model import Machine
+from legcal.machine.model_builder import create_model
 
 TABLES = sorted((ROOT / "models" / "tables").glob("*.yaml"))
 REAL = ROOT / "tests" / "data" / "nategh-agheli-real"

@@ -30,30 +30,20 @@ from simulated import settings
 from thinned import thinned
 
 import legcal
-from legcal.calibration.joint_fit import (
-    DEFAULT_SETTINGS,
-    KINDS,
-    FitProblem,
-    GammaTrials,
-    RefinementSettings,
-    Solution,
-    State,
-    build_fit,
-    known_gammas,
-    loses_outlines,
-    observed_outlines,
-    possible_biases,
-    refine,
-)
+from legcal.calibration.joint_fit.factors import known_gammas, observed_outlines
+from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.gammas import (
     GAMMA_RANGE,
     GAMMA_STEP,
     GAMMA_TOLERANCE,
     MAX_GAMMA_TRIALS,
+    GammaTrials,
+    loses_outlines,
     most_likely,
     next_trial,
 )
 from legcal.calibration.joint_fit.outline_errors import (
+    KINDS,
     LIMB_SIGMA,
     N_KINDS,
     PLACES,
@@ -62,24 +52,30 @@ from legcal.calibration.joint_fit.outline_errors import (
     EstimatedGamma,
     NoiseModel,
     estimated_biases,
+    possible_biases,
     sigmas_at_places,
 )
+from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.rounds import (
     NO_CHANGES,
     Changes,
     check_convergence,
     with_edge_biases,
 )
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementSettings, State
 from legcal.calibration.outline_detection import detect
-from legcal.data import Measurements, Outlines, no_outlines
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines, no_outlines
 from legcal.errors import DidNotConverge
-from legcal.estimation import information, linearize, score_test, scores_of_block
-from legcal.geometry import Array, BoolArray
-from legcal.perception import used_as_before
-from legcal.perception.outline import WRONG_WIDTH
-from legcal.simulation import moved_outlines
-from legcal.simulation import simulate as simulate_folder
-from legcal.vision import EPSILON
+from legcal.estimation.problem import linearize
+from legcal.estimation.solver import information
+from legcal.estimation.uncertainty import score_test, scores_of_block
+from legcal.geometry.types import Array, BoolArray
+from legcal.perception.outline import WRONG_WIDTH, used_as_before
+from legcal.simulation.dataset import simulate as simulate_folder
+from legcal.simulation.observe import moved_outlines
+from legcal.vision.cylinder import EPSILON
 
 SHARE = 0.2  # of outlines that are wrong
 LOG_GAMMA = 0.6

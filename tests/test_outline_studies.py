@@ -43,20 +43,18 @@ from parameter_steps import written_with
 from rich.console import Console
 from thinned import thinned
 
-from legcal.calibration import Solution, Start
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.variables import Start
 from legcal.errors import DidNotConverge, NotIdentifiable
-from legcal.geometry import Array, components
-from legcal.machine import (
-    Leg,
-    LegKind,
-    load_mechanism,
-    parametrization_of,
-    platform_in_base,
-    pose_equations,
-    shipped_names,
-    vector_of,
-)
-from legcal.simulation import Record, child_seed, run_study
+from legcal.geometry.motions import components
+from legcal.geometry.types import Array
+from legcal.machine.equations import pose_equations
+from legcal.machine.files import shipped_names
+from legcal.machine.kinematics import platform_in_base
+from legcal.machine.leg import Leg, LegKind
+from legcal.machine.loader import load_mechanism
+from legcal.machine.parameters import parametrization_of, vector_of
+from legcal.simulation.study import Record, child_seed, run_study
 
 NOISE = Noise()
 N_POSES = 5

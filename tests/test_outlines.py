@@ -12,12 +12,12 @@ from six_photographs import six_photographs
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
-from legcal.machine import Cylinder
-from legcal.perception import measure_photographs, with_measured_radii
+from legcal.machine.leg import Cylinder
 from legcal.perception.blocks import BlockLine
 from legcal.perception.detection import measure_outlines
 from legcal.perception.outline import NARROW_BIAS, WRONG_WIDTH, PartVerdict, verdict
 from legcal.perception.part_edges import MIN_LONE_SCORE, EdgePair, _alone, _lines
+from legcal.perception.photographs import measure_photographs, with_measured_radii
 from legcal.perception.placement import Placement, Search
 from legcal.perception.subpixel_edges import MeasuredEdge
 from legcal.progress import no_progress

@@ -23,36 +23,26 @@ from thinned import thinned
 
 import legcal
 from legcal import identifiability
-from legcal.calibration.joint_fit import refine
 from legcal.calibration.joint_fit.diagnostics import refuse_contradicted_values
+from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.variables import LegConstraints, start_from
 from legcal.errors import OutOfClass
-from legcal.estimation import Frames
-from legcal.geometry import Array, cross
-from legcal.machine import (
-    Leg,
-    Machine,
-    follow_poses,
-    geometries,
-    inverse_kinematics,
-    load_mechanism,
-    machine_ties,
-    moved_legs,
-    on_ties,
-    parametrization_of,
-    platform_in_base,
-    solve_poses,
-)
-from legcal.simulation import (
-    Level,
-    ParameterErrors,
-    SimulationSettings,
-    Spread,
-    simulate,
-    write_true_model,
-)
+from legcal.estimation.problem import Frames
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array
+from legcal.machine.kinematics import follow_poses, inverse_kinematics, platform_in_base
+from legcal.machine.leg import Leg
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.parameters import geometries, moved_legs, parametrization_of
+from legcal.machine.solved_poses import solve_poses
+from legcal.machine.ties import machine_ties, on_ties
+from legcal.simulation.dataset import simulate
+from legcal.simulation.request import Level
+from legcal.simulation.settings import ParameterErrors, SimulationSettings, Spread
+from legcal.simulation.truth import write_true_model
 
 KINDS: dict[str, tuple[Callable[[], MachineSpec], int, int]] = {  # mobility, parameters less ties
     "exechon": (exechon, 3, 19 - 7),

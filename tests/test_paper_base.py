@@ -10,12 +10,17 @@ from fit_sessions import PINHOLE
 from scipy.spatial.transform import RigidTransform, Rotation
 from staged_sessions import Observed, exact_session, made_up_base, noisy_session, seen_from, shipped
 
-from legcal.data import LegAxes, Measurements, View
+from legcal.data.axes import LegAxes
+from legcal.data.measurements import Measurements, View
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, BoolArray, IntArray, normal_basis, turned_axis
-from legcal.machine import JointType, Leg, LegKind
-from legcal.paper import Criteria, NominalMachine, joints_in_camera, run_base_steps
+from legcal.geometry.axes import turned_axis
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import JointType, Leg, LegKind
+from legcal.paper import joints_in_camera
 from legcal.paper.camera_poses import candidate_camera_poses
+from legcal.paper.criteria import Criteria
+from legcal.paper.four_steps import run_base_steps
 from legcal.paper.joints_in_base import locate_joints_in_base
 from legcal.paper.joints_in_camera import (
     joint_residuals,
@@ -24,7 +29,9 @@ from legcal.paper.joints_in_camera import (
     residual_jacobian,
 )
 from legcal.paper.leg_directions import directions_through_joints, observed_directions
-from legcal.simulation import OutlineNoise, nominal_of
+from legcal.paper.nominal import NominalMachine
+from legcal.simulation.observe import OutlineNoise
+from legcal.simulation.paper import nominal_of
 
 # Step 1: joints and axes in the cameras
 

@@ -21,15 +21,14 @@ from staged_sessions import (
 
 from legcal.calibration.identify.predicted_observations import planned_observations
 from legcal.errors import DidNotConverge, NotIdentifiable
-from legcal.geometry import Array, IntArray, normal_basis
-from legcal.machine import EquationKind, LegKind, leg_equations, load_mechanism
-from legcal.paper import (
-    Transformation,
-    platform,
-    run_base_steps,
-    run_platform_steps,
-    run_steps,
-)
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.equations import leg_equations
+from legcal.machine.leg import EquationKind, LegKind
+from legcal.machine.loader import load_mechanism
+from legcal.paper import platform
+from legcal.paper.criteria import Transformation
+from legcal.paper.four_steps import run_base_steps, run_platform_steps, run_steps
 from legcal.paper.gibbs import axis_frames, motion_after
 from legcal.paper.least_squares import IpoptSolution, LeastSquares, solve_least_squares
 from legcal.paper.leg_directions import LegDirections, directions_through_joints
@@ -49,7 +48,8 @@ from legcal.paper.offsets import (
 from legcal.paper.platform import locate_platform_joints
 from legcal.paper.platform_pose import PlatformPoses, locate_platform, register_by_rays
 from legcal.paper.platform_printed import fixed_direction, locate_passive_end, revolute_axis
-from legcal.simulation import OutlineNoise, nominal_of
+from legcal.simulation.observe import OutlineNoise
+from legcal.simulation.paper import nominal_of
 
 TRANSFORMATIONS: tuple[Transformation, ...] = ("points", "cross_product")
 

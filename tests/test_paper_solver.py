@@ -13,14 +13,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge
-from legcal.geometry import (
-    axis_angles,
-    normal_basis,
-    register_groups,
-    register_in_plane,
-    register_points,
-    turned_axis,
-)
+from legcal.geometry.axes import axis_angles, turned_axis
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.motions import register_groups, register_in_plane, register_points
 from legcal.paper.gibbs import (
     angles_of,
     axis_frames,

@@ -23,11 +23,14 @@ from thinned import thinned
 
 from legcal.calibration.identify.predicted_observations import planned_observations
 from legcal.calibration.identify.ranks import Analysis, determined
-from legcal.data import LegAxes, axes_from_outlines
+from legcal.data.axes import LegAxes, axes_from_outlines
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array
-from legcal.machine import LegKind, from_vector, load_mechanism, parametrize, to_vector
-from legcal.paper import Criteria, Transformation, run_base_steps
+from legcal.geometry.types import Array
+from legcal.machine.leg import LegKind
+from legcal.machine.loader import load_mechanism
+from legcal.machine.parameters import from_vector, parametrize, to_vector
+from legcal.paper.criteria import Criteria, Transformation
+from legcal.paper.four_steps import run_base_steps
 from legcal.paper.joints_in_base import build_rigid_base as build_base
 from legcal.paper.joints_in_base import build_scalar_products
 from legcal.paper.least_squares import IpoptSolution, LeastSquares
@@ -37,19 +40,16 @@ from legcal.paper.platform import RigidProblem, build_rigid_platform
 from legcal.paper.platform_pose import build_rays
 from legcal.paper.platform_printed import build_mean_distances
 from legcal.paper.unknowns import Unknowns
-from legcal.simulation import (
+from legcal.simulation.hexapod import (
     PAPER_VIEWS,
-    OutlineNoise,
-    TableNoise,
     extreme_poses,
     hexapod_cameras,
     hexapod_session,
-    nominal_of,
     paper_hexapod,
     perturb,
-    platform_errors,
-    shifted_outlines,
 )
+from legcal.simulation.observe import OutlineNoise, TableNoise, shifted_outlines
+from legcal.simulation.paper import nominal_of, platform_errors
 
 # (14) does not see the length that all rods of an ideal linear Delta have.
 MACHINES = [name for name in SHIPPED if name != "linear-delta"]

@@ -15,9 +15,10 @@ from photograph_files import exif, jpeg, png, tiff
 
 from legcal import calibrate, calibrate_camera, load_dataset
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
-from legcal.data import compression_note
+from legcal.data.photograph_notes import compression_note
 from legcal.errors import DatasetError, NotVisible
-from legcal.vision import ImageFacts, read_camera, read_facts
+from legcal.vision.camera_file import read_camera
+from legcal.vision.image_facts import ImageFacts, read_facts
 
 __all__ = ["folder"]
 

@@ -23,32 +23,33 @@ from machines import read_family
 from rich.console import Console
 
 import legcal
-from legcal import planning
-from legcal.data import load_dataset
+from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
-from legcal.geometry import Array
-from legcal.machine import (
-    ARM_KINDS,
-    Cylinder,
-    Feasibility,
-    Pulses,
-    create_model,
-    follow,
-    inverse_kinematics,
-    kind_of_parameter,
-    load_mechanism,
-    random_configurations,
-    slider_columns,
-)
-from legcal.planning import Setting, planner
+from legcal.geometry.types import Array
+from legcal.machine.actuator import Pulses
+from legcal.machine.configurations import random_configurations
+from legcal.machine.feasibility import Feasibility
+from legcal.machine.kinematics import follow, inverse_kinematics
+from legcal.machine.leg import Cylinder
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import slider_columns
+from legcal.machine.model_builder import create_model
+from legcal.machine.parameters import ARM_KINDS, kind_of_parameter
 from legcal.planning import places as camera_places
+from legcal.planning import planner
 from legcal.planning.exchange import Session, choose
-from legcal.planning.information import Contributions
-from legcal.planning.planner import Scene, Task
-from legcal.report import plan_table
-from legcal.report.plan import checklist
-from legcal.simulation import Level, ParameterErrors, SimulationSettings, simulate
-from legcal.vision import sample_camera
+from legcal.planning.information import DEFAULT_NOISE, WHITE, Contributions, Predictor
+from legcal.planning.noise import read_noise
+from legcal.planning.places import Place, Setting, parse_bounds
+from legcal.planning.planned_session import Plan
+from legcal.planning.planner import Candidates, Scene, Task
+from legcal.planning.request import difference
+from legcal.planning.session import write_session
+from legcal.report.plan import checklist, plan_table
+from legcal.simulation.dataset import simulate
+from legcal.simulation.request import Level
+from legcal.simulation.settings import ParameterErrors, SimulationSettings
+from legcal.vision.camera import sample_camera
 
 FEW = Setting(draws=3)
 BOUNDS = "0m:2m,-2m:2m,0.5m:2m"  # of cameras
@@ -79,27 +80,25 @@ def small_search() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def planned(small_search: None) -> planning.Plan:
+def planned(small_search: None) -> Plan:
     """A plan for outlines with white noise, its work done elsewhere."""
     return legcal.plan(
-        "3-rpr", images=6, cameras=2, seed=3, noise=planning.WHITE, setting=FEW,
-        bounds=planning.parse_bounds(BOUNDS), workers=Elsewhere(),
+        "3-rpr", images=6, cameras=2, seed=3, noise=WHITE, setting=FEW,
+        bounds=parse_bounds(BOUNDS), workers=Elsewhere(),
     )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def shot(planned: planning.Plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def shot(planned: Plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated session of it, beside the plan."""
     folder = tmp_path_factory.mktemp("planned")
-    planning.write_session(planned, folder / "session")
+    write_session(planned, folder / "session")
     settings = SimulationSettings(seed=5, plan=folder / "session", level=Level.OUTLINES)
     simulate(load_mechanism("3-rpr"), folder / "shot", settings)
     return folder
 
 
-def test_a_planned_session_is_a_dataset_and_simulation_shoots_it(
-    planned: planning.Plan, shot: Path
-) -> None:
+def test_a_planned_session_is_a_dataset_and_simulation_shoots_it(planned: Plan, shot: Path) -> None:
     dataset = load_dataset(shot / "session", check_images=False)
     machine, m = dataset.machine, dataset.measurements
     assert m.n_rows == planned.n_images == 6
@@ -116,7 +115,7 @@ def test_a_planned_session_is_a_dataset_and_simulation_shoots_it(
 
 
 def test_the_expected_error_is_that_of_a_calibration_which_says_so(
-    planned: planning.Plan, shot: Path
+    planned: Plan, shot: Path
 ) -> None:
     found = legcal.calibrate(shot / "shot", output=shot / "out")
     assert found.platform is not None
@@ -144,14 +143,14 @@ def places(folder: Path, **more: Any) -> Path:
 
 
 def test_the_command_writes_what_python_plans(
-    planned: planning.Plan,
+    planned: Plan,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """With the same seed it is the same, to the last bit, wherever work is done."""
-    monkeypatch.setattr(planning, "USUAL", FEW)
-    monkeypatch.setattr(planning, "DEFAULT_NOISE", planning.WHITE)
+    monkeypatch.setattr("legcal.planning.places.USUAL", FEW)
+    monkeypatch.setattr("legcal.planning.information.DEFAULT_NOISE", WHITE)
     session = tmp_path / "session"
     assert run(monkeypatch, *WORDS, "--json", "-o", session) == 0
     printed = json.loads(capsys.readouterr().out)
@@ -171,7 +170,7 @@ def test_the_command_writes_what_python_plans(
 
 
 def test_a_search_that_is_stopped_writes_its_best_and_says_so(
-    planned: planning.Plan,
+    planned: Plan,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -184,9 +183,9 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
 
     monkeypatch.setattr(planner, "choose", stopped)
     monkeypatch.setattr("legcal.cli.plan._previews", lambda _: {})
-    monkeypatch.setattr("legcal.report.plan_files", lambda *_: {})
-    monkeypatch.setattr(planning, "USUAL", FEW)
-    monkeypatch.setattr(planning, "DEFAULT_NOISE", planning.WHITE)
+    monkeypatch.setattr("legcal.report.plan.plan_files", lambda *_: {})
+    monkeypatch.setattr("legcal.planning.places.USUAL", FEW)
+    monkeypatch.setattr("legcal.planning.information.DEFAULT_NOISE", WHITE)
     assert run(monkeypatch, *WORDS, "--json", "-o", tmp_path / "session") == 130
     printed = capsys.readouterr()
     assert json.loads(printed.out)["error"]["kind"] == "Interrupted"
@@ -202,12 +201,12 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
 def test_a_second_signal_ends_a_plan_at_once_and_leaves_no_session(
     place: str,
     number: signal.Signals,
-    planned: planning.Plan,
+    planned: Plan,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def stopped(*_found: Any, **_more: Any) -> planning.Plan:
+    def stopped(*_found: Any, **_more: Any) -> Plan:
         signal.raise_signal(signal.SIGINT)
         return planned
 
@@ -215,9 +214,9 @@ def test_a_second_signal_ends_a_plan_at_once_and_leaves_no_session(
         signal.raise_signal(number)
         pytest.fail("the second signal was not answered")
 
-    monkeypatch.setattr(planning, "plan", stopped)
+    monkeypatch.setattr("legcal.planning.request.plan", stopped)
     monkeypatch.setattr("legcal.cli.plan._previews", lambda _: {})
-    monkeypatch.setattr("legcal.report.plan_files", lambda *_: {})
+    monkeypatch.setattr("legcal.report.plan.plan_files", lambda *_: {})
     monkeypatch.setattr(place, stopped_again)
     assert run(monkeypatch, *WORDS, "-o", tmp_path / "session") == 130
     assert capsys.readouterr().err == "legcal: Stopped before the end.\n"
@@ -229,7 +228,7 @@ def test_a_stopped_search_says_that_it_missed_its_target() -> None:
         "3-rpr",
         target=1e-6,
         cameras=2,
-        bounds=planning.parse_bounds(BOUNDS),
+        bounds=parse_bounds(BOUNDS),
         setting=FEW,
         stop=lambda: True,
     )
@@ -239,12 +238,12 @@ def test_a_stopped_search_says_that_it_missed_its_target() -> None:
 
 
 def test_a_better_known_machine_is_what_more_images_and_a_given_session_make(
-    planned: planning.Plan, shot: Path, tmp_path: Path
+    planned: Plan, shot: Path, tmp_path: Path
 ) -> None:
     assert np.all(np.diff(planned.growth[:, 1]) < 0.0)
     more = legcal.plan(
         "3-rpr", images=2, cameras=1, places=places(tmp_path), given=shot / "session",
-        noise=planning.WHITE, setting=FEW,
+        noise=WHITE, setting=FEW,
     )  # fmt: skip
     assert more.error is not None
     assert planned.error is not None
@@ -264,12 +263,12 @@ def test_a_session_by_hand_is_shot_with_its_board_where_the_plan_lays_it(
     high = {f"t{k}": {"xyz": [float(np.cos(k)), float(np.sin(k)), 3.2]} for k in range(0, 8, 2)}
     (tmp_path / "high.yaml").write_text(yaml.safe_dump({"places": high}))
     held = legcal.plan(
-        "3-rpr", images=4, board="chessboard:6x5:40mm", hand_held=True, noise=planning.WHITE,
+        "3-rpr", images=4, board="chessboard:6x5:40mm", hand_held=True, noise=WHITE,
         setting=FEW, places=tmp_path / "high.yaml",
     )  # fmt: skip
     held = replace(held, views=(*held.views[:3], replace(held.views[3], via=("2",))))
     assert held.board is not None
-    planning.write_session(held, tmp_path / "session")
+    write_session(held, tmp_path / "session")
     (*_, last) = read_rows(tmp_path / "session" / "poses.csv")
     assert (last["pose"], last["on the way"]) == (held.views[3].name, held.views[1].name)
     settings = SimulationSettings(plan=tmp_path / "session", level=Level.OUTLINES)
@@ -296,10 +295,10 @@ def test_a_session_by_hand_is_shot_with_its_board_where_the_plan_lays_it(
         simulate(load_mechanism("3-rpr"), tmp_path / "again", settings)
 
 
-def test_what_is_seen_is_what_the_simulation_shows(planned: planning.Plan, tmp_path: Path) -> None:
+def test_what_is_seen_is_what_the_simulation_shows(planned: Plan, tmp_path: Path) -> None:
     """By another code, which casts rays at solids and draws silhouettes by their tangents."""
     exact = replace(planned, setting=replace(FEW, shift=0.0, turn=0.0))
-    planning.write_session(exact, tmp_path / "session")
+    write_session(exact, tmp_path / "session")
     settings = SimulationSettings(
         errors=ParameterErrors(), plan=tmp_path / "session", level=Level.OUTLINES, sigma_px=0.0
     )
@@ -328,8 +327,8 @@ def test_arms_that_are_cylinders_count_as_a_calibration_has_them(tmp_path: Path)
     """They are seen where the simulation shows them, and their lines become as well known."""
     machine = create_model(read_family("delta", arm_radius=8.0), tmp_path).machine
     setting = replace(FEW, shift=0.0, turn=0.0)
-    plan = legcal.plan(machine, images=15, seed=1, noise=planning.WHITE, setting=setting)
-    planning.write_session(plan, tmp_path / "session")
+    plan = legcal.plan(machine, images=15, seed=1, noise=WHITE, setting=setting)
+    write_session(plan, tmp_path / "session")
     lengths = {"leg1.base:leg1.platform": 5e-5}
     settings = SimulationSettings(
         plan=tmp_path / "session", level=Level.OUTLINES, seed=2, lengths=lengths
@@ -366,12 +365,12 @@ def test_bias_of_single_outlines_in_a_result_counts_as_errors_at_places(tmp_path
     for shared, places in (({}, (0.05, 0.01)), ({place: 0.02}, (0.05, 0.02))):
         found = {"legcal_result": 1, "residuals": {"noise": noise, "shared_px": shared}}
         (tmp_path / "result.json").write_text(json.dumps(found))
-        assert planning.read_noise(tmp_path).places_px == places
+        assert read_noise(tmp_path).places_px == places
 
 
 def test_a_box_between_the_places_around_a_machine_is_used(small_search: None) -> None:
     """From where a machine is shown as well, wherever that is."""
-    predictor = planning.Predictor(load_mechanism("hexapod"), sample_camera(), planning.WHITE, 1e-6)
+    predictor = Predictor(load_mechanism("hexapod"), sample_camera(), WHITE, 1e-6)
     poses = random_configurations(predictor.machine, 4, np.random.default_rng(0))
     around = [p.T_base_camera.translation for p in planner._places(Task(predictor, 6, 1), poses)]
     middle = np.mean(around[:2], axis=0)  # one nearer than the other
@@ -385,9 +384,7 @@ def test_a_box_between_the_places_around_a_machine_is_used(small_search: None) -
 def test_cameras_of_a_machine_that_hangs_stand_upright(small_search: None) -> None:
     """A tripod stands on the ground, whichever way the platform is."""
     places = planner._places(
-        Task(
-            planning.Predictor(load_mechanism("delta"), sample_camera(), planning.WHITE, 1e-6), 6, 1
-        ),
+        Task(Predictor(load_mechanism("delta"), sample_camera(), WHITE, 1e-6), 6, 1),
         random_configurations(load_mechanism("delta"), 4, np.random.default_rng(0)),
     )
     below = [place.T_base_camera.translation[2] < -0.5 for place in places]
@@ -395,7 +392,7 @@ def test_cameras_of_a_machine_that_hangs_stand_upright(small_search: None) -> No
     assert all(place.T_base_camera.rotation.as_matrix()[2, 1] < 0.0 for place in places)
 
 
-def test_the_way_between_planned_poses_is_free(planned: planning.Plan) -> None:
+def test_the_way_between_planned_poses_is_free(planned: Plan) -> None:
     machine = planned.machine
     feasibility, columns = Feasibility(machine), slider_columns(machine, machine.motors)[0]
     stations = [machine.home_configuration]
@@ -413,12 +410,10 @@ def test_the_way_between_planned_poses_is_free(planned: planning.Plan) -> None:
                 assert feasibility.problem(at, of_motors=False) is None
 
 
-def test_updates_of_the_covariance_are_those_of_the_information(planned: planning.Plan) -> None:
-    task = Task(
-        planning.Predictor(planned.machine, planned.camera, planning.DEFAULT_NOISE, 2e-6), 6, 1
-    )
+def test_updates_of_the_covariance_are_those_of_the_information(planned: Plan) -> None:
+    task = Task(Predictor(planned.machine, planned.camera, DEFAULT_NOISE, 2e-6), 6, 1)
     view = planned.views[0]
-    candidates = planning.Candidates(planning.Place(view.T_base_camera), view.poses)
+    candidates = Candidates(Place(view.T_base_camera), view.poses)
     found = Scene.nominal(task).of(candidates)
     assert found is not None
     session = Session([found])
@@ -495,14 +490,14 @@ def test_a_machine_whose_legs_always_collide_says_so() -> None:
 
 
 def test_plans_of_motors_that_turn_are_in_degrees_and_name_the_length_to_measure(
-    planned: planning.Plan, tmp_path: Path
+    planned: Plan, tmp_path: Path
 ) -> None:
     machine, sigma = load_mechanism("delta"), np.radians(0.5)
     drawn = random_configurations(machine, 2, np.random.default_rng(1))
     seen: Any = SimpleNamespace(legs_in=lambda *shape: np.ones(shape, dtype=np.bool_))
     view = replace(planned.views[0], poses=drawn, via=("", ""), seen=seen)
     plan = replace(planned, machine=machine, views=(view,), sigma_by_joint={"arm2": sigma})
-    planning.write_session(plan, tmp_path)
+    write_session(plan, tmp_path)
     rows = read_rows(tmp_path / "poses.csv")
     told = [[float(row[f"arm{j} [deg]"]) for j in (1, 2, 3)] for row in rows]
     found = load_dataset(tmp_path, check_images=False).measurements
@@ -518,9 +513,9 @@ def test_plans_of_motors_that_turn_are_in_degrees_and_name_the_length_to_measure
 
 
 def test_each_motor_counts_with_its_own_standard_deviation(monkeypatch: pytest.MonkeyPatch) -> None:
-    found: list[planning.Predictor] = []
+    found: list[Predictor] = []
 
-    def told(task: Task, *_: object) -> planning.Plan:
+    def told(task: Task, *_: object) -> Plan:
         found.append(task.predictor)
         raise DidNotConverge("It was told.")
 
@@ -553,7 +548,7 @@ def test_photographs_of_one_site_share_errors_at_its_places() -> None:
     """They tell as much as generalised least squares gets from all of them."""
     hexapod, session = load_mechanism("hexapod"), machine_session("hexapod", n_views=1)
     T_base_camera = hexapod.T_base_Rb * session.truth.T_camera_Rb[0].inv()
-    predictor = planning.Predictor(hexapod, sample_camera(), planning.DEFAULT_NOISE, 2e-6)
+    predictor = Predictor(hexapod, sample_camera(), DEFAULT_NOISE, 2e-6)
 
     def contributions(*taken: int, is_fit: bool = False) -> Contributions:
         shown = [np.flatnonzero(session.outlines.row == pose) for pose in taken]
@@ -600,9 +595,7 @@ def test_photographs_of_one_site_share_errors_at_its_places() -> None:
     np.testing.assert_allclose(searched.machine, left.machine, rtol=0.01, atol=1e-5)
 
 
-def test_what_else_is_in_the_way_is_refused(
-    planned: planning.Plan, shot: Path, tmp_path: Path
-) -> None:
+def test_what_else_is_in_the_way_is_refused(planned: Plan, shot: Path, tmp_path: Path) -> None:
     def refused(error: type[legcal.LegcalError], named: str, **asked: Any) -> None:
         of: dict[str, Any] = {"model": "3-rpr", "images": 4, "cameras": 1, "setting": FEW}
         with pytest.raises(error, match=named):
@@ -629,16 +622,13 @@ def test_what_else_is_in_the_way_is_refused(
     refused(NotIdentifiable, "plan .* --images or more", images=1, places=places(tmp_path))
     refused(DatasetError, "needed images of 3-rps", model="3-rps", given=shot / "session")
     upright, tilted = map(load_mechanism, ("3-upu", "3-upu-tilted"))
-    assert (
-        planning.difference(upright, tilted)
-        == "axes of joints up to 15 deg from those of the model"
-    )
-    assert not planning.difference(tilted, tilted)
+    assert difference(upright, tilted) == "axes of joints up to 15 deg from those of the model"
+    assert not difference(tilted, tilted)
     with pytest.raises(UsageError, match="--force"):
-        planning.write_session(planned, shot / "session")
+        write_session(planned, shot / "session")
     for text in ("1m", "0m:1m,0m:1m,1m:0m", "0m:1m,0m:1m,0m:1kg"):
         with pytest.raises(UsageError, match="--bounds"):
-            planning.parse_bounds(text)
+            parse_bounds(text)
     (shot / "session" / "images").mkdir()
     with pytest.raises(UsageError, match="photographs"):
-        planning.write_session(planned, shot / "session", force=True)
+        write_session(planned, shot / "session", force=True)

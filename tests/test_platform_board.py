@@ -22,11 +22,11 @@ from simulated import settings
 
 from legcal import calibrate, evaluate, identifiability, load_dataset, simulate
 from legcal.calibration.identify.identifiability import identifiability_of_dataset
-from legcal.calibration.joint_fit import refine
-from legcal.data import row_names
+from legcal.calibration.joint_fit.fit import refine
+from legcal.data.measurements import row_names
 from legcal.data.outlines import no_outlines
 from legcal.errors import DatasetError
-from legcal.simulation import SimulatedDataset
+from legcal.simulation.dataset import SimulatedDataset
 from legcal.simulation.request import Level
 from legcal.vision.board_file import parse_boards
 

@@ -19,20 +19,14 @@ from legcal.calibration.joint_fit.platform import (
 )
 from legcal.calibration.joint_fit.sensitivity import Sensitivity
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array
-from legcal.machine import (
-    LegKind,
-    Machine,
-    configurations,
-    forward_kinematics_many,
-    geometries,
-    load_mechanism,
-    parametrization_of,
-    parametrize,
-    platform_in_base,
-    pose_differences,
-    random_configurations,
-)
+from legcal.geometry.types import Array
+from legcal.machine import configurations
+from legcal.machine.configurations import random_configurations
+from legcal.machine.kinematics import forward_kinematics_many, platform_in_base, pose_differences
+from legcal.machine.leg import LegKind
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.parameters import geometries, parametrization_of, parametrize
 
 MACHINES = ("hexapod-rod", "3-rpr", "3-rps", "3-spr", "3-upu-tilted", "tricept")
 

@@ -13,7 +13,7 @@ from format_schemas import FOLDER, NAMES, schema_text
 from hexapod_example import Run
 
 import legcal
-from legcal.files import schema_names
+from legcal.files.published import schema_names
 
 ROOT = Path(__file__).parents[1]
 

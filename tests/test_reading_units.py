@@ -16,10 +16,14 @@ from machines import ROOT, read_table
 from photograph_files import jpeg
 
 import legcal
-from legcal.data import Dataset, load_dataset, sigmas_of
+from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.reading_units import sigmas_of
 from legcal.errors import LegcalError, ModelError, UsageError
-from legcal.machine import create_model, load_mechanism, write_model
-from legcal.simulation import Distribution, Level, SimulationSettings, Spread
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model_builder import create_model
+from legcal.machine.model_writer import write_model
+from legcal.simulation.request import Level
+from legcal.simulation.settings import Distribution, SimulationSettings, Spread
 
 ANGLES = 0.5 * np.sin(np.arange(24.0).reshape(4, 6))  # [rad]
 BOTH_WAYS = np.concatenate([ANGLES, -ANGLES])

@@ -12,14 +12,13 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
-from legcal.data import Measurements, Outlines, View
-from legcal.geometry import Array, Image
-from legcal.machine import (
-    Cylinder,
-    inverse_kinematics,
-    load_mechanism,
-    random_configurations,
-)
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines
+from legcal.geometry.types import Array, Image
+from legcal.machine.configurations import random_configurations
+from legcal.machine.kinematics import inverse_kinematics
+from legcal.machine.leg import Cylinder
+from legcal.machine.loader import load_mechanism
 from legcal.perception import recognition
 from legcal.perception.camera_search import (
     PoseCandidates,
@@ -53,7 +52,8 @@ from legcal.perception.view_fit import (
     reversed_pose,
     sideways_sigmas,
 )
-from legcal.vision import Camera, outlines_of_axis
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import outlines_of_axis
 
 CAMERA = Camera(np.array([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]]), 640, 480)
 OWN, TWIN = [0, 1, 2, 3, 4, 5], [1, 0, 3, 2, 5, 4]  # rods in pairs

@@ -11,8 +11,8 @@ import pytest
 from command_line import run
 
 from legcal import load_dataset, load_mechanism
-from legcal.data import reading_columns
-from legcal.geometry import Array
+from legcal.data.measurements import reading_columns
+from legcal.geometry.types import Array
 from legcal.recordings.frames import VIDEOS
 from legcal.recordings.stillness import clock_offset
 

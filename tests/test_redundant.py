@@ -21,35 +21,33 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings
 
 import legcal
-from legcal.calibration.joint_fit import refine
+from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.outlier_readings import with_judged_readings
 from legcal.calibration.joint_fit.platform import platform_by_parameters
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
-from legcal.exports import ExportOptions, Subject, export
-from legcal.geometry import Array
-from legcal.machine import (
-    Contradiction,
+from legcal.exports.formats import export
+from legcal.exports.subject import ExportOptions, Subject
+from legcal.geometry.types import Array
+from legcal.machine.configurations import random_configurations
+from legcal.machine.kinematics import (
     Follower,
-    Machine,
-    contradictions,
     forward_kinematics,
     forward_kinematics_many,
-    geometries,
     inverse_kinematics,
-    legs_in_links,
-    load_mechanism,
-    parametrization_of,
     platform_in_base,
     platforms_in_base,
-    random_configurations,
-    reading_residuals,
-    slider_columns,
-    solve_poses,
 )
+from legcal.machine.loader import load_mechanism
 from legcal.machine.mobility import generic_configurations
-from legcal.simulation import Level, SimulationSettings, simulate
+from legcal.machine.model import Machine, slider_columns
+from legcal.machine.parameters import geometries, legs_in_links, parametrization_of
+from legcal.machine.redundancy import Contradiction, contradictions, reading_residuals
+from legcal.machine.solved_poses import solve_poses
+from legcal.simulation.dataset import simulate
 from legcal.simulation.poses import given_poses
+from legcal.simulation.request import Level
+from legcal.simulation.settings import SimulationSettings
 
 
 def _concurrent() -> MachineSpec:

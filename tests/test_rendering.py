@@ -14,14 +14,17 @@ from scipy.special import ndtr
 from simulated import settings
 from thinned import thinned
 
-from legcal.data import Dataset, Outlines, load_dataset
-from legcal.data.outlines import read_observations
+from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.outlines import Outlines, read_observations
 from legcal.errors import UsageError
-from legcal.geometry import Array
-from legcal.machine import Machine, load_mechanism
-from legcal.simulation import Appearance, Level, Light, prepare_view, simulate
+from legcal.geometry.types import Array
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.simulation.dataset import simulate
+from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.pipeline import CAMERAS
-from legcal.simulation.rendering.scene import develop
+from legcal.simulation.rendering.scene import develop, prepare_view
+from legcal.simulation.request import Level
 from legcal.simulation.solids import (
     Box,
     Material,
@@ -35,7 +38,9 @@ from legcal.simulation.solids import (
     placed,
     solids_of,
 )
-from legcal.vision import Camera, camera_info, outlines_of_axis
+from legcal.vision.camera import Camera
+from legcal.vision.camera_file import camera_info
+from legcal.vision.cylinder import outlines_of_axis
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))

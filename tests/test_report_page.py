@@ -19,16 +19,18 @@ from rich.table import Table as TextTable
 from scipy.ndimage import map_coordinates
 
 import legcal
-from legcal.calibration import Calibration, platform_map
 from legcal.calibration.fit_overlays import with_overlays
+from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import write_result
+from legcal.calibration.workspace_errors import platform_map
 from legcal.errors import OutOfResources, UsageError
-from legcal.pages import Items, Number, Text, Verdict, number, page_html
+from legcal.pages.document import Items, Number, Text, Verdict, number
+from legcal.pages.html import page_html
 from legcal.perception.overlays import COLOURS
 from legcal.report.page.calibration_page import calibration_page
 from legcal.report.page.parameter_rows import parameter_tables
 from legcal.report.page.text_page import text_page
-from legcal.vision import outlines_of_axis
+from legcal.vision.cylinder import outlines_of_axis
 
 SECTIONS = (
     "verdict",
@@ -260,7 +262,7 @@ def test_calibrate_writes_the_report_unless_it_should_not(
     example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
-    monkeypatch.setattr("legcal.calibration.calibrate", _writing(example_run.calibration))
+    monkeypatch.setattr("legcal.calibration.pipeline.calibrate", _writing(example_run.calibration))
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1790000000")
     assert run(monkeypatch, "calibrate", example_run.folder, "-o", out) == 0
     page = (out / "report.html").read_bytes()
@@ -294,7 +296,7 @@ def test_a_page_that_fails_loses_nothing_else(
     out = Path(shutil.copytree(example_run.output, tmp_path / "out"))
     assert (out / "report.html").exists()
     words = ("calibrate", example_run.folder, "-o", out)
-    monkeypatch.setattr("legcal.calibration.calibrate", _writing(example_run.calibration))
+    monkeypatch.setattr("legcal.calibration.pipeline.calibrate", _writing(example_run.calibration))
     monkeypatch.setattr("legcal.report.page.calibration_page.verdict_of", fails)
     assert run(monkeypatch, *words, "--json") == 0
     printed = capsys.readouterr()
@@ -323,7 +325,9 @@ def test_the_truth_is_for_the_page_alone(
     mean = 1e3 * after.displacement.mean()
     assert f"by {mean:.3f} mm" in found.xpath("string(//section[@id='truth']/p)")
 
-    monkeypatch.setattr("legcal.calibration.calibrate", lambda *_, **__: pytest.fail("too late"))
+    monkeypatch.setattr(
+        "legcal.calibration.pipeline.calibrate", lambda *_, **__: pytest.fail("too late")
+    )
     words = ("calibrate", example_run.folder, "-o", tmp_path / "new", "--truth")
     assert run(monkeypatch, *words, "hexapod", "--no-report") == 2
     assert run(monkeypatch, *words, "3-rpr") == 2
@@ -391,7 +395,9 @@ def test_pages_of_earlier_results_go_and_files_of_others_stay(
     page.write_text("mine")
     write_result(calibration, out)
     assert page.read_text() == "mine"
-    monkeypatch.setattr("legcal.calibration.calibrate", lambda *_, **__: pytest.fail("too late"))
+    monkeypatch.setattr(
+        "legcal.calibration.pipeline.calibrate", lambda *_, **__: pytest.fail("too late")
+    )
     assert run(monkeypatch, "calibrate", example_run.folder, "-o", out) == 2
 
 

@@ -18,11 +18,12 @@ from simulated import simulated
 from legcal.cli.app import app
 from legcal.data.dataset_file import read_dataset_file
 from legcal.errors import LegcalError
-from legcal.files import read_yaml, schema_names
+from legcal.files.published import schema_names
+from legcal.files.schema import read_yaml
 from legcal.machine.description_table import read_description
 from legcal.machine.schema import read_mechanism_file
-from legcal.simulation import Level
-from legcal.vision import read_camera
+from legcal.simulation.request import Level
+from legcal.vision.camera_file import read_camera
 
 jsonschema = pytest.importorskip("jsonschema", reason="jsonschema (extra test) is not installed")
 

@@ -17,17 +17,13 @@ from fit_sessions import (
     with_camera,
 )
 
-from legcal.calibration.joint_fit import (
-    FOUND_CAMERA,
-    NO_CHOICES,
-    Choices,
-    Prior,
-    Solution,
-    refine,
-)
-from legcal.geometry import Array
-from legcal.machine import moved_legs
-from legcal.vision import Camera, with_intrinsics
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
+from legcal.calibration.joint_fit.sensitivity import FOUND_CAMERA
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.geometry.types import Array
+from legcal.machine.parameters import moved_legs
+from legcal.vision.camera import Camera, with_intrinsics
 
 PART = 1e-3  # of the errors whose effects are reported
 RADII = [f"leg{j}.radius.rod" for j in range(1, 7)]

@@ -18,26 +18,24 @@ from rich.console import Console
 from simulated import files_of, settings, simulated, small_camera
 
 import legcal
-from legcal.data import View, load_dataset
+from legcal.data.dataset import load_dataset
+from legcal.data.measurements import View
 from legcal.data.outlines import format_observations, read_observations
 from legcal.errors import DatasetError, NotVisible, OutOfResources, UsageError
-from legcal.machine import LegKind, load_mechanism
-from legcal.report import simulation_table
-from legcal.simulation import (
+from legcal.machine.leg import LegKind
+from legcal.machine.loader import load_mechanism
+from legcal.report.images import simulation_table
+from legcal.simulation.dataset import SimulatedDataset, simulate, summary_document
+from legcal.simulation.folder import TRUTH_NAME, check_dataset_destination, dataset_folder
+from legcal.simulation.observe import TableNoise
+from legcal.simulation.request import Level, Request, Sampling
+from legcal.simulation.settings import (
     Distribution,
-    Level,
     ParameterErrors,
-    Request,
-    Sampling,
-    SimulatedDataset,
     SimulationSettings,
     Spread,
-    TableNoise,
     requested,
-    simulate,
-    summary_document,
 )
-from legcal.simulation.folder import TRUTH_NAME, check_dataset_destination, dataset_folder
 
 FEW = settings(poses=1, views=1)
 

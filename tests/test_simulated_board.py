@@ -11,14 +11,18 @@ import pytest
 from boards import CHARUCO
 from simulated import small_camera
 
-from legcal.data import load_dataset
+from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, NotVisible
-from legcal.files import motion_from_xyz_quat
-from legcal.machine import Machine, load_mechanism
-from legcal.perception import camera_poses_by_board, find_corners
-from legcal.simulation import Level, SimulationSettings, simulate
+from legcal.files.motions import motion_from_xyz_quat
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.perception.board_corners import find_corners
+from legcal.perception.board_poses import camera_poses_by_board
 from legcal.simulation.board import chosen_board
-from legcal.vision import parse_board
+from legcal.simulation.dataset import simulate
+from legcal.simulation.request import Level
+from legcal.simulation.settings import SimulationSettings
+from legcal.vision.board_file import parse_board
 
 
 @cache

@@ -12,25 +12,19 @@ from machines import ROOT
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
-from legcal.geometry import Array
-from legcal.machine import (
-    JITTER,
-    MIN_SINGULARITY,
-    Configurations,
-    Feasibility,
-    LegKind,
-    Machine,
-    forward_kinematics,
-    inverse_kinematics,
-    load_mechanism,
-    singularity,
-    vectors_A_to_B,
-)
-from legcal.machine.mobility import dimensionless, is_on_same_side
-from legcal.simulation import Sampling, commanded_poses, draw_poses, write_true_model
+from legcal.geometry.types import Array
+from legcal.machine.configurations import MIN_SINGULARITY, Configurations
+from legcal.machine.feasibility import JITTER, Feasibility
+from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.leg import LegKind
+from legcal.machine.loader import load_mechanism
+from legcal.machine.mobility import dimensionless, is_on_same_side, singularity
+from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.simulation import poses as module
-from legcal.simulation.poses import are_extreme, given_poses
+from legcal.simulation.poses import are_extreme, commanded_poses, draw_poses, given_poses
+from legcal.simulation.request import Sampling
 from legcal.simulation.settings import DEFAULT_ERRORS
+from legcal.simulation.truth import write_true_model
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 LONG_TRAVEL = "nategh-agheli"  # whose legs cannot all be near the ends of their travel

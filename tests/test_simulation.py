@@ -9,18 +9,21 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge
-from legcal.geometry import look_at
-from legcal.machine import JITTER, load_mechanism, to_vector
-from legcal.simulation import (
-    OutlineNoise,
-    TableNoise,
+from legcal.geometry.motions import look_at
+from legcal.machine.feasibility import JITTER
+from legcal.machine.loader import load_mechanism
+from legcal.machine.parameters import to_vector
+from legcal.simulation.hexapod import (
     extreme_poses,
+    follow_from_home,
     hexapod_cameras,
     hexapod_session,
     paper_hexapod,
     perturb,
+    poses_with_lengths,
+    simulated_leg_vectors,
 )
-from legcal.simulation.hexapod import follow_from_home, poses_with_lengths, simulated_leg_vectors
+from legcal.simulation.observe import OutlineNoise, TableNoise
 
 
 def test_the_hexapod_in_memory_is_the_shipped_one() -> None:

@@ -11,17 +11,12 @@ from machines import SHIPPED, displaced, of_types, planar, ring
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge
-from legcal.geometry import Array
-from legcal.machine import (
-    Follower,
-    LegKind,
-    Machine,
-    forward_kinematics,
-    inverse_kinematics,
-    load_mechanism,
-    singularity,
-    vectors_A_to_B,
-)
+from legcal.geometry.types import Array
+from legcal.machine.kinematics import Follower, forward_kinematics, inverse_kinematics
+from legcal.machine.leg import LegKind
+from legcal.machine.loader import load_mechanism
+from legcal.machine.mobility import singularity
+from legcal.machine.model import Machine, vectors_A_to_B
 
 machine_of = cache(load_mechanism)
 RING = [10.0, 110.0, 130.0, 230.0, 250.0, 350.0]

@@ -10,15 +10,17 @@ from scipy.spatial.transform import Rotation
 from yourdfpy import URDF
 
 from legcal.errors import ModelError
-from legcal.geometry import Array
-from legcal.machine import Machine, load_mechanism, vectors_A_to_B
-from legcal.simulation import draw_poses, dressed
+from legcal.geometry.types import Array
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine, vectors_A_to_B
+from legcal.simulation.poses import draw_poses
 from legcal.simulation.solids import (
     Box,
     Mesh,
     Shape,
     SolidCylinder,
     Sphere,
+    dressed,
     link_poses,
     placed,
     solids_of,

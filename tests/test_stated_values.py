@@ -16,16 +16,12 @@ from fit_sessions import (
 )
 from thinned import thinned
 
-from legcal.calibration.joint_fit import (
-    NO_CHOICES,
-    Choices,
-    Prior,
-    Solution,
-    refine,
-)
 from legcal.calibration.joint_fit.factors import BoardCorners
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.errors import DidNotConverge, NotIdentifiable
-from legcal.vision import with_intrinsics
+from legcal.vision.camera import with_intrinsics
 
 
 @pytest.fixture(scope="module")

@@ -13,23 +13,27 @@ from rich.console import Console
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, UsageError
-from legcal.geometry import Array
-from legcal.machine import KinematicParameters, from_vector, to_vector
-from legcal.report import study_table
-from legcal.simulation import (
+from legcal.geometry.types import Array
+from legcal.machine.leg import KinematicParameters
+from legcal.machine.parameters import from_vector, to_vector
+from legcal.report.study import study_table
+from legcal.simulation.hexapod import (
     HexapodSession,
     PaperHexapod,
-    PaperStudy,
-    TableNoise,
-    child_seed,
+    noncoplanar_hexapod,
     paper_hexapod,
-    platform_errors,
-    run_study,
+    random_hexapod_poses,
 )
-from legcal.simulation.hexapod import noncoplanar_hexapod, random_hexapod_poses
-from legcal.simulation.paper import ESTIMATORS, expected_errors, expected_norm
+from legcal.simulation.observe import TableNoise
+from legcal.simulation.paper import (
+    ESTIMATORS,
+    PaperStudy,
+    expected_errors,
+    expected_norm,
+    platform_errors,
+)
 from legcal.simulation.paper_report import SCALARS, Means
-from legcal.simulation.study import StudyResult
+from legcal.simulation.study import StudyResult, child_seed, run_study
 
 N_RUNS = 2
 STUDY = PaperStudy(n_poses=8)

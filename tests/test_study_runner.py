@@ -17,9 +17,8 @@ import pytest
 from toy_studies import Deadly, Draws, Mistaken
 
 from legcal.errors import DidNotConverge, OutOfResources, UsageError
-from legcal.simulation import run_study
 from legcal.simulation.checkpoint import CHECKPOINT_NAME, header, open_checkpoint
-from legcal.simulation.study import DOCUMENT_NAME
+from legcal.simulation.study import DOCUMENT_NAME, run_study
 
 PROGRAM = Path(__file__).with_name("toy_studies.py")
 

@@ -8,8 +8,7 @@ from legcal.data.axes import LegAxes, axes_of_table
 from legcal.errors import NotVisible
 from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array, IntArray
-from legcal.simulation import TableNoise
-from legcal.simulation.observe import table_of, table_of_lines
+from legcal.simulation.observe import TableNoise, table_of, table_of_lines
 from legcal.vision.cylinder import (
     angles_of_direction,
     direction_derivative,

@@ -16,22 +16,26 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from outline_tables import LEG_NAMES, LEGS, assert_same, outlines_of, recorded
 
-from legcal.data import (
+from legcal.data.axes import (
     LegAxes,
-    Outlines,
-    View,
     axes_from_outlines,
     axes_of_table,
     join_axes,
-    no_outlines,
+    read_axes,
     write_axis_table,
+)
+from legcal.data.measurements import View, row_names
+from legcal.data.outlines import (
+    ENCODING,
+    QUALITY,
+    Outlines,
+    no_outlines,
+    read_observations,
+    reject_unused_legs,
     write_observations,
 )
-from legcal.data.axes import read_axes
-from legcal.data.measurements import row_names
-from legcal.data.outlines import ENCODING, QUALITY, read_observations, reject_unused_legs
 from legcal.errors import DatasetError
-from legcal.geometry import Array, IntArray
+from legcal.geometry.types import Array, IntArray
 
 FAST = settings(
     deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]

@@ -12,15 +12,16 @@ from layouts import Layout, write_machine
 from machines import of_types
 from scipy.ndimage import map_coordinates
 
-from legcal.geometry import Array
-from legcal.machine import (
-    Machine,
-    inverse_kinematics,
-    load_mechanism,
-    reading_residuals,
-    shipped_names,
-)
-from legcal.viewer import Motion, Photographs, Source, Stage, open_source
+from legcal.geometry.types import Array
+from legcal.machine.files import shipped_names
+from legcal.machine.kinematics import inverse_kinematics
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.redundancy import reading_residuals
+from legcal.viewer.motion import Motion
+from legcal.viewer.photographs import Photographs
+from legcal.viewer.source import Source, open_source
+from legcal.viewer.stage import Stage
 
 MODELS = [name for name in shipped_names() if "hexapod-" not in name or name == "hexapod-rod"]
 

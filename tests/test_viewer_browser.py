@@ -15,7 +15,9 @@ import pytest
 from browser import PATIENCE, chromium, errors
 from hexapod_example import Run
 
-from legcal.viewer import Address, Source, Window, open_source
+from legcal.viewer.address import Address
+from legcal.viewer.source import Source, open_source
+from legcal.viewer.window import Window
 
 pytestmark = pytest.mark.system
 

@@ -11,20 +11,22 @@ from thinned import thinned
 
 import legcal
 from legcal.errors import NotVisible
-from legcal.geometry import Array, look_at
-from legcal.machine import Configurations, Machine
-from legcal.simulation import (
+from legcal.geometry.motions import look_at
+from legcal.geometry.types import Array
+from legcal.machine.configurations import Configurations
+from legcal.machine.model import Machine
+from legcal.simulation.cameras import cameras_around
+from legcal.simulation.solids import Box, PosedMachine, Solid, dressed, pose_machine, solids_of
+from legcal.simulation.visibility import (
+    MIN_SHARE,
     LegView,
-    cameras_around,
-    dressed,
+    contact_offsets,
     legs_in_image,
-    pose_machine,
     silhouette,
     take_images,
 )
-from legcal.simulation.solids import Box, PosedMachine, Solid, solids_of
-from legcal.simulation.visibility import MIN_SHARE, contact_offsets
-from legcal.vision import Camera, outlines_of_axis, sample_camera
+from legcal.vision.camera import Camera, sample_camera
+from legcal.vision.cylinder import outlines_of_axis
 from legcal.vision.distortion import DistortionModel
 from legcal.vision.visibility import in_picture, pixels_inside
 

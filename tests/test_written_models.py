@@ -18,42 +18,36 @@ from thinned import thinned
 
 from legcal import load_mechanism, simulate
 from legcal.errors import DidNotConverge, ModelError, OutOfClass, UsageError
-from legcal.exports import Subject, export
-from legcal.geometry import Array, roll_pitch_yaw
-from legcal.machine import (
-    EquationKind,
-    Leg,
-    LegKind,
-    Machine,
-    UrdfPatch,
+from legcal.exports.formats import export
+from legcal.exports.subject import Subject
+from legcal.geometry.rotations import roll_pitch_yaw
+from legcal.geometry.types import Array
+from legcal.machine.configurations import random_configurations
+from legcal.machine.equations import pose_equations
+from legcal.machine.home import home_of_legs
+from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.leg import EquationKind, Leg, LegKind
+from legcal.machine.model import Machine, joint_values
+from legcal.machine.model_builder import create_model
+from legcal.machine.model_writer import (
     check_closes,
-    create_model,
-    forward_kinematics,
-    geometries,
-    home_of_legs,
-    inverse_kinematics,
-    joint_values,
-    moved_legs,
-    parametrization_of,
-    pose_equations,
-    random_configurations,
-    reframed,
     reload_and_check,
-    vector_of,
     write_calibrated_yaml,
     write_model,
     write_urdf,
 )
-from legcal.simulation import (
-    Distribution,
-    Level,
-    ParameterErrors,
-    SimulationSettings,
-    Spread,
-    draw_poses,
-    write_true_model,
+from legcal.machine.parameters import (
+    geometries,
+    moved_legs,
+    parametrization_of,
+    reframed,
+    vector_of,
 )
-from legcal.simulation.truth import draw_errors
+from legcal.machine.urdf import UrdfPatch
+from legcal.simulation.poses import draw_poses
+from legcal.simulation.request import Level
+from legcal.simulation.settings import Distribution, ParameterErrors, SimulationSettings, Spread
+from legcal.simulation.truth import draw_errors, write_true_model
 
 ORIGIN = re.compile(rb"""(<origin\b[^>]*?\bxyz\s*=\s*["'])([^"']*)(["'])""")
 ORIGINS = re.compile(rb'(<origin xyz=")[^"]*(" rpy=")[^"]*(")')

@@ -19,15 +19,17 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
 
 from legcal import calibrate, detect, load_dataset
-from legcal.calibration import Calibration, Detection, refine
-from legcal.calibration.joint_fit import DISAGREES
+from legcal.calibration.detection import Detection
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.rounds import DISAGREES
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.calibration.outlier_images import outlier_images
 from legcal.calibration.pipeline import rough_placement
-from legcal.data import Outlines
+from legcal.calibration.result import Calibration
+from legcal.data.outlines import Outlines
 from legcal.errors import NotIdentifiable
-from legcal.geometry import BoolArray
-from legcal.machine import load_mechanism
+from legcal.geometry.types import BoolArray
+from legcal.machine.loader import load_mechanism
 from legcal.perception import photographs
 from legcal.perception.diagnostics import (
     NOTHING_LIKE,

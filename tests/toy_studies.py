@@ -13,7 +13,7 @@ import numpy as np
 
 from legcal.errors import DidNotConverge
 from legcal.signals import stopped_by_signals
-from legcal.simulation import Record, run_study
+from legcal.simulation.study import Record, run_study
 
 
 @dataclass(frozen=True)

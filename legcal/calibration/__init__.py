@@ -1,6 +1,6 @@
 """The jobs, each a client of the rooms below: calibrate, check, detect, identify, locate, noise.
 
-A :class:`legcal.data.Dataset` goes in. ``calibrate`` (``pipeline``) checks that it can be
+A :class:`legcal.data.dataset.Dataset` goes in. ``calibrate`` (``pipeline``) checks that it can be
 identified (``identify``), puts it into canonical order (``ordered_dataset``), recognises and
 measures the legs, runs the four steps (``four_steps``) and the joint fit (``joint_fit``) and
 measures again (sections 3.1 to 3.5), judges what the platform gains (``verdict``) and writes the
@@ -11,7 +11,3 @@ Beside them stand
 ``measure_noise`` (section 4.2, Table 1), ``evaluate`` (eq 20), ``calibrate_camera`` and ``locate``.
 What ``--json`` prints is a model for each job.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

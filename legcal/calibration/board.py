@@ -14,29 +14,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit import BoardCorners, Solution
+from legcal.calibration.joint_fit.factors import BoardCorners
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.location.frames import PosePairs, transforms
 from legcal.calibration.location.search import search
 from legcal.calibration.ordered_dataset import OrderedDataset
-from legcal.data import (
-    CORNERS_NAME,
-    MIN_CORNERS,
-    Corners,
-    Dataset,
-    LegAxes,
-    Measurements,
-    join_corners,
-)
+from legcal.data.axes import LegAxes
+from legcal.data.corners import Corners, join_corners
+from legcal.data.dataset import CORNERS_NAME, MIN_CORNERS, Dataset
+from legcal.data.measurements import Measurements
 from legcal.errors import DatasetError, NotVisible
-from legcal.geometry import IntArray, components, pose_distance
-from legcal.perception import (
-    FAR_OFF,
-    board_poses_in_images,
-    camera_poses_by_board,
-    detect_corners,
-    require_board,
-)
-from legcal.vision import FixedBoard
+from legcal.geometry.motions import components, pose_distance
+from legcal.geometry.types import IntArray
+from legcal.perception.board_corners import detect_corners, require_board
+from legcal.perception.board_poses import board_poses_in_images, camera_poses_by_board
+from legcal.perception.diagnostics import FAR_OFF
+from legcal.vision.board import FixedBoard
 
 Poses = Sequence[RigidTransform | None]  # one a view
 _MAX_DISTANCE, _MAX_ANGLE = FAR_OFF

@@ -17,22 +17,15 @@ from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, frame_on_points, normal_basis, whitener
-from legcal.machine import (
-    Actuator,
-    ActuatorColumns,
-    Leg,
-    LegKind,
-    Line,
-    Machine,
-    Parametrization,
-    actuator_index,
-    actuators_of,
-    geometries,
-    twist_after,
-    vector_of,
-    with_platform_points,
-)
+from legcal.geometry.covariances import whitener
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.motions import frame_on_points
+from legcal.geometry.types import Array
+from legcal.machine.actuator import Actuator, ActuatorColumns, Line
+from legcal.machine.leg import Leg, LegKind, with_platform_points
+from legcal.machine.model import Machine
+from legcal.machine.parameters import Parametrization, geometries, twist_after, vector_of
+from legcal.machine.rods import actuator_index, actuators_of
 
 _STEP = 1e-6  # [m or rad]
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration.joint_fit import PlatformAccuracy
+from legcal.calibration.joint_fit.platform import PlatformAccuracy
 from legcal.errors import DatasetError
-from legcal.files import read_json
+from legcal.files.reading import read_json
 
 PLAN_NAME = "plan.json"  # what a session that was planned says of itself
 AS_PLANNED = 1.3  # times the error that was expected: no more needs no remark on light

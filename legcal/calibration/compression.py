@@ -14,12 +14,15 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from legcal.calibration.joint_fit import NoiseModel
-from legcal.data import GOOD_QUALITY, Outlines, no_outlines
-from legcal.geometry import Array
-from legcal.perception import Photographs, Placement, measure_photographs
+from legcal.calibration.joint_fit.outline_errors import NoiseModel
+from legcal.data.outlines import Outlines, no_outlines
+from legcal.data.photograph_notes import GOOD_QUALITY
+from legcal.geometry.types import Array
+from legcal.perception.photographs import Photographs, measure_photographs
+from legcal.perception.placement import Placement
 from legcal.progress import Report
-from legcal.vision import Grey, ImageFacts
+from legcal.vision.image_facts import ImageFacts
+from legcal.vision.image_file import Grey
 
 STAGE = "Compressing once more"
 _MAX_IMAGES = 8

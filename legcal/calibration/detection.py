@@ -24,33 +24,17 @@ from scipy.spatial.transform import RigidTransform
 from legcal.brief import brief
 from legcal.calibration.documents import LeftOut, Overlay, left_out_blocks
 from legcal.calibration.outline_editor import outline_editor
-from legcal.data import (
-    CORNERS_NAME,
-    OBSERVATIONS_NAME,
-    Corners,
-    Dataset,
-    ImageReader,
-    Outlines,
-    along_legs,
-    is_edited,
-    row_names,
-    write_corners,
-    write_observations,
-)
+from legcal.data.corners import Corners, write_corners
+from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, Dataset, ImageReader
+from legcal.data.measurements import row_names
+from legcal.data.outlines import Outlines, along_legs, is_edited, write_observations
 from legcal.errors import OutOfResources, UsageError
-from legcal.files import (
-    MAX_IMAGE,
-    Document,
-    OutputKind,
-    check_destination,
-    path_problem,
-    read_bytes,
-    read_json,
-    result_folder,
-)
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Cylinder
-from legcal.pages import (
+from legcal.files.folder import OutputKind, check_destination, path_problem, result_folder
+from legcal.files.reading import MAX_IMAGE, read_bytes, read_json
+from legcal.files.schema import Document
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import Cylinder
+from legcal.pages.document import (
     MAX_ROWS,
     Cell,
     Link,
@@ -61,25 +45,24 @@ from legcal.pages import (
     Table,
     Text,
     number,
-    page_html,
 )
-from legcal.perception import (
-    HIDDEN,
-    NOT_PLACED,
-    OUTSIDE,
+from legcal.pages.html import page_html
+from legcal.perception.detection import NOT_PLACED
+from legcal.perception.diagnostics import images_left_out
+from legcal.perception.outline import HIDDEN, OUTSIDE
+from legcal.perception.overlays import (
     Mark,
     PartMarks,
-    PlacedArm,
     draw,
-    images_left_out,
     marks_of_corners,
     marks_of_image,
     marks_of_pairs,
-    predict_legs_and_arms,
     short_reason,
 )
+from legcal.perception.placement import PlacedArm, predict_legs_and_arms
 from legcal.progress import Report
-from legcal.vision import Camera, PredictedLeg
+from legcal.vision.camera import Camera
+from legcal.vision.visibility import PredictedLeg
 from legcal.workers import Run
 
 DETECTION = OutputKind("detection", "detection.json", "legcal_detection")

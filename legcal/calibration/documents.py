@@ -20,12 +20,13 @@ from pydantic import (
     model_serializer,
 )
 
-from legcal.data import Measurements, by_cause, row_names
+from legcal.data.image_causes import by_cause
+from legcal.data.measurements import Measurements, row_names
 from legcal.errors import DatasetError
-from legcal.files import (
+from legcal.files.motions import Pose
+from legcal.files.schema import (
     Document,
     Number,
-    Pose,
     SparseDocument,
     Triple,
     Version,
@@ -34,8 +35,9 @@ from legcal.files import (
     refuse_too_large,
     validate,
 )
-from legcal.machine import Actuator, ActuatorBlock
-from legcal.vision import Link
+from legcal.machine.actuator import Actuator
+from legcal.machine.inspection import ActuatorBlock
+from legcal.vision.board import Link
 
 AxesByLeg = dict[str, Triple]  # unit vectors
 Matrix = list[list[Number]]

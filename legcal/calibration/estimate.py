@@ -14,19 +14,17 @@ import numpy as np
 from legcal.calibration.board import BoardViews
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.four_steps import Steps, four_steps, starts
-from legcal.calibration.joint_fit import (
-    DEFAULT_SETTINGS,
-    RefinementSettings,
-    Solution,
-    in_file_order,
-    refine,
-)
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.solution import Solution, in_file_order
+from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementSettings
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
 from legcal.calibration.outlier_images import outlier_images
-from legcal.data import Corners, Measurements, Outlines, along_legs, reject_unused_legs
+from legcal.data.corners import Corners
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines, along_legs, reject_unused_legs
 from legcal.errors import NotVisible
-from legcal.machine import Machine
-from legcal.perception import Placement
+from legcal.machine.model import Machine
+from legcal.perception.placement import Placement
 
 # Of all outlines that are measured in photographs: light at the limb that no model of shading
 # predicts looks like other radii, so that residuals never show it [px].

@@ -22,24 +22,17 @@ from legcal.calibration.documents import (
     UnreachedRow,
 )
 from legcal.calibration.link_joints import compared_joints
-from legcal.data import Dataset, few, load_dataset, row_names
+from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.measurements import few, row_names
 from legcal.errors import DidNotConverge, ModelError
-from legcal.geometry import Array
-from legcal.machine import (
-    WORKSPACE_POSES,
-    WORKSPACE_SEED,
-    Machine,
-    followed_poses,
-    geometries,
-    load_mechanism,
-    parametrization_of,
-    platforms_in_base,
-    pose_differences,
-    random_poses,
-    reading_residuals,
-    vector_of,
-)
-from legcal.vision import Link
+from legcal.geometry.types import Array
+from legcal.machine.configurations import WORKSPACE_POSES, WORKSPACE_SEED, random_poses
+from legcal.machine.kinematics import followed_poses, platforms_in_base, pose_differences
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.parameters import geometries, parametrization_of, vector_of
+from legcal.machine.redundancy import reading_residuals
+from legcal.vision.board import Link
 
 WHO: tuple[Literal["model", "reference"], ...] = ("model", "reference")
 MAX_DRAWS = 20  # of poses in place of those that the reference does not reach

@@ -22,7 +22,7 @@ from legcal.calibration.diagnosis.diagnosis import MIN_IMAGES, Diagnosis, diagno
 from legcal.calibration.documents import DiagnosisBlock
 from legcal.calibration.estimate import unseen_legs
 from legcal.calibration.identify.identifiability import check_identifiable
-from legcal.calibration.joint_fit import Choices
+from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.ordered_dataset import (
     OrderedDataset,
     contradicting_readings,
@@ -30,33 +30,18 @@ from legcal.calibration.ordered_dataset import (
 )
 from legcal.calibration.outline_detection import detected
 from legcal.calibration.pipeline import chosen_parameters, exact_cameras
-from legcal.data import (
-    GOOD_QUALITY,
-    Dataset,
-    ImageReader,
-    by_cause,
-    compressed,
-    dataset_at,
-    few,
-    few_views,
-    images_in_words,
-    inspect_files,
-    load_dataset,
-    notes_on_photographs,
-    reading_columns,
-    row_names,
-)
+from legcal.data.dataset import Dataset, ImageReader, inspect_files, load_dataset
+from legcal.data.holdout import dataset_at
+from legcal.data.image_causes import by_cause, images_in_words
+from legcal.data.measurements import few, few_views, reading_columns, row_names
+from legcal.data.photograph_notes import GOOD_QUALITY, compressed, notes_on_photographs
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible
-from legcal.files import Document
-from legcal.geometry import Array
-from legcal.perception import (
-    TAKE_AGAIN,
-    Exposure,
-    defects_of,
-    left_out_notes,
-    measure_exposure,
-    unplaced_notes,
-)
+from legcal.files.schema import Document
+from legcal.geometry.types import Array
+from legcal.perception.diagnostics import TAKE_AGAIN, left_out_notes
+from legcal.perception.image_quality import Exposure, measure_exposure
+from legcal.perception.photographs import defects_of
+from legcal.perception.placement import unplaced_notes
 from legcal.progress import Progress, Report, shown_progress
 from legcal.workers import Run, Workers, worker_pool
 

@@ -13,14 +13,16 @@ from pathlib import Path
 import numpy as np
 
 from legcal.calibration.detection import OVERLAYS, Detection, draw_images, is_overlay
-from legcal.calibration.joint_fit import Solution
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.result import Calibration
-from legcal.data import Dataset
+from legcal.data.dataset import Dataset
 from legcal.errors import UsageError
-from legcal.files import RESULT, in_the_way, path_problem, read_json
-from legcal.geometry import components
-from legcal.machine import ends_in_base, measured_readings, with_radii
-from legcal.perception import placed_arms
+from legcal.files.folder import RESULT, in_the_way, path_problem
+from legcal.files.reading import read_json
+from legcal.geometry.motions import components
+from legcal.machine.leg import with_radii
+from legcal.machine.rods import ends_in_base, measured_readings
+from legcal.perception.placement import placed_arms
 from legcal.progress import Report
 from legcal.workers import Run
 

@@ -26,17 +26,9 @@ from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import RESULT_NAME, load_result
 from legcal.cluster import Stamp, stamp_of
 from legcal.errors import DatasetError, LegcalError, OutOfResources, UsageError
-from legcal.files import (
-    TEMPORARY_SUFFIX,
-    Column,
-    Document,
-    Number,
-    OutputKind,
-    check_destination,
-    format_table,
-    read_table,
-    write_atomically,
-)
+from legcal.files.folder import TEMPORARY_SUFFIX, OutputKind, check_destination, write_atomically
+from legcal.files.schema import Document, Number
+from legcal.files.table import Column, format_table, read_table
 from legcal.progress import Progress, shown_progress
 from legcal.workers import Workers, worker_pool
 

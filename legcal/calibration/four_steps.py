@@ -9,13 +9,19 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.calibration.board import BoardViews, Poses, in_one_camera
-from legcal.calibration.joint_fit import Start, start_from
+from legcal.calibration.joint_fit.variables import Start, start_from
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
-from legcal.data import Order, Outlines, along_legs, axes_from_outlines, few_views, inverse
+from legcal.data.axes import axes_from_outlines
+from legcal.data.image_tables import Order, inverse
+from legcal.data.measurements import few_views
+from legcal.data.outlines import Outlines, along_legs
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
-from legcal.machine import Leg, geometries, machine_ties, on_ties, parametrization_of, reframed
-from legcal.paper import nominal_machine, run_base_steps, run_platform_steps
-from legcal.perception import Placement
+from legcal.machine.leg import Leg
+from legcal.machine.parameters import geometries, parametrization_of, reframed
+from legcal.machine.ties import machine_ties, on_ties
+from legcal.paper.four_steps import run_base_steps, run_platform_steps
+from legcal.paper.nominal import nominal_machine
+from legcal.perception.placement import Placement
 
 
 @brief

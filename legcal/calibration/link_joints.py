@@ -28,19 +28,16 @@ from legcal.calibration.documents import (
     ParameterRow,
     WeakInLinks,
 )
-from legcal.files import Pose
-from legcal.geometry import Array, BoolArray, IntArray, normal_basis, turned_axis
-from legcal.machine import (
-    AT_ZERO,
-    SHOWN,
-    LegColumns,
-    Machine,
-    describe_direction,
-    free_coordinates,
-    geometries,
-    parametrization_of,
-)
-from legcal.vision import LINKS, Link
+from legcal.files.motions import Pose
+from legcal.geometry.axes import turned_axis
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.directions import SHOWN, describe_direction
+from legcal.machine.leg import LegColumns
+from legcal.machine.model import Machine
+from legcal.machine.parameters import free_coordinates, geometries, parametrization_of
+from legcal.machine.rods import AT_ZERO
+from legcal.vision.board import LINKS, Link
 
 FRAMES: dict[Link, str] = {"base": "R_b", "platform": "R_e"}
 _MARKS: tuple[FrameMark, ...] = ("origin", "x axis", "xy plane")

@@ -14,24 +14,27 @@ import numpy as np
 from legcal.calibration.board import BoardViews
 from legcal.calibration.compression import compression_effect
 from legcal.calibration.estimate import Estimate, fit_outlines
-from legcal.calibration.joint_fit import GammaTrials, Solution, known_gammas, loses_outlines
+from legcal.calibration.joint_fit.factors import known_gammas
+from legcal.calibration.joint_fit.gammas import GammaTrials, loses_outlines
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
-from legcal.data import Outlines, compression_note, few, image_notes, no_outlines, through_cameras
+from legcal.data.image_causes import image_notes
+from legcal.data.measurements import few
+from legcal.data.outlines import Outlines, no_outlines, through_cameras
+from legcal.data.photograph_notes import compression_note
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
-from legcal.geometry import components
-from legcal.machine import Machine, ends_in_base, measured_readings
-from legcal.perception import (
-    NOTHING_LIKE,
+from legcal.geometry.motions import components
+from legcal.machine.model import Machine
+from legcal.machine.rods import ends_in_base, measured_readings
+from legcal.perception.diagnostics import NOTHING_LIKE, is_visible, reject_images
+from legcal.perception.outline import used_as_before
+from legcal.perception.photographs import (
     MeasuredImages,
     Photographs,
-    Placement,
-    is_visible,
     measure_photographs,
-    placed_arms,
-    reject_images,
-    used_as_before,
     with_measured_radii,
 )
+from legcal.perception.placement import Placement, placed_arms
 
 MIN_FOUND_AGAIN = 0.5  # of the outlines of an image, or of all
 

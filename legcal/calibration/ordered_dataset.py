@@ -13,40 +13,33 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.joint_fit import Choices, FittedLegs, fitted_legs, start_from
-from legcal.data import (
-    Dataset,
-    DetectionPlan,
-    LegAxes,
-    Measurements,
+from legcal.calibration.joint_fit.parameter_choices import Choices
+from legcal.calibration.joint_fit.variables import FittedLegs, fitted_legs, start_from
+from legcal.data.axes import LegAxes
+from legcal.data.cache import DetectionPlan, plan_dataset
+from legcal.data.dataset import Dataset
+from legcal.data.holdout import dataset_at
+from legcal.data.image_causes import by_cause, images_in_words
+from legcal.data.image_tables import (
     Order,
-    by_cause,
     canonical_order,
-    dataset_at,
-    few,
-    images_in_words,
     inverse,
     measurements_at,
-    plan_dataset,
     reorder_measurements,
-    row_names,
 )
+from legcal.data.measurements import Measurements, few, row_names
 from legcal.errors import DatasetError
-from legcal.geometry import Array, IntArray, components, product
-from legcal.machine import (
-    Contradiction,
-    Leg,
-    Machine,
-    contradictions,
-    followed_poses,
-    geometries,
-    platform_in_base,
-    platforms_in_base,
-    solve_poses,
-    vectors_A_to_B,
-)
-from legcal.paper import Criteria, Transformation
-from legcal.perception import CandidatePairs, Photographs
+from legcal.geometry.motions import components, product
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.kinematics import followed_poses, platform_in_base, platforms_in_base
+from legcal.machine.leg import Leg
+from legcal.machine.model import Machine, vectors_A_to_B
+from legcal.machine.parameters import geometries
+from legcal.machine.redundancy import Contradiction, contradictions
+from legcal.machine.solved_poses import solve_poses
+from legcal.paper.criteria import Criteria, Transformation
+from legcal.perception.candidate_pairs import CandidatePairs
+from legcal.perception.photographs import Photographs
 from legcal.progress import Report
 from legcal.workers import Run
 

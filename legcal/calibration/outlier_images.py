@@ -15,23 +15,18 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit import DISAGREES, Solution
-from legcal.data import Measurements, few
+from legcal.calibration.joint_fit.rounds import DISAGREES
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.data.measurements import Measurements, few
 from legcal.errors import DidNotConverge
-from legcal.estimation import (
-    Factor,
-    Frames,
-    Problem,
-    PseudoHuber,
-    Residuals,
-    Variables,
-    all_free,
-    minimise,
-    normal_equations,
-)
-from legcal.files import SHOWN_IN
-from legcal.geometry import Array, IntArray, cross
-from legcal.machine import Machine, actuator_index, joints_at, reading_of_rod
+from legcal.estimation.loss import PseudoHuber
+from legcal.estimation.problem import Factor, Frames, Problem, Residuals, Variables, all_free
+from legcal.estimation.solver import minimise, normal_equations
+from legcal.files.quantity import SHOWN_IN
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.model import Machine
+from legcal.machine.rods import actuator_index, joints_at, reading_of_rod
 
 MIN_REJECTED = 0.34  # share of an image's outlines that the fit rejected
 MIN_REJECTED_LEGS = 2  # of which it rejected all outlines

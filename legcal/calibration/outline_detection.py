@@ -22,34 +22,31 @@ from legcal.calibration.detection import (
 from legcal.calibration.joint_fit.diagnostics import arms_of_other_widths, wrong_arms_in_words
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.calibration.pipeline import rough_placement
-from legcal.data import (
-    Dataset,
+from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.image_causes import image_notes
+from legcal.data.image_tables import inverse
+from legcal.data.measurements import few_views
+from legcal.data.outlines import (
     Outlines,
     are_of_arms,
-    few_views,
-    image_notes,
-    inverse,
     join_outlines,
-    load_dataset,
     merge_edited,
     no_outlines,
     reject_unused_legs,
 )
 from legcal.errors import DatasetError
-from legcal.files import output_path
-from legcal.geometry import IntArray, components
-from legcal.machine import measured_readings
-from legcal.perception import (
-    BEFORE_FIT,
+from legcal.files.folder import output_path
+from legcal.geometry.motions import components
+from legcal.geometry.types import IntArray
+from legcal.machine.rods import measured_readings
+from legcal.perception.diagnostics import BEFORE_FIT, hint_notes
+from legcal.perception.photographs import (
     MeasuredImages,
-    PlacedArm,
-    Placement,
     given_outlines,
-    hint_notes,
     measure_photographs,
     place_and_measure,
-    placed_arms,
 )
+from legcal.perception.placement import PlacedArm, Placement, placed_arms
 from legcal.progress import Progress, shown_progress
 from legcal.workers import Workers, worker_pool
 

@@ -10,10 +10,14 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from legcal.data import OBSERVATIONS_NAME, Dataset, Outlines, format_observations, row_names
-from legcal.geometry import Array, cross
-from legcal.pages import OutlineEditor
-from legcal.vision import Camera, PredictedLeg
+from legcal.data.dataset import OBSERVATIONS_NAME, Dataset
+from legcal.data.measurements import row_names
+from legcal.data.outlines import Outlines, format_observations
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array
+from legcal.pages.document import OutlineEditor
+from legcal.vision.camera import Camera
+from legcal.vision.visibility import PredictedLeg
 
 # Of an end that a person places over an enlarged photograph: edges are blurred over a pixel or two,
 # and where in that width their middle is the eye says to about half a pixel.

@@ -29,55 +29,40 @@ from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose, notes_be
 from legcal.calibration.estimate import TRIAL, Estimate, fit_outlines
 from legcal.calibration.fit_overlays import check_overlays, with_overlays
 from legcal.calibration.identify.identifiability import check_identifiable
-from legcal.calibration.joint_fit import (
-    DEFAULT_SETTINGS,
-    Choices,
-    HeldOut,
-    Prior,
-    Solution,
-    compare_held_out,
-    known_gammas,
-    known_parameters,
-    resolve,
-)
+from legcal.calibration.joint_fit.factors import known_gammas
+from legcal.calibration.joint_fit.held_out import HeldOut, compare_held_out
+from legcal.calibration.joint_fit.parameter_choices import Choices, Prior, known_parameters, resolve
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
 from legcal.calibration.near_fit import measure_again, not_found_again, shown_near
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, write_result
 from legcal.calibration.verdict import judge
-from legcal.data import (
-    Dataset,
-    Override,
-    dataset_at,
-    few_views,
-    fingerprint,
-    image_notes,
-    load_dataset,
-    overrides_of_call,
-    plan_dataset,
-    reject_unused_legs,
-    split_images,
-    store_outlines,
-)
+from legcal.data.cache import fingerprint, plan_dataset, store_outlines
+from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.holdout import dataset_at, split_images
+from legcal.data.image_causes import image_notes
+from legcal.data.measurements import few_views
+from legcal.data.outlines import reject_unused_legs
+from legcal.data.overrides import Override, overrides_of_call
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
-from legcal.files import check_destination, output_path
-from legcal.geometry import IntArray
-from legcal.paper import Criteria, Transformation
-from legcal.perception import (
+from legcal.files.folder import check_destination, output_path
+from legcal.geometry.types import IntArray
+from legcal.paper.criteria import Criteria, Transformation
+from legcal.perception.diagnostics import hint_notes, is_measurable
+from legcal.perception.free_poses import require_rough_cameras, require_standing_joints
+from legcal.perception.outline import measure_in_brief
+from legcal.perception.photographs import (
     MeasuredImages,
-    Placement,
     detection_settings,
     given_outlines,
-    hint_notes,
-    is_measurable,
-    measure_in_brief,
     nominal_placement,
     place_and_measure,
-    require_rough_cameras,
-    require_standing_joints,
 )
+from legcal.perception.placement import Placement
 from legcal.progress import Progress, shown_progress
-from legcal.vision import shared_cameras, stated_covariances
+from legcal.vision.camera import shared_cameras, stated_covariances
 from legcal.workers import Workers, worker_pool
 
 TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal one [rad]

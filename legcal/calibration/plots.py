@@ -9,13 +9,13 @@ import numpy as np
 from legcal.calibration.documents import ParameterRow, Result
 from legcal.errors import UsageError
 from legcal.figures import new_figure, plain
-from legcal.geometry import Array
+from legcal.geometry.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from legcal.calibration.joint_fit import Posterior
+    from legcal.calibration.joint_fit.held_out import Posterior
 
 _ARROW = 0.06  # of the width of an image: the arrow of an outline that is three rms off
 _WIDTH, _HEIGHT = 4.5, 3.8  # of a panel [inch]

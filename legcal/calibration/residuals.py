@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.brief import brief
-from legcal.calibration.joint_fit import Posterior
-from legcal.data import Dataset, Outlines, canonical_order
-from legcal.geometry import Array, IntArray
+from legcal.calibration.joint_fit.held_out import Posterior
+from legcal.data.dataset import Dataset
+from legcal.data.image_tables import canonical_order
+from legcal.data.outlines import Outlines
+from legcal.geometry.types import Array, IntArray
 
 
 @brief

@@ -36,35 +36,27 @@ from legcal.calibration.documents import (
     left_out_blocks,
 )
 from legcal.calibration.four_steps import Steps
-from legcal.calibration.joint_fit import (
-    HeldOut,
-    PlatformAccuracy,
-    PlatformError,
-    Solution,
-    board_scale,
-    known_parameters,
-    poses_at_readings,
-)
+from legcal.calibration.joint_fit.held_out import HeldOut
+from legcal.calibration.joint_fit.parameter_choices import board_scale, known_parameters
+from legcal.calibration.joint_fit.platform import PlatformAccuracy, PlatformError, poses_at_readings
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.link_joints import joints_in_links, weak_in_links
 from legcal.calibration.plots import plot_residuals
 from legcal.calibration.residuals import OutlineResiduals, outline_residuals
 from legcal.calibration.summary import Summarised, few_lines
-from legcal.data import Corners, Dataset, row_names
-from legcal.files import Pose
-from legcal.machine import (
-    ActuatorBlock,
-    Leg,
-    LegKind,
-    actuators_of,
-    describe_direction,
-    geometries,
-    nominal_axes,
-    parametrization_of,
-    pose_differences,
-    vector_of,
-)
-from legcal.perception import images_left_out
-from legcal.vision import LINKS, Link, camera_numbers, shared_cameras
+from legcal.data.corners import Corners
+from legcal.data.dataset import Dataset
+from legcal.data.measurements import row_names
+from legcal.files.motions import Pose
+from legcal.machine.directions import describe_direction
+from legcal.machine.inspection import ActuatorBlock
+from legcal.machine.kinematics import pose_differences
+from legcal.machine.leg import Leg, LegKind
+from legcal.machine.parameters import geometries, nominal_axes, parametrization_of, vector_of
+from legcal.machine.rods import actuators_of
+from legcal.perception.diagnostics import images_left_out
+from legcal.vision.board import LINKS, Link
+from legcal.vision.camera import camera_numbers, shared_cameras
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -23,44 +23,36 @@ from legcal.calibration.documents import (
     unreadable,
 )
 from legcal.calibration.fit_overlays import draw_overlays, earlier_overlays
-from legcal.calibration.joint_fit import (
-    KINDS,
-    PLACES,
-    KnownIntrinsics,
-)
+from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
+from legcal.calibration.joint_fit.parameter_choices import KnownIntrinsics
 from legcal.calibration.link_joints import joints_in_links
 from legcal.calibration.result import Calibration
 from legcal.calibration.summary import Summarised, few_lines
-from legcal.data import CORNERS_NAME, OBSERVATIONS_NAME, write_corners, write_observations
+from legcal.data.corners import write_corners
+from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME
+from legcal.data.outlines import write_observations
 from legcal.errors import DatasetError, DidNotConverge, ModelError, OutOfClass, OutOfResources
-from legcal.files import result_folder
-from legcal.geometry import Array
-from legcal.machine import (
+from legcal.files.folder import result_folder
+from legcal.geometry.types import Array
+from legcal.machine.files import RESULT_YAML
+from legcal.machine.home import home_of_legs
+from legcal.machine.leg import Leg
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.model_writer import reload_and_check, write_calibrated_yaml, write_urdf
+from legcal.machine.parameters import (
     ARM_KINDS,
-    RESULT_YAML,
-    Leg,
-    Machine,
     calibrated_axis,
     geometries,
-    home_of_legs,
     kind_of_parameter,
-    load_mechanism,
     nominal_axes,
     parametrization_of,
-    reload_and_check,
     turns_between,
     vector_of,
-    write_calibrated_yaml,
-    write_urdf,
 )
-from legcal.pages import PAGE
+from legcal.pages.html import PAGE
 from legcal.progress import Report, no_progress
-from legcal.vision import (
-    Camera,
-    camera_numbers,
-    intrinsic_names,
-    intrinsic_values,
-)
+from legcal.vision.camera import Camera, camera_numbers, intrinsic_names, intrinsic_values
 from legcal.workers import Run, in_turn
 
 Beside = Callable[[Calibration, Path], None]

@@ -23,8 +23,8 @@ from legcal.calibration.documents import (
 from legcal.calibration.link_joints import FRAMES, joints_title, mark_in_words
 from legcal.calibration.plots import plot_uncertainty
 from legcal.errors import OutOfResources
-from legcal.machine import list_in_words
-from legcal.vision import LINKS, Link
+from legcal.machine.directions import list_in_words
+from legcal.vision.board import LINKS, Link
 
 if TYPE_CHECKING:
     import pandas

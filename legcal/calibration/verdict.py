@@ -9,18 +9,17 @@ import numpy as np
 from legcal.calibration.closeness import closeness
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.four_steps import Steps
-from legcal.calibration.joint_fit import (
-    FOUND_CAMERA,
-    SCALE,
-    HeldOut,
-    PlatformAccuracy,
-    Solution,
-    known_parameters,
-    platform_accuracy,
-)
+from legcal.calibration.joint_fit.held_out import HeldOut
+from legcal.calibration.joint_fit.parameter_choices import known_parameters
+from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
+from legcal.calibration.joint_fit.scale import SCALE
+from legcal.calibration.joint_fit.sensitivity import FOUND_CAMERA
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.result import Calibration, Verdict
-from legcal.data import Corners, Dataset, few_views
-from legcal.perception import far_off
+from legcal.data.corners import Corners
+from legcal.data.dataset import Dataset
+from legcal.data.measurements import few_views
+from legcal.perception.diagnostics import far_off
 
 _DO_NOT_LOAD = "Do not load this into the controller"
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations

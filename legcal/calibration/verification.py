@@ -24,33 +24,29 @@ from legcal.calibration.documents import (
     FitQuality,
     MovedPlatform,
 )
-from legcal.calibration.joint_fit import (
-    Choices,
-    NoiseModel,
-    PlatformPair,
-    Prior,
-    Solution,
-)
+from legcal.calibration.joint_fit.held_out import PlatformPair
+from legcal.calibration.joint_fit.outline_errors import NoiseModel
+from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.ordered_dataset import Options, order_dataset
 from legcal.calibration.pipeline import estimate_parameters, outline_key
 from legcal.calibration.result_folder import EarlierResult, load_result
-from legcal.data import Dataset, load_dataset
+from legcal.data.dataset import Dataset, load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
-from legcal.estimation import Frames
-from legcal.geometry import Array
-from legcal.machine import (
+from legcal.estimation.problem import Frames
+from legcal.geometry.types import Array
+from legcal.machine.equations import pose_sensitivity
+from legcal.machine.model import Machine, vectors_A_to_B
+from legcal.machine.parameters import (
     ARM_KINDS,
-    Machine,
     Parametrization,
     geometries,
     kind_of_parameter,
     parametrization_of,
-    pose_sensitivity,
     vector_of,
-    vectors_A_to_B,
 )
 from legcal.progress import Progress, shown_progress
-from legcal.vision import shared_cameras
+from legcal.vision.camera import shared_cameras
 from legcal.workers import Workers, worker_pool
 
 SIGNIFICANCE = 0.01

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.calibration.joint_fit import (
+from legcal.calibration.joint_fit.platform import (
     PlatformError,
     expected_error,
     platform_by_parameters,
@@ -22,15 +22,12 @@ from legcal.calibration.joint_fit import (
 )
 from legcal.calibration.result import Calibration
 from legcal.errors import DidNotConverge, NotIdentifiable
-from legcal.geometry import Array, BoolArray, motions_of
-from legcal.machine import (
-    Machine,
-    geometries,
-    platforms_in_base,
-    pose_differences,
-    readings_at_poses,
-    workspace,
-)
+from legcal.geometry.motions import motions_of
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.configurations import workspace
+from legcal.machine.kinematics import platforms_in_base, pose_differences
+from legcal.machine.model import Machine, readings_at_poses
+from legcal.machine.parameters import geometries
 
 N_ACROSS, N_LEVELS = 7, 3  # places of the grid in x and y, and in z
 MIN_PLACES = 6  # of a grid that the machine reaches, for it to say anything

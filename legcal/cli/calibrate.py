@@ -23,13 +23,13 @@ from legcal.cli.options import (
     write_page,
 )
 from legcal.errors import UsageError
-from legcal.paper import Criteria, Transformation
+from legcal.paper.criteria import Criteria, Transformation
 from legcal.processors import processors
 
 if TYPE_CHECKING:
-    from legcal.calibration import Calibration
-    from legcal.data import Dataset
-    from legcal.machine import Machine
+    from legcal.calibration.result import Calibration
+    from legcal.data.dataset import Dataset
+    from legcal.machine.model import Machine
 
 _TESTS = "Tests of a result"
 _FLEETS = "Fleets: several datasets, or --list"
@@ -239,10 +239,15 @@ def calibrate(
             "alone compares the result with it; leave one of them out."
         )
     with loading():
-        from legcal import calibration, report
-        from legcal.pages import PAGE
+        from legcal.calibration import pipeline
+        from legcal.calibration.fleet import FleetMachine, FleetOptions, calibrate_fleet, read_fleet
+        from legcal.calibration.result_folder import REPORT_NAME
+        from legcal.pages.html import PAGE
+        from legcal.report import calibration
+        from legcal.report.fleet import fleet_table
+        from legcal.report.page.writing import write_report
 
-        run, summary = calibration.calibrate, report.summary
+        run, summary = pipeline.calibrate, calibration.summary
     arguments: dict[str, Any] = {
         "criteria": criteria,
         "transformation": transformation,
@@ -259,8 +264,8 @@ def calibrate(
                 "The command could not be run: found --truth beside several datasets, needed one, "
                 "whose machine it is; leave it out."
             )
-        fleet = [] if machines is None else calibration.read_fleet(machines)
-        fleet += [calibration.FleetMachine.of(path) for path in datasets]
+        fleet = [] if machines is None else read_fleet(machines)
+        fleet += [FleetMachine.of(path) for path in datasets]
         if earlier is not None:
             if not earlier.is_dir():
                 raise UsageError(
@@ -269,19 +274,19 @@ def calibrate(
                 )
             fleet = [replace(one, earlier=one.earlier or earlier / one.name) for one in fleet]
         page_of_machine = partial(_page_of_machine, command_line()) if with_report else None
-        outcome = calibration.calibrate_fleet(
+        outcome = calibrate_fleet(
             fleet,
             output,
-            options=calibration.FleetOptions(arguments, page_of_machine),
+            options=FleetOptions(arguments, page_of_machine),
             workers=cluster or workers or processors(),
             resume=resume,
             progress=not quiet,
         )
-        show(as_json, outcome.document, lambda: report.fleet_table(outcome, output))
+        show(as_json, outcome.document, lambda: fleet_table(outcome, output))
         if set(outcome.counts) != {"trustworthy"}:
             raise typer.Exit(1)
         return
-    page = output / calibration.REPORT_NAME
+    page = output / REPORT_NAME
     if with_report and page.exists():
         PAGE.check_place(page)
     given: Path | Dataset = datasets[0]
@@ -289,9 +294,7 @@ def calibrate(
     if truth is not None:
         given, true = _with_truth(datasets[0], truth)
     page_of = PageOfResult(
-        lambda found, folder: report.write_report(
-            found, output, command_line(), truth=true, into=folder
-        )
+        lambda found, folder: write_report(found, output, command_line(), truth=true, into=folder)
     )
     found = run(
         given,
@@ -313,20 +316,18 @@ def calibrate(
 
 def _page_of_machine(command: str, found: Calibration, output: Path, folder: Path) -> None:
     """Make the page of a machine of a fleet, in any process."""
-    from legcal import report
+    from legcal.report.page.writing import write_report
 
-    page = PageOfResult(
-        lambda result, into: report.write_report(result, output, command, into=into)
-    )
+    page = PageOfResult(lambda result, into: write_report(result, output, command, into=into))
     page(found, folder)
     page.say()
 
 
 def _with_truth(folder: Path, truth: str) -> tuple[Dataset, Machine]:
     """Return a dataset and the true model; refuse, before any work, that of another machine."""
-    from legcal.calibration import evaluate
-    from legcal.data import load_dataset
-    from legcal.machine import load_mechanism
+    from legcal.calibration.evaluation import evaluate
+    from legcal.data.dataset import load_dataset
+    from legcal.machine.loader import load_mechanism
 
     dataset, true = load_dataset(folder), load_mechanism(truth)
     evaluate(dataset.machine, true)
@@ -338,9 +339,9 @@ def _page_of_check(output: Path) -> Path:
 
     Its own page would be lost.
     """
-    from legcal import calibration
-    from legcal.files import RESULT, check_path
-    from legcal.pages import PAGE
+    from legcal.calibration.result_folder import REPORT_NAME
+    from legcal.files.folder import RESULT, check_path
+    from legcal.pages.html import PAGE
 
     check_path(output)
     if RESULT.is_in(output):
@@ -355,14 +356,14 @@ def _page_of_check(output: Path) -> Path:
             f"{output}: the page of the check could not be written: found '{error.strerror}', "
             "needed a path that can be created; give another output folder."
         ) from error
-    page = output / calibration.REPORT_NAME
+    page = output / REPORT_NAME
     PAGE.check_place(page)
     return page
 
 
 def _lengths(stated: Sequence[str]) -> list[str]:
     """Return measured lengths, checked to be between two joints."""
-    from legcal.files import describe
+    from legcal.files.schema import describe
 
     for text in stated:
         if ":" not in text.partition("=")[0]:
@@ -385,17 +386,19 @@ def _check(
     as_json: bool,
 ) -> None:
     """Test an earlier result with new images."""
-    from legcal import calibration, report
+    from legcal.calibration.verification import SIGNIFICANCE, check
+    from legcal.report.calibration import check_summary
+    from legcal.report.page.verdicts import check_verdict
 
-    found = calibration.check(
+    found = check(
         dataset,
         result,
-        significance=calibration.SIGNIFICANCE if significance is None else significance,
+        significance=SIGNIFICANCE if significance is None else significance,
         progress=not quiet,
         workers=workers,
     )
     title = f"Check of {result.resolve().name}"
-    write_page(page, title, report.check_summary(found), report.check_verdict(found))
-    show(as_json, found.document, lambda: report.check_summary(found))
+    write_page(page, title, check_summary(found), check_verdict(found))
+    show(as_json, found.document, lambda: check_summary(found))
     if found.movement.moved:
         raise typer.Exit(1)

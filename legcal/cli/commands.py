@@ -22,7 +22,7 @@ from legcal.cli.options import (
     write_page,
 )
 from legcal.errors import UsageError, printable
-from legcal.vision import DistortionModel
+from legcal.vision.distortion import DistortionModel
 
 
 def camera(
@@ -58,9 +58,10 @@ def camera(
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate a camera from photographs of a chessboard, ChArUco board or AprilGrid."""
-    from legcal import calibration, report
+    from legcal.calibration.camera_calibration.calibration import calibrate_camera
+    from legcal.report.images import camera_table
 
-    found = calibration.calibrate_camera(
+    found = calibrate_camera(
         images,
         board,
         model=model,
@@ -69,7 +70,7 @@ def camera(
         progress=not quiet,
         workers=image_workers(cluster, workers),
     )
-    show(as_json, found.document, lambda: report.camera_table(found, output))
+    show(as_json, found.document, lambda: camera_table(found, output))
 
 
 def detect(
@@ -90,12 +91,13 @@ def detect(
     as_json: JsonOption = False,
 ) -> None:
     """Find the outlines of the legs and show them over the images, to see what went wrong."""
-    from legcal import calibration, report
+    from legcal.calibration import outline_detection
+    from legcal.report.images import detection_table
 
-    found = calibration.detect(
+    found = outline_detection.detect(
         dataset, output=output, progress=not quiet, workers=image_workers(cluster, workers)
     )
-    show(as_json, lambda: found.document, lambda: report.detection_table(found, output))
+    show(as_json, lambda: found.document, lambda: detection_table(found, output))
     if found.unplaced or not found.outlines.used.any():
         raise typer.Exit(1)
 
@@ -111,10 +113,11 @@ def doctor(
 
     Exit 0 if nothing stands against it, 1 if something does, 2 if files cannot be used.
     """
-    from legcal import calibration, report
+    from legcal.calibration import examination
+    from legcal.report.doctor import examination_table
 
-    found = calibration.doctor(dataset, progress=not quiet, workers=image_workers(cluster, workers))
-    show(as_json, found.document, lambda: report.examination_table(found))
+    found = examination.doctor(dataset, progress=not quiet, workers=image_workers(cluster, workers))
+    show(as_json, found.document, lambda: examination_table(found))
     if not found.is_ready:
         raise typer.Exit(1 if found.is_usable else 2)
 
@@ -135,10 +138,11 @@ def evaluate(
     as_json: JsonOption = False,
 ) -> None:
     """Compare two models: platform errors of eq (20), and every parameter."""
-    from legcal import calibration, report
+    from legcal.calibration import evaluation
+    from legcal.report.calibration import accuracy_table
 
-    found = calibration.evaluate(model, reference, dataset=dataset)
-    show(as_json, found.document, lambda: report.accuracy_table(found))
+    found = evaluation.evaluate(model, reference, dataset=dataset)
+    show(as_json, found.document, lambda: accuracy_table(found))
 
 
 def identify(
@@ -187,16 +191,18 @@ def identify(
     as_json: JsonOption = False,
 ) -> None:
     """Say which parameters a calibration can identify, and what would identify the others."""
-    from legcal import calibration, report
+    from legcal.calibration.identify.identifiability import answer
+    from legcal.report.identify import identify_table
+    from legcal.report.page.verdicts import identify_verdict
 
     check_page(page)
     views = [text.split(",") for text in view or []]
-    found = calibration.answer(
+    found = answer(
         model, views, images, board=board, platform_board=platform_board, hand_held=hand_held
     )
-    verdict = report.identify_verdict(found)
-    write_page(page, f"Identifiability of {model}", report.identify_table(found), verdict)
-    show(as_json, found.document, lambda: report.identify_table(found))
+    verdict = identify_verdict(found)
+    write_page(page, f"Identifiability of {model}", identify_table(found), verdict)
+    show(as_json, found.document, lambda: identify_table(found))
 
 
 def inspect(
@@ -218,8 +224,11 @@ def inspect(
     ] = None,
 ) -> None:
     """Show a mechanism as legcal understands it: legs, joints, frames, mobility."""
-    from legcal import report
-    from legcal.machine import load_mechanism, machine_document, write_model
+    from legcal.machine.inspection import machine_document
+    from legcal.machine.loader import load_mechanism
+    from legcal.machine.model_writer import write_model
+    from legcal.report.machine import inspect_table
+    from legcal.report.machine_picture import MACHINE_PICTURE, draw_machine
 
     if picture is not None:
         if picture.suffix.lower() != ".svg":
@@ -227,16 +236,16 @@ def inspect(
                 f"{picture}: the picture could not be written: found another ending, needed .svg; "
                 "give the name of an SVG file."
             )
-        report.MACHINE_PICTURE.check_place(picture)
+        MACHINE_PICTURE.check_place(picture)
     machine = load_mechanism(model)
     description = machine_document(machine)
     if picture is not None:
-        report.MACHINE_PICTURE.write(picture, report.draw_machine(machine))
+        MACHINE_PICTURE.write(picture, draw_machine(machine))
         typer.echo(printable(f"Wrote {picture}."), err=True)
     if write is not None:
         for path in write_model(machine, write):
             typer.echo(printable(f"Wrote {path}."), err=True)
-    show(as_json, lambda: description, lambda: report.inspect_table(description))
+    show(as_json, lambda: description, lambda: inspect_table(description))
 
 
 def locate(
@@ -282,9 +291,16 @@ def locate(
     as_json: JsonOption = False,
 ) -> None:
     """Find the base in the world and the tool in the platform from measured tool poses."""
-    from legcal import calibration, report
-    from legcal.files import ANGLE, LENGTH, parse_quantity
-    from legcal.machine import load_mechanism
+    from legcal.calibration.location import locate
+    from legcal.calibration.location.document import (
+        LOCATION_FILE,
+        location_document,
+        write_location,
+    )
+    from legcal.calibration.location.urdf import write_located_model
+    from legcal.files.quantity import ANGLE, LENGTH, parse_quantity
+    from legcal.machine.loader import load_mechanism
+    from legcal.report.machine import location_table
 
     if urdf is None and (world_link, tool_link) != ("world", "tool"):
         raise UsageError(
@@ -296,9 +312,9 @@ def locate(
         return None if text is None else parse_quantity(text, units, what)
 
     check_page(page)
-    calibration.LOCATION_FILE.check_place(output)
+    LOCATION_FILE.check_place(output)
     machine = load_mechanism(model)
-    location = calibration.locate(
+    location = locate.locate(
         machine,
         poses,
         position_sigma=quantity(position_sigma, LENGTH, "--position-sigma"),
@@ -308,18 +324,16 @@ def locate(
     )
     written = []
     if urdf is not None:
-        paths = calibration.write_located_model(
-            machine, location, urdf, world=world_link, tool=tool_link
-        )
+        paths = write_located_model(machine, location, urdf, world=world_link, tool=tool_link)
         written += [str(path) for path in paths]
-    calibration.write_location(location, output)
+    write_location(location, output)
     written.append(str(output))
     title = f"Base and tool of {machine.name}"
-    write_page(page, title, report.location_table(location, written))
+    write_page(page, title, location_table(location, written))
     show(
         as_json,
-        lambda: calibration.location_document(location) | {"written": written},
-        lambda: report.location_table(location, written),
+        lambda: location_document(location) | {"written": written},
+        lambda: location_table(location, written),
     )
     if not location.trustworthy:
         raise typer.Exit(1)
@@ -327,7 +341,7 @@ def locate(
 
 def _point(text: str) -> list[float]:
     """Return three lengths, in metres or with their units."""
-    from legcal.files import read_value
+    from legcal.files.quantity import read_value
 
     try:
         values = [read_value(part) for part in text.split(",")]
@@ -351,10 +365,11 @@ def noise(
     as_json: JsonOption = False,
 ) -> None:
     """Estimate how precisely images tell where legs are, from repeated images of the same poses."""
-    from legcal import calibration, report
+    from legcal.calibration.measurement_noise.comparison import measure_noise
+    from legcal.report.noise import noise_table
 
     check_page(page)
-    found = calibration.measure_noise(dataset, progress=not quiet, workers=image_workers(cluster))
+    found = measure_noise(dataset, progress=not quiet, workers=image_workers(cluster))
     title = f"Measurement noise of {found.dataset.machine.name}"
-    write_page(page, title, report.noise_table(found))
-    show(as_json, found.document, lambda: report.noise_table(found))
+    write_page(page, title, noise_table(found))
+    show(as_json, found.document, lambda: noise_table(found))

@@ -20,9 +20,10 @@ def example(
     """Copy the dataset that comes with legcal: a hexapod, 45 photographs (11 MB)."""
     from rich.text import Text
 
-    from legcal import data, report
+    from legcal.data.example import copy_example
+    from legcal.report.render import report
 
-    data.copy_example(output)
+    copy_example(output)
     lines = (
         f"written: {output}",
         f"Next: legcal calibrate {shlex.quote(str(output))} -o calibrated",
@@ -30,5 +31,5 @@ def example(
     show(
         as_json,
         lambda: {"path": str(output)},
-        lambda: report.report([Text(line, overflow="ignore") for line in lines]),
+        lambda: report([Text(line, overflow="ignore") for line in lines]),
     )

@@ -46,18 +46,20 @@ def export(
     """Write a calibration or a model for another program or a controller."""
     from rich.text import Text
 
-    from legcal import exports, report
+    from legcal.exports import formats
+    from legcal.exports.subject import ExportOptions
+    from legcal.report.render import report
 
-    found = exports.export(
+    found = formats.export(
         source,
         to,
         output,
-        options=exports.ExportOptions(inertia=inertia, nodes=nodes),
+        options=ExportOptions(inertia=inertia, nodes=nodes),
         force=force,
     )
     lines = [f"written: {path}" for path in found.paths] + list(found.notes)
     show(
         as_json,
         found.document,
-        lambda: report.report([Text(line, overflow="fold") for line in lines]),
+        lambda: report([Text(line, overflow="fold") for line in lines]),
     )

@@ -74,11 +74,12 @@ def import_(
     as_json: JsonOption = False,
 ) -> None:
     """Make a dataset from recordings of a machine that rests at each pose."""
-    from legcal import recordings, report
     from legcal.progress import shown_progress
+    from legcal.recordings.importing import import_recordings, plan_import
+    from legcal.report.new_dataset import import_table, written_lines
 
     with shown_progress(not quiet) as progress:
-        found = recordings.plan_import(
+        found = plan_import(
             sources,
             model,
             output,
@@ -93,12 +94,12 @@ def import_(
             progress=progress,
         )
     if not as_json:
-        print_table(report.import_table(found))
+        print_table(import_table(found))
     written = []
     if not dry_run:
         with shown_progress(not quiet) as progress:
-            written = recordings.import_recordings(found, force=force, progress=progress)
+            written = import_recordings(found, force=force, progress=progress)
     if as_json:
         print_json(found.document(written))
     elif written:
-        print_table(report.written_lines(output, written, found.machine))
+        print_table(written_lines(output, written, found.machine))

@@ -95,9 +95,10 @@ def init(
     as_json: JsonOption = False,
 ) -> None:
     """Make a dataset from a folder of photographs and a table of readings."""
-    from legcal import data, report
+    from legcal.data.new_dataset import plan_new_dataset, write_new_dataset
+    from legcal.report.new_dataset import matching_table, written_lines
 
-    found = data.plan_new_dataset(
+    found = plan_new_dataset(
         folder,
         readings,
         model,
@@ -112,9 +113,9 @@ def init(
         servos=servo or (),
     )
     if not as_json:
-        print_table(report.matching_table(found))
-    written = [] if dry_run else data.write_new_dataset(found, force=force)
+        print_table(matching_table(found))
+    written = [] if dry_run else write_new_dataset(found, force=force)
     if as_json:
         print_json(found.document(written))
     elif written:
-        print_table(report.written_lines(output, written, found.machine))
+        print_table(written_lines(output, written, found.machine))

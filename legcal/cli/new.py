@@ -1,4 +1,4 @@
-"""``legcal new``: most of its options are the fields of :class:`legcal.machine.Dimensions`."""
+"""``legcal new``: most of its options are the fields of ``Dimensions``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import typer
 
 from legcal.cli.options import JsonOption, declare, declared, parameters_of, show
 from legcal.errors import UsageError
-from legcal.machine import Dimensions
+from legcal.machine.dimensions import Dimensions
 
 
 def new(
@@ -38,7 +38,12 @@ def new(
     """Write a model, YAML and URDF, from a table of joints or a few dimensions."""
     from rich.text import Text
 
-    from legcal import machine, report
+    from legcal.machine.family import description_of
+    from legcal.machine.inspection import machine_document
+    from legcal.machine.model_builder import create_model
+    from legcal.machine.table_template import write_template
+    from legcal.report.machine import inspect_table
+    from legcal.report.render import report
 
     given = Dimensions(**options)
     if template:
@@ -47,24 +52,24 @@ def new(
                 "The template could not be written: found other options beside --template, needed "
                 "--output and --name only; leave them out, and write your numbers in the table."
             )
-        yaml, csv = machine.write_template(output, given.name, force=force)
+        yaml, csv = write_template(output, given.name, force=force)
         lines = f"written: {yaml} {csv}", f"Next: legcal new {shlex.quote(str(yaml))} -o ."
         show(
             as_json,
             lambda: {"paths": {"yaml": str(yaml), "csv": str(csv)}},
-            lambda: report.report([Text(line, overflow="ignore") for line in lines]),
+            lambda: report([Text(line, overflow="ignore") for line in lines]),
         )
         return
-    model = machine.description_of(table, given)
-    created = machine.create_model(model, output, force=force)
-    description = machine.machine_document(created.machine)
+    model = description_of(table, given)
+    created = create_model(model, output, force=force)
+    description = machine_document(created.machine)
     description["diagnostics"] = [*model.notes, *description["diagnostics"]]
     paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
     written = f"written: {paths['yaml']} {paths['urdf']}"
     show(
         as_json,
         lambda: description | {"paths": paths},
-        lambda: report.report(report.inspect_table(description), Text(written, overflow="ignore")),
+        lambda: report(inspect_table(description), Text(written, overflow="ignore")),
     )
 
 

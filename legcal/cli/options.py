@@ -81,7 +81,7 @@ PageOption = Annotated[
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from legcal.pages import Verdict
+    from legcal.pages.document import Verdict
 
 
 def declared(request: type) -> Iterator[inspect.Parameter]:
@@ -113,7 +113,7 @@ def declare(command: Callable[..., None], order: Sequence[inspect.Parameter]) ->
 
 def check_page(page: Path | None) -> None:
     """Refuse, before any work, a place where no page can be written."""
-    from legcal.pages import PAGE
+    from legcal.pages.html import PAGE
 
     if page is not None:
         PAGE.check_place(page)
@@ -127,14 +127,13 @@ def write_page(
     figures: Mapping[str, Path] = MappingProxyType({}),
 ) -> None:
     """Write what is printed as a page, with figures (PNG) by their captions, where one is asked."""
-    from legcal import report
+    from legcal.report.page import writing
+    from legcal.report.page.text_page import picture, text_page
 
     if page is not None:
-        blocks = [report.picture(path, caption) for caption, path in figures.items()]
-        found = report.text_page(
-            title, text, verdict=verdict, blocks=blocks, command=command_line()
-        )
-        report.write_page(found, page)
+        blocks = [picture(path, caption) for caption, path in figures.items()]
+        found = text_page(title, text, verdict=verdict, blocks=blocks, command=command_line())
+        writing.write_page(found, page)
 
 
 @dataclass
@@ -200,7 +199,7 @@ def print_table(renderable: RenderableType) -> None:
     from rich.console import Console
 
     if isinstance(renderable, str):
-        from legcal.report import report
+        from legcal.report.render import report
 
         renderable = report(renderable)
     with _writing_to_stdout():

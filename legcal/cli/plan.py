@@ -22,7 +22,7 @@ from legcal.cli.options import (
 from legcal.errors import printable
 
 if TYPE_CHECKING:
-    from legcal.planning import Plan
+    from legcal.planning.planned_session import Plan
 
 
 def plan(
@@ -128,17 +128,21 @@ def plan(
     as_json: JsonOption = False,
 ) -> None:
     """Plan a session: poses and camera places that determine a machine best."""
-    from legcal import planning, report
-    from legcal.files import LENGTH, parse_quantity
+    from legcal.files.quantity import LENGTH, parse_quantity
+    from legcal.planning import request
+    from legcal.planning.information import DEFAULT_NOISE
+    from legcal.planning.places import USUAL, parse_bounds
+    from legcal.planning.session import check_session, write_session
+    from legcal.report.plan import plan_files, plan_table
     from legcal.signals import first_signal_waits, is_waiting
 
     def length(text: str | None, option: str) -> float | None:
         return None if text is None else parse_quantity(text, LENGTH, option)
 
-    planning.check_session(output, force=force)
+    check_session(output, force=force)
     error = length(model_error, "--model-error") or 0.0
     with first_signal_waits():  # Ctrl-C ends the search: the best so far is written
-        found = planning.plan(
+        found = request.plan(
             model,
             images=images,
             images_per_view=images_per_view,
@@ -147,30 +151,30 @@ def plan(
             criterion=criterion,
             parameters=parameter or (),
             camera=camera,
-            noise=planning.DEFAULT_NOISE if noise is None else noise,
+            noise=DEFAULT_NOISE if noise is None else noise,
             encoder_sigma=encoder_sigma,
-            bounds=None if bounds is None else planning.parse_bounds(bounds),
+            bounds=None if bounds is None else parse_bounds(bounds),
             places=places,
             given=given,
             board=board,
             hand_held=hand_held,
-            setting=replace(planning.USUAL, length=error),
+            setting=replace(USUAL, length=error),
             seed=seed,
             workers=image_workers(cluster, workers),
             progress=not quiet,
             stop=is_waiting,
         )
-        pictures = report.plan_files(found, _previews(found), command_line())
-        planning.write_session(found, output, force=force, pictures=pictures)
+        pictures = plan_files(found, _previews(found), command_line())
+        write_session(found, output, force=force, pictures=pictures)
         if is_waiting() and sys.stderr is not None:
             text = f"The session was written to {output}, with the best plan found before the stop."
             sys.stderr.write(f"legcal: {printable(text)}\n")
-    show(as_json, found.document, lambda: report.plan_table(found, output))
+    show(as_json, found.document, lambda: plan_table(found, output))
 
 
 def _previews(plan: Plan) -> dict[str, bytes]:
     """Return a small rendered photograph of each view, by its name."""
-    from legcal.simulation import preview
+    from legcal.simulation.previews import preview
 
     views = plan.views[:1] if plan.hand_held else plan.views
     return {

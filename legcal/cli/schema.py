@@ -18,7 +18,8 @@ def schema(
     ] = None,
 ) -> None:
     """Print the JSON Schema of a file or document, for editors and programs that check them."""
-    from legcal.files import closest, schema_content, schema_names
+    from legcal.files.published import schema_content, schema_names
+    from legcal.files.schema import closest
 
     names = schema_names()
     if name is None:

@@ -1,4 +1,4 @@
-"""``legcal simulate``: its options are the fields of :class:`legcal.simulation.Request`."""
+"""``legcal simulate``: its options are the fields of :class:`legcal.simulation.request.Request`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from legcal.cli.options import (
     parameters_of,
     show,
 )
-from legcal.simulation import Request
+from legcal.simulation.request import Request
 
 OutputOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="DATASET", help="The folder to write.")
@@ -41,10 +41,11 @@ def simulate(
 
     The default is 45 photographs: 3 views of 15 extreme poses each.
     """
-    from legcal.machine import load_mechanism
-    from legcal.report import simulation_table
-    from legcal.simulation import requested, summary_document
-    from legcal.simulation import simulate as run
+    from legcal.machine.loader import load_mechanism
+    from legcal.report.images import simulation_table
+    from legcal.simulation.dataset import simulate as run
+    from legcal.simulation.dataset import summary_document
+    from legcal.simulation.settings import requested
 
     nominal = load_mechanism(model).require_rigid_platform()
     settings = requested(Request(**options), nominal)

@@ -74,8 +74,10 @@ def paper(
     as_json: JsonOption = False,
 ) -> None:
     """Repeat section 4.3 of the paper: calibrations of a 6-SPU, before and after."""
-    from legcal.report import study_table
-    from legcal.simulation import PaperStudy, StudyResult, TableNoise, run_study
+    from legcal.report.study import study_table
+    from legcal.simulation.observe import TableNoise
+    from legcal.simulation.paper import PaperStudy
+    from legcal.simulation.study import StudyResult, run_study
 
     def make_page(found: StudyResult, folder: Path) -> None:
         caption = "Mean errors of the parameters, as in Fig. 4 of the paper; fig4.html enlarges it."

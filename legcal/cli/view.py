@@ -40,12 +40,14 @@ def view(
     with loading():
         from rich.text import Text
 
-        from legcal import viewer
+        from legcal.viewer.address import Address, check_address
+        from legcal.viewer.source import open_source
+        from legcal.viewer.window import Window, require_viser
 
-        viewer.require_viser()
-    address = viewer.Address(host, port)
-    viewer.check_address(address)
-    window = viewer.Window(viewer.open_source(source, dataset), address)
+        require_viser()
+    address = Address(host, port)
+    check_address(address)
+    window = Window(open_source(source, dataset), address)
     name = printable(window.source.name)
     print_table(Text(f"{window.address} shows {name}; Ctrl-C ends it.", overflow="fold"))
     if browser and _has_screen():

@@ -26,14 +26,12 @@ from legcal.data.measurements import (
 )
 from legcal.data.outlines import Outlines
 from legcal.errors import NotVisible
-from legcal.files import Column, format_table, read_table, write_atomically
-from legcal.geometry import Array, IntArray, cross, nearest_point_to_line, normal_basis
-from legcal.vision import (
-    Camera,
-    axis_of_outlines,
-    direction_derivative,
-    direction_of_angles,
-)
+from legcal.files.folder import write_atomically
+from legcal.files.table import Column, format_table, read_table
+from legcal.geometry.lines import cross, nearest_point_to_line, normal_basis
+from legcal.geometry.types import Array, IntArray
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import axis_of_outlines, direction_derivative, direction_of_angles
 
 VALUES = ("psi", "theta", "x", "z")
 SIGMAS = tuple(f"sigma_{name}" for name in VALUES)

@@ -24,10 +24,12 @@ from legcal.data.outlines import (
     no_outlines,
     write_observations,
 )
-from legcal.files import MAX_DOCUMENT, MAX_IMAGE, FileSchema, read_bytes, write_atomically
-from legcal.geometry import BoolArray, IntArray
+from legcal.files.folder import write_atomically
+from legcal.files.reading import MAX_DOCUMENT, MAX_IMAGE, read_bytes
+from legcal.files.schema import FileSchema
+from legcal.geometry.types import BoolArray, IntArray
 from legcal.version import __version__
-from legcal.vision import board_document
+from legcal.vision.board_file import board_document
 
 FORMAT = 1
 _INCOMPLETE = "incomplete"  # the fingerprint while the table is being written: it matches nothing

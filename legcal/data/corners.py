@@ -18,9 +18,11 @@ from legcal.data.image_tables import ImageTable
 from legcal.data.measurements import Measurements, find_rows, places, refuse_unknown_rows
 from legcal.data.outlines import SOURCES, UNLESS_REJECTED, VERDICT_COLUMNS, VERDICTS
 from legcal.errors import DatasetError
-from legcal.files import Column, describe, format_table, read_table, write_atomically
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.vision import FixedBoard
+from legcal.files.folder import write_atomically
+from legcal.files.schema import describe
+from legcal.files.table import Column, format_table, read_table
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.vision.board import FixedBoard
 
 NUMBERS = ("u", "v", "sigma")
 COLUMNS = ("view", "image", "corner", *NUMBERS, *(column.name for column in VERDICT_COLUMNS))

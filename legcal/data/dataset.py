@@ -34,19 +34,17 @@ from legcal.data.reading_units import (
     sigma_too_large,
 )
 from legcal.errors import DatasetError
-from legcal.files import closest, describe, path_problem
-from legcal.machine import Machine, load_mechanism, shipped_folder, shipped_names
-from legcal.vision import (
-    Camera,
-    FixedBoard,
-    Grey,
-    ImageFacts,
-    Link,
-    decode_image,
-    inspect_image,
-    parse_boards,
-    read_camera,
-)
+from legcal.files.folder import path_problem
+from legcal.files.schema import closest, describe
+from legcal.machine.files import shipped_folder, shipped_names
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.vision.board import FixedBoard, Link
+from legcal.vision.board_file import parse_boards
+from legcal.vision.camera import Camera
+from legcal.vision.camera_file import read_camera
+from legcal.vision.image_facts import ImageFacts
+from legcal.vision.image_file import Grey, decode_image, inspect_image
 from legcal.workers import KeptArrays
 
 AXES_NAME = "axes.csv"

@@ -21,21 +21,12 @@ from pydantic import (
 from legcal.data.overrides import Override, read_override
 from legcal.data.reading_units import ReadingsEntry, ReadingUnitName
 from legcal.errors import DatasetError
-from legcal.files import (
-    PRIOR_SCHEMA,
-    FileSchema,
-    MotionEntry,
-    Name,
-    Number,
-    Quantity,
-    Version,
-    describe,
-    read_prior,
-    read_yaml,
-    validate,
-)
-from legcal.machine import DATASET_YAML, list_in_words
-from legcal.vision import Link
+from legcal.files.motions import MotionEntry
+from legcal.files.quantity import PRIOR_SCHEMA, Quantity, read_prior
+from legcal.files.schema import FileSchema, Name, Number, Version, describe, read_yaml, validate
+from legcal.machine.directions import list_in_words
+from legcal.machine.files import DATASET_YAML
+from legcal.vision.board import Link
 
 ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
 _Text = Annotated[str, Strict(), WithJsonSchema({"type": "string"})]

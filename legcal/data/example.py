@@ -4,8 +4,8 @@ import shutil
 from pathlib import Path
 
 from legcal.errors import OutOfResources, UsageError
-from legcal.files import OutputKind, check_path, holds_files, result_folder
-from legcal.machine import DATASET_YAML, shipped_folder
+from legcal.files.folder import OutputKind, check_path, holds_files, result_folder
+from legcal.machine.files import DATASET_YAML, shipped_folder
 
 EXAMPLE = "examples/hexapod"
 KIND = OutputKind("example", "", "legcal_dataset")

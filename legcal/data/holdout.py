@@ -14,7 +14,7 @@ import numpy as np
 from legcal.data.dataset import Dataset
 from legcal.data.image_tables import canonical_order, measurements_at
 from legcal.errors import NotIdentifiable, UsageError
-from legcal.geometry import BoolArray, IntArray
+from legcal.geometry.types import BoolArray, IntArray
 
 _SEED = 20020721
 

@@ -14,7 +14,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 
 from legcal.data.measurements import Measurements
-from legcal.geometry import BoolArray, IntArray
+from legcal.geometry.types import BoolArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

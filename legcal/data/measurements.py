@@ -26,20 +26,13 @@ from legcal.data.reading_units import (
     legs_with_readings,
     sigmas_of_legs,
 )
-from legcal.files import (
-    ANGLE,
-    LENGTH,
-    Column,
-    Table,
-    closest,
-    describe,
-    path_problem,
-    place_in,
-    read_table,
-)
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import TRAVEL_MARGIN, Leg
-from legcal.vision import Camera
+from legcal.files.folder import path_problem
+from legcal.files.quantity import ANGLE, LENGTH
+from legcal.files.schema import closest, describe
+from legcal.files.table import Column, Table, place_in, read_table
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import TRAVEL_MARGIN, Leg
+from legcal.vision.camera import Camera
 
 MAX_NAMED = 5  # views or other things, in one sentence
 # Of the travel, and in standard deviations: readings outside by less are within it but for rounding

@@ -33,22 +33,19 @@ from legcal.data.photograph_matching import (
 from legcal.data.reading_units import are_commands, sigma_in, sigma_too_large, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
 from legcal.errors import DatasetError, UsageError
-from legcal.files import (
-    LENGTH,
-    NAME_NEEDED,
-    Document,
-    Number,
-    OutputKind,
-    check_path,
-    describe,
-    format_table,
-    is_name,
-    parse_quantity,
-    result_folder,
-    with_schema,
-)
-from legcal.machine import DATASET_YAML, Leg, Machine, Pulses, load_mechanism, shipped_names
-from legcal.vision import Camera, inspect_image, read_camera
+from legcal.files.folder import OutputKind, check_path, result_folder
+from legcal.files.published import with_schema
+from legcal.files.quantity import LENGTH, parse_quantity
+from legcal.files.schema import NAME_NEEDED, Document, Number, describe, is_name
+from legcal.files.table import format_table
+from legcal.machine.actuator import Pulses
+from legcal.machine.files import DATASET_YAML, shipped_names
+from legcal.machine.leg import Leg
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.vision.camera import Camera
+from legcal.vision.camera_file import read_camera
+from legcal.vision.image_file import inspect_image
 
 DATASET_FOLDER = OutputKind("dataset", "", "legcal_dataset")  # other files may stand beside it
 MEASUREMENTS = "measurements.csv"

@@ -24,18 +24,13 @@ from legcal.data.measurements import (
     refuse_unknown_legs,
     refuse_unknown_rows,
 )
-from legcal.files import (
-    Column,
-    Table,
-    closest,
-    describe,
-    format_table,
-    read_table,
-    write_atomically,
-)
-from legcal.geometry import Array, BoolArray, IntArray, cross
-from legcal.machine import Leg
-from legcal.vision import Camera
+from legcal.files.folder import write_atomically
+from legcal.files.schema import closest, describe
+from legcal.files.table import Column, Table, format_table, read_table
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import Leg
+from legcal.vision.camera import Camera
 
 QUALITY = ("contrast", "length", "residual")  # how well an outline was seen
 ENCODING = ("gamma", "by_gamma")  # how an outline depends on the gamma of the camera

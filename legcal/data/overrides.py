@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from legcal.errors import UsageError
-from legcal.files import EXAMPLE, Quantity, describe, read_prior, read_value
+from legcal.files.quantity import EXAMPLE, Quantity, read_prior, read_value
+from legcal.files.schema import describe
 
 Action = Literal["prior", "fixed", "free"]
 _WORDS: Mapping[Action, str] = {

@@ -18,15 +18,11 @@ from pathlib import Path, PurePosixPath
 
 from legcal.data.measurements import few
 from legcal.errors import DatasetError, UsageError
-from legcal.files import MAX_IMAGE, NAME_NEEDED, closest, describe, is_name, read_bytes
-from legcal.vision import (
-    CONVERT,
-    CONVERT_HEIC,
-    FOREIGN_SUFFIXES,
-    HEIC_SUFFIXES,
-    image_suffixes,
-    read_facts,
-)
+from legcal.files.reading import MAX_IMAGE, read_bytes
+from legcal.files.schema import NAME_NEEDED, closest, describe, is_name
+from legcal.vision.heic import HEIC_SUFFIXES
+from legcal.vision.image_facts import read_facts
+from legcal.vision.image_file import CONVERT, CONVERT_HEIC, FOREIGN_SUFFIXES, image_suffixes
 
 MAX_PHOTOGRAPHS = 50_000
 MAX_VIEWS = 12  # that names of photographs are taken for

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from legcal.data.measurements import Measurements, few, few_views
-from legcal.vision import Difference, ImageFacts, differences
+from legcal.vision.image_facts import ImageFacts
+from legcal.vision.photograph_comparison import Difference, differences
 
 GOOD_QUALITY = 95  # of a JPEG, from which on its loss is far below the noise of a camera
 _TURNS = {1: "not to be turned", 3: "to be turned by 180 deg", 6: "to be turned by 90 deg",

@@ -17,18 +17,11 @@ import numpy as np
 from pydantic import GetJsonSchemaHandler, model_validator
 
 from legcal.errors import DatasetError, UsageError
-from legcal.files import (
-    ANGLE,
-    LENGTH,
-    SHOWN_IN,
-    FileSchema,
-    Number,
-    closest,
-    describe,
-    split_quantity,
-)
-from legcal.geometry import Array
-from legcal.machine import Leg, Pulses
+from legcal.files.quantity import ANGLE, LENGTH, SHOWN_IN, split_quantity
+from legcal.files.schema import FileSchema, Number, closest, describe
+from legcal.geometry.types import Array
+from legcal.machine.actuator import Pulses
+from legcal.machine.leg import Leg
 
 PULSES = "us"
 SERVO_SIGMA = math.radians(0.5)  # [rad], of what a hobby servo makes of its command

@@ -28,19 +28,13 @@ from legcal.data.measurements import (
 )
 from legcal.data.reading_units import PULSES, ReadingUnit, unit_named
 from legcal.errors import DatasetError, UsageError
-from legcal.files import (
-    ANGLE,
-    LENGTH,
-    SHOWN_IN,
-    Column,
-    Lines,
-    describe,
-    is_number,
-    read_table,
-    split_heading,
-)
-from legcal.geometry import Array
-from legcal.machine import Leg, Machine, Pulses
+from legcal.files.quantity import ANGLE, LENGTH, SHOWN_IN
+from legcal.files.schema import describe
+from legcal.files.table import Column, Lines, is_number, read_table, split_heading
+from legcal.geometry.types import Array
+from legcal.machine.actuator import Pulses
+from legcal.machine.leg import Leg
+from legcal.machine.model import Machine
 
 LEAST_USED = 0.01  # of the travel: less is the use that is made of it in a larger unit
 # units that are tried where none is stated, of motors that slide and that turn

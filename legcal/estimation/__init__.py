@@ -38,7 +38,3 @@ score tests of columns that were not fitted (:func:`score_test`, :func:`scores_o
 covariance of predictions (:func:`explained_share`) come from the same matrix. Variances of random
 effects are estimated by restricted maximum likelihood (:class:`Effects`).
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

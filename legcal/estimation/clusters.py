@@ -24,7 +24,7 @@ import numpy as np
 from legcal.estimation.loss import LEAST_SQUARES, Loss
 from legcal.estimation.problem import Linearization, Problem, S
 from legcal.estimation.solver import NormalEquations, inverse_on_range
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 
 _RANGE = 1e-9  # of an information: what is smaller is rounding
 _MIN_DOF = 4.0  # of a ratio that is believed

@@ -14,7 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
-from legcal.geometry import Array
+from legcal.geometry.types import Array
 
 
 class Loss(Protocol):

@@ -28,7 +28,7 @@ from legcal.estimation.problem import (
     Tangent,
     linearize,
 )
-from legcal.geometry import Array, BoolArray
+from legcal.geometry.types import Array, BoolArray
 
 _FIRST_DAMPING = 1e-6
 _MIN_DAMPING = 1e-10

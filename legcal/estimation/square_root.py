@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from legcal.estimation.problem import Problem, S, linearize
-from legcal.geometry import Array, IntArray
+from legcal.geometry.types import Array, IntArray
 
 _UNKNOWN = 1e-3  # [1 / unit]: singular values of unknowns that count as not determined
 
@@ -18,7 +18,7 @@ _UNKNOWN = 1e-3  # [1 / unit]: singular values of unknowns that count as not det
 def information_rows(problem: Problem[S], state: S) -> Array:
     """Return rows (m, n_kept) of the kept unknowns, eliminated elements being free.
 
-    Their R^T R is the reduced matrix of :func:`legcal.estimation.information`, without a loss.
+    Their R^T R is the reduced matrix of ``information``, without a loss.
     """
     linear = linearize(problem, state)
     free, by_element = [linear.prior_J], []

@@ -18,7 +18,7 @@ from legcal.estimation.solver import (
     inverse_on_range,
     normal_equations,
 )
-from legcal.geometry import Array, IntArray
+from legcal.geometry.types import Array, IntArray
 
 _STIFF = 1e6  # information on what is tied, over that of measurements
 _ROUNDING = 1e-12  # of information, in differences

@@ -8,7 +8,3 @@ programs compute with (``urdf``, ``mjcf``, ``python``, ``c``, ``matlab``), milli
 in those that people and controllers read (``table``, ``csv``, ``json``, ``linuxcnc``,
 ``correction``).
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -20,21 +20,19 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import OutOfClass, UsageError
 from legcal.exports.identifiers import comment
 from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import (
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.configurations import workspace
+from legcal.machine.coordinates import (
     COORDINATES,
-    Machine,
     coordinates_of,
-    equations_of_readings,
-    leg_scale,
     own_coordinates,
-    poses_after,
     poses_at_coordinates,
-    readings_at_poses,
-    solve,
     turned_back,
-    workspace,
 )
+from legcal.machine.kinematics import equations_of_readings
+from legcal.machine.mobility import leg_scale
+from legcal.machine.model import Machine, readings_at_poses
+from legcal.machine.solver import poses_after, solve
 from legcal.version import __version__
 
 UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")

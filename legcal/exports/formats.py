@@ -16,7 +16,8 @@ from legcal.exports.mjcf import mjcf_files, mjcf_refusal
 from legcal.exports.parameter_files import csv_files, json_files, table_files
 from legcal.exports.robot_files import ros_files, urdf_files
 from legcal.exports.subject import RESULT_NAME, ExportOptions, Rendered, Subject, load_subject
-from legcal.files import Document, Number, OutputFile, OutputKind, SparseDocument, result_folder
+from legcal.files.folder import OutputFile, OutputKind, result_folder
+from legcal.files.schema import Document, Number, SparseDocument
 
 Render = Callable[[Subject, ExportOptions, Path], Rendered]
 

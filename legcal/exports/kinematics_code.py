@@ -25,19 +25,15 @@ from legcal.exports.identifiers import (
     matlab_string,
 )
 from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
-from legcal.geometry import Array, normal_basis
-from legcal.machine import (
-    COORDINATES,
-    Actuator,
-    EquationKind,
-    Leg,
-    LegKind,
-    Machine,
-    actuator_index,
-    inverse_kinematics,
-    leg_scale,
-    own_coordinates,
-)
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array
+from legcal.machine.actuator import Actuator
+from legcal.machine.coordinates import COORDINATES, own_coordinates
+from legcal.machine.kinematics import inverse_kinematics
+from legcal.machine.leg import EquationKind, Leg, LegKind
+from legcal.machine.mobility import leg_scale
+from legcal.machine.model import Machine
+from legcal.machine.rods import actuator_index
 from legcal.version import __version__
 
 TEMPLATES = Path(__file__).parent / "templates"

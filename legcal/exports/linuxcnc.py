@@ -15,7 +15,8 @@ import numpy as np
 
 from legcal.exports.identifiers import comment
 from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
-from legcal.machine import LegKind, readings_at
+from legcal.machine.leg import LegKind
+from legcal.machine.model import readings_at
 from legcal.version import __version__
 
 N_STRUTS = 6

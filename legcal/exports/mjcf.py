@@ -17,8 +17,9 @@ from scipy.spatial.transform import RigidTransform
 from legcal.exports.identifiers import comment
 from legcal.exports.robot_files import STUB_INERTIA, STUB_MASS
 from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject, other_gains
-from legcal.geometry import Array
-from legcal.machine import Machine, UrdfJoint, origins_of, parse_robot
+from legcal.geometry.types import Array
+from legcal.machine.model import Machine
+from legcal.machine.urdf import UrdfJoint, origins_of, parse_robot
 from legcal.version import __version__
 
 WORLD = "world"

@@ -17,12 +17,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
-from legcal.geometry import Array
-from legcal.machine import Leg, LegKind, Machine, actuators_of, geometries
+from legcal.geometry.types import Array
+from legcal.machine.leg import Leg, LegKind
+from legcal.machine.model import Machine
+from legcal.machine.parameters import geometries
+from legcal.machine.rods import actuators_of
 from legcal.version import __version__
 
 if TYPE_CHECKING:
-    from legcal.calibration import JointInLink
+    from legcal.calibration.documents import JointInLink
 
 UNITS = {"m": (1e3, "mm"), "rad": (float(np.degrees(1.0)), "deg")}  # of files; others stay
 COLUMNS = ("name", "frame", "unit", "value", "nominal", "change", "sigma", "status")

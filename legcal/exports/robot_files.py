@@ -15,8 +15,8 @@ from lxml import etree
 
 from legcal.exports.identifiers import identifier
 from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject, other_gains
-from legcal.files import motion_to_xyz_quat
-from legcal.machine import Machine
+from legcal.files.motions import motion_to_xyz_quat
+from legcal.machine.model import Machine
 from legcal.version import __version__
 
 STUB_MASS, STUB_INERTIA = 1.0, 1e-3  # [kg], [kg m^2] about all axes of the link

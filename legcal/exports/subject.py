@@ -10,18 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from legcal.machine import (
-    LegColumns,
-    Machine,
-    geometries,
-    legs_in_links,
-    load_mechanism,
-    model_name,
-    parametrization_of,
-)
+from legcal.machine.leg import LegColumns
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.model_writer import model_name
+from legcal.machine.parameters import geometries, legs_in_links, parametrization_of
 
 if TYPE_CHECKING:
-    from legcal.calibration import EarlierResult
+    from legcal.calibration.result_folder import EarlierResult
 
 RESULT_NAME = "result.json"
 
@@ -88,7 +84,7 @@ def load_subject(given: str | Path) -> Subject:
     """
     path = Path(given)
     if os.path.isfile(path / RESULT_NAME) or path.name == RESULT_NAME:
-        from legcal.calibration import load_result
+        from legcal.calibration.result_folder import load_result
 
         result = load_result(path)
         return Subject(result.machine, str(given), _nominal(result), result)

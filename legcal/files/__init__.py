@@ -4,7 +4,3 @@ What any room reads or writes goes through here, so that every file is refused i
 paths and bytes in, checked documents (:class:`FileSchema`), columns (:class:`Table`) and numbers
 with units out. Only rotations are known (:class:`MotionEntry`), no machine and no camera.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, field_validator
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.files.schema import Document, FileSchema, Metres, Number, Triple
-from legcal.geometry import motion_of
+from legcal.geometry.motions import motion_of
 
 QUATERNION_TOLERANCE = 1e-3  # files round to a few digits; more is a mistake
 

@@ -34,7 +34,7 @@ from legcal.files.schema import (
     is_name,
     nearest,
 )
-from legcal.geometry import Array, BoolArray
+from legcal.geometry.types import Array, BoolArray
 
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 MAX_ROWS = 50_000

@@ -2,7 +2,3 @@
 
 The one place of the sign of eq (1): the moment of a line is u x M. No robot and no camera.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,7 +1,7 @@
 """Axes as two angles from a nominal one: rotations about its normal basis.
 
 The angles w of an axis v turn it by exp([w_1 e_1 + w_2 e_2]_x), with e_1, e_2 the
-:func:`~legcal.geometry.normal_basis` of v. Axes are lines: v and -v have the same angles.
+:func:`~legcal.geometry.lines.normal_basis` of v. Axes are lines: v and -v have the same angles.
 """
 
 import numpy as np

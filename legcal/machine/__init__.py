@@ -10,7 +10,3 @@ Poses and closed chains have one solver (:func:`solve_poses`, :func:`forward_kin
 random configurations one sampler (:func:`random_configurations`). Calibrated models are written as
 patches of the files read.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from legcal.geometry import Array, cross
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
 from legcal.machine.description import Description, Home, LegEntry, LegType, leg_type
 from legcal.machine.description_table import in_metres

@@ -23,15 +23,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from legcal.geometry import (
-    Array,
-    axis_angles,
-    axis_angles_slope,
-    cross,
-    matrix_applied,
-    normal_basis,
-    turned_axis,
-)
+from legcal.geometry.axes import axis_angles, axis_angles_slope, turned_axis
+from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.motions import matrix_applied
+from legcal.geometry.types import Array
 
 
 class ActuatorKind(StrEnum):

@@ -8,15 +8,12 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError
-from legcal.files import SHOWN_IN, motion_to_xyz_quat
-from legcal.geometry import (
-    Array,
-    cross,
-    cross_matrices,
-    frame_on_points,
-    motion_of,
-    normal_basis,
-)
+from legcal.files.motions import motion_to_xyz_quat
+from legcal.files.quantity import SHOWN_IN
+from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.motions import frame_on_points, motion_of
+from legcal.geometry.rotations import cross_matrices
+from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
 from legcal.machine.description import (
     Description,

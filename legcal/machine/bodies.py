@@ -12,7 +12,8 @@ from typing import Literal
 import numpy as np
 
 from legcal.errors import ModelError
-from legcal.geometry import Array, matrix_inverse, matrix_product
+from legcal.geometry.motions import matrix_inverse, matrix_product
+from legcal.geometry.types import Array
 from legcal.machine.chain import Closure
 from legcal.machine.urdf import Urdf
 

@@ -15,7 +15,8 @@ import pinocchio as pin
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import ModelError
-from legcal.geometry import Array, IntArray, motion_of
+from legcal.geometry.motions import motion_of
+from legcal.geometry.types import Array, IntArray
 
 
 @dataclass(frozen=True)

@@ -15,14 +15,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import OutOfClass
-from legcal.geometry import (
-    Array,
-    cross,
-    matrix_applied,
-    matrix_inverse,
-    matrix_product,
-    normal_basis,
-)
+from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.motions import matrix_applied, matrix_inverse, matrix_product
+from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
 from legcal.machine.leg import Axis, JointType, Leg, LegChain, LegKind, Pivot, Step
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.mobility import CLOSED, leg_scale
 from legcal.machine.model import Machine, internal_coordinates, readings_at, slider_columns
 from legcal.machine.solver import Equations, Retraction, solve

@@ -16,7 +16,8 @@ from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge
-from legcal.geometry import Array, BoolArray, motions_of
+from legcal.geometry.motions import motions_of
+from legcal.geometry.types import Array, BoolArray
 from legcal.machine.equations import PoseEquations, equations_at_readings, freedoms, pose_equations
 from legcal.machine.kinematics import follow, follow_poses
 from legcal.machine.leg import Leg

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.equations import machine_equations
 from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine

@@ -10,14 +10,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from legcal.geometry import (
-    Array,
-    cross,
-    distance_to_line,
-    matrix_applied,
-    matrix_inverse,
-    matrix_product,
-)
+from legcal.geometry.lines import cross, distance_to_line
+from legcal.geometry.motions import matrix_applied, matrix_inverse, matrix_product
+from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Arm, Line
 from legcal.machine.bodies import Bodies
 from legcal.machine.leg import Cylinder, JointType, Leg, LegChain, Step

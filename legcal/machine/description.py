@@ -7,8 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.files import motion_from_xyz_quat
-from legcal.geometry import Array, distance_to_line
+from legcal.files.motions import motion_from_xyz_quat
+from legcal.geometry.lines import distance_to_line
+from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
 from legcal.machine.classification import PERPENDICULAR
 from legcal.machine.leg import (

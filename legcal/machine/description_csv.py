@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from legcal.errors import DatasetError
-from legcal.files import Column, Lines, Table, describe, is_number, read_table, split_heading
+from legcal.files.schema import describe
+from legcal.files.table import Column, Lines, Table, is_number, read_table, split_heading
 
 WHAT = "table"
 MAX_NUMBER = 1e9  # of any number, whatever its unit

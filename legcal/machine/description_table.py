@@ -16,12 +16,11 @@ from pydantic import BeforeValidator, Field, WithJsonSchema
 from scipy.spatial.transform import Rotation
 
 from legcal.errors import DatasetError, ModelError
-from legcal.files import (
+from legcal.files.motions import Quaternion, Vector
+from legcal.files.schema import (
     FileSchema,
     Number,
     PlainName,
-    Quaternion,
-    Vector,
     Version,
     closest,
     describe,
@@ -29,7 +28,7 @@ from legcal.files import (
     read_yaml,
     validate,
 )
-from legcal.geometry import Array
+from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind, Pulses
 from legcal.machine.description import (
     NEEDED_TYPE,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import qr
 
-from legcal.geometry import Array
+from legcal.geometry.types import Array
 from legcal.machine.parameters import owner_of_parameter
 
 SHOWN = 0.02  # of the largest component

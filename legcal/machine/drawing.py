@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.figures import new_figure, plain
-from legcal.geometry import Array
+from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 from legcal.machine.rods import actuator_index, actuators_of
 

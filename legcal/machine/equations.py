@@ -26,7 +26,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
+from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns, JointMotion
 from legcal.machine.leg import EquationKind, JointType, Leg, LegColumns, LegKind
 from legcal.machine.model import Machine

@@ -9,8 +9,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import UsageError
-from legcal.files import plain_name
-from legcal.geometry import Array, cross
+from legcal.files.schema import plain_name
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array
 from legcal.machine.actuated_family import (
     ALIASES,
     FAMILIES,

@@ -16,7 +16,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, ModelError
-from legcal.geometry import Array, BoolArray, IntArray, segment_distance
+from legcal.geometry.lines import segment_distance
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.configurations import (
     MIN_SINGULARITY,
     Configurations,

@@ -4,7 +4,8 @@ import os
 from pathlib import Path
 
 from legcal.errors import DatasetError, ModelError
-from legcal.files import RESULT, content_of
+from legcal.files.folder import RESULT
+from legcal.files.schema import content_of
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 

@@ -17,8 +17,8 @@ from scipy.linalg import null_space
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass
-from legcal.files import closest
-from legcal.geometry import Array
+from legcal.files.schema import closest
+from legcal.geometry.types import Array
 from legcal.machine.bodies import rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.files import find_model, find_urdf, read_file, yaml_of_urdf

@@ -13,8 +13,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, ModelError
-from legcal.files import SHOWN_IN
-from legcal.geometry import Array, motion_of
+from legcal.files.quantity import SHOWN_IN
+from legcal.geometry.motions import motion_of
+from legcal.geometry.types import Array
 from legcal.machine.closing import close_at
 from legcal.machine.equations import (
     PoseEquations,

@@ -7,7 +7,8 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import model_validator
 
-from legcal.files import Document, Number, Pose, SparseDocument, Triple
+from legcal.files.motions import Pose
+from legcal.files.schema import Document, Number, SparseDocument, Triple
 from legcal.machine.leg import JointType, Leg, LegKind
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.schema import motor_entries

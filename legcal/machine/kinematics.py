@@ -15,8 +15,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.files import closest
-from legcal.geometry import Array, BoolArray, IntArray, matrix_of, motion_of, motions_of, product
+from legcal.files.schema import closest
+from legcal.geometry.motions import matrix_of, motion_of, motions_of, product
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.closing import close_at, closure_equations
 from legcal.machine.equations import (
     is_constrained,

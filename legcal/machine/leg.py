@@ -17,14 +17,9 @@ from typing import Literal
 import numpy as np
 
 from legcal.brief import brief
-from legcal.geometry import (
-    Array,
-    BoolArray,
-    distance_to_line,
-    matrix_applied,
-    matrix_inverse,
-    matrix_product,
-)
+from legcal.geometry.lines import distance_to_line
+from legcal.geometry.motions import matrix_applied, matrix_inverse, matrix_product
+from legcal.geometry.types import Array, BoolArray
 from legcal.machine.actuator import Actuator, ActuatorColumns, Arm
 from legcal.machine.bodies import Connection
 

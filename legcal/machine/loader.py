@@ -16,8 +16,10 @@ from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, LegcalError, ModelError, OutOfClass
-from legcal.files import SHOWN_IN, MotionEntry, closest, motion_to_xyz_quat
-from legcal.geometry import Array
+from legcal.files.motions import MotionEntry, motion_to_xyz_quat
+from legcal.files.quantity import SHOWN_IN
+from legcal.files.schema import closest
+from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Pulses
 from legcal.machine.bodies import Bodies, rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure

@@ -17,8 +17,10 @@ from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass
-from legcal.files import closest
-from legcal.geometry import Array, cross, rotation_between
+from legcal.files.schema import closest
+from legcal.geometry.lines import cross
+from legcal.geometry.rotations import rotation_between
+from legcal.geometry.types import Array
 from legcal.machine.schema import MAX_LOOPS, MechanismFile
 from legcal.machine.spanning_tree import (
     DRAWING,

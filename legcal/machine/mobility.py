@@ -10,7 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, cross
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array
 from legcal.machine.equations import is_constrained, machine_equations, machine_equations_at
 from legcal.machine.model import (
     B_at,

@@ -11,7 +11,8 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.errors import OutOfClass, UsageError
-from legcal.geometry import Array, frame_on_points
+from legcal.geometry.motions import frame_on_points
+from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
 from legcal.machine.chain import ClosedChain
 from legcal.machine.drawing import Sketch, motor_lines

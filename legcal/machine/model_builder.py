@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from legcal.errors import LegcalError, OutOfResources, UsageError
-from legcal.files import temporary_folder, write_schemas
-from legcal.geometry import Array, cross
+from legcal.files.folder import temporary_folder
+from legcal.files.published import write_schemas
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array
 from legcal.machine.assembly import Assembled, AssembledLeg, assemble
 from legcal.machine.description import Description
 from legcal.machine.leg import JointType, LegKind

@@ -18,8 +18,9 @@ import yaml
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, OutOfResources, UsageError
-from legcal.files import motion_to_xyz_quat, write_atomically
-from legcal.geometry import roll_pitch_yaw
+from legcal.files.folder import write_atomically
+from legcal.files.motions import motion_to_xyz_quat
+from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.machine.files import FOLDER_YAML, read_file
 from legcal.machine.formats import XML_SUFFIXES
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from legcal.geometry import Array, cross, normal_basis
+from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
 from legcal.machine.assembly import AssembledLeg
 from legcal.machine.spanning_tree import box_xml, origin_xml_at, visual_xml

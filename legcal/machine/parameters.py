@@ -14,18 +14,11 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import (
-    Array,
-    BoolArray,
-    IntArray,
-    axis_angles,
-    cross,
-    frame_on_points,
-    matrix_applied,
-    normal_basis,
-    rotation_between,
-    turned_axis,
-)
+from legcal.geometry.axes import axis_angles, turned_axis
+from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.motions import frame_on_points, matrix_applied
+from legcal.geometry.rotations import rotation_between
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.leg import (
     KinematicParameters,
@@ -275,7 +268,7 @@ def vector_of(
 def numbers_of(legs: Sequence[Leg], nominal: Sequence[Leg]) -> Array:
     """Return the numbers of legs, (n_legs, 25), in the order of :class:`LegColumns` [m, rad].
 
-    Axes are :func:`~legcal.geometry.axis_angles` from the nominal ones, zero for legs without one.
+    Axes are ``axis_angles`` from the nominal ones, zero for legs without one.
     """
     numbers = np.zeros((len(legs), LegColumns.COUNT))
     for row, leg, start in zip(numbers, legs, nominal, strict=True):

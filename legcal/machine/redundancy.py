@@ -20,7 +20,8 @@ import numpy as np
 from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, BoolArray, IntArray, components
+from legcal.geometry.motions import components
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.equations import equations_at, equations_at_readings, freedoms
 from legcal.machine.model import Machine, readings_at, slider_columns, vectors_A_to_B
 from legcal.machine.parameters import geometries, parametrization_of

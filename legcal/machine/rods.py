@@ -13,7 +13,8 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, IntArray, cross
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array, IntArray
 from legcal.machine.actuator import Actuator
 from legcal.machine.leg import Leg
 from legcal.machine.solver import solve

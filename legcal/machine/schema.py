@@ -8,16 +8,16 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from legcal.errors import DatasetError, ModelError
-from legcal.files import (
+from legcal.files.motions import MotionEntry
+from legcal.files.published import with_schema
+from legcal.files.schema import (
     FileSchema,
-    MotionEntry,
     Number,
     PlainName,
     Version,
     closest,
     parse_yaml,
     validate,
-    with_schema,
 )
 from legcal.machine.actuator import Actuator
 from legcal.machine.files import DATASET_YAML, read_file, what_a_dataset_is_for

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, motion_of
+from legcal.geometry.motions import motion_of
+from legcal.geometry.types import Array
 from legcal.machine.equations import (
     PoseEquations,
     constraints_at,

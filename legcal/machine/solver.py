@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from legcal.geometry import Array, BoolArray, moved_poses
+from legcal.geometry.motions import moved_poses
+from legcal.geometry.types import Array, BoolArray
 
 Equations = Callable[[Array], tuple[Array, Array]]  # points (k, ...) to (k, m) and (k, m, n)
 Retraction = Callable[[Array, Array], Array]  # points (k, ...) and steps (k, n) to points

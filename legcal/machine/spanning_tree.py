@@ -18,7 +18,9 @@ from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import OutOfClass
-from legcal.geometry import Array, cross, roll_pitch_yaw
+from legcal.geometry.lines import cross
+from legcal.geometry.rotations import roll_pitch_yaw
+from legcal.geometry.types import Array
 from legcal.machine.bodies import frame_link
 from legcal.machine.schema import MechanismFile
 from legcal.machine.urdf import Urdf

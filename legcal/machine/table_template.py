@@ -6,7 +6,9 @@ import os
 from pathlib import Path
 
 from legcal.errors import OutOfResources, UsageError
-from legcal.files import plain_name, with_schema, write_atomically
+from legcal.files.folder import write_atomically
+from legcal.files.published import with_schema
+from legcal.files.schema import plain_name
 
 TEMPLATE_NAME = "my-hexapod"
 

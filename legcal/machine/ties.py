@@ -25,7 +25,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
+from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.directions import SHOWN, describe_direction, sparse_basis
 from legcal.machine.equations import (
     PoseEquations,

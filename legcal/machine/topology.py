@@ -16,8 +16,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from legcal.errors import OutOfClass
-from legcal.files import is_plain_name
-from legcal.geometry import Array, cross
+from legcal.files.schema import is_plain_name
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array
 from legcal.machine.bodies import Bodies, Connection, frame_link, rigid_bodies
 from legcal.machine.chain import Closure
 from legcal.machine.classification import (

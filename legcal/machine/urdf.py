@@ -14,8 +14,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.brief import brief
 from legcal.errors import ModelError
-from legcal.files import NAME_NEEDED, describe, is_name
-from legcal.geometry import Array, matrix_of, roll_pitch_yaw
+from legcal.files.schema import NAME_NEEDED, describe, is_name
+from legcal.geometry.motions import matrix_of
+from legcal.geometry.rotations import roll_pitch_yaw
+from legcal.geometry.types import Array
 from legcal.machine.files import read_file
 
 MAX_ELEMENTS = 50_000

@@ -3,7 +3,3 @@
 In goes a :class:`Page` of sections and blocks, texts as they are; out comes HTML by the one
 template (:func:`page_html`), with one style sheet and script, and plotly inside where it has plots.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

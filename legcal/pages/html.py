@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from markupsafe import Markup
 
 from legcal.errors import printable
-from legcal.files import OutputFile
+from legcal.files.folder import OutputFile
 from legcal.pages.document import OutlineEditor, Page, Picture, Plot, Row
 from legcal.version import __version__
 

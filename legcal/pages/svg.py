@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from legcal.errors import printable
-from legcal.geometry import Array
+from legcal.geometry.types import Array
 
 INK, DIM, RULE, BLUE, GREY = "#1d2126", "#667080", "#dfe3e8", "#1f5fa8", "#8b929c"
 _MAX_BARS = 14  # of a histogram

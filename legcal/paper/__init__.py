@@ -17,7 +17,3 @@ Each step has the criterion as printed (``literal``) and a weighted one. Step 1 
 reweighted by default; the others are problems of ``least_squares``, built with CasADi and solved
 with IPOPT. Errors of the platform (20) are those of the machine room's ``pose_differences``.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

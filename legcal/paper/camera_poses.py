@@ -11,8 +11,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data import LegAxes, Measurements
-from legcal.geometry import Array, IntArray, cross, register_points
+from legcal.data.axes import LegAxes
+from legcal.data.measurements import Measurements
+from legcal.geometry.lines import cross
+from legcal.geometry.motions import register_points
+from legcal.geometry.types import Array, IntArray
 from legcal.paper.gibbs import axis_frames
 from legcal.paper.nominal import NominalMachine
 

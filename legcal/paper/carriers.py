@@ -16,8 +16,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from legcal.geometry import Array, IntArray, cross, normal_basis, turned_axis
-from legcal.machine import Actuator, ActuatorColumns
+from legcal.geometry.axes import turned_axis
+from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.actuator import Actuator, ActuatorColumns
 
 MIN_IMAGES = {False: 3, True: 5}  # of one view, by whether the actuator turns
 _SAME = 1e-9  # of the normalised information of (6'): smaller eigenvalues are rounding

@@ -21,8 +21,9 @@ from math import comb
 
 import numpy as np
 
-from legcal.geometry import Array, IntArray
-from legcal.machine import EquationKind, Leg, LegKind, n_frame_legs
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.leg import EquationKind, Leg, LegKind
+from legcal.machine.parameters import n_frame_legs
 from legcal.paper.carriers import MIN_IMAGES
 
 _SAME_DIRECTION = 1e-9  # of the normalised information of eq (6)

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from legcal.data import LegAxes, Measurements
-from legcal.machine import KinematicParameters, Leg
+from legcal.data.axes import LegAxes
+from legcal.data.measurements import Measurements
+from legcal.machine.leg import KinematicParameters, Leg
 from legcal.paper.criteria import Criteria, Transformation
 from legcal.paper.joints_in_base import JointsInBase, locate_joints_in_base
 from legcal.paper.joints_in_camera import locate_joints_in_cameras

@@ -1,11 +1,11 @@
 """Unknown motions and axes inside the steps, in CasADi and for numbers.
 
 Unknown rotations are Gibbs vectors w = tan(angle / 2) along the axis, counted from a start: they
-have no branches and no square root. It is the chart of :class:`legcal.estimation.Frames`, except
+have no branches and no square root. It is the chart of ``Frames``, except
 that a small w is half of a rotation vector, and that steps begin with the translation.
 
 An unknown axis is turned about its normal basis e1, e2 by two turns, w = (turn_1 e1 + turn_2 e2) /
-2: its :func:`~legcal.geometry.axis_angles` but for a factor near one (:func:`gibbs_of`).
+2: its :func:`~legcal.geometry.axes.axis_angles` but for a factor near one (:func:`gibbs_of`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,11 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, motion_of, normal_basis, turned, turned_axis
+from legcal.geometry.axes import turned_axis
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.motions import motion_of
+from legcal.geometry.rotations import turned
+from legcal.geometry.types import Array
 
 # Unknown motions
 

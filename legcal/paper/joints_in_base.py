@@ -29,8 +29,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, NotIdentifiable
-from legcal.geometry import Array, BoolArray, IntArray, components, whitener
-from legcal.machine import ActuatorColumns, LegColumns
+from legcal.geometry.covariances import whitener
+from legcal.geometry.motions import components
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.actuator import ActuatorColumns
+from legcal.machine.leg import LegColumns
 from legcal.paper.camera_poses import candidate_camera_poses, signs_seen
 from legcal.paper.criteria import Criteria
 from legcal.paper.gibbs import (

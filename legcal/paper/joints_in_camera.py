@@ -20,18 +20,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data import LegAxes, Measurements
+from legcal.data.axes import LegAxes
+from legcal.data.measurements import Measurements
 from legcal.errors import NotIdentifiable
-from legcal.geometry import (
-    Array,
-    BoolArray,
-    IntArray,
-    cross,
-    normal_basis,
-    register_points,
-    turned_axis,
-)
-from legcal.machine import Actuator
+from legcal.geometry.axes import turned_axis
+from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.motions import register_points
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.actuator import Actuator
 from legcal.paper.camera_poses import candidate_camera_poses, side_of_plane, signs_seen
 from legcal.paper.carriers import (
     MIN_IMAGES,

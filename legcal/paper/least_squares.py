@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse import csc_array, diags_array
 
 from legcal.errors import DidNotConverge
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.signals import held_back_signals, is_waiting
 
 _RANK = 1e-7  # singular values of the scaled Jacobian below this are undetermined directions

@@ -11,8 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from legcal.data import LegAxes, Measurements, join_axes
-from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
+from legcal.data.axes import LegAxes, join_axes
+from legcal.data.measurements import Measurements
+from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.paper.joints_in_base import JointsInBase
 from legcal.paper.joints_in_camera import JointsInCamera, joint_residuals, residual_jacobian
 from legcal.paper.nominal import NominalMachine

@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from legcal.machine import EquationKind, JointType, VectorOps, axis_in_leg, twist_residual
+from legcal.machine.equations import VectorOps, axis_in_leg, twist_residual
+from legcal.machine.leg import EquationKind, JointType
 from legcal.paper.gibbs import moved_points, turned_frame, turned_points
 
 N_UNKNOWNS = 15

@@ -11,19 +11,18 @@ from functools import cached_property
 
 import numpy as np
 
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import (
-    Actuator,
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.actuator import Actuator
+from legcal.machine.leg import (
     EquationKind,
     KinematicParameters,
     Leg,
     LegKind,
-    Machine,
-    geometries,
-    is_spatial,
     parameters_of_legs,
     point_like_legs,
 )
+from legcal.machine.model import Machine
+from legcal.machine.parameters import geometries, is_spatial
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,8 @@ import casadi as ca
 import numpy as np
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, IntArray
-from legcal.machine import LegColumns
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.leg import LegColumns
 from legcal.paper.criteria import Criteria
 from legcal.paper.least_squares import IpoptSolution, LeastSquares, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections

@@ -26,8 +26,10 @@ import casadi as ca
 import numpy as np
 
 from legcal.errors import DidNotConverge, NotIdentifiable
-from legcal.geometry import Array, BoolArray, IntArray, whitener
-from legcal.machine import EquationKind, JointType, Leg, LegColumns, leg_equations
+from legcal.geometry.covariances import whitener
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.equations import leg_equations
+from legcal.machine.leg import EquationKind, JointType, Leg, LegColumns
 from legcal.paper.criteria import Criteria, Transformation
 from legcal.paper.joints_in_base import JointsInBase
 from legcal.paper.joints_in_camera import JointsInCamera

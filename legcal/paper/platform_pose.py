@@ -19,12 +19,8 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import (
-    Array,
-    IntArray,
-    register_groups,
-    register_in_plane,
-)
+from legcal.geometry.motions import register_groups, register_in_plane
+from legcal.geometry.types import Array, IntArray
 from legcal.paper.criteria import Transformation
 from legcal.paper.gibbs import motion_after, moved_points, stepped_poses
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares

@@ -16,16 +16,11 @@ from dataclasses import replace
 import numpy as np
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, BoolArray, IntArray, frame_on_points, turned_axis
-from legcal.machine import (
-    EquationKind,
-    JointType,
-    Leg,
-    LegColumns,
-    LegKind,
-    tied_twist,
-    twist_after,
-)
+from legcal.geometry.axes import turned_axis
+from legcal.geometry.motions import frame_on_points
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import EquationKind, JointType, Leg, LegColumns, LegKind
+from legcal.machine.parameters import tied_twist, twist_after
 from legcal.paper.criteria import Transformation
 from legcal.paper.gibbs import angles_of, axis_frames
 from legcal.paper.joints_in_base import JointsInBase, distance_of_joints

@@ -13,16 +13,10 @@ from functools import cached_property
 
 import numpy as np
 
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import (
-    ActuatorColumns,
-    Leg,
-    LegColumns,
-    Parametrization,
-    numbers_of,
-    parametrize,
-    with_numbers,
-)
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.actuator import ActuatorColumns
+from legcal.machine.leg import Leg, LegColumns
+from legcal.machine.parameters import Parametrization, numbers_of, parametrize, with_numbers
 from legcal.paper.gibbs import angles_of, axis_frames, gibbs_of
 from legcal.paper.nominal import NominalMachine
 

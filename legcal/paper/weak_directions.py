@@ -14,16 +14,12 @@ import casadi as ca
 import numpy as np
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, IntArray, axis_angles, normal_basis
-from legcal.machine import (
-    SHOWN,
-    Leg,
-    LegColumns,
-    describe_direction,
-    pose_sensitivity,
-    sparse_basis,
-    split_by_motion,
-)
+from legcal.geometry.axes import axis_angles
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.directions import SHOWN, describe_direction, sparse_basis, split_by_motion
+from legcal.machine.equations import pose_sensitivity
+from legcal.machine.leg import Leg, LegColumns
 from legcal.paper.gibbs import axis_slope, gibbs_of
 from legcal.paper.least_squares import Term
 from legcal.paper.nominal import NominalMachine

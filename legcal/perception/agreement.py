@@ -11,8 +11,9 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data import Measurements, Outlines
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.camera_search import flipped, place_camera
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.pair_matching import Picture

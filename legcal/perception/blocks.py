@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.light import Samples, to_light
 from legcal.perception.limb import N_SIMPLE, powers, simple_functions
 from legcal.perception.pixel_sums import PixelBins, PixelSums, applied
 from legcal.perception.profiles import Edge, read_profiles
-from legcal.vision import Camera, Grey
+from legcal.vision.camera import Camera
+from legcal.vision.image_file import Grey
 
 DEPTH = (2.0, 2.5)  # used distance from an outline: [px] and in blurs
 MAX_DEPTH = 0.8  # largest used depth, in half-widths

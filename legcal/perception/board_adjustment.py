@@ -13,26 +13,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.estimation import (
-    COST_TOLERANCE,
+from legcal.estimation.clusters import Clusters, clustered
+from legcal.estimation.loss import Huber
+from legcal.estimation.problem import (
     NO_PRIOR,
-    Clusters,
     Factor,
     Frames,
     GaussianPrior,
-    Huber,
     Problem,
     Residuals,
     Variables,
     all_free,
-    clustered,
     fixed_at_start,
     linearize,
-    minimise,
-    normal_equations,
 )
-from legcal.geometry import Array, BoolArray, IntArray, cross
-from legcal.vision import (
+from legcal.estimation.solver import COST_TOLERANCE, minimise, normal_equations
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.vision.camera import (
     DISTORTION_MODELS,
     Camera,
     distort_derivatives,

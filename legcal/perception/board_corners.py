@@ -14,25 +14,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from legcal.data import MIN_CORNERS, Corners, Measurements, found_corners, join_corners
+from legcal.data.corners import Corners, found_corners, join_corners
+from legcal.data.dataset import MIN_CORNERS
+from legcal.data.measurements import Measurements
 from legcal.errors import NotVisible
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.corner_lattice import Print, expected, find_lattice, measured
 from legcal.perception.placement import Load
 from legcal.perception.saddles import Saddles, fit_saddles, near_saddles
 from legcal.progress import Report
-from legcal.vision import (
-    APRIL_TAGS,
-    DICTIONARIES,
-    Board,
-    Grey,
-    charuco_board,
-    dictionary,
-    possible_scale,
-    quiet_opencv,
-    reduced,
-    rescaled,
-)
+from legcal.vision.board import APRIL_TAGS, DICTIONARIES, Board, charuco_board, dictionary
+from legcal.vision.image_file import Grey, possible_scale, quiet_opencv, reduced, rescaled
 from legcal.workers import Run
 
 STAGE = "Searching the board"

@@ -15,11 +15,14 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtri
 
-from legcal.data import MIN_CORNERS, Corners, Measurements, few, row_names
+from legcal.data.corners import Corners
+from legcal.data.dataset import MIN_CORNERS
+from legcal.data.measurements import Measurements, few, row_names
 from legcal.errors import DatasetError, NotVisible
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.board_adjustment import BoardImages, adjust_board
-from legcal.vision import Board, Camera
+from legcal.vision.board import Board
+from legcal.vision.camera import Camera
 
 SAME_ANGLE, SIMILAR_ANGLE = 1e-3, np.deg2rad(3.0)  # between poses of one plane: of an image, a view
 MAX_RESIDUAL_PX, MAX_RESIDUAL_SIGMA = 1.0, 5.0  # root mean square of corners of this board

@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from legcal.geometry import Array, BoolArray, Image, IntArray
+from legcal.geometry.types import Array, BoolArray, Image, IntArray
 from legcal.perception.light import Samples, reduce
-from legcal.vision import Camera, Grey
+from legcal.vision.camera import Camera
+from legcal.vision.image_file import Grey
 
 LONG_SIDE = 480  # of the reduced picture at least [px]
 MAX_REDUCTION = 4  # by which a picture is reduced: legs are 12 px wide and more

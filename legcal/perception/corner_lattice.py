@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.saddles import MAX_SHIFT_PX, MIN_CONTRAST, Saddles, fit_saddles, near_saddles
-from legcal.vision import Grey
+from legcal.vision.image_file import Grey
 
 _BLUR = 1.2  # [px] before derivatives are taken
 _MAX_CANDIDATES = 1500

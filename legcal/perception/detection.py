@@ -6,8 +6,8 @@ from functools import partial
 
 import numpy as np
 
-from legcal.data import Outlines, join_outlines, no_outlines
-from legcal.geometry import Array
+from legcal.data.outlines import Outlines, join_outlines, no_outlines
+from legcal.geometry.types import Array
 from legcal.perception.outline import (
     OUTSIDE,
     ImageSearch,
@@ -17,7 +17,7 @@ from legcal.perception.outline import (
     outline_table,
 )
 from legcal.perception.placement import Placement, Search, predict_legs_and_arms
-from legcal.vision import PredictedLeg
+from legcal.vision.visibility import PredictedLeg
 from legcal.workers import Run, in_turn
 
 NOT_PLACED = "the camera of its view could not be placed"  # a reason

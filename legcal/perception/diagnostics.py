@@ -15,15 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data import (
-    Measurements,
-    Outlines,
-    by_cause,
-    few_views,
-    images_in_words,
-    is_edited,
-)
-from legcal.geometry import BoolArray, IntArray, pose_distance
+from legcal.data.image_causes import by_cause, images_in_words
+from legcal.data.measurements import Measurements, few_views
+from legcal.data.outlines import Outlines, is_edited
+from legcal.geometry.motions import pose_distance
+from legcal.geometry.types import BoolArray, IntArray
 from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped, shrunk
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.detection import NOT_PLACED

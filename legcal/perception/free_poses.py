@@ -21,28 +21,27 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data import Measurements, few_views
+from legcal.data.measurements import Measurements, few_views
 from legcal.errors import NotIdentifiable
-from legcal.estimation import (
+from legcal.estimation.problem import (
     Factor,
     GaussianPrior,
     Problem,
     Residuals,
     Variables,
     all_free,
-    information,
     linearize,
 )
-from legcal.geometry import Array, BoolArray, IntArray, cross, motions_of, rotation_matrices
-from legcal.machine import (
-    LegKind,
-    Machine,
-    is_constrained,
-    leg_scale,
-    machine_equations,
-    poses_after,
-    solve,
-)
+from legcal.estimation.solver import information
+from legcal.geometry.lines import cross
+from legcal.geometry.motions import motions_of
+from legcal.geometry.rotations import rotation_matrices
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.equations import is_constrained, machine_equations
+from legcal.machine.leg import LegKind
+from legcal.machine.mobility import leg_scale
+from legcal.machine.model import Machine
+from legcal.machine.solver import poses_after, solve
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.pair_matching import (
     CameraPoses,

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from legcal.geometry import BoolArray, IntArray
+from legcal.geometry.types import BoolArray, IntArray
 from legcal.perception.light import reduce
-from legcal.vision import Grey
+from legcal.vision.image_file import Grey
 
 BLACK, WHITE = 8.0, 247.0  # what nearly all of an image is below or above [grey levels]
 BRIGHTEST = 254.5  # [grey levels]

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from legcal.geometry import BoolArray
-from legcal.vision import Grey
+from legcal.geometry.types import BoolArray
+from legcal.vision.image_file import Grey
 
 Samples = NDArray[np.float32]
 

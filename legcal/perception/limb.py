@@ -25,7 +25,7 @@ from functools import cache
 import numpy as np
 from scipy.special import gamma, ndtr, pbdv
 
-from legcal.geometry import Array
+from legcal.geometry.types import Array
 
 # Columns: 1, z, the Gaussian g(z), z g(z), and blurred powers of max(z, 0) or their products by z.
 ONE, Z, GAUSS, Z_GAUSS, STEP, MINUS_HALF, Z_MINUS_HALF, HALF, RAMP, THREE_HALVES, SQUARE = range(11)

@@ -13,21 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from legcal.data import Outlines
-from legcal.geometry import Array, IntArray
+from legcal.data.outlines import Outlines
+from legcal.geometry.types import Array, IntArray
 from legcal.perception.part_edges import EdgePair, LegPart, block_positions, find_pairs
 from legcal.perception.profiles import Edge
 from legcal.perception.subpixel_edges import MeasuredEdge, measure_edges
-from legcal.vision import (
-    EPSILON,
-    Band,
-    Camera,
-    Grey,
-    PredictedLeg,
-    Segment,
-    hidden_by,
-    least_length,
-)
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import EPSILON
+from legcal.vision.image_file import Grey
+from legcal.vision.visibility import Band, PredictedLeg, Segment, hidden_by, least_length
 
 OUTSIDE = "outside the image"  # a reason
 HIDDEN = "hidden by"  # the beginning of one

@@ -15,11 +15,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from legcal.data import Corners, Outlines
-from legcal.geometry import Array, BoolArray, Image
+from legcal.data.corners import Corners
+from legcal.data.outlines import Outlines
+from legcal.geometry.types import Array, BoolArray, Image
 from legcal.perception.candidate_pairs import find_candidate_pairs, find_segments
 from legcal.perception.outline import OUTSIDE
-from legcal.vision import Camera, Grey, PredictedLeg
+from legcal.vision.camera import Camera
+from legcal.vision.image_file import Grey
+from legcal.vision.visibility import PredictedLeg
 
 MarkKind = Literal["edge 1", "edge 2", "axis", "rejected", "predicted", "pair", "corner"]
 N_POINTS = 40  # of a curve

@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array, IntArray, cross, cross_matrices, rotation_matrices
-from legcal.machine import Cylinder
+from legcal.geometry.lines import cross
+from legcal.geometry.rotations import cross_matrices, rotation_matrices
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.leg import Cylinder
 from legcal.perception.candidate_pairs import CandidatePairs
-from legcal.vision import visible_segments
+from legcal.vision.visibility import visible_segments
 
 MIN_DEPTH = 0.02  # depth of the nearest point of a leg [m]
 WIDTH_ERROR = 0.08  # of a pair and of what is predicted: relative, one standard deviation

@@ -16,9 +16,11 @@ import cv2
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.light import Samples
-from legcal.vision import Band, Camera, Grey, PredictedLeg, Segment
+from legcal.vision.camera import Camera
+from legcal.vision.image_file import Grey
+from legcal.vision.visibility import Band, PredictedLeg, Segment
 
 BLOCK_LENGTH = 8.0  # along the part [px]
 ROWS, ROWS_NEAR = 4, 2  # of samples in a block, and where all windows are small

@@ -18,17 +18,13 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data import (
-    Measurements,
-    Outlines,
-    images_in_words,
-    is_edited,
-    join_outlines,
-    merge_edited,
-    no_outlines,
-)
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Cylinder, Leg, Machine, joints_at, measured_readings, vectors_at
+from legcal.data.image_causes import images_in_words
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines, is_edited, join_outlines, merge_edited, no_outlines
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import Cylinder, Leg
+from legcal.machine.model import Machine, vectors_at
+from legcal.machine.rods import joints_at, measured_readings
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.detection import measure_outlines
 from legcal.perception.diagnostics import (
@@ -52,7 +48,9 @@ from legcal.perception.radii import LegRadius, RadiusFactors, radius_notes
 from legcal.perception.recognition import PlacedViews, place_views
 from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
-from legcal.vision import EPSILON, Camera, look_alike, shared_cameras
+from legcal.vision.camera import Camera, shared_cameras
+from legcal.vision.cylinder import EPSILON
+from legcal.vision.visibility import look_alike
 from legcal.workers import Run
 
 DETECTOR_VERSION = 13  # raise it whenever outlines or notes that are kept come out differently

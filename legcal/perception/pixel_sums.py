@@ -19,7 +19,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import ndtr
 
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.light import Samples
 
 BINS_PER_BLUR = 3.0

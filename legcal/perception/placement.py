@@ -13,14 +13,18 @@ from types import MappingProxyType
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data import Measurements, by_cause, few_views, image_notes
+from legcal.data.image_causes import by_cause, image_notes
+from legcal.data.measurements import Measurements, few_views
 from legcal.errors import NotVisible
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Cylinder, Leg, arms_at, cylinder_of_arm
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm
+from legcal.machine.rods import arms_at
 from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
 from legcal.perception.radii import NO_RADIUS_FACTORS, RadiusFactors
-from legcal.vision import Camera, Grey, PredictedLeg, predict_legs
+from legcal.vision.camera import Camera
+from legcal.vision.image_file import Grey
+from legcal.vision.visibility import PredictedLeg, predict_legs
 
 Load = Callable[[int], Grey]  # the image of a row
 Joined = Sequence[RigidTransform | None] | None  # T_board_camera of views that show a board

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.blocks import Blocks
 from legcal.perception.light import Samples
 from legcal.perception.limb import (

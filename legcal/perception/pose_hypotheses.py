@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.pair_matching import (
     WIDTH_ERROR,

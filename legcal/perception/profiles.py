@@ -10,9 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.light import Samples
-from legcal.vision import Band, Camera, Grey
+from legcal.vision.camera import Camera
+from legcal.vision.image_file import Grey
+from legcal.vision.visibility import Band
 
 SATURATED = 250.0  # grey level from which a pixel is saturated
 MAX_NOISY = 4  # saturated pixels of a block that may be noise

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from legcal.geometry import Array, IntArray
-from legcal.machine import Cylinder
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.leg import Cylinder
 from legcal.perception.pair_matching import (
     CameraPoses,
     PairMatches,
@@ -22,7 +22,7 @@ from legcal.perception.pair_matching import (
     gauss_newton_step,
     match_pairs,
 )
-from legcal.vision import look_alike
+from legcal.vision.visibility import look_alike
 
 FACTORS = (1.0, 0.93, 1.075, 0.86, 1.16, 0.8, 1.25, 0.72, 1.38)  # of radii that are tried
 TOLERANCES = (0.018, 0.018, 0.012, 0.012)  # of an axis from its pair, on the sensor plane

@@ -15,9 +15,10 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data import Measurements, Outlines
-from legcal.geometry import Array, IntArray
-from legcal.machine import Cylinder, with_radii
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.leg import Cylinder, with_radii
 from legcal.perception.camera_search import (
     START_PICTURES,
     PoseCandidates,

@@ -21,8 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.vision import Grey
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.vision.image_file import Grey
 
 _Levels = NDArray[np.floating[Any]]
 

@@ -12,12 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from legcal.geometry import Array
+from legcal.geometry.types import Array
 from legcal.perception.blocks import BLURS, BlockLine, Blocks, depth_for_blur
 from legcal.perception.pixel_sums import medians
 from legcal.perception.pooled_fit import PooledLines, fit_pooled
 from legcal.perception.profiles import Edge
-from legcal.vision import Camera, Grey
+from legcal.vision.camera import Camera
+from legcal.vision.image_file import Grey
 
 FIRST_BLUR = 1.0  # [px]
 MIN_CHI2_GAIN = 30  # by an edge, from which on a block shows one

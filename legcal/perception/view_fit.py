@@ -1,7 +1,7 @@
 """Views fitted to their outlines, and guided matching of the legs that are missing.
 
 Edge pairs place a camera to some millimetres and leave out legs that have none; outlines are far
-better known. A group of views is one :class:`legcal.estimation.Problem`:
+better known. A group of views is one :class:`legcal.estimation.problem.Problem`:
 
     pose        of the machine in the frame of the group, about the middle of its joints
     shift       of A and B of each leg against the model
@@ -20,28 +20,30 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data import Outlines, is_edited, join_outlines
+from legcal.data.outlines import Outlines, is_edited, join_outlines
 from legcal.errors import NotVisible
-from legcal.estimation import (
+from legcal.estimation.problem import (
     Factor,
     Frames,
     GaussianPrior,
     Linearization,
-    NormalEquations,
     Problem,
     Residuals,
     Variables,
     all_free,
-    information,
     linearize,
 )
-from legcal.geometry import Array, BoolArray, IntArray, cross, whitener
-from legcal.machine import main_cylinders
+from legcal.estimation.solver import NormalEquations, information
+from legcal.geometry.covariances import whitener
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import main_cylinders
 from legcal.perception.detection import NOT_PLACED, measure_outlines
 from legcal.perception.outline import OUTSIDE, Method, measure
 from legcal.perception.pair_matching import MIN_DEPTH, CameraPoses, depth_reversed
 from legcal.perception.placement import Group, Placement, Search
-from legcal.vision import Camera, outlines_of_axis
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import outlines_of_axis
 from legcal.workers import Run, in_turn
 
 DISAGREES = "disagrees with the other legs of its view"  # a reason

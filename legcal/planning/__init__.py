@@ -20,7 +20,3 @@ ends on it: "a better selection of the end-effector poses".
 ``session``          its folder
 ==================== ===================================================================
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

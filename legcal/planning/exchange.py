@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from legcal.geometry import Array, IntArray
+from legcal.geometry.types import Array, IntArray
 from legcal.planning.information import KINEMATIC, Contributions
 from legcal.progress import Report, no_progress
 

@@ -12,11 +12,19 @@ from enum import StrEnum
 
 import numpy as np
 
-from legcal.calibration import FittedLegs, PlatformError, expected_error, platform_by_parameters
+from legcal.calibration.joint_fit.platform import (
+    PlatformError,
+    expected_error,
+    platform_by_parameters,
+)
+from legcal.calibration.joint_fit.variables import FittedLegs
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.files import closest
-from legcal.geometry import Array, cross
-from legcal.machine import Machine, platforms_in_base, workspace
+from legcal.files.schema import closest
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array
+from legcal.machine.configurations import workspace
+from legcal.machine.kinematics import platforms_in_base
+from legcal.machine.model import Machine
 from legcal.planning.exchange import Criterion
 
 

@@ -23,29 +23,26 @@ import numpy as np
 from scipy.linalg import block_diag, null_space
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration import (
-    NO_CHOICES,
-    Choices,
-    FitProblem,
-    FittedLegs,
+from legcal.calibration.joint_fit.factors import ObservedOutlines
+from legcal.calibration.joint_fit.outline_errors import (
     NoiseModel,
-    ObservedOutlines,
-    Prior,
-    Start,
-    State,
-    arm_sigmas,
-    build_fit,
-    fitted_legs,
     possible_biases,
     shifts_at_places,
     shifts_of_edges,
     with_gamma,
 )
-from legcal.data import Measurements, Outlines, View
-from legcal.estimation import Frames, linearize
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Leg, Machine, owner_of_parameter, reading_of_rod
-from legcal.vision import Camera
+from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
+from legcal.calibration.joint_fit.problem import FitProblem, arm_sigmas, build_fit
+from legcal.calibration.joint_fit.variables import FittedLegs, Start, State, fitted_legs
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines
+from legcal.estimation.problem import Frames, linearize
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import Leg
+from legcal.machine.model import Machine
+from legcal.machine.parameters import owner_of_parameter
+from legcal.machine.rods import reading_of_rod
+from legcal.vision.camera import Camera
 
 KINEMATIC = "machine"  # names of coordinates of the machine begin so
 _WEAK = 1.0  # [m] and [rad] that is known of what has no other prior

@@ -13,10 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, BoolArray, normal_basis
-from legcal.machine import Machine
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.model import Machine
 from legcal.planning.sight import NEAREST, Bodies, behind_plate
-from legcal.vision import Board, Camera, dictionary, facing_board, in_picture, rays_past_axes
+from legcal.vision.board import Board, dictionary, facing_board
+from legcal.vision.camera import Camera
+from legcal.vision.visibility import in_picture, rays_past_axes
 
 _SIDES = 4  # directions beside the machine
 _DISTANCE = 1.05  # half diagonals of the board beyond the base joints

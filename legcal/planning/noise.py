@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from legcal.calibration import KINDS, PLACES
-from legcal.data import OBSERVATIONS_NAME, OUTLINE_COLUMNS
+from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
+from legcal.data.dataset import OBSERVATIONS_NAME
+from legcal.data.outlines import OUTLINE_COLUMNS
 from legcal.errors import DatasetError, UsageError
-from legcal.files import read_json, read_table
+from legcal.files.reading import read_json
+from legcal.files.table import read_table
 from legcal.planning.information import DEFAULT_NOISE, PredictedNoise
 
 _USUAL_LENGTH = 200.0  # [px] of an outline, where a document does not say

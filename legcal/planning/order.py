@@ -8,15 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from legcal.geometry import Array
-from legcal.machine import (
-    Configurations,
-    Feasibility,
-    Machine,
-    motor_travel,
-    platform_pose,
-    slider_columns,
-)
+from legcal.geometry.types import Array
+from legcal.machine.configurations import Configurations
+from legcal.machine.feasibility import Feasibility, motor_travel
+from legcal.machine.model import Machine, platform_pose, slider_columns
 
 HOME = "home"
 _STOPS = (0.2, 0.4, 0.6, 0.8, 1.0)  # parts of a way that are looked at

@@ -18,21 +18,16 @@ from pydantic import ConfigDict, Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import NotVisible, UsageError
-from legcal.files import (
-    LENGTH,
-    FileSchema,
-    MotionEntry,
-    PlainName,
-    Quaternion,
-    Vector,
-    parse_quantity,
-    read_json,
-    read_yaml,
-    validate,
-)
-from legcal.geometry import Array, direction_above, look_at
-from legcal.machine import Machine, vectors_A_to_B
-from legcal.vision import Camera, in_picture
+from legcal.files.motions import MotionEntry, Quaternion, Vector
+from legcal.files.quantity import LENGTH, parse_quantity
+from legcal.files.reading import read_json
+from legcal.files.schema import FileSchema, PlainName, read_yaml, validate
+from legcal.geometry.lines import direction_above
+from legcal.geometry.motions import look_at
+from legcal.geometry.types import Array
+from legcal.machine.model import Machine, vectors_A_to_B
+from legcal.vision.camera import Camera
+from legcal.vision.visibility import in_picture
 
 _TURNS = 16  # directions around the machine
 _LIFTS = (0.1, 0.4, 0.75, 1.15)  # [rad] above the plane across the machine

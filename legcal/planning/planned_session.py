@@ -11,17 +11,20 @@ from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.calibration import KINDS, PLACES, PlatformError
-from legcal.files import Document, Number, Pose, Version
-from legcal.geometry import Array, BoolArray
-from legcal.machine import Configurations, Machine
+from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
+from legcal.calibration.joint_fit.platform import PlatformError
+from legcal.files.motions import Pose
+from legcal.files.schema import Document, Number, Version
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.configurations import Configurations
+from legcal.machine.model import Machine
 from legcal.planning.goals import Goal
 from legcal.planning.information import PredictedNoise
 from legcal.planning.laid_board import LaidBoard
 from legcal.planning.places import MAX_ANGLE, MAX_DRAWS, MAX_LENGTH, Setting
 from legcal.planning.sight import Seen
 from legcal.version import __version__
-from legcal.vision import Camera
+from legcal.vision.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)

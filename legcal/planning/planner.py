@@ -16,11 +16,15 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration import poses_at_readings
+from legcal.calibration.joint_fit.platform import poses_at_readings
 from legcal.errors import NotIdentifiable, NotVisible
-from legcal.files import SHOWN_IN
-from legcal.geometry import Array, BoolArray, look_at
-from legcal.machine import Configurations, Leg, Machine, platforms_in_base
+from legcal.files.quantity import SHOWN_IN
+from legcal.geometry.motions import look_at
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.configurations import Configurations
+from legcal.machine.kinematics import platforms_in_base
+from legcal.machine.leg import Leg
+from legcal.machine.model import Machine
 from legcal.planning.exchange import Chosen, Criterion, Session, choose, exchange
 from legcal.planning.goals import Goal, Workspace, criterion_of, workspace_of
 from legcal.planning.information import Contributions, Predictor
@@ -38,7 +42,8 @@ from legcal.planning.planned_session import Plan, PlannedView, pose_labels
 from legcal.planning.poses import candidate_poses, drawn_legs, poses_near, some_of
 from legcal.planning.sight import NEAREST, Bodies, Seen, what_is_seen
 from legcal.progress import Report, no_progress
-from legcal.vision import Board, in_picture, least_length
+from legcal.vision.board import Board
+from legcal.vision.visibility import in_picture, least_length
 from legcal.workers import Run, in_turn
 
 MIN_POSES, POSES_EACH, MOST_POSES = 20, 6, 320  # candidates, by images

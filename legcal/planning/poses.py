@@ -7,27 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from legcal.calibration import FittedLegs, poses_at_readings
+from legcal.calibration.joint_fit.platform import poses_at_readings
+from legcal.calibration.joint_fit.variables import FittedLegs
 from legcal.errors import DidNotConverge
-from legcal.estimation import Frames
-from legcal.geometry import Array, BoolArray
-from legcal.machine import (
-    ARM_KINDS,
-    Configurations,
-    Feasibility,
-    Leg,
-    LegKind,
-    Machine,
-    feasible_poses,
-    follow,
-    is_held_by_default,
-    kind_of_parameter,
-    motor_travel,
-    moved_legs,
-    platforms_in_base,
-    poses_at,
-    slider_columns,
-)
+from legcal.estimation.problem import Frames
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.configurations import Configurations
+from legcal.machine.feasibility import Feasibility, feasible_poses, motor_travel, poses_at
+from legcal.machine.kinematics import follow, platforms_in_base
+from legcal.machine.leg import Leg, LegKind
+from legcal.machine.model import Machine, slider_columns
+from legcal.machine.parameters import ARM_KINDS, is_held_by_default, kind_of_parameter, moved_legs
 from legcal.planning.places import USUAL, Setting
 from legcal.progress import Report, no_progress
 

@@ -8,11 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration import NO_CHOICES, Choices, Prior
-from legcal.data import Dataset, load_dataset, sigmas_of
+from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
+from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.reading_units import sigmas_of
 from legcal.errors import DatasetError, NotIdentifiable, UsageError
-from legcal.geometry import Array
-from legcal.machine import Machine, follow_each, load_mechanism, poses_at
+from legcal.geometry.types import Array
+from legcal.machine.feasibility import poses_at
+from legcal.machine.kinematics import follow_each
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
 from legcal.planning.goals import Goal
 from legcal.planning.information import DEFAULT_NOISE, PredictedNoise, Predictor
 from legcal.planning.noise import read_noise
@@ -28,15 +32,10 @@ from legcal.planning.places import (
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Task, plan_session
 from legcal.progress import Progress, Report, shown_progress
-from legcal.vision import (
-    Board,
-    Camera,
-    board_document,
-    board_of,
-    parse_board,
-    read_camera,
-    sample_camera,
-)
+from legcal.vision.board import Board
+from legcal.vision.board_file import board_document, board_of, parse_board
+from legcal.vision.camera import Camera, sample_camera
+from legcal.vision.camera_file import read_camera
 from legcal.workers import Run, Workers, worker_pool
 
 SIGMA_Q = 2e-6  # [m] of a reading, where nobody says

@@ -14,25 +14,28 @@ from typing import Any
 import numpy as np
 import yaml
 
-from legcal.calibration import PLAN_NAME
-from legcal.data import reading_columns, sigmas_of_legs
+from legcal.calibration.closeness import PLAN_NAME
+from legcal.data.measurements import reading_columns
+from legcal.data.reading_units import sigmas_of_legs
 from legcal.errors import UsageError
-from legcal.files import (
-    SHOWN_IN,
+from legcal.files.folder import (
     OutputKind,
     check_destination,
-    format_table,
     holds_files,
-    motion_to_xyz_quat,
     output_path,
     result_folder,
-    with_schema,
 )
-from legcal.geometry import roll_pitch_yaw
-from legcal.machine import DATASET_YAML, write_model
+from legcal.files.motions import motion_to_xyz_quat
+from legcal.files.published import with_schema
+from legcal.files.quantity import SHOWN_IN
+from legcal.files.table import format_table
+from legcal.geometry.rotations import roll_pitch_yaw
+from legcal.machine.files import DATASET_YAML
+from legcal.machine.model_writer import write_model
 from legcal.planning.order import HOME
 from legcal.planning.planned_session import Plan
-from legcal.vision import board_document, camera_info
+from legcal.vision.board_file import board_document
+from legcal.vision.camera_file import camera_info
 
 CAMERA, MEASUREMENTS = "camera_info.yaml", "measurements.csv"
 HAND = "hand"  # the view of a camera in the hand

@@ -15,18 +15,19 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data import Outlines
-from legcal.estimation import Frames
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Cylinder, Leg, Machine, ends_in_base, readings_of_rods
-from legcal.perception import placed_arms
-from legcal.vision import (
-    EPSILON,
-    Camera,
+from legcal.data.outlines import Outlines
+from legcal.estimation.problem import Frames
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import Cylinder, Leg
+from legcal.machine.model import Machine
+from legcal.machine.rods import ends_in_base, readings_of_rods
+from legcal.perception.placement import placed_arms
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import EPSILON, outlines_of_axis
+from legcal.vision.visibility import (
     in_picture,
     least_length,
     longest_runs,
-    outlines_of_axis,
     rays_past_axes,
     visible_segments,
 )

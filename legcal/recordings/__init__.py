@@ -4,7 +4,3 @@ In go a recording for each camera position, readings with their times, and a mod
 dataset of the frames in which the machine stood still (section 3.1 begins with its images). Frames
 are read one at a time, twice: to find out when the machine moved, and to write those that are used.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

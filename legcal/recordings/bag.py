@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legcal.errors import DatasetError, UsageError
-from legcal.files import describe
-from legcal.machine import Machine
+from legcal.files.schema import describe
+from legcal.machine.model import Machine
 from legcal.recordings.frames import Frame
 from legcal.recordings.series import Series, series_of_joints
-from legcal.vision import quiet_opencv
+from legcal.vision.image_file import quiet_opencv
 
 _BAGS = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"

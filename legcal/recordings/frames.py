@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from legcal.data import Photograph, find_photographs, photograph_time
+from legcal.data.photograph_matching import Photograph, find_photographs, photograph_time
 from legcal.errors import DatasetError
-from legcal.files import MAX_IMAGE, read_bytes
+from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.recordings.series import Series, unix_seconds
-from legcal.vision import quiet_opencv
+from legcal.vision.image_file import quiet_opencv
 
 # OpenCV's decoder reads it once: quiet (AV_LOG_QUIET), since damage is told in a sentence.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

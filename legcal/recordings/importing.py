@@ -11,28 +11,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from legcal.data import (
-    DATASET_FOLDER,
-    MIN_SIGMA,
-    few,
-    plan_new_dataset,
-    usual_sigma,
-    write_new_dataset,
-)
+from legcal.data.measurements import few
+from legcal.data.new_dataset import DATASET_FOLDER, MIN_SIGMA, plan_new_dataset, write_new_dataset
+from legcal.data.reading_units import usual_sigma
 from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.files import (
-    NAME_NEEDED,
-    Document,
-    Number,
-    check_path,
-    describe,
-    existing_parent,
-    format_table,
-    is_name,
-    temporary_folder,
-)
-from legcal.geometry import Array
-from legcal.machine import Machine, load_mechanism
+from legcal.files.folder import check_path, existing_parent, temporary_folder
+from legcal.files.schema import NAME_NEEDED, Document, Number, describe, is_name
+from legcal.files.table import format_table
+from legcal.geometry.types import Array
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
 from legcal.progress import Report, no_progress
 from legcal.recordings.bag import Bag, is_bag
 from legcal.recordings.frames import VIDEOS, ImageFolder, Recording, Video
@@ -46,7 +34,7 @@ from legcal.recordings.stillness import (
     reading_speeds,
     still_frames,
 )
-from legcal.vision import read_camera
+from legcal.vision.camera_file import read_camera
 
 LEAST_STILL = 0.3  # [s]
 ONE_CLOCK = 2.0  # [s] that frames and readings in one bag are apart at most
@@ -211,7 +199,7 @@ def plan_import(
     cameras : sequence of str
         Camera files: one for all views, or ``VIEW=FILE`` for each.
     unit, lengths
-        As for :func:`legcal.data.plan_new_dataset`.
+        As for :func:`legcal.data.new_dataset.plan_new_dataset`.
     offset : float, optional
         The clock of the camera less that of the readings [s]; found from motion by default.
     still : float

@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.data import ReadingsSheet, reading_columns
+from legcal.data.measurements import reading_columns
+from legcal.data.readings_sheet import ReadingsSheet
 from legcal.errors import DatasetError
-from legcal.files import describe
-from legcal.geometry import Array
-from legcal.machine import Machine
+from legcal.files.schema import describe
+from legcal.geometry.types import Array
+from legcal.machine.model import Machine
 
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import correlate
 
-from legcal.geometry import Array, BoolArray
+from legcal.geometry.types import Array, BoolArray
 
 MIN_CONTRAST = 5.0  # of motion to rest, in scatters of rest: a normal distribution has 2.7
 MIN_AGREEMENT = 0.5  # correlation of motion in frames and readings

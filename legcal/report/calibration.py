@@ -9,25 +9,15 @@ import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
-from legcal.calibration import (
-    FRAMES,
-    NUMBERS,
-    UNITS,
-    joints_title,
-    mark_in_words,
-    residuals_in_words,
-    sentences,
-    tables,
-)
+from legcal.calibration.link_joints import FRAMES, joints_title, mark_in_words
+from legcal.calibration.summary import NUMBERS, UNITS, residuals_in_words, sentences, tables
 from legcal.report.render import report, table
 
 if TYPE_CHECKING:
-    from legcal.calibration import (
-        Calibration,
-        Check,
-        Evaluation,
-        Explanation,
-    )
+    from legcal.calibration.change_detection import Explanation
+    from legcal.calibration.evaluation import Evaluation
+    from legcal.calibration.result import Calibration
+    from legcal.calibration.verification import Check
 
 _SAME_M, _SAME_RAD = 1e-9, 1e-9  # [m, rad]: frames that are closer are in the same place
 _EXPLANATIONS = 3  # that are named beside the best

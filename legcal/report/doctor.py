@@ -7,7 +7,8 @@ import shlex
 from rich.console import RenderableType
 from rich.text import Text
 
-from legcal.calibration import UNITS, Examination
+from legcal.calibration.examination import Examination
+from legcal.calibration.summary import UNITS
 from legcal.errors import printable
 from legcal.report.render import heading, report, table
 

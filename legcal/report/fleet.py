@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.console import RenderableType
 
-from legcal.calibration import FleetDocument, fleet_cells, fleet_columns
+from legcal.calibration.fleet import FleetDocument, fleet_cells, fleet_columns
 from legcal.report.render import report, table
 
 _MOST_ROWS = 60  # the files have all of them

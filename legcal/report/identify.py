@@ -9,19 +9,18 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from legcal.calibration import (
+from legcal.calibration.identify.predicted_observations import legs_in_words, views_in_words
+from legcal.calibration.identify.report import (
     BoardReport,
     CameraIntrinsics,
     Identifiability,
     Ranks,
     WeakDirection,
-    legs_in_words,
-    views_in_words,
 )
-from legcal.machine import leg_labels, list_in_words
+from legcal.machine.directions import leg_labels, list_in_words
 from legcal.report.render import report as blocks
 from legcal.report.render import table
-from legcal.vision import Link
+from legcal.vision.board import Link
 
 CONDITIONS = {
     "eq12": "base joints and axes (12)",

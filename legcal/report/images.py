@@ -12,9 +12,10 @@ import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
-from legcal.calibration import DETECTION_PAGE, CameraCalibration, Detection
+from legcal.calibration.camera_calibration.document import CameraCalibration
+from legcal.calibration.detection import DETECTION_PAGE, Detection
 from legcal.report.render import heading, report, table
-from legcal.vision import intrinsic_unit
+from legcal.vision.camera import intrinsic_unit
 
 _OFTEN = 0.5  # of the images, in which a leg should be seen
 

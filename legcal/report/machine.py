@@ -11,10 +11,10 @@ from rich.console import RenderableType
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
-from legcal.calibration import Location
-from legcal.files import SHOWN_IN
-from legcal.geometry import roll_pitch_yaw
-from legcal.machine import Machine
+from legcal.calibration.location.document import Location
+from legcal.files.quantity import SHOWN_IN
+from legcal.geometry.rotations import roll_pitch_yaw
+from legcal.machine.model import Machine
 from legcal.report.render import heading, report, table
 
 _TURNS = ("roll, x", "pitch, y", "yaw, z")

@@ -13,19 +13,18 @@ from html import escape
 import numpy as np
 
 from legcal.errors import printable
-from legcal.files import OutputFile
-from legcal.geometry import Array
-from legcal.machine import (
+from legcal.files.folder import OutputFile
+from legcal.geometry.types import Array
+from legcal.machine.drawing import (
     AXIS_COLOURS,
     BASE_COLOUR,
     LEG_COLOUR,
     MOTOR_COLOUR,
     PLATFORM_COLOUR,
-    Machine,
     around,
     motor_lines,
-    vectors_A_to_B,
 )
+from legcal.machine.model import Machine, vectors_A_to_B
 
 _SIDE, _EDGE, _HEAD, _LINE = 420.0, 46.0, 44.0, 15.0  # of a panel, its margin, title, text [px]
 _ARM = 34.0  # of the axis of a frame [px]

@@ -9,11 +9,11 @@ from pathlib import Path
 from rich.console import RenderableType
 from rich.text import Text
 
-from legcal.data import NewDataset
+from legcal.data.new_dataset import NewDataset
 from legcal.errors import printable
-from legcal.files import SHOWN_IN
-from legcal.machine import Machine
-from legcal.recordings import Import
+from legcal.files.quantity import SHOWN_IN
+from legcal.machine.model import Machine
+from legcal.recordings.importing import Import
 from legcal.report.machine import scale_option
 from legcal.report.render import heading, report, table
 

@@ -9,14 +9,16 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from legcal.calibration import (
-    ANGLES,
+from legcal.calibration.measurement_noise.document import (
     CALLED,
-    OUTLINE,
-    QUANTITIES,
     DatasetNoise,
     LegNoise,
     MethodNoise,
+)
+from legcal.calibration.measurement_noise.repeatability import (
+    ANGLES,
+    OUTLINE,
+    QUANTITIES,
     PooledSpread,
 )
 from legcal.report.render import heading, report, table

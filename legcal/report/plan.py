@@ -14,11 +14,15 @@ from rich.console import RenderableType
 
 from legcal.errors import printable
 from legcal.figures import new_figure, plain
-from legcal.files import SHOWN_IN
-from legcal.geometry import Array
-from legcal.machine import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR, poses_at, vectors_A_to_B
-from legcal.pages import Drawing, Items, Picture, Row, page_html
-from legcal.planning import LaidBoard, Plan, views_in_words
+from legcal.files.quantity import SHOWN_IN
+from legcal.geometry.types import Array
+from legcal.machine.drawing import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR
+from legcal.machine.feasibility import poses_at
+from legcal.machine.model import vectors_A_to_B
+from legcal.pages.document import Drawing, Items, Picture, Row
+from legcal.pages.html import page_html
+from legcal.planning.laid_board import LaidBoard
+from legcal.planning.planned_session import Plan, views_in_words
 from legcal.report.machine import scale_option
 from legcal.report.page.text_page import text_page
 from legcal.report.render import heading, report, table

@@ -4,7 +4,3 @@ In come a machine, the document of a calibration and cameras; out come points an
 base link: joints at readings, what a calibration changed and weak directions as motions, ellipsoids
 of joints, pyramids of what cameras see. How they are drawn is said elsewhere.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

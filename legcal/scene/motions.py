@@ -8,18 +8,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, components
-from legcal.machine import (
-    Leg,
-    Machine,
-    Parametrization,
-    ends_in_base,
-    first_rods,
-    motor_lines,
-)
+from legcal.geometry.motions import components
+from legcal.geometry.types import Array
+from legcal.machine.drawing import motor_lines
+from legcal.machine.leg import Leg
+from legcal.machine.model import Machine
+from legcal.machine.parameters import Parametrization
+from legcal.machine.rods import ends_in_base, first_rods
 
 if TYPE_CHECKING:
-    from legcal.calibration import Result
+    from legcal.calibration.documents import Result
 
 FACTORS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000, 50000)
 _SHOWN = 0.12  # of the size of the machine: how far the largest change is drawn at first
@@ -61,7 +59,7 @@ def placed_model(
     """
     poses = near
     if by_readings:
-        from legcal.calibration import poses_at_readings  # which a model alone does not need
+        from legcal.calibration.joint_fit.platform import poses_at_readings
 
         poses = poses_at_readings(machine, legs, q, near)
     frame = machine.T_base_Rb

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array
+from legcal.geometry.types import Array
 
 if TYPE_CHECKING:
-    from legcal.calibration import Result
-    from legcal.vision import Camera
+    from legcal.calibration.documents import Result
+    from legcal.vision.camera import Camera
 
 _STRAIGHT = 1e-9  # of the squared size: a bend that is none
 

@@ -6,7 +6,3 @@ memory; for studies, records of many runs. The room stands beside the others: it
 them but report and command line, and only the command line and benchmarks import it, so that the
 method cannot see the truth.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

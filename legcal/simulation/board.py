@@ -13,22 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from legcal.files import motion_to_xyz_quat
-from legcal.geometry import Array, BoolArray
+from legcal.files.motions import motion_to_xyz_quat
+from legcal.geometry.types import Array, BoolArray
 from legcal.simulation.solids import Box, Material, PlacedSolid, PosedMachine, Solid, triangles
 from legcal.simulation.visibility import pixels_in_image
-from legcal.vision import (
+from legcal.vision.board import (
     APRIL_TAGS,
     Board,
     BoardKind,
-    Camera,
     FixedBoard,
     Link,
-    board_document,
     charuco_board,
     dictionary,
-    read_board_file,
 )
+from legcal.vision.board_file import board_document, read_board_file
+from legcal.vision.camera import Camera
 
 INK = 0.06  # how much of the light that white returns black does
 TAG_BORDER = 2  # modules of the black frame of a tag, as Kalibr prints it

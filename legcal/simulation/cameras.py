@@ -19,10 +19,13 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DatasetError, NotVisible
-from legcal.files import FileSchema, MotionEntry, PlainName, read_yaml, validate
-from legcal.geometry import Array, direction_above, look_at, normal_basis
-from legcal.machine import Machine
-from legcal.planning import feet
+from legcal.files.motions import MotionEntry
+from legcal.files.schema import FileSchema, PlainName, read_yaml, validate
+from legcal.geometry.lines import direction_above, normal_basis
+from legcal.geometry.motions import look_at
+from legcal.geometry.types import Array
+from legcal.machine.model import Machine
+from legcal.planning.laid_board import feet
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard
 from legcal.simulation.rendering.rays import in_view, surrounding_points
@@ -33,7 +36,9 @@ from legcal.simulation.visibility import (
     legs_in_image,
     longest_in_images,
 )
-from legcal.vision import Board, Camera, Link, facing_board, read_camera, sample_camera
+from legcal.vision.board import Board, Link, facing_board
+from legcal.vision.camera import Camera, sample_camera
+from legcal.vision.camera_file import read_camera
 
 _MAX_SHIFT = 0.015  # [m]; a dataset may be off by 2 cm and 2 degrees
 _MAX_TURN = float(np.deg2rad(1.5))

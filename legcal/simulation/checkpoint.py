@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from legcal.errors import OutOfResources, UsageError
-from legcal.files import open_regular
+from legcal.files.reading import open_regular
 from legcal.signals import raise_if_stopped
 from legcal.version import __version__
 

@@ -11,21 +11,21 @@ from typing import Any
 import numpy as np
 
 from legcal.brief import brief
-from legcal.calibration import PLAN_NAME
-from legcal.data import (
-    AXES_NAME,
-    CORNERS_NAME,
-    OBSERVATIONS_NAME,
-    Measurements,
-    sigma_too_large,
-    write_axis_table,
-    write_corners,
-    write_observations,
-)
+from legcal.calibration.closeness import PLAN_NAME
+from legcal.data.axes import write_axis_table
+from legcal.data.corners import write_corners
+from legcal.data.dataset import AXES_NAME, CORNERS_NAME, OBSERVATIONS_NAME
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import write_observations
+from legcal.data.reading_units import sigma_too_large
 from legcal.errors import UsageError
-from legcal.files import MAX_DOCUMENT, Document, describe, output_path, read_bytes
-from legcal.geometry import Array
-from legcal.machine import Machine, load_mechanism, write_model
+from legcal.files.folder import output_path
+from legcal.files.reading import MAX_DOCUMENT, read_bytes
+from legcal.files.schema import Document, describe
+from legcal.geometry.types import Array
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.model_writer import write_model
 from legcal.progress import Progress, Report, shown_progress
 from legcal.simulation.board import documents
 from legcal.simulation.folder import (

@@ -17,36 +17,30 @@ from typing import Any
 
 import yaml
 
-from legcal.calibration import PLAN_NAME
-from legcal.data import (
-    AXES_NAME,
-    CACHE_NAME,
-    CORNERS_NAME,
-    OBSERVATIONS_NAME,
-    OUTLINE_COLUMNS,
-    Measurements,
-)
+from legcal.calibration.closeness import PLAN_NAME
+from legcal.data.dataset import AXES_NAME, CACHE_NAME, CORNERS_NAME, OBSERVATIONS_NAME
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import OUTLINE_COLUMNS
 from legcal.errors import DatasetError, UsageError
-from legcal.files import (
+from legcal.files.folder import (
     OutputKind,
     check_destination,
     check_path,
-    format_table,
     holds_files,
     in_the_way,
-    motion_to_xyz_quat,
     path_problem,
-    read_json,
-    read_table,
     result_folder,
-    with_schema,
 )
-from legcal.machine import Machine
+from legcal.files.motions import motion_to_xyz_quat
+from legcal.files.published import with_schema
+from legcal.files.reading import read_json
+from legcal.files.table import format_table, read_table
+from legcal.machine.model import Machine
 from legcal.simulation.board import documents
 from legcal.simulation.session import SimulatedSession
 from legcal.simulation.settings import SimulationSettings
 from legcal.version import __version__
-from legcal.vision import camera_info
+from legcal.vision.camera_file import camera_info
 
 TRUTH = "truth"
 TRUTH_NAME = f"{TRUTH}/truth.json"

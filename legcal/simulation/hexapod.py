@@ -11,18 +11,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data import LegAxes, Measurements, Outlines, View, axes_from_outlines, axes_of_table
+from legcal.data.axes import LegAxes, axes_from_outlines, axes_of_table
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines
 from legcal.errors import DidNotConverge
-from legcal.geometry import Array, BoolArray, frame_on_points, look_at
-from legcal.machine import (
-    KinematicParameters,
-    from_vector,
-    near_ends,
-    point_like_legs,
-    pose_equations,
-    solve_poses,
-    to_vector,
-)
+from legcal.geometry.motions import frame_on_points, look_at
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.equations import pose_equations
+from legcal.machine.feasibility import near_ends
+from legcal.machine.leg import KinematicParameters, point_like_legs
+from legcal.machine.parameters import from_vector, to_vector
+from legcal.machine.solved_poses import solve_poses
 from legcal.simulation.cameras import rough_pose
 from legcal.simulation.observe import (
     OutlineNoise,
@@ -33,7 +32,7 @@ from legcal.simulation.observe import (
     plain_scene,
 )
 from legcal.simulation.visibility import Viewpoint
-from legcal.vision import Camera, sample_camera
+from legcal.vision.camera import Camera, sample_camera
 
 PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs seen at a time
 _DISTANCE = 0.9  # [m] of cameras from the middle of the machine, about

@@ -14,12 +14,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from legcal.data import Corners, Outlines, found_corners, join_corners
+from legcal.data.corners import Corners, found_corners, join_corners
+from legcal.data.outlines import Outlines
 from legcal.errors import NotVisible
-from legcal.geometry import Array, IntArray, cross
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array, IntArray
 from legcal.simulation.solids import PosedMachine
 from legcal.simulation.visibility import Images, LegView, Stretch, Viewpoint, silhouette
-from legcal.vision import Camera
+from legcal.vision.camera import Camera
 
 EXACT_PX = 1e-3  # standard deviation that outlines and corners without noise claim
 _MIN_UPRIGHT_AXIS = 1e-3  # component along the image y axis below which a leg has no point M_LS

@@ -10,27 +10,19 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 from scipy.special import elliprg
 
-from legcal.calibration import (
-    FittedLegs,
-    Start,
-    average_images,
-    bound,
-    build_fit,
-    cameras_from_hints,
-    refine,
-    start_from,
-)
-from legcal.data import LegAxes, no_outlines
+from legcal.calibration.joint_fit.factors import average_images
+from legcal.calibration.joint_fit.fit import bound, refine
+from legcal.calibration.joint_fit.problem import build_fit
+from legcal.calibration.joint_fit.variables import FittedLegs, Start, cameras_from_hints, start_from
+from legcal.data.axes import LegAxes
+from legcal.data.outlines import no_outlines
 from legcal.errors import LegcalError
-from legcal.geometry import Array
-from legcal.machine import (
-    KinematicParameters,
-    parametrize,
-    point_like_legs,
-    pose_sensitivity,
-    to_vector,
-)
-from legcal.paper import NominalMachine, point_like_machine, run_steps
+from legcal.geometry.types import Array
+from legcal.machine.equations import pose_sensitivity
+from legcal.machine.leg import KinematicParameters, point_like_legs
+from legcal.machine.parameters import parametrize, to_vector
+from legcal.paper.four_steps import run_steps
+from legcal.paper.nominal import NominalMachine, point_like_machine
 from legcal.simulation.checkpoint import has_keys, is_failure, is_number
 from legcal.simulation.hexapod import (
     PAPER_VIEWS,

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from legcal.files import Document, Number
-from legcal.geometry import Array
-from legcal.machine import parametrize, point_like_legs, to_vector
+from legcal.files.schema import Document, Number
+from legcal.geometry.types import Array
+from legcal.machine.leg import point_like_legs
+from legcal.machine.parameters import parametrize, to_vector
 from legcal.simulation.hexapod import PaperHexapod
 from legcal.simulation.study import Record
 

@@ -8,13 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration import PLAN_NAME
-from legcal.data import Measurements, load_dataset
+from legcal.calibration.closeness import PLAN_NAME
+from legcal.data.dataset import load_dataset
+from legcal.data.measurements import Measurements
 from legcal.errors import DidNotConverge, NotVisible, UsageError
-from legcal.files import read_json, validate
-from legcal.geometry import Array
-from legcal.machine import Configurations, Machine, follow_each, poses_at
-from legcal.planning import PlanDocument, Setting, difference
+from legcal.files.reading import read_json
+from legcal.files.schema import validate
+from legcal.geometry.types import Array
+from legcal.machine.configurations import Configurations
+from legcal.machine.feasibility import poses_at
+from legcal.machine.kinematics import follow_each
+from legcal.machine.model import Machine
+from legcal.planning.places import Setting
+from legcal.planning.planned_session import PlanDocument
+from legcal.planning.request import difference
 from legcal.simulation.board import PlacedBoard
 from legcal.simulation.cameras import MAX_HAND_DRAWS
 from legcal.simulation.solids import PosedMachine

@@ -1,6 +1,6 @@
 """Poses that a controller could command: both the true machine and its nominal model reach them.
 
-They are drawn (:func:`legcal.machine.feasible_poses`) or given by their readings.
+They are drawn (:func:`legcal.machine.feasibility.feasible_poses`) or given by their readings.
 """
 
 from __future__ import annotations
@@ -9,28 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.data import reading_columns, readings_in
+from legcal.data.measurements import reading_columns, readings_in
 from legcal.errors import DatasetError, DidNotConverge, UsageError
-from legcal.files import read_table
-from legcal.geometry import Array, BoolArray
-from legcal.machine import (
-    JITTER,
-    TRAVEL_TOLERANCE,
-    Configurations,
-    Feasibility,
-    Machine,
-    contradictions,
-    feasible_poses,
-    follow,
-    followed_poses,
-    motor_travel,
-    platform_in_base,
-    platform_pose,
-    poses_at,
-    singularities,
-    singularity,
-    slider_columns,
-)
+from legcal.files.table import read_table
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.configurations import TRAVEL_TOLERANCE, Configurations
+from legcal.machine.feasibility import JITTER, Feasibility, feasible_poses, motor_travel, poses_at
+from legcal.machine.kinematics import follow, followed_poses, platform_in_base
+from legcal.machine.mobility import singularities, singularity
+from legcal.machine.model import Machine, platform_pose, slider_columns
+from legcal.machine.redundancy import contradictions
 from legcal.progress import Report, no_progress
 from legcal.simulation.request import Sampling
 

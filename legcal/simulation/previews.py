@@ -8,13 +8,14 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.machine import Configurations, Machine
-from legcal.planning import LaidBoard
+from legcal.machine.configurations import Configurations
+from legcal.machine.model import Machine
+from legcal.planning.laid_board import LaidBoard
 from legcal.simulation.board import PlacedBoard
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.scene import prepare_view
 from legcal.simulation.solids import dressed, pose_machine
-from legcal.vision import Camera
+from legcal.vision.camera import Camera
 
 _WIDTH = 400  # [px]
 

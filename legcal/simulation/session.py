@@ -13,9 +13,12 @@ from uuid import uuid4
 
 import numpy as np
 
-from legcal.data import Corners, Measurements, Outlines, View
+from legcal.data.corners import Corners
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines
 from legcal.errors import NotVisible, UsageError
-from legcal.machine import Configurations, Machine
+from legcal.machine.configurations import Configurations
+from legcal.machine.model import Machine
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard, chosen_board, placed_at
 from legcal.simulation.cameras import (
@@ -47,7 +50,8 @@ from legcal.simulation.request import Level
 from legcal.simulation.settings import Distribution, SimulationSettings
 from legcal.simulation.solids import PlacedSolid, PosedMachine, dressed, pose_machine
 from legcal.simulation.visibility import Images, Viewpoint, take_images
-from legcal.vision import Board, Camera, FixedBoard
+from legcal.vision.board import Board, FixedBoard
+from legcal.vision.camera import Camera
 from legcal.workers import Workers, worker_pool
 
 Streams = Mapping[str, np.random.Generator]

@@ -21,28 +21,21 @@ from typing import Annotated, Any, get_type_hints
 import numpy as np
 from pydantic import Field, create_model
 
-from legcal.calibration import joints_of_length
-from legcal.data import SIGMA_RANGE
+from legcal.calibration.joint_fit.parameter_choices import joints_of_length
+from legcal.data.axes import SIGMA_RANGE
 from legcal.errors import UsageError
-from legcal.files import (
-    ANGLE,
-    LENGTH,
-    PIXELS,
-    FileSchema,
-    closest,
-    describe,
-    parse_quantity,
-    read_yaml,
-    validate,
-)
-from legcal.machine import Leg, LegKind, Machine, kind_of_parameter, parametrization_of
+from legcal.files.quantity import ANGLE, LENGTH, PIXELS, parse_quantity
+from legcal.files.schema import FileSchema, closest, describe, read_yaml, validate
+from legcal.machine.leg import Leg, LegKind
+from legcal.machine.model import Machine
+from legcal.machine.parameters import kind_of_parameter, parametrization_of
 from legcal.option_fields import flags_of
 from legcal.simulation.board import KINDS as BOARD_KINDS
 from legcal.simulation.observe import TableNoise
 from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.pipeline import CAMERAS
 from legcal.simulation.request import Angles, Level, Request, Sampling
-from legcal.vision import Board
+from legcal.vision.board import Board
 
 MAX_SIZE = 1.0  # [m] or [rad]
 ANGLES = ("axes", "twists")

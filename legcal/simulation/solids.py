@@ -14,31 +14,17 @@ from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError
-from legcal.files import MAX_MESH, open_regular
-from legcal.geometry import (
-    Array,
-    BoolArray,
-    IntArray,
-    cross,
-    distance_to_line,
-    matrix_product,
-    motions_of,
-    product,
-)
-from legcal.machine import (
-    COAXIAL,
-    Actuator,
-    Configurations,
-    Leg,
-    Machine,
-    arms_at,
-    first_rods,
-    joint_values,
-    number_list,
-    origins_of,
-    parse_robot,
-    vectors_A_to_B,
-)
+from legcal.files.reading import MAX_MESH, open_regular
+from legcal.geometry.lines import cross, distance_to_line
+from legcal.geometry.motions import matrix_product, motions_of, product
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.actuator import Actuator
+from legcal.machine.configurations import Configurations
+from legcal.machine.cylinders import COAXIAL
+from legcal.machine.leg import Leg
+from legcal.machine.model import Machine, joint_values, vectors_A_to_B
+from legcal.machine.rods import arms_at, first_rods
+from legcal.machine.urdf import number_list, origins_of, parse_robot
 
 _SIZES = {"cylinder": ("radius", "length"), "sphere": ("radius",), "box": ("size",)}
 

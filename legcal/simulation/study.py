@@ -22,7 +22,8 @@ import numpy as np
 
 from legcal.brief import brief
 from legcal.errors import DidNotConverge, LegcalError, OutOfResources, UsageError
-from legcal.files import TEMPORARY_SUFFIX, OutputKind, SparseDocument, check_path, result_folder
+from legcal.files.folder import TEMPORARY_SUFFIX, OutputKind, check_path, result_folder
+from legcal.files.schema import SparseDocument
 from legcal.processors import processors
 from legcal.progress import Progress, shown_progress
 from legcal.simulation.checkpoint import (

@@ -16,25 +16,22 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, ModelError, OutOfClass, UsageError
-from legcal.files import MAX_TEXT, SHOWN_IN, read_bytes
-from legcal.machine import (
-    Leg,
-    Machine,
-    UrdfPatch,
-    check_closes,
+from legcal.files.quantity import SHOWN_IN
+from legcal.files.reading import MAX_TEXT, read_bytes
+from legcal.machine.home import home_of_legs
+from legcal.machine.leg import Leg
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.model_writer import check_closes, mechanism_text, model_name, write_urdf
+from legcal.machine.parameters import (
     geometries,
-    home_of_legs,
     kind_of_parameter,
-    load_mechanism,
-    machine_ties,
-    mechanism_text,
-    model_name,
     moved_legs,
-    on_ties,
     parametrization_of,
     reframed,
-    write_urdf,
 )
+from legcal.machine.ties import machine_ties, on_ties
+from legcal.machine.urdf import UrdfPatch
 from legcal.simulation.settings import (
     ANGLES,
     ERRORS_OF,

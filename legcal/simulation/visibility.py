@@ -11,11 +11,14 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import NotVisible, UsageError
-from legcal.geometry import Array, BoolArray, IntArray, cross, matrix_applied
-from legcal.machine import Cylinder, Leg, cylinder_of_arm, main_cylinders
+from legcal.geometry.lines import cross
+from legcal.geometry.motions import matrix_applied
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm, main_cylinders
 from legcal.progress import Report, no_progress
 from legcal.simulation.solids import PosedMachine
-from legcal.vision import Camera, least_length
+from legcal.vision.camera import Camera
+from legcal.vision.visibility import least_length
 
 MIN_SHARE = 0.4  # of a leg's length that one stretch must show
 SAMPLES = 96  # points along a leg

@@ -6,7 +6,3 @@ stands, moved by readings (closed-loop kinematics) or by the platform's own coor
 cameras, their images without distortion, and outlines in space. :class:`Window` alone knows the
 browser: it shows them with viser, an extra.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,6 +1,6 @@
 """Where the machine stands, moved by readings or by the platform's own coordinates.
 
-Readings move the closed chain, each step from the last (:class:`legcal.machine.Follower`); a pose
+Readings move the closed chain, each step from the last (``Follower``); a pose
 is met exactly and the legs follow. What cannot be reached leaves the machine where it was, with
 the reason in words.
 """
@@ -13,20 +13,13 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import LegcalError
-from legcal.geometry import Array, BoolArray, motion_of
-from legcal.machine import (
-    Follower,
-    Machine,
-    consistent_readings,
-    coordinates_of,
-    followed_poses,
-    joint_values,
-    leg_scale,
-    own_coordinates,
-    poses_at_coordinates,
-    readings_at,
-    readings_at_poses,
-)
+from legcal.geometry.motions import motion_of
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.coordinates import coordinates_of, own_coordinates, poses_at_coordinates
+from legcal.machine.kinematics import Follower, followed_poses
+from legcal.machine.mobility import leg_scale
+from legcal.machine.model import Machine, joint_values, readings_at, readings_at_poses
+from legcal.machine.redundancy import consistent_readings
 
 _AT_END = 1e-6  # [m] from the end of a travel
 _TICKS = 40  # by which the range of a coordinate is looked for, on either side of home

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import LegcalError
-from legcal.files import motion_from_xyz_quat
-from legcal.geometry import Array, BoolArray
+from legcal.files.motions import motion_from_xyz_quat
+from legcal.geometry.types import Array, BoolArray
 from legcal.viewer.source import Source
 
 if TYPE_CHECKING:
-    from legcal.calibration import EarlierResult
-    from legcal.data import Dataset
-    from legcal.vision import Camera
+    from legcal.calibration.result_folder import EarlierResult
+    from legcal.data.dataset import Dataset
+    from legcal.vision.camera import Camera
 
 MAX_CAMERAS = 200
 _SIDE = 720  # longer side of a photograph as it is shown [px]
@@ -73,7 +73,7 @@ class Photographs:
         self.q = np.zeros((0, source.machine.n_legs))
         if source.dataset is None:
             return
-        from legcal.data import row_names
+        from legcal.data.measurements import row_names
 
         measurements = source.dataset.measurements
         self.places = _places(source.dataset, source.result)

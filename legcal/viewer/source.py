@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from legcal.errors import UsageError
-from legcal.exports import load_subject
-from legcal.machine import DATASET_YAML, Machine, shipped_names
+from legcal.exports.subject import load_subject
+from legcal.machine.files import DATASET_YAML, shipped_names
+from legcal.machine.model import Machine
 
 if TYPE_CHECKING:
-    from legcal.calibration import EarlierResult
-    from legcal.data import Dataset
+    from legcal.calibration.result_folder import EarlierResult
+    from legcal.data.dataset import Dataset
 
 _MARKERS = (DATASET_YAML, "result.json", "calibrated.yaml", "robot.yaml")
 
@@ -70,7 +71,7 @@ def open_source(given: str | Path, dataset: str | Path | None = None) -> Source:
                 f"--dataset could not be used: found the dataset {path} beside it, needed a result "
                 "or a model; leave one of them out."
             )
-        from legcal.data import load_dataset
+        from legcal.data.dataset import load_dataset
 
         found = load_dataset(path, check_images=False)
         return Source(found.machine, dataset=found)
@@ -87,7 +88,7 @@ def open_source(given: str | Path, dataset: str | Path | None = None) -> Source:
 
 def _session(machine: Machine, given: str | Path, result: EarlierResult | None) -> Dataset:
     """Return the session of a machine, with the outlines that its calibration used."""
-    from legcal.data import OBSERVATIONS_NAME, load_dataset, read_outlines
+    from legcal.data.dataset import OBSERVATIONS_NAME, load_dataset, read_outlines
 
     dataset = load_dataset(given, check_images=False)
     names = dataset.machine.leg_names

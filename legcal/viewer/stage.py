@@ -8,26 +8,14 @@ from functools import cached_property
 
 import numpy as np
 
-from legcal.geometry import Array
-from legcal.machine import (
-    Leg,
-    Machine,
-    corners_of_base,
-    geometries,
-    motor_lines,
-    moved_legs,
-    parametrization_of,
-    platform_in_base,
-)
-from legcal.scene import (
-    FACTORS,
-    PlacedModel,
-    around,
-    directions,
-    ellipsoids,
-    enlargement,
-    placed_model,
-)
+from legcal.geometry.types import Array
+from legcal.machine.drawing import corners_of_base, motor_lines
+from legcal.machine.kinematics import platform_in_base
+from legcal.machine.leg import Leg
+from legcal.machine.model import Machine
+from legcal.machine.parameters import geometries, moved_legs, parametrization_of
+from legcal.scene.motions import FACTORS, PlacedModel, directions, placed_model
+from legcal.scene.shapes import around, ellipsoids, enlargement
 from legcal.viewer.motion import Posture
 from legcal.viewer.source import Source
 

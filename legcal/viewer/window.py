@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from legcal.errors import UsageError
-from legcal.files import SHOWN_IN
-from legcal.geometry import Array
-from legcal.machine import COORDINATES
-from legcal.scene import FACTORS
+from legcal.files.quantity import SHOWN_IN
+from legcal.geometry.types import Array
+from legcal.machine.coordinates import COORDINATES
+from legcal.scene.motions import FACTORS
 from legcal.viewer.address import Address, check_address
 from legcal.viewer.motion import Motion
 from legcal.viewer.photographs import Photographs, Place

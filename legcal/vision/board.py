@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
+from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.types import Array, BoolArray, IntArray
 
 BoardKind = Literal["chessboard", "charuco", "aprilgrid"]
 

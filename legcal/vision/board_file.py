@@ -12,17 +12,9 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, Strict, field_validator, model_validator
 
 from legcal.errors import DatasetError, UsageError
-from legcal.files import (
-    LENGTH,
-    FileSchema,
-    MotionEntry,
-    Number,
-    closest,
-    describe,
-    parse_quantity,
-    read_yaml,
-    validate,
-)
+from legcal.files.motions import MotionEntry
+from legcal.files.quantity import LENGTH, parse_quantity
+from legcal.files.schema import FileSchema, Number, closest, describe, read_yaml, validate
 from legcal.vision.board import (
     APRIL_TAGS,
     DICTIONARIES,

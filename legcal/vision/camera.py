@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from legcal.geometry import Array
+from legcal.geometry.types import Array
 from legcal.vision.distortion import DistortionModel
 
 _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)

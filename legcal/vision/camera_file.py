@@ -12,8 +12,9 @@ import yaml
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from legcal.errors import DatasetError
-from legcal.files import FileSchema, content_of, parse_yaml, validate, with_schema
-from legcal.geometry import Array
+from legcal.files.published import with_schema
+from legcal.files.schema import FileSchema, content_of, parse_yaml, validate
+from legcal.geometry.types import Array
 from legcal.vision.camera import DISTORTION_MODELS, Camera, intrinsic_names
 from legcal.vision.distortion import DistortionModel
 from legcal.vision.image_file import quiet_opencv, size_problem

@@ -9,7 +9,8 @@ theta far better than psi.
 import numpy as np
 
 from legcal.errors import NotVisible
-from legcal.geometry import Array, cross, moment, nearest_point_to_origin
+from legcal.geometry.lines import cross, moment, nearest_point_to_origin
+from legcal.geometry.types import Array
 
 EPSILON = np.array([1.0, -1.0])
 

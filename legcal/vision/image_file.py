@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from legcal.cluster import file_of_task
 from legcal.errors import DatasetError
-from legcal.files import MAX_IMAGE, read_bytes
-from legcal.geometry import Array
+from legcal.files.reading import MAX_IMAGE, read_bytes
+from legcal.geometry.types import Array
 from legcal.vision.camera import Camera
 from legcal.vision.heic import (
     HEIC_SUFFIXES,

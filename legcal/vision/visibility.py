@@ -8,8 +8,9 @@ from itertools import islice
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, BoolArray, IntArray, moment
-from legcal.machine import Cylinder, main_cylinders
+from legcal.geometry.lines import moment
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import Cylinder, main_cylinders
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 

@@ -33,9 +33,10 @@ from characterisation.running import Outcome, run, words_of
 
 from fuzzing.mutations import mutate
 from fuzzing.subjects import SUBJECTS, Subject
-from legcal.machine import Machine, loader
+from legcal.machine import loader
 from legcal.machine.files import find_model
 from legcal.machine.formats import read_source
+from legcal.machine.model import Machine
 from legcal.machine.spanning_tree import Source
 
 MAX_SECONDS = 5.0  # of work of the processor, on a usual machine

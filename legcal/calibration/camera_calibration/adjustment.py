@@ -9,9 +9,11 @@ import numpy as np
 
 from legcal.calibration.camera_calibration.consensus import agreeing_images
 from legcal.calibration.camera_calibration.starts import again, part_of
-from legcal.geometry import Array, BoolArray
-from legcal.perception import SHEET, AdjustedBoard, BoardImages
-from legcal.vision import DistortionModel, ImageSize, intrinsic_names
+from legcal.geometry.types import Array, BoolArray
+from legcal.perception.board_adjustment import SHEET, AdjustedBoard, BoardImages
+from legcal.vision.camera import intrinsic_names
+from legcal.vision.distortion import DistortionModel
+from legcal.vision.image_file import ImageSize
 
 _MAX_ROUNDS = 6
 OUTLIER_SIGMAS = 6.0  # standard deviations of a corner that is left out

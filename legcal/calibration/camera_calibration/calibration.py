@@ -29,13 +29,13 @@ from legcal.calibration.camera_calibration.document import (
 )
 from legcal.calibration.camera_calibration.lens import ChosenLens, chosen_lens, given_lens
 from legcal.calibration.camera_calibration.picture import PICTURE_FILE, write_picture
-from legcal.data import few
+from legcal.data.measurements import few
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
-from legcal.files import MAX_IMAGE, describe, read_bytes
-from legcal.geometry import Array
-from legcal.perception import (
-    SHEET,
-    BoardImages,
+from legcal.files.reading import MAX_IMAGE, read_bytes
+from legcal.files.schema import describe
+from legcal.geometry.types import Array
+from legcal.perception.board_adjustment import SHEET, BoardImages
+from legcal.perception.board_corners import (
     NumberedCorners,
     SeenBoard,
     board_in_words,
@@ -45,22 +45,20 @@ from legcal.perception import (
     tags_are_mirrored,
 )
 from legcal.progress import Progress, Report, shown_progress
-from legcal.vision import (
+from legcal.vision.board import Board
+from legcal.vision.board_file import board_of
+from legcal.vision.camera import Camera
+from legcal.vision.distortion import DistortionModel
+from legcal.vision.image_facts import ImageFacts, read_facts
+from legcal.vision.image_file import (
     BadImage,
-    Board,
-    Camera,
-    DistortionModel,
-    ImageFacts,
     ImageSize,
-    board_of,
-    differences,
     image_size,
     image_suffixes,
     likely_cause,
-    read_facts,
     read_image,
-    recorded,
 )
+from legcal.vision.photograph_comparison import differences, recorded
 from legcal.workers import Run, Workers, worker_pool
 
 _STAGE, _ADJUSTING = "Searching the board", "Adjusting the camera"

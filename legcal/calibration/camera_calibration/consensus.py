@@ -1,7 +1,7 @@
 """Which images of a board agree on a camera, and what is the matter with the others.
 
 An image says little of a camera alone; it contradicts a group of images by its score and
-information (:class:`legcal.estimation.Clusters`), along all numbers of the camera and of the sheet,
+information (``Clusters``), along all numbers of the camera and of the sheet,
 along the focal length, the principal point, and along the sheet. The group begins as the half of
 the images that is cheapest together (least trimmed squares from many random starts, on the
 quadratic costs of all images), takes in whatever does not contradict it, and is fitted again until
@@ -19,10 +19,20 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtri
 
 from legcal.calibration.camera_calibration.starts import again, from_scratch, part_of
-from legcal.estimation import COST_TOLERANCE, Clusters
-from legcal.geometry import Array, BoolArray
-from legcal.perception import LOSS, SHEET, AdjustedBoard, BoardImages, Sheet, adjust_board
-from legcal.vision import DistortionModel, ImageSize, intrinsic_names, intrinsic_values
+from legcal.estimation.clusters import Clusters
+from legcal.estimation.solver import COST_TOLERANCE
+from legcal.geometry.types import Array, BoolArray
+from legcal.perception.board_adjustment import (
+    LOSS,
+    SHEET,
+    AdjustedBoard,
+    BoardImages,
+    Sheet,
+    adjust_board,
+)
+from legcal.vision.camera import intrinsic_names, intrinsic_values
+from legcal.vision.distortion import DistortionModel
+from legcal.vision.image_file import ImageSize
 
 _SIGNIFICANCE = 1e-5  # of a contradiction
 _FEW = 5  # images of which none can be outvoted

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.special import fdtrc
 
 from legcal.calibration.camera_calibration.adjustment import RobustFit
-from legcal.data import few
+from legcal.data.measurements import few
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array
-from legcal.perception import SHEET, adjust_board
-from legcal.vision import Camera, intrinsic_names
+from legcal.geometry.types import Array
+from legcal.perception.board_adjustment import SHEET, adjust_board
+from legcal.vision.camera import Camera, intrinsic_names
 
 MIN_IMAGES, _FEW_IMAGES = 3, 10
 _MAX_FOCAL_SIGMA, _WEAK_FOCAL_SIGMA = 0.05, 0.003  # as parts of the focal length

@@ -10,10 +10,13 @@ from typing import Any
 import numpy as np
 
 from legcal.brief import brief
-from legcal.files import Document, OutputFile
-from legcal.geometry import Array
-from legcal.perception import SHEET
-from legcal.vision import CALIBRATED, Board, Camera, camera_info, intrinsic_names, intrinsic_values
+from legcal.files.folder import OutputFile
+from legcal.files.schema import Document
+from legcal.geometry.types import Array
+from legcal.perception.board_adjustment import SHEET
+from legcal.vision.board import Board
+from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values
+from legcal.vision.camera_file import CALIBRATED, camera_info
 
 CAMERA_FILE = OutputFile(
     "the camera", "camera file", CALIBRATED, "a new file or one that this command wrote"

@@ -15,9 +15,11 @@ from scipy.special import stdtr
 
 from legcal.calibration.camera_calibration.adjustment import RobustFit, robust_fit
 from legcal.calibration.camera_calibration.starts import again, part_of
-from legcal.geometry import Array
-from legcal.perception import BoardImages, adjust_board
-from legcal.vision import DistortionModel, ImageSize, intrinsic_names
+from legcal.geometry.types import Array
+from legcal.perception.board_adjustment import BoardImages, adjust_board
+from legcal.vision.camera import intrinsic_names
+from legcal.vision.distortion import DistortionModel
+from legcal.vision.image_file import ImageSize
 
 SIMPLEST: DistortionModel = "plumb_bob"
 _RICHER: tuple[DistortionModel, ...] = ("equidistant", "rational_polynomial")

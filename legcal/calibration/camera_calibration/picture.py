@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legcal.calibration.camera_calibration.document import CameraCalibration
-from legcal.files import OutputFile
+from legcal.files.folder import OutputFile
 
 _LONGER = 1280  # side of the picture [px]
 _CELLS = 16  # along it

@@ -10,16 +10,12 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception import AdjustedBoard, BoardImages, Sheet, adjust_board, plane_poses
-from legcal.vision import (
-    DISTORTION_MODELS,
-    Camera,
-    DistortionModel,
-    ImageSize,
-    intrinsic_names,
-    quiet_opencv,
-)
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.perception.board_adjustment import AdjustedBoard, BoardImages, Sheet, adjust_board
+from legcal.perception.board_poses import plane_poses
+from legcal.vision.camera import DISTORTION_MODELS, Camera, intrinsic_names
+from legcal.vision.distortion import DistortionModel
+from legcal.vision.image_file import ImageSize, quiet_opencv
 
 _FOCAL_LENGTHS = (0.25, 4.0, 13)  # least to greatest, how many: parts of the longer side
 _MAX_ANGLE = 1.45  # [rad] to the axis of a fisheye lens

@@ -35,20 +35,17 @@ from legcal.calibration.diagnosis.mistakes import (
 from legcal.calibration.documents import DiagnosisBlock
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.errors import LegcalError
-from legcal.geometry import Array, IntArray
-from legcal.machine import Machine, vectors_A_to_B
-from legcal.perception import (
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.model import Machine, vectors_A_to_B
+from legcal.perception.agreement import (
     Agreement,
     Assumption,
-    Group,
-    Placement,
-    Search,
     compare_assumptions,
-    far_off,
-    group_views,
     pairs_of_images,
     pairs_of_outlines,
 )
+from legcal.perception.diagnostics import far_off
+from legcal.perception.placement import Group, Placement, Search, group_views
 from legcal.progress import no_progress
 
 _Judged = tuple[Mistake, Agreement]  # with what all images say of it

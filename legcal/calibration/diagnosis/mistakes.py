@@ -11,11 +11,14 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.ordered_dataset import OrderedDataset
-from legcal.data import INCH, few, inverse, readings_of_lengths, row_names
-from legcal.files import LENGTH
-from legcal.geometry import Array, IntArray
-from legcal.machine import Leg, Machine, follow_poses, readings_at
-from legcal.perception import LEFT_RIGHT, UPSIDE_DOWN
+from legcal.data.image_tables import inverse
+from legcal.data.measurements import INCH, few, readings_of_lengths, row_names
+from legcal.files.quantity import LENGTH
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.kinematics import follow_poses
+from legcal.machine.leg import Leg
+from legcal.machine.model import Machine, readings_at
+from legcal.perception.camera_search import LEFT_RIGHT, UPSIDE_DOWN
 
 _STEP = 1.0 / 16.0  # of the way from home to readings, at least
 _MIRROR = np.diag([1.0, -1.0, 1.0])

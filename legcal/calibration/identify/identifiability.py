@@ -28,23 +28,24 @@ from legcal.calibration.identify.remedies import (
 )
 from legcal.calibration.identify.report import Identifiability, Ranks, Recommendation
 from legcal.calibration.identify.scale import is_scale_open, refusal_of_scale, scale_sources
-from legcal.calibration.joint_fit import NO_CHOICES, Choices, known_parameters, resolve
-from legcal.data import Dataset
-from legcal.errors import NotIdentifiable, UsageError
-from legcal.files import closest
-from legcal.machine import (
-    DATASET_YAML,
-    TRAVEL_MARGIN,
-    JointType,
-    Machine,
-    geometries,
-    is_held_by_default,
-    legs_outside,
-    load_mechanism,
-    singularity_note,
-    ties_in_words,
+from legcal.calibration.joint_fit.parameter_choices import (
+    NO_CHOICES,
+    Choices,
+    known_parameters,
+    resolve,
 )
-from legcal.paper import (
+from legcal.data.dataset import Dataset
+from legcal.errors import NotIdentifiable, UsageError
+from legcal.files.schema import closest
+from legcal.machine.diagnostics import singularity_note
+from legcal.machine.files import DATASET_YAML
+from legcal.machine.home import legs_outside
+from legcal.machine.leg import TRAVEL_MARGIN, JointType
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.parameters import geometries, is_held_by_default
+from legcal.machine.ties import ties_in_words
+from legcal.paper.conditions import (
     Condition,
     count_conditions,
     enough_readings,
@@ -59,7 +60,7 @@ _ROUGH = 0.1  # mean leg lengths: calibrations do not accept directions known to
 
 
 def answer(
-    # A machine as :func:`legcal.machine.load_mechanism` takes it, or a dataset folder or its
+    # A machine as :func:`legcal.machine.loader.load_mechanism` takes it, or a dataset folder or its
     # ``dataset.yaml``
     source: str,
     views: Sequence[Sequence[str]],  # legs of each view; none for a dataset
@@ -98,7 +99,7 @@ def answer(
             f"its own views and images, needed a model for that; leave {option} out, or name the "
             "model."
         )
-    from legcal.data import load_dataset
+    from legcal.data.dataset import load_dataset
 
     dataset = load_dataset(path, check_images=False)
     known = known_parameters(

@@ -21,11 +21,10 @@ from legcal.calibration.identify.predicted_observations import (
     at_platform_joints,
 )
 from legcal.calibration.identify.report import CameraIntrinsics
-from legcal.calibration.joint_fit import Choices
-from legcal.calibration.joint_fit.parameter_choices import joints_of_length
+from legcal.calibration.joint_fit.parameter_choices import Choices, joints_of_length
 from legcal.calibration.joint_fit.problem import arm_sigmas
 from legcal.calibration.joint_fit.variables import RefinementSettings
-from legcal.estimation import (
+from legcal.estimation.problem import (
     NO_PRIOR,
     Factor,
     GaussianPrior,
@@ -33,21 +32,14 @@ from legcal.estimation import (
     Residuals,
     Variables,
     all_free,
-    information_rows,
-    marginal_rows,
 )
-from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
-from legcal.machine import (
-    ARM_KINDS,
-    ActuatorColumns,
-    EquationKind,
-    LegColumns,
-    freedoms,
-    is_held_by_default,
-    kind_of_parameter,
-    parametrize,
-    pose_equations,
-)
+from legcal.estimation.square_root import information_rows, marginal_rows
+from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.actuator import ActuatorColumns
+from legcal.machine.equations import freedoms, pose_equations
+from legcal.machine.leg import EquationKind, LegColumns
+from legcal.machine.parameters import ARM_KINDS, is_held_by_default, kind_of_parameter, parametrize
 
 SIGMA_EXACT = 1e-7  # [m]: of what the mechanism itself demands
 INTRINSICS = ("fx", "fy", "cx", "cy")

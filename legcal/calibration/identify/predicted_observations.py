@@ -16,46 +16,40 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.ordered_dataset import nominal_poses
-from legcal.data import Dataset, sigmas_of_legs
-from legcal.estimation import Frames
-from legcal.geometry import Array, BoolArray, IntArray, components, cross
-from legcal.machine import (
-    Actuator,
-    ActuatorColumns,
-    Arm,
-    JointMotion,
-    Leg,
-    LegColumns,
-    LegKind,
-    Machine,
+from legcal.data.dataset import Dataset
+from legcal.data.reading_units import sigmas_of_legs
+from legcal.estimation.problem import Frames
+from legcal.geometry.lines import cross
+from legcal.geometry.motions import components
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.actuator import Actuator, ActuatorColumns, Arm, JointMotion
+from legcal.machine.configurations import random_postures_of_legs
+from legcal.machine.directions import leg_labels, list_in_words
+from legcal.machine.equations import freedoms
+from legcal.machine.leg import Leg, LegColumns, LegKind, main_cylinders
+from legcal.machine.model import Machine
+from legcal.machine.parameters import (
     Parametrization,
-    Ties,
+    geometries,
+    is_spatial,
+    moved_legs,
+    parametrization_of,
+)
+from legcal.machine.rods import (
     actuator_index,
     actuators_of,
     arms_at,
-    by_step,
     coordinates_at,
     ends_at_poses,
     first_rods,
-    freedoms,
-    geometries,
-    independent,
     internal_index,
     internal_joints_of,
-    is_spatial,
     joints_at,
-    leg_labels,
-    list_in_words,
-    machine_ties,
-    main_cylinders,
-    moved_legs,
-    on_ties,
-    parametrization_of,
     platform_joints_at,
-    random_postures_of_legs,
-    ties_of,
 )
-from legcal.vision import Link, shared_cameras
+from legcal.machine.ties import Ties, by_step, independent, machine_ties, on_ties, ties_of
+from legcal.vision.board import Link
+from legcal.vision.camera import shared_cameras
 
 _TIMES = {2: "two", 3: "three", 4: "four"}
 SIGMA_PX = 0.1  # of an outline across a leg, in the image

@@ -31,18 +31,14 @@ from legcal.calibration.identify.steps import (
     offsets_from_distances,
     scalar_products,
 )
-from legcal.calibration.joint_fit import NO_CHOICES, Choices
+from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.errors import NotIdentifiable
-from legcal.estimation import GaussianPrior, compress, information_rows, marginal_rows
-from legcal.geometry import Array, IntArray
-from legcal.machine import (
-    SHOWN,
-    describe_direction,
-    pose_sensitivity,
-    sparse_basis,
-    split_by_motion,
-)
-from legcal.vision import Link
+from legcal.estimation.problem import GaussianPrior
+from legcal.estimation.square_root import compress, information_rows, marginal_rows
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.directions import SHOWN, describe_direction, sparse_basis, split_by_motion
+from legcal.machine.equations import pose_sensitivity
+from legcal.vision.board import Link
 
 _ERROR = 1e-3  # [m], the largest component of a direction whose effect is reported
 _HARMLESS = 1e-3  # of that: the platform does not move

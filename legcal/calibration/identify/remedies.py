@@ -37,11 +37,13 @@ from legcal.calibration.identify.steps import (
     by_all_parameters,
     offsets_from_distances,
 )
-from legcal.estimation import compress, eliminate, marginal_rows
-from legcal.geometry import Array, IntArray
-from legcal.machine import JointType, Machine, list_in_words
-from legcal.paper import Condition, count_conditions, three_legs_at_once
-from legcal.vision import Link
+from legcal.estimation.square_root import compress, eliminate, marginal_rows
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.directions import list_in_words
+from legcal.machine.leg import JointType
+from legcal.machine.model import Machine
+from legcal.paper.conditions import Condition, count_conditions, three_legs_at_once
+from legcal.vision.board import Link
 
 _CAMERA = 6  # unknowns of its pose
 _MOST_VIEWS = 4

@@ -9,8 +9,8 @@ from typing import Any
 from pydantic import Field
 
 from legcal.brief import brief
-from legcal.files import Document, SparseDocument
-from legcal.paper import Condition
+from legcal.files.schema import Document, SparseDocument
+from legcal.paper.conditions import Condition
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,12 @@ from legcal.calibration.identify.information import (
 from legcal.calibration.identify.ranks import Analysis, undetermined
 from legcal.calibration.identify.report import ScaleSource
 from legcal.calibration.joint_fit.variables import RefinementSettings
-from legcal.data import Dataset
-from legcal.estimation import GaussianPrior, Variables, all_free, information_rows, marginal_rows
-from legcal.geometry import Array, IntArray
-from legcal.machine import LegColumns, radius_name
-from legcal.vision import Link
+from legcal.data.dataset import Dataset
+from legcal.estimation.problem import GaussianPrior, Variables, all_free
+from legcal.estimation.square_root import information_rows, marginal_rows
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.leg import LegColumns, radius_name
+from legcal.vision.board import Link
 
 LENGTH_SIGMA = 5e-5  # [m] of a length that somebody measures
 _OPEN = 1e-6  # of their mean, in directions that are not determined: lengths are open

@@ -18,17 +18,12 @@ from legcal.calibration.identify.predicted_observations import (
     at_base_joints,
     at_platform_joints,
 )
-from legcal.estimation import compress, eliminate, grouped
-from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
-from legcal.machine import (
-    Actuator,
-    ActuatorColumns,
-    ActuatorKind,
-    EquationKind,
-    JointType,
-    LegColumns,
-)
-from legcal.paper import Carrier, CarrierColumns
+from legcal.estimation.square_root import compress, eliminate, grouped
+from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.actuator import Actuator, ActuatorColumns, ActuatorKind
+from legcal.machine.leg import EquationKind, JointType, LegColumns
+from legcal.paper.carriers import Carrier, CarrierColumns
 
 MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
 _MIN_DISTANCE = 1e-3  # mean leg lengths: nearer joints count as one

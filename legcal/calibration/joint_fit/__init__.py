@@ -27,7 +27,3 @@ that reject outlines and estimate their noise, checks of the result, its assembl
 Another kind of measurement is a class with a ``factor`` in ``factors`` and a line in its registry
 ``Observed``; what it depends on besides is a field of ``State`` and a block in ``problem``.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -16,15 +16,11 @@ from scipy.linalg import null_space
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import State, with_values
 from legcal.errors import NotIdentifiable
-from legcal.estimation import NormalEquations, inverse_on_range, marginal, named_information
-from legcal.geometry import Array, BoolArray
-from legcal.machine import (
-    SHOWN,
-    describe_direction,
-    pose_sensitivity,
-    sparse_basis,
-    split_by_motion,
-)
+from legcal.estimation.solver import NormalEquations, inverse_on_range
+from legcal.estimation.uncertainty import marginal, named_information
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.directions import SHOWN, describe_direction, sparse_basis, split_by_motion
+from legcal.machine.equations import pose_sensitivity
 
 _MAX_SIGMA = 0.1  # of the mean leg length
 _HELD_SIGMA = 0.01  # of it, where the platform does not move

@@ -22,25 +22,18 @@ from legcal.calibration.joint_fit.parameter_choices import Prior, board_scale
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.variables import Start, State, intrinsic_of
-from legcal.data import Outlines
+from legcal.data.outlines import Outlines
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
-from legcal.estimation import (
-    NormalEquations,
-    information,
-    inverse_on_range,
-    marginal,
-    named_information,
-)
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import (
-    Leg,
-    actuators_of,
-    list_in_words,
-    owner_of_parameter,
-    radius_name,
-)
-from legcal.perception import WRONG_WIDTH
-from legcal.vision import LINKS, Link, intrinsic_names, intrinsic_unit
+from legcal.estimation.solver import NormalEquations, information, inverse_on_range
+from legcal.estimation.uncertainty import marginal, named_information
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.directions import list_in_words
+from legcal.machine.leg import Leg, radius_name
+from legcal.machine.parameters import owner_of_parameter
+from legcal.machine.rods import actuators_of
+from legcal.perception.outline import WRONG_WIDTH
+from legcal.vision.board import LINKS, Link
+from legcal.vision.camera import intrinsic_names, intrinsic_unit
 
 _SIGNIFICANT = 5.0  # standard deviations between a prior and the measurements
 _MIN_INFORMATION = 1e-9  # of a prior's information: what measurements must have for a test

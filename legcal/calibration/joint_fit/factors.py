@@ -1,6 +1,6 @@
 """Measurements and their factors: outlines, readings, axes, and corners of calibration boards.
 
-Each kind is a class of arrays, one row a measurement, with the :class:`legcal.estimation.Factor`
+Each kind is a class of arrays, one row a measurement, with the ``Factor``
 that it is in the fit; :class:`Observed` registers the kinds. A measurement in an image depends on
 both ends of a leg in the camera frame; these depend on joints, camera and platform pose. Ends of an
 arm stand in their place where that is seen, and depend on its motor. Rotations change by Cayley's
@@ -21,21 +21,21 @@ import numpy as np
 
 from legcal.calibration.joint_fit.parameter_choices import Choices, joints_of_length
 from legcal.calibration.joint_fit.variables import FittedLegs, State
-from legcal.data import Corners, LegAxes, Measurements, Outlines, join_axes
+from legcal.data.axes import LegAxes, join_axes
+from legcal.data.corners import Corners
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError
-from legcal.estimation import Factor, Residuals, Touch
-from legcal.geometry import Array, BoolArray, IntArray, cross, whitener
-from legcal.machine import ActuatorColumns, JointMotion, LegColumns, LegKind, actuator_index
-from legcal.vision import (
-    EPSILON,
-    LINKS,
-    Camera,
-    FixedBoard,
-    Link,
-    intrinsic_names,
-    shared_cameras,
-    undistort_with_derivatives,
-)
+from legcal.estimation.problem import Factor, Residuals, Touch
+from legcal.geometry.covariances import whitener
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.actuator import ActuatorColumns, JointMotion
+from legcal.machine.leg import LegColumns, LegKind
+from legcal.machine.rods import actuator_index
+from legcal.vision.board import LINKS, FixedBoard, Link
+from legcal.vision.camera import Camera, intrinsic_names, shared_cameras, undistort_with_derivatives
+from legcal.vision.cylinder import EPSILON
 
 _SAME_GAMMA = 1e-6  # relative difference of gammas that count as one
 _SIX, _ALL, _ONE = slice(0, 6), slice(None), slice(0, 1)

@@ -46,17 +46,15 @@ from legcal.calibration.joint_fit.variables import (
     Start,
     State,
 )
-from legcal.data import LegAxes, Measurements, Outlines, are_of_arms
+from legcal.data.axes import LegAxes
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines, are_of_arms
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
-from legcal.estimation import (
-    Minimum,
-    Residuals,
-    information,
-    linearize,
-    named_covariance,
-)
-from legcal.geometry import Array
-from legcal.machine import Leg
+from legcal.estimation.problem import Residuals, linearize
+from legcal.estimation.solver import Minimum, information
+from legcal.estimation.uncertainty import named_covariance
+from legcal.geometry.types import Array
+from legcal.machine.leg import Leg
 
 _MAX_RADIUS_CHANGE = 0.5
 _COST_TOLERANCE = 1e-6  # relative: the same minimum

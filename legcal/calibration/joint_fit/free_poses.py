@@ -14,16 +14,12 @@ import numpy as np
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import LegConstraints, State
-from legcal.estimation import (
-    GaussianPrior,
-    Linearization,
-    PseudoHuber,
-    linearize,
-    minimise,
-    normal_equations,
-)
-from legcal.geometry import Array, BoolArray
-from legcal.machine import first_rods, freedoms, pose_equations
+from legcal.estimation.loss import PseudoHuber
+from legcal.estimation.problem import GaussianPrior, Linearization, linearize
+from legcal.estimation.solver import minimise, normal_equations
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.equations import freedoms, pose_equations
+from legcal.machine.rods import first_rods
 
 _SEED, _DRAWN = 1965, 16  # places from which every pose is looked for, beside where it is
 _TURN, _SHIFT = 0.4, 0.3  # of these from there [rad, mean leg lengths], one standard deviation

@@ -22,9 +22,11 @@ import numpy as np
 from legcal.calibration.joint_fit.outline_errors import GAMMA_SIGMA
 from legcal.calibration.joint_fit.rounds import with_edge_biases
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.data import Outlines, few_views
-from legcal.estimation import minimise, restricted_log_likelihood
-from legcal.geometry import Array
+from legcal.data.measurements import few_views
+from legcal.data.outlines import Outlines
+from legcal.estimation.solver import minimise
+from legcal.estimation.uncertainty import restricted_log_likelihood
+from legcal.geometry.types import Array
 
 GAMMA_RANGE = (1.0, 3.0)  # of gammas that are tried: linear, or encoded for screens
 GAMMA_STEP = 0.4  # of the logarithm

@@ -16,17 +16,14 @@ from legcal.calibration.joint_fit.factors import observed_outlines
 from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel, possible_biases
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import Postures, State
-from legcal.data import Measurements, Outlines
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines
 from legcal.errors import NotIdentifiable, NotVisible
-from legcal.estimation import (
-    Linearization,
-    NormalEquations,
-    explained_share,
-    information,
-    linearize,
-)
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import pose_differences
+from legcal.estimation.problem import Linearization, linearize
+from legcal.estimation.solver import NormalEquations, information
+from legcal.estimation.uncertainty import explained_share
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.kinematics import pose_differences
 
 
 @dataclass(frozen=True, eq=False)

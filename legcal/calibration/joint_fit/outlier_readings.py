@@ -1,6 +1,6 @@
 """Outliers among the readings of redundant motors: found, named, left out.
 
-Every reading is tested as it is before images are searched (:class:`legcal.machine.ReadingTests`),
+Every reading is tested as it is before images are searched (``ReadingTests``),
 here against all measurements. The first fits have rough readings, so that single wrong ones stand
 out; with the stated standard deviations they would bend the model, and outlines would seem to be
 wrong in their place.
@@ -17,19 +17,13 @@ import numpy as np
 from legcal.calibration.joint_fit.factors import ActuatorReadings, Readings
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import State
-from legcal.data import few
-from legcal.estimation import (
-    Linearization,
-    NormalEquations,
-    explained_share,
-    information,
-    linearize,
-    normal_equations,
-    score_test,
-)
-from legcal.files import SHOWN_IN
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import AS_LIKELY, MIN_REDUNDANCY, ROUGH_READING, ReadingTests
+from legcal.data.measurements import few
+from legcal.estimation.problem import Linearization, linearize
+from legcal.estimation.solver import NormalEquations, information, normal_equations
+from legcal.estimation.uncertainty import explained_share, score_test
+from legcal.files.quantity import SHOWN_IN
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.redundancy import AS_LIKELY, MIN_REDUNDANCY, ROUGH_READING, ReadingTests
 
 _FACTORS = "readings", "actuator_readings"
 _MOST_OF_MOTOR = 0.1  # of the readings of a motor that may be wrong by accident

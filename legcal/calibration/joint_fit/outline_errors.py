@@ -34,9 +34,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from legcal.calibration.joint_fit.factors import ObservedOutlines
-from legcal.data import few_views
-from legcal.estimation import Effects, estimate_variances, expected_variances
-from legcal.geometry import Array, BoolArray, IntArray, whitener
+from legcal.data.measurements import few_views
+from legcal.estimation.variances import Effects, estimate_variances, expected_variances
+from legcal.geometry.covariances import whitener
+from legcal.geometry.types import Array, BoolArray, IntArray
 
 _SUM = np.array([1.0, 1.0])
 _DIFFERENCE = np.array([-1.0, 1.0])

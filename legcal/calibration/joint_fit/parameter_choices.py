@@ -10,30 +10,22 @@ from typing import Literal
 
 import numpy as np
 
-from legcal.data import Action, Override, View
+from legcal.data.measurements import View
+from legcal.data.overrides import Action, Override
 from legcal.errors import DatasetError, UsageError
-from legcal.files import closest
-from legcal.geometry import Array
-from legcal.machine import (
-    Leg,
-    LegKind,
-    Machine,
+from legcal.files.schema import closest
+from legcal.geometry.types import Array
+from legcal.machine.leg import Leg, LegKind, radius_name
+from legcal.machine.model import Machine
+from legcal.machine.parameters import (
     free_coordinates,
     geometries,
     is_held_by_default,
     parametrization_of,
-    radius_name,
     vector_of,
 )
-from legcal.vision import (
-    FixedBoard,
-    Link,
-    board_name,
-    intrinsic_names,
-    intrinsic_unit,
-    intrinsic_values,
-    shared_cameras,
-)
+from legcal.vision.board import FixedBoard, Link, board_name
+from legcal.vision.camera import intrinsic_names, intrinsic_unit, intrinsic_values, shared_cameras
 
 
 @dataclass(frozen=True)

@@ -16,19 +16,14 @@ from legcal.brief import brief
 from legcal.calibration.joint_fit.sensitivity import Sensitivity
 from legcal.calibration.joint_fit.variables import platform_poses
 from legcal.errors import DidNotConverge
-from legcal.estimation import Frames
-from legcal.geometry import Array, BoolArray
-from legcal.machine import (
-    Leg,
-    LegKind,
-    Machine,
-    Parametrization,
-    geometries,
-    platforms_in_base,
-    pose_differences,
-    pose_sensitivity,
-    workspace,
-)
+from legcal.estimation.problem import Frames
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.configurations import workspace
+from legcal.machine.equations import pose_sensitivity
+from legcal.machine.kinematics import platforms_in_base, pose_differences
+from legcal.machine.leg import Leg, LegKind
+from legcal.machine.model import Machine
+from legcal.machine.parameters import Parametrization, geometries
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,31 +52,29 @@ from legcal.calibration.joint_fit.variables import (
     changed_cameras,
     intrinsic_of,
 )
-from legcal.data import LegAxes, Measurements, Outlines, row_names
+from legcal.data.axes import LegAxes
+from legcal.data.measurements import Measurements, row_names
+from legcal.data.outlines import Outlines
 from legcal.errors import NotIdentifiable
-from legcal.estimation import (
+from legcal.estimation.loss import PseudoHuber
+from legcal.estimation.problem import (
     NO_PRIOR,
     Frames,
     GaussianPrior,
     Problem,
-    PseudoHuber,
     Variables,
     all_free,
     fixed_at_start,
 )
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import (
-    ActuatorColumns,
-    Leg,
-    Parametrization,
-    freedoms,
-    is_held_by_default,
-    radius_name,
-    readings_of_rods,
-    wholly_tied,
-)
-from legcal.vision import (
-    LINKS,
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.actuator import ActuatorColumns
+from legcal.machine.equations import freedoms
+from legcal.machine.leg import Leg, radius_name
+from legcal.machine.parameters import Parametrization, is_held_by_default
+from legcal.machine.rods import readings_of_rods
+from legcal.machine.ties import wholly_tied
+from legcal.vision.board import LINKS
+from legcal.vision.camera import (
     Camera,
     intrinsic_names,
     intrinsic_unit,

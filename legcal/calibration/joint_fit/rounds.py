@@ -39,24 +39,13 @@ from legcal.calibration.joint_fit.outline_errors import (
 )
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
-from legcal.data import few
+from legcal.data.measurements import few
 from legcal.errors import DidNotConverge
-from legcal.estimation import (
-    GaussianPrior,
-    Minimum,
-    Residuals,
-    explained_share,
-    information,
-    linearize,
-    minimise,
-    normal_equations,
-    response,
-    robust_cost,
-    score_test,
-    scores_of_block,
-)
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.vision import EPSILON
+from legcal.estimation.problem import GaussianPrior, Residuals, linearize
+from legcal.estimation.solver import Minimum, information, minimise, normal_equations, robust_cost
+from legcal.estimation.uncertainty import explained_share, response, score_test, scores_of_block
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.vision.cylinder import EPSILON
 
 _NOMINAL_SIGMA = 0.1  # of the mean leg length, angles at it
 _BOARD_ROUNDS = 3

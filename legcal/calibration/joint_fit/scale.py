@@ -16,8 +16,11 @@ from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.sensitivity import Sensitivity
 from legcal.calibration.joint_fit.variables import State
 from legcal.errors import DidNotConverge, NotIdentifiable
-from legcal.geometry import Array
-from legcal.machine import LegColumns, actuators_of, kind_of_parameter, list_in_words
+from legcal.geometry.types import Array
+from legcal.machine.directions import list_in_words
+from legcal.machine.leg import LegColumns
+from legcal.machine.parameters import kind_of_parameter
+from legcal.machine.rods import actuators_of
 
 SCALE = "the scale, which radii alone say, by one standard deviation"
 _FEWEST = 3  # radii

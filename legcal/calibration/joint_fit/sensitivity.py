@@ -16,17 +16,13 @@ import numpy as np
 
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import LegConstraints, State, intrinsic_of
-from legcal.estimation import (
-    Linearization,
-    NormalEquations,
-    normal_equations,
-    residual_changes,
-    response,
-    score_test,
-)
-from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import LegColumns, is_held_by_default
-from legcal.vision import shared_cameras
+from legcal.estimation.problem import Linearization
+from legcal.estimation.solver import NormalEquations, normal_equations
+from legcal.estimation.uncertainty import residual_changes, response, score_test
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import LegColumns
+from legcal.machine.parameters import is_held_by_default
+from legcal.vision.camera import shared_cameras
 
 FOUND_CAMERA = "cameras as the measurements have them"  # where these contradict their files
 _FOCAL_PART = 0.01  # of the focal length: the error whose effect is reported

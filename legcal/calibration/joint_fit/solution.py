@@ -43,27 +43,24 @@ from legcal.calibration.joint_fit.sensitivity import (
     sensitivities,
 )
 from legcal.calibration.joint_fit.variables import State
-from legcal.data import Dataset, Order, Outlines, inverse, reorder_measurements
-from legcal.estimation import (
-    NormalEquations,
-    WorstDirection,
-    linearize,
-    named_covariance,
-    robust_cost,
-    worst_directions,
-)
-from legcal.geometry import Array, IntArray
-from legcal.machine import (
+from legcal.data.dataset import Dataset
+from legcal.data.image_tables import Order, inverse, reorder_measurements
+from legcal.data.outlines import Outlines
+from legcal.estimation.problem import linearize
+from legcal.estimation.solver import NormalEquations, robust_cost
+from legcal.estimation.uncertainty import WorstDirection, named_covariance, worst_directions
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.leg import (
     KinematicParameters,
     Leg,
-    Parametrization,
     parameters_of_legs,
-    parametrize,
     radius_name,
     with_platform_points,
 )
-from legcal.perception import TOO_FEW_LEGS
-from legcal.vision import Camera, Link
+from legcal.machine.parameters import Parametrization, parametrize
+from legcal.perception.photographs import TOO_FEW_LEGS
+from legcal.vision.board import Link
+from legcal.vision.camera import Camera
 
 _SIGNIFICANT = 5.0  # standard deviations of chi2
 ParameterStatus = Literal["estimated", "fixed", "weak"]

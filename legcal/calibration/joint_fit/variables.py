@@ -15,38 +15,30 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data import Measurements
+from legcal.data.measurements import Measurements
 from legcal.errors import DatasetError, DidNotConverge
-from legcal.estimation import Frames, Problem, Tangent
-from legcal.geometry import Array, BoolArray, IntArray, axis_angles_slope
-from legcal.machine import (
-    ActuatorColumns,
-    JointMotion,
-    Leg,
-    LegColumns,
-    Machine,
+from legcal.estimation.problem import Frames, Problem, Tangent
+from legcal.geometry.axes import axis_angles_slope
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.actuator import ActuatorColumns, JointMotion
+from legcal.machine.equations import PoseEquations, freedoms, posture_constraints
+from legcal.machine.leg import Leg, LegColumns
+from legcal.machine.model import Machine
+from legcal.machine.parameters import (
     Parametrization,
-    PoseEquations,
-    Ties,
-    actuator_index,
-    actuators_of,
-    first_rods,
-    freedoms,
     geometries,
-    independent,
     is_spatial,
     moved_legs,
     parametrize,
-    posture_constraints,
-    solve_poses,
-    solve_postures,
     tied_twist,
     tied_twist_slope,
-    ties_of,
     vector_of,
     with_numbers,
 )
-from legcal.vision import Camera, intrinsic_names, intrinsic_values, with_intrinsics
+from legcal.machine.rods import actuator_index, actuators_of, first_rods
+from legcal.machine.solved_poses import solve_poses, solve_postures
+from legcal.machine.ties import Ties, independent, ties_of
+from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 
 _RANK = 1e-7  # of the largest singular value
 _TIED, _TIE_STEPS = 1e-13, 20  # [m], and steps towards it
@@ -93,7 +85,7 @@ class Start:
 class Postures(NamedTuple):
     """Platform poses T_Rb_Re with the readings of actuators, which are unknowns beside each.
 
-    They move by 6 + n numbers each: those of :class:`legcal.estimation.Frames`, then readings.
+    They move by 6 + n numbers each: those of ``Frames``, then readings.
     """
 
     R: Array  # (n_poses, 3, 3)

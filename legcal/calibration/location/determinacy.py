@@ -25,8 +25,8 @@ from legcal.calibration.location.fit import (
 from legcal.calibration.location.frames import N_STEP, PosePairs, jacobian
 from legcal.calibration.location.tool_poses import ToolMeasurements
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, BoolArray
-from legcal.machine import random_poses
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.configurations import random_poses
 
 _MAX_SIGMA = 0.1  # [rad], and of the length of the machine: what is known worse is open
 _MACHINE_TOLERANCE = 2e-3  # of the best singular value: what no pose of a machine shows better

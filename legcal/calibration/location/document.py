@@ -13,18 +13,11 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.errors import DatasetError
-from legcal.files import (
-    FileSchema,
-    MotionEntry,
-    Number,
-    OutputFile,
-    Version,
-    motion_to_xyz_quat,
-    read_yaml,
-    validate,
-    with_schema,
-)
-from legcal.geometry import Array
+from legcal.files.folder import OutputFile
+from legcal.files.motions import MotionEntry, motion_to_xyz_quat
+from legcal.files.published import with_schema
+from legcal.files.schema import FileSchema, Number, Version, read_yaml, validate
+from legcal.geometry.types import Array
 
 LocatedFrame = Literal["base", "tool"]
 PoseComponent = Literal["position", "orientation"]

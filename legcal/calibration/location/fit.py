@@ -29,7 +29,7 @@ from legcal.calibration.location.frames import (
 )
 from legcal.calibration.location.search import kept_rows
 from legcal.calibration.location.tool_poses import PoseNoise, ToolMeasurements
-from legcal.estimation import (
+from legcal.estimation.problem import (
     Factor,
     Frames,
     GaussianPrior,
@@ -37,9 +37,9 @@ from legcal.estimation import (
     Residuals,
     Variables,
     all_free,
-    minimise,
 )
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.estimation.solver import minimise
+from legcal.geometry.types import Array, BoolArray, IntArray
 
 RANK_TOLERANCE = 1e-9  # of the largest singular value: what is below is open
 _MAX_ROUNDS = 30  # of frames and variances in turn

@@ -12,7 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array, BoolArray, IntArray, cross_matrices, moved_poses
+from legcal.geometry.motions import moved_poses
+from legcal.geometry.rotations import cross_matrices
+from legcal.geometry.types import Array, BoolArray, IntArray
 
 N_STEP = 12
 

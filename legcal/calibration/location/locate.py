@@ -28,11 +28,14 @@ from legcal.calibration.location.tool_poses import (
     read_tool_poses,
     tool_measurements,
 )
-from legcal.data import sigmas_of
+from legcal.data.reading_units import sigmas_of
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
-from legcal.files import describe, split_quantity
-from legcal.geometry import Array, pose_distance
-from legcal.machine import Machine, load_mechanism
+from legcal.files.quantity import split_quantity
+from legcal.files.schema import describe
+from legcal.geometry.motions import pose_distance
+from legcal.geometry.types import Array
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
 
 _MAX_OUTLIERS = 4  # a row of so many may disagree, and one of few
 _LARGE_RESIDUAL = 0.05  # residuals in parts of the spread of positions, and [rad]

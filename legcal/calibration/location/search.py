@@ -22,8 +22,9 @@ from legcal.calibration.location.frames import (
     jacobian,
     residuals,
 )
-from legcal.geometry import Array, BoolArray, IntArray, nearest_rotation
-from legcal.machine import solve
+from legcal.geometry.rotations import nearest_rotation
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.solver import solve
 
 _MAX_ROWS = 40  # that starts are tried on
 _SUBSETS = 30

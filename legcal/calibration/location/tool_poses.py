@@ -25,24 +25,20 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.brief import brief
 from legcal.calibration.location.frames import PosePairs, tool_motions
 from legcal.calibration.result_folder import RESULT_NAME, load_result
-from legcal.data import reading_columns, readings_in
+from legcal.data.measurements import reading_columns, readings_in
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
-from legcal.files import QUATERNION_TOLERANCE, Column, Table, read_table
-from legcal.geometry import Array, BoolArray, IntArray, cross_matrices, whitener
-from legcal.machine import (
-    RESULT_YAML,
-    Machine,
-    first_rods,
-    forward_kinematics_many,
-    freedoms,
-    geometries,
-    leg_scale,
-    parametrization_of,
-    platforms_in_base,
-    pose_equations,
-    pose_sensitivity,
-    readings_of_rods,
-)
+from legcal.files.motions import QUATERNION_TOLERANCE
+from legcal.files.table import Column, Table, read_table
+from legcal.geometry.covariances import whitener
+from legcal.geometry.rotations import cross_matrices
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.equations import freedoms, pose_equations, pose_sensitivity
+from legcal.machine.files import RESULT_YAML
+from legcal.machine.kinematics import forward_kinematics_many, platforms_in_base
+from legcal.machine.mobility import leg_scale
+from legcal.machine.model import Machine
+from legcal.machine.parameters import geometries, parametrization_of
+from legcal.machine.rods import first_rods, readings_of_rods
 
 MIN_SIGMA = 1e-9  # [m, rad]; nobody measures better, and files round
 MAX_ANGLE_SIGMA = 0.2  # [rad]; a larger one is none of a measured orientation

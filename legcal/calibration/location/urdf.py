@@ -14,9 +14,13 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.location.document import Location
 from legcal.errors import ModelError, UsageError
-from legcal.files import existing_parent, is_plain_name, temporary_folder
-from legcal.geometry import roll_pitch_yaw
-from legcal.machine import Machine, Urdf, UrdfPatch, load_mechanism, write_model
+from legcal.files.folder import existing_parent, temporary_folder
+from legcal.files.schema import is_plain_name
+from legcal.geometry.rotations import roll_pitch_yaw
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.model_writer import write_model
+from legcal.machine.urdf import Urdf, UrdfPatch
 
 WORLD = "world"
 TOOL = "tool"

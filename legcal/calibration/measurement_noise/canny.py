@@ -1,6 +1,6 @@
 """Outlines as the paper found them: Canny's edge points, and a line by least squares (4.2).
 
-The search for the edges is that of :func:`legcal.perception.measure`, so that both methods look at
+The search for the edges is that of ``measure``, so that both methods look at
 the same edges; the points are whole pixels, and the line through them is the one with the least sum
 of squared distances (total least squares). The thresholds follow the picture in the usual way: a
 share of all pixels is no edge. Nothing more is asked of the lines: that shading displaces them, and
@@ -13,18 +13,19 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from legcal.data import Outlines
-from legcal.geometry import Array
-from legcal.perception import (
+from legcal.data.outlines import Outlines
+from legcal.geometry.types import Array
+from legcal.perception.outline import (
     MIN_LONE_KEPT,
     ImageSearch,
-    LegPart,
     OutlineLine,
     PartLines,
     find_parts,
     outline_table,
 )
-from legcal.vision import Grey, least_length
+from legcal.perception.part_edges import LegPart
+from legcal.vision.image_file import Grey
+from legcal.vision.visibility import least_length
 
 SMOOTHING = 1.0  # of the picture before its gradient is taken [px]
 NO_EDGE = 0.9  # share of the pixels whose gradient is below the upper threshold

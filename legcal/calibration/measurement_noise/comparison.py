@@ -24,23 +24,23 @@ from legcal.calibration.measurement_noise.repeatability import (
     leg_orientations,
 )
 from legcal.calibration.ordered_dataset import order_dataset
-from legcal.data import Dataset, Measurements, Outlines, few, load_dataset, no_outlines
+from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.measurements import Measurements, few
+from legcal.data.outlines import Outlines, no_outlines
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible
-from legcal.geometry import Array, BoolArray
-from legcal.machine import forward_kinematics_many
-from legcal.perception import (
-    BEFORE_FIT,
-    Method,
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.kinematics import forward_kinematics_many
+from legcal.perception.diagnostics import BEFORE_FIT, hint_notes
+from legcal.perception.outline import Method, measure
+from legcal.perception.photographs import (
     Photographs,
-    Placement,
-    hint_notes,
-    measure,
     measure_photographs,
     nominal_placement,
     recognise_and_place,
 )
+from legcal.perception.placement import Placement
 from legcal.progress import Progress, Report, shown_progress
-from legcal.vision import EPSILON
+from legcal.vision.cylinder import EPSILON
 from legcal.workers import Workers, worker_pool
 
 _METHODS: dict[str, tuple[Method, str]] = {

@@ -18,9 +18,9 @@ from legcal.calibration.measurement_noise.repeatability import (
     Sample,
     pool,
 )
-from legcal.data import Dataset
-from legcal.files import Document
-from legcal.geometry import Array
+from legcal.data.dataset import Dataset
+from legcal.files.schema import Document
+from legcal.geometry.types import Array
 
 CALLED = {"detector": "detector", "canny": "Canny"}  # methods, in words
 _EVERY = (*QUANTITIES, OUTLINE)

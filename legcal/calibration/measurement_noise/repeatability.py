@@ -15,13 +15,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaincinv
 
-from legcal.data import LegAxes, Measurements, Outlines, along_legs, axes_from_outlines
+from legcal.data.axes import LegAxes, axes_from_outlines
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines, along_legs
 from legcal.errors import NotVisible
-from legcal.files import Document
-from legcal.geometry import Array, BoolArray, IntArray, cross
-from legcal.machine import Leg
-from legcal.perception import HIDDEN, OUTSIDE
-from legcal.vision import Camera, angles_of_direction
+from legcal.files.schema import Document
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import Leg
+from legcal.perception.outline import HIDDEN, OUTSIDE
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import angles_of_direction
 
 ANGLES = ("psi", "theta", "angle", "tilt")
 QUANTITIES = ("psi", "theta", "x", "z", "angle", "across", "tilt", "depth")  # of an axis

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from legcal.calibration import Calibration
-from legcal.pages import Gallery, Items, Page, Row, Section, Text, time_of_page
+from legcal.calibration.result import Calibration
+from legcal.pages.document import Gallery, Items, Page, Row, Section, Text
+from legcal.pages.html import time_of_page
 from legcal.report.page.crops import outline_crops
 from legcal.report.page.evidence import (
     correlation_blocks,

@@ -10,13 +10,15 @@ import cv2
 import numpy as np
 from markupsafe import Markup
 
-from legcal.calibration import Calibration
-from legcal.data import row_names
+from legcal.calibration.result import Calibration
+from legcal.data.measurements import row_names
 from legcal.errors import LegcalError
-from legcal.geometry import Array, Image, components
-from legcal.machine import arms_at, ends_at_poses, measured_readings
-from legcal.pages import Crop
-from legcal.vision import Camera, outlines_of_axis
+from legcal.geometry.motions import components
+from legcal.geometry.types import Array, Image
+from legcal.machine.rods import arms_at, ends_at_poses, measured_readings
+from legcal.pages.document import Crop
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import outlines_of_axis
 
 N_WORST, N_MEDIAN = 30, 10
 MAX_BYTES = 1_300_000  # of all pictures as they are written: pages of any size stay below 9 MB

@@ -12,10 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from legcal.calibration import UNITS, Calibration, ranks_of_dataset
-from legcal.data import OBSERVATIONS_NAME, Dataset
+from legcal.calibration.identify.identifiability import ranks_of_dataset
+from legcal.calibration.result import Calibration
+from legcal.calibration.summary import UNITS
+from legcal.data.dataset import OBSERVATIONS_NAME, Dataset
 from legcal.errors import LegcalError
-from legcal.pages import Cell, Drawing, Facts, Items, Table, Text, matrix, number
+from legcal.pages.document import Cell, Drawing, Facts, Items, Table, Text, number
+from legcal.pages.svg import matrix
 from legcal.report.identify import CONDITIONS
 from legcal.report.page.parameter_rows import correlation
 from legcal.version import __version__

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from legcal.calibration import UNITS, Calibration
-from legcal.geometry import Array
-from legcal.pages import Cell, Drawing, Table, change_bars, number
+from legcal.calibration.result import Calibration
+from legcal.calibration.summary import UNITS
+from legcal.geometry.types import Array
+from legcal.pages.document import Cell, Drawing, Table, number
+from legcal.pages.svg import change_bars
 
 _BY_PRIOR = 0.7  # of the standard deviation of a prior: beyond it the images say little
 _PARALLEL = 1e-9

@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from legcal.calibration import Calibration, PlatformMap, platform_map
-from legcal.geometry import Array
-from legcal.pages import Drawing, Plot, Row, Table, Text, histogram, number, number_grid
+from legcal.calibration.result import Calibration
+from legcal.calibration.workspace_errors import PlatformMap, platform_map
+from legcal.geometry.types import Array
+from legcal.pages.document import Drawing, Plot, Row, Table, Text, number
+from legcal.pages.svg import histogram, number_grid
 from legcal.report.page.residual_plots import FONT
 
 _FLAT = 1e-3  # of its extent: the height of a workspace in a plane

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
-from legcal.calibration import Calibration
-from legcal.data import row_names
-from legcal.geometry import Array, IntArray
-from legcal.pages import Plot, plain
+from legcal.calibration.result import Calibration
+from legcal.data.measurements import row_names
+from legcal.geometry.types import Array, IntArray
+from legcal.pages.document import Plot, plain
 
 _MAX_WORD = 14  # letters of a name at an axis
 MAX_POINTS = 3000  # of a chart: what a browser draws at once

@@ -7,22 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from legcal.calibration import Calibration
-from legcal.data import row_names
-from legcal.geometry import Array, components
-from legcal.machine import MOTOR_COLOUR, Leg, geometries, moved_legs
-from legcal.pages import Plot, plain
+from legcal.calibration.result import Calibration
+from legcal.data.measurements import row_names
+from legcal.geometry.motions import components
+from legcal.geometry.types import Array
+from legcal.machine.drawing import MOTOR_COLOUR
+from legcal.machine.leg import Leg
+from legcal.machine.parameters import geometries, moved_legs
+from legcal.pages.document import Plot, plain
 from legcal.report.page.residual_plots import FONT
-from legcal.scene import (
-    FACTORS,
-    PlacedModel,
-    around,
-    directions,
-    ellipsoids,
-    enlargement,
-    placed_model,
-    pyramid,
-)
+from legcal.scene.motions import FACTORS, PlacedModel, directions, placed_model
+from legcal.scene.shapes import around, ellipsoids, enlargement, pyramid
 
 MAX_POSES = 60  # of the slider
 MAX_CAMERAS = 60

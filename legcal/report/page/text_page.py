@@ -14,7 +14,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table as TextTable
 from rich.text import Text as TextLine
 
-from legcal.pages import (
+from legcal.pages.document import (
     Cell,
     Facts,
     Items,
@@ -25,8 +25,8 @@ from legcal.pages import (
     Table,
     Text,
     Verdict,
-    time_of_page,
 )
+from legcal.pages.html import time_of_page
 from legcal.version import __version__
 
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")  # that begins a cell: it sorts by its value

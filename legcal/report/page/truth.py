@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from legcal.calibration import UNITS, Calibration, Evaluation, evaluate
-from legcal.machine import Machine
-from legcal.pages import Drawing, Text, error_bars
+from legcal.calibration.evaluation import Evaluation, evaluate
+from legcal.calibration.result import Calibration
+from legcal.calibration.summary import UNITS
+from legcal.machine.model import Machine
+from legcal.pages.document import Drawing, Text
+from legcal.pages.svg import error_bars
 
 
 def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) -> list[Any]:

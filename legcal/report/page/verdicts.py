@@ -6,8 +6,10 @@ import shlex
 
 import numpy as np
 
-from legcal.calibration import Calibration, Check, Identifiability
-from legcal.pages import Light, Verdict
+from legcal.calibration.identify.report import Identifiability
+from legcal.calibration.result import Calibration
+from legcal.calibration.verification import Check
+from legcal.pages.document import Light, Verdict
 
 _WORDS: dict[Light, str] = {
     "good": "Use it",

@@ -5,12 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from legcal.calibration import REPORT_NAME
-from legcal.machine import RESULT_YAML, Machine, load_mechanism
-from legcal.pages import PAGE, Page, page_html
+from legcal.calibration.result_folder import REPORT_NAME
+from legcal.machine.files import RESULT_YAML
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.pages.document import Page
+from legcal.pages.html import PAGE, page_html
 
 if TYPE_CHECKING:
-    from legcal.calibration import Calibration
+    from legcal.calibration.result import Calibration
 
 
 def write_page(page: Page, path: Path) -> None:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from legcal.errors import UsageError
-from legcal.files import closest, describe
+from legcal.files.schema import closest, describe
 from legcal.simulation.rendering.pipeline import CAMERAS, CameraPipeline
 from legcal.simulation.rendering.rays import Single
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.simulation.rendering.appearance import mottled
 from legcal.simulation.rendering.rays import (
     Faces,

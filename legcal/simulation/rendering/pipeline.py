@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from legcal.errors import OutOfResources
-from legcal.geometry import Image
+from legcal.geometry.types import Image
 from legcal.simulation.rendering.rays import Single
 
 Subsampling = Literal["4:4:4", "4:2:2", "4:2:0"]

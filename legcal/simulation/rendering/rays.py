@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, IntArray
+from legcal.geometry.types import Array, IntArray
 from legcal.simulation.solids import Box, Material, Mesh, PlacedSolid, Shape, SolidCylinder, Sphere
-from legcal.vision import Camera
+from legcal.vision.camera import Camera
 
 Single = NDArray[np.float32]
 Faces = NDArray[np.integer[Any]]

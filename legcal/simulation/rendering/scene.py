@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array, BoolArray, Image, IntArray
+from legcal.geometry.types import Array, BoolArray, Image, IntArray
 from legcal.simulation.rendering.appearance import SAMPLES, Appearance, background
 from legcal.simulation.rendering.light import (
     CoarseSurface,
@@ -42,7 +42,7 @@ from legcal.simulation.solids import (
     SolidCylinder,
     Sphere,
 )
-from legcal.vision import Camera
+from legcal.vision.camera import Camera
 
 _TABLE = Material(albedo=0.22, specular=0.06, shininess=12.0, limb=0.0, texture=0.08,
                   tint=(1.15, 1.0, 0.85))  # fmt: skip
