@@ -94,6 +94,7 @@ PUBLIC: dict[str, set[str]] = {
         "photograph_notes",
         "reading_units",
         "readings_sheet",
+        "reasons",
     },
     "recordings": {"importing"},
     "estimation": {
@@ -112,7 +113,6 @@ PUBLIC: dict[str, set[str]] = {
         "board_poses",
         "camera_search",
         "candidate_pairs",
-        "detection",
         "diagnostics",
         "free_poses",
         "image_quality",

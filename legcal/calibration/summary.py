@@ -22,6 +22,7 @@ from legcal.calibration.documents import (
 )
 from legcal.calibration.link_joints import FRAMES, joints_title, mark_in_words
 from legcal.calibration.plots import plot_uncertainty
+from legcal.data.reasons import reason_in_words
 from legcal.errors import OutOfResources
 from legcal.machine.directions import list_in_words
 from legcal.vision.board import LINKS, Link
@@ -321,7 +322,7 @@ def _observation_lines(result: Result) -> list[str]:
             "their table gives."
         ]
     most = sorted(seen.rejected.items(), key=lambda one: -one[1])[:_MAX_REASONS]
-    rejected = ", ".join(f"{count} {reason}" for reason, count in most)
+    rejected = ", ".join(f"{count} {reason_in_words(reason)}" for reason, count in most)
     lines = [f"Outlines: {seen.used} of {seen.total} used{f'; rejected: {rejected}' * bool(most)}."]
     if seen.total == 0:  # boards are the whole measurement
         lines = ["Outlines: none, no leg was measured."]

@@ -23,6 +23,7 @@ from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.variables import Start, State, intrinsic_of
 from legcal.data.outlines import Outlines
+from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.solver import NormalEquations, information, inverse_on_range
 from legcal.estimation.uncertainty import marginal, named_information
@@ -31,7 +32,6 @@ from legcal.machine.directions import list_in_words
 from legcal.machine.leg import Leg, radius_name
 from legcal.machine.parameters import owner_of_parameter
 from legcal.machine.rods import actuators_of
-from legcal.perception.outline import WRONG_WIDTH
 from legcal.vision.board import LINKS, Link
 from legcal.vision.camera import intrinsic_names, intrinsic_unit
 
@@ -444,7 +444,7 @@ def arms_of_other_widths(outlines: Outlines, is_arm: BoolArray) -> dict[int, str
     *is_arm* says which outlines of the table are of arms. Both edges of another shape, or of
     another radius, are found in most images, and those that are used pass by chance.
     """
-    is_wide = np.array([why.startswith(WRONG_WIDTH) for why in outlines.reason], dtype=np.bool_)
+    is_wide = outlines.rejected_for(Reason.WIDTH)
     found = dict[int, str]()
     for leg in np.unique(outlines.leg[is_arm & outlines.used]).tolist():
         own = is_arm & (outlines.leg == leg)
