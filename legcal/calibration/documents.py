@@ -38,6 +38,7 @@ from legcal.files.schema import (
 )
 from legcal.machine.actuator import Actuator
 from legcal.machine.inspection import ActuatorBlock
+from legcal.machine.parameter_id import ParameterId
 from legcal.vision.board import Link
 
 AxesByLeg = dict[str, Triple]  # unit vectors
@@ -72,7 +73,8 @@ class ParameterRow(SparseDocument):
     @property
     def is_shown(self) -> bool:
         """Whether tables have it: they leave out gains of motors that are fixed at 1."""
-        return not (self.name.endswith(".gain") and self.status == "fixed" and self.value == 1.0)
+        is_gain = ParameterId.parse(self.name).kind == "gain"
+        return not (is_gain and self.status == "fixed" and self.value == 1.0)
 
 
 class Kinematic(Document):

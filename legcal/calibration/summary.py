@@ -25,6 +25,7 @@ from legcal.calibration.plots import plot_uncertainty
 from legcal.data.reasons import reason_in_words
 from legcal.errors import OutOfResources
 from legcal.machine.directions import list_in_words
+from legcal.machine.parameter_id import ParameterId
 from legcal.vision.board import LINKS, Link
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ class ParameterTable:
         """Return the table of a result, joint centres in R_b and R_e or left out."""
         rows, digits = [], []
         for row in result.parameters:
-            if not row.is_shown or (not joints and row.name.endswith(_COORDINATES)):
+            if not row.is_shown or (not joints and ParameterId.parse(row.name).is_joint_coordinate):
                 continue
             scale, unit, n = UNITS[row.unit]
             value, nominal = scale * row.value, scale * row.nominal
@@ -184,7 +185,6 @@ class ParameterTable:
 
 _CALIBRATED = ("nominal", "calibrated", "change", "sigma")
 NUMBERS = {*_CALIBRATED, "in_frame", *(f"in {frame}" for frame in FRAMES.values())}
-_COORDINATES = tuple(f".{side}.{axis}" for side in LINKS for axis in "xyz")
 
 
 def _cell(column: str, x: Any, digits: int) -> str:

@@ -63,7 +63,7 @@ class Reason(StrEnum):
 
 
 # In words: without a detail, and with one.
-WORDS_BY_CODE = {
+WORDS_BY_CODE: dict[str, tuple[str, str]] = {
     Reason.NONE: ("", ""),
     Reason.OUTSIDE: ("outside the image", ""),
     Reason.HIDDEN: ("hidden by another leg", "hidden by {}"),
@@ -173,9 +173,9 @@ def reason_in_words(code: str) -> str:
 
 _CODES = frozenset(map(str, Reason))
 _SENTENCES = [  # of versions that stored sentences; the ones with a detail first
-    (re.compile(re.escape(words).replace(r"\{\}", "(.+)")), reason)
+    (re.compile(re.escape(words).replace(r"\{\}", "(.+)")), Reason(code))
     for k in (1, 0)
-    for reason, both in WORDS_BY_CODE.items()
+    for code, both in WORDS_BY_CODE.items()
     if (words := both[k]) not in ("", "{}")
 ]
 
