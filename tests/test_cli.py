@@ -161,6 +161,28 @@ def test_a_command_that_does_not_parse_is_told_with_where_its_options_are(
     assert f"; legcal {words[0]} --help lists" in line
 
 
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("simulate", "hexapod", "-o", "x", "--poses="), ("empty text", "--poses=")),
+        (
+            ("calibrate", "x", "--check", "y", "--criteria", "literal", "--holdout", "0.2"),
+            ("--criteria", "--holdout", "--check"),
+        ),
+        (("calibrate", "x", "--check", "y", "--significance", "1"), ("significance 1", "0.5")),
+    ],
+)
+def test_options_without_sense_are_refused_by_name(
+    words: tuple[str, ...],
+    named: tuple[str, ...],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(monkeypatch, *words) == 2
+    said = capsys.readouterr().err
+    assert [word for word in named if word not in said] == []
+
+
 @pytest.mark.parametrize("workers", ["0", "-1", "257", "1000000"])
 @pytest.mark.parametrize("words", [("detect", "x", "-o", "y"), ("study", "paper", "-o", "y")])
 def test_impossible_numbers_of_processes_are_refused_before_any_is_started(
