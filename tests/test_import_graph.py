@@ -132,7 +132,6 @@ PUBLIC: dict[str, set[str]] = {
         "documents",
         "evaluation",
         "examination",
-        "fleet",
         "identify.identifiability",
         "identify.predicted_observations",
         "identify.report",
@@ -164,7 +163,6 @@ PUBLIC: dict[str, set[str]] = {
     "report": {
         "calibration",
         "doctor",
-        "fleet",
         "identify",
         "images",
         "machine",
