@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from command_line import run as run_command
 from dataset_folder import HEXAPOD, Folder, folder
-from pool_work import keep_row, row_zero_after_row_five
+from pool_work import row_zero_after_row_five
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import load_dataset, load_mechanism
@@ -28,24 +28,13 @@ from legcal.errors import DatasetError, ModelError, OutOfResources, UsageError
 from legcal.files.folder import check_destination, result_folder, write_atomically
 from legcal.files.schema import closest, parse_yaml
 from legcal.signals import raise_if_stopped, stopped_by_signals
-from legcal.workers import KeptArrays, Run, worker_pool
+from legcal.workers import Run, worker_pool
 
 __all__ = ["folder"]
 
 LONG = "a" * 400
 Handler = Callable[[int, FrameType | None], object]
 
-KEPT = """
-from functools import partial
-from pool_work import keep_row
-from legcal.workers import KeptArrays, worker_pool
-
-kept = KeptArrays(12, 8 * 24)
-with worker_pool(2) as run:
-    print(*(sum(run(partial(keep_row, kept), range(12))) for _ in range(2)))
-values = [kept.get(row) for row in range(12)]
-print(all(one is None or (one == row).all() for row, one in enumerate(values)))
-"""
 POOL = """
 import multiprocessing, os, time
 from legcal.workers import worker_pool
@@ -251,25 +240,6 @@ def test_results_come_as_they_are_finished_and_rows_are_taken_as_processes_get_f
     assert sorted([first, *rest]) == taken == list(range(40))
     (tmp_path / "done").unlink()
     assert list(two_processes(work, range(6))) == list(range(6))
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="needs memory files")
-def test_what_a_process_keeps_others_find_while_there_is_room() -> None:
-    kept = KeptArrays(12, 8 * 24)
-    before = KeptArrays(3, 100)
-    kept.keep(0, np.arange(6, dtype=np.uint8).reshape(2, 3))
-    assert before.get(0) is None
-    with worker_pool(1) as run:
-        assert list(run(partial(keep_row, kept), [0, 1, 1])) == [True, False, True]
-    found = kept.get(0)
-    assert found is not None
-    assert found.dtype == np.uint8
-    np.testing.assert_array_equal(found, [[0, 1, 2], [3, 4, 5]])
-    program = subprocess.run(
-        [sys.executable, "-c", KEPT], capture_output=True, text=True, check=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-    assert program.stdout.split() == ["0", "8", "True"]
 
 
 @pytest.mark.system

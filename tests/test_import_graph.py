@@ -183,7 +183,6 @@ PUBLIC: dict[str, set[str]] = {
 OUTSIDE = {
     "__main__",
     "brief",
-    "cluster",
     "errors",
     "figures",
     "option_fields",
