@@ -110,44 +110,29 @@ def worker_pool(
     UsageError
         If workers cannot be used.
     """
-    if not is_number(workers):
-        with _given(cast("str | Submitter", workers), failure) as (submit, slots):
-            yield partial(_results, submit, slots, in_order)
-        return
-    if not isinstance(workers, SupportsIndex):
-        raise UsageError(
-            f"{failure}: found {type(workers).__name__} as workers, needed a number of processes, "
-            "the address of a Dask scheduler, or an object with submit as executors have it; give "
-            "one."
-        )
-    if workers <= 1:
+    if isinstance(workers, SupportsIndex) and workers <= 1:
         yield in_turn
         return
     with _told_if_ended(failure), ExitStack() as stack:
-        started = cache(lambda: stack.enter_context(_processes(workers)))
-
-        def run(task: Callable[[S], T], rows: Iterable[S], /) -> Iterable[T]:
-            return _results(started().submit, workers, in_order, task, rows)
-
-        yield run
-
-
-@contextmanager
-def _given(workers: str | Submitter, failure: str) -> Iterator[tuple[_Submit, int]]:
-    """Give what submits calls to workers that this module does not start, and their number."""
-    if isinstance(workers, str):
-        client = _client(workers, failure)
-        try:
-            with _cluster(client, failure) as cluster:
-                yield cluster
-        finally:
-            client.close(timeout=2)
-    elif hasattr(workers, "get_executor"):
-        with _cluster(workers, failure) as cluster:
-            yield cluster
-    else:
-        with _told_if_ended(failure):
-            yield workers.submit, getattr(workers, "_max_workers", None) or processors()
+        submit: _Submit
+        if isinstance(workers, SupportsIndex):
+            started = cache(lambda: stack.enter_context(_processes(workers)))
+            submit, slots = lambda *call: started().submit(*call), int(workers)
+        elif isinstance(workers, str):
+            client = _client(workers, failure)
+            stack.callback(client.close, timeout=2)
+            submit, slots = stack.enter_context(_cluster(client, failure))
+        elif hasattr(workers, "get_executor"):
+            submit, slots = stack.enter_context(_cluster(workers, failure))
+        elif hasattr(workers, "submit"):
+            submit, slots = workers.submit, getattr(workers, "_max_workers", None) or processors()
+        else:
+            raise UsageError(
+                f"{failure}: found {type(workers).__name__} as workers, needed a number of "
+                "processes, the address of a Dask scheduler, or an object with submit as executors "
+                "have it; give one."
+            )
+        yield partial(_results, submit, slots, in_order)
 
 
 # Handing out
@@ -336,7 +321,7 @@ def _cluster(client: Any, failure: str) -> Iterator[tuple[_Submit, int]]:
     Dask has another worker do what a worker that dies was working on.
     """
     from distributed import TimeoutError as NoWorker
-    from distributed.comm import CommClosedError
+    from distributed.comm.core import CommClosedError
     from distributed.scheduler import KilledWorker
 
     address = client.scheduler.address

@@ -10,11 +10,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 import pytest
@@ -33,7 +32,6 @@ from legcal.workers import Run, worker_pool
 __all__ = ["folder"]
 
 LONG = "a" * 400
-Handler = Callable[[int, FrameType | None], object]
 
 POOL = """
 import multiprocessing, os, time
@@ -47,16 +45,7 @@ if __name__ == "__main__":
 """
 
 
-@contextmanager
-def handled(number: signal.Signals, by: signal.Handlers | Handler) -> Iterator[None]:
-    """Handle a signal in one way for a while, whatever the tests were started under."""
-    before = signal.signal(number, by)
-    try:
-        yield
-    finally:
-        signal.signal(number, before)
-
-
+@pytest.mark.usefixtures("answered_signals")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_the_first_signal_interrupts_and_the_second_ends_the_process(name: str) -> None:
     number, ended = signal.Signals[name], []
@@ -71,50 +60,27 @@ def test_the_first_signal_interrupts_and_the_second_ends_the_process(name: str) 
                 raise_if_stopped()
             ended.append(True)
 
-    with handled(number, signal.default_int_handler):
-        with pytest.raises(KeyboardInterrupt):
-            work()
-        assert ended
-        assert signal.getsignal(number) is signal.default_int_handler
+    before = signal.getsignal(number)
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert ended
+    assert signal.getsignal(number) is before
     raise_if_stopped()
 
 
-def test_an_interrupt_that_is_swallowed_is_raised_again_but_not_in_its_clean_up(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    cleaned = []
-    monkeypatch.setattr("legcal.signals._AGAIN", 0.2)
-
-    @stopped_by_signals()
-    def work() -> None:
-        try:
-            with suppress(KeyboardInterrupt):
-                signal.raise_signal(signal.SIGINT)
-            time.sleep(20.0)
-        finally:
-            time.sleep(0.3)
-            cleaned.append(True)
-
-    with handled(signal.SIGINT, signal.default_int_handler), pytest.raises(KeyboardInterrupt):
-        work()
-    assert cleaned
-
-
-@pytest.mark.parametrize("error", [ImportError("numpy"), SystemExit(0), None])
-def test_a_block_that_heard_a_signal_is_interrupted_whatever_came_of_it(
-    error: BaseException | None,
-) -> None:
+@pytest.mark.usefixtures("answered_signals")
+def test_an_error_that_a_library_made_of_a_signal_is_an_interrupt() -> None:
     @stopped_by_signals()
     def work() -> None:
         with suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
-        if error is not None:
-            raise error
+        raise ImportError("numpy")
 
-    with handled(signal.SIGINT, signal.default_int_handler), pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt):
         work()
 
 
+@pytest.mark.usefixtures("answered_signals")
 def test_nothing_is_written_once_a_signal_was_heard(tmp_path: Path) -> None:
     def write_file() -> None:
         write_atomically(tmp_path / "file", b"new")
@@ -131,18 +97,18 @@ def test_nothing_is_written_once_a_signal_was_heard(tmp_path: Path) -> None:
             with pytest.raises(KeyboardInterrupt):
                 write()
 
-    with handled(signal.SIGINT, signal.default_int_handler), pytest.raises(KeyboardInterrupt):
-        work()
+    work()
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("answered_signals")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGHUP"])
 def test_a_signal_that_was_ignored_stays_so(name: str) -> None:
     number = signal.Signals[name]
-    with handled(number, signal.SIG_IGN):
-        with stopped_by_signals():
-            signal.raise_signal(number)
-        assert signal.getsignal(number) is signal.SIG_IGN
+    signal.signal(number, signal.SIG_IGN)
+    with stopped_by_signals():
+        signal.raise_signal(number)
+    assert signal.getsignal(number) is signal.SIG_IGN
 
 
 @pytest.mark.system
