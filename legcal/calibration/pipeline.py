@@ -176,7 +176,6 @@ def calibrate(
         *found.solution.notes,
         *_camera_notes(dataset, found.solution),
         *exact_cameras(dataset, choices),
-        *pool.notes,
     ]
     calibration = judge(
         dataset_at(dataset, fitted),
