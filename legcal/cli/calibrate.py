@@ -41,6 +41,24 @@ def _refuse_fleet(given: object) -> None:
         )
 
 
+def _refuse_old(parameter: typer.CallbackParam, given: list[str] | None) -> None:
+    """Refuse an option of earlier versions with its new spelling."""
+    if given:
+        option = parameter.opts[0]
+        new = " ".join(f"--set {text}{'=free' * (option == '--free')}" for text in given)
+        old = " ".join(f"{option} {text}" for text in given)
+        raise UsageError(f"The command could not be run: {old} is now written {new}.")
+
+
+def _refuse_significance(given: float | None) -> None:
+    """Refuse an option of earlier versions."""
+    if given is not None:
+        raise UsageError(
+            "The command could not be run: --significance is gone; call "
+            f"legcal.check(dataset, result, significance={given:g}) in Python."
+        )
+
+
 def calibrate(
     datasets: Annotated[
         list[Path], typer.Argument(metavar="DATASET", help="The folder that holds dataset.yaml.")
@@ -70,11 +88,14 @@ def calibrate(
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Detect again, even where a cached detection fits.")
     ] = False,
-    prior: Annotated[
+    settings: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME=VALUE+-SIGMA",
-            help="What is known already: leg1.length=0.4200+-0.0001, or 420+-0.1mm.",
+            "--set",
+            metavar="NAME[=VALUE[±SIGMA]]",
+            help="NAME holds a parameter at its nominal value, NAME=VALUE at that one, "
+            "NAME=VALUE±SIGMA (or +-) says how well it is known (leg1.length=420±0.1mm), NAME=free "
+            "estimates it without a prior (c1.f?, *.radius.*).",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None,
@@ -85,23 +106,6 @@ def calibrate(
             help="A distance of two joints that was measured by hand: "
             "leg1.base:leg3.base=400+-0.05mm, or both ends of a rod. Motors that turn carry no "
             "length: one fixes the scale.",
-            rich_help_panel=_PARAMETERS,
-        ),
-    ] = None,
-    fix: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME[=VALUE]",
-            help="Fix at the nominal value, or at a given one.",
-            rich_help_panel=_PARAMETERS,
-        ),
-    ] = None,
-    free: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Estimate what is fixed otherwise (camera), and what has a prior (radii, twists, "
-            "calibrated cameras) without one.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None,
@@ -149,13 +153,11 @@ def calibrate(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", hidden=True, callback=_refuse_fleet)] = False,
     workers: WorkersOption = None,
+    fix: Annotated[list[str] | None, typer.Option(hidden=True, callback=_refuse_old)] = None,
+    free: Annotated[list[str] | None, typer.Option(hidden=True, callback=_refuse_old)] = None,
+    prior: Annotated[list[str] | None, typer.Option(hidden=True, callback=_refuse_old)] = None,
     significance: Annotated[
-        float | None,
-        typer.Option(
-            metavar="P",
-            help="With --check: probability of a false alarm; 0.01 by default.",
-            rich_help_panel=_TESTS,
-        ),
+        float | None, typer.Option(hidden=True, callback=_refuse_significance)
     ] = None,
 ) -> None:
     """Compute the calibrated model from images and encoder readings, or check an earlier one."""
@@ -164,10 +166,8 @@ def calibrate(
     dataset = datasets[0]
     if check is not None:
         others = {
-            "--prior": prior,
+            "--set": settings or None,
             "--length": length,
-            "--fix": fix,
-            "--free": free,
             "--holdout": holdout,
             "--fresh": fresh or None,
             "--criteria": None if criteria == "default" else criteria,
@@ -183,13 +183,8 @@ def calibrate(
             )
         page = None if output is None or not with_report else _page_of_check(output)
         on = image_workers(cluster, workers)
-        _check(dataset, check, significance, page, on, quiet=quiet, as_json=as_json)
+        _check(dataset, check, page, on, quiet=quiet, as_json=as_json)
         return
-    if significance is not None:
-        raise UsageError(
-            "The significance could not be used: found --significance without --check, needed the "
-            "result to test; name it or leave the significance out."
-        )
     if output is None:
         raise UsageError(
             "The calibration could not be run: found no --output (-o), needed the result folder to "
@@ -203,6 +198,7 @@ def calibrate(
     with loading():
         from legcal.calibration import pipeline
         from legcal.calibration.result_folder import REPORT_NAME
+        from legcal.data.overrides import overrides_of_settings
         from legcal.pages.html import PAGE
         from legcal.report import calibration
         from legcal.report.page.writing import write_report
@@ -212,12 +208,11 @@ def calibrate(
         "criteria": criteria,
         "transformation": transformation,
         "use_cache": not fresh,
-        "priors": [*(prior or ()), *_lengths(length or ())],
-        "fixed": fix or (),
-        "free": free or (),
         "holdout": holdout,
         "overlays": overlays,
     }
+    arguments |= overrides_of_settings(settings or ())
+    arguments["priors"] += _lengths(length or ())
     page = output / REPORT_NAME
     if with_report and page.exists():
         PAGE.check_place(page)
@@ -301,7 +296,6 @@ def _lengths(stated: Sequence[str]) -> list[str]:
 def _check(
     dataset: Path,
     result: Path,
-    significance: float | None,
     page: Path | None,
     workers: int | str,
     *,
@@ -309,14 +303,13 @@ def _check(
     as_json: bool,
 ) -> None:
     """Test an earlier result with new images."""
-    from legcal.calibration.verification import SIGNIFICANCE, check
+    from legcal.calibration.verification import check
     from legcal.report.calibration import check_summary
     from legcal.report.page.verdicts import check_verdict
 
     found = check(
         dataset,
         result,
-        significance=SIGNIFICANCE if significance is None else significance,
         progress=not quiet,
         workers=workers,
     )

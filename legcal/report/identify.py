@@ -244,7 +244,7 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
         if report.scale:
             lines.append(
                 "But for the scale: calibrate refuses this machine until a length or radii are "
-                "stated (--length, --prior), or a board is seen."
+                "stated (--length, --set), or a board is seen."
             )
         if not report.staged.complete:
             lines.append("The steps alone do not: calibration starts from the nominal model.")

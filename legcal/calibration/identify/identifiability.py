@@ -479,7 +479,7 @@ def _refusal(dataset: Dataset, report: Identifiability) -> str:
         f"{dataset.folder}: the parameters cannot be identified: found that these views and poses "
         f"determine {report.full.rank} of {report.full.of} at best and leave open "
         f"{_directions(report.full, harmless=False)}, needed everything that moves the platform; "
-        f"{remedy}, or state what is known of them with --prior."
+        f"{remedy}, or state what is known of them with --set."
     )
 
 

@@ -122,7 +122,7 @@ def _refuse_other_size(
             f"The calibration board{which} does not fit the readings and the legs: found that it "
             f"is {size} the dataset says ({found.apart:.0f} standard deviations away), needed its "
             f"dimensions to {1e2 * sigma:.2g} %; measure the board and correct its dimensions in "
-            f"dataset.yaml, or let the fit find them (--free {name})."
+            f"dataset.yaml, or let the fit find them (--set {name}=free)."
         )
 
 
