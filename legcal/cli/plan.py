@@ -120,7 +120,7 @@ def plan(
             show_default=False,
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of all that is drawn.")] = 0,
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier plan there.")] = False,

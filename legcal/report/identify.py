@@ -235,7 +235,7 @@ def _remedies(report: Identifiability) -> Table:
 
 
 def _verdict(report: Identifiability) -> list[str | RenderableType]:
-    """Return what follows."""
+    """Return the verdict and the remedies."""
     harmless = sum(weak.harmless for weak in report.full.weak)
     lines: list[str | RenderableType] = []
     if report.identifiable:

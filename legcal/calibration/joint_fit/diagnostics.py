@@ -276,7 +276,7 @@ def _wide_prior(problem: FitProblem, state: State, name: str, value: float, sigm
 
 
 def _fitted(problem: FitProblem, state: State) -> tuple[Fit, HeldDirections]:
-    """Return the fit with what was fixed free, and what it holds."""
+    """Fit again with the fixed parameters free; return the fit and the directions it holds."""
     first = first_minimum(problem, state)
     normal = information(problem, first.state, first.linear, problem.loss)
     held = open_directions(problem, first.state, normal)
