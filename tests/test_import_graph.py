@@ -133,7 +133,6 @@ PUBLIC: dict[str, set[str]] = {
         "documents",
         "evaluation",
         "examination",
-        "fleet",
         "identify.identifiability",
         "identify.predicted_observations",
         "identify.report",
@@ -165,7 +164,6 @@ PUBLIC: dict[str, set[str]] = {
     "report": {
         "calibration",
         "doctor",
-        "fleet",
         "identify",
         "images",
         "machine",
@@ -186,7 +184,6 @@ PUBLIC: dict[str, set[str]] = {
 OUTSIDE = {
     "__main__",
     "brief",
-    "cluster",
     "errors",
     "figures",
     "option_fields",
