@@ -417,11 +417,12 @@ def measure_photographs(
     placement: Placement,
     report: Report,
     *,
+    method: Method = measure,
     stage: str = MEASURING,
 ) -> Outlines:
     """Return all outlines: those measured near a placement, and those kept."""
     search = photographs.search(placement)
-    return _measured(photographs, search, placement, report, method=measure, stage=stage)[0]
+    return _measured(photographs, search, placement, report, method=method, stage=stage)[0]
 
 
 def with_measured_radii(
