@@ -55,6 +55,7 @@ PUBLIC: dict[str, set[str]] = {
         "model",
         "model_builder",
         "model_writer",
+        "parameter_id",
         "parameters",
         "redundancy",
         "rods",
@@ -94,6 +95,7 @@ PUBLIC: dict[str, set[str]] = {
         "photograph_notes",
         "reading_units",
         "readings_sheet",
+        "reasons",
     },
     "recordings": {"importing"},
     "estimation": {
@@ -112,7 +114,6 @@ PUBLIC: dict[str, set[str]] = {
         "board_poses",
         "camera_search",
         "candidate_pairs",
-        "detection",
         "diagnostics",
         "free_poses",
         "image_quality",

@@ -22,8 +22,10 @@ from legcal.calibration.documents import (
 )
 from legcal.calibration.link_joints import FRAMES, joints_title, mark_in_words
 from legcal.calibration.plots import plot_uncertainty
+from legcal.data.reasons import reason_in_words
 from legcal.errors import OutOfResources
 from legcal.machine.directions import list_in_words
+from legcal.machine.parameter_id import ParameterId
 from legcal.vision.board import LINKS, Link
 
 if TYPE_CHECKING:
@@ -54,7 +56,7 @@ class ParameterTable:
         """Return the table of a result, joint centres in R_b and R_e or left out."""
         rows, digits = [], []
         for row in result.parameters:
-            if not row.is_shown or (not joints and row.name.endswith(_COORDINATES)):
+            if not row.is_shown or (not joints and ParameterId.parse(row.name).is_joint_coordinate):
                 continue
             scale, unit, n = UNITS[row.unit]
             value, nominal = scale * row.value, scale * row.nominal
@@ -183,7 +185,6 @@ class ParameterTable:
 
 _CALIBRATED = ("nominal", "calibrated", "change", "sigma")
 NUMBERS = {*_CALIBRATED, "in_frame", *(f"in {frame}" for frame in FRAMES.values())}
-_COORDINATES = tuple(f".{side}.{axis}" for side in LINKS for axis in "xyz")
 
 
 def _cell(column: str, x: Any, digits: int) -> str:
@@ -321,7 +322,7 @@ def _observation_lines(result: Result) -> list[str]:
             "their table gives."
         ]
     most = sorted(seen.rejected.items(), key=lambda one: -one[1])[:_MAX_REASONS]
-    rejected = ", ".join(f"{count} {reason}" for reason, count in most)
+    rejected = ", ".join(f"{count} {reason_in_words(reason)}" for reason, count in most)
     lines = [f"Outlines: {seen.used} of {seen.total} used{f'; rejected: {rejected}' * bool(most)}."]
     if seen.total == 0:  # boards are the whole measurement
         lines = ["Outlines: none, no leg was measured."]

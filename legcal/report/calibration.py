@@ -11,6 +11,7 @@ from rich.text import Text
 
 from legcal.calibration.link_joints import FRAMES, joints_title, mark_in_words
 from legcal.calibration.summary import NUMBERS, UNITS, residuals_in_words, sentences, tables
+from legcal.machine.parameter_id import ParameterId
 from legcal.report.render import report, table
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def accuracy_table(evaluation: Evaluation) -> RenderableType:
     rows = [
         (name, f"{value:z.4f}", f"{reference:z.4f}", f"{value - reference:+z.4f}")
         for name, value, reference in zip(evaluation.names, values, references, strict=True)
-        if not (name.endswith(".gain") and value == reference == 1.0)
+        if not (ParameterId.parse(name).kind == "gain" and value == reference == 1.0)
     ]
     angles = "; axes and twists in deg" * ("rad" in evaluation.units)
     columns = ("parameter", ">model", ">reference", ">difference")

@@ -40,6 +40,7 @@ from legcal.calibration.joint_fit.outline_errors import (
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
 from legcal.data.measurements import few
+from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge
 from legcal.estimation.problem import GaussianPrior, Residuals, linearize
 from legcal.estimation.solver import Minimum, information, minimise, normal_equations, robust_cost
@@ -499,20 +500,19 @@ def check_convergence(
     )
 
 
-DISAGREES = "disagrees with the fit"  # the beginning of a reason
 _ON_EDGE_PX = 1.5  # [px] at both ends
 _NEARER = 0.25  # of the distance from the outline that it was taken for
 
 
 def rejection_reasons(
     problem: FitProblem, state: State, rejected: IntArray, offsets: Array
-) -> list[str]:
+) -> list[Rejection]:
     """Return the reasons of rejection of outlines (m,): how far off, and which edge they lie on.
 
     *offsets* (n, 2) of all outlines are from where the fit puts them [px].
     """
     away = np.abs(offsets[rejected]).max(axis=1, initial=0.0)
-    reasons = [f"{DISAGREES} by {distance:.1f} px" for distance in away.tolist()]
+    details = [f"{distance:.1f} px" for distance in away.tolist()]
     o, names = problem.outlines, problem.legs.names
     part = np.repeat(np.arange(len(o.parts)), len(EPSILON))
     edges = [
@@ -532,5 +532,5 @@ def rejection_reasons(
     for i, distances in enumerate(found.reshape(len(rejected), len(edges))):
         nearest = int(np.argmin(distances))
         if distances[nearest] < min(_ON_EDGE_PX, _NEARER * away[i]):
-            reasons[i] += f", lies on {edges[nearest]}"
-    return reasons
+            details[i] += f", lies on {edges[nearest]}"
+    return [Rejection(Reason.DISAGREES, detail) for detail in details]
