@@ -165,6 +165,8 @@ def test_a_command_that_does_not_parse_is_told_with_where_its_options_are(
     ("words", "named"),
     [
         (("noise", "dataset", "--json"), ["legcal noise is gone: calibrate", "plan --noise"]),
+        (("init", "photos", "--match=order"), ["--match of legcal init is gone", "column image"]),
+        (("import", "a.bag", "--still", "1"), ["--still of legcal import is gone", "0.3 s"]),
     ],
 )
 def test_what_earlier_versions_had_is_refused_with_what_does_the_same_now(

@@ -10,7 +10,26 @@ COMMANDS = {
     "noise": "calibrate writes the noise of its outlines into its result, and legcal plan --noise "
     "RESULT reads it there",
 }
-OPTIONS: Mapping[str, Mapping[str, str]] = {}
+_DRY_RUN = "what was understood is shown before it is written, and files that are there stay"
+_TOPIC = "write the topic of the images behind the bag, BAG:/left/image_raw"
+OPTIONS: Mapping[str, Mapping[str, str]] = {
+    "init": {
+        "--servo": "write centre_us and us_per_deg of each servo into legcal.motors of the model",
+        "--views": "give a FOLDER that holds only the photographs to use",
+        "--view-pattern": "put the photographs of each place in a folder, or add a column view",
+        "--match": "rows and photographs are matched by a column image, else by a column time, "
+        "else in order; remove the column that is not to count",
+        "--dry-run": _DRY_RUN,
+    },
+    "import": {
+        "--unit": "state the unit in the headings of the table, such as 'leg1 [mm]'",
+        "--still": "rests of 0.3 s and more are used",
+        "--image-topic": _TOPIC,
+        "--joint-topic": "joint states are read from the only topic that has them or from "
+        "/joint_states; give others as a table with --readings",
+        "--dry-run": _DRY_RUN,
+    },
+}
 """What stands in place of options, by command: the rest of a sentence."""
 
 
