@@ -7,7 +7,6 @@ from .calibration.location.document import load_location as load_location
 from .calibration.location.document import write_location as write_location
 from .calibration.location.locate import locate as locate
 from .calibration.location.tool_poses import ToolPoses as ToolPoses
-from .calibration.measurement_noise.comparison import measure_noise as measure_noise
 from .calibration.outline_detection import detect as detect
 from .calibration.pipeline import calibrate as calibrate
 from .calibration.result_folder import load_result as load_result

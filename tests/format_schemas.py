@@ -20,7 +20,6 @@ from legcal.calibration.documents import (
 from legcal.calibration.examination import ExaminationDocument
 from legcal.calibration.identify.report import IdentifyDocument
 from legcal.calibration.location.document import LocationFile
-from legcal.calibration.measurement_noise.document import NoiseDocument
 from legcal.data.dataset_file import DatasetEntry
 from legcal.data.new_dataset import NewDatasetDocument
 from legcal.exports.formats import ExportDocument
@@ -108,7 +107,6 @@ DOCUMENTS: Mapping[str, type[BaseModel]] = {  # that legcal writes
     "detect": DetectionDocument,
     "doctor": ExaminationDocument,
     "camera-calibration": CameraDocument,
-    "noise": NoiseDocument,
 }
 
 

@@ -34,7 +34,7 @@ from legcal.data.dataset import Dataset, ImageReader, inspect_files, load_datase
 from legcal.data.holdout import dataset_at
 from legcal.data.image_causes import by_cause, images_in_words
 from legcal.data.measurements import few, few_views, reading_columns, row_names
-from legcal.data.photograph_notes import GOOD_QUALITY, compressed, notes_on_photographs
+from legcal.data.photograph_notes import compression_notes, notes_on_photographs
 from legcal.data.reasons import Reason, reason_in_words
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible
 from legcal.files.schema import Document
@@ -463,14 +463,8 @@ def _look_at_photographs(
             same,
         )
     _look_at_views(found, {row: one for row, one in exposures.items() if row not in defects})
-    lossy = compressed(m, dataset.facts)
-    if lossy:
-        found.add(
-            "photographs",
-            "note",
-            f"Lossy compression moves outlines: found {lossy}; store photographs without loss "
-            f"(PNG, TIFF) or as JPEGs of quality {GOOD_QUALITY} or more.",
-        )
+    for what in compression_notes(m, dataset.facts):
+        found.add("photographs", "note", what)
     return exposures
 
 

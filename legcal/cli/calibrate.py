@@ -31,34 +31,6 @@ _TESTS = "Tests of a result"
 _PARAMETERS = "Parameters by name (or a pattern: '*.offset'); each may be repeated"
 
 
-def _refuse_fleet(given: object) -> None:
-    """Refuse what earlier versions took for several machines in one command."""
-    if given:
-        raise UsageError(
-            "The command could not be run: found several machines (--list, --earlier, --resume or "
-            "more than one DATASET), needed one dataset; run legcal calibrate for each of them, or "
-            "a loop in Python (docs/python.md, Many machines)."
-        )
-
-
-def _refuse_old(parameter: typer.CallbackParam, given: list[str] | None) -> None:
-    """Refuse an option of earlier versions with its new spelling."""
-    if given:
-        option = parameter.opts[0]
-        new = " ".join(f"--set {text}{'=free' * (option == '--free')}" for text in given)
-        old = " ".join(f"{option} {text}" for text in given)
-        raise UsageError(f"The command could not be run: {old} is now written {new}.")
-
-
-def _refuse_significance(given: float | None) -> None:
-    """Refuse an option of earlier versions."""
-    if given is not None:
-        raise UsageError(
-            "The command could not be run: --significance is gone; call "
-            f"legcal.check(dataset, result, significance={given:g}) in Python."
-        )
-
-
 def calibrate(
     datasets: Annotated[
         list[Path], typer.Argument(metavar="DATASET", help="The folder that holds dataset.yaml.")
@@ -147,22 +119,15 @@ def calibrate(
             "The calibration does not see it.",
         ),
     ] = None,
-    fleet: Annotated[
-        list[str] | None,
-        typer.Option("--list", "--earlier", hidden=True, callback=_refuse_fleet),
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", hidden=True, callback=_refuse_fleet)] = False,
     workers: WorkersOption = None,
-    fix: Annotated[list[str] | None, typer.Option(hidden=True, callback=_refuse_old)] = None,
-    free: Annotated[list[str] | None, typer.Option(hidden=True, callback=_refuse_old)] = None,
-    prior: Annotated[list[str] | None, typer.Option(hidden=True, callback=_refuse_old)] = None,
-    significance: Annotated[
-        float | None, typer.Option(hidden=True, callback=_refuse_significance)
-    ] = None,
 ) -> None:
     """Compute the calibrated model from images and encoder readings, or check an earlier one."""
     if len(datasets) > 1:
-        _refuse_fleet(datasets)
+        raise UsageError(
+            f"The command could not be run: found {len(datasets)} datasets, needed one dataset; "
+            "run legcal calibrate for each of them, or a loop in Python (docs/python.md, Many "
+            "machines)."
+        )
     dataset = datasets[0]
     if check is not None:
         others = {

@@ -73,8 +73,8 @@ def plan(
     noise: Annotated[
         Path | None,
         typer.Option(
-            metavar="RESULT|FILE",
-            help="Errors of outlines: an earlier result, or what legcal noise --json printed.",
+            metavar="RESULT",
+            help="Errors of outlines as an earlier result has them.",
         ),
     ] = None,
     bounds: Annotated[

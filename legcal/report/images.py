@@ -106,9 +106,7 @@ def detection_table(found: Detection, output: Path) -> RenderableType:
     )
 
 
-def simulation_table(
-    document: dict[str, Any], *, repeated: bool, to_measure: str = ""
-) -> RenderableType:
+def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> RenderableType:
     """Return the document of ``simulate``: how many images of each view show each leg.
 
     *to_measure* is the distance that would fix the scale, where nothing in the dataset does.
@@ -121,7 +119,6 @@ def simulation_table(
         for name, view in views.items()
     ]
     folder = shlex.quote(document["dataset"])
-    is_noise = repeated and document["level"] == "photographs"
     return report(
         heading(
             document["mechanism"],
@@ -151,7 +148,6 @@ def simulation_table(
                 f"the true model: {document['truth']}",
                 f"calibrate with: legcal calibrate {folder} -o OUT",
                 f"judge with: legcal evaluate OUT/calibrated.yaml {shlex.quote(document['truth'])}",
-                *([f"measure noise with: legcal noise {folder}"] * is_noise),
             )
         ],
     )

@@ -308,7 +308,6 @@ def _images() -> Iterable[Case]:
         (Step("detect {in}/set -o {out} --json", folder="{out}"),),
         input="repeats",
     )
-    yield Case("noise", (Step("noise {in}/set --json"), Step("noise {in}/set")), input="repeats")
     camera = "camera {in}/set/images --board {in}/set/dataset.yaml"
     yield Case(
         "camera",

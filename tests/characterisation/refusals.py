@@ -269,7 +269,6 @@ def _use() -> Iterable[Refusal]:
         ("criteria", "calibrate x -o {out} --criteria best", ("--criteria", "best", "literal")),
         ("transformation", "calibrate x -o {out} --transformation q", ("--transformation",)),
         ("workers", "detect x -o {out} --workers 0", ("--workers", "found 0")),
-        ("noise-nowhere", "noise nowhere", ("nowhere",)),
         ("detect-nowhere", "detect nowhere -o {out}", ("nowhere",)),
         ("identify-nowhere", "identify nowhere.yaml", ("nowhere.yaml",)),
         ("identify-nothing", "identify", ("MODEL|DATASET",)),
@@ -734,8 +733,6 @@ def _tables() -> Iterable[Refusal]:
         command = f"calibrate {{in}} -o {{out}} {words}"
         yield Refusal(f"axes-{name}", command, named, "3-rpr-axes")
     yield Refusal("axes-detect", "detect {in} -o {out}", ("axes",), "3-rpr-axes")
-    yield Refusal("noise-no-images", "noise {in}", ("24",), "3-rpr-axes")
-    yield Refusal("noise-no-repeats", "noise {in}", (), "3-rpr-outlines")
 
     c = "corners.csv"
     line = "view,image,corner,u,v,sigma,verdict,reason,source\n"
