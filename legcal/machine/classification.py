@@ -127,63 +127,24 @@ def _check_moves(chain: LegChain, axis: Axis) -> None:
         )
 
 
-def check_carried(chain: LegChain, carrier: Step, path: Path) -> None:
-    """Check that a leg which ends on a body that the platform carries is a rod of the class.
-
-    Raises
-    ------
-    OutOfClass
-        If it hangs on no motor, or does not turn freely about B.
-    """
-    if chain.actuator is not None and chain.platform.type is JointType.SPHERICAL:
-        return
-    found = (
-        f"a joint {chain.platform.type.value or 'that is fixed'} at its end"
-        if chain.actuator is not None
-        else "no motor on the base that moves its joint at A"
-    )
-    name = next((s.connection.joint for s in chain.steps if s.connection.joint), "")
-    raise OutOfClass(
-        f"{path}: the leg of joint '{name}' is outside the method: it ends on a body that the "
-        f"platform carries by joint '{carrier.name}', and found {found}, needed a rod on a "
-        "carriage or an arm with a spherical joint there; this machine cannot be calibrated this "
-        "way."
-    )
-
-
 def actuator_of(
-    chain: LegChain, T_base: Array, travel: tuple[float, float], link: str
+    chain: LegChain, T_body_base: Array, travel: tuple[float, float], link: str
 ) -> Actuator | None:
-    """Return what the rod of a chain hangs on, in the base link at T_base in its body."""
-    return (
-        None if chain.actuator is None else _carrier(chain.actuator, chain.A, T_base, travel, link)
-    )
-
-
-def internal_joint_of(
-    chain: LegChain, T_platform: Array, travel: tuple[float, float], link: str
-) -> Actuator | None:
-    """Return what carries B of a chain, in the platform link at T_platform in its body."""
-    if chain.internal is None:
+    """Return what the rod of a chain hangs on, in the base link, at T_body_base in its body."""
+    step = chain.actuator
+    if step is None:
         return None
-    return _carrier(chain.internal, chain.B_platform, T_platform, travel, link)
-
-
-def _carrier(
-    step: Step, centre: Array, T_body_link: Array, travel: tuple[float, float], link: str
-) -> Actuator:
-    """Return a joint of base or platform that carries a joint centre in its body."""
-    inverse = matrix_inverse(T_body_link)
+    inverse = matrix_inverse(T_body_base)
     point, axis = step.line(step.near)
     sign = 1.0 if step.near == 0 else -1.0  # a joint moves its child
-    centre, at = matrix_applied(inverse, centre), matrix_applied(inverse, point)
+    A, at = matrix_applied(inverse, chain.A), matrix_applied(inverse, point)
     direction = sign * (inverse[:3, :3] @ axis)
     turns = step.connection.type == "revolute"
     return Actuator(
         joint=str(step.connection.joint),
         kind=ActuatorKind.REVOLUTE if turns else ActuatorKind.PRISMATIC,
         axis=direction,
-        point=at + ((centre - at) @ direction) * direction if turns else at,
+        point=at + ((A - at) @ direction) * direction if turns else at,
         travel=travel,
         link=link,
     )
@@ -199,7 +160,6 @@ def leg_of(
     spatial: bool,
     home: RigidTransform | None,
     actuator: Actuator | None = None,
-    internal: Actuator | None = None,
 ) -> Leg:
     """Return a leg in the links of base and platform, which stand at T_body_link in their bodies.
 
@@ -236,7 +196,6 @@ def leg_of(
         travel=travel,
         chain=chain,
         actuator=actuator,
-        internal=internal,
     )
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.mobility import CLOSED, leg_scale
-from legcal.machine.model import Machine, internal_coordinates, readings_at, slider_columns
+from legcal.machine.model import Machine, readings_at, slider_columns
 from legcal.machine.solver import Equations, Retraction, solve
 
 POSE_TOLERANCE = 1e-11  # [m, rad]: of a pose at which the chain is closed
@@ -44,7 +44,6 @@ def close_at(
         if joint.type in ("revolute", "continuous", "prismatic"):
             angles[chain.v_index(joint.name)] = True
     set_first = slider_columns(machine, range(machine.n_legs))[1]
-    set_first += [chain.v_index(joint.joint) for joint in machine.internal_joints]
     angles[set_first] = False
     # Gaps of legs shorter than a metre count in leg lengths: beside angles in radians they would
     # weigh too little to be closed, and AXIS_TOLERANCE would be a large part of a leg.
@@ -117,10 +116,6 @@ def _placed(
     q = readings_at(machine, T_base_platform)
     sliding = [j for j, leg in enumerate(machine.legs) if leg.prismatic is not None]
     configuration[slider_columns(machine, sliding)[0]] = q[sliding]
-    if machine.internal_joints:
-        s = internal_coordinates(machine, T_base_platform.as_matrix()[None])[0]
-        for joint, value in zip(machine.internal_joints, s.tolist(), strict=True):
-            configuration = chain.with_value(configuration, joint.joint, value)
     return configuration
 
 

@@ -172,7 +172,6 @@ def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> Rig
             platform_axis=wanted.platform_axis,
             twist=wanted.twist,
             actuator=wanted.actuator,
-            internal=wanted.internal,
         )
         for leg, wanted in zip(machine.legs, legs_in_links(machine, legs), strict=True)
     )

@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, LegcalError, ModelError, OutOfClass
@@ -27,7 +26,6 @@ from legcal.machine.classification import (
     CONCURRENT,
     PERPENDICULAR,
     actuator_of,
-    internal_joint_of,
     leg_of,
 )
 from legcal.machine.cylinders import (
@@ -41,7 +39,6 @@ from legcal.machine.equations import (
     constraints_at,
     leg_equations,
     n_pose_constraints,
-    pose_equations,
 )
 from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home, home_at_mid_travel
@@ -54,7 +51,6 @@ from legcal.machine.leg import (
     EquationKind,
     JointType,
     LegChain,
-    Step,
 )
 from legcal.machine.mobility import (
     CONFIGURATIONS,
@@ -66,7 +62,7 @@ from legcal.machine.mobility import (
 from legcal.machine.model import B_at, Machine, joint_values, vectors_A_to_B
 from legcal.machine.origins import with_own_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
-from legcal.machine.rods import coordinates_at, reading_of_rod, rod_mode
+from legcal.machine.rods import reading_of_rod, rod_mode
 from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.solved_poses import MAX_POSE_ERROR
 from legcal.machine.spanning_tree import Source
@@ -88,8 +84,6 @@ from legcal.machine.topology import (
 from legcal.machine.urdf import Urdf, UrdfJoint
 
 MAX_ORIGIN = 1e4  # [m]; beyond, floats do not resolve the tolerances of joints
-_FREE = 1e-6  # of the largest slope: a joint that moves no rod
-_FOLLOWS = 1e-3  # of how a joint inside the platform moves rods
 MAX_TURN = 4.0 * np.pi  # [rad] of an arm; limits beyond are most likely degrees
 _DEVIATION = {  # by [deg]
     EquationKind.BASE_AXIS: "its revolute axis at the base {} deg from perpendicular to the leg",
@@ -163,7 +157,6 @@ def _load(source: Source) -> Machine:
         _check_unit(machine)  # before lengths of hundreds of metres fail to close
     if file.legcal is not None and file.legcal.home is not None:  # a drawing may be anywhere
         check_home_travel(machine)
-    machine = _with_followers(machine, given)
     try:
         pose, configuration = closed_home(machine, given)
     except (ModelError, DidNotConverge):
@@ -178,12 +171,6 @@ def _load(source: Source) -> Machine:
     configurations = generic_configurations(machine, CONFIGURATIONS)
     machine = replace(machine, mobility=mobility(machine, configurations))
     machine = replace(machine, motor_rank=motor_rank(machine, configurations))
-    if machine.internal_joints and machine.is_redundant:
-        raise OutOfClass(
-            f"{machine.yaml_path}: this machine is outside the method: found {len(machine.motors)} "
-            f"motors for the {machine.mobility} freedoms of a platform of several bodies, needed "
-            "no more motors than freedoms there; remove one from name_mot."
-        )
     _check_equations(machine, configurations)
     _check_dependence(machine)
     _check_ties(machine)
@@ -219,11 +206,6 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     chain = _closed_chain(urdf, closures, in_plane, block, chains)
     home = None if block.home is None else block.home.motion()
     actuators = _actuators(chains, block, urdf, ends[0], yaml_path)
-    inside = {
-        step.name: internal_joint_of(chain, ends[1], *_moved_by(step, urdf))
-        for chain in reversed(chains)
-        if (step := chain.internal) is not None
-    }
     legs = tuple(
         leg_of(
             name,
@@ -234,7 +216,6 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
             spatial=normals is None,
             home=home,
             actuator=actuators.get(leg_chain.motor),
-            internal=None if leg_chain.internal is None else inside[leg_chain.internal.name],
         )
         for name, leg_chain in zip(block.legs, chains, strict=True)
     )
@@ -315,12 +296,6 @@ def _actuators(
     if problems:
         raise ModelError(problems)
     return stated
-
-
-def _moved_by(step: Step, urdf: Urdf) -> tuple[tuple[float, float], str]:
-    """Return the limits of a joint of the tree [m or rad], infinite without any, and its child."""
-    joint = urdf.joints[step.name]
-    return joint.limits or (-np.inf, np.inf), joint.child
 
 
 def _travel(chain: LegChain, urdf: Urdf) -> tuple[float, float]:
@@ -609,45 +584,6 @@ def _check_frames(machine: Machine) -> None:
         raise ModelError(problems)
 
 
-def _with_followers(machine: Machine, home: RigidTransform | None) -> Machine:
-    """Return the machine with its joints inside the platform marked: which follow from a pose.
-
-    Raises
-    ------
-    OutOfClass
-        If one of them moves no rod.
-    """
-    if not machine.internal_joints:
-        return machine
-    T = (machine.home if home is None else home).as_matrix()[None]
-    R, t, n = T[:, :3, :3], T[:, :3, 3], len(machine.actuators)
-    slopes = pose_equations(machine.legs, R, t, q=coordinates_at(machine.legs, R, t)).by_q[0]
-    of_motors, inside = slopes[:, :n], slopes[:, n:]
-    moved = np.linalg.norm(inside, axis=0)
-    if moved.min() < _FREE * np.abs(slopes).max():
-        free = machine.internal_joints[int(np.argmin(moved))].joint
-        raise OutOfClass(
-            f"{machine.yaml_path}: this machine is outside the method: found that the joint "
-            f"'{free}' inside the platform moves no rod at home, needed rods that hold the body "
-            "behind it; fix that joint if it does not move, otherwise this machine cannot be "
-            "calibrated this way."
-        )
-    # What motors cannot make good says where a joint stands
-    left = inside - of_motors @ (np.linalg.pinv(of_motors) @ inside)
-    _, upper, order = qr(left / moved, mode="economic", pivoting=True)
-    rank = int(np.sum(np.abs(np.diag(upper)) > _FOLLOWS))
-    follow = [machine.internal_joints[i].joint for i in order[:rank]]
-    joints = {
-        joint.joint: replace(joint, follows=joint.joint in follow)
-        for joint in machine.internal_joints
-    }
-    legs = tuple(
-        leg if leg.internal is None else replace(leg, internal=joints[leg.internal.joint])
-        for leg in machine.legs
-    )
-    return replace(machine, legs=legs)
-
-
 def _check_origins(urdf: Urdf) -> None:
     """Check that no joint is so far out that rounding hides how joints lie to each other.
 
@@ -756,7 +692,7 @@ def _check_ties(machine: Machine) -> None:
         If errors that its constraints allow one by one destroy it together.
     """
     ties, n = machine_ties(machine), n_pose_constraints(machine.legs)
-    if machine.actuators and not machine.internal_joints and n_dependent_at_home(machine):
+    if machine.actuators and n_dependent_at_home(machine):
         joints = {leg.base_joint for leg in machine.legs} | {
             leg.platform_joint for leg in machine.legs
         }
@@ -826,9 +762,7 @@ def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
     q = np.array([joint_values(machine, c) for c in configurations])
     of_legs = []
     for j, leg in enumerate(machine.legs):
-        inside = None if leg.internal is None else leg.internal.joint
-        s = np.array([machine.chain.value(c, inside) if inside else 0.0 for c in configurations])
-        equations = leg_equations(leg, R, t, by_local=False, q=q[:, j], s=s)
+        equations = leg_equations(leg, R, t, by_local=False, q=q[:, j])
         values = equations.values.copy()
         if leg.actuator is None:
             values[:, 0] -= leg.sign * q[:, j]

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.errors import OutOfClass, UsageError
+from legcal.errors import UsageError
 from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
@@ -27,11 +27,8 @@ from legcal.machine.leg import (
 from legcal.machine.rods import (
     AT_ZERO,
     actuators_of,
-    coordinates_at,
     first_rods,
-    internal_joints_of,
     joints_at,
-    platform_joints_at,
     reading_legs,
     reading_of_rod,
 )
@@ -121,30 +118,6 @@ class Machine:
         """What moves joints at A, each once, in the base link."""
         return actuators_of(self.legs)
 
-    @cached_property
-    def internal_joints(self) -> tuple[Actuator, ...]:
-        """The joints inside a platform of several bodies, each once, in the platform link."""
-        return internal_joints_of(self.legs)
-
-    def require_rigid_platform(self) -> "Machine":
-        """Return the machine itself, for what can be done with a platform of one body only.
-
-        Raises
-        ------
-        OutOfClass
-            If its platform has several bodies.
-        """
-        if not self.internal_joints:
-            return self
-        joints = " and ".join(f"'{joint.joint}'" for joint in self.internal_joints)
-        plural = "s" * (len(self.internal_joints) > 1)
-        raise OutOfClass(
-            f"{self.yaml_path}: legcal identifies machines whose platform has several bodies, and "
-            f"does not calibrate them yet: found the joint{plural} {joints} inside the platform, "
-            "needed one rigid platform; inspect and identify work, and forward and inverse "
-            "kinematics in Python."
-        )
-
     @property
     def at_zero(self) -> str:
         """Words after "joints A": the reading at which their coordinates hold, if they move."""
@@ -200,7 +173,7 @@ class Machine:
 
     @property
     def B_platform(self) -> Array:
-        """Platform joint centres in the platform link, (n_legs, 3) [m]; internal joints at 0."""
+        """Platform joint centres in the platform link, (n_legs, 3) [m]."""
         return self._arrays[1].copy()
 
     @property
@@ -326,23 +299,10 @@ def vectors_A_to_B(machine: Machine, T_base_platform: RigidTransform) -> Array:
 def B_at(machine: Machine, poses: Array) -> Array:
     """Return the platform joint centres in the base link, (k, n_legs, 3) [m].
 
-    At poses T_base_platform (k, 3 or 4, 4); a body of a platform of several is where its rods hold
-    it.
+    Poses T_base_platform are (k, 3 or 4, 4).
     """
     R, t = poses[:, :3, :3], poses[:, :3, 3]
-    B = machine.B_platform
-    if machine.internal_joints:
-        B = platform_joints_at(machine.legs, internal_coordinates(machine, poses))
-    return np.asarray(B @ np.swapaxes(R, 1, 2) + t[:, None])
-
-
-def internal_coordinates(machine: Machine, poses: Array) -> Array:
-    """Return the coordinates of the joints inside the platform at the same poses, (k, n).
-
-    Those that the pose leaves free are at zero.
-    """
-    found = coordinates_at(machine.legs, poses[:, :3, :3], poses[:, :3, 3])
-    return found[:, len(machine.actuators) :]
+    return np.asarray(machine.B_platform @ np.swapaxes(R, 1, 2) + t[:, None])
 
 
 def vectors_at(machine: Machine, poses: Array) -> Array:

@@ -138,10 +138,7 @@ def _find_all(handles: Handles, leg: Leg, machine: Machine) -> None:
     if chain.actuator is not None:
         arm = handles.link(chain.actuator, chain.actuator.far)
         handles.of(chain.steps[1], chain.steps[1].near, arm, leg.name)
-    platform = machine.platform
-    if chain.internal is not None:
-        platform = handles.link(chain.internal, chain.internal.far)
-    handles.of(last, last.far, platform, leg.name)
+    handles.of(last, last.far, machine.platform, leg.name)
     if chain.slider is None:
         _in_rod(handles, leg, chain, (0.0, 0.0))
 

@@ -7,7 +7,7 @@ in front of the first underscore, where that tells them apart. The frames stand 
 joints span the largest triangle, or lie farthest apart in a plane.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -23,7 +23,6 @@ from legcal.machine.bodies import Bodies, Connection, frame_link, rigid_bodies
 from legcal.machine.chain import Closure
 from legcal.machine.classification import (
     CONCURRENT,
-    check_carried,
     classify_leg,
     is_actuator,
     nearest,
@@ -50,8 +49,7 @@ def find_chains(
 ) -> list[LegChain]:
     """Return the legs between two links, each classified as joint, slider or rod, joint.
 
-    Several rods may hang on what one of the *motors* on the base moves, and end on a body that the
-    platform carries by a joint.
+    Several rods may hang on what one of the *motors* on the base moves.
 
     Raises
     ------
@@ -66,57 +64,25 @@ def find_chains(
             "legcal.platform."
         )
     origin = bodies.T_body_link[platform][:3, 3]
-    inside = _internal_joints(bodies, urdf, *ends)
-    chains = []
-    for steps in _paths(bodies, urdf, *ends, motors, inside):
-        chain = classify_leg(steps, origin, urdf.path, motors)
-        last = steps[-1]
-        carrier = inside.get(last.connection.bodies[last.far])
-        if carrier is not None:
-            check_carried(chain, carrier, urdf.path)
-            chain = replace(chain, internal=carrier)
-        chains.append(chain)
-    return chains
-
-
-def _internal_joints(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> dict[str, Step]:
-    """Return the joint by which the platform carries each body on which legs end, by that body.
-
-    Seen from such a body, the legs without base and platform reach the base by several joints, and
-    the platform by this one.
-    """
-    found = {}
-    for connection in bodies.connections:
-        if platform not in connection.bodies or connection.joint is None:
-            continue
-        near = connection.bodies.index(platform)
-        body = connection.bodies[1 - near]
-        n_joints = sum(body in c.bodies for c in bodies.connections)
-        if body in (base, platform) or n_joints < 3:
-            continue
-        on_base, on_platform = _reached(bodies, body, (base, platform))
-        if len(on_base) > 1 and on_platform == [connection]:
-            found[body] = _step(connection, near, urdf)
-    return found
+    return [
+        classify_leg(steps, origin, urdf.path, motors)
+        for steps in _paths(bodies, urdf, *ends, motors)
+    ]
 
 
 def _paths(
-    bodies: Bodies,
-    urdf: Urdf,
-    base: str,
-    platform: str,
-    motors: Sequence[str],
-    inside: Mapping[str, Step],
+    bodies: Bodies, urdf: Urdf, base: str, platform: str, motors: Sequence[str]
 ) -> list[list[Step]]:
-    """Return the joints of every leg from base to platform, or to a body that this carries."""
+    """Return the joints of every leg from base to platform."""
     _refuse_second_mechanism(bodies, urdf, base, platform)
+    _refuse_carried_bodies(bodies, urdf, base, platform)
     at: dict[str, list[Connection]] = {}
     for connection in bodies.connections:
         _refuse_unsupported(connection, urdf, base, platform)
         for body in connection.bodies:
             at.setdefault(body, []).append(connection)
     begun: list[tuple[str, list[Step], Connection]] = []
-    used = {id(step.connection) for step in inside.values()}
+    used = set[int]()
     for first in at.get(base, []):
         step = _step(first, first.bodies.index(base), urdf)
         body = first.bodies[step.far]
@@ -132,7 +98,7 @@ def _paths(
             near = connection.bodies.index(body)
             steps.append(_step(connection, near, urdf))
             body = connection.bodies[1 - near]
-            if body == platform or body in inside:
+            if body == platform:
                 break
             if len(steps) > MAX_JOINTS_OF_LEG:
                 raise OutOfClass(
@@ -404,6 +370,24 @@ def _refuse_second_mechanism(bodies: Bodies, urdf: Urdf, base: str, platform: st
             )
 
 
+def _refuse_carried_bodies(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> None:
+    """Refuse a platform that carries, by a joint, another body on which legs end.
+
+    Seen from such a body, the legs without base and platform reach the base by several joints, and
+    the platform by this one.
+    """
+    for connection in bodies.connections:
+        if platform not in connection.bodies or connection.joint is None:
+            continue
+        body = connection.bodies[1 - connection.bodies.index(platform)]
+        n_joints = sum(body in c.bodies for c in bodies.connections)
+        if body in (base, platform) or n_joints < 3:
+            continue
+        on_base, on_platform = _reached(bodies, body, (base, platform))
+        if len(on_base) > 1 and on_platform == [connection]:
+            raise OutOfClass(_platform_of_several_bodies(urdf, body, connection))
+
+
 def _most_joined(bodies: Bodies, members: set[str]) -> str:
     """Return the body of some where most joints meet."""
     ends = [body for c in bodies.connections for body in c.bodies if body in members]
@@ -461,15 +445,18 @@ def _several_bodies(
             "own, otherwise this machine cannot be calibrated this way."
         )
     if len(on_base) > 1:
-        return (
-            f"{urdf.path}: this machine is outside the method: found a platform of several bodies, "
-            f"with {len(on_base)} legs that meet on link '{body}' and more than the internal "
-            f"{_name(on_platform[0])} between it and the platform, needed one revolute or "
-            "prismatic joint between the platform and each other body on which legs end; name the "
-            "body between these in legcal.platform (on an H4 the bar in the middle), otherwise "
-            "this machine cannot be calibrated this way."
-        )
+        return _platform_of_several_bodies(urdf, body, on_platform[0])
     return ""
+
+
+def _platform_of_several_bodies(urdf: Urdf, body: str, joint: Connection) -> str:
+    """Return why a platform that carries a body on which legs end is refused."""
+    return (
+        f"{urdf.path}: this machine is outside the method: found a platform of several bodies (as "
+        f"of an H4 or I4), because legs end on link '{body}', which {_name(joint)} connects to the "
+        f"platform, needed legs that end on one rigid platform; make {_name(joint)} fixed if it "
+        "does not move, otherwise this machine cannot be calibrated this way."
+    )
 
 
 def _reached(
@@ -587,8 +574,6 @@ def _platform_body(
             "legcal.legs if another link is the base."
         )
     meeting = [body for body in at if body != base and len(at[body]) > 2]
-    # What lies between bodies where chains meet, as the bar in the middle of an H4
-    meeting += [b for b in at if b not in (base, *meeting) and set(at[b]) <= set(meeting)]
     candidates = meeting or [body for body in at if body != base]
     candidates = [body for body in candidates if body in carried] or candidates
     candidates.sort(key=lambda body: (base in at[body], -len(at[body])))  # arms come last

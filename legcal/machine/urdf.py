@@ -386,8 +386,7 @@ def _joint(
         problems.add(
             element,
             "has <mimic>, which is not followed",
-            "close the loop in the mechanism YAML, or make a joint beyond the legs fixed (the tool "
-            "on the rack of an I4)",
+            "close the loop in the mechanism YAML, or make a joint beyond the legs fixed",
         )
     axis = _axis(element, kind, problems)
     limits = _limits(element, kind, problems, travel_needed)
