@@ -161,6 +161,26 @@ def test_a_command_that_does_not_parse_is_told_with_where_its_options_are(
     assert f"; legcal {words[0]} --help lists" in line
 
 
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("new", "t.csv", "-o", ".", "--travel", "0", "9"), ["--travel", "travel_low"]),
+        (("new", "--family", "delta", "-o", ".", "--rod-spacing=60"), ["--rod-spacing", "table"]),
+    ],
+)
+def test_what_earlier_versions_had_is_refused_with_what_does_the_same_now(
+    words: tuple[str, ...],
+    named: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(monkeypatch, *words) == 2
+    printed = capsys.readouterr()
+    said = printed.err or json.loads(printed.out)["error"]["message"]
+    assert [word for word in named if word not in said] == []
+    assert said.count("is gone") == 1
+
+
 @pytest.mark.parametrize("workers", ["0", "-1", "257", "1000000"])
 @pytest.mark.parametrize("words", [("detect", "x", "-o", "y"), ("study", "paper", "-o", "y")])
 def test_impossible_numbers_of_processes_are_refused_before_any_is_started(

@@ -11,7 +11,7 @@ from hexapod_example import HEXAPOD
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from layouts import Layout, write_machine
-from machines import MACHINES, of_types, read_family
+from machines import MACHINES, of_types, with_round_arms
 from random_legs import changed, closed_leg
 from scipy.spatial.transform import Rotation
 from thinned import thinned
@@ -157,7 +157,7 @@ def test_rows_equal_finite_differences_of_axes_cut_in_the_camera_and_of_legs(see
 
 def round_arms(folder: Path) -> Machine:
     """Return a Delta whose arms are cylinders."""
-    return create_model(read_family("delta", arm_radius=8.0), folder).machine
+    return create_model(with_round_arms("delta"), folder).machine
 
 
 def test_rows_of_arms_equal_finite_differences_of_their_axes(tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ from legcal.cli.init import init
 from legcal.cli.new import new
 from legcal.cli.options import INTERRUPTED, print_failure
 from legcal.cli.plan import plan
+from legcal.cli.retired import refuse_retired
 from legcal.cli.schema import schema
 from legcal.cli.simulate import simulate
 from legcal.cli.study import study
@@ -135,6 +136,7 @@ def run(*, as_json: bool) -> int:
     usage_error: type[Exception] = typer.BadParameter.__bases__[0]
     try:
         _refuse_empty(sys.argv[1:])
+        refuse_retired(sys.argv[1:])
         code = app(standalone_mode=False, prog_name="legcal")
     except typer.Abort as error:
         raise KeyboardInterrupt from error
