@@ -18,6 +18,7 @@ from legcal.exports.formats import export
 from legcal.exports.subject import Subject
 from legcal.geometry.types import Array
 from legcal.machine.configurations import random_configurations
+from legcal.machine.description_table import described_machine
 from legcal.machine.dimensions import Dimensions
 from legcal.machine.family import description_of
 from legcal.machine.home import home_of_legs
@@ -365,7 +366,7 @@ def test_legs_that_nobody_can_see_are_named_before_images_are_searched(tmp_path:
         ),
         ("home:\n", "home_readings: {arm7: 0.1}\n  home:\n", ("home_readings.arm7", "arm1")),
         ("home:\n", "home_readings: {arm1: 20}\n  home:\n", ("home_readings.arm1", "20 rad")),
-        (HOME, "", ("home is ambiguous", "no legcal.home", "0.2373", "-0.3741")),
+        (HOME, "", ("home is ambiguous", "write legcal.home,", "0.2373", "-0.3741")),
         (MOTORS, f"{MOTORS}- leg1_a2\n", ("'leg1_a2'", "one motor for each leg")),
         (MOTORS, "name_mot:\n", ("'arm1'", "carries 2 rods", "a motor in name_mot")),
         (A2, '"leg1_a2" type="prismatic"', ("slider 'leg1_a2'", "'arm1'")),
@@ -392,3 +393,18 @@ def test_exported_robots_are_the_same_machine(to: str, suffix: str, tmp_path: Pa
         for m in (machine, back)
     ]
     np.testing.assert_allclose(poses[1].as_matrix(), poses[0].as_matrix(), atol=1e-9)
+
+
+@pytest.mark.parametrize(("to", "suffix"), [("urdf", "urdf"), ("mjcf", "xml")])
+def test_of_two_readings_at_home_the_one_that_a_file_draws_is_taken(
+    to: str, suffix: str, tmp_path: Path
+) -> None:
+    motors = ARMS["actuators"]
+    wide = {name: arm | {"travel_deg": [-175, 175]} for name, arm in motors.items()}
+    table = ARMS | {"actuators": wide, "home_readings_deg": dict.fromkeys(motors, 20)}
+    machine = create_model(described_machine(table, Path("wide")), tmp_path).machine
+    export(Subject(machine, "wide"), to, tmp_path / f"wide.{suffix}")
+    back = load_mechanism(tmp_path / f"wide.{suffix}")
+    assert [leg.mode for leg in back.legs] == [leg.mode for leg in machine.legs]
+    if to == "mjcf":  # which has the joint values of home; a URDF has zeros
+        np.testing.assert_allclose(readings_at(back, back.home), np.radians(20.0), atol=1e-9)

@@ -276,7 +276,7 @@ MJCF: Rows = [
 ]  # fmt: skip
 MJCF_OUT_OF_CLASS: Rows = [
     (CONNECT, CONNECT.replace("leg1_seat", "leg2_tube"),
-     ("; check <equality> and that the root is the base.",)),
+     ("check <equality>", "root of the tree is the base")),
     ("</worldbody>", '<body name="arm"><joint name="elbow"/></body></worldbody>',
      ("joints of something else", "'elbow'")),
 ]  # fmt: skip

@@ -172,5 +172,5 @@ def _not_closed(machine: Machine, T_base_platform: RigidTransform, problem: str)
     place = "(" + ", ".join(f"{1e3 * x:.1f}" for x in T_base_platform.translation) + ")"
     return DidNotConverge(
         f"{machine.yaml_path}: the legs could not be closed with the platform at {place} mm: "
-        f"{problem}; check that the legs reach this pose (legcal.home)."
+        f"{problem}; check that the legs reach this pose ({machine.urdf.wording.home})."
     )

@@ -147,7 +147,7 @@ def _require(machine: Machine, count: int, found: int) -> None:
         raise DidNotConverge(
             f"{machine.yaml_path}: random poses could not be drawn: found {found} of "
             f"{count} inside the travel in {MAX_DRAWS} tries for each, needed all; check "
-            "legcal.home and the limits of the sliders."
+            f"{machine.urdf.wording.home} and the limits of the sliders."
         )
 
 

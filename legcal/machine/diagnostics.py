@@ -24,7 +24,7 @@ def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]
         xyz = ", ".join(f"{x:.6g}" for x in machine.home.translation)
         quat = ", ".join(f"{x:.6g}" for x in machine.home.rotation.as_quat(canonical=True))
         notes.append(
-            f"legcal.home is not given: a pose {middle} was taken, xyz "
+            f"{machine.urdf.wording.no_home}: a pose {middle} was taken, xyz "
             f"[{xyz}], quat_xyzw [{quat}]; write it down if the machine is assembled this way."
         )
     outside = legs_outside(machine)
@@ -32,8 +32,8 @@ def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]
         home_reading_in_words(machine.legs[j], float(q[j])) for j in outside
     ):
         notes.append(
-            f"{name} is at {reading} at home, outside its travel of {travel}; check legcal.home or "
-            "the limits."
+            f"{name} is at {reading} at home, outside its travel of {travel}; check the "
+            f"limits, or {machine.urdf.wording.correct_home}."
         )
     tied = ties_in_words(machine)
     notes += [] if tied is None else [tied]
@@ -66,8 +66,9 @@ def singularity_note(machine: Machine) -> str | None:
         return None
     return (
         "the mechanism is singular at home: the platform moves there although all motors stand "
-        f"(singularity measure {measure:.1g}, needed above {_MIN_SINGULARITY:g}); correct "
-        "legcal.home, or the joints if they make similar figures on base and platform."
+        f"(singularity measure {measure:.1g}, needed above {_MIN_SINGULARITY:g}); "
+        f"{machine.urdf.wording.correct_home}, or the joints if they make similar figures on base "
+        "and platform."
     )
 
 

@@ -26,7 +26,6 @@ from legcal.machine.mjcf import read_mjcf_source
 from legcal.machine.schema import MAX_LOOPS, MechanismFile, read_mechanism_file
 from legcal.machine.solver import Equations, solve
 from legcal.machine.spanning_tree import (
-    DRAWING,
     Loop,
     LoopKind,
     Source,
@@ -51,6 +50,7 @@ from legcal.machine.urdf import (
     parse_xml,
     read_urdf,
 )
+from legcal.machine.wording import BLOCK, NO_BLOCK, URDF_LOOPS
 
 XML_SUFFIXES = (".urdf", ".xml", ".mjcf")
 _UNIVERSAL = re.compile(r"UJOINT_([XYZ])([XYZ])")
@@ -63,25 +63,12 @@ _RIGID = 1e-3  # determinants of rotations but for rounding
 _SPREAD = 0.1  # [rad] and [m], of the start of a trial, times its number
 _MAX_STEP = 0.3  # step [rad, m]
 
-_NO_BLOCK = (
-    ("legcal.home could not be used", "the pose that the file draws could not be used"),
-    ("legcal.home is not given", "the file draws no closed pose"),
-    ("write legcal.home", "add a block legcal with home"),
-    ("correct legcal.home", "add a block legcal with another home"),
-    ("check legcal.home or the limits", "check the limits, or add a block legcal with home"),
-    ("correct legcal.base or legcal.platform", "add a block legcal with another base or platform"),
-    (", legcal.base and legcal.platform", ", or add a block legcal with another base and platform"),
-    ("write legcal.base, legcal.platform and legcal.legs",
-     "add a block legcal with base, platform and legs"),
-)  # fmt: skip
-
 KINDS: dict[str, LoopKind] = {
     **dict.fromkeys(("spherical", "ball", "point"), "point"),
     **dict.fromkeys(("fixed", "weld"), "weld"),
     **dict.fromkeys(("revolute", "continuous", "hinge"), "revolute"),
     "universal": "universal",
 }
-_WORDS = (("closed_loop", "<loop_joint> or <constraint>"), *DRAWING)
 
 
 def read_source(model: str | Path) -> Source:
@@ -133,7 +120,7 @@ def read_yaml_source(path: Path) -> Source:
     )
     check_stand_ins(file, urdf, path)
     if not file.joint_name:
-        return Source(path, file, urdf, words=_NO_BLOCK if block is None else ())
+        return Source(path, file, urdf if block else replace(urdf, wording=NO_BLOCK))
     return _converted(path, file, urdf)
 
 
@@ -157,8 +144,9 @@ def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
                 "for another joint (joint_name), needed another joint of that leg; name its "
                 "prismatic joint."
             )
-    words = _NO_BLOCK if file.legcal is None else ()
-    return Source(path, file.model_copy(update=changes), completed, words=words)
+    wording = NO_BLOCK if file.legcal is None else BLOCK
+    completed = replace(completed, wording=wording)
+    return Source(path, file.model_copy(update=changes), completed)
 
 
 def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
@@ -268,8 +256,8 @@ def read_loop_source(path: Path, content: bytes) -> Source:
         type=[kind for _, kind in pairs],
         name_mot=motors,
     )
-    urdf = parse_urdf(path, written, travel_needed=False)
-    return Source(path, file, urdf, tuple(notes), words=_WORDS)
+    urdf = replace(parse_urdf(path, written, travel_needed=False), wording=URDF_LOOPS)
+    return Source(path, file, urdf, tuple(notes))
 
 
 def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: Problems) -> list[Loop]:
@@ -435,7 +423,13 @@ def completed(source: Source) -> Source:
     if found is None:
         return source
     size = float(np.ptp([pose.translation for pose in poses.values()], axis=0).max())
-    return replace(source, poses=poses, is_drawn_open=not sliders and off > _OPEN * size)
+    drawn = {
+        name: float(configuration[chain.q_index(name)])
+        for name in source.file.name_mot
+        if name in urdf.joints and urdf.joints[name].type in ("prismatic", "revolute")
+    }
+    is_open = not sliders and off > _OPEN * size
+    return replace(source, poses=poses, drawn=drawn, is_drawn_open=is_open)
 
 
 def _levelled(
@@ -555,6 +549,6 @@ def _with_travel(
     names: Sequence[str] = list(readings)
     return replace(
         source,
-        urdf=parse_urdf(source.urdf.path, content),
+        urdf=replace(parse_urdf(source.urdf.path, content), wording=source.urdf.wording),
         notes=(*source.notes, travel_note(names, travel)),
     )

@@ -73,8 +73,8 @@ def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
     projected, problem = project_pose(machine, home)
     if problem is not None:
         raise ModelError(
-            f"{machine.yaml_path}: legcal.home could not be used: found {problem} there, needed "
-            "a closed pose; correct legcal.home."
+            f"{machine.yaml_path}: {machine.urdf.wording.home} could not be used: found {problem} "
+            f"there, needed a closed pose; {machine.urdf.wording.correct_home}."
         )
     return projected
 
@@ -124,7 +124,8 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
     if best is None:
         raise DidNotConverge(
             f"{machine.yaml_path}: no home pose was found: with all legs at mid-travel the "
-            f"loops did not close from {TRIALS} starts, needed a closed pose; write legcal.home."
+            f"loops did not close from {TRIALS} starts, needed a closed pose; "
+            f"{machine.urdf.wording.state_home}."
         )
     home = best[1]
     if machine.actuators:
@@ -134,10 +135,11 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
         sides = [_height(machine, T, centre) for T in (home, other) if T is not None]
         if np.prod(sides) < 0.0 and min(map(abs, sides)) > MIN_APART * reach:
             poses = " and ".join(_in_yaml(T) for T in (home, other) if T is not None)
+            wording = machine.urdf.wording
             raise ModelError(
-                f"{machine.yaml_path}: the assembly at home is ambiguous: found no legcal.home, "
-                f"and that at the same readings of the motors the rods reach the platform at "
-                f"{poses}, needed one; write legcal.home with the pose in which the machine is "
+                f"{machine.yaml_path}: the assembly at home is ambiguous: found that "
+                f"{wording.no_home}, and that at the same readings of the motors the rods reach "
+                f"the platform at {poses}, needed one; {wording.state_home}, as the machine is "
                 "assembled."
             )
     return home

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, LegcalError, ModelError, OutOfClass
+from legcal.errors import DidNotConverge, ModelError, OutOfClass
 from legcal.files.motions import MotionEntry, motion_to_xyz_quat
 from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import closest
@@ -110,12 +110,7 @@ def load_mechanism(model: str | Path) -> Machine:
     OutOfClass
         If the mechanism is not one that the method covers.
     """
-    source = read_source(model)
-    try:
-        return _load(source)
-    except LegcalError as error:
-        said = [source.in_format_terms(problem) for problem in error.problems]
-        raise type(error)(said) from error
+    return _load(read_source(model))
 
 
 def _load(source: Source) -> Machine:
@@ -152,7 +147,7 @@ def _load(source: Source) -> Machine:
             machine = _in_modes(machine, given, q)
     else:
         if machine.actuators:
-            q = _readings_at_home(machine, block.home_readings or {})
+            q = _readings_at_home(machine, block.home_readings or {}, source.drawn)
             machine = _in_modes(machine, machine.home, q)
         _check_unit(machine)  # before lengths of hundreds of metres fail to close
     if file.legcal is not None and file.legcal.home is not None:  # a drawing may be anywhere
@@ -175,9 +170,7 @@ def _load(source: Source) -> Machine:
     _check_dependence(machine)
     _check_ties(machine)
     proposed = proposal_notes(file.legcal, machine)
-    found = map(
-        source.in_format_terms, mechanism_notes(machine, home_is_given=block.home is not None)
-    )
+    found = mechanism_notes(machine, home_is_given=block.home is not None)
     return replace(machine, diagnostics=(*source.notes, *proposed, *found))
 
 
@@ -331,8 +324,12 @@ def _stated_or_middle(machine: Machine, given: Mapping[str, float]) -> list[floa
     return [given.get(str(leg.prismatic), 0.5 * sum(leg.travel)) for leg in machine.legs]
 
 
-def _readings_at_home(machine: Machine, given: Mapping[str, float]) -> list[float]:
+def _readings_at_home(
+    machine: Machine, given: Mapping[str, float], drawn: Mapping[str, float]
+) -> list[float]:
     """Return the joint values at home: as *given* for actuators, else the one inside the travel.
+
+    Where both are, it is the one that the file has *drawn*.
 
     Raises
     ------
@@ -364,12 +361,15 @@ def _readings_at_home(machine: Machine, given: Mapping[str, float]) -> list[floa
             continue
         inside = [bool(leg.in_travel(np.array([x]))[0]) for x in both]
         scale = 1e-6 * max(1.0, float(np.ptp(leg.travel)))
+        if all(inside) and leg.actuator.joint in drawn:
+            q[j] = min(both, key=lambda x: abs(x - drawn[str(leg.prismatic)]))
+            continue
         if all(inside) and abs(both[0] - both[1]) > scale:
             raise ModelError(
                 f"{path}: the assembly of leg '{leg.name}' at home is ambiguous: found that its "
                 f"rod reaches the platform at {said} of '{leg.actuator.joint}', both inside its "
-                "travel, needed one; write legcal.home_readings with the reading of each actuator "
-                "at home, or narrow the limits of the joint."
+                f"travel, needed one; {machine.urdf.wording.state_readings}, or narrow the limits "
+                "of the joint."
             )
         middle = 0.5 * sum(leg.travel)
         q[j] = both[inside.index(True)] if any(inside) else min(both, key=lambda x: abs(x - middle))

@@ -11,7 +11,7 @@ get a link of its own there (:func:`with_own_origins`).
 from __future__ import annotations
 
 from collections.abc import Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -125,7 +125,7 @@ def with_own_origins(
                     frame_link(urdf, frame), link, link, joint, RigidTransform.identity()
                 )
                 changed = _renamed(changed, frame, link)
-            urdf = parse_urdf(urdf.path, patch.content())
+            urdf = replace(parse_urdf(urdf.path, patch.content()), wording=urdf.wording)
         else:
             return urdf, changed
 

@@ -60,8 +60,7 @@ def find_chains(
     if ends[0] == ends[1]:
         raise OutOfClass(
             f"{urdf.path}: this is not a parallel mechanism: found the platform '{platform}' fixed "
-            f"to the base '{base}', needed legs between them; correct legcal.base or "
-            "legcal.platform."
+            f"to the base '{base}', needed legs between them; {urdf.wording.correct_ends}."
         )
     origin = bodies.T_body_link[platform][:3, 3]
     return [
@@ -516,7 +515,8 @@ def _not_a_chain(
         found = f"shares link '{body}' with another leg or branches there"
     return (
         f"{urdf.path}: this is not a platform on separate legs: the chain that starts with "
-        f"{_name(first)} {found}, {needed} check closed_loop, legcal.base and legcal.platform."
+        f"{_name(first)} {found}, {needed} check {urdf.wording.closures}, or "
+        f"{urdf.wording.correct_ends}."
     )
 
 
@@ -569,9 +569,9 @@ def _platform_body(
     if n_base < 2:
         joints = "1 joint" if n_base == 1 else "no joint"
         raise OutOfClass(
-            f"{path}: this is not a parallel mechanism: found {joints} on the base (the root of "
-            "the URDF), needed one for each leg; write legcal.base, legcal.platform and "
-            "legcal.legs if another link is the base."
+            f"{path}: this is not a parallel mechanism: found {joints} on the base "
+            f"({urdf.wording.root}), needed one for each leg; {urdf.wording.state_ends} if another "
+            "link is the base."
         )
     meeting = [body for body in at if body != base and len(at[body]) > 2]
     candidates = meeting or [body for body in at if body != base]
@@ -590,7 +590,7 @@ def _platform_body(
     if found:
         raise OutOfClass(
             f"{path}: no platform could be proposed: found several links where legs could end "
-            f"({', '.join(found)}), needed one; write legcal.platform and legcal.legs."
+            f"({', '.join(found)}), needed one; {urdf.wording.state_ends}."
         )
     if meeting:
         raise reasons[0]
