@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -15,7 +15,6 @@ from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
 from legcal.machine.chain import ClosedChain
-from legcal.machine.drawing import Sketch, motor_lines
 from legcal.machine.leg import (
     Cylinder,
     KinematicParameters,
@@ -33,9 +32,6 @@ from legcal.machine.rods import (
     reading_of_rod,
 )
 from legcal.machine.urdf import Urdf
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @brief
@@ -238,30 +234,6 @@ class Machine:
             platform[leg, rank:n_d] = 0.0
         found = parameters_of_legs(self.legs_of_frames)
         return replace(found, base_joints=base, platform_joints=platform)
-
-    def plot(self) -> "Figure":
-        """Return a figure of the machine at home from above and from the side, in millimetres.
-
-        Joints have the number of their leg (A1 on the base, B1 on the platform); those that define
-        R_b and R_e have a ring, and axes are red (x), green (y) and blue (z).
-        """
-        return self.sketch.plot()
-
-    @cached_property
-    def sketch(self) -> Sketch:
-        """What pictures of the machine at home show."""
-        B = B_at(self, self.home.as_matrix()[None])[0]
-        A = B - vectors_A_to_B(self, self.home)
-        return Sketch.of(
-            self.name,
-            self.leg_names,
-            self.frame_legs,
-            tuple(max([c.radius for c in leg.cylinders], default=0.0) for leg in self.legs),
-            (A, B),
-            (("R_b", self.T_base_Rb), ("R_e", self.home * self.T_platform_Re)),
-            motor_lines(self.legs, A[None]),
-            spatial=self.spatial,
-        )
 
     def with_radii(self, radius: Callable[[int, Cylinder], float]) -> "Machine":
         """Return the mechanism with other radii of its visible cylinders, as :func:`with_radii`."""
