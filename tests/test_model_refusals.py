@@ -755,7 +755,7 @@ SPECIFIED: dict[str, tuple[Callable[[], MachineSpec], tuple[str, ...]]] = {
     **{
         f"slider off, {types}": (
             partial(_missing, types, 0.002),
-            ("'leg2_slider'", "by 2 mm", "0.01 mm"),
+            ("'leg2_slider'", "by 2 mm", "needed at most 0.01"),
         )
         for types in ("US", "RS", "UU", "RR")
     },
@@ -784,9 +784,15 @@ def test_legs_outside_the_method_are_refused_with_the_amount(name: str, tmp_path
     assert all(word in problem for word in named), problem
 
 
-@pytest.mark.parametrize("types", ["US", "RS", "UU"])
-def test_a_slider_that_misses_its_joint_by_a_hair_is_accepted(types: str, tmp_path: Path) -> None:
-    load_mechanism(write_machine(tmp_path, _missing(types, 2e-6), Layout()))
+@pytest.mark.parametrize(("types", "scale"), [("US", 1.0), ("RS", 0.1), ("UU", 25.0)])
+def test_by_how_much_a_slider_may_miss_its_joint_grows_with_the_machine(
+    types: str, scale: float, tmp_path: Path
+) -> None:
+    near = load_mechanism(write_machine(tmp_path, _scaled(_missing(types, 4e-6), scale), Layout()))
+    assert near.home.translation[2] == pytest.approx(0.6 * scale, rel=1e-4)
+    path = write_machine(tmp_path, _scaled(_missing(types, 4e-5), scale), Layout())
+    (problem,) = refused(path, OutOfClass)
+    assert f"by {0.04 * scale:.4g} mm" in problem
 
 
 def test_three_axes_that_meet_in_two_points_are_no_spherical_joint(tmp_path: Path) -> None:

@@ -331,7 +331,8 @@ def random_postures_of_legs(
     start = solve_poses(legs, frame_legs, home.rotation.as_matrix()[None], home.translation[None])
     drive = _Drive(legs, frame_legs, start.R, start.t)
     at_home = drive.values(start.R, start.t)[0]
-    slack = 1e-6 + 0.05 * (travel[:, 1] - travel[:, 0])
+    rounding = NEARLY_CLOSED * float(drive.lengths(start.R, start.t).mean())
+    slack = rounding + 0.05 * (travel[:, 1] - travel[:, 0])
     low = np.minimum(travel[:, 0], at_home) - slack  # home counts as inside
     high = np.maximum(travel[:, 1], at_home) + slack
     found = start.R[:0], start.t[:0]

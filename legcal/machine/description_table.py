@@ -344,6 +344,7 @@ OPTIONS = {
     "home": "--height",
 }
 _TRAVELS = ("travel", "travel_deg", "travel_us")
+_SAME = 1e-6  # of the span of the joints: so near, joints are one
 
 
 def read_description(
@@ -832,20 +833,21 @@ def _impossible_legs(described: Description) -> list[str]:
     ]
     # Legs that begin and end in the same two points, and joints all in one point.
     legs = described.legs
+    A, B = (np.array([getattr(leg, side) for leg in legs]) for side in ("A_base", "B_platform"))
+    spans = [float(np.linalg.norm(np.ptp(joints, axis=0))) for joints in (A, B)]
     for j, one in enumerate(legs):
         for two in legs[j + 1 :]:
             gap = max(
                 float(np.linalg.norm(one.A_base - two.A_base)),
                 float(np.linalg.norm(one.B_platform - two.B_platform)),
             )
-            if gap < 1e-6:
+            if gap <= _SAME * max(spans):
                 problems.append(
                     f"{described.source}: legs '{one.name}' and '{two.name}' could not be used: "
                     "found both between the same two points, needed different joints; correct "
                     "their rows."
                 )
-    if any(float(np.ptp([getattr(leg, s) for leg in legs], axis=0).max()) < 1e-6 for s in
-           ("A_base", "B_platform")):  # fmt: skip
+    if min(spans) <= _SAME * max(spans):
         problems.append(
             f"{described.source}: the joints could not be used: found all of one side in one "
             "point, needed them spread out; correct base_joints or platform_joints."

@@ -23,9 +23,9 @@ from legcal.machine.actuator import Actuator, Pulses
 from legcal.machine.bodies import Bodies, rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.classification import (
-    CONCURRENT,
     PERPENDICULAR,
     actuator_of,
+    joint_tolerance,
     leg_of,
 )
 from legcal.machine.cylinders import (
@@ -360,7 +360,7 @@ def _readings_at_home(
                 )
             continue
         inside = [bool(leg.in_travel(np.array([x]))[0]) for x in both]
-        scale = 1e-6 * max(1.0, float(np.ptp(leg.travel)))
+        scale = 1e-6 * float(np.ptp(leg.travel))
         if all(inside) and leg.actuator.joint in drawn:
             q[j] = min(both, key=lambda x: abs(x - drawn[str(leg.prismatic)]))
             continue
@@ -725,21 +725,22 @@ def _check_across(machine: Machine) -> None:
     Raises
     ------
     OutOfClass
-        If one is more than 10 um open, or turned by more than 1 mrad.
+        If one is further open than joints may be off, or turned by more than 1 mrad.
     """
+    within = joint_tolerance((machine.A_base, machine.B_platform))
     row, residual = 0, machine.chain.residual(machine.home_configuration)
     problems = []
     for closure in machine.chain.closures:
         gap = float(np.linalg.norm(residual[row : row + 3]))
         tilt = float(np.linalg.norm(residual[row + 3 : row + closure.rows]))
         row += closure.rows
-        if gap > CONCURRENT or tilt > PERPENDICULAR:
+        if gap > within or tilt > PERPENDICULAR:
             problems.append(
                 f"{machine.yaml_path}: the loops could not be closed: found "
                 f"'{closure.frame_1}' and '{closure.frame_2}' {1e3 * gap:.3g} mm and "
                 f"{np.degrees(tilt):.3f} deg apart across the plane in which the legs move, needed "
-                f"at most 0.01 mm and {np.degrees(PERPENDICULAR):.2g} deg; correct the origins and "
-                "axes along this leg."
+                f"at most {1e3 * within:.2g} mm and {np.degrees(PERPENDICULAR):.2g} deg; correct "
+                "the origins and axes along this leg."
             )
     if problems:
         raise OutOfClass(problems)
@@ -755,7 +756,8 @@ def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
     Raises
     ------
     OutOfClass
-        If a length is more than 10 um off, or an axis, a direction or a twist more than 1 mrad.
+        If a length is further off than joints may be, or an axis, a direction or a twist by more
+        than 1 mrad.
     """
     poses = [machine.chain.placement(c, machine.base, machine.platform) for c in configurations]
     R, t = np.array([R for R, _ in poses]), np.array([t for _, t in poses])
@@ -768,10 +770,11 @@ def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
             values[:, 0] -= leg.sign * q[:, j]
         of_legs.append((leg.name, equations.kinds, np.abs(values)))
     problems: dict[str, str] = {}
+    within = joint_tolerance((machine.A_base, machine.B_platform))
     for k in range(len(configurations)):
         for name, kinds, values in of_legs:
             for kind, value in zip(kinds, values[k].tolist(), strict=True):
-                problem = _broken_equation(kind, value)
+                problem = _broken_equation(kind, value, within)
                 if problem is not None:
                     problems.setdefault(
                         name,
@@ -782,12 +785,15 @@ def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
         raise OutOfClass(list(problems.values()))
 
 
-def _broken_equation(kind: EquationKind, value: float) -> str | None:
-    """Return how an equation is broken, None if it is kept."""
+def _broken_equation(kind: EquationKind, value: float, within: float) -> str | None:
+    """Return how an equation is broken, None if it is kept; lengths *within* so much [m]."""
     if kind is EquationKind.LENGTH:
-        if value <= CONCURRENT:
+        if value <= within:
             return None
-        return f"its length {1e3 * value:.3g} mm from reading plus offset, needed at most 0.01 mm,"
+        return (
+            f"its length {1e3 * value:.3g} mm from reading plus offset, needed at most "
+            f"{1e3 * within:.2g} mm,"
+        )
     if value <= PERPENDICULAR:
         return None
     angle = f"{np.degrees(np.arcsin(min(value, 1.0))):.3g}"

@@ -22,9 +22,9 @@ from legcal.geometry.types import Array
 from legcal.machine.bodies import Bodies, Connection, frame_link, rigid_bodies
 from legcal.machine.chain import Closure
 from legcal.machine.classification import (
-    CONCURRENT,
     classify_leg,
     is_actuator,
+    joint_tolerance,
     nearest,
     off_square,
     parallel,
@@ -63,14 +63,25 @@ def find_chains(
             f"to the base '{base}', needed legs between them; {urdf.wording.correct_ends}."
         )
     origin = bodies.T_body_link[platform][:3, 3]
+    within = joint_tolerance(_joints_on(bodies, end) for end in ends)
     return [
-        classify_leg(steps, origin, urdf.path, motors)
-        for steps in _paths(bodies, urdf, *ends, motors)
+        classify_leg(steps, origin, urdf.path, within, motors)
+        for steps in _paths(bodies, urdf, *ends, motors, within)
+    ]
+
+
+def _joints_on(bodies: Bodies, body: str) -> list[Array]:
+    """Return where the joints of a body stand in it, (3,) each [m]."""
+    return [
+        T[:3, 3]
+        for connection in bodies.connections
+        for end, T in zip(connection.bodies, connection.T_body_joint, strict=True)
+        if end == body
     ]
 
 
 def _paths(
-    bodies: Bodies, urdf: Urdf, base: str, platform: str, motors: Sequence[str]
+    bodies: Bodies, urdf: Urdf, base: str, platform: str, motors: Sequence[str], within: float
 ) -> list[list[Step]]:
     """Return the joints of every leg from base to platform."""
     _refuse_second_mechanism(bodies, urdf, base, platform)
@@ -108,10 +119,10 @@ def _paths(
             onward = [c for c in at[body] if c is not connection]
             if body == base or len(onward) != 1 or id(onward[0]) in used:
                 problem = ""
-                if len(onward) > 1 and not _is_an_arm(steps):
+                if len(onward) > 1 and not _is_an_arm(steps, within):
                     problem = _several_bodies(bodies, urdf, steps, body, (base, platform))
                 raise OutOfClass(
-                    problem or _not_a_chain(urdf, steps, body, base, len(onward), motors)
+                    problem or _not_a_chain(urdf, steps, body, base, len(onward), motors, within)
                 )
             connection = onward[0]
         paths.append(steps)
@@ -482,7 +493,13 @@ def _reached(
 
 
 def _not_a_chain(
-    urdf: Urdf, steps: list[Step], body: str, base: str, n_onward: int, motors: Sequence[str]
+    urdf: Urdf,
+    steps: list[Step],
+    body: str,
+    base: str,
+    n_onward: int,
+    motors: Sequence[str],
+    within: float,
 ) -> str:
     """Return why the leg that starts with some joints is not a chain."""
     needed = "needed one unbranched chain from base to platform for each leg;"
@@ -505,7 +522,7 @@ def _not_a_chain(
         found = "returns to the base"
     elif n_onward == 0:
         found = f"ends at link '{body}' without reaching the platform"
-    elif n_onward > 1 and _is_an_arm(steps):
+    elif n_onward > 1 and _is_an_arm(steps, within):
         found = f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
         needed = (
             "needed joints whose centres are fixed in the base, or a motor in name_mot that moves "
@@ -520,7 +537,7 @@ def _not_a_chain(
     )
 
 
-def _is_an_arm(steps: list[Step]) -> bool:
+def _is_an_arm(steps: list[Step], within: float) -> bool:
     """Say whether joints make an arm whose end moves: one revolute, or several apart."""
     if any(step.connection.type != "revolute" for step in steps):
         return False
@@ -528,7 +545,7 @@ def _is_an_arm(steps: list[Step]) -> bool:
         return True
     for one, two in pairwise(steps):
         near, far = nearest(Axis(one.name, *one.line(one.far)), Axis(two.name, *two.line(two.near)))
-        if near is None or far is None or float(np.linalg.norm(far - near)) > CONCURRENT:
+        if near is None or far is None or float(np.linalg.norm(far - near)) > within:
             return True
     return False
 
