@@ -94,7 +94,7 @@ def _commands_and_models_are_read_once() -> Iterator[None]:
         return source
 
     def load_once(source: Source) -> Machine:
-        if source.words or source.notes or source.poses is not None:
+        if source.file.legcal is None or source.notes or source.poses is not None:
             return load(source)
         key = (source.path.name, source.urdf.path.name, repr(source.file), source.urdf.text)
         if key not in machines:

@@ -200,6 +200,8 @@ def test_options_without_sense_are_refused_by_name(
         (("calibrate", "x", "--significance=0.05"), ["legcal.check"]),
         (("calibrate", "--list", "machines.csv"), ["docs/python.md"]),
         (("calibrate", "x", "--resume"), ["docs/python.md"]),
+        (("new", "t.csv", "-o", ".", "--travel", "0", "9"), ["--travel", "travel_low"]),
+        (("new", "--family", "delta", "-o", ".", "--rod-spacing=60"), ["--rod-spacing", "table"]),
     ],
 )
 def test_what_earlier_versions_had_is_refused_with_what_does_the_same_now(

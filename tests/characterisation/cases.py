@@ -165,20 +165,6 @@ def _models() -> Iterable[Case]:
         ),
         input="model",
     )
-    family = "new --family {} --unit mm --base-radius 300 --platform-radius 150 -o {{out}} --json"
-    options = {
-        "6-UPS": "--height 400 --base-spread 20 --platform-spread 25 --name mine",
-        "3-UPU": "--height 0.4 --tilt 10 --travel 0 0.2 --offset 0.3 --leg-radius 0.01",
-        "3-RPR": "--turn 20",
-        "6-SS": "--height 400",
-        "3-RPS": "--height 400 --turn 5",
-    }
-    for kind, words in options.items():
-        command = family.format(kind)
-        if kind == "3-UPU":  # in metres
-            command = command.replace("mm --base-radius 300 --platform-radius 150", "m"
-                                      " --base-radius 0.3 --platform-radius 0.15")  # fmt: skip
-        yield Case(f"new-{kind}", (Step(f"{command} {words}", folder="{out}"),))
     yield Case(
         "new-csv-and-force",
         (

@@ -978,31 +978,8 @@ def _new() -> Iterable[Refusal]:
             f"csv-{name}", f"new {{in}}/m.csv -o {{out}} {words}", named, "",
             (text("m.csv", content),),
         )  # fmt: skip
-    family = "--base-radius 300 --platform-radius 150"
-    families: list[tuple[str, str, tuple[str, ...]]] = [
-        ("nothing", "", ("--family",)),
-        ("sizes", "--family 6-UPS", ("--base-radius", "--platform-radius", "--height")),
-        ("name", "--family hexapod", ("'hexapod'",)),
-        ("one", "--family 1-UPS", ("'1-UPS'", "2")),
-        ("class", "--family 3-PPS", ("'3-PPS'",)),
-        ("unit", f"--family 6-UPS --unit inch {family} --height 4", ("'inch'", "mm")),
-        ("radius", "--family 6-UPS --unit mm --base-radius -3 --platform-radius 2 --height 4",
-         ("--base-radius", "-3")),
-        ("height", f"--family 3-RPR --unit mm {family} --height 4", ("--height",)),
-        ("tilt", f"--family 3-RPR --unit mm {family} --tilt 4", ("--tilt",)),
-        ("spread", f"--family 3-RPS --unit mm {family} --height 4 --base-spread 30",
-         ("--base-spread", "3")),
-        ("offset", f"--family 6-SS --unit mm {family} --height 4 --offset 3", ("--offset",)),
-        ("turn", f"--family 6-UPS --unit mm {family} --height 400 --turn 200", ("--turn", "200")),
-        ("travel", f"--family 6-UPS --unit mm {family} --height 400 --travel 2 1",
-         ("--travel", "2 1")),
-        ("path", f"--family 6-UPS --unit mm {family} --height 400 --name ../up", ("'../up'",)),
-        ("metres", f"--family 6-UPS --unit m {family} --height 400", ("m",)),
-    ]  # fmt: skip
-    yield from _worded("family", "new -o {out}", families)
     for name, words, named in (
-        ("both", "{in}/3-rps.yaml --family 6-UPS", ("--family",)),
-        ("beside", "{in}/3-rps.yaml --base-radius 3 --tilt 0", ("--base-radius", "--tilt")),
+        ("both", "{in}/3-rps.yaml --family delta", ("--family",)),
         ("missing", "{in}/none.yaml", ("none.yaml",)),
         ("unit-of-two", "{in}/3-rps.yaml --unit m", ("--unit m", "'mm'")),
     ):
