@@ -230,6 +230,15 @@ def test_impossible_numbers_of_processes_are_refused_before_any_is_started(
     assert f"--workers could not be used: found {workers}, needed 1 to 256 processes" in said
 
 
+@pytest.mark.parametrize("words", [("detect", "x", "-o", "y"), ("study", "paper", "-o", "y")])
+def test_a_number_of_processes_beside_a_cluster_is_refused(
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("LEGCAL_CLUSTER", "tcp://127.0.0.1:1")
+    assert run(monkeypatch, *words, "--workers", "2") == 2
+    assert "found --workers beside a cluster" in capsys.readouterr().err
+
+
 def test_help_names_the_unit_of_the_tool_position(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
