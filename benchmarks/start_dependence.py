@@ -26,7 +26,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from legcal import LegcalError, calibrate, load_dataset, load_mechanism
+from legcal import LegcalError, calibrate, load_dataset
 from legcal.calibration import Calibration, estimate
 from legcal.calibration.four_steps import starts
 from legcal.calibration.joint_fit import Start

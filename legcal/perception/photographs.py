@@ -55,7 +55,7 @@ from legcal.progress import Report
 from legcal.vision import EPSILON, Camera, look_alike, shared_cameras
 from legcal.workers import Run
 
-DETECTOR_VERSION = 13  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 14  # raise it whenever outlines or notes that are kept come out differently
 MEASURING = "Measuring outlines"  # a stage of progress
 CHOICE_ROUNDS = 2  # in which outlines decide between poses that readings leave open
 FreePosesOf = Mapping[int, tuple[RigidTransform, ...]]  # T_base_platform of poses, likeliest first
