@@ -64,7 +64,7 @@ SESSIONS = {
     "hexapod photographs": Session("hexapod", Level.PHOTOGRAPHS, 1),
     "6-sps photographs": Session("6-sps", Level.PHOTOGRAPHS, 2),
     "3-rps photographs": Session("3-rps", Level.PHOTOGRAPHS, 3),
-    "3-spr photographs": Session("3-spr", Level.PHOTOGRAPHS, 4),
+    "nategh-agheli photographs": Session("nategh-agheli", Level.PHOTOGRAPHS, 4),
     "hexapod-strut photographs": Session("hexapod-strut", Level.PHOTOGRAPHS, 5),
     "linear-delta photographs": Session("linear-delta", Level.PHOTOGRAPHS, 6),
     "3-rpr photographs": Session("3-rpr", Level.PHOTOGRAPHS, 7),

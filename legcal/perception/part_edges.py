@@ -37,8 +37,8 @@ MAX_RIVAL = 0.6  # of its score, which no other line may reach
 MIN_RIVAL_DISTANCE = 3.0  # from which on a line is another one, in the middle [px]
 NOISE_LEVELS = 4.0  # an edge this many times as steep as the median counts half
 BESIDE_WEIGHT = 0.8  # what an edge counts in the columns beside it
-# An edge that was found to a pixel may be where it is predicted [px]; found ones are off by multiples
-# of half a pixel, which rounding must not decide.
+# An edge that was found a pixel off may be where it is predicted [px]. Found ones are off by
+# multiples of half a pixel: between two of these, rounding decides nothing.
 MAX_PREDICTION_ERROR = 1.25
 
 

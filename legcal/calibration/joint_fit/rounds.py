@@ -1,9 +1,11 @@
 """From a first minimum to the final one: outlines and corners rejected, their errors estimated.
 
-Rounds reject outliers until the set of inliers stays the same. Then the noise of outlines and the
-variances of common-mode edge biases are estimated by restricted maximum likelihood and all is
-fitted again, until these converge. The last fit has the variances that are expected in place of
-the likeliest ones, which are too small on average.
+Rounds reject outliers until the set of inliers stays the same. They begin at the minimum that all
+outlines have together, wherever the search for it began, and outliers lose their weight smoothly
+with their distance: none stays out only because it was out before. Then the noise of outlines and
+the variances of common-mode edge biases are estimated by restricted maximum likelihood and all is
+fitted again, until these converge. The last fit has the variances that are expected in place of the
+likeliest ones, which are too small on average.
 """
 
 from __future__ import annotations
