@@ -27,20 +27,17 @@ from unittest.mock import patch
 import numpy as np
 
 from legcal import LegcalError, calibrate, load_dataset
-from legcal.calibration import Calibration, estimate
+from legcal.calibration import estimate
 from legcal.calibration.four_steps import starts
-from legcal.calibration.joint_fit import Start
+from legcal.calibration.joint_fit.variables import Start
+from legcal.calibration.result import Calibration
 from legcal.data.outlines import Outlines, read_observations, write_observations
-from legcal.geometry import Array
-from legcal.simulation import (
-    Level,
-    ParameterErrors,
-    SimulationSettings,
-    Spread,
-    moved_outlines,
-    simulate,
-    write_true_model,
-)
+from legcal.geometry.types import Array
+from legcal.simulation.dataset import simulate
+from legcal.simulation.observe import moved_outlines
+from legcal.simulation.request import Level
+from legcal.simulation.settings import ParameterErrors, SimulationSettings, Spread
+from legcal.simulation.truth import write_true_model
 
 EXAMPLE = Path(__file__).parents[1] / "examples/hexapod"
 OFF = 3e-3  # [m] of joints and lengths of the third start
