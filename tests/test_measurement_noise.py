@@ -278,7 +278,7 @@ def canny_errors(
     shown = np.ones((1, n), dtype=np.bool_)
     image = np.clip(pixels, 0, 255).astype(np.float32)
     names = [f"leg{i + 1}" for i in range(n)]
-    search = Search(lambda row: image, m, A, B, cylinders, shown, names)
+    search = Search(lambda row: image, m, A, B, cylinders, shown, names, float(lengths.mean()))
     placement = Placement(A, B, (RigidTransform.identity(),))
     canny, ours = (
         measure_outlines(search, placement, [0], method=method)[0]
