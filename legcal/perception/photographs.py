@@ -117,6 +117,7 @@ class Photographs:
             self.cylinders,
             self.wanted,
             self.machine.leg_names,
+            self.machine.size,
             {} if pairs is None else pairs,
             {} if blur is None else blur,
         )
