@@ -7,7 +7,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 
-from characterisation.inputs import ROOT, made_input
+from made_inputs import ROOT, made_input
 
 from fuzzing.running import Case
 from fuzzing.subjects import SUBJECTS, Subject
