@@ -25,7 +25,6 @@ from legcal.cli.commands import (
     identify,
     inspect,
     locate,
-    noise,
 )
 from legcal.cli.example import example
 from legcal.cli.export import export
@@ -86,7 +85,6 @@ for command in (
     export,
     new,
     init,
-    noise,
     plan,
     simulate,
     example,

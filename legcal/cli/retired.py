@@ -6,9 +6,40 @@ from collections.abc import Mapping, Sequence
 
 from legcal.errors import UsageError
 
-COMMANDS: Mapping[str, str] = {}
+COMMANDS = {
+    "noise": "calibrate writes the noise of its outlines into its result, and legcal plan --noise "
+    "RESULT reads it there",
+}
 _TABLE = "write it in the table, for which legcal new --template makes one to start from"
+_DRY_RUN = "what was understood is shown before it is written, and files that are there stay"
+_TOPIC = "write the topic of the images behind the bag, BAG:/left/image_raw"
+_ONE_MACHINE = "calibrate one dataset a call, many in a loop (docs/python.md, Many machines)"
 OPTIONS: Mapping[str, Mapping[str, str]] = {
+    "calibrate": {
+        "--fix": "write --set NAME, or --set NAME=VALUE",
+        "--free": "write --set NAME=free",
+        "--prior": "write --set NAME=VALUE±SIGMA",
+        "--significance": "call legcal.check(dataset, result, significance=P) in Python",
+        "--list": _ONE_MACHINE,
+        "--earlier": _ONE_MACHINE,
+        "--resume": _ONE_MACHINE,
+    },
+    "init": {
+        "--servo": "write centre_us and us_per_deg of each servo into legcal.motors of the model",
+        "--views": "give a FOLDER that holds only the photographs to use",
+        "--view-pattern": "put the photographs of each place in a folder, or add a column view",
+        "--match": "rows and photographs are matched by a column image, else by a column time, "
+        "else in order; remove the column that is not to count",
+        "--dry-run": _DRY_RUN,
+    },
+    "import": {
+        "--unit": "state the unit in the headings of the table, such as 'leg1 [mm]'",
+        "--still": "rests of 0.3 s and more are used",
+        "--image-topic": _TOPIC,
+        "--joint-topic": "joint states are read from the only topic that has them or from "
+        "/joint_states; give others as a table with --readings",
+        "--dry-run": _DRY_RUN,
+    },
     "new": {
         "--offset": "write offsets in the table (in a CSV the column offset), or give --min-length "
         "and --max-length",
@@ -23,7 +54,7 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "--template --family delta makes one to start from",
         "--rod-spacing": "write the joints in the table, for which legcal new --template --family "
         "delta makes one to start from",
-    }
+    },
 }
 """What stands in place of options, by command: the rest of a sentence."""
 

@@ -51,11 +51,11 @@ def simulate(
     settings = requested(Request(**options), nominal)
     workers = image_workers(cluster)
     made = run(nominal, output, settings, force=force, workers=workers, progress=not quiet)
-    document, repeated = summary_document(made), options["images"] > 1
+    document = summary_document(made)
     show(
         as_json,
         lambda: document,
-        lambda: simulation_table(document, repeated=repeated, to_measure=made.to_measure),
+        lambda: simulation_table(document, to_measure=made.to_measure),
     )
 
 
