@@ -465,7 +465,7 @@ def _seen(n_views: int) -> BoardViews:
     corners = found_corners(none.astype(np.intp), none.astype(np.intp), np.zeros((0, 2)), none)
     T_board_camera = RigidTransform.from_translation([0.0, 0.0, -1.0])
     boards = (FixedBoard(Board("chessboard", 7, 6, 0.03), "base"),)
-    return BoardViews(boards, corners, (T_board_camera,) * n_views, {}, ())
+    return BoardViews(boards, corners, (T_board_camera,) * n_views, {}, (), 0.4)
 
 
 def _with_board(T_base_board: RigidTransform | None) -> Any:

@@ -191,8 +191,6 @@ def test_options_without_sense_are_refused_by_name(
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (("new", "t.csv", "-o", ".", "--travel", "0", "9"), ["--travel", "travel_low"]),
-        (("new", "--family", "delta", "-o", ".", "--rod-spacing=60"), ["--rod-spacing", "table"]),
         (("noise", "dataset", "--json"), ["legcal noise is gone: calibrate", "plan --noise"]),
         (("init", "photos", "--match=order"), ["--match of legcal init is gone", "column image"]),
         (("import", "a.bag", "--still", "1"), ["--still of legcal import is gone", "0.3 s"]),
@@ -202,6 +200,8 @@ def test_options_without_sense_are_refused_by_name(
         (("calibrate", "x", "--significance=0.05"), ["legcal.check"]),
         (("calibrate", "--list", "machines.csv"), ["docs/python.md"]),
         (("calibrate", "x", "--resume"), ["docs/python.md"]),
+        (("new", "t.csv", "-o", ".", "--travel", "0", "9"), ["--travel", "travel_low"]),
+        (("new", "--family", "delta", "-o", ".", "--rod-spacing=60"), ["--rod-spacing", "table"]),
     ],
 )
 def test_what_earlier_versions_had_is_refused_with_what_does_the_same_now(
@@ -228,6 +228,15 @@ def test_impossible_numbers_of_processes_are_refused_before_any_is_started(
     assert run(monkeypatch, *words, "--workers", workers) == 2
     said = capsys.readouterr().err
     assert f"--workers could not be used: found {workers}, needed 1 to 256 processes" in said
+
+
+@pytest.mark.parametrize("words", [("detect", "x", "-o", "y"), ("study", "paper", "-o", "y")])
+def test_a_number_of_processes_beside_a_cluster_is_refused(
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("LEGCAL_CLUSTER", "tcp://127.0.0.1:1")
+    assert run(monkeypatch, *words, "--workers", "2") == 2
+    assert "found --workers beside a cluster" in capsys.readouterr().err
 
 
 def test_help_names_the_unit_of_the_tool_position(

@@ -16,7 +16,6 @@ from legcal.cli.options import (
     WorkersOption,
     command_line,
     image_workers,
-    loading,
     show,
     write_page,
 )
@@ -160,15 +159,13 @@ def calibrate(
             "The truth could not be used: found --truth beside --no-report, needed the page, which "
             "alone compares the result with it; leave one of them out."
         )
-    with loading():
-        from legcal.calibration import pipeline
-        from legcal.calibration.result_folder import REPORT_NAME
-        from legcal.data.overrides import overrides_of_settings
-        from legcal.pages.html import PAGE
-        from legcal.report import calibration
-        from legcal.report.page.writing import write_report
+    from legcal.calibration import pipeline
+    from legcal.calibration.result_folder import REPORT_NAME
+    from legcal.data.overrides import overrides_of_settings
+    from legcal.pages.html import PAGE
+    from legcal.report import calibration
+    from legcal.report.page.writing import write_report
 
-        run, summary = pipeline.calibrate, calibration.summary
     arguments: dict[str, Any] = {
         "criteria": criteria,
         "transformation": transformation,
@@ -188,7 +185,7 @@ def calibrate(
     page_of = PageOfResult(
         lambda found, folder: write_report(found, output, command_line(), truth=true, into=folder)
     )
-    found = run(
+    found = pipeline.calibrate(
         given,
         output=output,
         progress=not quiet,
@@ -200,7 +197,7 @@ def calibrate(
     show(
         as_json,
         lambda: found.result.document(),
-        lambda: summary(found, output, verbose=verbose),
+        lambda: calibration.summary(found, output, verbose=verbose),
     )
     if not found.verdict.trustworthy:
         raise typer.Exit(1)

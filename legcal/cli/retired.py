@@ -10,10 +10,10 @@ COMMANDS = {
     "noise": "calibrate writes the noise of its outlines into its result, and legcal plan --noise "
     "RESULT reads it there",
 }
-_TABLE = "write it in the table, for which legcal new --template makes one to start from"
 _DRY_RUN = "what was understood is shown before it is written, and files that are there stay"
 _TOPIC = "write the topic of the images behind the bag, BAG:/left/image_raw"
 _ONE_MACHINE = "calibrate one dataset a call, many in a loop (docs/python.md, Many machines)"
+_TABLE = "write it in the table, for which legcal new --template makes one to start from"
 OPTIONS: Mapping[str, Mapping[str, str]] = {
     "calibrate": {
         "--fix": "write --set NAME, or --set NAME=VALUE",

@@ -68,6 +68,12 @@ class Machine:
         reach = float(np.ptp(self.A_base, axis=0).max())
         return np.asarray(across / size) if size > 1e-3 * reach else np.array([0.0, 0.0, 1.0])
 
+    @cached_property
+    def size(self) -> float:
+        """Mean leg length at home [m]: what errors and tolerances of lengths are parts of."""
+        vectors = vectors_at(self, self.home.as_matrix()[None])[0]
+        return float(np.linalg.norm(vectors, axis=1).mean())
+
     @property
     def n_legs(self) -> int:
         """Number of legs."""
