@@ -53,7 +53,7 @@ def _temporary_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Non
 @pytest.fixture
 def answered_signals() -> Iterator[None]:
     """Answer signals as Python does, also where the tests were started with them ignored."""
-    handlers = {
+    handlers: dict[signal.Signals, Any] = {
         signal.SIGINT: signal.default_int_handler,
         signal.SIGTERM: signal.SIG_DFL,
         signal.SIGHUP: signal.SIG_DFL,
