@@ -8,10 +8,11 @@ with the file. Write it anew only where the new answers are better, and say why 
 
 The record of a command has its exit code; ``facts``, which must be equal (status, counts, ranks,
 kind of an error); ``sizes``, which agree within SIZE_TOLERANCE (predicted errors of the platform,
-sums of squares); and ``estimates``, the value and standard deviation of each parameter, which agree
-within VALUE_TOLERANCE standard deviations and SIZE_TOLERANCE. The keys of ``--json`` are recorded
-for each command: those of all its documents, and for each other key the sessions that have it. Keys
-that the data choose (names of legs, views) are written as ``*``. Sentences are not recorded.
+sums of squares, places of cameras); and ``estimates``, the value and standard deviation of each
+parameter, which agree within VALUE_TOLERANCE standard deviations and SIZE_TOLERANCE. The keys of
+``--json`` are recorded for each command: those of all its documents, and for each other key the
+sessions that have it. Keys that the data choose (names of legs, views) are written as ``*``.
+Sentences are not recorded.
 
 The datasets are files in tests/data/recorded, so that they do not change with the simulation.
 """
@@ -339,10 +340,19 @@ def answer_of(name: str, document: dict[str, Any]) -> dict[str, Any]:
     if name == "calibrate":
         statuses = Counter(p["status"] for p in document["parameters"])
         facts |= {f"parameters {status}": count for status, count in sorted(statuses.items())}
+        legs = zip(document["legs"], document["offsets"], strict=True)
+        facts["without offset"] = [leg for leg, offset in legs if offset is None]
     if name == "identify":
         for condition in document["conditions"]:
             facts[f"{condition['name']}.ok"] = condition["ok"]
-    sizes = {k: rounded(v) for k, v in selected(document, SIZES.get(name, ())).items()}
+    sizes = selected(document, SIZES.get(name, ()))
+    if name == "calibrate":
+        for view, place in document["views"].items():
+            for axis, x in zip("xyz", place["T_base_camera"]["xyz"], strict=True):
+                sizes[f"{view}.{axis}"] = x
+    if name == "evaluate":
+        sizes |= {p["name"]: p["difference"] for p in document["parameters"]}
+    sizes = {path: rounded(size) for path, size in sizes.items()}
     parts = {"facts": facts, "sizes": sizes, "estimates": estimates_of(name, document)}
     return {kind: values for kind, values in parts.items() if values}
 
@@ -407,7 +417,7 @@ def _step_differences(
 
 
 def _size_difference(where: str, name: str, value: float, before: float) -> Difference:
-    change = value / before - 1.0 if before else math.inf * (value != before)
+    change = value / before - 1.0 if before else math.inf if value else 0.0
     return Difference(where, name, f"{100.0 * change:+.2f} %", abs(change) / SIZE_TOLERANCE)
 
 

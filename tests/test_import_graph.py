@@ -132,7 +132,6 @@ PUBLIC: dict[str, set[str]] = {
         "documents",
         "evaluation",
         "examination",
-        "fleet",
         "identify.identifiability",
         "identify.predicted_observations",
         "identify.report",
@@ -161,7 +160,6 @@ PUBLIC: dict[str, set[str]] = {
     "report": {
         "calibration",
         "doctor",
-        "fleet",
         "identify",
         "images",
         "machine",
@@ -181,7 +179,6 @@ PUBLIC: dict[str, set[str]] = {
 OUTSIDE = {
     "__main__",
     "brief",
-    "cluster",
     "errors",
     "figures",
     "option_fields",

@@ -446,7 +446,7 @@ def test_a_fit_that_still_changes_a_lot_is_refused(session: HexapodSession) -> N
 
 def test_a_fit_that_still_changes_a_little_says_so(session: HexapodSession) -> None:
     (note,) = _fit_in_rounds(session, 0.2, 4).notes or ("",)
-    assert "not quite converged" in note
+    assert "has not converged" in note
     assert " px to 0." in note
 
 

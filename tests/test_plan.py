@@ -169,6 +169,7 @@ def test_the_command_writes_what_python_plans(
     assert len((session / "poses.csv").read_text().splitlines()) == 1 + 6
 
 
+@pytest.mark.usefixtures("answered_signals")
 def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     planned: Plan,
     tmp_path: Path,
@@ -196,6 +197,7 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     assert any("stopped" in note for note in document["notes"])
 
 
+@pytest.mark.usefixtures("answered_signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("place", ["legcal.cli.plan._previews", "legcal.planning.session._poses"])
 def test_a_second_signal_ends_a_plan_at_once_and_leaves_no_session(

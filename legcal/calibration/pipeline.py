@@ -176,7 +176,6 @@ def calibrate(
         *found.solution.notes,
         *_camera_notes(dataset, found.solution),
         *exact_cameras(dataset, choices),
-        *pool.notes,
     ]
     calibration = judge(
         dataset_at(dataset, fitted),
@@ -300,7 +299,7 @@ def _estimate(
 
 
 def _unused_share(estimate: Estimate) -> float:
-    """Return which part of the outlines that should be measured was not used."""
+    """Return the share of the measurable outlines that the fit does not use."""
     shown = estimate.solution.outlines.choose(is_measurable(estimate.solution.outlines))
     return 1.0 - float(shown.used.mean()) if len(shown) else 1.0
 

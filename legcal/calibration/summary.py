@@ -239,6 +239,16 @@ def sentences(result: Result, *, verbose: bool = False) -> list[str]:
     ]
 
 
+def brief_sentences(result: Result) -> list[str]:
+    """Return what the first screen says beside the verdict and the platform error."""
+    return [
+        *_direction_lines(result, 1),
+        *_observation_lines(result),
+        *([] if result.holdout is None else _holdout_lines(result.holdout)),
+        *(f"Note: {note}" for note in result.notes),
+    ]
+
+
 def summary(result: Result) -> str:
     """Return the table of parameters, what it means, and the verdict as one text."""
     shown = [f"{title}\n{table!r}" for title, table in tables(result)]
@@ -410,11 +420,14 @@ def residuals_in_words(found: ReadingResiduals) -> str:
     )
 
 
-def _direction_lines(result: Result) -> list[str]:
+def _direction_lines(result: Result, n_worst: int | None = None) -> list[str]:
     """Return which combinations of parameters are least certain, and which are held."""
-    worst = [f"{weak.in_words} ({1e3 * weak.sigma_m:.3f} mm)" for weak in result.weakest]
-    where = "in R_b and R_e" if any(one.links is None for one in result.weakest) else "in the links"
-    least = f"Least certain combinations (1 sigma, {where}): {'; '.join(worst)}."
+    weakest = result.weakest[:n_worst]
+    worst = [f"{weak.in_words} ({1e3 * weak.sigma_m:.3f} mm)" for weak in weakest]
+    where = "in R_b and R_e" if any(one.links is None for one in weakest) else "in the links"
+    least = (
+        f"Least certain combination{'s' * (len(worst) > 1)} (1 sigma, {where}): {'; '.join(worst)}."
+    )
     lines = [least] if worst else []
     if result.held:
         lines.append(

@@ -28,7 +28,7 @@ class ImageTable:
         return len(self.row)
 
     def row_keys(self) -> list[tuple[Any, ...]]:
-        """Return what makes each row one and the same, by which tables are sorted."""
+        """Return the identity of each row, the key by which tables are sorted."""
         raise NotImplementedError
 
     def choose(self, chosen: BoolArray | IntArray) -> Self:

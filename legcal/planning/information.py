@@ -126,7 +126,7 @@ class Contributions:
         return rows.reshape(len(order) * rows.shape[1], rows.shape[2])
 
     def repeated(self, times: float) -> Contributions:
-        """Return what so many photographs at each image add."""
+        """Return the information of *times* photographs in place of each one."""
         return replace(self, rows=self.rows * np.sqrt(times), at_site=self.at_site * times)
 
 

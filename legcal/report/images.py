@@ -135,7 +135,7 @@ def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> Rende
             Text(
                 "Readings of motors that turn carry no length, and nothing else in this dataset "
                 f"does: simulate with --length {to_measure}=0.05mm, or calibrate with --length "
-                "or --prior.",
+                "or --set.",
                 style="yellow",
             )
             if to_measure

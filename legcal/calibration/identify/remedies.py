@@ -168,7 +168,7 @@ class _Candidates:
         return eliminate(rows[None], _CAMERA)[:, chosen[0].default_steps[0].columns]
 
     def analyses(self, size: int) -> list[Analysis]:
-        """Return what each view of so many legs says alone."""
+        """Analyse every possible view of *size* legs by itself."""
         if size not in self.of_size:
             views = self.windows(size)
             seen = np.zeros((len(views), self.machine.n_legs), dtype=np.bool_)

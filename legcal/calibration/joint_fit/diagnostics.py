@@ -122,7 +122,7 @@ def _refuse_other_size(
             f"The calibration board{which} does not fit the readings and the legs: found that it "
             f"is {size} the dataset says ({found.apart:.0f} standard deviations away), needed its "
             f"dimensions to {1e2 * sigma:.2g} %; measure the board and correct its dimensions in "
-            f"dataset.yaml, or let the fit find them (--free {name})."
+            f"dataset.yaml, or let the fit find them (--set {name}=free)."
         )
 
 
@@ -276,7 +276,7 @@ def _wide_prior(problem: FitProblem, state: State, name: str, value: float, sigm
 
 
 def _fitted(problem: FitProblem, state: State) -> tuple[Fit, HeldDirections]:
-    """Return the fit with what was fixed free, and what it holds."""
+    """Fit again with the fixed parameters free; return the fit and the directions it holds."""
     first = first_minimum(problem, state)
     normal = information(problem, first.state, first.linear, problem.loss)
     held = open_directions(problem, first.state, normal)

@@ -442,7 +442,7 @@ class Changes:
 
     @classmethod
     def of(cls, before: Fit, after: Fit) -> Changes:
-        """Return what lies between two fits to the same outlines."""
+        """Compare two successive fits to the same outlines."""
         n_changed = int(np.sum(after.accepted != before.accepted))
         return cls(_sizes(before), _sizes(after), n_changed, int(after.accepted.sum()))
 
@@ -495,8 +495,8 @@ def check_convergence(
             "outlines that are wrong."
         )
     return (
-        "The errors of the outlines have not quite converged, which leaves the uncertainty of the "
-        f"result that uncertain: {found}.",
+        "The noise of the outlines has not converged; the stated uncertainty may be wrong: "
+        f"{found}.",
     )
 
 

@@ -73,7 +73,7 @@ def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
                     "calibration board on the base."
                     if problem.legs.n_actuators
                     else "put a calibration board on the platform and one on the base, give a leg "
-                    "an encoder, or state measured coordinates of joints (--prior)."
+                    "an encoder, or state measured coordinates of joints (--set)."
                 ),
                 *failure.problems,
             ]
