@@ -30,7 +30,13 @@ from legcal.errors import DatasetError, LegcalError, ModelError
 from legcal.geometry.types import Image
 from legcal.machine.model import Machine
 from legcal.vision.camera import Camera
-from legcal.vision.image_file import BadImage, decode_image, image_size, inspect_image, read_image
+from legcal.vision.image_file import (
+    BadImage,
+    decode_image,
+    image_size,
+    inspect_image,
+    read_image,
+)
 
 __all__ = ["folder"]
 
