@@ -356,7 +356,7 @@ def test_a_3upu_turns_only_where_its_axes_are_tilted() -> None:
         assert (turned > 0.05) if turns else (turned < 1e-9)
 
 
-# --- refusals beside those of the characterisation ----------------------------------------------
+# --- refusals beside those of the table ----------------------------------------------
 
 SPS = {"type": "SPS"}
 ROD = {"type": None, "types": ["SPU", "SPU", "SS"]}

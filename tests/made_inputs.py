@@ -14,17 +14,25 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
+from command_outcomes import Outcome, run
 from scipy.spatial.transform import Rotation
 
-from characterisation.running import Outcome, run
-
-ROOT = Path(__file__).resolve().parents[2]
-MACHINES = sorted(  # those that were shipped when this was recorded
-    path.stem.removeprefix("model-")
-    for path in (Path(__file__).parent / "expected").glob("model-*.json")
-)
+ROOT = Path(__file__).resolve().parents[1]
+MACHINES = [
+    "3-rpr",
+    "3-rps",
+    "3-spr",
+    "3-upu",
+    "3-upu-tilted",
+    "6-sps",
+    "hexapod",
+    "hexapod-rod",
+    "hexapod-strut",
+    "nategh-agheli",
+    "tricept",
+]
 LEVELS = ("axes", "outlines", "photographs")
-PLACES = Path(__file__).parent / "expected" / "places.json"  # of cameras, by machine and view
+PLACES = Path(__file__).parent / "data/camera_places.json"  # of cameras, by machine and view
 SEED = "3"
 POSES = {"axes": "8", "outlines": "8", "photographs": "6"}
 JOINTS = [f"leg{j}_prismatic" for j in range(1, 7)]
@@ -33,7 +41,7 @@ SIZE = (64, 48)  # of pictures that nobody looks at
 
 @cache
 def _top() -> Path:
-    return Path(tempfile.mkdtemp(prefix="legcal-characterisation-"))
+    return Path(tempfile.mkdtemp(prefix="legcal-inputs-"))
 
 
 def remove_inputs() -> None:
