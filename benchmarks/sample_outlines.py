@@ -9,6 +9,7 @@ the inside of the leg. The truth is read here and in tests only.
 
 import json
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -105,8 +106,8 @@ def show(title: str, outlines: Outlines, error: Array, visible: Array, seconds: 
         print(f"  edge {edge}: median {np.median(middle[outlines.edge[used] == edge]):+.3f} px")
     rms = np.sqrt(np.mean(pull**2))
     print(f"  error over claimed sigma, ends: robust {spread(pull, 0.0):.2f}, rms {rms:.2f}")
-    for reason in sorted({r for r in outlines.reason if r}):
-        print(f"  rejected: {reason} ({outlines.reason.count(reason) // 2})")
+    for reason, n in Counter(str(why) for why in outlines.reason if why).most_common():
+        print(f"  rejected: {reason} ({n // 2})")
 
 
 def spread(values: Array, centre: float | None = None) -> float:
@@ -132,7 +133,8 @@ def main() -> None:
 
     A, B = joint_centres(machine, measurements)
     rough = [view.T_base_camera for view in measurements.views]
-    search, rows = Search(load, measurements, A, B, cylinders, wanted, names), np.arange(len(A))
+    search = Search(load, measurements, A, B, cylinders, wanted, names, machine.size)
+    rows = np.arange(len(A))
     for words, hints in (("with", rough), ("without", [None] * len(rough))):
         start = time.perf_counter()
         placed = place_views(search, rows, hints).recognised()

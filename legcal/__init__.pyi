@@ -16,6 +16,7 @@ from .errors import LegcalError as LegcalError
 from .exports.formats import export as export
 from .exports.subject import ExportOptions as ExportOptions
 from .machine.configurations import random_configurations as random_configurations
+from .machine.drawing import plot_machine as plot_machine
 from .machine.kinematics import Follower as Follower
 from .machine.kinematics import forward_kinematics as forward_kinematics
 from .machine.kinematics import inverse_kinematics as inverse_kinematics

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from threading import current_thread, main_thread
 from types import FrameType
 
+INTERRUPTED = 130  # exit code of a command that a signal stopped
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # the last is not on every system
 _NUMBERS = [signal.Signals[name] for name in _NAMES if hasattr(signal, name)]
 _heard: list[int] = []  # the signals that stopped the command

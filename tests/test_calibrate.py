@@ -1,6 +1,6 @@
 """The whole path from a dataset to the result folder: recovery, invariance, verdict, refusals.
 
-What every command writes for every shipped machine is compared in characterisation/.
+What commands write for small sessions of all classes is compared in test_recorded_sessions.py.
 """
 
 import json
@@ -219,7 +219,7 @@ def test_a_leg_of_a_view_that_was_left_out_speaks_against_a_model(
     "model",
     [
         PLANAR,
-        *(  # the others' numbers from outlines are in tests/characterisation
+        *(  # the others' numbers from outlines are in test_recorded_sessions.py
             pytest.param(name, marks=pytest.mark.slow)
             for name in (
                 *("tricept", "3-upu", "3-spr", "3-rps", "3-upu-tilted", "6-sps", "hexapod-rod"),
@@ -465,7 +465,7 @@ def _seen(n_views: int) -> BoardViews:
     corners = found_corners(none.astype(np.intp), none.astype(np.intp), np.zeros((0, 2)), none)
     T_board_camera = RigidTransform.from_translation([0.0, 0.0, -1.0])
     boards = (FixedBoard(Board("chessboard", 7, 6, 0.03), "base"),)
-    return BoardViews(boards, corners, (T_board_camera,) * n_views, {}, ())
+    return BoardViews(boards, corners, (T_board_camera,) * n_views, {}, (), 0.4)
 
 
 def _with_board(T_base_board: RigidTransform | None) -> Any:

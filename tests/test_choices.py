@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 from chosen import HEXAPOD, choose, known
-from command_line import run
 from dataset_folder import Folder, folder
 
 from legcal import calibrate, load_dataset, load_mechanism
@@ -295,22 +294,3 @@ def test_a_name_says_whose_number_it_is_whatever_the_leg_is_called(leg: str) -> 
 def test_one_option_fixes_frees_and_gives_priors(text: str, argument: dict[str, Any]) -> None:
     nothing: dict[str, list[str]] = {"priors": [], "fixed": [], "free": []}
     assert overrides_of_settings([text]) == nothing | argument
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        (("--fix", "leg1.offset=0.35"), "--set leg1.offset=0.35"),
-        (("--free", "c1.fx", "--free", "c1.fy"), "--set c1.fx=free --set c1.fy=free"),
-        (("--prior", "leg1.offset=0.35+-1e-4"), "--set leg1.offset=0.35+-1e-4"),
-        (("--significance", "0.05"), "significance=0.05"),
-    ],
-)
-def test_options_of_earlier_versions_are_refused_with_the_new_spelling(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    old: tuple[str, ...],
-    new: str,
-) -> None:
-    assert run(monkeypatch, "calibrate", "examples/hexapod", *old) == 2
-    assert new in capsys.readouterr().err

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from characterisation.inputs import ROOT, made_input
 from fuzzing.mutations import mutate
 from fuzzing.running import Case, count_cases, drawn_cases, run_cases
 from fuzzing.subjects import SUBJECTS
+from made_inputs import ROOT, made_input
 
 from legcal import LegcalError, load_mechanism
 from legcal.errors import DatasetError

@@ -1,6 +1,6 @@
 """The dataset folder: dataset.yaml, measurements.csv and image files, read and refused.
 
-Refusals of single cells and keys are in the table of tests/characterisation; here are those that
+Refusals of single cells and keys are in tests/refusal_table.py; here are those that
 Python alone shows, and every kind and every fault of an image file.
 """
 

@@ -267,7 +267,9 @@ def _view_of_outlines() -> None:
     ends = np.array([T.apply(B) for T in start.T_Rb_Re])
     every = np.ones((len(m.views), len(A)), dtype=np.bool_)
     cylinders = [leg.cylinders for leg in start.legs]
-    search = Search(_no_image, m, np.broadcast_to(A, ends.shape), ends, cylinders, every, m.image)
+    size = float(np.linalg.norm(ends[0] - A, axis=1).mean())
+    A_of_rows = np.broadcast_to(A, ends.shape)
+    search = Search(_no_image, m, A_of_rows, ends, cylinders, every, m.image, size)
     rough = [T.inv() for T in start.T_camera_Rb]
     to_first = [start.T_camera_Rb[0] * T for T in rough]  # two cameras on one mount
     (group, _) = group_views(m, np.arange(m.n_rows), rough, [*to_first[:2], None])

@@ -226,6 +226,7 @@ def test_poses_are_found_near_rough_cameras(n_motors: int, tmp_path: Path) -> No
         cylinders,
         np.ones((2, machine.n_legs), dtype=np.bool_),
         machine.leg_names,
+        machine.size,
         pairs,
     )
     found = find_free_poses(search, machine, range(4), rough, in_turn, lambda _: None)

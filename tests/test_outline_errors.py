@@ -578,7 +578,7 @@ def test_note_on_a_gamma_says_how_well_it_is_known_and_names_few_views() -> None
     assert "of views c0, c1, c2, c3, c4 and 3 more is not given, and its outlines hardly" in vague
 
 
-def trial(session: HexapodSession, gamma: float, lost: float = np.inf) -> Outlines:
+def trial(session: HexapodSession, gamma: float, lost: float = np.inf, seed: int = 4) -> Outlines:
     """Return outlines of a camera of LOG_GAMMA, measured with a gamma.
 
     Each knows its response to it to a third. Those that it moves by more than *lost* [px] are not
@@ -586,7 +586,7 @@ def trial(session: HexapodSession, gamma: float, lost: float = np.inf) -> Outlin
     """
     away = LOG_GAMMA - np.log(gamma)
     outlines = encoded(session, away)
-    wrong = np.random.default_rng(4).normal(1.0, 0.33, len(outlines))
+    wrong = np.random.default_rng(seed).normal(1.0, 0.33, len(outlines))
     return replace(
         outlines,
         gamma=np.full(len(outlines), gamma),
@@ -595,24 +595,34 @@ def trial(session: HexapodSession, gamma: float, lost: float = np.inf) -> Outlin
     )
 
 
-@pytest.mark.parametrize("lost", [np.inf, 0.15])
-def test_the_most_likely_gamma_is_that_of_the_same_outlines(
-    session: HexapodSession, lost: float
-) -> None:
+def gammas_tried(session: HexapodSession, lost: float, seed: int) -> tuple[Solution, GammaTrials]:
+    """Return the fit with a gamma of 1, and all trials that follow it."""
     measurements, start = without_gamma(session.measurements), disturbed_start(session)
 
     def fitted(gamma: float) -> Solution:
-        return refine(session.legs, measurements, trial(session, gamma, lost), start)
+        return refine(session.legs, measurements, trial(session, gamma, lost, seed), start)
 
     first = fitted(1.0)
     trials = GammaTrials.begun(first, {})
     while gammas := trials.next():
         trials = trials.tried(gammas, fitted(gammas["c1"]))
-    found = trials.found()
-    assert found.keys() == {"c1", "c2", "c3"}
-    assert np.log(found["c1"]) == pytest.approx(LOG_GAMMA, abs=GAMMA_TOLERANCE)
-    assert trials.notes({}) == ()
-    assert GammaTrials.begun(first, {"c2": 1.0}).next() == {}  # by outlines that are kept
+    return first, trials
+
+
+@pytest.mark.parametrize("lost", [np.inf, 0.15])
+def test_the_most_likely_gamma_is_that_of_the_same_outlines(
+    session: HexapodSession, lost: float
+) -> None:
+    off = []
+    for seed in (3, 4, 5):
+        first, trials = gammas_tried(session, lost, seed)
+        found = trials.found()
+        assert found.keys() == {"c1", "c2", "c3"}
+        off.append(np.log(found["c1"]) - LOG_GAMMA)
+        assert trials.notes({}) == ()
+        assert GammaTrials.begun(first, {"c2": 1.0}).next() == {}  # by outlines that are kept
+    # A single one may be as far off as the tolerance.
+    assert np.sqrt(np.mean(np.square(off))) < 0.75 * GAMMA_TOLERANCE
 
 
 def test_fewer_outlines_speak_for_no_gamma(session: HexapodSession) -> None:

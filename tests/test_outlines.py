@@ -72,7 +72,9 @@ def detect_with_blur(
     names = [f"leg{i + 1}" for i in range(len(bars))]
     wanted, one_view = np.ones((1, len(bars)), dtype=np.bool_), measurements(cam, len(bars))
     cylinders = [cylinder(b, radius) for b in bars]
-    search = Search(lambda row: image.astype(np.float32), one_view, A, B, cylinders, wanted, names)
+    size = float(np.linalg.norm(B - A, axis=2).mean())
+    grey = image.astype(np.float32)
+    search = Search(lambda row: grey, one_view, A, B, cylinders, wanted, names, size)
     found, blur = measure_outlines(search, Placement(A, B, (IDENTITY,), blur=known), [0])
     return found, float(blur[0])
 
@@ -301,9 +303,8 @@ def test_tube_and_rod_are_two_parts() -> None:
         Cylinder("rod", 0.009, "platform", -0.8 * length, 0.0),
     )
     A, B, wanted = whole.A[None, None], whole.B[None, None], np.ones((1, 1), dtype=np.bool_)
-    search = Search(
-        lambda row: image.astype(np.float32), measurements(cam, 1), A, B, [parts], wanted, ["leg1"]
-    )
+    grey, m = image.astype(np.float32), measurements(cam, 1)
+    search = Search(lambda row: grey, m, A, B, [parts], wanted, ["leg1"], length)
     found, _ = measure_outlines(search, Placement(A, B, (IDENTITY,)), [0])
     assert found.part == ("rod", "rod", "tube", "tube")
     assert np.all(found.used), found.reason

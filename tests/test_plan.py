@@ -19,7 +19,7 @@ import yaml
 from command_line import run
 from csv_rows import read_rows
 from fit_sessions import machine_session
-from machines import read_family
+from machines import with_round_arms
 from rich.console import Console
 
 import legcal
@@ -327,7 +327,7 @@ def test_what_is_seen_is_what_the_simulation_shows(planned: Plan, tmp_path: Path
 @pytest.mark.system
 def test_arms_that_are_cylinders_count_as_a_calibration_has_them(tmp_path: Path) -> None:
     """They are seen where the simulation shows them, and their lines become as well known."""
-    machine = create_model(read_family("delta", arm_radius=8.0), tmp_path).machine
+    machine = create_model(with_round_arms("delta"), tmp_path).machine
     setting = replace(FEW, shift=0.0, turn=0.0)
     plan = legcal.plan(machine, images=15, seed=1, noise=WHITE, setting=setting)
     write_session(plan, tmp_path / "session")

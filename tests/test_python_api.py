@@ -111,14 +111,16 @@ def test_a_machine_is_drawn_with_numbered_joints_and_hostile_names(tmp_path: Pat
     machine = legcal.load_mechanism("3-rps")
     legs = [dataclasses.replace(leg, name=f"$\\frac{{{leg.name}") for leg in machine.legs]
     hostile = dataclasses.replace(machine, name="$x^$", legs=tuple(legs))
-    figure = hostile.plot()
+    figure = legcal.plot_machine(hostile)
     figure.savefig(tmp_path / "machine.png", dpi=20)
     above, side = figure.axes
     for panel in (above, side):
         assert {"A1", "A2", "A3", "B1", "B2", "B3"} <= {text.get_text() for text in panel.texts}
     discs = np.asarray(above.collections[0].get_offsets(), dtype=np.float64)
     np.testing.assert_allclose(discs, 1e3 * machine.A_base[:, :2])
-    assert len(legcal.load_mechanism("3-rpr").plot().axes) == 1  # a plane is seen from above
+    assert (
+        len(legcal.plot_machine(legcal.load_mechanism("3-rpr")).axes) == 1
+    )  # a plane is seen from above
     assert pyplot.get_fignums() == []
 
 

@@ -1,7 +1,8 @@
 """Photographs measured again close to a fit, and fitted again.
 
-What is measured there does not depend on where the search began. Where the outlines show the gamma
-of a camera that is not given, all is done again with that.
+What is measured there depends little on where the search for the fit began: fits that agree give
+the same outlines, others give edges that light leaves open at one or another place. Where the
+outlines show the gamma of a camera that is not given, all is done again with that.
 """
 
 from __future__ import annotations

@@ -16,7 +16,6 @@ from legcal.cli.options import (
     WorkersOption,
     command_line,
     image_workers,
-    loading,
     show,
     write_page,
 )
@@ -29,34 +28,6 @@ if TYPE_CHECKING:
 
 _TESTS = "Tests of a result"
 _PARAMETERS = "Parameters by name (or a pattern: '*.offset'); each may be repeated"
-
-
-def _refuse_fleet(given: object) -> None:
-    """Refuse what earlier versions took for several machines in one command."""
-    if given:
-        raise UsageError(
-            "The command could not be run: found several machines (--list, --earlier, --resume or "
-            "more than one DATASET), needed one dataset; run legcal calibrate for each of them, or "
-            "a loop in Python (docs/python.md, Many machines)."
-        )
-
-
-def _refuse_old(parameter: typer.CallbackParam, given: list[str] | None) -> None:
-    """Refuse an option of earlier versions with its new spelling."""
-    if given:
-        option = parameter.opts[0]
-        new = " ".join(f"--set {text}{'=free' * (option == '--free')}" for text in given)
-        old = " ".join(f"{option} {text}" for text in given)
-        raise UsageError(f"The command could not be run: {old} is now written {new}.")
-
-
-def _refuse_significance(given: float | None) -> None:
-    """Refuse an option of earlier versions."""
-    if given is not None:
-        raise UsageError(
-            "The command could not be run: --significance is gone; call "
-            f"legcal.check(dataset, result, significance={given:g}) in Python."
-        )
 
 
 def calibrate(
@@ -147,22 +118,15 @@ def calibrate(
             "The calibration does not see it.",
         ),
     ] = None,
-    fleet: Annotated[
-        list[str] | None,
-        typer.Option("--list", "--earlier", hidden=True, callback=_refuse_fleet),
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", hidden=True, callback=_refuse_fleet)] = False,
     workers: WorkersOption = None,
-    fix: Annotated[list[str] | None, typer.Option(hidden=True, callback=_refuse_old)] = None,
-    free: Annotated[list[str] | None, typer.Option(hidden=True, callback=_refuse_old)] = None,
-    prior: Annotated[list[str] | None, typer.Option(hidden=True, callback=_refuse_old)] = None,
-    significance: Annotated[
-        float | None, typer.Option(hidden=True, callback=_refuse_significance)
-    ] = None,
 ) -> None:
     """Compute the calibrated model from images and encoder readings, or check an earlier one."""
     if len(datasets) > 1:
-        _refuse_fleet(datasets)
+        raise UsageError(
+            f"The command could not be run: found {len(datasets)} datasets, needed one dataset; "
+            "run legcal calibrate for each of them, or a loop in Python (docs/python.md, Many "
+            "machines)."
+        )
     dataset = datasets[0]
     if check is not None:
         others = {
@@ -195,15 +159,13 @@ def calibrate(
             "The truth could not be used: found --truth beside --no-report, needed the page, which "
             "alone compares the result with it; leave one of them out."
         )
-    with loading():
-        from legcal.calibration import pipeline
-        from legcal.calibration.result_folder import REPORT_NAME
-        from legcal.data.overrides import overrides_of_settings
-        from legcal.pages.html import PAGE
-        from legcal.report import calibration
-        from legcal.report.page.writing import write_report
+    from legcal.calibration import pipeline
+    from legcal.calibration.result_folder import REPORT_NAME
+    from legcal.data.overrides import overrides_of_settings
+    from legcal.pages.html import PAGE
+    from legcal.report import calibration
+    from legcal.report.page.writing import write_report
 
-        run, summary = pipeline.calibrate, calibration.summary
     arguments: dict[str, Any] = {
         "criteria": criteria,
         "transformation": transformation,
@@ -223,7 +185,7 @@ def calibrate(
     page_of = PageOfResult(
         lambda found, folder: write_report(found, output, command_line(), truth=true, into=folder)
     )
-    found = run(
+    found = pipeline.calibrate(
         given,
         output=output,
         progress=not quiet,
@@ -235,7 +197,7 @@ def calibrate(
     show(
         as_json,
         lambda: found.result.document(),
-        lambda: summary(found, output, verbose=verbose),
+        lambda: calibration.summary(found, output, verbose=verbose),
     )
     if not found.verdict.trustworthy:
         raise typer.Exit(1)

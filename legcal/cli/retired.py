@@ -12,7 +12,18 @@ COMMANDS = {
 }
 _DRY_RUN = "what was understood is shown before it is written, and files that are there stay"
 _TOPIC = "write the topic of the images behind the bag, BAG:/left/image_raw"
+_ONE_MACHINE = "calibrate one dataset a call, many in a loop (docs/python.md, Many machines)"
+_TABLE = "write it in the table, for which legcal new --template makes one to start from"
 OPTIONS: Mapping[str, Mapping[str, str]] = {
+    "calibrate": {
+        "--fix": "write --set NAME, or --set NAME=VALUE",
+        "--free": "write --set NAME=free",
+        "--prior": "write --set NAME=VALUE±SIGMA",
+        "--significance": "call legcal.check(dataset, result, significance=P) in Python",
+        "--list": _ONE_MACHINE,
+        "--earlier": _ONE_MACHINE,
+        "--resume": _ONE_MACHINE,
+    },
     "init": {
         "--servo": "write centre_us and us_per_deg of each servo into legcal.motors of the model",
         "--views": "give a FOLDER that holds only the photographs to use",
@@ -28,6 +39,21 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "--joint-topic": "joint states are read from the only topic that has them or from "
         "/joint_states; give others as a table with --readings",
         "--dry-run": _DRY_RUN,
+    },
+    "new": {
+        "--offset": "write offsets in the table (in a CSV the column offset), or give --min-length "
+        "and --max-length",
+        "--travel": "write travel in the table (in a CSV the columns travel_low and travel_high), "
+        "or give --min-length and --max-length",
+        "--platform-in": "write platform_in in the table (in a CSV a column of that name)",
+        "--base-spread": _TABLE,
+        "--platform-spread": _TABLE,
+        "--turn": _TABLE,
+        "--tilt": "write base_axes and platform_axes in the table",
+        "--arm-radius": "write arm_radius of each motor in the table, for which legcal new "
+        "--template --family delta makes one to start from",
+        "--rod-spacing": "write the joints in the table, for which legcal new --template --family "
+        "delta makes one to start from",
     },
 }
 """What stands in place of options, by command: the rest of a sentence."""

@@ -47,7 +47,7 @@ def simulate(
     from legcal.simulation.dataset import summary_document
     from legcal.simulation.settings import requested
 
-    nominal = load_mechanism(model).require_rigid_platform()
+    nominal = load_mechanism(model)
     settings = requested(Request(**options), nominal)
     workers = image_workers(cluster)
     made = run(nominal, output, settings, force=force, workers=workers, progress=not quiet)

@@ -258,7 +258,7 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         )
     camera_paths = tuple(folder / view.camera for view in entry.views.values())
     cameras = _read_cameras(camera_paths, problems)
-    machine = load_mechanism(_mechanism_path(folder, entry.mechanism)).require_rigid_platform()
+    machine = load_mechanism(_mechanism_path(folder, entry.mechanism))
     problems += _leg_problems(yaml_path, entry.views, machine.leg_names)
     if problems:
         raise DatasetError(problems)

@@ -229,7 +229,7 @@ def plan_new_dataset(
         With one sentence for each thing that is wrong.
     """
     folder, path, destination = Path(folder), Path(readings), Path(destination)
-    machine = load_mechanism(model).require_rigid_platform()
+    machine = load_mechanism(model)
     _check_place(folder, destination)
     photographs = find_photographs(folder)
     by_names, pattern = with_likely_views(photographs)

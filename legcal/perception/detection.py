@@ -68,7 +68,8 @@ def _of_image(
         error = np.broadcast_to(placement.joint_error, search.wanted.shape)[view]
         error = np.concatenate([error, [arm.error for arm in arms.values()]])
         for leg in predicted:
-            window[leg.leg] += placement.pixel_error + error[leg.leg] * _pixels_per_metre(leg)
+            joint_error = search.size * error[leg.leg]
+            window[leg.leg] += placement.pixel_error + joint_error * _pixels_per_metre(leg)
     known = placement.blur[view] if placement.blur else np.nan
     blur = search.blur.get(row, 0.0) if np.isnan(known) else known
     one = ImageSearch(
@@ -98,5 +99,7 @@ def _longest(search: Search, leg: int) -> str:
 
 def _pixels_per_metre(leg: PredictedLeg) -> float:
     """Return how large a metre appears at the nearer joint of a leg [px/m]."""
-    nearest = max(min(leg.A_camera[2], leg.B_camera[2]), 0.2 * leg.A_camera[2], 1e-3)
+    depths = leg.A_camera[2], leg.B_camera[2]
+    length = float(np.linalg.norm(leg.B_camera - leg.A_camera))
+    nearest = max(min(depths), 0.2 * depths[0], 0.0025 * length)
     return float(leg.band.scale / nearest)

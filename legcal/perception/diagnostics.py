@@ -33,8 +33,8 @@ from legcal.perception.pair_matching import (
 from legcal.perception.placement import Placement, Search, sensor_extent
 from legcal.workers import Run
 
-TOLERANCE = 0.006  # of an axis from its edge pair [m]
-NOMINAL_TOLERANCE = 0.015  # the same of a leg that nothing has moved from where the model has it
+TOLERANCE = 0.015  # of an axis from its edge pair, of the mean leg length
+NOMINAL_TOLERANCE = 0.0375  # the same of a leg that nothing has moved from where the model has it
 MIN_SHARE = 0.35  # share of the legs that explain
 MIN_GAIN = 2.0, 0.15  # the same against the reading's: factor, more
 MIN_SHARE_OF_USUAL = 0.5  # of the share that the other images of the view reach
@@ -61,8 +61,8 @@ _CAMERA_AXES = {
     "x forward and z up": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
     "x left and y up, or its images are upside down": np.diag([-1.0, -1.0, 1.0]),
 }
-FAR_OFF = (0.06, np.deg2rad(6.0))  # three times what a rough pose is good to: [m], angle
-FAR_OFF_PART = 0.06  # of the distance of the camera, where that is more
+# Three times what a rough pose is good to: part of the distance of the camera, angle
+FAR_OFF = (0.06, np.deg2rad(6.0))
 BEFORE_FIT = 2.5  # times more, while the cameras are only where legs were recognised
 
 
@@ -369,7 +369,8 @@ def _picture(
     """Return pairs with what a view should show at the reading of a row."""
     wanted = np.flatnonzero(search.wanted[view]) if legs is None else legs
     targets = leg_segments(search.A_base[row], search.B_base[row], search.cylinders, wanted)
-    return Picture(pairs, targets, sensor_extent(search.measurements.views[view].camera))
+    corners = sensor_extent(search.measurements.views[view].camera)
+    return Picture(pairs, targets, corners, search.size)
 
 
 def _share(
@@ -495,8 +496,7 @@ def far_off(hint: RigidTransform, T_base_camera: RigidTransform, reach: float = 
     """Say whether a rough pose is farther from a pose than rough ones are."""
     distance = float(np.linalg.norm(T_base_camera.translation))
     apart, angle = pose_distance(hint, T_base_camera)
-    nearest, part = reach * FAR_OFF[0], reach * FAR_OFF_PART
-    return apart > max(nearest, part * distance) or angle > reach * FAR_OFF[1]
+    return apart > reach * FAR_OFF[0] * distance or angle > reach * FAR_OFF[1]
 
 
 def _other_meanings(hint: RigidTransform) -> Iterator[tuple[str, RigidTransform]]:

@@ -99,9 +99,10 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
     if parts:
         near = search.near_fit
         edges = [
-            Edge(part.band, v, float(epsilon), part.half_width, part.hidden)
+            Edge(part.band, v, float(epsilon), 0.5 * float(np.mean(pair[1] - pair[0])), part.hidden)
             for part in parts
-            for v, epsilon in zip(part.near if near else part.edges.v, EPSILON, strict=True)
+            for pair in [part.near if near else part.edges.v]
+            for v, epsilon in zip(pair, EPSILON, strict=True)
         ]
         measured, blur = measure_edges(
             search.grey, search.camera, edges, together, search.blur, near_fit=near

@@ -53,7 +53,7 @@ from legcal.vision.cylinder import EPSILON
 from legcal.vision.visibility import look_alike
 from legcal.workers import Run
 
-DETECTOR_VERSION = 13  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 14  # raise it whenever outlines or notes that are kept come out differently
 MEASURING = "Measuring outlines"  # a stage of progress
 CHOICE_ROUNDS = 2  # in which outlines decide between poses that readings leave open
 FreePosesOf = Mapping[int, tuple[RigidTransform, ...]]  # T_base_platform of poses, likeliest first
@@ -117,6 +117,7 @@ class Photographs:
             self.cylinders,
             self.wanted,
             self.machine.leg_names,
+            self.machine.size,
             {} if pairs is None else pairs,
             {} if blur is None else blur,
         )

@@ -139,7 +139,6 @@ def plan(
         If one of the processes is ended from outside, or the cluster lost.
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
-    machine.require_rigid_platform()
     listed = () if places is None else tuple(read_places(Path(places), machine))
     n_views = _n_views(cameras, len(listed), hand_held=hand_held)
     n_images = _n_images(images, images_per_view, n_views, target)

@@ -211,7 +211,7 @@ def plan_import(
     DatasetError, ModelError, UsageError
         If a file cannot be read, nothing moves or nothing rests, or the clocks cannot be compared.
     """
-    machine = load_mechanism(model).require_rigid_platform()
+    machine = load_mechanism(model)
     destination = Path(destination)
     check_path(destination, DATASET_FOLDER)
     recordings = [open_recording(Path(path), machine) for path in sources]

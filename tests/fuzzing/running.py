@@ -28,8 +28,8 @@ from unittest.mock import patch
 
 import numpy as np
 import yaml
-from characterisation.inputs import made_input
-from characterisation.running import Outcome, run, words_of
+from command_outcomes import Outcome, run, words_of
+from made_inputs import made_input
 
 from fuzzing.mutations import mutate
 from fuzzing.subjects import SUBJECTS, Subject

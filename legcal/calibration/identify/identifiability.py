@@ -360,11 +360,6 @@ def _machine_notes(machine: Machine) -> list[str]:
             "poses between home and travel were judged too, which the machine may not reach; "
             "correct legcal.home or the limits."
         )
-    if machine.internal_joints:
-        notes.append(
-            "The platform has several bodies: legcal identifies such a machine, and does not "
-            "calibrate it yet."
-        )
     tied = ties_in_words(machine)
     notes += [] if tied is None else [tied]
     singular = singularity_note(machine)
@@ -386,7 +381,6 @@ def conditions_of(machine: Machine, predicted: PredictedObservations) -> tuple[C
         passive=[j for j, has in enumerate(predicted.with_length) if not has],
         board=bool(predicted.board.all()),
         actuators=predicted.on_actuators,
-        bodies=predicted.bodies,
     )
     frame, pose = predicted.frame[predicted.view[image]], predicted.pose[image]
     moves = predicted.carried_by[leg] >= 0

@@ -210,9 +210,9 @@ class FitProblem(Problem[State]):
         """Return the distances of both ends of outlines from predicted ones, (n, 2) [px]."""
         return self.outlines.offsets(self.keys, state)
 
-    def weighted(self, noise: NoiseModel, accepted: BoolArray | None = None) -> FitProblem:
-        """Return the problem with outlines of other noise, those that are not accepted left out."""
-        whitening = noise.whitening(self.outlines.covariance, accepted)
+    def weighted(self, noise: NoiseModel, weight: Array | BoolArray | None = None) -> FitProblem:
+        """Return the problem with outlines of other noise, their squares weighted (n_outlines,)."""
+        whitening = noise.whitening(self.outlines.covariance, weight)
         return self.with_factors(replace(self.factor("outlines"), whitening=whitening))
 
     def with_biases(self, biases: EdgeBiases) -> FitProblem:
