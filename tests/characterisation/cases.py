@@ -46,8 +46,7 @@ class Case:
     @property
     def is_rough(self) -> bool:
         """Whether its numbers come from outlines that were searched in photographs."""
-        searched = "photographs" in self.input or self.input == "repeats"
-        return searched and not self.name.startswith("identify")
+        return "photographs" in self.input or self.input == "repeats"
 
     def observe(self, folder: Path) -> dict[str, Any]:
         """Run it in an empty folder, and return all facts."""
@@ -154,8 +153,6 @@ def _models() -> Iterable[Case]:
             input="tables",
             slow=machine != "3-rps",
         )
-        alike = machine in {"6-sps", "hexapod-rod"}
-        yield Case(f"identify-{machine}", (Step(f"identify {machine} --json"),), slow=alike)
     yield Case(
         "inspect-text-and-write",
         (
@@ -195,30 +192,6 @@ def _models() -> Iterable[Case]:
     )
     written = Step("inspect {in}/planar.xml --write {out} --json", folder="{out}")
     yield Case("inspect-formats", (*steps, written), input="formats")
-
-
-def _identify() -> Iterable[Case]:
-    views = {
-        "paper": ("leg1,leg2,leg3,leg4", "leg3,leg4,leg5,leg6", "leg1,leg2,leg5,leg6"),
-        "weak": ("leg1,leg2,leg3,leg4,leg5", "leg1,leg2,leg3,leg4,leg5", "leg5,leg6"),
-        "narrow": ("leg1,leg2,leg3", "leg4,leg5,leg6", "leg1,leg2,leg3"),
-    }
-    for name, chosen in views.items():
-        words = " ".join(f"--view {view}" for view in chosen)
-        yield Case(f"identify-views-{name}", (Step(f"identify hexapod {words} --json"),))
-    words = "--view leg1,leg2 --view leg3,leg4,leg5,leg6 --images 6"
-    yield Case(
-        "identify-options",
-        (
-            Step(f"identify hexapod {words} --json"),
-            Step(f"identify hexapod {words} --board --json"),
-            Step(f"identify hexapod {words} --board --hand-held --json"),
-            Step(f"identify hexapod {words}"),
-        ),
-    )
-    yield Case("identify-dataset", (Step("identify {in} --json"),), input="hexapod-outlines")
-    step = Step("identify {in} --json")
-    yield Case("identify-photographs", (step,), input="3-rpr-photographs", slow=True)
 
 
 def _calibrate() -> Iterable[Case]:
@@ -274,23 +247,6 @@ def _calibrate() -> Iterable[Case]:
         input="3-rpr-photographs",
         slow=True,
     )
-
-
-def _boards() -> Iterable[Case]:
-    for name, words in {  # test_calibrate.py shows a board in the hand
-        "unknown": "--board charuco --views 2",
-        "known": "--board chessboard --board-pose --views 2",
-        "hand-held": "--board aprilgrid --hand-held --views 1",
-    }.items():
-        yield Case(
-            f"board-{name}",
-            (
-                Step(f"simulate 3-rpr -o {{here}}/set --level outlines --poses 7 --seed 4 {words}"),
-                Step("calibrate {here}/set -o {out} --json", folder="{out}"),
-                Step("identify {here}/set --json"),
-            ),
-            slow=True,
-        )
 
 
 def _images() -> Iterable[Case]:
@@ -436,9 +392,7 @@ def _others() -> Iterable[Case]:
 CASES: tuple[Case, ...] = (
     *_chains(),
     *_models(),
-    *_identify(),
     *_calibrate(),
-    *_boards(),
     *_images(),
     *_locate(),
     *_simulate(),
